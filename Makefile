@@ -1,0 +1,43 @@
+# make train: from a fresh clone to a trained policy. make test: everything that CI checks.
+# ARGS passes overrides on: make train ARGS="task=cartpole_swingup seed=2"
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+ARGS ?=
+
+.PHONY: setup train check lint types imports wheel test test-full clean
+
+setup: $(STAMP)
+
+# The pinned versions are installed once; later calls cost nothing until the dependencies change.
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python >= 3.11 is needed; choose one with: make setup PYTHON=python3.11"; exit 1; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev]"
+	@touch $@
+
+train: setup
+	$(BIN)/ksim-rl train $(ARGS)
+
+check: lint types imports
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: setup
+	$(BIN)/pyright
+
+imports: setup
+	$(BIN)/lint-imports
+
+test: setup check
+	$(BIN)/python -m pytest $(ARGS)
+
+test-full: setup check
+	$(BIN)/python -m pytest -m "full or not full" $(ARGS)
+
+clean:
+	rm -rf build dist .pytest_cache .ruff_cache .import_linter_cache

@@ -1,0 +1,72 @@
+"""Errors for users: each names the field, the value and what would be valid."""
+
+import difflib
+from collections.abc import Iterable
+from numbers import Real
+
+
+def near(name: str, choices: Iterable[str], *, limit: int = 3) -> str:
+    """Return a hint with the choices that resemble `name`, or with all of them when none does."""
+    choices = sorted(set(choices))
+    lower = {choice.lower(): choice for choice in choices}
+    close = [lower[match] for match in difflib.get_close_matches(name.lower(), lower, n=limit, cutoff=0.6)]
+    if close:
+        return f"did you mean {' or '.join(repr(choice) for choice in close)}?"
+    if not choices:
+        return "there is none to choose from"
+    shown = ", ".join(choices[:20])
+    return f"valid: {shown}" + (f", ... ({len(choices)} in all)" if len(choices) > 20 else "")
+
+
+def unknown_name(kind: str, name: str, choices: Iterable[str]) -> ValueError:
+    """Build the error for a name that matches nothing, with the near names."""
+    return ValueError(f"unknown {kind} {name!r}: {near(name, choices)}")
+
+
+def check_in_range(
+    field: str,
+    value: object,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    low_open: bool = False,
+) -> None:
+    """Refuse a number that is not finite or lies outside `[low, high]` (`(low, high]` with `low_open`).
+
+    Raises:
+        ValueError: naming the field, the value and the valid range.
+    """
+    bounds = f"{'(' if low_open or low is None else '['}{'-inf' if low is None else low}, "
+    bounds += f"{'inf' if high is None else high}{')' if high is None else ']'}"
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise ValueError(f"{field}={value!r}: expected a number in {bounds}")
+    number = float(value)
+    below = low is not None and (number <= low if low_open else number < low)
+    if number != number or abs(number) == float("inf") or below or (high is not None and number > high):
+        raise ValueError(f"{field}={value!r}: expected a finite number in {bounds}")
+
+
+def check_choice(field: str, value: object, choices: Iterable[object]) -> None:
+    """Refuse a value that is none of `choices`.
+
+    Raises:
+        ValueError: naming the field, the value and the near or valid choices.
+    """
+    choices = list(choices)
+    if value not in choices:
+        hint = near(str(value), [str(choice) for choice in choices])
+        raise ValueError(f"{field}={value!r}: {hint}")
+
+
+def check_pair(field: str, value: object, *, low: float | None = None, high: float | None = None) -> None:
+    """Refuse a range that is not a pair of finite, ordered numbers within `[low, high]`.
+
+    Raises:
+        ValueError: naming the field, the value and what a valid range looks like.
+    """
+    if not isinstance(value, (tuple, list)) or len(value) != 2:
+        raise ValueError(f"{field}={value!r}: expected a pair (low, high)")
+    for index, number in enumerate(value):
+        check_in_range(f"{field}[{index}]", number, low=low, high=high)
+    if value[0] > value[1]:
+        raise ValueError(f"{field}={value!r}: low exceeds high; expected a pair (low, high)")

@@ -1,0 +1,21 @@
+"""How rollouts are collected."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectorCfg:
+    """Options of `RolloutCollector` that a config may set.
+
+    Attributes:
+        require_graphs: on CUDA, fail where CUDA graphs are unavailable instead of running slower with a warning.
+        warmup: on CUDA, how many rollouts run eagerly before one is captured; they are ordinary rollouts.
+    """
+
+    require_graphs: bool = False
+    warmup: int = 2
+
+    def __post_init__(self) -> None:
+        """Refuse a warm-up that would capture cold kernels."""
+        if isinstance(self.warmup, bool) or not isinstance(self.warmup, int) or self.warmup < 1:
+            raise ValueError(f"warmup={self.warmup!r}: expected a whole number of at least 1")

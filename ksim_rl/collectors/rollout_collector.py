@@ -1,0 +1,161 @@
+"""Collects rollouts of fixed length from all envs, as one CUDA graph where there is CUDA."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ksim_rl import dims
+from ksim_rl.collectors.collector_cfg import CollectorCfg
+from ksim_rl.envs.masked_reset import MaskedReset
+from ksim_rl.physics.capture import Captured
+
+Policy = Callable[[TensorDictBase], TensorDictBase]
+
+
+class RolloutCollector:
+    """Runs `policy` in `env` for T steps at a time; envs that end are reset within the rollout.
+
+    On CUDA the T steps of policy, physics, terms, transforms and resets are one graph: the first rollouts run eagerly
+    (they warm the kernels up and are as good as any), the next is captured, and from then on each is one launch. On
+    CPU each control step's physics is one Warp graph and torch stays eager.
+
+    The rollout is the same as that of `EnvBase.rollout(T, policy, break_when_any_done=False, auto_reset=False)`.
+
+    Args:
+        env: an env of batch size [E] whose `step_and_maybe_reset` does not synchronize (`ManagerBasedRlEnv`,
+            `MaskedTransformedEnv`); on CPU any TorchRL env of batch size [E].
+        policy: writes `"action"` (and what training needs) into the tensordict that it is given.
+        rollout_length: T.
+        keys: the leaves to store; None stores all. Fewer leaves cost less memory and time.
+        cfg: options of the capture.
+        exploration: whether the policy samples or acts deterministically.
+
+    Raises:
+        ValueError: if T is no positive whole number or `keys` names a leaf that no step produces.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        policy: Policy,
+        *,
+        rollout_length: int,
+        keys: Sequence[NestedKey] | None = None,
+        cfg: CollectorCfg | None = None,
+        exploration: ExplorationType = ExplorationType.RANDOM,
+    ) -> None:
+        if isinstance(rollout_length, bool) or not isinstance(rollout_length, int) or rollout_length < 1:
+            raise ValueError(f"rollout_length={rollout_length!r}: expected a whole number of at least 1")
+        if len(env.batch_size) != 1:
+            raise ValueError(f"env.batch_size={tuple(env.batch_size)}: expected one dim, [E]")
+        cfg = cfg or CollectorCfg()
+        self.env, self.policy, self.rollout_length = env, policy, rollout_length
+        self._keys = None if keys is None else list(keys)
+        self._exploration = exploration
+        self._root: TensorDict | None = None
+        self._storage_TE: TensorDict | None = None
+        self._leaves: list[tuple[NestedKey, Tensor]] = []
+        device = env.device or torch.device("cpu")
+        self._run = Captured(
+            self._rollout, device=device, warmup=cfg.warmup, require_graphs=cfg.require_graphs
+        )
+
+    @torch.no_grad()
+    def collect(self) -> TensorDict:
+        """Run T steps and return the rollout, `["E","T"]`.
+
+        The memory is reused: the next call overwrites what this one returned.
+        """
+        if self._root is None:
+            self.reset()
+        self._run()
+        assert self._storage_TE is not None
+        if isinstance(self.env, MaskedReset):
+            # The env's own reference points into the graph's memory, which the next replay overwrites.
+            self.env.last_root = self._root
+        rollout_ET = self._storage_TE.transpose(0, 1)
+        return dims.name(rollout_ET, dims.E, dims.T)
+
+    def __iter__(self) -> Iterator[TensorDict]:
+        """Collect rollouts without end."""
+        while True:
+            yield self.collect()
+
+    @torch.no_grad()
+    def reset(self) -> None:
+        """Reset all envs; the next rollout starts there."""
+        root_E = self.env.reset()
+        if self._root is None:
+            self._root = root_E.clone()
+        else:
+            self._root.update_(root_E)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the EnvState from which the next rollout starts, by flat key."""
+        if self._root is None:
+            return {}
+        return {_flat(key): self._root.get(key).clone() for key in self._root.keys(True, True)}
+
+    @torch.no_grad()
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state_dict`; the env's own state is loaded apart.
+
+        Raises:
+            ValueError: if the state is of another env.
+        """
+        if self._root is None:
+            self.reset()
+        assert self._root is not None
+        own = {_flat(key): self._root.get(key) for key in self._root.keys(True, True)}
+        if own.keys() != state.keys():
+            raise ValueError(
+                f"state of another collector: missing {sorted(own.keys() - state.keys())}, "
+                f"unknown {sorted(state.keys() - own.keys())}"
+            )
+        for name, leaf in own.items():
+            leaf.copy_(state[name])
+
+    def _rollout(self) -> None:
+        assert self._root is not None
+        root_keys = list(self._root.keys(True, True))
+        root_E = self._root.copy()
+        with set_exploration_type(self._exploration):
+            for t in range(self.rollout_length):
+                env_state_E, root_E = self.env.step_and_maybe_reset(self.policy(root_E))
+                self._store(t, env_state_E)
+                root_E = root_E.select(*root_keys)
+        for key in root_keys:
+            self._root.get(key).copy_(root_E.get(key))
+
+    def _store(self, t: int, env_state_E: TensorDictBase) -> None:
+        if self._storage_TE is None:
+            self._allocate(env_state_E)
+        for key, leaf_TE in self._leaves:
+            leaf_TE[t].copy_(env_state_E.get(key))
+
+    def _allocate(self, env_state_E: TensorDictBase) -> None:
+        produced = list(env_state_E.keys(True, True))
+        for key in self._keys or []:
+            if key not in produced and (not isinstance(key, tuple) or len(key) > 1 or key[0] not in produced):
+                raise ValueError(f"keys: no step produces {key!r}; it produces {sorted(map(_flat, produced))}")
+        kept_E = env_state_E.select(*(self._keys or produced))
+        self._storage_TE = TensorDict(
+            {
+                key: torch.zeros(self.rollout_length, *leaf.shape, dtype=leaf.dtype, device=leaf.device)
+                for key, leaf in kept_E.items(True, True)
+            },
+            batch_size=[self.rollout_length, *env_state_E.batch_size],
+            device=env_state_E.device,
+        )
+        self._leaves = list(self._storage_TE.items(True, True))
+
+
+def _flat(key: NestedKey) -> str:
+    return key if isinstance(key, str) else ".".join(key)

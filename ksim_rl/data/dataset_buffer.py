@@ -1,0 +1,114 @@
+"""The dataset of one RL update.
+
+A TorchRL replay buffer that is filled, used for some epochs, and filled again.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import ReplayBuffer
+from torchrl.data.replay_buffers import Sampler
+
+from ksim_rl import dims
+from ksim_rl.data.dataset_cfg import DatasetCfg
+from ksim_rl.data.dataset_storage import DatasetStorage, DatasetWriter
+from ksim_rl.data.epoch_sampler import EpochSampler
+
+
+class DatasetBuffer(ReplayBuffer):
+    """Holds D env states and yields minibatches of B of them.
+
+    Storage, sampler and writer are TorchRL parts. `extend` takes a whole dataset, `["E","T"]` or `["D"]`, and
+    copies it into storage whose addresses never change; `sample` gives the next minibatch `["B"]`; `epoch`
+    gives `num_minibatches` of them that cover the dataset exactly once; `all` gives the dataset `["D"]`. None
+    of them makes a host sync, so whole epochs can be captured in a CUDA graph. Rows with a non-finite element
+    are removed, masked and counted: see `DatasetStorage`.
+
+    Args:
+        cfg: sizes of the dataset and its minibatches.
+        keys: leaves to store; None stores all that the data has.
+        seed: of the order of the env states.
+        sampler: any TorchRL sampler instead of `EpochSampler`.
+        device: where the dataset lives; "auto" takes the device of the first data.
+    """
+
+    def __init__(
+        self,
+        cfg: DatasetCfg,
+        *,
+        keys: Sequence[NestedKey] | None = None,
+        seed: int = 0,
+        sampler: Sampler | None = None,
+        device: torch.device | str = "auto",
+    ) -> None:
+        self._dataset = DatasetStorage(cfg.num_env_states, device=device)
+        super().__init__(
+            storage=self._dataset,
+            sampler=EpochSampler(seed=seed) if sampler is None else sampler,
+            writer=DatasetWriter(),
+            batch_size=cfg.num_env_states_per_minibatch,
+        )
+        self.cfg = cfg
+        self._keys = None if keys is None else list(keys)
+
+    @property
+    def non_finite_count(self) -> Tensor:
+        """Rows removed so far because an element was not finite, int64 [] on the device."""
+        return self._dataset.non_finite_count
+
+    def extend(self, data: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
+        """Replace the dataset by `data` and return the indices written, [D].
+
+        Args:
+            data: a rollout `["E","T"]` or any TensorDict of D env states; env-major order.
+
+        Raises:
+            ValueError: if `data` has not exactly D env states (the message has the numbers), or lacks a key.
+        """
+        size = self.cfg.num_env_states
+        if data.numel() != size:
+            raise ValueError(
+                f"the data has {data.numel()} env states (batch_size {tuple(data.batch_size)}), the dataset holds "
+                f"num_env_states_per_minibatch={self.cfg.num_env_states_per_minibatch} * "
+                f"num_minibatches={self.cfg.num_minibatches} = {size}: collect rollouts of {size} / num_envs steps"
+            )
+        if self._keys is not None:
+            missing = [key for key in self._keys if data.get(key, None) is None]
+            if missing:
+                raise ValueError(
+                    f"the data lacks {missing}; it has {sorted(map(str, data.keys(True, True)))}"
+                )
+            data = data.select(*self._keys, ("collector", "mask"), strict=False)
+        return super().extend(data, update_priority=update_priority)
+
+    def sample(self, batch_size: int | None = None, return_info: bool = False) -> Any:
+        """Return the next minibatch `["B"]` of the present epoch, with the info dict if `return_info`."""
+        result = super().sample(batch_size, return_info)
+        dims.name(result[0] if return_info else result, dims.B)
+        return result
+
+    def epoch(self) -> Iterator[TensorDictBase]:
+        """Yield `num_minibatches` minibatches `["B"]` that cover the dataset exactly once, in a new order."""
+        if isinstance(self._sampler, EpochSampler):
+            self._sampler.restart()
+        # One gather for all minibatches: a quarter of the kernels, and each minibatch is a contiguous slice.
+        data_D, _ = self._sample(self.cfg.num_env_states)
+        for minibatch_B in data_D.split(self.cfg.num_env_states_per_minibatch):
+            yield dims.name(minibatch_B, dims.B)
+
+    def all(self) -> TensorDictBase:
+        """Return the dataset `["D"]`: views of the storage, which the next `extend` overwrites."""
+        return dims.name(self._dataset.get(slice(None)), dims.D)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the dataset, the sampler's integers and the counter of removed rows."""
+        return super().state_dict() | {"non_finite_count": self.non_finite_count.clone()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue where `state_dict` was taken."""
+        super().load_state_dict(state_dict)
+        self.non_finite_count.copy_(state_dict["non_finite_count"])

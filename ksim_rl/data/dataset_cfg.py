@@ -1,0 +1,82 @@
+"""The arithmetic of the words: dataset, minibatch, rollout."""
+
+import math
+from dataclasses import dataclass
+
+from ksim_rl.checks import check_in_range
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetCfg:
+    """How many env states one RL update uses, and in how many gradient steps an epoch splits them.
+
+    Attributes:
+        num_env_states_per_minibatch: B, env states in one gradient step.
+        num_minibatches: gradient steps per epoch.
+    """
+
+    num_env_states_per_minibatch: int
+    num_minibatches: int
+
+    def __post_init__(self) -> None:
+        """Refuse values that are no positive whole numbers, naming the field."""
+        for field in ("num_env_states_per_minibatch", "num_minibatches"):
+            _check_count(field, getattr(self, field))
+
+    @property
+    def num_env_states(self) -> int:
+        """D, the size of the dataset."""
+        return self.num_env_states_per_minibatch * self.num_minibatches
+
+    def rollout_length(self, num_envs: int) -> int:
+        """Return T for so many parallel environments; see `rollout_length`."""
+        return rollout_length(self.num_env_states_per_minibatch, self.num_minibatches, num_envs)
+
+
+def rollout_length(num_env_states_per_minibatch: int, num_minibatches: int, num_envs: int) -> int:
+    """Return T, the steps that each env takes for one dataset: D / num_envs.
+
+    Raises:
+        ValueError: if T is no whole number; the message has the three numbers and the nearest working values
+            of each.
+    """
+    _check_count("num_env_states_per_minibatch", num_env_states_per_minibatch)
+    _check_count("num_minibatches", num_minibatches)
+    _check_count("num_envs", num_envs)
+    num_env_states = num_env_states_per_minibatch * num_minibatches
+    if num_env_states % num_envs == 0:
+        return num_env_states // num_envs
+
+    # n * M is a multiple of E exactly when n is a multiple of E / gcd(E, M).
+    per_minibatch = _near_multiples(
+        num_env_states_per_minibatch, num_envs // math.gcd(num_envs, num_minibatches)
+    )
+    minibatches = _near_multiples(
+        num_minibatches, num_envs // math.gcd(num_envs, num_env_states_per_minibatch)
+    )
+    envs = _near_divisors(num_env_states, num_envs)
+    raise ValueError(
+        f"num_env_states_per_minibatch={num_env_states_per_minibatch} * num_minibatches={num_minibatches} = "
+        f"{num_env_states} env states cannot be shared equally by num_envs={num_envs}: each env would take "
+        f"{num_env_states / num_envs:.4g} steps. Change one of them: "
+        f"num_env_states_per_minibatch={per_minibatch}, num_minibatches={minibatches} or num_envs={envs}"
+    )
+
+
+def _check_count(field: str, value: int) -> None:
+    check_in_range(field, value, low=1)
+    if not isinstance(value, int):
+        raise ValueError(f"{field}={value!r}: expected a whole number >= 1")
+
+
+def _near_multiples(value: int, factor: int) -> str:
+    below = value // factor * factor
+    return " or ".join(str(number) for number in (below, below + factor) if number > 0)
+
+
+def _near_divisors(number: int, value: int) -> str:
+    small = [divisor for divisor in range(1, math.isqrt(number) + 1) if number % divisor == 0]
+    divisors = sorted({*small, *(number // divisor for divisor in small)})
+    near = [divisor for divisor in divisors if divisor < value][-1:]
+    near += [divisor for divisor in divisors if divisor > value][:1]
+    return " or ".join(str(divisor) for divisor in near)

@@ -1,0 +1,159 @@
+"""Static storage of one dataset, which no non-finite number enters."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data.replay_buffers import Writer
+from torchrl.data.replay_buffers.storages import TensorStorage
+
+from ksim_rl import dims
+
+# Where TorchRL's losses look for rows to leave out (`LossModule.loss_mask_key`), stock ones included.
+MASK_KEY = ("collector", "mask")
+
+
+class DatasetStorage(TensorStorage):
+    """A TorchRL storage of D env states that are always written together, in place.
+
+    The first write allocates it; later ones copy into the same addresses, so that a captured update stays
+    valid.
+
+    A row with a non-finite element in any leaf is removed without a host sync: its leaves become those of the
+    first row that is finite, `("collector", "mask")` reads False there, and `non_finite_count` grows by one.
+    All rows stay finite, so nothing non-finite reaches a loss or, through a zero times infinity, a gradient;
+    and TorchRL's losses leave rows with a False mask out of their means. (Zeros instead of a finite row would
+    not do: a standard deviation of zero has no logarithm.) If no row at all is finite, the leaves are zero
+    where they were not, and every mask is False.
+
+    Args:
+        max_size: D.
+        device: where the data lives; "auto" takes the device of the first data.
+    """
+
+    def __init__(self, max_size: int, *, device: torch.device | str = "auto") -> None:
+        # TensorStorage wants either data or a size, and allocates from the data only.
+        super().__init__(None, max_size, device=device)
+        self.non_finite_count = torch.zeros((), dtype=torch.int64)
+        if self.device != "auto":
+            self.non_finite_count = self.non_finite_count.to(self.device)
+
+    @torch.no_grad()
+    def write(self, data: TensorDictBase) -> None:
+        """Replace the content by `data`, whose batch dims of D elements in all are flattened in row-major
+        order.
+
+        Raises:
+            ValueError: if `data` has not D elements, or its leaves are not those of the first write.
+        """
+        if data.numel() != self.max_size:
+            raise ValueError(
+                f"the dataset holds {self.max_size} env states, the data has {data.numel()}: batch_size "
+                f"{tuple(data.batch_size)}"
+            )
+        leaves: dict[Any, Tensor] = dict(data.items(include_nested=True, leaves_only=True))
+        mask = leaves.pop(MASK_KEY, None)
+        if not self.initialized:
+            self._allocate(leaves, data.batch_dims)
+        stored = self._stored_leaves(leaves, data.batch_dims)
+        for key, leaf_D in stored.items():
+            leaf_D.unflatten(0, data.batch_size).copy_(leaves[key])
+
+        finite_D1 = _finite_rows(stored.values())
+        mask_D1: Tensor = self._storage.get(MASK_KEY)
+        mask_D1.copy_(finite_D1)
+        if mask is not None:
+            mask_D1.logical_and_(mask.reshape(-1, 1))
+        _replace_rows(stored.values(), keep_D1=finite_D1, donor_D1=mask_D1)
+        self.non_finite_count.add_((~finite_D1).sum())
+        self._len = self.max_size
+        self._bump_mutation_revision()
+
+    def _allocate(self, leaves: dict[Any, Tensor], batch_dims: int) -> None:
+        if self.device == "auto":
+            self.device = next(iter(leaves.values())).device
+            self.non_finite_count = self.non_finite_count.to(self.device)
+        content = TensorDict({}, batch_size=[self.max_size], device=self.device)
+        for key, leaf in leaves.items():
+            shape = (self.max_size, *leaf.shape[batch_dims:])
+            content.set(key, torch.empty(shape, dtype=leaf.dtype, device=self.device))
+        content.set(MASK_KEY, torch.ones((self.max_size, 1), dtype=torch.bool, device=self.device))
+        self._storage = dims.name(content, dims.D)
+        self.initialized = True
+
+    def _stored_leaves(self, leaves: dict[Any, Tensor], batch_dims: int) -> dict[Any, Tensor]:
+        stored: dict[Any, Tensor] = dict(self._storage.items(include_nested=True, leaves_only=True))
+        del stored[MASK_KEY]
+        if stored.keys() != leaves.keys():
+            missing, extra = list(stored.keys() - leaves.keys()), list(leaves.keys() - stored.keys())
+            raise ValueError(
+                f"the data must have the leaves of the first write: missing {missing}, new {extra}"
+            )
+        for key, leaf in leaves.items():
+            if stored[key].shape[1:] != leaf.shape[batch_dims:] or stored[key].dtype != leaf.dtype:
+                raise ValueError(
+                    f"leaf {key!r} is {leaf.dtype} {tuple(leaf.shape[batch_dims:])} per env state; the first write "
+                    f"had {stored[key].dtype} {tuple(stored[key].shape[1:])}"
+                )
+        return stored
+
+
+class DatasetWriter(Writer):
+    """Writes a whole dataset at once into a `DatasetStorage`."""
+
+    _storage: DatasetStorage
+
+    def add(self, data: Any) -> int:
+        """Refuse: a dataset is written as a whole."""
+        raise ValueError(
+            "a dataset is written as a whole: use extend() with all its env states instead of add()"
+        )
+
+    def extend(self, data: Sequence | TensorDictBase) -> Tensor:
+        """Replace the content and return the indices written, which are all, [D]."""
+        if not isinstance(data, TensorDictBase):
+            raise ValueError(f"extend() got {type(data).__name__}: expected a TensorDict, e.g. a rollout")
+        self._storage.write(data)
+        return torch.arange(self._storage.max_size, device=self._storage.device)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return nothing: the writer has no state."""
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Read nothing."""
+
+    def dumps(self, path: Any) -> None:
+        """Write nothing."""
+
+    def loads(self, path: Any) -> None:
+        """Read nothing."""
+
+    def _empty(self, empty_write_count: bool = True) -> None:
+        """Forget nothing."""
+
+
+def _finite_rows(leaves_D: Iterable[Tensor]) -> Tensor:
+    """Return bool [D, 1]: whether each element of a row is finite in all leaves."""
+    finite_D1: Tensor | None = None
+    for leaf_D in leaves_D:
+        if leaf_D.is_floating_point():
+            leaf_finite_D1 = leaf_D.isfinite().reshape(leaf_D.shape[0], -1).all(1, keepdim=True)
+            finite_D1 = leaf_finite_D1 if finite_D1 is None else finite_D1 & leaf_finite_D1
+    if finite_D1 is None:
+        raise ValueError("the data has no floating-point leaf: nothing to learn from")
+    return finite_D1
+
+
+def _replace_rows(leaves_D: Iterable[Tensor], *, keep_D1: Tensor, donor_D1: Tensor) -> None:
+    """Overwrite rows where `keep_D1` is False, in place, by the first row that `donor_D1` marks."""
+    # argmax gives the first of equal values. If none is marked it gives row 0, which nan_to_num makes finite.
+    donor_1 = donor_D1.flatten().to(torch.uint8).argmax().unsqueeze(0)
+    for leaf_D in leaves_D:
+        row = leaf_D.index_select(0, donor_1)
+        if leaf_D.is_floating_point():
+            row = row.nan_to_num(0.0, 0.0, 0.0)
+        keep = keep_D1.reshape(-1, *[1] * (leaf_D.ndim - 1))
+        torch.where(keep, leaf_D, row, out=leaf_D)

@@ -1,0 +1,161 @@
+"""Sampling without replacement, whose order is a function of (seed, epoch) and stays on the device."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchrl.data.replay_buffers import Sampler
+from torchrl.data.replay_buffers.storages import Storage
+
+from ksim_rl import random
+
+_STREAM = random.stream_id("data.epoch_sampler")
+
+
+class EpochSampler(Sampler):
+    """Yields every stored env state once per epoch, in a new random order each epoch.
+
+    A drop-in for TorchRL's `SamplerWithoutReplacement` in any replay buffer. The order is the rank of
+    counter-based random keys, so it needs no generator, makes no host sync, can be captured in a CUDA graph
+    (the epoch counter is a device tensor; capture whole epochs), and resumes from four integers.
+
+    Args:
+        seed: two samplers with the same seed give the same orders.
+        shuffle: False reads in the order of the storage.
+        drop_last: leave out the last, smaller minibatch when the sizes do not divide.
+    """
+
+    def __init__(self, *, seed: int = 0, shuffle: bool = True, drop_last: bool = False) -> None:
+        self.seed = seed
+        self.shuffle = shuffle
+        self.drop_last = drop_last
+        self._size = 0
+        self._position = 0
+        self._ran_out = False
+        self._first_epoch = 0
+        # Device tensors: epochs started so far, and the order of the present one.
+        self._epoch: Tensor | None = None
+        self._order_D: Tensor | None = None
+
+    def set_seed(self, seed: int) -> None:
+        """Start again with another seed, at epoch 0. Keeps the counter's address."""
+        self.seed = seed
+        self._empty()
+        self._first_epoch = 0
+        if self._epoch is not None:
+            self._epoch.zero_()
+
+    def extend(self, index: Tensor) -> None:
+        """Start a new epoch, because the data is new."""
+        self.restart()
+
+    def restart(self) -> None:
+        """Leave the present epoch: the next sample is the first of a new one."""
+        self._position = 0
+        self._ran_out = False
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
+        """Return the indices of the next minibatch [B] and an empty info dict.
+
+        Raises:
+            ValueError: if `drop_last` leaves nothing, because the minibatch is larger than the storage.
+        """
+        size = len(storage)  # type: ignore[arg-type]
+        if size == 0:
+            raise RuntimeError("the replay buffer is empty: extend it before sampling")
+        if self.drop_last and batch_size > size:
+            raise ValueError(
+                f"batch_size={batch_size} exceeds the {size} stored elements and drop_last=True: "
+                "nothing could be sampled; use a smaller batch_size or drop_last=False"
+            )
+        if size != self._size:
+            self._size, self._position = size, 0
+        if self._position == 0:
+            self._order_D = self._next_order(size, torch.device(getattr(storage, "device", None) or "cpu"))
+        assert self._order_D is not None
+        index = self._order_D[self._position : self._position + batch_size]
+        self._position += batch_size
+        left = size - self._position
+        self._ran_out = left <= 0 or (self.drop_last and left < batch_size)
+        if self._ran_out:
+            self._position = 0
+        self._remaining_batches = left // batch_size if self.drop_last else -(-left // batch_size)
+        if storage.ndim > 1:
+            index = torch.unravel_index(index, storage.shape)
+        return index, {}
+
+    def _next_order(self, size: int, device: torch.device) -> Tensor:
+        if not self.shuffle:
+            return torch.arange(size, device=device)
+        if self._epoch is None or self._epoch.device != device:
+            self._epoch = torch.full((), self._first_epoch, dtype=torch.int64, device=device)
+        order_D = permutation(self.seed, self._epoch, size)
+        self._epoch.add_(1)
+        return order_D
+
+    @property
+    def ran_out(self) -> bool:
+        """Whether the last minibatch was the last of its epoch; iterating over the buffer stops there."""
+        return self._ran_out
+
+    @ran_out.setter
+    def ran_out(self, value: bool) -> None:
+        self._ran_out = value
+
+    def state_dict(self) -> dict[str, int]:
+        """Return the integers from which the orders continue exactly (reads the epoch counter on the host).
+
+        Eturn the integers from which the orders continue exactly (reads the epoch counter on the host).
+        """
+        epoch = self._first_epoch if self._epoch is None else int(self._epoch)
+        return {"seed": self.seed, "epoch": epoch, "size": self._size, "position": self._position}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue where `state_dict` was taken."""
+        self.seed = int(state_dict["seed"])
+        self._first_epoch = int(state_dict["epoch"])
+        self._size, self._position = int(state_dict["size"]), int(state_dict["position"])
+        self._ran_out = False
+        device = torch.device("cpu") if self._epoch is None else self._epoch.device
+        if self._epoch is not None:
+            self._epoch.fill_(self._first_epoch)
+        if self._position > 0:
+            previous = torch.full((), self._first_epoch - 1, dtype=torch.int64, device=device)
+            self._order_D = (
+                permutation(self.seed, previous, self._size)
+                if self.shuffle
+                else torch.arange(self._size, device=device)
+            )
+
+    def dumps(self, path: str | Path) -> None:
+        """Write the state as JSON into the folder `path`."""
+        folder = Path(path)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "epoch_sampler.json").write_text(json.dumps(self.state_dict()))
+
+    def loads(self, path: str | Path) -> None:
+        """Read what `dumps` wrote."""
+        self.load_state_dict(json.loads((Path(path) / "epoch_sampler.json").read_text()))
+
+    def _empty(self) -> None:
+        self._size = 0
+        self._position = 0
+        self._ran_out = False
+        self._order_D = None
+
+
+def permutation(seed: int, epoch: Tensor, size: int) -> Tensor:
+    """Return a random permutation of `range(size)` that depends on `seed` and `epoch` only.
+
+    Args:
+        epoch: int64 []; its device is that of the result.
+
+    Returns:
+        int64 [size].
+    """
+    seed_tensor = torch.full((), seed, dtype=torch.int64, device=epoch.device)
+    keys = random.row_keys(seed_tensor, _STREAM, epoch, size)
+    # 63 random bits: ties are rare, and the rank of equal keys is still a permutation.
+    return torch.argsort((keys.first_E << 31) ^ keys.second_E, stable=True)

@@ -1,0 +1,393 @@
+"""The env: a TorchRL `EnvBase` over Warp-batched MuJoCo, made of terms."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import secrets
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import mujoco_warp
+import numpy as np
+import torch
+import warp
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Composite, Unbounded
+
+from ksim_rl import dims
+from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.managers import (
+    ActionManager,
+    CommandManager,
+    CurriculumManager,
+    EpisodeLog,
+    EventManager,
+    MetricManager,
+    ObservationManager,
+    RewardManager,
+    TerminationManager,
+)
+from ksim_rl.envs.masked_reset import MaskedReset
+from ksim_rl.envs.rendering import OffscreenRenderer
+from ksim_rl.envs.reset_to_default import ResetToDefault
+from ksim_rl.envs.scene import build_spec
+from ksim_rl.envs.sensors import ContactTracker
+from ksim_rl.envs.view import EnvView
+from ksim_rl.envs.visualizer import DebugVisualizer
+from ksim_rl.physics import World, load_model
+
+RENDER_MODES = (None, "rgb_array")
+
+
+class ManagerBasedRlEnv(MaskedReset):
+    """E parallel worlds that emit EnvStates `["E"]`.
+
+    Keys of a root: `("obs", term)` and `("command", name)`, float32 [E, L]; `"action"`, float32 [E, L]; and under
+    `"next"` the same obs and command of the state reached, `"reward"` float32 and `"done"`, `"terminated"`,
+    `"truncated"` bool, [E, 1] each. `next` holds the true observation of the state reached, also where the episode
+    ended there. A world whose physics is not finite, or whose action is not, ends with `terminated` and reward 0; its
+    `next` observation is that of the model's default state, since the state reached does not exist.
+
+    Args:
+        cfg: what the env is made of.
+        device: where worlds and data live.
+        render_mode: None, or "rgb_array" for `render()`.
+
+    Raises:
+        ValueError: naming the field of `cfg` that is wrong and what would be valid.
+    """
+
+    is_vector_env = True
+
+    def __init__(
+        self, cfg: ManagerBasedRlEnvCfg, device: str | torch.device = "cpu", render_mode: str | None = None
+    ) -> None:
+        if render_mode not in RENDER_MODES:
+            raise ValueError(f"render_mode={render_mode!r}: expected one of {RENDER_MODES}")
+        super().__init__(device=torch.device(device), batch_size=[cfg.scene.num_envs])
+        self.cfg = cfg
+        self.render_mode = render_mode
+        self.metadata = {
+            "mujoco_version": mujoco.__version__,
+            "warp_version": warp.__version__,
+            "mujoco_warp_version": mujoco_warp.__version__,
+            "render_modes": list(RENDER_MODES),
+        }
+        spec = build_spec(cfg.scene)
+        cfg.sim.apply_to(spec)
+        model = load_model(spec)
+        self._renderer = OffscreenRenderer(model, cfg.viewer, spacing=cfg.scene.spacing) if render_mode else None
+        self._is_closed = False
+
+        events = {"reset": ResetToDefault()} if cfg.events is None else dict(cfg.events)
+        self.world = World(
+            model,
+            num_envs=cfg.scene.num_envs,
+            device=device,
+            sim=cfg.sim,
+            per_world_fields=tuple({field for term in events.values() for field in term.per_world_fields}),
+        )
+        self.view = EnvView(
+            self.world,
+            step_dt=self.step_dt,
+            soft_joint_pos_limit_factor=cfg.scene.soft_joint_pos_limit_factor,
+        )
+        self.world.refresh()
+        self._events_cfg: Mapping[str, Any] = events
+        self.load_managers()
+        self.view.freeze()
+        self._make_specs()
+        self.seed(-1 if cfg.seed is None else cfg.seed)
+
+    # -- what it is made of --------------------------------------------------------------------------------------
+
+    def load_managers(self) -> None:
+        """Build the managers: events and commands, then actions and observations, then the rest.
+
+        Each term runs once here, so that names that match nothing are errors before the first step.
+        """
+        cfg, view = self.cfg, self.view
+        self._contact_trackers = [
+            ContactTracker(name, sensor, view) for name, sensor in cfg.scene.sensors.items()
+        ]
+        view.contacts.update(zip(cfg.scene.sensors, self._contact_trackers, strict=True))
+        self.event_manager = EventManager(self._events_cfg, view)
+        view.refreshed()
+        self.command_manager = CommandManager(cfg.commands, view)
+        self.action_manager = ActionManager(cfg.actions, view)
+        self.observation_manager = ObservationManager(cfg.observations, view)
+        adapted = frozenset(
+            name for term in cfg.curriculum.values() for name in getattr(term, "adapted_rewards", ())
+        )
+        self.reward_manager = RewardManager(
+            cfg.rewards, view, scale=self.step_dt if cfg.scale_rewards_by_dt else 1.0, adapted=adapted
+        )
+        view.reward_weights = dict(
+            zip(self.reward_manager.names, self.reward_manager.weights_R.unbind(), strict=True)
+        )
+        self.termination_manager = TerminationManager(
+            cfg.terminations, view, is_finite_horizon=cfg.is_finite_horizon
+        )
+        self.metric_manager = MetricManager(cfg.metrics, view)
+        self.curriculum_manager = CurriculumManager(cfg.curriculum, view)
+        self._log = EpisodeLog(view, self.reward_manager, self.termination_manager, self.metric_manager)
+
+    @property
+    def unwrapped(self) -> ManagerBasedRlEnv:
+        """This env, without any wrapper."""
+        return self
+
+    @property
+    def num_envs(self) -> int:
+        """E."""
+        return self.cfg.scene.num_envs
+
+    @property
+    def physics_dt(self) -> float:
+        """Seconds of one physics substep."""
+        return float(self.world.mj_model.opt.timestep)
+
+    @property
+    def step_dt(self) -> float:
+        """Seconds of one env step."""
+        return self.physics_dt * self.cfg.decimation
+
+    @property
+    def max_episode_length_s(self) -> float:
+        """Seconds after which an episode is cut; 0 for never."""
+        return self.cfg.episode_length_s
+
+    @property
+    def max_episode_length(self) -> int:
+        """Env steps after which an episode is cut; 0 for never."""
+        # Rounding first keeps 20 s / 0.02 s at 1000 steps in floating point.
+        return math.ceil(round(self.cfg.episode_length_s / self.step_dt, 6))
+
+    def _make_specs(self) -> None:
+        num_envs, device = self.num_envs, self.device
+
+        def vectors(values: Mapping[str, Tensor]) -> Composite:
+            leaves = {name: Unbounded(shape=value.shape, device=device) for name, value in values.items()}
+            return Composite(leaves, shape=[num_envs], device=device)
+
+        observation = {"obs": vectors(self.observation_manager.read())}
+        if self.command_manager.values:
+            observation["command"] = vectors(self.command_manager.values)
+        flag = Binary(n=1, shape=(num_envs, 1), dtype=torch.bool, device=device)
+        self.observation_spec = self._named(Composite(observation, shape=[num_envs], device=device))
+        self.full_action_spec = self._named(
+            Composite(
+                action=Unbounded(shape=(num_envs, self.action_manager.size), device=device),
+                shape=[num_envs],
+                device=device,
+            )
+        )
+        self.full_reward_spec = self._named(
+            Composite(reward=Unbounded(shape=(num_envs, 1), device=device), shape=[num_envs], device=device)
+        )
+        self.full_done_spec = self._named(
+            Composite(
+                done=flag,
+                terminated=flag.clone(),
+                truncated=flag.clone(),
+                shape=[num_envs],
+                device=device,
+            )
+        )
+
+    @staticmethod
+    def _named(spec: Composite) -> Composite:
+        spec.names = [dims.E]
+        return spec
+
+    # -- step and reset ------------------------------------------------------------------------------------------
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        view, world = self.view, self.world
+        action_EL = self._checked_action(tensordict.get("action"))
+        view.step_count.add_(1)
+        self.event_manager.step()
+        finite_E = self.action_manager.apply(action_EL)
+
+        world.step(self.cfg.decimation)
+        finite_E = finite_E & torch.isfinite(world.qpos_EL.sum(-1) + world.qvel_EL.sum(-1))
+        # Clearing failed worlds at once keeps everything that is computed from here on finite.
+        world.reset(~finite_E)
+        world.refresh()
+        view.refreshed()
+
+        view.episode_step_E.add_(1)
+        for tracker in self._contact_trackers:
+            tracker.update()
+        terminated_E, truncated_E = self.termination_manager.step(finite_E)
+        done_E = terminated_E | truncated_E
+        reward_E = self.reward_manager.step(finite_E)
+        self.metric_manager.step(finite_E)
+        self._log.step(done_E)
+        self.command_manager.step(~done_E)
+        return self._env_state(
+            reward=reward_E[:, None],
+            done=done_E[:, None],
+            terminated=terminated_E[:, None],
+            truncated=truncated_E[:, None],
+        )
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        view = self.view
+        mask_E = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        if tensordict is not None and "_reset" in tensordict.keys():
+            mask_E = tensordict.get("_reset").view(self.num_envs)
+        view.reset_count_E.add_(mask_E)
+        self.curriculum_manager.reset(mask_E)
+        self.world.reset(mask_E)
+        view.memories.clear(mask_E)
+        view.episode_step_E.masked_fill_(mask_E, 0)
+        self.event_manager.reset(mask_E)
+        self._recompute(*self.event_manager.fields("reset", "interval", "step"))
+        self.command_manager.resample(mask_E)
+        self.world.refresh()
+        view.refreshed()
+        self.command_manager.refresh(mask_E)
+        no_E1 = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+        return self._env_state(done=no_E1, terminated=no_E1.clone(), truncated=no_E1.clone())
+
+    def _env_state(self, **leaves: Tensor) -> TensorDict:
+        data: dict[str, Any] = {"obs": self.observation_manager.read()}
+        if self.command_manager.values:
+            data["command"] = {name: value.clone() for name, value in self.command_manager.values.items()}
+        return TensorDict(
+            data | leaves, batch_size=self.batch_size, device=self.device, names=[dims.E]
+        )
+
+    def _checked_action(self, action_EL: Tensor | None) -> Tensor:
+        expected = (self.num_envs, self.action_manager.size)
+        if action_EL is None:
+            raise ValueError(f"the tensordict has no 'action': expected float32 of shape {expected}")
+        if tuple(action_EL.shape) != expected or action_EL.dtype != torch.float32:
+            raise ValueError(
+                f"action has dtype {action_EL.dtype} and shape {tuple(action_EL.shape)}: expected torch.float32 and "
+                f"{expected}"
+            )
+        return action_EL
+
+    def _recompute(self, *fields: str) -> None:
+        if fields:
+            self.world.set_const(fields)
+
+    # -- seeds ---------------------------------------------------------------------------------------------------
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Seed all draws and redo the startup events: what follows is a function of the seed alone."""
+        seed = secrets.randbelow(2**31) if seed is None else seed
+        self.cfg = dataclasses.replace(self.cfg, seed=seed)
+        view = self.view
+        view.seed.fill_(seed)
+        view.step_count.zero_()
+        view.reset_count_E.zero_()
+        self.event_manager.startup()
+        self._recompute(*self.event_manager.fields("startup"))
+
+    # -- what trainers read --------------------------------------------------------------------------------------
+
+    def episode_log(self) -> dict[str, Tensor]:
+        """Return sums over the episodes that ended since `episode_log_reset_`, float32 [] on the device.
+
+        Keys: `episodes`, `length_sum`, `return_sum`, `reward/<term>`, `termination/<term>` (with `non_finite`),
+        `metric/<name>`.
+        """
+        return self._log.read()
+
+    def episode_log_reset_(self) -> None:
+        """Start the sums of `episode_log` anew."""
+        self._log.clear()
+
+    def curriculum_levels(self) -> dict[str, Tensor]:
+        """Return the latest level of each curriculum, float32 [] on the device."""
+        return dict(zip(self.curriculum_manager.names, self.curriculum_manager.levels_C.unbind(), strict=True))
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """Return all that the env needs to continue bit-exactly: physics, clocks, commands, counters, memories."""
+        state = {f"world.{name}": value for name, value in self.world.state_dict().items()}
+        state |= {f"env.{name}": tensor.clone() for name, tensor in self._buffers_to_save().items()}
+        return state
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> None:
+        """Continue from a `state_dict`.
+
+        Raises:
+            ValueError: if entries are missing or unknown, or shapes differ: the state is of another env.
+        """
+        own = self._buffers_to_save()
+        given = {name.removeprefix("env."): value for name, value in state_dict.items() if name.startswith("env.")}
+        if own.keys() != given.keys():
+            raise ValueError(
+                f"state of another env: missing {sorted(own.keys() - given.keys())}, "
+                f"unknown {sorted(given.keys() - own.keys())}"
+            )
+        for name, buffer in own.items():
+            if buffer.shape != given[name].shape:
+                raise ValueError(
+                    f"state of another env: {name} has shape {tuple(given[name].shape)}, expected {tuple(buffer.shape)}"
+                )
+            buffer.copy_(given[name])
+        prefix = "world."
+        self.world.load_state_dict(
+            {name.removeprefix(prefix): value for name, value in state_dict.items() if name.startswith(prefix)}
+        )
+        self.world.refresh()
+        self.view.refreshed()
+        self.cfg = dataclasses.replace(self.cfg, seed=int(self.view.seed))
+
+    def _buffers_to_save(self) -> dict[str, Tensor]:
+        view = self.view
+        counters = {
+            "seed": view.seed,
+            "step_count": view.step_count,
+            "reset_count_E": view.reset_count_E,
+            "episode_step_E": view.episode_step_E,
+            "reward_weights_R": self.reward_manager.weights_R,
+            "curriculum_levels_C": self.curriculum_manager.levels_C,
+            "episode_log_N": self._log.totals_N,
+        }
+        return counters | view.memories.buffers()
+
+    # -- pictures and the end ------------------------------------------------------------------------------------
+
+    def setup_manager_visualizers(self) -> dict[str, Any]:
+        """Return the terms that draw themselves, by name."""
+        return {f"commands/{name}": term for name, term in self.cfg.commands.items()}
+
+    def update_visualizers(self, visualizer: DebugVisualizer) -> None:
+        """Let each term of `setup_manager_visualizers` draw the env that the viewer shows."""
+        for scope, term in self.setup_manager_visualizers().items():
+            with self.view.scope(scope):
+                term.draw_debug(self.view, visualizer, self.cfg.viewer.env_index)
+
+    def render(self) -> np.ndarray | None:
+        """Return a picture of the current state, uint8 [H, W, 3], or None without a render mode.
+
+        Raises:
+            RuntimeError: if no OpenGL platform is there, with the ways to get one.
+        """
+        if self._renderer is None:
+            return None
+        return self._renderer.render(self.world, draw=self.update_visualizers)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Free the worlds' memory.
+
+        Raises:
+            RuntimeError: if the env is closed already and `raise_if_closed`.
+        """
+        if self._is_closed:
+            if raise_if_closed:
+                raise RuntimeError("the env is closed already")
+            return
+        self._is_closed = True
+        self.is_closed = True
+        if self._renderer is not None:
+            self._renderer.close()
+        self.world.close()

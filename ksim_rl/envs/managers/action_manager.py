@@ -1,0 +1,45 @@
+"""Splits the action among its terms and remembers it."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from ksim_rl.envs.term import ActionTerm
+from ksim_rl.envs.view import EnvView
+
+
+class ActionManager:
+    """Gives each action term its columns, in the order of the config."""
+
+    def __init__(self, terms: Mapping[str, ActionTerm], view: EnvView) -> None:
+        self._view = view
+        self._parts: list[tuple[str, ActionTerm, slice]] = []
+        start = 0
+        for name, term in terms.items():
+            with view.scope(f"actions/{name}"):
+                stop = start + term.size(view)
+            self._parts.append((f"actions/{name}", term, slice(start, stop)))
+            start = stop
+        self.size = start
+        view.action_EL = view.memories.get("actions.action_EL", start)
+        view.last_action_EL = view.memories.get("actions.last_action_EL", start)
+        self._run_terms(view.action_EL)
+
+    def apply(self, action_EL: Tensor) -> Tensor:
+        """Write the controls of `action_EL` [E, L]; rows with a non-finite entry repeat their last action.
+
+        Returns:
+            Which rows were finite, bool [E].
+        """
+        view = self._view
+        finite_E = torch.isfinite(action_EL.sum(-1))
+        view.last_action_EL.copy_(view.action_EL)
+        view.action_EL.copy_(torch.where(finite_E[:, None], action_EL, view.last_action_EL))
+        self._run_terms(view.action_EL)
+        return finite_E
+
+    def _run_terms(self, action_EL: Tensor) -> None:
+        for scope, term, columns in self._parts:
+            with self._view.scope(scope):
+                term(self._view, action_EL[:, columns])

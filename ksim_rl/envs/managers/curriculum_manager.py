@@ -1,0 +1,25 @@
+"""Runs the curricula for the rows that reset, and reports their levels."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from ksim_rl.envs.term import CurriculumTerm
+from ksim_rl.envs.view import EnvView
+
+
+class CurriculumManager:
+    """Keeps the latest level of each curriculum on the device."""
+
+    def __init__(self, terms: Mapping[str, CurriculumTerm], view: EnvView) -> None:
+        self._view = view
+        self._terms = dict(terms)
+        self.names = tuple(terms)
+        self.levels_C = torch.zeros(len(self.names), device=view.device)
+
+    def reset(self, mask_E: Tensor) -> None:
+        """Adapt to the episodes that just ended in the rows of `mask_E`."""
+        for index, (name, term) in enumerate(self._terms.items()):
+            with self._view.scope(f"curriculum/{name}", self._view.reset_count_E):
+                self.levels_C[index].copy_(term(self._view, mask_E))

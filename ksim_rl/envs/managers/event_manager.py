@@ -1,0 +1,74 @@
+"""Runs events: at startup, for rows that reset, by per-env clocks, and at every step."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from ksim_rl.envs.term import EventTerm
+from ksim_rl.envs.view import EnvView
+
+
+class EventManager:
+    """Runs each event in its mode.
+
+    Interval clocks count down in seconds, one per env and event, and start anew when a row resets.
+    """
+
+    def __init__(self, terms: Mapping[str, EventTerm], view: EnvView) -> None:
+        self._view = view
+        self._by_mode: dict[str, list[tuple[str, EventTerm]]] = {}
+        for name, term in terms.items():
+            self._by_mode.setdefault(term.mode, []).append((f"events/{name}", term))
+        self._clocks: dict[str, Tensor] = {}
+        for scope, _ in self._by_mode.get("interval", []):
+            self._clocks[scope] = view.memories.get(f"{scope}.time_left_E")
+        nobody_E = torch.zeros(view.num_envs, dtype=torch.bool, device=view.device)
+        for scope, term in ((f"events/{name}", term) for name, term in terms.items()):
+            with view.scope(scope):
+                term(view, nobody_E)
+
+    def fields(self, *modes: str) -> tuple[str, ...]:
+        """Return the per-world model fields that the events of these modes write."""
+        terms = [term for mode in modes for _, term in self._by_mode.get(mode, [])]
+        return tuple(dict.fromkeys(field for term in terms for field in term.per_world_fields))
+
+    def startup(self) -> None:
+        """Run the startup events for all rows; their numbers depend on the seed only."""
+        everybody_E = torch.ones(self._view.num_envs, dtype=torch.bool, device=self._view.device)
+        for scope, term in self._by_mode.get("startup", []):
+            with self._view.scope(scope, self._view.startup_counter):
+                term(self._view, everybody_E)
+
+    def reset(self, mask_E: Tensor) -> None:
+        """Run the reset events for the rows of `mask_E`, and restart their interval clocks."""
+        view = self._view
+        for scope, term in self._by_mode.get("reset", []):
+            with view.scope(scope, view.reset_count_E):
+                term(view, mask_E)
+        for scope, term in self._by_mode.get("interval", []):
+            with view.scope(f"{scope}/clock", view.reset_count_E):
+                self._restart(scope, term, mask_E)
+
+    def step(self) -> None:
+        """Run the interval events whose clocks have run out, and the step events."""
+        view = self._view
+        for scope, term in self._by_mode.get("interval", []):
+            clock_E = self._clocks[scope]
+            clock_E.sub_(view.step_dt)
+            due_E = clock_E <= 0.0
+            with view.scope(f"{scope}/interval"):
+                self._restart(scope, term, due_E)
+            with view.scope(scope):
+                term(view, due_E)
+        if "step" in self._by_mode:
+            everybody_E = torch.ones(view.num_envs, dtype=torch.bool, device=view.device)
+            for scope, term in self._by_mode["step"]:
+                with view.scope(scope):
+                    term(view, everybody_E)
+
+    def _restart(self, scope: str, term: EventTerm, mask_E: Tensor) -> None:
+        assert term.interval_range_s is not None
+        low, high = term.interval_range_s
+        clock_E = self._clocks[scope]
+        clock_E.copy_(torch.where(mask_E, self._view.uniform(1, low, high)[:, 0], clock_E))

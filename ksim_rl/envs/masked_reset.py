@@ -1,0 +1,258 @@
+"""Resets as masks: no host sync in `step_and_maybe_reset`, and partial resets that leave the other rows alone."""
+
+import secrets
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.batched_envs import BatchedEnvBase
+from torchrl.envs.common import _EnvWrapper
+
+from ksim_rl import checks, dims
+
+_RESET = "_reset"
+_RESET_KEYWORDS = ("tensordict", "seed", "env_ids", "options", "set_state", "select_reset_only")
+
+
+class MaskedReset(EnvBase):
+    """Base of an env with batch size [E] whose `_reset` honours the mask `"_reset"` (bool, [E, 1]), all-False included.
+
+    Write `class MyEnv(MaskedReset)` instead of `class MyEnv(EnvBase)`, with `_step`, `_reset` and `_set_seed` as
+    TorchRL asks for. `_reset` must change the state of the masked rows only; what it returns in the other rows is
+    ignored, so it may return anything there. It gives:
+
+    * `maybe_reset`: `_reset` runs at every step with `done` as its mask, so that nothing is read by the host.
+      Trajectories equal TorchRL's own if the draws in `_reset` are keyed per row (see `ksim_rl.random`).
+    * `reset(tensordict, seed=, env_ids=, options=)`: untouched rows come back with their last root values.
+    * `seed(seed=-1)`: returns the seed used. It ends in `_set_seed`, so that is where an env stores it.
+    * `rollout` labelled ("E", "T"), and the label "E" on all that `step` and `reset` return.
+
+    An env with batch size [] and foreign simulators (Gym, batched processes) keep TorchRL's own reset: those cannot
+    be asked to reset nothing.
+    """
+
+    # A reference, so that it costs nothing per step. Inside a captured graph it points to the graph's static output.
+    _last_root: TensorDictBase | None = None
+
+    @property
+    def last_root(self) -> TensorDictBase | None:
+        """The root values that the next action answers to; a caller that replays a graph sets it after a replay."""
+        return self.__dict__.get("_last_root")
+
+    @last_root.setter
+    def last_root(self, tensordict: TensorDictBase | None) -> None:
+        self.__dict__["_last_root"] = tensordict
+
+    @property
+    def dim_names(self) -> list[str | None]:
+        """Labels of the batch dims: the spec's own, else "E" for the first."""
+        names: list[str | None] = [None] * len(self.batch_size)
+        if names:
+            names[0] = dims.E
+        return names
+
+    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        next_td = self._labelled(super()._step_proc_data(next_tensordict_out))
+        self.__dict__["_last_root"] = next_td
+        return next_td
+
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Reset the rows that are done, without asking the host whether there are any."""
+        if not self._masks_resets():
+            return super().maybe_reset(tensordict)
+        # A copy: an env may clear its own done buffer in place while transforms still read the mask.
+        mask_E1 = tensordict.get("done").clone()
+        reset_td = TensorDict({_RESET: mask_E1}, batch_size=tensordict.batch_size, device=tensordict.device)
+        root = self._merge(tensordict, self._fresh(reset_td), mask_E1)
+        self.__dict__["_last_root"] = root
+        return root
+
+    def reset(
+        self,
+        tensordict: TensorDictBase | None = None,
+        *,
+        seed: int | None = None,
+        env_ids: Sequence[int] | Tensor | None = None,
+        options: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> TensorDictBase:
+        """Reset all rows, or those of `env_ids` or of the mask `tensordict["_reset"]`.
+
+        Untouched rows keep their state and come back with their last root values, or with those of `tensordict`.
+
+        Args:
+            tensordict: may hold the mask `"_reset"` (bool, [E] or [E, 1]) and root values; updated in place.
+            seed: set first, as `env.seed(seed)` does.
+            env_ids: rows to reset. They are checked on the host: inside a hot loop pass a mask instead.
+            options: none exist; anything but None or {} is refused.
+            **kwargs: TorchRL's own `set_state` and `select_reset_only`.
+
+        Raises:
+            TypeError: on a keyword that does not exist.
+            ValueError: on options, on rows that do not exist, on a mask of the wrong shape or dtype.
+        """
+        for keyword in kwargs:
+            if keyword not in _RESET_KEYWORDS:
+                hint = checks.near(keyword, _RESET_KEYWORDS)
+                raise TypeError(f"reset() got an unexpected keyword {keyword!r}: {hint}")
+        if options:
+            raise ValueError(f"options={options!r}: this env has no reset options; use seed= or env_ids=")
+        if seed is not None:
+            self.seed(seed)
+        if env_ids is not None:
+            tensordict = self._with_mask_of(tensordict, env_ids)
+        mask_E1 = None if tensordict is None else self._checked_mask(tensordict)
+        if tensordict is not None and mask_E1 is not None:
+            self._complete_with_last_root(tensordict)
+        if not self._masks_resets():
+            root = self._labelled(super().reset(tensordict, **kwargs))
+        else:
+            root = self._masked_reset(tensordict, mask_E1, **kwargs)
+        self.__dict__["_last_root"] = root
+        return root
+
+    def seed(self, seed: int = -1) -> int:
+        """Seed the env, with a drawn seed for -1, and return the seed used."""
+        if seed == -1:
+            seed = secrets.randbelow(2**31)
+        self.set_seed(seed)
+        return seed
+
+    def rollout(self, *args: Any, **kwargs: Any) -> TensorDictBase:
+        """TorchRL's rollout, with its dims labelled ("E", "T")."""
+        rollout_ET = super().rollout(*args, **kwargs)
+        names = self.dim_names if rollout_ET.batch_dims == len(self.batch_size) + 1 else [None]
+        rollout_ET.names = [*names, dims.T]
+        return rollout_ET
+
+    def _masks_resets(self) -> bool:
+        """Whether resets go through masks; decided from what never changes, so it costs a dict look-up."""
+        known = self.__dict__.get("_masks_resets_cached")
+        if known is None:
+            inner: Any = self
+            while "base_env" in inner._modules:
+                inner = inner.base_env
+            foreign = isinstance(inner, _EnvWrapper | BatchedEnvBase)
+            known = bool(self.batch_size) and not foreign and self.reset_keys == [_RESET] and self._simple_done
+            self.__dict__["_masks_resets_cached"] = known
+        return known
+
+    def _masked_reset(
+        self,
+        tensordict: TensorDictBase | None,
+        mask_E1: Tensor | None,
+        *,
+        set_state: bool | None = None,
+        select_reset_only: bool = False,
+    ) -> TensorDictBase:
+        if tensordict is not None:
+            self._assert_tensordict_shape(tensordict)
+        set_state = self._resolve_set_state(set_state, tensordict, select_reset_only)
+        forwarded = {} if set_state is None else {"set_state": set_state}
+        reset_td = tensordict
+        if tensordict is not None:
+            keys = [_RESET] if select_reset_only else [_RESET, *self.state_spec.keys(True, True)]
+            reset_td = tensordict.select(*keys, strict=False)
+            if mask_E1 is not None:
+                reset_td.set(_RESET, mask_E1)
+            tensordict.pop(_RESET, None)
+        fresh = self._fresh(reset_td, **forwarded)
+        if tensordict is None:
+            return self._labelled(fresh)
+        if mask_E1 is None:
+            return self._labelled(tensordict.update(fresh.exclude(_RESET)))
+        return self._merge(tensordict, fresh, mask_E1)
+
+    def _fresh(self, reset_td: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
+        fresh = self._reset(reset_td, **kwargs)  # pyright: ignore[reportArgumentType]
+        self._complete_done(self.full_done_spec, fresh)
+        return fresh
+
+    def _merge(self, root: TensorDictBase, fresh: TensorDictBase, mask_E1: Tensor) -> TensorDictBase:
+        """Write the rows of `fresh` that the mask names into `root`, leaf by leaf, and return `root`."""
+        batch_size = root.batch_size
+        masks: dict[int, Tensor] = {}
+        for key in fresh.keys(True, True):
+            if key == _RESET:
+                continue
+            new, old = fresh.get(key), root.get(key, None)
+            if old is not None and isinstance(old, Tensor):
+                if old.ndim not in masks:
+                    masks[old.ndim] = mask_E1.view(*batch_size, *[1] * (old.ndim - len(batch_size)))
+                new = torch.where(masks[old.ndim], new, old)
+            root.set(key, new)
+        return self._labelled(root)
+
+    def _labelled(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if tensordict.batch_dims == len(self.batch_size) and tensordict.batch_dims:
+            tensordict.names = self.dim_names
+        return tensordict
+
+    def _complete_with_last_root(self, tensordict: TensorDictBase) -> None:
+        """Give a partial reset the root values that it was not given."""
+        root_keys = [*self.full_observation_spec.keys(True, True), *self.full_done_spec.keys(True, True)]
+        missing = [key for key in root_keys if tensordict.get(key, None) is None]
+        if missing and self.last_root is None:
+            raise RuntimeError(
+                "a partial reset needs the last root values of the other rows, and there are none yet: "
+                "call reset() without env_ids and without '_reset' first"
+            )
+        for key in missing:
+            value = self.last_root.get(key, None)  # pyright: ignore[reportOptionalMemberAccess]
+            if value is not None:
+                tensordict.set(key, value)
+
+    def _checked_mask(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Return the mask in the shape of `done`, or None for a reset of all rows."""
+        mask = tensordict.get(_RESET, None)
+        if mask is None or self.reset_keys != [_RESET]:
+            return None
+        done_shape = self.full_done_spec["done"].shape
+        if mask.dtype != torch.bool or mask.shape not in (self.batch_size, done_shape):
+            raise ValueError(
+                f"tensordict['_reset'] has shape {tuple(mask.shape)} and dtype {mask.dtype}: "
+                f"expected {tuple(self.batch_size)} or {tuple(done_shape)} and torch.bool"
+            )
+        return mask.reshape(done_shape)
+
+    def _with_mask_of(self, tensordict: TensorDictBase | None, env_ids: Sequence[int] | Tensor) -> TensorDictBase:
+        """Turn row numbers into the mask before any transform sees them."""
+        if tensordict is not None and tensordict.get(_RESET, None) is not None:
+            raise ValueError("env_ids= and tensordict['_reset'] were both given: pass one of them")
+        mask_E = mask_from_env_ids(env_ids, self.batch_size, self.device)
+        mask = mask_E.reshape(self.full_done_spec["done"].shape)
+        if tensordict is None:
+            return TensorDict({_RESET: mask}, batch_size=self.batch_size, device=self.device)
+        return tensordict.set(_RESET, mask)
+
+
+def mask_from_env_ids(
+    env_ids: Sequence[int] | Tensor, batch_size: torch.Size, device: torch.device | None
+) -> Tensor:
+    """Return the bool mask [E] of the rows `env_ids`.
+
+    Raises:
+        ValueError: unless `env_ids` are distinct integers in [0, E).
+    """
+    if len(batch_size) != 1:
+        raise ValueError(f"env_ids need one batch dim, and this env has batch_size {tuple(batch_size)}")
+    num_envs = batch_size[0]
+    if isinstance(env_ids, Tensor) and (env_ids.dtype.is_floating_point or env_ids.dtype == torch.bool):
+        raise ValueError(f"env_ids has dtype {env_ids.dtype}: expected integers; a mask goes to tensordict['_reset']")
+    ids = env_ids.reshape(-1).tolist() if isinstance(env_ids, Tensor) else list(env_ids)
+    if any(isinstance(row, bool) or not hasattr(row, "__index__") for row in ids):
+        raise ValueError(f"env_ids={ids!r}: expected integers")
+    ids = [row.__index__() for row in ids]
+    outside = sorted({row for row in ids if not 0 <= row < num_envs})
+    if outside:
+        raise ValueError(f"env_ids holds {outside}: valid rows are 0 to {num_envs - 1}")
+    if len(set(ids)) != len(ids):
+        repeated = sorted({row for row in ids if ids.count(row) > 1})
+        raise ValueError(f"env_ids names {repeated} more than once: give each row once")
+    mask = [False] * num_envs
+    for row in ids:
+        mask[row] = True
+    return torch.tensor(mask, device=device)

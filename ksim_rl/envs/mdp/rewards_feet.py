@@ -1,0 +1,127 @@
+"""Rewards for how feet move. Most count only while the command asks to move (`is_commanded`).
+
+Foot poses and velocities are of the current state (position and velocity stage); contacts and forces belong to the
+last physics substep (acceleration stage).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import check_in_range
+from ksim_rl.envs.mdp.command_speed import is_commanded
+from ksim_rl.envs.names import Patterns
+from ksim_rl.envs.term import RewardTerm
+from ksim_rl.envs.view import EnvView
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootClearance(RewardTerm):
+    """active * sum_f |height_f - target_height| * |v_xy,f|, m^2/s, [E]: a foot that moves should be at that height.
+
+    Attributes:
+        sites: the feet; heights are above flat ground (z = 0), velocities in the world frame.
+        target_height: m.
+        command, command_threshold: the term is 0 unless the commanded speed exceeds the threshold.
+    """
+
+    sites: Patterns
+    target_height: float
+    command: str
+    command_threshold: float
+
+    def __call__(self, view: EnvView) -> Tensor:
+        index = view.sites(self.sites)
+        miss_EF = (view.site_pos_w(index)[..., 2] - self.target_height).abs()
+        speed_EF = torch.linalg.vector_norm(view.site_lin_vel_w(index)[..., :2], dim=-1)
+        return (miss_EF * speed_EF).sum(-1) * is_commanded(view, self.command, self.command_threshold)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootSwingHeight(RewardTerm):
+    """active * sum_f landed_f * (peak_f / target_height - 1)^2, [E]; `peak` is the swing's greatest height.
+
+    The peak starts at 0 after each landing and each reset.
+
+    Attributes:
+        sensor: contact sensor, one geom per foot, in the order of `sites`.
+        sites: the feet; heights are above flat ground (z = 0).
+        target_height: m.
+        command, command_threshold: the term is 0 unless the commanded speed exceeds the threshold.
+    """
+
+    sensor: str
+    sites: Patterns
+    target_height: float
+    command: str
+    command_threshold: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_in_range("target_height", self.target_height, low=0.0, low_open=True)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        contact = view.contact(self.sensor)
+        height_EF = view.site_pos_w(view.sites(self.sites))[..., 2]
+        memory_EF = view.memory("peak_EF", height_EF.shape[-1])
+        peak_EF = torch.where(contact.found_EN > 0, memory_EF, torch.maximum(memory_EF, height_EF))
+        memory_EF.copy_(torch.where(contact.first_contact_EN > 0, 0.0, peak_EF))
+        cost_E = ((peak_EF / self.target_height - 1.0).square() * contact.first_contact_EN).sum(-1)
+        return cost_E * is_commanded(view, self.command, self.command_threshold)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootSlip(RewardTerm):
+    """active * sum_f contact_f * |v_xy,f|^2, (m/s)^2, [E]; velocities of the sites in the world frame.
+
+    Attributes:
+        sensor: contact sensor, one geom per foot, in the order of `sites`.
+        command, command_threshold: the term is 0 unless the commanded speed exceeds the threshold.
+    """
+
+    sensor: str
+    sites: Patterns
+    command: str
+    command_threshold: float
+
+    def __call__(self, view: EnvView) -> Tensor:
+        speed2_EF = view.site_lin_vel_w(view.sites(self.sites))[..., :2].square().sum(-1)
+        cost_E = (speed2_EF * view.contact(self.sensor).found_EN).sum(-1)
+        return cost_E * is_commanded(view, self.command, self.command_threshold)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoftLanding(RewardTerm):
+    """active * sum_f landed_f * |force_f|, N, [E]; the net contact force at the end of the step of touch-down."""
+
+    sensor: str
+    command: str
+    command_threshold: float
+
+    def __call__(self, view: EnvView) -> Tensor:
+        contact = view.contact(self.sensor)
+        force_EF = torch.linalg.vector_norm(contact.force_EN3, dim=-1)
+        cost_E = (force_EF * contact.first_contact_EN).sum(-1)
+        return cost_E * is_commanded(view, self.command, self.command_threshold)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeetAirTime(RewardTerm):
+    """active * number of feet whose present flight has lasted between two thresholds (s), [E]."""
+
+    sensor: str
+    threshold_min: float
+    threshold_max: float
+    command: str
+    command_threshold: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_in_range("threshold_max", self.threshold_max, low=self.threshold_min)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        air_time_EF = view.contact(self.sensor).air_time_EN
+        inside_EF = (air_time_EF > self.threshold_min) & (air_time_EF < self.threshold_max)
+        count_E = inside_EF.to(torch.float32).sum(-1)
+        return count_E * is_commanded(view, self.command, self.command_threshold)

@@ -1,0 +1,108 @@
+"""Names of a model's elements, resolved once to index tensors or slices."""
+
+import re
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import near
+
+Patterns = str | Sequence[str]
+Index = Tensor | slice
+
+
+class NameResolver:
+    """Looks up names and regular expressions (full match) among the elements of one model.
+
+    Each pattern's matches come in the model's order; patterns keep the order in which they are given. So `".*"` gives
+    the model's order, and a tuple of plain names gives its own. Results are remembered: a look-up in a step costs one
+    dict access, and the index is a slice wherever the ids are contiguous.
+
+    Raises:
+        ValueError: if a pattern matches nothing (with the near names), or two patterns match the same element.
+    """
+
+    def __init__(self, mj_model: mujoco.MjModel, device: torch.device) -> None:
+        self._model = mj_model
+        self._device = device
+        self._tables: dict[str, list[str]] = {
+            "body": _names(mj_model, mujoco.mjtObj.mjOBJ_BODY, mj_model.nbody),
+            "geom": _names(mj_model, mujoco.mjtObj.mjOBJ_GEOM, mj_model.ngeom),
+            "site": _names(mj_model, mujoco.mjtObj.mjOBJ_SITE, mj_model.nsite),
+            "joint": [mj_model.joint(i).name for i in scalar_joint_ids(mj_model)],
+            "actuator": _names(mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, mj_model.nu),
+            "sensor": _names(mj_model, mujoco.mjtObj.mjOBJ_SENSOR, mj_model.nsensor),
+        }
+        self._ids: dict[tuple[str, tuple[str, ...]], tuple[int, ...]] = {}
+        self._indices: dict[tuple[str, tuple[str, ...]], Index] = {}
+
+    def names(self, kind: str) -> list[str]:
+        """Return all names of a kind, in the model's order; joints are the hinges and slides."""
+        return list(self._tables[kind])
+
+    def ids(self, kind: str, patterns: Patterns) -> tuple[int, ...]:
+        """Return the ids that the patterns match; a joint's id counts hinges and slides only."""
+        key = (kind, (patterns,) if isinstance(patterns, str) else tuple(patterns))
+        if key not in self._ids:
+            self._ids[key] = _match(kind, key[1], self._tables[kind])
+        return self._ids[key]
+
+    def index(self, kind: str, patterns: Patterns) -> Index:
+        """Return the ids as a slice if they are contiguous, else as an int64 tensor on the device."""
+        key = (kind, (patterns,) if isinstance(patterns, str) else tuple(patterns))
+        if key not in self._indices:
+            self._indices[key] = as_index(self.ids(kind, patterns), self._device)
+        return self._indices[key]
+
+    def actuators_of_joints(self, patterns: Patterns) -> Index:
+        """Return the actuators that drive the joints of `patterns`, in the order of these joints."""
+        joint_names = [self._tables["joint"][i] for i in self.ids("joint", patterns)]
+        key = ("actuator of joint", tuple(joint_names))
+        if key not in self._indices:
+            of_joint = {}
+            for actuator in range(self._model.nu):
+                if self._model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT:
+                    of_joint.setdefault(self._model.joint(self._model.actuator_trnid[actuator, 0]).name, actuator)
+            idle = [name for name in joint_names if name not in of_joint]
+            if idle:
+                raise ValueError(f"no actuator drives joint {idle[0]!r}: {near(idle[0], of_joint)}")
+            self._indices[key] = as_index([of_joint[name] for name in joint_names], self._device)
+        return self._indices[key]
+
+
+def scalar_joint_ids(mj_model: mujoco.MjModel) -> list[int]:
+    """Return the ids of the joints with one degree of freedom: hinges and slides."""
+    scalar = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    return [int(i) for i in np.flatnonzero(np.isin(mj_model.jnt_type, scalar))]
+
+
+def as_index(ids: Sequence[int], device: torch.device) -> Index:
+    """Return a slice for contiguous increasing ids (no copy when indexing), else an int64 tensor."""
+    ids = [int(i) for i in ids]
+    if ids and ids == list(range(ids[0], ids[0] + len(ids))):
+        return slice(ids[0], ids[0] + len(ids))
+    return torch.tensor(ids, device=device, dtype=torch.int64)
+
+
+def _names(mj_model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> list[str]:
+    return [mujoco.mj_id2name(mj_model, kind, i) or "" for i in range(count)]
+
+
+def _match(kind: str, patterns: tuple[str, ...], table: list[str]) -> tuple[int, ...]:
+    found: list[int] = []
+    for pattern in patterns:
+        try:
+            expression = re.compile(pattern)
+        except re.error as error:
+            raise ValueError(f"{kind} pattern {pattern!r} is no regular expression: {error}") from None
+        matches = [i for i, name in enumerate(table) if name and expression.fullmatch(name)]
+        if not matches:
+            raise ValueError(f"no {kind} matches {pattern!r}: {near(pattern, [name for name in table if name])}")
+        doubled = [table[i] for i in matches if i in found]
+        if doubled:
+            raise ValueError(f"{kind} {doubled[0]!r} is matched by two of the patterns {patterns}: give it once")
+        found.extend(matches)
+    return tuple(found)

@@ -1,0 +1,120 @@
+"""The tasks by name, as Python functions and as the Hydra config group `task`."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Sequence
+from functools import cache
+
+import torch
+from hydra import compose, initialize
+from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
+
+import ksim_rl.envs.tasks
+from ksim_rl.checks import unknown_name
+from ksim_rl.envs.config_tree import from_tree, to_tree
+from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
+from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
+from ksim_rl.envs.overrides import check_overrides
+from ksim_rl.envs.task import Task
+from ksim_rl.envs.transforms.compile_groups import compile_groups
+
+_CONFIG = "ksim_rl_env"
+
+
+@cache
+def _tasks() -> dict[str, Task]:
+    """Import all task modules once and collect their `Task`s."""
+    found: dict[str, Task] = {}
+    for module_info in pkgutil.iter_modules(ksim_rl.envs.tasks.__path__, "ksim_rl.envs.tasks."):
+        module = importlib.import_module(module_info.name)
+        for value in vars(module).values():
+            if isinstance(value, Task):
+                found[value.name] = value
+    return dict(sorted(found.items()))
+
+
+def names() -> list[str]:
+    """Return the names of the registered tasks."""
+    return list(_tasks())
+
+
+def task(name: str) -> Task:
+    """Return a task by name.
+
+    Raises:
+        ValueError: if there is none of this name, with the near names.
+    """
+    tasks = _tasks()
+    if name not in tasks:
+        raise unknown_name("task", name, tasks)
+    return tasks[name]
+
+
+@cache
+def register_configs() -> None:
+    """Store each task's config tree in Hydra's config group `task`."""
+    store = ConfigStore.instance()
+    for name in names():
+        store.store(group="task", name=name, node=to_tree(task(name).cfg(), ManagerBasedRlEnvCfg))
+    store.store(name=_CONFIG, node={"defaults": [{"task": "???"}, "_self_"]})
+
+
+def make_cfg(name: str, overrides: Sequence[str] = ()) -> ManagerBasedRlEnvCfg:
+    """Return a task's config with Hydra overrides applied, such as `"task.rewards.upright.weight=0.5"`.
+
+    Raises:
+        ValueError: naming the task or field that does not exist, or the value that is not valid, before any model is
+            compiled.
+    """
+    tree = to_tree(task(name).cfg(), ManagerBasedRlEnvCfg)
+    check_overrides({"task": tree}, overrides)
+    register_configs()
+    with initialize(version_base="1.3", config_path=None):
+        composed = compose(config_name=_CONFIG, overrides=[f"task={name}", *overrides])
+    return from_tree(ManagerBasedRlEnvCfg, OmegaConf.to_container(composed.task, resolve=True), "task")
+
+
+def build(
+    cfg: ManagerBasedRlEnvCfg,
+    *,
+    device: str | torch.device = "cpu",
+    render_mode: str | None = None,
+) -> MaskedTransformedEnv:
+    """Build the env of a config, with the transforms that its observation groups ask for."""
+    base_env = ManagerBasedRlEnv(cfg, device=device, render_mode=render_mode)
+    env = MaskedTransformedEnv(base_env, compile_groups(cfg.observations))
+    env.seed(base_env.cfg.seed)
+    return env
+
+
+def make(
+    name: str,
+    *,
+    num_envs: int,
+    device: str | torch.device = "cpu",
+    seed: int | None = None,
+    overrides: Sequence[str] = (),
+    render_mode: str | None = None,
+) -> MaskedTransformedEnv:
+    """Build a registered task, ready to train on.
+
+    Args:
+        name: one of `names()`.
+        num_envs: E.
+        device: where worlds and data live.
+        seed: of all draws; None keeps the task's own, and if that is None too, draws one.
+        overrides: Hydra overrides of the task's config.
+        render_mode: None, or "rgb_array" for `render()`.
+
+    Returns:
+        The transformed env, keys `"actor"`, `"critic"` (or whatever groups the task has) and `"action"`.
+
+    Raises:
+        ValueError: naming the task, field or value that is wrong and what would be valid.
+    """
+    given = [f"task.scene.num_envs={num_envs}"] + ([] if seed is None else [f"task.seed={seed}"])
+    return build(make_cfg(name, [*overrides, *given]), device=device, render_mode=render_mode)

@@ -1,0 +1,31 @@
+"""What a registered task is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """An env config with what is known about training it.
+
+    A module in `ksim_rl/envs/tasks/` that holds one at its top level registers it.
+
+    Attributes:
+        name: as in `task=<name>`.
+        description: one line for the table of tasks.
+        cfg: returns the env's config.
+        training: defaults for training by dotted config key, such as `{"objective.gamma": 0.99}`; the command line
+            overrides them.
+        solved_at: the mean evaluation return that counts as solved; None if there is no such figure.
+    """
+
+    name: str
+    description: str
+    cfg: Callable[[], ManagerBasedRlEnvCfg]
+    training: Mapping[str, Any] = field(default_factory=dict)
+    solved_at: float | None = None

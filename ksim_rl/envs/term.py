@@ -1,0 +1,148 @@
+"""The kinds of term that an env is made of: small frozen dataclasses that read an `EnvView`.
+
+A term's parameters are its fields, so that the same object is written in Python and as a Hydra `_target_`. Terms hold
+no tensors: names are resolved through the view, which remembers them, and what a term must keep from step to step is
+a named buffer of the view (`view.memory`). A term must not branch on tensor values, read a tensor on the host or
+allocate sizes that depend on data: the step that calls it is captured into a CUDA graph.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from torch import Tensor
+
+from ksim_rl.checks import check_choice, check_in_range, check_pair
+
+if TYPE_CHECKING:
+    from ksim_rl.envs.view import EnvView
+
+EVENT_MODES = ("startup", "reset", "interval", "step")
+METRIC_REDUCTIONS = ("mean", "last", "max", "sum")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationTerm(ABC):
+    """A clean reading: float32 [E, L]. Noise, delay and history are transforms, not part of the term."""
+
+    @abstractmethod
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading of the current state, float32 [E, L]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardTerm(ABC):
+    """A reward per second (or per step, if the env does not scale by dt), before its weight.
+
+    A term of weight 0 is not computed.
+    """
+
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_in_range("weight", self.weight)
+
+    @abstractmethod
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward of the current state, float32 [E]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TerminationTerm(ABC):
+    """A condition that ends the episode; `time_out` marks it as a truncation."""
+
+    time_out: bool = False
+
+    @abstractmethod
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return which envs end, bool [E]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricTerm(ABC):
+    """A value per step that is reduced over the episode and reported when it ends."""
+
+    reduce: Literal["mean", "last", "max", "sum"] = "mean"
+
+    def __post_init__(self) -> None:
+        check_choice("reduce", self.reduce, METRIC_REDUCTIONS)
+
+    @abstractmethod
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the value of the current state, float32 [E]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EventTerm(ABC):
+    """A write to the simulation: `startup` once, `reset` for rows that reset, `interval` by per-env clocks, `step`.
+
+    An event must not read a derived quantity (a body or site pose, a sensor) after it wrote state: derived quantities
+    are refreshed after all events of the moment have run.
+    """
+
+    mode: Literal["startup", "reset", "interval", "step"] = "reset"
+    interval_range_s: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        check_choice("mode", self.mode, EVENT_MODES)
+        if (self.mode == "interval") != (self.interval_range_s is not None):
+            raise ValueError(
+                f"interval_range_s={self.interval_range_s!r} with mode={self.mode!r}: give a pair of seconds with "
+                "mode='interval', and None with any other"
+            )
+        if self.interval_range_s is not None:
+            check_pair("interval_range_s", self.interval_range_s, low=0.0)
+
+    @property
+    def per_world_fields(self) -> tuple[str, ...]:
+        """The MuJoCo model fields that this event writes, which therefore become one array per world."""
+        return ()
+
+    @abstractmethod
+    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+        """Apply the event to the rows of `mask_E`, bool [E]; other rows must stay bit-identical."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommandTerm(ABC):
+    """A generator of commands with a per-env clock that resamples."""
+
+    resampling_time_range_s: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        check_pair("resampling_time_range_s", self.resampling_time_range_s, low=0.0)
+
+    @abstractmethod
+    def resample(self, view: EnvView, mask_E: Tensor) -> None:
+        """Draw new targets for the rows of `mask_E`, bool [E], into `view.memory` buffers."""
+
+    @abstractmethod
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the command of the current state and targets, float32 [E, K]."""
+
+    def draw_debug(self, view: EnvView, visualizer: object, env_index: int) -> None:
+        """Draw the command of one env (nothing by default)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActionTerm(ABC):
+    """A map from some columns of the action to the controls of actuators."""
+
+    @abstractmethod
+    def size(self, view: EnvView) -> int:
+        """Return how many columns of the action this term takes."""
+
+    @abstractmethod
+    def __call__(self, view: EnvView, action_EK: Tensor) -> None:
+        """Write the controls that `action_EK` (this term's columns, finite) asks for, for the whole env step."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurriculumTerm(ABC):
+    """A rule that adapts difficulty; it runs for the rows that reset, before the reset events."""
+
+    @abstractmethod
+    def __call__(self, view: EnvView, mask_E: Tensor) -> Tensor:
+        """Adapt and return the level to report, float32 []; its state lives in `view.memory(..., keep=True)`."""

@@ -1,0 +1,99 @@
+"""Concatenation of observations into the vectors that networks read."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torchrl.data import Composite
+from torchrl.data.tensor_specs import Unbounded
+from torchrl.envs.transforms import Transform
+
+from ksim_rl import checks
+from ksim_rl.envs.transforms.group_spec import GroupSpec
+from ksim_rl.envs.transforms.keyed_transform import as_keys
+from ksim_rl.envs.transforms.specs import bounded, bounds, drop_leaf_spec, flat_size, leaf_spec, set_leaf_spec
+
+
+class ObservationGroups(Transform):
+    """Concatenate observations, each flattened per env, into one vector [E, L] per group.
+
+    Args:
+        groups: group name -> keys of its terms, in the order of the columns.
+        drop: keys to remove afterwards (all the terms for True), in the data and in the specs.
+
+    Example:
+        >>> groups = ObservationGroups({"actor": ["joint_pos", "joint_vel"], "critic": ["joint_pos", "height"]})
+        >>> groups.slice("actor", "joint_vel")  # once an env holds it: the columns of a term
+    """
+
+    def __init__(
+        self, groups: Mapping[NestedKey, Sequence[NestedKey]], *, drop: bool | Sequence[NestedKey] = False
+    ) -> None:
+        if not groups:
+            raise ValueError("groups={}: expected at least one group")
+        self.groups = {name: as_keys(terms) for name, terms in groups.items()}
+        for name, terms in self.groups.items():
+            if not terms or len(set(terms)) != len(terms):
+                raise ValueError(f"groups[{name!r}]={terms}: expected one or more distinct terms")
+        every = list(dict.fromkeys(term for terms in self.groups.values() for term in terms))
+        super().__init__(in_keys=every, out_keys=list(self.groups))
+        self.drop = [] if drop is False else every if drop is True else as_keys(drop)
+        self.group_specs: dict[NestedKey, GroupSpec] = {}
+
+    def slice(self, group: NestedKey, term: NestedKey) -> slice:
+        """Return the columns of a term in the vector of a group.
+
+        Raises:
+            ValueError: if there is no such group or term; it lists the near names.
+            RuntimeError: if no env has asked for its specs yet.
+        """
+        if group not in self.groups:
+            raise checks.unknown_name("group", str(group), map(str, self.groups))
+        if group not in self.group_specs:
+            raise RuntimeError("the columns are known once an env holds the transform and has made its specs")
+        return self.group_specs[group].slice(term)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the vectors' specs and remove the dropped ones."""
+        batch_size = observation_spec.shape
+        vectors = {}
+        for name, terms in self.groups.items():
+            specs = [leaf_spec(observation_spec, term, type(self).__name__) for term in terms]
+            sizes = tuple(flat_size(spec, len(batch_size)) for spec in specs)
+            ends = [bounds(spec) if spec.dtype.is_floating_point else None for spec in specs]
+            dtype = specs[0].dtype
+            for spec in specs[1:]:
+                dtype = torch.promote_types(dtype, spec.dtype)
+            size = sum(sizes)
+            if all(end is not None for end in ends):
+                low, high = (
+                    torch.cat([e[side].reshape(*batch_size, n) for e, n in zip(ends, sizes, strict=True)], -1)
+                    for side in (0, 1)
+                )
+                vectors[name] = bounded(low, high, dtype=dtype, device=observation_spec.device)
+            else:
+                vectors[name] = Unbounded((*batch_size, size), dtype=dtype, device=observation_spec.device)
+            self.group_specs[name] = GroupSpec(name=name, terms=tuple(terms), sizes=sizes)
+        for name, spec in vectors.items():
+            set_leaf_spec(observation_spec, name, spec)
+        for key in self.drop:
+            drop_leaf_spec(observation_spec, key)
+        return observation_spec
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        batch_size = next_tensordict.batch_size
+        vectors = {}
+        for name, terms in self.groups.items():
+            values = [next_tensordict.get(term) for term in terms]
+            flat = [v if v.ndim == len(batch_size) + 1 else v.reshape(*batch_size, -1) for v in values]
+            vectors[name] = flat[0] if len(flat) == 1 else torch.cat(flat, dim=-1)
+        for name, vector in vectors.items():
+            next_tensordict.set(name, vector)
+        if self.drop:
+            next_tensordict = next_tensordict.exclude(*self.drop, inplace=True)
+        return next_tensordict
+
+    forward = _call
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)

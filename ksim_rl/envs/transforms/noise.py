@@ -1,0 +1,162 @@
+"""Sensor noise."""
+
+from collections.abc import Mapping, Sequence
+from typing import Self
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite
+
+from ksim_rl import random
+from ksim_rl.envs.transforms.keyed_transform import KeyedTransform, Keys, as_keys, checked_out_keys
+from ksim_rl.envs.transforms.noise_cfg import NoiseCfg
+from ksim_rl.envs.transforms.noise_columns import NoiseColumns, widen
+from ksim_rl.envs.transforms.specs import bounded, bounds, flat_size, leaf_spec, set_leaf_spec
+
+
+class ObservationNoise(KeyedTransform):
+    """Noise on floating-point observations, drawn once per env step, for the reset observation too.
+
+    Given other `out_keys`, the clean reading stays beside the noisy one (for an asymmetric critic). All keys of one
+    transform share one draw, so one transform with many keys is cheaper than many with one.
+
+    `env.eval()` turns it off and `env.train()` on again, `enable_` does the same for one transform; both write a device
+    flag, so a captured or compiled step follows.
+
+    Args:
+        in_keys: observations, of any shape; nested keys as tuples.
+        out_keys: where the noisy ones go. Default: in place of the clean ones.
+        noise: one for all keys, or a sequence or mapping with one per key.
+        enabled: whether noise is on from the start.
+        seed, stream: see `KeyedTransform`.
+
+    Example:
+        >>> noise = ObservationNoise(["imu"], noise=GaussianNoise(std=0.1, bias=UniformNoise(low=-0.2, high=0.2)))
+    """
+
+    enabled: Tensor
+    bias_EL: Tensor
+
+    def __init__(
+        self,
+        in_keys: Keys,
+        out_keys: Keys | None = None,
+        *,
+        noise: NoiseCfg | Sequence[NoiseCfg] | Mapping[NestedKey, NoiseCfg],
+        enabled: bool = True,
+        seed: int = 0,
+        stream: str | None = None,
+    ) -> None:
+        in_keys = as_keys(in_keys)
+        super().__init__(in_keys, checked_out_keys(in_keys, out_keys), seed=seed, stream=stream)
+        self.noise = _one_per_key(noise, self.in_keys)
+        self._wanted = enabled
+        self._shapes: list[torch.Size] | None = None
+        self.noise_columns: NoiseColumns | None = None
+        self.bias_columns: NoiseColumns | None = None
+        self.register_buffer("enabled", torch.tensor(enabled), persistent=False)
+        self.register_buffer("bias_EL", None)
+
+    def enable_(self, enabled: bool = True) -> Self:
+        """Turn the noise on or off, in place."""
+        self._wanted = enabled
+        self.enabled.fill_(enabled)
+        return self
+
+    def train(self, mode: bool = True) -> Self:
+        """Follow the mode of the env: noise is for training only."""
+        super().train(mode)
+        # TorchRL calls eval() on each transform that it attaches: that is no wish for evaluation.
+        if self._in_env():
+            self.enabled.fill_(self._wanted and mode)
+        return self
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Widen the bounds by the reach of the noise."""
+        batch_dims = observation_spec.ndim
+        specs = [leaf_spec(observation_spec, key, type(self).__name__) for key in self.in_keys]
+        for key, spec in zip(self.in_keys, specs, strict=True):
+            if not spec.dtype.is_floating_point:
+                raise ValueError(f"ObservationNoise: {key!r} is {spec.dtype}: noise needs floating-point observations")
+        for key, out_key, spec, cfg in zip(self.in_keys, self.out_keys, specs, self.noise, strict=True):
+            low, high = widen(cfg, key, *bounds(spec), batch_dims)
+            set_leaf_spec(observation_spec, out_key, bounded(low, high, dtype=spec.dtype, device=spec.device))
+        self._size_rows(observation_spec.shape.numel(), observation_spec.device)
+        self._size_columns([spec.shape[batch_dims:] for spec in specs])
+        return observation_spec
+
+    def _size_columns(self, shapes: list[torch.Size]) -> None:
+        if shapes == self._shapes:
+            return
+        self._shapes = shapes
+        sizes, device = [shape.numel() for shape in shapes], self.step_count.device
+        self.noise_columns = NoiseColumns(self.noise, self.in_keys, sizes, device)
+        if any(cfg.bias is not None for cfg in self.noise):
+            self.bias_columns = NoiseColumns([cfg.bias for cfg in self.noise], self.in_keys, sizes, device)
+            present = self._buffers["bias_EL"]
+            if present is None or present.shape != (self.num_rows, self.bias_columns.size):
+                self._buffers["bias_EL"] = self.bias_columns.neutral().expand(self.num_rows, -1).clone()
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if self._shapes is None:
+            shape = tensordict_reset.batch_size
+            self._size_rows(shape.numel(), tensordict_reset.device)
+            self._size_columns([tensordict_reset.get(key).shape[len(shape) :] for key in self.in_keys])
+        mask_E = self._reset_rows(tensordict)
+        if self.bias_columns is not None:
+            bias_EL = self.bias_columns.sample(lambda kind: self._reset_keys(f"bias/{kind}"), self.num_rows)
+            self.bias_EL.copy_(torch.where(mask_E[:, None], bias_EL, self.bias_EL))
+        sample_EL = self._columns.sample(lambda kind: self._reset_keys(f"reset/{kind}"), self.num_rows)
+        return self._write(tensordict_reset, sample_EL, self.bias_EL)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self.step_count.add_(1)
+        sample_EL = self._columns.sample(lambda kind: self._step_keys(f"step/{kind}"), self.num_rows)
+        return self._write(next_tensordict, sample_EL, self.bias_EL)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Add fresh noise to a batch of samples (no bias: samples belong to no episode)."""
+        num_rows = tensordict.numel()
+        self._size_columns([tensordict.get(key).shape[tensordict.ndim :] for key in self.in_keys])
+        self.step_count.add_(1)
+
+        def keys_of(kind: str) -> random.RowKeys:
+            return random.row_keys(self.seed_value, self._stream_id(f"forward/{kind}"), self.step_count, num_rows)
+
+        return self._write(tensordict, self._columns.sample(keys_of, num_rows), None)
+
+    @property
+    def _columns(self) -> NoiseColumns:
+        assert self.noise_columns is not None, "an env sizes its transforms before it steps"
+        return self.noise_columns
+
+    def _write(self, tensordict: TensorDictBase, sample_EL: Tensor, bias_EL: Tensor | None) -> TensorDictBase:
+        values = [tensordict.get(key) for key in self.in_keys]
+        flat = [value.reshape(sample_EL.shape[0], -1) for value in values]
+        clean_EL = flat[0] if len(flat) == 1 else torch.cat(flat, dim=1)
+        biased_EL = clean_EL
+        if bias_EL is not None and self.bias_columns is not None:
+            biased_EL = self.bias_columns.apply_to(clean_EL, bias_EL)
+        noisy_EL = torch.where(self.enabled, self._columns.apply_to(biased_EL, sample_EL), clean_EL)
+        start = 0
+        for out_key, value, part in zip(self.out_keys, values, flat, strict=True):
+            size = part.shape[1]
+            noisy = noisy_EL[:, start : start + size].reshape(value.shape)
+            tensordict.set(out_key, noisy.to(value.dtype))
+            start += size
+        return tensordict
+
+
+def _one_per_key(
+    noise: NoiseCfg | Sequence[NoiseCfg] | Mapping[NestedKey, NoiseCfg], in_keys: Sequence[NestedKey]
+) -> list[NoiseCfg]:
+    if isinstance(noise, NoiseCfg):
+        return [noise] * len(in_keys)
+    if isinstance(noise, Mapping):
+        if set(noise) != set(in_keys):
+            raise ValueError(f"noise has the keys {list(noise)}, but in_keys={list(in_keys)}: give one per key")
+        return [noise[key] for key in in_keys]
+    if len(noise) != len(in_keys):
+        raise ValueError(f"noise has {len(noise)} entries for the {len(in_keys)} of in_keys={list(in_keys)}")
+    return list(noise)

@@ -1,0 +1,76 @@
+"""Reading and writing of leaf specs and their bounds."""
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+
+from ksim_rl import checks
+
+
+def leaf_spec(observation_spec: Composite, key: NestedKey, owner: str) -> TensorSpec:
+    """Return the spec of `key`.
+
+    Raises:
+        KeyError: if there is none; it lists the near names.
+    """
+    leaves = {_spell(leaf): leaf for leaf in observation_spec.keys(True, True)}
+    if _spell(key) not in leaves:
+        raise KeyError(f"{owner}: the env has no observation {key!r}: {checks.near(_spell(key), leaves)}")
+    return observation_spec[key]
+
+
+def set_leaf_spec(observation_spec: Composite, key: NestedKey, spec: TensorSpec) -> None:
+    """Set the spec of `key`, with the nested specs above it."""
+    path = key if isinstance(key, tuple) else (key,)
+    parent = observation_spec
+    for name in path[:-1]:
+        if name not in parent.keys():
+            parent[name] = Composite(shape=parent.shape, device=parent.device)
+        parent = parent[name]
+    parent[path[-1]] = spec
+
+
+def drop_leaf_spec(observation_spec: Composite, key: NestedKey) -> None:
+    """Remove the spec of `key`, and nested specs that it leaves empty."""
+    del observation_spec[key]
+    if isinstance(key, tuple) and len(key) > 1:
+        above = key[:-1] if len(key) > 2 else key[0]
+        if not list(observation_spec[above].keys()):
+            drop_leaf_spec(observation_spec, above)
+
+
+def bounds(spec: TensorSpec) -> tuple[Tensor, Tensor]:
+    """Return (low, high) in the spec's shape; infinite where the spec has none."""
+    if isinstance(spec, Bounded):
+        space = spec.space
+        return space.low.expand(spec.shape).clone(), space.high.expand(spec.shape).clone()
+    high = torch.full(spec.shape, torch.inf, device=spec.device)
+    return -high, high
+
+
+def bounded(low: Tensor, high: Tensor, *, dtype: torch.dtype, device: torch.device | None) -> TensorSpec:
+    """Return a `Bounded` spec, or `Unbounded` where no element has a bound."""
+    if bool(torch.isinf(low).all()) and bool(torch.isinf(high).all()):
+        return Unbounded(shape=low.shape, dtype=dtype, device=device)
+    return Bounded(low=low.to(dtype), high=high.to(dtype), shape=low.shape, dtype=dtype, device=device)
+
+
+def add_bounds(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Return the range of x + y for x in a, y in b."""
+    return a[0] + b[0], a[1] + b[1]
+
+
+def multiply_bounds(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Return the range of x * y for x in a, y in b; 0 times infinity is 0, as no finite x exceeds it."""
+    corners = torch.stack([torch.nan_to_num(x * y, nan=0.0, posinf=torch.inf, neginf=-torch.inf) for x in a for y in b])
+    return corners.amin(0), corners.amax(0)
+
+
+def flat_size(spec: TensorSpec, batch_dims: int) -> int:
+    """Return the number of elements per env."""
+    return spec.shape[batch_dims:].numel()
+
+
+def _spell(key: NestedKey) -> str:
+    return key if isinstance(key, str) else "/".join(key)

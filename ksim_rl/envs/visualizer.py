@@ -1,0 +1,100 @@
+"""Debug drawing: what terms may draw, and the drawing of it into a MuJoCo scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import mujoco
+import numpy as np
+
+Vector = Sequence[float] | np.ndarray
+Rgba = tuple[float, float, float, float]
+
+
+class DebugVisualizer(Protocol):
+    """What commands, rewards and sensors draw with. Positions in m, world frame; colors in [0, 1]."""
+
+    def arrow(self, start: Vector, end: Vector, *, rgba: Rgba, width: float = 0.02) -> None:
+        """Draw an arrow from `start` to `end`."""
+
+    def sphere(self, center: Vector, *, radius: float, rgba: Rgba) -> None:
+        """Draw a ball."""
+
+    def frame(self, origin: Vector, rotation: np.ndarray, *, scale: float = 0.1) -> None:
+        """Draw the axes of a rotation matrix [3, 3] in red, green and blue."""
+
+    def line(self, start: Vector, end: Vector, *, rgba: Rgba, width: float = 2.0) -> None:
+        """Draw a line; `width` in pixels."""
+
+    def ghost(self, qpos: np.ndarray, *, rgba: Rgba) -> None:
+        """Draw the robot in another pose, transparently."""
+
+    def text(self, position: Vector, content: str) -> None:
+        """Write a label."""
+
+
+class SceneVisualizer:
+    """Draws into a `mujoco.MjvScene`; what exceeds the scene's capacity is refused, not dropped."""
+
+    def __init__(self, model: mujoco.MjModel, scene: mujoco.MjvScene, offset: Vector = (0.0, 0.0, 0.0)) -> None:
+        self._model, self._scene = model, scene
+        self._offset = np.asarray(offset, dtype=np.float64)
+
+    def arrow(self, start: Vector, end: Vector, *, rgba: Rgba, width: float = 0.02) -> None:
+        """Draw an arrow from `start` to `end`."""
+        self._connector(mujoco.mjtGeom.mjGEOM_ARROW, width, start, end, rgba)
+
+    def sphere(self, center: Vector, *, radius: float, rgba: Rgba) -> None:
+        """Draw a ball."""
+        self._next(mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, radius), center, rgba)
+
+    def frame(self, origin: Vector, rotation: np.ndarray, *, scale: float = 0.1) -> None:
+        """Draw the axes of a rotation matrix [3, 3] in red, green and blue."""
+        for axis in range(3):
+            rgba = (float(axis == 0), float(axis == 1), float(axis == 2), 1.0)
+            end = np.asarray(origin) + scale * np.asarray(rotation)[:, axis]
+            self._connector(mujoco.mjtGeom.mjGEOM_CYLINDER, scale / 20, origin, end, rgba)
+
+    def line(self, start: Vector, end: Vector, *, rgba: Rgba, width: float = 2.0) -> None:
+        """Draw a line; `width` in pixels."""
+        self._connector(mujoco.mjtGeom.mjGEOM_LINE, width, start, end, rgba)
+
+    def ghost(self, qpos: np.ndarray, *, rgba: Rgba) -> None:
+        """Draw the robot in another pose, transparently."""
+        data = mujoco.MjData(self._model)
+        data.qpos[:] = qpos
+        mujoco.mj_forward(self._model, data)
+        first = self._scene.ngeom
+        add_geoms(self._model, data, self._scene, self._offset)
+        for index in range(first, self._scene.ngeom):
+            self._scene.geoms[index].rgba[:] = rgba
+
+    def text(self, position: Vector, content: str) -> None:
+        """Write a label."""
+        geom = self._next(mujoco.mjtGeom.mjGEOM_LABEL, np.full(3, 0.1), position, (1.0, 1.0, 1.0, 1.0))
+        geom.label = content
+
+    def _next(self, kind: mujoco.mjtGeom, size: np.ndarray, position: Vector, rgba: Rgba) -> mujoco.MjvGeom:
+        if self._scene.ngeom >= self._scene.maxgeom:
+            raise RuntimeError(f"the scene is full: {self._scene.maxgeom} geoms")
+        geom = self._scene.geoms[self._scene.ngeom]
+        center = np.asarray(position, dtype=np.float64) + self._offset
+        mujoco.mjv_initGeom(geom, kind, size, center, np.eye(3).ravel(), np.asarray(rgba, dtype=np.float32))
+        self._scene.ngeom += 1
+        return geom
+
+    def _connector(self, kind: mujoco.mjtGeom, width: float, start: Vector, end: Vector, rgba: Rgba) -> None:
+        geom = self._next(kind, np.zeros(3), start, rgba)
+        begin, finish = (np.asarray(point, dtype=np.float64) + self._offset for point in (start, end))
+        mujoco.mjv_connector(geom, kind, width, begin, finish)
+
+
+def add_geoms(model: mujoco.MjModel, data: mujoco.MjData, scene: mujoco.MjvScene, offset: np.ndarray) -> None:
+    """Add the moving geoms of `data` to the scene, shifted by `offset` (m)."""
+    first = scene.ngeom
+    mujoco.mjv_addGeoms(
+        model, data, mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.mjtCatBit.mjCAT_DYNAMIC.value, scene
+    )
+    for index in range(first, scene.ngeom):
+        scene.geoms[index].pos[:] += offset

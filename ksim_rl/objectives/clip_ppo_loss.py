@@ -1,0 +1,212 @@
+"""The clipped surrogate loss of PPO, free of host syncs."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection
+from tensordict.nn import (
+    CompositeDistribution,
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    dispatch,
+)
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torch.distributions import Distribution
+from torchrl import objectives
+from torchrl.modules.distributions.utils import has_analytic_entropy
+
+from ksim_rl.objectives.gaussian_kl import gaussian_parameters, kl_divergence
+
+
+class ClipPPOLoss(objectives.ClipPPOLoss):
+    """TorchRL's `ClipPPOLoss` (Schulman et al., arXiv 1707.06347), with the same options, losses and
+    gradients.
+
+    The stock loss reads tensor values on the host 1 to 3 times per call and breaks `fullgraph` compilation
+    with `clip_value`; this one never does. It also writes `kl`, the exact divergence from the policy that
+    collected the data to the present one, when the data has its `loc` and `scale`.
+
+    Losses are means over the env states, without a factor 0.5:
+    `loss_objective` = -mean(min(r A, clip(r, 1 - clip_epsilon, 1 + clip_epsilon) A)), r the probability
+    ratio; `loss_critic` = critic_coeff * mean(max((v - R)^2, (v_old + clip(v - v_old, -clip_value,
+    clip_value) - R)^2)) with `loss_critic_type="l2"`, which is rsl_rl's clipped value loss with
+    `value_loss_coef = critic_coeff`; `loss_entropy` = -entropy_coeff * mean(entropy). Env states whose
+    `("collector", "mask")` is False are left out.
+
+    Args:
+        actor_network, critic_network: TensorDict modules; the actor is probabilistic.
+        clip_value: radius of the value clipping, in units of the value; True takes `clip_epsilon`, None or
+            False does not clip. It is a plain number here: a captured graph or a compiled loss keeps the one
+            it saw.
+        log_ratio_statistics: also write TorchRL's `ESS`, `max_ratio` and `mean_ratio`.
+        **kwargs: all other options of TorchRL's `ClipPPOLoss`.
+    """
+
+    @dataclass
+    class _AcceptedKeys(objectives.ClipPPOLoss._AcceptedKeys):
+        """Adds the keys of the collecting policy's distribution to those of TorchRL."""
+
+        loc: NestedKey = "loc"
+        scale: NestedKey = "scale"
+
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential | None = None,
+        critic_network: TensorDictModuleBase | None = None,
+        *,
+        clip_epsilon: float | tuple[float, float] = 0.2,
+        clip_value: bool | float | None = None,
+        log_ratio_statistics: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        # TorchRL keeps clip_value in a buffer and tests it in an `if`, which is a host sync.
+        super().__init__(actor_network, critic_network, clip_epsilon=clip_epsilon, clip_value=None, **kwargs)
+        if clip_value is True:
+            if isinstance(clip_epsilon, (tuple, list)):
+                raise ValueError(
+                    f"clip_value=True takes the radius from clip_epsilon={clip_epsilon!r}, which has two: pass a number"
+                )
+            clip_value = float(clip_epsilon)
+        self.clip_value = float(clip_value) if clip_value else None
+        self.log_ratio_statistics = log_ratio_statistics
+
+    @property
+    def dataset_keys(self) -> list[NestedKey]:
+        """The leaves that a dataset needs for this loss, advantages already estimated."""
+        keys = self.tensor_keys
+        critic_keys = (
+            []
+            if self.critic_network is None
+            else [*self.critic_network.in_keys, keys.value, keys.value_target]
+        )
+        wanted = [
+            *self.actor_network.in_keys,
+            keys.action,
+            keys.sample_log_prob,
+            keys.loc,
+            keys.scale,
+            keys.advantage,
+        ]
+        return list(dict.fromkeys([*wanted, *critic_keys]))
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the losses and what is logged beside them, all detached but those named `loss_*`.
+
+        Args:
+            tensordict: a minibatch `["B"]` with the `dataset_keys`. Without an advantage it must be a
+                rollout, from which the value estimator computes one.
+
+        Returns:
+            TensorDict without batch dims: `loss_objective`, `loss_critic`, `loss_entropy`, `entropy`,
+                `kl_approx`,
+            `kl`, `clip_fraction`, `value_clip_fraction`, `explained_variance`.
+        """
+        tensordict = tensordict.clone(False)
+        advantage = self._advantage(tensordict)
+        log_weight, dist, kl_approx, log_is_weight = self._log_weight(
+            tensordict, adv_shape=advantage.shape[:-1]
+        )
+        if advantage.shape != log_weight.shape:
+            raise ValueError(
+                f"the advantage has shape {tuple(advantage.shape)}, the log-probability ratio "
+                f"{tuple(log_weight.shape)}: both must be batch shape + (1,)"
+            )
+        # The clipping acts on the ratio to the proximal policy; the gain is weighted by that to the
+        # collecting one.
+        log_behavior_weight = log_weight if log_is_weight is None else log_weight + log_is_weight
+        log_clipped = log_weight.clamp(*self._clip_bounds)
+        clipped = log_clipped != log_weight
+        if log_is_weight is not None:
+            log_clipped = log_clipped + log_is_weight
+        gain = torch.minimum(log_behavior_weight.exp() * advantage, log_clipped.exp() * advantage)
+
+        losses = {"loss_objective": -gain}
+        logged = {
+            "clip_fraction": clipped.to(gain.dtype),
+            "kl_approx": kl_approx,
+            **self._kl(tensordict, dist),
+        }
+        out = TensorDict({})
+        if self.entropy_bonus:
+            entropy = self._get_entropy(dist, adv_shape=advantage.shape[:-1])
+            losses["loss_entropy"] = self._weighted_loss_entropy(entropy)
+            if is_tensor_collection(entropy):
+                out.set("composite_entropy", entropy.detach())
+                entropy = entropy.sum(dim="feature", reduce=True)
+            logged["entropy"] = entropy
+        if self._has_critic:
+            losses["loss_critic"], value_clip_fraction, explained_variance = self.loss_critic(tensordict)
+            if value_clip_fraction is not None:
+                out.set("value_clip_fraction", value_clip_fraction)
+            if explained_variance is not None:
+                out.set("explained_variance", explained_variance)
+        if self.log_ratio_statistics:
+            out.update(_ratio_statistics(log_behavior_weight.detach()))
+        for name, loss in losses.items():
+            out.set(name, self._reduce_loss(loss, tensordict).squeeze(-1))
+        for name, quantity in logged.items():
+            out.set(name, self._reduce_loss(quantity.detach(), tensordict, reduction="mean"))
+        self._clear_weakrefs(
+            tensordict,
+            out,
+            "actor_network_params",
+            "critic_network_params",
+            "target_actor_network_params",
+            "target_critic_network_params",
+        )
+        return out
+
+    def _advantage(self, tensordict: TensorDictBase) -> Tensor:
+        advantage = tensordict.get(self.tensor_keys.advantage, None)
+        estimate = advantage is None
+        if estimate:
+            self.value_estimator(
+                tensordict,
+                params=self._cached_critic_network_params_detached,
+                target_params=self.target_critic_network_params,
+            )
+            advantage = tensordict.get(self.tensor_keys.advantage)
+        return self._maybe_normalize_advantage(advantage, tensordict, update_norm=estimate)
+
+    def _standardize_advantage(self, advantage: Tensor, tensordict: TensorDictBase) -> Tensor:
+        masks = [tensordict.get(key, None) for key in self._loss_mask_keys()]
+        masks = [self._expand_loss_mask(mask, advantage) for mask in masks if mask is not None]
+        if not masks or self.normalize_advantage_exclude_dims:
+            return super()._standardize_advantage(advantage, tensordict)
+        mask = masks[0] if len(masks) == 1 else torch.stack(masks).all(0)
+        zero = torch.zeros_like(advantage)
+        count = mask.sum()
+        error = advantage - torch.where(mask, advantage, zero).sum() / count.clamp_min(1)
+        variance = torch.where(mask, error, zero).square().sum() / (count - 1).clamp_min(1)
+        return error / variance.sqrt().clamp_min(torch.finfo(torch.float32).resolution)
+
+    def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor | TensorDictBase:
+        if isinstance(dist, CompositeDistribution) or not has_analytic_entropy(dist):
+            return super()._get_entropy(dist, adv_shape)
+        # TorchRL falls back on samples where the entropy is not finite, and asks the host for it.
+        return dist.entropy().unsqueeze(-1)
+
+    def _kl(self, tensordict: TensorDictBase, dist: Distribution) -> dict[str, Tensor]:
+        loc_old = tensordict.get(self.tensor_keys.loc, None)
+        scale_old = tensordict.get(self.tensor_keys.scale, None)
+        parameters = gaussian_parameters(dist)
+        if loc_old is None or scale_old is None or parameters is None:
+            return {}
+        with torch.no_grad():
+            return {"kl": kl_divergence(loc_old, scale_old, *parameters)}
+
+
+def _ratio_statistics(log_weight: Tensor) -> dict[str, Tensor]:
+    """Return TorchRL's statistics of the probability ratio.
+
+    Effective sample size (as a share), maximum and mean.
+    """
+    log_weight_B = log_weight.squeeze(-1)
+    log_size = 2.0 * log_weight_B.logsumexp(0) - (2.0 * log_weight_B).logsumexp(0)
+    ratio = log_weight.exp()
+    return {"ESS": log_size.exp() / log_weight.shape[0], "max_ratio": ratio.max(), "mean_ratio": ratio.mean()}

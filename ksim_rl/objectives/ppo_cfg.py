@@ -1,0 +1,85 @@
+"""The settings of proximal policy optimization."""
+
+from dataclasses import dataclass
+
+from ksim_rl.checks import check_choice, check_in_range
+
+SCHEDULES = ("adaptive", "fixed")
+NORMALIZATIONS = ("dataset", "minibatch", "none")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPOCfg:
+    """Proximal policy optimization (Schulman et al., arXiv 1707.06347); the defaults suit legged locomotion.
+
+    Attributes:
+        num_epochs: passes over each dataset.
+        gamma, lmbda: discount per step, and weight of longer returns in the advantage.
+        clip_epsilon: the probability ratio is clipped to [1 - clip_epsilon, 1 + clip_epsilon].
+        clip_value: radius of the value clipping; True takes `clip_epsilon`, False does not clip.
+        entropy_coeff, critic_coeff: weights of the entropy bonus and of the value loss.
+        normalize_advantage: over the whole "dataset", over each "minibatch", or "none".
+        learning_rate: of Adam, at the start.
+        schedule: "adaptive" changes it after each gradient step so that the divergence of the policy from the
+            one that collected the data stays near `desired_kl`; "fixed" keeps it.
+        desired_kl: in nats.
+        learning_rate_min, learning_rate_max: bounds of the adaptive schedule.
+        max_grad_norm: bound on the norm of the gradient; None does not clip.
+        betas, adam_eps, weight_decay: of Adam.
+        max_skipped_steps: so many gradient steps in a row that are not finite end the run.
+    """
+
+    num_epochs: int = 5
+    gamma: float = 0.99
+    lmbda: float = 0.95
+    clip_epsilon: float = 0.2
+    clip_value: bool | float = True
+    entropy_coeff: float = 0.01
+    critic_coeff: float = 1.0
+    normalize_advantage: str = "dataset"
+    learning_rate: float = 1e-3
+    schedule: str = "adaptive"
+    desired_kl: float = 0.01
+    learning_rate_min: float = 1e-5
+    learning_rate_max: float = 1e-2
+    max_grad_norm: float | None = 1.0
+    betas: tuple[float, float] = (0.9, 0.999)
+    adam_eps: float = 1e-8
+    weight_decay: float = 0.0
+    max_skipped_steps: int = 100
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, naming the field."""
+        object.__setattr__(self, "betas", tuple(self.betas))
+        for field in ("num_epochs", "max_skipped_steps"):
+            check_in_range(field, getattr(self, field), low=1)
+            if not isinstance(getattr(self, field), int):
+                raise ValueError(f"{field}={getattr(self, field)!r}: expected a whole number >= 1")
+        for field in ("gamma", "lmbda"):
+            check_in_range(field, getattr(self, field), low=0.0, high=1.0)
+        for field in (
+            "clip_epsilon",
+            "desired_kl",
+            "learning_rate",
+            "learning_rate_min",
+            "learning_rate_max",
+            "adam_eps",
+        ):
+            check_in_range(field, getattr(self, field), low=0.0, low_open=True)
+        check_in_range("clip_epsilon", self.clip_epsilon, high=1.0)
+        for field in ("entropy_coeff", "critic_coeff", "weight_decay"):
+            check_in_range(field, getattr(self, field), low=0.0)
+        if not isinstance(self.clip_value, bool):
+            check_in_range("clip_value", self.clip_value, low=0.0)
+        if self.max_grad_norm is not None:
+            check_in_range("max_grad_norm", self.max_grad_norm, low=0.0, low_open=True)
+        for index, beta in enumerate(self.betas):
+            check_in_range(f"betas[{index}]", beta, low=0.0, high=1.0)
+        if len(self.betas) != 2:
+            raise ValueError(f"betas={self.betas!r}: expected two numbers")
+        check_choice("schedule", self.schedule, SCHEDULES)
+        check_choice("normalize_advantage", self.normalize_advantage, NORMALIZATIONS)
+        if self.learning_rate_min > self.learning_rate_max:
+            raise ValueError(
+                f"learning_rate_min={self.learning_rate_min!r} exceeds learning_rate_max={self.learning_rate_max!r}"
+            )

@@ -1,0 +1,123 @@
+"""One gradient step of PPO, and the parts that it needs, built from one config."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor, nn
+
+from ksim_rl.objectives.adaptive_learning_rate import adapt_learning_rate_
+from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
+from ksim_rl.objectives.gae import GAE
+from ksim_rl.objectives.ppo_cfg import PPOCfg
+from ksim_rl.objectives.step_guard import StepGuard, clip_and_guard
+
+
+def make_gae(cfg: PPOCfg, critic: TensorDictModuleBase) -> GAE:
+    """Build the advantage estimator of `cfg`."""
+    normalize = cfg.normalize_advantage == "dataset"
+    return GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, critic=critic, normalize_advantage=normalize)
+
+
+def make_loss(
+    cfg: PPOCfg, actor: ProbabilisticTensorDictSequential, critic: TensorDictModuleBase
+) -> ClipPPOLoss:
+    """Build the loss of `cfg`. It uses the modules as they are: what changes in them changes in the loss."""
+    return ClipPPOLoss(
+        actor,
+        critic,
+        clip_epsilon=cfg.clip_epsilon,
+        clip_value=cfg.clip_value,
+        entropy_coeff=cfg.entropy_coeff,
+        critic_coeff=cfg.critic_coeff,
+        loss_critic_type="l2",
+        normalize_advantage=cfg.normalize_advantage == "minibatch",
+        functional=False,
+        log_ratio_statistics=False,
+    )
+
+
+def make_optimizer(cfg: PPOCfg, *modules: nn.Module) -> torch.optim.Adam:
+    """Build one fused Adam over the parameters of `modules`, each once, with the learning rate on the device.
+
+    `optimizer.param_groups[0]["lr"]` is a float32 tensor [] that changes in place. On CUDA the optimizer is
+    capturable.
+    """
+    parameters = list(dict.fromkeys(parameter for module in modules for parameter in module.parameters()))
+    device = parameters[0].device
+    return torch.optim.Adam(
+        parameters,
+        lr=torch.tensor(cfg.learning_rate, dtype=torch.float32, device=device),
+        betas=cfg.betas,
+        eps=cfg.adam_eps,
+        weight_decay=cfg.weight_decay,
+        fused=True,
+        capturable=device.type == "cuda",
+    )
+
+
+def load_optimizer_state_(optimizer: torch.optim.Optimizer, state_dict: dict[str, Any]) -> None:
+    """Load a state dict and keep the learning rate a tensor on the device of the parameters, at its address.
+
+    Oad a state dict and keep the learning rate a tensor on the device of the parameters, at its address.
+    """
+    learning_rates = [group["lr"] for group in optimizer.param_groups]
+    optimizer.load_state_dict(state_dict)
+    for group, learning_rate in zip(optimizer.param_groups, learning_rates, strict=True):
+        if isinstance(learning_rate, Tensor):
+            group["lr"] = learning_rate.copy_(torch.as_tensor(group["lr"]))
+
+
+def ppo_step(
+    loss: Callable[[TensorDictBase], TensorDictBase],
+    optimizer: torch.optim.Optimizer,
+    minibatch_B: TensorDictBase,
+    *,
+    cfg: PPOCfg,
+    guard: StepGuard | None = None,
+) -> dict[str, Tensor]:
+    """Make one gradient step on a minibatch. Makes no host sync and can be captured in a CUDA graph.
+
+    With the adaptive schedule the learning rate is changed before the step, as in rsl_rl. A step whose loss
+    or gradient is not finite changes no parameter, moment or step count of the optimizer.
+
+    Args:
+        loss: a `ClipPPOLoss`, also a compiled one; any callable that returns `loss_*` and, for the adaptive
+            schedule, `kl`.
+        optimizer: from `make_optimizer`; another one must be fused, with a tensor as learning rate.
+        minibatch_B: `["B"]`.
+        guard: counts skipped steps.
+
+    Returns:
+        What the loss returns, detached, and `loss`, `grad_norm` (before clipping), `learning_rate` (of this
+        step), `skipped` (0 or 1), each a tensor [].
+    """
+    losses = loss(minibatch_B)
+    total = torch.stack([value for name, value in losses.items() if name.startswith("loss_")]).sum()
+    learning_rate = optimizer.param_groups[0]["lr"]
+    if cfg.schedule == "adaptive":
+        adapt_learning_rate_(
+            learning_rate,
+            losses["kl"],
+            desired_kl=cfg.desired_kl,
+            lr_min=cfg.learning_rate_min,
+            lr_max=cfg.learning_rate_max,
+        )
+    optimizer.zero_grad(set_to_none=True)
+    total.backward()
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    grad_norm, found_inf = clip_and_guard(parameters, cfg.max_grad_norm, loss=total.detach())
+    # Fused optimizers read these two, which torch's GradScaler sets as well, and skip the step on the device.
+    optimizer.grad_scale, optimizer.found_inf = None, found_inf  # type: ignore[attr-defined]
+    optimizer.step()
+    if guard is not None:
+        guard.count_(found_inf)
+    return {
+        **{name: value.detach() for name, value in losses.items()},
+        "loss": total.detach(),
+        "grad_norm": grad_norm,
+        "learning_rate": learning_rate.clone(),
+        "skipped": found_inf,
+    }

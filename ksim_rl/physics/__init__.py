@@ -1,0 +1,20 @@
+"""MuJoCo model -> Warp world: batched step, refresh, masked reset, capture, guards."""
+
+from ksim_rl.physics import capture
+from ksim_rl.physics.capture import Captured
+from ksim_rl.physics.compile_notice import compile_notice
+from ksim_rl.physics.load import load_model, load_spec
+from ksim_rl.physics.overflow import OverflowReport
+from ksim_rl.physics.sim_cfg import SimCfg
+from ksim_rl.physics.world import World
+
+__all__ = [
+    "Captured",
+    "OverflowReport",
+    "SimCfg",
+    "World",
+    "capture",
+    "compile_notice",
+    "load_model",
+    "load_spec",
+]

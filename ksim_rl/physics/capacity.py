@@ -1,0 +1,169 @@
+"""Room for constraints and contacts: tight, but safe, from a probe of the model with MuJoCo's C engine."""
+
+import hashlib
+import math
+
+import mujoco
+import numpy as np
+
+from ksim_rl.physics.mujoco_messages import caught_warnings
+from ksim_rl.physics.sim_cfg import SimCfg
+
+MARGIN = 1.5
+EXTRA = 4
+MULTIPLE = 8
+RANDOM_STATES = 128
+DROPS = 8
+DROP_STEPS = 60
+# How deep a dropped body may start in the ground, in m.
+DEPTH = 0.02
+
+_cache: dict[bytes, tuple[int, int]] = {}
+
+
+def capacities(mj_model: mujoco.MjModel, sim: SimCfg) -> tuple[int, int]:
+    """Return (njmax, nconmax) per world: those of `sim`, or the probe's where they are None."""
+    if sim.njmax is not None and sim.nconmax is not None:
+        return sim.njmax, sim.nconmax
+    njmax, nconmax = probe(mj_model)
+    return sim.njmax or njmax, sim.nconmax or nconmax
+
+
+def probe(mj_model: mujoco.MjModel) -> tuple[int, int]:
+    """Return how many constraint rows and contacts a world of this model needs, with margin. Cached per model."""
+    buffer = np.empty(mujoco.mj_sizeModel(mj_model), dtype=np.uint8)
+    mujoco.mj_saveModel(mj_model, None, buffer)
+    key = hashlib.sha256(buffer.tobytes()).digest()
+    if key not in _cache:
+        with caught_warnings():
+            rows, contacts = _needed(mj_model)
+        _cache[key] = (with_margin(rows), with_margin(contacts))
+    return _cache[key]
+
+
+def with_margin(needed: int) -> int:
+    """Return a capacity for a need: half as much again and a little more, rounded up."""
+    return MULTIPLE * math.ceil((MARGIN * needed + EXTRA) / MULTIPLE)
+
+
+def _needed(mj_model: mujoco.MjModel) -> tuple[int, int]:
+    rng = np.random.default_rng(0)
+    mj_data = mujoco.MjData(mj_model)
+    pairs = CandidatePairs(mj_model)
+    most = np.zeros(2, dtype=int)
+
+    def measure() -> None:
+        most[0] = max(most[0], mj_data.nefc)
+        most[1] = max(most[1], mj_data.ncon, pairs.count(mj_data))
+
+    for key in range(-1, mj_model.nkey):
+        mujoco.mj_resetData(mj_model, mj_data)
+        if key >= 0:
+            mujoco.mj_resetDataKeyframe(mj_model, mj_data, key)
+        mujoco.mj_fwdPosition(mj_model, mj_data)
+        measure()
+    for index in range(RANDOM_STATES):
+        mujoco.mj_resetData(mj_model, mj_data)
+        mj_data.qpos[:] = random_qpos(mj_model, mj_data, rng)
+        put_in_ground(mj_model, mj_data, depth=DEPTH * rng.random())
+        mujoco.mj_fwdPosition(mj_model, mj_data)
+        measure()
+        if index < DROPS:
+            mj_data.ctrl[:] = random_ctrl(mj_model, rng)
+            for _ in range(DROP_STEPS):
+                mujoco.mj_step(mj_model, mj_data)
+                measure()
+    return int(most[0]), int(most[1])
+
+
+def random_qpos(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.random.Generator) -> np.ndarray:
+    """Draw joints within their limits (else within a turn or a metre), free and ball joints in any orientation."""
+    qpos = mj_data.qpos.copy()
+    for joint in range(mj_model.njnt):
+        adr, kind = int(mj_model.jnt_qposadr[joint]), mj_model.jnt_type[joint]
+        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+            start = adr + 3 if kind == mujoco.mjtJoint.mjJNT_FREE else adr
+            quat = rng.normal(size=4)
+            qpos[start : start + 4] = quat / np.linalg.norm(quat)
+        elif mj_model.jnt_limited[joint]:
+            qpos[adr] = rng.uniform(*mj_model.jnt_range[joint])
+        else:
+            reach = math.pi if kind == mujoco.mjtJoint.mjJNT_HINGE else 1.0
+            qpos[adr] += rng.uniform(-reach, reach)
+    return qpos
+
+
+def random_ctrl(mj_model: mujoco.MjModel, rng: np.random.Generator) -> np.ndarray:
+    """Draw controls within their ranges, else in [-1, 1]."""
+    low = np.where(mj_model.actuator_ctrllimited, mj_model.actuator_ctrlrange[:, 0], -1.0)
+    high = np.where(mj_model.actuator_ctrllimited, mj_model.actuator_ctrlrange[:, 1], 1.0)
+    return rng.uniform(low, high)
+
+
+def put_in_ground(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, *, depth: float) -> None:
+    """Move each free body, with what hangs on it, so that its lowest geom is `depth` (m) below the lowest plane."""
+    planes = np.flatnonzero(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    if planes.size == 0:
+        return
+    mujoco.mj_kinematics(mj_model, mj_data)
+    ground = mj_data.geom_xpos[planes, 2].max()
+    lowest = _lowest_points(mj_model, mj_data)
+    roots = mj_model.body_rootid[mj_model.geom_bodyid]
+    collides = (mj_model.geom_contype | mj_model.geom_conaffinity) != 0
+    for joint in np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+        geoms = collides & (roots == mj_model.body_rootid[mj_model.jnt_bodyid[joint]])
+        if geoms.any():
+            mj_data.qpos[mj_model.jnt_qposadr[joint] + 2] += ground - depth - lowest[geoms].min()
+
+
+def _lowest_points(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndarray:
+    """Return the height of each geom's lowest point, in m; for other than round geoms, that of its bounding box."""
+    up = mj_data.geom_xmat.reshape(-1, 3, 3)[:, 2]
+    center, half = mj_model.geom_aabb[:, :3], mj_model.geom_aabb[:, 3:]
+    box = mj_data.geom_xpos[:, 2] + (up * center).sum(1) - (np.abs(up) * half).sum(1)
+    radius = mj_model.geom_size[:, 0]
+    length = np.where(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE, mj_model.geom_size[:, 1], 0.0)
+    round_end = mj_data.geom_xpos[:, 2] - radius - np.abs(up[:, 2]) * length
+    is_round = np.isin(mj_model.geom_type, (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE))
+    return np.where(is_round, round_end, box)
+
+
+class CandidatePairs:
+    """Counts the geom pairs whose bounding spheres touch: Warp keeps a place in the contact pool for each of them.
+
+    The pairs that may collide at all are those of MuJoCo's filters: contype and conaffinity, not the same rigid body,
+    not parent and child, not excluded.
+    """
+
+    def __init__(self, mj_model: mujoco.MjModel) -> None:
+        self.mj_model = mj_model
+        first, second = np.triu_indices(mj_model.ngeom, k=1)
+        body_1, body_2 = mj_model.geom_bodyid[first], mj_model.geom_bodyid[second]
+        weld_1, weld_2 = mj_model.body_weldid[body_1], mj_model.body_weldid[body_2]
+        parent_1 = mj_model.body_weldid[mj_model.body_parentid[weld_1]]
+        parent_2 = mj_model.body_weldid[mj_model.body_parentid[weld_2]]
+        affine = (mj_model.geom_contype[first] & mj_model.geom_conaffinity[second]) | (
+            mj_model.geom_contype[second] & mj_model.geom_conaffinity[first]
+        )
+        keep = (affine != 0) & (weld_1 != weld_2)
+        if not mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
+            keep &= ~((weld_1 != 0) & (weld_2 != 0) & ((weld_1 == parent_2) | (weld_2 == parent_1)))
+        keep &= ~np.isin((body_1 << 16) + body_2, mj_model.exclude_signature)
+        self.first = np.concatenate([first[keep], mj_model.pair_geom1])
+        self.second = np.concatenate([second[keep], mj_model.pair_geom2])
+        self.margin = np.maximum(mj_model.geom_margin[self.first], mj_model.geom_margin[self.second])
+        self.is_plane = mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+
+    def count(self, mj_data: mujoco.MjData) -> int:
+        """Return the number of pairs that may touch in the present pose."""
+        if self.first.size == 0:
+            return 0
+        offset = mj_data.geom_xpos[self.second] - mj_data.geom_xpos[self.first]
+        radius_1, radius_2 = self.mj_model.geom_rbound[self.first], self.mj_model.geom_rbound[self.second]
+        reach = radius_1 + radius_2 + self.margin
+        normals = mj_data.geom_xmat.reshape(-1, 3, 3)[:, :, 2]
+        plane_1, plane_2 = self.is_plane[self.first], self.is_plane[self.second]
+        distance = np.linalg.norm(offset, axis=1)
+        distance = np.where(plane_1, (offset * normals[self.first]).sum(1), distance)
+        distance = np.where(plane_2, -(offset * normals[self.second]).sum(1), distance)
+        return int(np.count_nonzero(distance <= reach))

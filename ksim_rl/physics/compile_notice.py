@@ -1,0 +1,89 @@
+"""Say that Warp compiles kernels, instead of looking like a hang.
+
+The first use of a model compiles its kernels: 15 to 45 s, once per machine, then cached. Warp's own module-load lines
+are dropped; in their place each compiled module calls one hook with one line of text. The default hook writes the
+first line of a burst to stderr; a program with its own display sets another:
+
+    with compile_notice(lambda text: status.update(text)):
+        world.step(1)
+"""
+
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import warp as wp
+
+CompileHook = Callable[[str], None]
+
+# Warp ends a module's load line with "took 812.34 ms  (compiled)"; "(cached)" lines are not worth a word.
+COMPILED_LINE = re.compile(r"^\s*Module (?P<module>\S+).* took (?P<ms>[\d.]+) ms\s+\(compiled\)")
+# Compilations further apart than this belong to another model.
+BURST_GAP_S = 60.0
+
+
+class CompileLogger:
+    """A Warp logger that drops information lines and turns compilations into calls of a hook."""
+
+    def __init__(self, hook: CompileHook) -> None:
+        self.hook = hook
+        self.count = 0
+        self.seconds = 0.0
+        self.last_time = -BURST_GAP_S
+
+    def debug(self, message: str) -> None:
+        """Drop Warp's debug lines."""
+
+    def info(self, message: str) -> None:
+        """Drop Warp's information lines, and report those that tell of a compiled module."""
+        match = COMPILED_LINE.match(message)
+        if match is None:
+            return
+        now = time.monotonic()
+        if now - self.last_time > BURST_GAP_S:
+            self.count, self.seconds = 0, 0.0
+        self.last_time = now
+        self.count += 1
+        self.seconds += float(match["ms"]) / 1000.0
+        self.hook(
+            f"compiling Warp kernels (first use of this model, cached in {wp.config.kernel_cache_dir}): "
+            f"{self.count} modules, {self.seconds:.0f} s"
+        )
+
+    def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:
+        """Write Warp's warnings to stderr."""
+        sys.stderr.write(f"Warp warning: {message}\n")
+
+    def error(self, message: str) -> None:
+        """Write Warp's errors to stderr."""
+        sys.stderr.write(f"Warp error: {message}\n")
+
+
+def say_first(text: str) -> None:
+    """Write the first line of a burst of compilations to stderr; the default hook."""
+    if _logger.count == 1:
+        sys.stderr.write(text.rsplit(":", 1)[0] + " ...\n")
+
+
+_logger = CompileLogger(say_first)
+
+
+def install() -> None:
+    """Route Warp's messages through the hook. A logger that the program set itself stays."""
+    if type(wp.get_logger()).__name__ == "LoggerBasic":
+        wp.set_logger(_logger)
+
+
+install()
+
+
+@contextmanager
+def compile_notice(hook: CompileHook) -> Iterator[None]:
+    """Call `hook` with one line of text after each kernel module that Warp compiles in this block."""
+    saved, _logger.hook = _logger.hook, hook
+    try:
+        yield
+    finally:
+        _logger.hook = saved

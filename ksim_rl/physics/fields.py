@@ -1,0 +1,94 @@
+"""Model fields that differ between worlds, and the constants that follow from them."""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+
+import mujoco_warp as mjw
+import torch
+import warp as wp
+
+from ksim_rl.checks import unknown_name
+
+FIXED, KIN0, INERT0 = (int(mjw.SetConstGroup[name]) for name in ("FIXED", "KIN0", "INERT0"))
+ALL = FIXED | KIN0 | INERT0
+
+# What MuJoCo's mj_setConst derives from a field (see mujoco_warp.set_const). `actuator_gear` scales the moments.
+GROUPS_OF_FIELD = {
+    "qpos0": KIN0 | INERT0,
+    "body_mass": ALL,
+    "body_inertia": INERT0,
+    "body_ipos": ALL,
+    "body_iquat": ALL,
+    "body_pos": KIN0 | INERT0,
+    "body_quat": KIN0 | INERT0,
+    "dof_armature": INERT0,
+    "tendon_armature": INERT0,
+    "actuator_armature": INERT0,
+    "actuator_gear": INERT0,
+    "geom_size": FIXED,
+    "eq_data": KIN0,
+    "cam_pos": KIN0,
+    "cam_quat": KIN0,
+    "light_pos": KIN0,
+    "light_dir": KIN0,
+}
+DERIVED_FIELDS = {
+    FIXED: ("body_subtreemass", "geom_aabb", "geom_rbound"),
+    KIN0: (
+        "tendon_length0",
+        "eq_data",
+        "cam_pos0",
+        "cam_poscom0",
+        "cam_mat0",
+        "light_pos0",
+        "light_poscom0",
+        "light_dir0",
+    ),
+    INERT0: ("dof_invweight0", "body_invweight0", "tendon_invweight0", "actuator_acc0"),
+}
+# Not a field of the model but of its options, which put_model cannot expand.
+GRAVITY = "gravity"
+
+
+def model_fields() -> tuple[str, ...]:
+    """Return the names of all model fields that may differ between worlds."""
+    return tuple(
+        field.name
+        for field in dataclasses.fields(mjw.Model)
+        if (getattr(field.type, "shape", None) or ("",))[0] == "*"
+    )
+
+
+def const_groups(fields: Iterable[str]) -> int:
+    """Return the `SetConstGroup` bits of the constants that follow from `fields`."""
+    groups = 0
+    for field in fields:
+        groups |= GROUPS_OF_FIELD.get(field, 0)
+    return groups
+
+
+def fields_to_expand(fields: Sequence[str]) -> tuple[str, ...]:
+    """Return `fields` and, after them, the fields that are derived from them and so must differ as well.
+
+    Raises:
+        ValueError: naming a field that cannot differ between worlds, and the near names.
+    """
+    if isinstance(fields, str):
+        raise ValueError(f"per_world_fields={fields!r}: expected a sequence of names, such as ({fields!r},)")
+    valid = model_fields()
+    for field in fields:
+        if field != GRAVITY and field not in valid:
+            raise unknown_name("per-world model field", field, (*valid, GRAVITY))
+    groups = const_groups(fields)
+    derived = [name for group, names in DERIVED_FIELDS.items() if groups & group for name in names]
+    return tuple(dict.fromkeys([*(field for field in fields if field != GRAVITY), *derived]))
+
+
+def expand_gravity(warp_model: mjw.Model, num_envs: int) -> torch.Tensor:
+    """Give each world its own gravity vector, and return the view [E, 3], in m/s^2."""
+    shared = wp.to_torch(warp_model.opt.gravity)
+    gravity = wp.from_torch(shared.expand(num_envs, 3).contiguous(), dtype=wp.vec3)
+    # Kernels index it modulo its length; the flag tells Warp's helpers that its first dim is the world.
+    setattr(gravity, "_is_batched", True)  # noqa: B010
+    warp_model.opt.gravity = gravity
+    return wp.to_torch(gravity)

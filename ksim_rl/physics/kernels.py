@@ -1,0 +1,68 @@
+"""The few Warp kernels of our own."""
+
+# Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
+# pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false
+
+import warp as wp
+
+
+@wp.kernel(enable_backward=False)
+def zero_rows(mask: wp.array[bool], rows: wp.array2d[float]):
+    """Zero the rows of the worlds that `mask` names."""
+    world, i = wp.tid()
+    if mask[world]:
+        rows[world, i] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def record_overflow(
+    overflow: wp.array[int],
+    nefc: wp.array[int],
+    nacon: wp.array[int],
+    ncollision: wp.array[int],
+    sticky: wp.array[int],
+    most_nefc: wp.array[int],
+    most_pool: wp.array[int],
+):
+    """Keep each world's overflow bits and its largest need; world 0 does so for the pool of contacts."""
+    world = wp.tid()
+    sticky[world] = sticky[world] | overflow[world]
+    most_nefc[world] = wp.max(most_nefc[world], nefc[world])
+    if world == 0:
+        most_pool[0] = wp.max(most_pool[0], nacon[0])
+        most_pool[1] = wp.max(most_pool[1], ncollision[0])
+
+
+@wp.kernel(enable_backward=False)
+def tendon_velocity(
+    rownnz: wp.array[int],
+    rowadr: wp.array[int],
+    colind: wp.array[int],
+    jacobian: wp.array2d[float],
+    qvel: wp.array2d[float],
+    velocity: wp.array2d[float],
+):
+    """Multiply the sparse tendon Jacobian, whose pattern all worlds share, by qvel."""
+    world, row = wp.tid()
+    total = float(0.0)  # noqa: UP018 (Warp: a variable that changes in a loop)
+    for i in range(rowadr[row], rowadr[row] + rownnz[row]):
+        total += jacobian[world, i] * qvel[world, colind[i]]
+    velocity[world, row] = total
+
+
+@wp.kernel(enable_backward=False)
+def actuator_velocity(
+    rownnz: wp.array2d[int],
+    rowadr: wp.array2d[int],
+    colind: wp.array2d[int],
+    moment: wp.array2d[float],
+    qvel: wp.array2d[float],
+    velocity: wp.array2d[float],
+):
+    """Multiply each world's sparse actuator moments by qvel."""
+    world, row = wp.tid()
+    total = float(0.0)  # noqa: UP018 (Warp: a variable that changes in a loop)
+    for i in range(rowadr[world, row], rowadr[world, row] + rownnz[world, row]):
+        total += moment[world, i] * qvel[world, colind[world, i]]
+    velocity[world, row] = total

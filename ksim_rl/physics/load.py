@@ -1,0 +1,137 @@
+"""From an MJCF file, an XML string, a spec or a menagerie name to a checked model. Errors name file and element."""
+
+import re
+import warnings
+from pathlib import Path
+
+import mujoco
+import warp as wp
+
+from ksim_rl.physics import menagerie
+from ksim_rl.physics.model_checks import check_finite, warp_model_of
+from ksim_rl.physics.mujoco_messages import caught_warnings
+
+SUFFIXES = (".xml", ".mjcf", ".urdf")
+Source = str | Path | mujoco.MjSpec
+
+_ELEMENT = re.compile(r"Element '(?P<tag>[^']*)', line (?P<line>\d+)")
+_NAMED_ELEMENT = re.compile(r"Element name '(?P<name>[^']*)', id (?P<id>-?\d+)(, line (?P<line>\d+))?")
+_FILE_IN_MESSAGE = re.compile(r"file '(?P<file>[^']+)'")
+_LINE = re.compile(r"[Ll]ine number=(?P<line>\d+)")
+
+
+def load_spec(source: Source) -> mujoco.MjSpec:
+    """Parse a model into an editable spec.
+
+    Args:
+        source: a path to an MJCF or URDF file, an XML string, a spec (which is copied), or a menagerie name such as
+            "unitree_go1" or "unitree_go1/go1".
+
+    Raises:
+        ValueError: naming the file and the element.
+    """
+    return _parsed(source)[0]
+
+
+def load_model(source: Source) -> mujoco.MjModel:
+    """Compile a model, and check that its numbers are finite and that MuJoCo Warp can simulate it.
+
+    Args:
+        source: as in `load_spec`.
+
+    Raises:
+        ValueError: naming the file and the element, the field and its value, or the unsupported feature.
+    """
+    spec, text, label = _parsed(source)
+    with caught_warnings() as caught:
+        try:
+            mj_model = spec.compile()
+        except (ValueError, mujoco.FatalError) as error:
+            raise ValueError(_readable(str(error), label, text)) from None
+    check_finite(mj_model, label)
+    _pass_on(caught, label)
+    with wp.ScopedDevice("cpu"):
+        try:
+            warp_model_of(mj_model)
+        except ValueError as error:
+            raise ValueError(f"{label}: {error}") from error
+    return mj_model
+
+
+def _parsed(source: Source) -> tuple[mujoco.MjSpec, str, str]:
+    """Return the spec, its XML text (for messages), and how to call it in messages."""
+    if isinstance(source, mujoco.MjSpec):
+        return source.copy(), "", f"model {source.modelname!r}"
+    path, text, label = _read(source)
+    with caught_warnings() as caught:
+        try:
+            spec = mujoco.MjSpec.from_string(text) if path is None else mujoco.MjSpec.from_file(str(path))
+        except (ValueError, mujoco.FatalError) as error:
+            raise ValueError(_readable(str(error), label, text)) from None
+    _pass_on(caught, label)
+    return spec, text, label
+
+
+def _read(source: str | Path) -> tuple[Path | None, str, str]:
+    """Return the path (None for an XML string), the XML text, and how to call the source in messages."""
+    if not isinstance(source, (str, Path)):
+        kind = type(source).__name__
+        raise ValueError(
+            f"model source is {kind}: expected a path, an XML string, a MjSpec or a menagerie name"
+        )
+    if isinstance(source, str):
+        if not source.strip():
+            raise ValueError(
+                "model source is an empty string: expected a path, an XML string or a menagerie name"
+            )
+        if source.lstrip().startswith("<"):
+            return None, source, "XML string"
+        if menagerie.looks_like_name(source) and not Path(source).exists():
+            source = menagerie.model_path(source)
+    path = Path(source)
+    if path.is_dir() or not path.exists():
+        raise ValueError(f"model file {str(path)!r}: {'is a folder' if path.is_dir() else 'no such file'}")
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"model file {str(path)!r}: expected a name that ends in {', '.join(SUFFIXES)}")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"model file {str(path)!r} is not UTF-8 text: byte {error.start}") from None
+    except OSError as error:
+        raise ValueError(f"model file {str(path)!r} cannot be read: {error.strerror}") from None
+    if not text.strip():
+        raise ValueError(f"model file {str(path)!r} is empty")
+    return path, text, str(path)
+
+
+def _readable(message: str, label: str, text: str) -> str:
+    """Put MuJoCo's message on one line, with the source and the element."""
+    message = message.strip()
+    what = (
+        message.splitlines()[0].removeprefix("XML Error: ").removeprefix("Error: ").removeprefix("ParseXML: ")
+    )
+    if message.startswith("XML parse error"):
+        line = _LINE.search(message)
+        number = int(line["line"]) if line else 0
+        return f"{label}: not well-formed XML{_at_line(text, number)}"
+    if found := _ELEMENT.search(message):
+        return f"{label}: {what} (element <{found['tag']}>{_at_line(text, int(found['line']))})"
+    if found := _NAMED_ELEMENT.search(message):
+        called = f"{found['name']!r}" if found["name"] else f"number {found['id']} (unnamed)"
+        return f"{label}: {what} (element {called}{_at_line(text, int(found['line'] or 0))})"
+    if found := _FILE_IN_MESSAGE.search(message):
+        lines = [number for number, line in enumerate(text.splitlines(), 1) if found["file"] in line]
+        return f"{label}: {what}{_at_line(text, lines[0]) if lines else ''}"
+    return f"{label}: {what}"
+
+
+def _at_line(text: str, number: int) -> str:
+    lines = text.splitlines()
+    if not 1 <= number <= len(lines):
+        return f", line {number}" if number else ""
+    return f", line {number}: {lines[number - 1].strip()[:120]}"
+
+
+def _pass_on(caught: list[str], label: str) -> None:
+    for text in dict.fromkeys(caught):
+        warnings.warn(f"{label}: {text}", UserWarning, stacklevel=3)

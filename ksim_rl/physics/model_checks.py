@@ -1,0 +1,131 @@
+"""What a compiled model must satisfy before kernels are compiled for it: finite numbers, features that Warp has."""
+
+import warnings
+from collections.abc import Iterator
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+
+OBJECT_TYPES = {
+    "body": mujoco.mjtObj.mjOBJ_BODY,
+    "jnt": mujoco.mjtObj.mjOBJ_JOINT,
+    "geom": mujoco.mjtObj.mjOBJ_GEOM,
+    "site": mujoco.mjtObj.mjOBJ_SITE,
+    "cam": mujoco.mjtObj.mjOBJ_CAMERA,
+    "light": mujoco.mjtObj.mjOBJ_LIGHT,
+    "mesh": mujoco.mjtObj.mjOBJ_MESH,
+    "hfield": mujoco.mjtObj.mjOBJ_HFIELD,
+    "mat": mujoco.mjtObj.mjOBJ_MATERIAL,
+    "pair": mujoco.mjtObj.mjOBJ_PAIR,
+    "eq": mujoco.mjtObj.mjOBJ_EQUALITY,
+    "tendon": mujoco.mjtObj.mjOBJ_TENDON,
+    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
+    "sensor": mujoco.mjtObj.mjOBJ_SENSOR,
+    "numeric": mujoco.mjtObj.mjOBJ_NUMERIC,
+    "flex": mujoco.mjtObj.mjOBJ_FLEX,
+    "key": mujoco.mjtObj.mjOBJ_KEY,
+}
+ELEMENT_WORDS = {"jnt": "joint", "cam": "camera", "mat": "material", "eq": "equality", "key": "keyframe"}
+# The largest number that the float32 of the GPU holds.
+LARGEST = float(np.finfo(np.float32).max)
+# Fields whose enum values tell which elements use a feature that Warp lacks.
+ENUM_FIELDS = {
+    "actuator_trntype": mujoco.mjtTrn,
+    "actuator_dyntype": mujoco.mjtDyn,
+    "actuator_gaintype": mujoco.mjtGain,
+    "actuator_biastype": mujoco.mjtBias,
+    "eq_type": mujoco.mjtEq,
+    "geom_type": mujoco.mjtGeom,
+    "sensor_type": mujoco.mjtSensor,
+}
+
+
+def check_finite(mj_model: mujoco.MjModel, source: str) -> None:
+    """Refuse a model with a number that is NaN, infinite, or too large for float32.
+
+    Raises:
+        ValueError: naming the source, the field, its value, and the element that has it.
+    """
+    for field, values in _float_fields(mj_model):
+        flat = np.asarray(values, dtype=np.float64).reshape(-1)
+        bad = np.flatnonzero(~(np.abs(flat) <= LARGEST))
+        if bad.size:
+            where = _element_of(mj_model, field, int(bad[0]), np.shape(values))
+            raise ValueError(
+                f"{source}: {field}={flat[bad[0]]} in {where}: every number of a model must be finite and fit float32"
+            )
+
+
+def warp_model_of(mj_model: mujoco.MjModel, batch_sizes: dict[str, int] | None = None) -> mjw.Model:
+    """Put a model on Warp's current device.
+
+    Raises:
+        ValueError: naming the feature that MuJoCo Warp does not have, and what to do.
+    """
+    try:
+        with warnings.catch_warnings():
+            # It doubts friction of geoms without contacts; MuJoCo itself accepts them.
+            warnings.filterwarnings("ignore", message=".*may cause NaN")
+            return mjw.put_model(mj_model, batch_sizes)
+    except (NotImplementedError, ValueError) as error:
+        raise ValueError(
+            f"MuJoCo Warp cannot simulate this model: {_with_elements(mj_model, str(error))}"
+        ) from error
+
+
+def _float_fields(mj_model: mujoco.MjModel) -> Iterator[tuple[str, float | np.ndarray]]:
+    for name in dir(mj_model.opt):
+        value = getattr(mj_model.opt, name)
+        if not name.startswith("_") and isinstance(value, (float, np.ndarray)):
+            yield f"option.{name}", value
+    for name in dir(mj_model):
+        if name.startswith("_") or name.startswith("tex_"):
+            continue
+        value = getattr(mj_model, name)
+        if isinstance(value, np.ndarray) and np.issubdtype(value.dtype, np.floating):
+            yield name, value
+
+
+def _element_of(mj_model: mujoco.MjModel, field: str, flat_index: int, shape: tuple[int, ...]) -> str:
+    """Name the element that a number of a field belongs to."""
+    if field.startswith("option."):
+        return "<option>"
+    row = flat_index // max(1, int(np.prod(shape[1:])))
+    prefix = field.split("_")[0]
+    if prefix == "dof":
+        prefix, row = "jnt", int(mj_model.dof_jntid[row])
+    elif field in ("qpos0", "qpos_spring"):
+        prefix, row = "jnt", int(np.searchsorted(mj_model.jnt_qposadr, row, side="right")) - 1
+    if prefix not in OBJECT_TYPES:
+        return f"row {row}"
+    return _element(mj_model, prefix, row)
+
+
+def _element(mj_model: mujoco.MjModel, prefix: str, row: int) -> str:
+    name = mujoco.mj_id2name(mj_model, int(OBJECT_TYPES[prefix]), row)
+    word = ELEMENT_WORDS.get(prefix, prefix)
+    return f"{word} {name!r}" if name else f"{word} number {row} (unnamed)"
+
+
+def _with_elements(mj_model: mujoco.MjModel, message: str) -> str:
+    """Add the elements that use a feature named in a message of put_model, and what to do."""
+    users = []
+    for field, enum in ENUM_FIELDS.items():
+        for row, value in enumerate(getattr(mj_model, field)):
+            if enum(int(value)).name in message:
+                users.append(_element(mj_model, field.split("_")[0], row))
+    if "Actuator plugin" in message:
+        users += [
+            _element(mj_model, "actuator", int(i)) for i in np.flatnonzero(mj_model.actuator_plugin != -1)
+        ]
+    for enum in (
+        mujoco.mjtIntegrator,
+        mujoco.mjtCone,
+        mujoco.mjtSolver,
+        mujoco.mjtDisableBit,
+        mujoco.mjtEnableBit,
+    ):
+        users += ["<option>" for member in enum.__members__ if member in message]
+    used_by = f" Used by {', '.join(users[:5])}." if users else ""
+    return f"{message.rstrip('.')}.{used_by} Remove it from the model, or replace it by a supported feature."

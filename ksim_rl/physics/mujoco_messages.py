@@ -1,0 +1,22 @@
+"""Catch MuJoCo's warnings: left alone, they go to the terminal and into a file MUJOCO_LOG.TXT in the present folder."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import mujoco
+
+
+@contextmanager
+def caught_warnings() -> Iterator[list[str]]:
+    """Collect the text of MuJoCo's warnings in this block instead of printing them."""
+    caught: list[str] = []
+
+    def keep(text: bytes | str) -> None:
+        caught.append((text.decode(errors="replace") if isinstance(text, bytes) else text).strip())
+
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(keep)
+    try:
+        yield caught
+    finally:
+        mujoco.set_mju_user_warning(previous)

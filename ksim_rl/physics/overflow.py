@@ -1,0 +1,131 @@
+"""Contacts and constraints that did not fit are never silent: sticky bits and running maxima, read once per rollout."""
+
+import dataclasses
+import math
+
+import mujoco_warp as mjw
+import torch
+import warp as wp
+
+from ksim_rl.physics import kernels
+
+# The solver stopping at its iteration limit is a setting, not a loss of contacts.
+METRIC_BITS = ("ITERATIONS", "LS_ITERATIONS")
+# In the order of the bits, lowest first.
+BIT_NAMES = tuple(name for name, bit in mjw.OverflowType.__members__.items() if bit and bit & (bit - 1) == 0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OverflowReport:
+    """What the physics needed since the last report, beside what it has.
+
+    Args:
+        worlds: number of worlds that raised each overflow bit.
+        nefc: most constraint rows of any world, in any substep.
+        njmax: rows that each world has.
+        ncon: most contacts or candidate pairs in the pool of all worlds, in any substep.
+        naconmax: places in that pool.
+        num_envs: number of worlds.
+        messages: one line for each kind of loss, naming the needed and the present value. Empty: nothing was lost.
+    """
+
+    worlds: dict[str, int]
+    nefc: int
+    njmax: int
+    ncon: int
+    naconmax: int
+    num_envs: int
+    messages: tuple[str, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether no contact and no constraint was lost."""
+        return not self.messages
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Shares in [0, 1] and counts to log."""
+        return {
+            "nefc_share": self.nefc / self.njmax if self.njmax else 0.0,
+            "ncon_share": self.ncon / self.naconmax if self.naconmax else 0.0,
+            **{f"{name.lower()}_worlds": self.worlds[name] / self.num_envs for name in METRIC_BITS},
+        }
+
+
+class OverflowRecord:
+    """Sticky overflow bits and running maxima on the device; `read` is the only transfer to the host."""
+
+    def __init__(self, warp_data_E: mjw.Data) -> None:
+        self._warp_data_E = warp_data_E
+        num_envs = warp_data_E.nworld
+        self._sticky = wp.zeros(num_envs, dtype=int)
+        self._most_nefc = wp.zeros(num_envs, dtype=int)
+        self._most_pool = wp.zeros(2, dtype=int)
+        self.sticky_E = wp.to_torch(self._sticky)
+        self.most_nefc_E = wp.to_torch(self._most_nefc)
+        self.most_pool = wp.to_torch(self._most_pool)
+
+    def record(self) -> None:
+        """Launch the update of bits and maxima; runs after each substep, so before any reset clears them."""
+        d = self._warp_data_E
+        wp.launch(
+            kernels.record_overflow,
+            dim=d.nworld,
+            inputs=[d.overflow, d.nefc, d.nacon, d.ncollision],
+            outputs=[self._sticky, self._most_nefc, self._most_pool],
+        )
+
+    def clear(self) -> None:
+        """Start the next period."""
+        self.sticky_E.zero_()
+        self.most_nefc_E.zero_()
+        self.most_pool.zero_()
+
+    def read(self) -> OverflowReport:
+        """Copy one small tensor to the host, and say what it means."""
+        bits = torch.arange(len(BIT_NAMES), device=self.sticky_E.device, dtype=torch.int32)
+        counts = ((self.sticky_E[:, None] >> bits) & 1).sum(0)
+        numbers = torch.cat([counts, self.most_nefc_E.max().view(1), self.most_pool]).tolist()
+        d = self._warp_data_E
+        worlds = dict(zip(BIT_NAMES, numbers, strict=False))
+        nefc, ncon = numbers[len(BIT_NAMES)], max(numbers[len(BIT_NAMES) + 1 :])
+        return OverflowReport(
+            worlds=worlds,
+            nefc=nefc,
+            njmax=d.njmax,
+            ncon=ncon,
+            naconmax=d.naconmax,
+            num_envs=d.nworld,
+            messages=_messages(worlds, nefc=nefc, ncon=ncon, warp_data_E=d),
+        )
+
+
+def _messages(worlds: dict[str, int], *, nefc: int, ncon: int, warp_data_E: mjw.Data) -> tuple[str, ...]:
+    num_envs = warp_data_E.nworld
+    nconmax = warp_data_E.naconmax // num_envs
+    needed_nconmax = math.ceil(ncon / num_envs)
+    pool = (
+        f"the pool of contacts and candidate pairs needed {ncon} places but has {warp_data_E.naconmax}: "
+        f"set sim.nconmax >= {needed_nconmax} (now {nconmax} per world, {num_envs} worlds)"
+    )
+    rows = f"constraint rows needed {nefc} per world but has {warp_data_E.njmax}: set sim.njmax >= {nefc}"
+    known = {
+        "NEFC": rows,
+        "NJMAX_NNZ": f"the constraint Jacobian is full; it grows with njmax: raise sim.njmax above {warp_data_E.njmax}",
+        "BROADPHASE": pool,
+        "NARROWPHASE": pool,
+        "CCD": f"too many convex pairs: raise sim.nconmax above {nconmax}",
+        "HFIELD": "too many height-field cells under one geom: use smaller geoms or a coarser height field",
+        "CONTACT_MATCH": "a contact sensor matched more contacts than it keeps: "
+        'raise <custom><numeric name="contact_sensor_maxmatch" data="64"/></custom> in the model',
+        "EPA_HORIZON": "convex collision ran out of faces: simplify the meshes or raise sim.ccd_iterations",
+        "TACTILE": "a tactile sensor saw more geoms than it keeps",
+        "NVMAX": "too many degrees of freedom are awake",
+    }
+    lines: dict[str, list[str]] = {}
+    for name, count in worlds.items():
+        if count and name not in METRIC_BITS:
+            lines.setdefault(known.get(name, "the physics dropped something"), []).append(
+                f"{name} in {count} worlds"
+            )
+    return tuple(f"{text} ({', '.join(bits)})" for text, bits in lines.items())

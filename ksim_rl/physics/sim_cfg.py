@@ -1,0 +1,88 @@
+"""Solver and integrator settings, laid over those of a model."""
+
+import dataclasses
+
+import mujoco
+
+from ksim_rl.checks import check_choice, check_in_range
+
+INTEGRATORS = {
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
+}
+SOLVERS = {"cg": mujoco.mjtSolver.mjSOL_CG, "newton": mujoco.mjtSolver.mjSOL_NEWTON}
+CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SimCfg:
+    """Simulation settings. `None` keeps the model's own value.
+
+    Args:
+        timestep: of one physics step, in s.
+        integrator: one of "euler", "rk4", "implicit", "implicitfast", "discrete".
+        solver: "newton" or "cg".
+        cone: friction cones, "pyramidal" or "elliptic".
+        impratio: ratio of frictional to normal constraint impedance.
+        iterations: most iterations of the constraint solver.
+        ls_iterations: most iterations of its line search.
+        ccd_iterations: most iterations of convex collision detection.
+        njmax: most constraint rows of one world; `None` probes the model.
+        nconmax: contacts (and candidate pairs) per world. They share one pool of `num_envs * nconmax`; `None` probes.
+        deterministic: same results in each run on a GPU too, at a cost (large for scenes with many contacts).
+        require_graphs: refuse to run where graphs are unavailable, instead of a warning and a slow run.
+
+    See https://mujoco.readthedocs.io/en/stable/XMLreference.html#option
+
+    Raises:
+        ValueError: naming the field, the value and what is valid.
+    """
+
+    timestep: float | None = None
+    integrator: str | None = None
+    solver: str | None = None
+    cone: str | None = None
+    impratio: float | None = None
+    iterations: int | None = None
+    ls_iterations: int | None = None
+    ccd_iterations: int | None = None
+    njmax: int | None = None
+    nconmax: int | None = None
+    deterministic: bool = False
+    require_graphs: bool = False
+
+    def __post_init__(self) -> None:
+        for field in ("timestep", "impratio"):
+            value = getattr(self, field)
+            if value is not None:
+                check_in_range(field, value, low=0.0, low_open=True)
+        for field, choices in (("integrator", INTEGRATORS), ("solver", SOLVERS), ("cone", CONES)):
+            value = getattr(self, field)
+            if value is not None:
+                check_choice(field, value, choices)
+        for field in ("iterations", "ls_iterations", "ccd_iterations", "njmax", "nconmax"):
+            value = getattr(self, field)
+            if value is None:
+                continue
+            if isinstance(value, bool) or not isinstance(value, int):
+                raise ValueError(f"{field}={value!r}: expected a whole number >= 1, or None")
+            check_in_range(field, value, low=1)
+        for field in ("deterministic", "require_graphs"):
+            value = getattr(self, field)
+            if not isinstance(value, bool):
+                raise ValueError(f"{field}={value!r}: expected True or False")
+
+    def apply_to(self, target: mujoco.MjSpec | mujoco.MjModel) -> None:
+        """Write the settings that are not `None` into the options of a spec or a model, in place."""
+        option = target.option if isinstance(target, mujoco.MjSpec) else target.opt
+        for field in ("timestep", "impratio", "iterations", "ls_iterations", "ccd_iterations"):
+            value = getattr(self, field)
+            if value is not None:
+                setattr(option, field, value)
+        for field, values in (("integrator", INTEGRATORS), ("solver", SOLVERS), ("cone", CONES)):
+            value = getattr(self, field)
+            if value is not None:
+                setattr(option, field, int(values[value]))

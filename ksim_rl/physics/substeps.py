@@ -1,0 +1,108 @@
+"""The launch sequences of a world: substeps with sensors on the last one, and the refresh of derived quantities."""
+
+import dataclasses
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+
+from ksim_rl.physics import kernels
+
+# These read the contacts of the last substep's collision pass, which a reset empties.
+COLLISION_SENSORS = (
+    mujoco.mjtSensor.mjSENS_GEOMDIST,
+    mujoco.mjtSensor.mjSENS_GEOMNORMAL,
+    mujoco.mjtSensor.mjSENS_GEOMFROMTO,
+)
+TRANSMISSION_SENSORS = (mujoco.mjtSensor.mjSENS_ACTUATORPOS, mujoco.mjtSensor.mjSENS_ACTUATORVEL)
+TENDON_VELOCITY_SENSORS = (mujoco.mjtSensor.mjSENS_TENDONVEL,)
+
+
+class Substeps:
+    """Shallow variants of one Warp model, so that a stage is left out without touching the model itself.
+
+    The variants share all arrays with `warp_model`. Build them once its arrays are in their final place.
+    """
+
+    def __init__(self, mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+        self.warp_model = warp_model
+        self.warp_data_E = warp_data_E
+        sensor_type = mj_model.sensor_type
+        has_history = np.any(mj_model.sensor_history > 0, axis=-1)
+        # A delayed sensor samples at every substep.
+        self._silent_model = warp_model if has_history.any() else _without_sensors(warp_model)
+        self._refresh_model = _refreshable(
+            warp_model, skip=has_history | np.isin(sensor_type, COLLISION_SENSORS), sensor_type=sensor_type
+        )
+        self._needs_transmission = bool(np.isin(sensor_type, TRANSMISSION_SENSORS).any())
+        self._needs_tendon_velocity = bool(np.isin(sensor_type, TENDON_VELOCITY_SENSORS).any())
+
+    def advance(self, *, sensors: bool) -> None:
+        """Launch one physics step. Sensors never change the state that it reaches."""
+        mjw.step(self.warp_model if sensors else self._silent_model, self.warp_data_E)
+
+    def refresh(self) -> None:
+        """Launch what recomputes position- and velocity-stage quantities from the present qpos and qvel.
+
+        No collision pass: contacts, forces and the sensors that read them stay as the last substep left them.
+        """
+        m, d = self._refresh_model, self.warp_data_E
+        mjw.kinematics(m, d)
+        mjw.com_pos(m, d)
+        mjw.camlight(m, d)
+        mjw.flex(m, d)
+        mjw.tendon(m, d)
+        mjw.com_vel(m, d)
+        if self._needs_tendon_velocity:
+            wp.launch(
+                kernels.tendon_velocity,
+                dim=(d.nworld, m.ntendon),
+                inputs=[m.ten_J_rownnz, m.ten_J_rowadr, m.ten_J_colind, d.ten_J, d.qvel],
+                outputs=[d.ten_velocity],
+            )
+        if self._needs_transmission:
+            mjw.transmission(m, d)
+            wp.launch(
+                kernels.actuator_velocity,
+                dim=(d.nworld, m.nactuator),
+                inputs=[d.moment_rownnz, d.moment_rowadr, d.moment_colind, d.actuator_moment, d.qvel],
+                outputs=[d.actuator_velocity],
+            )
+        mjw.sensor_pos(m, d)
+        mjw.sensor_vel(m, d)
+
+
+def _without_sensors(warp_model: mjw.Model) -> mjw.Model:
+    opt = dataclasses.replace(
+        warp_model.opt, disableflags=int(warp_model.opt.disableflags) | int(mjw.DisableBit.SENSOR)
+    )
+    return dataclasses.replace(warp_model, opt=opt)
+
+
+def _refreshable(warp_model: mjw.Model, *, skip: np.ndarray, sensor_type: np.ndarray) -> mjw.Model:
+    """Leave only the sensors that follow from qpos and qvel alone.
+
+    Contact, limit, touch-grid and geom-distance sensors read rows or contacts of the last substep's collision pass.
+    They keep that substep's value; rows that reset since then read zero.
+    """
+    none = wp.zeros(0, dtype=int)
+    pos, vel = (
+        wp.array([i for i in ids.numpy() if not skip[i]], dtype=int)
+        for ids in (warp_model.sensor_pos_adr, warp_model.sensor_vel_adr)
+    )
+    rangefinder = sensor_type == mujoco.mjtSensor.mjSENS_RANGEFINDER
+    return dataclasses.replace(
+        warp_model,
+        sensor_pos_adr=pos,
+        sensor_vel_adr=vel,
+        sensor_limitpos_adr=none,
+        sensor_limitvel_adr=none,
+        sensor_contact_pos_adr=none,
+        sensor_contact_vel_adr=none,
+        sensor_stage_pos_adr=none,
+        sensor_stage_vel_adr=none,
+        nsensorcollision=0,
+        nsensortaxel=0,
+        nrangefinder=0 if np.any(rangefinder & skip) else warp_model.nrangefinder,
+    )

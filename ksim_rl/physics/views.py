@@ -1,0 +1,130 @@
+"""Zero-copy torch views of Warp arrays."""
+
+import dataclasses
+
+import mujoco_warp as mjw
+import warp as wp
+from torch import Tensor
+
+from ksim_rl.checks import unknown_name
+
+# A view `<name>_EL` for each; shapes [E, ...], float32, named as MuJoCo names them.
+VIEW_NAMES = (
+    "qpos",
+    "qvel",
+    "qacc",
+    "act",
+    "ctrl",
+    "sensordata",
+    "actuator_force",
+    "qfrc_actuator",
+    "qfrc_applied",
+    "xfrc_applied",
+    "xpos",
+    "xquat",
+    "xmat",
+    "xipos",
+    "cvel",
+    "subtree_com",
+    "geom_xpos",
+    "geom_xmat",
+    "site_xpos",
+    "site_xmat",
+)
+# Left as they were by mujoco_warp.reset_data, though they belong to the episode that ended.
+ACCELERATION_STAGE = (
+    "actuator_force",
+    "qfrc_actuator",
+    "qfrc_constraint",
+    "qfrc_passive",
+    "cacc",
+    "cfrc_int",
+    "cfrc_ext",
+)
+
+
+def float_rows(warp_data_E: mjw.Data, names: tuple[str, ...]) -> list[wp.array]:
+    """Return the named arrays as rows of floats, one per world, on the same memory."""
+    rows = []
+    for name in names:
+        tensor = wp.to_torch(getattr(warp_data_E, name))
+        if tensor.numel():
+            rows.append(wp.from_torch(tensor.view(tensor.shape[0], -1), dtype=wp.float32))
+    return rows
+
+
+def nbytes(warp_data_E: mjw.Data) -> int:
+    """Return the memory that all arrays of a Data take, in bytes."""
+    return sum(array.capacity for array in arrays(warp_data_E).values())
+
+
+def arrays(data: object, prefix: str = "") -> dict[str, wp.array]:
+    """Return the Warp arrays of a Data by dotted name, with those of its contacts and constraints."""
+    found: dict[str, wp.array] = {}
+    for field in dataclasses.fields(data):  # type: ignore[arg-type]
+        value = getattr(data, field.name)
+        if isinstance(value, wp.array):
+            found[prefix + field.name] = value
+        elif dataclasses.is_dataclass(value):
+            found |= arrays(value, f"{field.name}.")
+    return found
+
+
+class DataViews:
+    """The torch views of a Data. They share its memory, and so show each change at once."""
+
+    qpos_EL: Tensor
+    qvel_EL: Tensor
+    qacc_EL: Tensor
+    act_EL: Tensor
+    ctrl_EL: Tensor
+    sensordata_EL: Tensor
+    actuator_force_EL: Tensor
+    qfrc_actuator_EL: Tensor
+    qfrc_applied_EL: Tensor
+    xfrc_applied_EL: Tensor
+    xpos_EL: Tensor
+    xquat_EL: Tensor
+    xmat_EL: Tensor
+    xipos_EL: Tensor
+    cvel_EL: Tensor
+    subtree_com_EL: Tensor
+    geom_xpos_EL: Tensor
+    geom_xmat_EL: Tensor
+    site_xpos_EL: Tensor
+    site_xmat_EL: Tensor
+    time_E: Tensor
+
+    def __init__(self, warp_data_E: mjw.Data) -> None:
+        self._arrays = arrays(warp_data_E)
+        self._views: dict[str, Tensor] = {}
+        for name in VIEW_NAMES:
+            setattr(self, f"{name}_EL", self.view(name))
+        self.time_E = self.view("time")
+
+    def view(self, name: str) -> Tensor:
+        """Return the view of any array of the Warp data, such as "qfrc_constraint", "efc.force" or "contact.dist".
+
+        Vectors, quaternions (w x y z) and matrices become trailing dims. Rows of `efc` beyond `nefc`, and all of
+        `contact` after a reset, hold leftovers.
+
+        Raises:
+            ValueError: with the near names, if there is no such array.
+        """
+        if name not in self._views:
+            if name not in self._arrays:
+                raise unknown_name("data array", name, self._arrays)
+            self._views[name] = wp.to_torch(self._arrays[name])
+        return self._views[name]
+
+    def views(self) -> dict[str, Tensor]:
+        """Return the views made so far, by name."""
+        return dict(self._views)
+
+    def drop_views(self) -> None:
+        """Forget the views, so that their memory can be freed."""
+        self._arrays.clear()
+        self._views.clear()
+        for name in [*(f"{name}_EL" for name in VIEW_NAMES), "time_E"]:
+            if hasattr(self, name):
+                delattr(self, name)

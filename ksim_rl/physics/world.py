@@ -1,0 +1,191 @@
+"""One model, many worlds: batched physics on MuJoCo Warp with zero-copy torch views."""
+
+import copy
+from collections.abc import Sequence
+
+import mujoco
+import mujoco_warp as mjw
+import torch
+import warp as wp
+from torch import Tensor
+
+from ksim_rl.checks import unknown_name
+from ksim_rl.physics import capacity, kernels, state, views
+from ksim_rl.physics.fields import GRAVITY, const_groups, expand_gravity, fields_to_expand
+from ksim_rl.physics.graphs import WarpGraphs
+from ksim_rl.physics.model_checks import warp_model_of
+from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
+from ksim_rl.physics.sim_cfg import SimCfg
+from ksim_rl.physics.streams import checked_device, warp_scope
+from ksim_rl.physics.substeps import Substeps
+
+
+class World(views.DataViews):
+    """`num_envs` worlds of one model.
+
+    Position- and velocity-stage quantities (poses, velocities, their sensors) are those of the present state after
+    `refresh`. Acceleration-stage ones (`qacc`, actuator and contact forces, contact sensors, accelerometers) belong to
+    the last substep; rows that reset since then read zero. All views keep their address for the life of the world and
+    are changed in place. Everything after construction can be captured in a CUDA graph, except `overflow_report`,
+    `state_dict` and `load_state_dict`.
+
+    Args:
+        mj_model: the compiled model; it is copied.
+        num_envs: number of worlds.
+        device: "cpu", "cuda" or "cuda:<index>".
+        sim: settings laid over those of the model.
+        per_world_fields: model fields that may differ between worlds, by MuJoCo's names, and "gravity" (which always
+            may). What MuJoCo derives from them at compile time differs as well; call `set_const` after writing.
+
+    Raises:
+        ValueError: naming the argument, its value and what is valid.
+    """
+
+    def __init__(
+        self,
+        mj_model: mujoco.MjModel,
+        *,
+        num_envs: int,
+        device: str | torch.device = "cpu",
+        sim: SimCfg | None = None,
+        per_world_fields: Sequence[str] = (),
+    ) -> None:
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+            raise ValueError(f"num_envs={num_envs!r}: expected a whole number >= 1")
+        self.sim = SimCfg() if sim is None else sim
+        self.device = checked_device(device)
+        self.num_envs = num_envs
+        self.mj_model = copy.copy(mj_model)
+        self.sim.apply_to(self.mj_model)
+        expanded = fields_to_expand(per_world_fields)
+        self._graphs = WarpGraphs(self.device, require_graphs=self.sim.require_graphs)
+        with warp_scope(self.device):
+            self.warp_model = warp_model_of(self.mj_model, dict.fromkeys(expanded, num_envs))
+            self.warp_model.opt.warn_overflow = 0
+            self.warp_model.opt.deterministic = self.sim.deterministic
+            if self.device.type == "cuda" and not wp.is_conditional_graph_supported():
+                self.warp_model.opt.graph_conditional = False
+            self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim)
+            self.warp_data_E = mjw.make_data(
+                self.mj_model, nworld=num_envs, nconmax=self.nconmax, njmax=self.njmax
+            )
+            gravity_EL = expand_gravity(self.warp_model, num_envs)
+            self._overflow = OverflowRecord(self.warp_data_E)
+            self._reset_mask = wp.zeros(num_envs, dtype=bool)
+            self._zeroed_at_reset = views.float_rows(self.warp_data_E, views.ACCELERATION_STAGE)
+            self._substeps = Substeps(self.mj_model, self.warp_model, self.warp_data_E)
+        self._reset_mask_E = wp.to_torch(self._reset_mask)
+        self._fields = {name: wp.to_torch(getattr(self.warp_model, name)) for name in expanded}
+        self._fields[GRAVITY] = gravity_EL
+        self.gravity_EL = gravity_EL
+        super().__init__(self.warp_data_E)
+        self.refresh()
+
+    @property
+    def timestep(self) -> float:
+        """Duration of one substep, in s."""
+        return float(self.mj_model.opt.timestep)
+
+    def step(self, n: int = 1) -> None:
+        """Advance all worlds by `n` substeps under the present `ctrl`; sensors are computed on the last one only."""
+        if n < 1:
+            raise ValueError(f"n={n}: expected at least 1 substep")
+        self._graphs.run(("step", n), lambda: self._launch_substeps(n))
+
+    def refresh(self) -> None:
+        """Recompute position- and velocity-stage quantities and sensors from the present `qpos` and `qvel`.
+
+        Acceleration-stage quantities keep the last substep's values: there is no collision pass. Actuator lengths and
+        velocities are recomputed only if a sensor reads them.
+        """
+        self._graphs.run("refresh", self._substeps.refresh)
+
+    def reset(self, mask_E: Tensor) -> None:
+        """Put the worlds where `mask_E` (bool [E]) is true back to the model's `qpos0`, at rest, time 0.
+
+        Their acceleration-stage quantities and sensors read zero until the next step; the other rows do not change.
+        Call `refresh` afterwards (and after writing another pose), before reading poses.
+        """
+        if mask_E.dtype != torch.bool or mask_E.shape != (self.num_envs,):
+            raise ValueError(
+                f"mask_E is {mask_E.dtype} of shape {tuple(mask_E.shape)}: expected torch.bool of shape "
+                f"({self.num_envs},)"
+            )
+        self._reset_mask_E.copy_(mask_E)
+        self._graphs.run("reset", self._launch_reset)
+
+    def field(self, name: str) -> Tensor:
+        """Return the view [E, ...] of a model field that differs between worlds.
+
+        Raises:
+            ValueError: if the field is not expanded per world.
+        """
+        if name not in self._fields:
+            if hasattr(self.warp_model, name):
+                raise ValueError(
+                    f"model field {name!r} is shared by all worlds: add it to per_world_fields when the world is built "
+                    f"(now: {', '.join(sorted(self._fields))})"
+                )
+            raise unknown_name("per-world model field", name, self._fields)
+        return self._fields[name]
+
+    def set_const(self, fields: Sequence[str]) -> None:
+        """Recompute, in all worlds, the constants that MuJoCo derives from `fields` (after writing into them)."""
+        groups = const_groups(fields)
+        if groups:
+            self._graphs.run(
+                ("set_const", groups), lambda: mjw.set_const(self.warp_model, self.warp_data_E, groups)
+            )
+
+    def overflow_report(self, *, clear: bool = True) -> OverflowReport:
+        """Read what the physics needed since the last report; one transfer to the host. Call it once per rollout."""
+        report = self._overflow.read()
+        if clear:
+            self._overflow.clear()
+        return report
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Copy everything that the next steps depend on, so that a restored world continues bit for bit on CPU."""
+        return {name: tensor.clone() for name, tensor in self._state_tensors().items()}
+
+    def load_state_dict(self, state_dict: dict[str, Tensor]) -> None:
+        """Write a saved state into the present arrays, then `refresh`.
+
+        Raises:
+            ValueError: if a tensor is missing, unknown, or of another shape (other model or `num_envs`).
+        """
+        state.load(self._state_tensors(), state_dict)
+        self.refresh()
+
+    def bytes_per_world(self) -> int:
+        """Return the memory that one more world takes, in bytes (arrays of data and of expanded fields)."""
+        fields = sum(tensor.numel() * tensor.element_size() for tensor in self._fields.values())
+        return (views.nbytes(self.warp_data_E) + fields) // self.num_envs
+
+    def close(self) -> None:
+        """Free the graphs and arrays. Views that are still held keep their memory."""
+        self._graphs.clear()
+        for name in ("warp_data_E", "warp_model", "_substeps", "_overflow", "_zeroed_at_reset", "_fields"):
+            if hasattr(self, name):
+                delattr(self, name)
+        self.drop_views()
+
+    def _state_tensors(self) -> dict[str, Tensor]:
+        tensors = state.data_tensors(self.warp_data_E)
+        tensors |= {f"field/{name}": tensor for name, tensor in self._fields.items()}
+        tensors |= {
+            "overflow/sticky": self._overflow.sticky_E,
+            "overflow/most_nefc": self._overflow.most_nefc_E,
+            "overflow/most_pool": self._overflow.most_pool,
+        }
+        return tensors
+
+    def _launch_substeps(self, n: int) -> None:
+        for substep in range(n):
+            self._substeps.advance(sensors=substep == n - 1)
+            self._overflow.record()
+
+    def _launch_reset(self) -> None:
+        mjw.reset_data(self.warp_model, self.warp_data_E, reset=self._reset_mask)
+        for rows in self._zeroed_at_reset:
+            wp.launch(kernels.zero_rows, dim=rows.shape, inputs=[self._reset_mask], outputs=[rows])

@@ -1,0 +1,100 @@
+"""A probe env whose every answer is known in closed form."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from ksim_rl import random
+
+
+class CounterEnv(EnvBase):
+    """Env e counts its own steps and ends after `lengths[e]` of them; a plain `EnvBase`, with masked `_reset`.
+
+    Observations ([E, 1] float32 unless stated): "count" (steps since the reset), "episode" (resets so far), "row" (its
+    own number), "drawn" (uniform on [0, 1), drawn at the reset from seed, row and episode), and ("obs", "vector")
+    [E, 3] = count + (0, 100, 200). Reward is the action's sum. Even rows terminate, odd rows are truncated.
+
+    Args:
+        lengths: steps per episode, one per env; `()` gives one env with batch size [] that ends after 3 steps.
+        action_size: A of the action [E, A].
+    """
+
+    count_E: Tensor
+    episode_E: Tensor
+    seed_value: Tensor
+
+    def __init__(
+        self, lengths: Sequence[int] = (3, 5, 4), *, action_size: int = 2, device: Any = "cpu"
+    ) -> None:
+        batch = (len(lengths),) if lengths else ()
+        super().__init__(device=torch.device(device), batch_size=torch.Size(batch))
+        self.num_rows = max(1, len(lengths))
+        self.register_buffer("length_E", torch.tensor(list(lengths) or [3], device=device))
+        self.register_buffer("count_E", torch.zeros(self.num_rows, dtype=torch.int64, device=device))
+        self.register_buffer("episode_E", torch.zeros(self.num_rows, dtype=torch.int64, device=device))
+        self.register_buffer("seed_value", torch.zeros((), dtype=torch.int64, device=device))
+        self.register_buffer("row_E", torch.arange(self.num_rows, device=device))
+        self.register_buffer("offset_L", torch.tensor([0.0, 100.0, 200.0], device=device))
+        scalar = Unbounded((*batch, 1), device=self.device)
+        self.observation_spec = Composite(
+            count=scalar.clone(),
+            episode=scalar.clone(),
+            row=scalar.clone(),
+            drawn=Bounded(0.0, 1.0, (*batch, 1), device=self.device),
+            obs=Composite(vector=Unbounded((*batch, 3), device=self.device), shape=batch, device=self.device),
+            shape=batch,
+            device=self.device,
+        )
+        self.action_spec = Bounded(-1.0, 1.0, (*batch, action_size), device=self.device)
+        self.reward_spec = scalar.clone()
+        done = Binary(1, dtype=torch.bool, shape=(*batch, 1), device=self.device)
+        self.full_done_spec = Composite(
+            done=done, terminated=done.clone(), truncated=done.clone(), shape=batch, device=self.device
+        )
+
+    def _observe(self) -> dict[str, Any]:
+        keys = random.row_keys(self.seed_value, 1, self.episode_E, self.num_rows)
+        count_E1 = self.count_E[:, None].float()
+        batch = self.batch_size
+        return {
+            "count": count_E1.reshape(*batch, 1),
+            "episode": self.episode_E.float().reshape(*batch, 1),
+            "row": self.row_E.float().reshape(*batch, 1),
+            "drawn": random.uniform(keys, 1).reshape(*batch, 1),
+            "obs": TensorDict(
+                {"vector": (count_E1 + self.offset_L).reshape(*batch, 3)}, batch_size=batch, device=self.device
+            ),
+        }
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict.get("action")
+        if action.shape != self.action_spec.shape or action.dtype != self.action_spec.dtype:
+            raise ValueError(
+                f"action has shape {tuple(action.shape)} and dtype {action.dtype}: "
+                f"expected {tuple(self.action_spec.shape)} and {self.action_spec.dtype}"
+            )
+        self.count_E.add_(1)
+        ended_E = self.count_E >= self.length_E
+        even_E = self.row_E % 2 == 0
+        flags = {"done": ended_E, "terminated": ended_E & even_E, "truncated": ended_E & ~even_E}
+        values = self._observe() | {k: v.reshape(*self.batch_size, 1) for k, v in flags.items()}
+        values["reward"] = action.sum(-1, keepdim=True)
+        return TensorDict(values, batch_size=self.batch_size, device=self.device)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        mask_E = torch.ones_like(self.count_E, dtype=torch.bool) if mask is None else mask.reshape(-1)
+        self.count_E.copy_(torch.where(mask_E, 0, self.count_E))
+        self.episode_E.add_(mask_E)
+        flag = torch.zeros((*self.batch_size, 1), dtype=torch.bool, device=self.device)
+        values = self._observe() | {"done": flag, "terminated": flag.clone(), "truncated": flag.clone()}
+        return TensorDict(values, batch_size=self.batch_size, device=self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.seed_value.fill_(0 if seed is None else seed)
+        self.episode_E.zero_()

@@ -1,0 +1,130 @@
+"""Counting of the operations that make the host wait for the device, on any machine."""
+
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+
+_ALWAYS = {
+    "aten::_local_scalar_dense": "a tensor's value read by Python (item, bool, float, int)",
+    "aten::nonzero": "nonzero",
+    "aten::nonzero_static": "nonzero_static",
+    "aten::masked_select": "masked_select",
+    "aten::equal": "torch.equal",
+    "aten::is_nonzero": "a tensor used as a condition",
+    "aten::_unique": "unique",
+    "aten::_unique2": "unique",
+    "aten::unique_dim": "unique",
+    "aten::unique_consecutive": "unique_consecutive",
+    "aten::unique_dim_consecutive": "unique_consecutive",
+    "aten::bincount": "bincount",
+    "aten::histc": "histc",
+    "aten::_assert_scalar": "an assertion on a value",
+    "aten::lift_fresh": "a tensor made from Python data (torch.tensor, torch.as_tensor)",
+    "aten::_pin_memory": "pin_memory",
+}
+# These never reach the dispatcher on the CPU.
+_METHODS = {
+    Tensor.tolist: "tolist",
+    Tensor.numpy: "numpy",
+    Tensor.__array__: "conversion to numpy",
+    Tensor.cpu: "cpu",
+    Tensor.cuda: "cuda",
+}
+_INDEXING = {"aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_"}
+_INTERNAL = ("/torch/", "/contextlib.py", "sync_count.py")
+
+
+@dataclass(kw_only=True)
+class SyncCount:
+    """What `count_syncs` saw.
+
+    Args:
+        calls: one line per sync, with the place in the code.
+    """
+
+    calls: list[str] = field(default_factory=list)
+
+    @property
+    def total(self) -> int:
+        """Number of syncs."""
+        return len(self.calls)
+
+    def report(self) -> str:
+        """Return the distinct syncs with their counts, the most frequent first."""
+        distinct = sorted(set(self.calls), key=self.calls.count, reverse=True)
+        return "\n".join(f"{self.calls.count(call)} x {call}" for call in distinct) or "no host sync"
+
+
+@contextmanager
+def count_syncs() -> Iterator[SyncCount]:
+    """Count the host syncs of the code inside, as they would happen on a GPU.
+
+    It sees values read by Python, boolean indexing, results whose size depends on data, copies between devices, and
+    tensors made from Python data. It does not see what C++ reads without the dispatcher: on a GPU,
+    `torch.cuda.set_sync_debug_mode("error")` is the last word. Inside compiled code it sees nothing.
+
+    Example:
+        >>> with count_syncs() as syncs:
+        ...     env.step_and_maybe_reset(td)
+        >>> assert syncs.total == 0, syncs.report()
+    """
+    count = SyncCount()
+    with _Methods(count), _Operations(count):
+        yield count
+
+
+class _Methods(TorchFunctionMode):
+    def __init__(self, count: SyncCount) -> None:
+        super().__init__()
+        self.count = count
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        what = _METHODS.get(func)
+        if what is not None:
+            self.count.calls.append(f"{what} at {_place()}")
+        return func(*args, **(kwargs or {}))
+
+
+class _Operations(TorchDispatchMode):
+    def __init__(self, count: SyncCount) -> None:
+        super().__init__()
+        self.count = count
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        what = _why_it_syncs(func, args, kwargs)
+        if what is not None:
+            self.count.calls.append(f"{what} at {_place()}")
+        return func(*args, **kwargs)
+
+
+def _why_it_syncs(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> str | None:
+    name = func._schema.name
+    if name in _ALWAYS:
+        return _ALWAYS[name]
+    if name in _INDEXING and any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
+        return "indexing by a mask"
+    if name == "aten::repeat_interleave" and kwargs.get("output_size") is None and func._overloadname == "Tensor":
+        return "repeat_interleave without output_size"
+    if name == "aten::_to_copy" and _differs(args[0].device, kwargs.get("device")):
+        return "copy to another device"
+    if name == "aten::copy_" and isinstance(args[1], Tensor) and _differs(args[0].device, args[1].device):
+        return "copy between devices"
+    return None
+
+
+def _differs(here: torch.device, there: torch.device | None) -> bool:
+    return there is not None and torch.device(there).type != here.type
+
+
+def _place() -> str:
+    """Return file:line of the innermost frames outside torch."""
+    frames = [f for f in traceback.extract_stack() if not any(part in f.filename for part in _INTERNAL)]
+    return " < ".join(f"{f.filename.rsplit('/', 1)[-1]}:{f.lineno}" for f in reversed(frames[-3:]))

@@ -1,0 +1,229 @@
+"""Checkpoints that survive a crash at any moment, detect any damage, and hold nothing that can execute.
+
+A checkpoint is a folder with `tensors.safetensors` and `manifest.json`. The manifest holds the format version, the
+run's resolved config, the plain (JSON) part of the state, and the size and SHA-256 of the tensor file; its own
+SHA-256 is its first field. The folder is written under a temporary name, flushed to disk, and renamed into place; the
+folder's parent is flushed before an older checkpoint goes. There are no pickles.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+from safetensors import SafetensorError
+
+from ksim_rl.trainers import state_tree
+
+FORMAT_VERSION = 1
+MANIFEST, TENSORS = "manifest.json", "tensors.safetensors"
+_TEMPORARY, _DISCARDED = ".writing-", ".discarded-"
+_MAX_MANIFEST_BYTES = 64 * 2**20
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that is absent, damaged, or of another format; the message says which, and what to do."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checkpoint:
+    """What `load` returns: the state as nested dicts, the config and the iteration it was saved after."""
+
+    path: Path
+    iteration: int
+    config: dict[str, Any]
+    state: state_tree.State
+
+
+def save(
+    folder: Path, state: Mapping[str, Any], *, iteration: int, config: Mapping[str, Any], keep: int = 3
+) -> Path:
+    """Write one more checkpoint into `folder` and drop all but the newest `keep`.
+
+    Raises:
+        OSError: when the disk is full or not writable; earlier checkpoints are untouched then.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors, values = state_tree.split(state)
+    tensor_bytes = safetensors.torch.save(tensors)
+    manifest_bytes = _seal(
+        {
+            "format_version": FORMAT_VERSION,
+            "iteration": iteration,
+            "files": {TENSORS: {"bytes": len(tensor_bytes), "sha256": _sha256(tensor_bytes)}},
+            "values": values,
+            "config": dict(config),
+        }
+    )
+
+    name = _unused_name(folder, iteration)
+    temporary = folder / f"{_TEMPORARY}{name}"
+    try:
+        temporary.mkdir()
+        _write_durably(temporary / TENSORS, tensor_bytes)
+        _write_durably(temporary / MANIFEST, manifest_bytes)
+        _flush_folder(temporary)
+        os.replace(temporary, folder / name)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    _flush_folder(folder)
+
+    for old in saved(folder)[:-keep]:
+        discarded = folder / f"{_DISCARDED}{old.name}"
+        # Renamed first, so that a crash while deleting leaves no half checkpoint under a valid name.
+        os.replace(old, discarded)
+        shutil.rmtree(discarded)
+    return folder / name
+
+
+def load(path: Path) -> Checkpoint:
+    """Read one checkpoint, verifying every byte before any of it is used.
+
+    Raises:
+        CheckpointError: with the reason, when anything is absent, damaged, surplus or of another version.
+    """
+    manifest = _read_manifest(path)
+    files = manifest["files"]
+    surplus = {entry.name for entry in path.iterdir()} - {MANIFEST, *files}
+    if surplus:
+        raise CheckpointError(
+            f"{path}: unexpected file {sorted(surplus)[0]!r}; a checkpoint holds only its own"
+        )
+    tensor_bytes = _read_regular_file(path / TENSORS, limit=files[TENSORS]["bytes"])
+    if len(tensor_bytes) != files[TENSORS]["bytes"]:
+        raise CheckpointError(
+            f"{path / TENSORS}: damaged: {len(tensor_bytes)} bytes, the manifest says {files[TENSORS]['bytes']}"
+        )
+    if _sha256(tensor_bytes) != files[TENSORS]["sha256"]:
+        raise CheckpointError(f"{path / TENSORS}: damaged: its SHA-256 is not the manifest's")
+    try:
+        state = state_tree.join(safetensors.torch.load(tensor_bytes), manifest["values"])
+    except (SafetensorError, ValueError) as error:
+        raise CheckpointError(f"{path / TENSORS}: not a valid tensor file: {error}") from error
+    return Checkpoint(path=path, iteration=manifest["iteration"], config=manifest["config"], state=state)
+
+
+def saved(folder: Path) -> list[Path]:
+    """Return the checkpoints in `folder`, oldest first."""
+    if not folder.is_dir():
+        return []
+    found = [entry for entry in folder.iterdir() if _order(entry.name) is not None and entry.is_dir()]
+    return sorted(found, key=lambda entry: _order(entry.name) or (0, 0))
+
+
+def latest(path: Path) -> Path:
+    """Find the newest checkpoint of a run folder or a checkpoint folder; a checkpoint itself is returned as it is.
+
+    Raises:
+        CheckpointError: when there is none.
+    """
+    if (path / MANIFEST).exists():
+        return path
+    for folder in (path / "checkpoint", path):
+        if checkpoints := saved(folder):
+            return checkpoints[-1]
+    raise CheckpointError(
+        f"{path}: no checkpoint here; expected a run folder, its checkpoint/ or one of those in it"
+    )
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete what a crash left behind while saving or deleting."""
+    if folder.is_dir():
+        for entry in folder.iterdir():
+            if entry.name.startswith((_TEMPORARY, _DISCARDED)):
+                shutil.rmtree(entry)
+
+
+def _seal(manifest: dict[str, Any]) -> bytes:
+    body = json.dumps(manifest, sort_keys=True, allow_nan=False, separators=(",", ":"))
+    return f'{{"manifest_sha256":"{_sha256(body.encode())}",\n"manifest":{body}}}\n'.encode()
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    if not path.is_dir():
+        raise CheckpointError(f"{path}: no such checkpoint folder")
+    raw = _read_regular_file(path / MANIFEST, limit=_MAX_MANIFEST_BYTES)
+    try:
+        manifest = json.loads(raw)["manifest"]
+        intact = _seal(manifest) == raw
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise CheckpointError(f"{path / MANIFEST}: damaged: {type(error).__name__}: {error}") from error
+    if not intact:
+        raise CheckpointError(f"{path / MANIFEST}: damaged: its SHA-256 does not match its content")
+    if not isinstance(manifest, dict) or manifest.get("format_version") != FORMAT_VERSION:
+        version = manifest.get("format_version") if isinstance(manifest, dict) else None
+        raise CheckpointError(
+            f"{path}: checkpoint format {version!r}, this version reads {FORMAT_VERSION}: "
+            "load it with the version of ksim_rl that wrote it"
+        )
+    well_formed = (
+        isinstance(manifest.get("iteration"), int)
+        and isinstance(manifest.get("config"), dict)
+        and isinstance(manifest.get("values"), dict)
+        and isinstance(manifest.get("files"), dict)
+        and set(manifest["files"]) == {TENSORS}
+        and isinstance(manifest["files"][TENSORS], dict)
+        and isinstance(manifest["files"][TENSORS].get("bytes"), int)
+        and isinstance(manifest["files"][TENSORS].get("sha256"), str)
+    )
+    if not well_formed:
+        raise CheckpointError(
+            f"{path / MANIFEST}: not a checkpoint manifest: a field is missing or of another type"
+        )
+    return manifest
+
+
+def _read_regular_file(path: Path, *, limit: int) -> bytes:
+    """Read a file, following no link; one byte beyond `limit` is read so that a longer file shows."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        with os.fdopen(descriptor, "rb") as file:
+            content = file.read(limit + 1)
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{path}: missing") from error
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read: {error.strerror}") from error
+    if len(content) > limit:
+        raise CheckpointError(f"{path}: damaged: longer than the {limit} bytes it may have")
+    return content
+
+
+def _write_durably(path: Path, content: bytes) -> None:
+    with open(path, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _flush_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _order(name: str) -> tuple[int, int] | None:
+    number, _, repeat = name.partition("_")
+    if number.isdecimal() and (not repeat or repeat.isdecimal()):
+        return int(number), int(repeat or 0)
+    return None
+
+
+def _unused_name(folder: Path, iteration: int) -> str:
+    name, repeat = f"{iteration:08d}", 0
+    while (folder / name).exists():
+        repeat += 1
+        name = f"{iteration:08d}_{repeat}"
+    return name
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

@@ -1,0 +1,91 @@
+"""Learning curves of a run as one picture."""
+
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ksim_rl.trainers.loggers.csv_table import STEP, read_table
+
+# Panels in reading order: title, the metrics drawn in it with their labels.
+PANELS: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
+    (
+        "Return",
+        (("episode/return", "training episodes"), ("evaluation/return_mean", "evaluation, deterministic")),
+    ),
+    ("Episode length (env steps)", (("episode/length", "training episodes"),)),
+    ("Value loss", (("loss/value", "value"),)),
+    ("Policy loss", (("loss/policy", "policy"),)),
+    ("Entropy (nats)", (("loss/entropy", "entropy"),)),
+    ("KL divergence of one update", (("update/kl", "KL"),)),
+    ("Learning rate", (("update/learning_rate", "learning rate"),)),
+    ("Std of the actions", (("policy/std", "std"),)),
+    ("Env states per second", (("throughput/env_states_per_s", "speed"),)),
+)
+_COLORS = ("#3465a4", "#cc5500")
+
+
+def draw(table: Path, picture: Path, *, title: str, solved_at: float | None = None) -> None:
+    """Draw the learning curves of a metrics table into a PNG.
+
+    Args:
+        table: the run's `metrics.csv`.
+        picture: the file to write.
+        title: stands above the panels.
+        solved_at: the return at which the task counts as solved; drawn as a line.
+
+    Raises:
+        ValueError: when the table has no rows.
+    """
+    _, rows = read_table(table)
+    if not rows:
+        raise ValueError(f"{table}: no rows to draw")
+    present = [
+        (name, series) for name, series in PANELS if any(row.get(key) for row in rows for key, _ in series)
+    ]
+    columns = min(3, len(present))
+    lines = -(-len(present) // columns)
+    figure = Figure(figsize=(4.6 * columns, 2.9 * lines + 0.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=13)
+    for index, (name, series) in enumerate(present):
+        axes = figure.add_subplot(lines, columns, index + 1)
+        _draw_panel(axes, rows, name, series, solved_at=solved_at if name == "Return" else None)
+    figure.savefig(picture, dpi=110)
+
+
+def _draw_panel(
+    axes: Axes,
+    rows: list[dict[str, str]],
+    name: str,
+    series: tuple[tuple[str, str], ...],
+    *,
+    solved_at: float | None,
+) -> None:
+    labelled = 0
+    for (key, label), color in zip(series, _COLORS, strict=False):
+        points = [(float(row[STEP]), float(row[key])) for row in rows if row.get(key)]
+        if points:
+            marker = "o" if len(points) < 25 else None
+            axes.plot(
+                *zip(*points, strict=True),
+                color=color,
+                label=label,
+                marker=marker,
+                markersize=3,
+                linewidth=1.6,
+            )
+            labelled += 1
+    if solved_at is not None:
+        axes.axhline(
+            solved_at, color="#4e9a06", linestyle="--", linewidth=1.2, label=f"solved at {solved_at:g}"
+        )
+        labelled += 1
+    axes.set_title(name, fontsize=10.5)
+    axes.set_xlabel("env states", fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    if labelled > 1:
+        axes.legend(fontsize=8, frameon=False)

@@ -1,0 +1,96 @@
+"""How good a policy is: its deterministic actions in envs of their own, one whole episode in each."""
+
+from dataclasses import asdict, dataclass
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ksim_rl.physics.capture import Captured
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """Statistics over episodes. `unfinished` ones were cut at the step limit and count with what they had."""
+
+    return_mean: float
+    return_std: float
+    length_mean: float
+    episodes: int
+    unfinished: int
+
+    def as_dict(self) -> dict[str, float]:
+        """Return the figures by name."""
+        return asdict(self)
+
+
+class Evaluator:
+    """Runs the first episode of each env from the same seed, with the policy's deterministic action.
+
+    Args:
+        env: envs that nothing else steps; one episode is counted in each. Its batch size is `["E"]`.
+        policy: reads the env's observations and writes its action.
+        max_steps: the step limit; the env's `max_episode_length` is the natural one.
+        seed: of the initial states, so that evaluations of one run compare.
+    """
+
+    def __init__(self, env: EnvBase, policy: TensorDictModuleBase, *, max_steps: int, seed: int) -> None:
+        self.env, self.policy = env, policy
+        self.max_steps, self.seed = max_steps, seed
+        num_envs, device = env.batch_size[0], env.device or torch.device("cpu")
+        self._return_E = torch.zeros(num_envs, dtype=torch.float64, device=device)
+        self._length_E = torch.zeros(num_envs, dtype=torch.float64, device=device)
+        self._running_E = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self._current_E: TensorDictBase | None = None
+        self._step = Captured(self._count_one_step, device=device)
+
+    def __call__(self) -> Evaluation:
+        """Evaluate, reading the device once at the end."""
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            self._start()
+            for _ in range(self.max_steps):
+                self._step()
+        std, mean = torch.std_mean(self._return_E, correction=0)
+        figures = torch.stack([mean, std, self._length_E.mean(), self._running_E.sum().to(torch.float64)])
+        return_mean, return_std, length_mean, unfinished = figures.tolist()
+        return Evaluation(
+            return_mean=return_mean,
+            return_std=return_std,
+            length_mean=length_mean,
+            episodes=self._return_E.numel(),
+            unfinished=int(unfinished),
+        )
+
+    def _start(self) -> None:
+        self.env.set_seed(self.seed)
+        first_E = self.env.reset()
+        if self._current_E is None:
+            self._current_E = first_E.clone()
+        else:
+            self._keep(first_E)
+        self._return_E.zero_()
+        self._length_E.zero_()
+        self._running_E.fill_(True)
+
+    def _count_one_step(self) -> None:
+        assert self._current_E is not None
+        acting_E = self.policy(self._current_E.copy())
+        stepped_E, current_E = self.env.step_and_maybe_reset(acting_E)
+        reward_E, done_E = (_column(stepped_E, key) for key in (("next", "reward"), ("next", "done")))
+        self._return_E.add_(torch.where(self._running_E, reward_E.to(torch.float64), 0.0))
+        self._length_E.add_(self._running_E)
+        self._running_E.logical_and_(~done_E)
+        self._keep(current_E)
+
+    def _keep(self, source_E: TensorDictBase) -> None:
+        """Copy into the buffers that a captured step reads, which stay where they are."""
+        assert self._current_E is not None
+        for key in self._current_E.keys(True, True):
+            self._current_E.get(key).copy_(source_E.get(key))
+
+
+def _column(td: TensorDictBase, key: tuple[str, ...]) -> Tensor:
+    return td.get(key).squeeze(-1)

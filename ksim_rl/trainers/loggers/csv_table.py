@@ -1,0 +1,60 @@
+"""All metrics of a run in one CSV file, one row per logged iteration."""
+
+import csv
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+STEP = "env_states"
+
+
+class CsvTable:
+    """A CSV file that grows by rows, and by columns when a metric appears for the first time.
+
+    TorchRL's `CSVLogger` writes one file per metric; this one opens in a spreadsheet. A cell is empty where a row has
+    no such metric. Rows at or beyond the first step that is logged are dropped, so that a resumed run has each
+    iteration once.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._columns, self._rows = read_table(path) if path.exists() else ([STEP], [])
+        self._started = False
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
+        """Append one row."""
+        row = {STEP: str(step), **{name: f"{value:.9g}" for name, value in metrics.items()}}
+        new_columns = [name for name in row if name not in self._columns]
+        if not self._started:
+            self._rows = [old for old in self._rows if int(old[STEP]) < step]
+        self._rows.append(row)
+        self._columns += new_columns
+        if new_columns or not self._started:
+            self._rewrite()
+        else:
+            with open(self.path, "a", newline="") as file:
+                self._writer(file).writerow(row)
+        self._started = True
+
+    def close(self) -> None:
+        """Do nothing: each row is written when it is logged."""
+
+    def _rewrite(self) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = self.path.with_name(f".{self.path.name}.writing")
+        with open(temporary, "w", newline="") as file:
+            writer = self._writer(file)
+            writer.writeheader()
+            writer.writerows(self._rows)
+        os.replace(temporary, self.path)
+
+    def _writer(self, file) -> csv.DictWriter:
+        return csv.DictWriter(file, self._columns, restval="", lineterminator="\n")
+
+
+def read_table(path: Path) -> tuple[list[str], list[dict[str, str]]]:
+    """Read a table: its columns, and its rows as text by column."""
+    with open(path, newline="") as file:
+        reader = csv.DictReader(file)
+        rows = [row for row in reader if row.get(STEP)]
+        return list(reader.fieldnames or [STEP]), rows

@@ -1,0 +1,173 @@
+"""One RL update: advantages, dataset, gradient steps, observation statistics; one CUDA graph where there is CUDA."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor
+
+from ksim_rl.data import DatasetBuffer, DatasetCfg
+from ksim_rl.modules import update_normalizers
+from ksim_rl.objectives import (
+    PPOCfg,
+    StepGuard,
+    load_optimizer_state_,
+    make_gae,
+    make_loss,
+    make_optimizer,
+    ppo_step,
+)
+from ksim_rl.physics.capture import Captured
+from ksim_rl.trainers import state_tree
+
+# Names of the logged means, by the names that `ppo_step` gives them.
+LOGGED = {
+    "loss_objective": "loss/policy",
+    "loss_critic": "loss/value",
+    "entropy": "loss/entropy",
+    "kl": "update/kl",
+    "clip_fraction": "update/clip_fraction",
+    "explained_variance": "update/explained_variance",
+    "grad_norm": "update/grad_norm",
+}
+
+
+class PPOUpdate:
+    """Improves actor and critic with one rollout, without a host sync.
+
+    On CUDA the first updates run eagerly and the next is captured. So each rollout must be the same memory, which is
+    what `RolloutCollector` gives.
+
+    Args:
+        cfg: of the objective.
+        actor: writes `action`, `action_log_prob`, `loc` and `scale`.
+        critic: writes `state_value`.
+        data: sizes of dataset and minibatch.
+        seed: of the order of the env states in the minibatches.
+        device: where all of it lives.
+    """
+
+    def __init__(
+        self,
+        cfg: PPOCfg,
+        *,
+        actor: ProbabilisticTensorDictSequential,
+        critic: TensorDictModuleBase,
+        data: DatasetCfg,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.cfg, self.actor, self.critic = cfg, actor, critic
+        self.device = torch.device(device)
+        self.advantage = make_gae(cfg, critic)
+        self.loss = make_loss(cfg, actor, critic)
+        self.optimizer = make_optimizer(cfg, actor, critic)
+        self.dataset = DatasetBuffer(data, keys=self.loss.dataset_keys, seed=seed, device=self.device)
+        self.guard = StepGuard(device=self.device)
+        self.gradient_steps = cfg.num_epochs * data.num_minibatches
+        self._rollout_ET: TensorDictBase | None = None
+        self._sums: dict[str, Tensor] = {}
+        self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
+        self._run = Captured(self._update, device=self.device)
+
+    @property
+    def rollout_keys(self) -> list[Any]:
+        """The leaves of an env state that an update reads."""
+        observations = [*self.actor.in_keys, *self.critic.in_keys]
+        written = {"action", "action_log_prob", "loc", "scale"}
+        following = [("next", key) for key in (*self.critic.in_keys, "reward", "done", "terminated")]
+        return [*dict.fromkeys(observations), *sorted(written), *following]
+
+    def __call__(self, rollout_ET: TensorDictBase) -> None:
+        """Update the networks with a rollout `["E","T"]` of the dataset's size."""
+        self._rollout_ET = rollout_ET
+        self._run()
+
+    def metrics(self) -> dict[str, Tensor]:
+        """Return what the last update measured, each a tensor [] on the device; means are over its gradient steps."""
+        means = {name: total / self.gradient_steps for name, total in self._sums.items()}
+        return means | {
+            "update/learning_rate": self.optimizer.param_groups[0]["lr"],
+            "update/skipped_steps": self.guard.skipped,
+            "update/skipped_in_a_row": self._longest_skip,
+            "update/non_finite_env_states": self.dataset.non_finite_count,
+        }
+
+    def check(self, metrics: Mapping[str, float]) -> None:
+        """Stop a run whose gradient steps are all skipped; `metrics` are those of `metrics()`, on the host.
+
+        Raises:
+            NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped.
+        """
+        if metrics["update/skipped_in_a_row"] >= self.cfg.max_skipped_steps:
+            self.guard.check(self.cfg.max_skipped_steps)
+
+    def _update(self) -> None:
+        assert self._rollout_ET is not None
+        self._clear_sums()
+        rollout_ET = self.advantage(self._rollout_ET)
+        self.dataset.extend(rollout_ET)
+        for _ in range(self.cfg.num_epochs):
+            for minibatch_B in self.dataset.epoch():
+                self._measure(ppo_step(self.loss, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard))
+        # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
+        update_normalizers(rollout_ET, self.actor, self.critic)
+
+    def _measure(self, step: Mapping[str, Tensor]) -> None:
+        for name, logged in LOGGED.items():
+            if name in step:
+                # A skipped step is counted; its numbers would spoil the means.
+                value = torch.where(step["skipped"] > 0, 0.0, step[name].detach())
+                self._sums.setdefault(logged, torch.zeros((), device=self.device)).add_(value)
+        torch.maximum(self._longest_skip, self.guard.skipped_in_a_row, out=self._longest_skip)
+
+    def _clear_sums(self) -> None:
+        self._longest_skip.zero_()
+        for total in self._sums.values():
+            total.zero_()
+
+    def state_dict(self) -> state_tree.State:
+        """Return networks, optimizer, sampler and counters."""
+        optimizer = self.optimizer.state_dict()
+        return {
+            "actor": self.actor.state_dict(),
+            "critic": self.critic.state_dict(),
+            "optimizer": {
+                "learning_rate": optimizer["param_groups"][0]["lr"],
+                "moments": optimizer["state"],
+            },
+            "sampler": self.dataset.sampler.state_dict(),
+            "guard": self.guard.state_dict(),
+            "non_finite_env_states": self.dataset.non_finite_count,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue where `state_dict` was taken; tensors keep their addresses.
+
+        Raises:
+            ValueError: naming the tensor that is missing, unknown or of another shape or type.
+        """
+        state_tree.copy_into(self.actor.state_dict(), state["actor"], what="actor")
+        state_tree.copy_into(self.critic.state_dict(), state["critic"], what="critic")
+        state_tree.copy_into(self.guard.state_dict(), state["guard"], what="guard")
+        self._load_optimizer(state["optimizer"])
+        self.dataset.sampler.load_state_dict(state["sampler"])
+        self.dataset.non_finite_count.copy_(state["non_finite_env_states"])
+
+    def _load_optimizer(self, state: Mapping[str, Any]) -> None:
+        parameters = self.optimizer.param_groups[0]["params"]
+        moments = {int(index): entry for index, entry in state["moments"].items()}
+        if moments and set(moments) != set(range(len(parameters))):
+            raise ValueError(f"optimizer: {len(moments)} parameters in the checkpoint, {len(parameters)} in this run")
+        for index, entry in moments.items():
+            for name in ("exp_avg", "exp_avg_sq"):
+                if entry[name].shape != parameters[index].shape:
+                    raise ValueError(
+                        f"optimizer: {name} of parameter {index} has shape {list(entry[name].shape)} in the "
+                        f"checkpoint and {list(parameters[index].shape)} in this run"
+                    )
+        groups = self.optimizer.state_dict()["param_groups"]
+        groups[0] = groups[0] | {"lr": state["learning_rate"]}
+        load_optimizer_state_(self.optimizer, {"state": moments, "param_groups": groups})

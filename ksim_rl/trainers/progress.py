@@ -1,0 +1,114 @@
+"""Progress of a run: one live panel on a terminal, plain lines in a pipe."""
+
+from collections.abc import Mapping
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+# What is shown, in this order, where the run has it: metric, label, format.
+SHOWN = (
+    ("env_states", "env states", "{:,.0f}"),
+    ("throughput/env_states_per_s", "env states/s", "{:,.0f}"),
+    ("episode/return", "reward", "{:.3g}"),
+    ("episode/length", "episode length", "{:.4g}"),
+    ("loss/policy", "policy loss", "{:.2g}"),
+    ("loss/value", "value loss", "{:.2g}"),
+    ("loss/entropy", "entropy", "{:.3g}"),
+    ("update/learning_rate", "learning rate", "{:.1e}"),
+    ("evaluation/return_mean", "evaluation", "{:.4g}"),
+)
+
+
+class RunProgress:
+    """Shows iteration, speed, reward, episode length, losses and the time left.
+
+    Use as a context manager around the run. `note` prints a line that stays; `status` shows what is going on while
+    nothing else moves (kernel compilation).
+
+    Args:
+        total: iterations of the whole run.
+        done: iterations of it that are already done.
+        console: where to write; the default is stdout.
+        enabled: False shows nothing but notes.
+    """
+
+    def __init__(
+        self, total: int, *, done: int = 0, console: Console | None = None, enabled: bool = True
+    ) -> None:
+        self.total, self.done = total, done
+        self.console = console or Console(highlight=False)
+        self._enabled = enabled
+        self._status = ""
+        self._metrics: dict[str, float] = {}
+        self._live: Live | None = None
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=None),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left {task.fields[left]}"),
+            console=self.console,
+            expand=True,
+        )
+        self._task: TaskID = self._bar.add_task("iteration", total=total, completed=done, left="?")
+
+    def __enter__(self) -> "RunProgress":
+        if self._enabled and self.console.is_terminal:
+            self._live = Live(self._panel(), console=self.console, refresh_per_second=4)
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live is not None:
+            self._live.update(self._panel(), refresh=True)
+            self._live.stop()
+            self._live = None
+
+    def update(self, iteration: int, metrics: Mapping[str, float], *, seconds_left: float | None) -> None:
+        """Show the state after `iteration`."""
+        self.done = iteration
+        self._metrics |= metrics
+        self._status = ""
+        left = "?" if seconds_left is None else clock(seconds_left)
+        self._bar.update(self._task, completed=iteration, left=left)
+        if self._live is not None:
+            self._live.update(self._panel())
+        elif self._enabled:
+            shown = ", ".join(f"{label} {text}" for label, text in self._figures(metrics))
+            self._print(f"iteration {iteration}/{self.total}: {shown}, left {left}")
+
+    def note(self, text: str) -> None:
+        """Print one line that stays."""
+        self._print(text)
+
+    def status(self, text: str) -> None:
+        """Show what is going on now; in a pipe, a repetition of the same beginning is printed once."""
+        beginning = text.split(":")[0]
+        if self._live is not None:
+            self._status = text
+            self._live.update(self._panel())
+        elif beginning != self._status:
+            self._status = beginning
+            self._print(text)
+
+    def _print(self, text: str) -> None:
+        self.console.print(text, markup=False, soft_wrap=True)
+
+    def _figures(self, metrics: Mapping[str, float]) -> list[tuple[str, str]]:
+        return [(label, pattern.format(metrics[name])) for name, label, pattern in SHOWN if name in metrics]
+
+    def _panel(self) -> Group:
+        figures = self._figures(self._metrics)
+        table = Table.grid(padding=(0, 2))
+        for start in range(0, len(figures), 3):
+            table.add_row(*(f"[dim]{label}[/dim] {text}" for label, text in figures[start : start + 3]))
+        return Group(self._bar, table, *([self._status] if self._status else []))
+
+
+def clock(seconds: float) -> str:
+    """Write a duration as h:mm:ss or m:ss."""
+    minutes, second = divmod(round(seconds), 60)
+    hours, minute = divmod(minutes, 60)
+    return f"{hours}:{minute:02d}:{second:02d}" if hours else f"{minute}:{second:02d}"

@@ -1,0 +1,91 @@
+"""Nested state as flat, plain parts: tensors by path, and JSON values by path.
+
+A path joins the keys with `/`; a key's own `~` and `/` are written `~0` and `~1` (JSON Pointer, RFC 6901).
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+State = dict[str, Any]
+
+
+def split(state: Mapping[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Separate nested state into tensors (detached copies on the host) and JSON values, each by path.
+
+    Raises:
+        ValueError: for a leaf that is neither a tensor nor plain data (None, bool, int, float,
+            str, or a list of those).
+    """
+    tensors: dict[str, Tensor] = {}
+    values: dict[str, Any] = {}
+
+    def visit(path: str, node: Any) -> None:
+        if isinstance(node, Mapping) and node:
+            for key, child in node.items():
+                escaped = str(key).replace("~", "~0").replace("/", "~1")
+                visit(f"{path}/{escaped}", child)
+        elif isinstance(node, Mapping):
+            values[path] = {}
+        elif isinstance(node, Tensor):
+            tensors[path] = node.detach().to("cpu", copy=True).contiguous()
+        elif _is_plain(node):
+            values[path] = list(node) if isinstance(node, tuple) else node
+        else:
+            raise ValueError(
+                f"state {path} is a {type(node).__name__}: a checkpoint holds tensors and plain data "
+                "(None, bool, int, float, str, lists of those) only"
+            )
+
+    visit("", state)
+    return tensors, values
+
+
+def join(tensors: Mapping[str, Tensor], values: Mapping[str, Any]) -> State:
+    """Undo `split`."""
+    if list(values) == [""] and not tensors:
+        return {}
+    state: State = {}
+    for path, leaf in [*tensors.items(), *values.items()]:
+        *parents, last = [key.replace("~1", "/").replace("~0", "~") for key in path.split("/")[1:]]
+        node = state
+        for key in parents:
+            node = node.setdefault(key, {})
+            if not isinstance(node, dict):
+                raise ValueError(f"state {path} lies below a leaf")
+        node[last] = leaf
+    return state
+
+
+def copy_into(live: Mapping[str, Tensor], saved: Mapping[str, Any], *, what: str) -> None:
+    """Copy saved tensors into live ones, in place, so that captured graphs keep their addresses.
+
+    Raises:
+        ValueError: naming the first tensor that is missing, unknown, or of another shape or dtype.
+    """
+    for name in live:
+        if name not in saved:
+            raise ValueError(f"{what}: the checkpoint has no {name!r}")
+    for name, tensor in saved.items():
+        if name not in live:
+            raise ValueError(f"{what}: the checkpoint's {name!r} is unknown to this run")
+        have, want = _describe(tensor), _describe(live[name])
+        if have != want:
+            raise ValueError(f"{what}: {name!r} is {have} in the checkpoint and {want} in this run")
+    with torch.no_grad():
+        for name, tensor in live.items():
+            tensor.copy_(saved[name])
+
+
+def _describe(value: Any) -> str:
+    if isinstance(value, Tensor):
+        return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
+    return type(value).__name__
+
+
+def _is_plain(node: Any) -> bool:
+    if isinstance(node, (list, tuple)):
+        return all(_is_plain(item) for item in node)
+    return node is None or isinstance(node, (bool, int, float, str))

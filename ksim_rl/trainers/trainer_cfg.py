@@ -1,0 +1,52 @@
+"""How long a run is, and what happens beside learning."""
+
+from dataclasses import dataclass
+
+from ksim_rl.checks import check_choice, check_in_range
+
+MATMUL_PRECISIONS = ("highest", "high", "medium")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainerCfg:
+    """Options of `Trainer`. Intervals are in iterations; 0 means never.
+
+    Attributes:
+        num_iterations: an iteration is one rollout and one update, D env states.
+        eval_interval: between evaluations with deterministic actions in envs of their own.
+        eval_episodes: episodes of an evaluation, one env each; 0 means no evaluation at all.
+        stop_when_solved: end the run as soon as an evaluation reaches the task's threshold.
+        checkpoint_interval: between checkpoints; the last iteration is always saved.
+        keep_checkpoints: how many of the newest checkpoints stay.
+        log_interval: between rows of the logs and lines of progress.
+        matmul_precision: of float32 products on CUDA; "high" is TF32.
+        video: record the final policy.
+        video_s: seconds of it.
+    """
+
+    num_iterations: int = 100
+    eval_interval: int = 20
+    eval_episodes: int = 100
+    stop_when_solved: bool = True
+    checkpoint_interval: int = 20
+    keep_checkpoints: int = 3
+    log_interval: int = 1
+    matmul_precision: str = "high"
+    video: bool = True
+    video_s: float = 10.0
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, naming the field."""
+        for name, low in (
+            ("num_iterations", 1),
+            ("eval_interval", 0),
+            ("eval_episodes", 0),
+            ("checkpoint_interval", 0),
+            ("keep_checkpoints", 1),
+            ("log_interval", 1),
+        ):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < low:
+                raise ValueError(f"{name}={value!r}: expected a whole number >= {low}")
+        check_choice("matmul_precision", self.matmul_precision, MATMUL_PRECISIONS)
+        check_in_range("video_s", self.video_s, low=0.0, low_open=True)

@@ -1,0 +1,80 @@
+"""A video of a policy: the frames that `env.render()` gives while it acts."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+
+class VideoUnavailableError(RuntimeError):
+    """There is no video; the message says why and how to get one."""
+
+
+def record(
+    env: EnvBase, policy: TensorDictModuleBase, path: Path, *, steps: int, fps: float, seed: int = 0
+) -> Path:
+    """Let the policy act, deterministically, and write what a camera sees.
+
+    Args:
+        env: has a `render()` that returns uint8 [H, W, 3].
+        policy: writes the action.
+        path: an `.mp4` file; without a video encoder a `.gif` beside it is written instead.
+        steps: env steps to show.
+        fps: pictures per second at real speed; more than 50 are thinned out.
+
+    Returns:
+        The file written.
+
+    Raises:
+        VideoUnavailableError: when nothing can be rendered, with the reason and the fix.
+    """
+    every = max(1, round(fps / 50))
+    frames = _frames(env, policy, steps=steps, every=every, seed=seed)
+    try:
+        first = next(frames)
+    except RuntimeError as error:
+        raise VideoUnavailableError(str(error)) from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        return _write(path, first, frames, fps=fps / every)
+    except (ImportError, RuntimeError, OSError):
+        # No ffmpeg for this platform: a GIF needs only Pillow. The frames begin anew, as the generator is spent.
+        frames = _frames(env, policy, steps=steps, every=every, seed=seed)
+        return _write(path.with_suffix(".gif"), next(frames), frames, fps=min(fps / every, 25))
+
+
+def _write(path: Path, first: np.ndarray, rest: Iterator[np.ndarray], *, fps: float) -> Path:
+    if path.suffix == ".gif":
+        writer = imageio.get_writer(path, duration=1000 / fps, loop=0)
+    else:
+        # H.264 wants even sides; with macro_block_size=2 imageio pads only odd ones.
+        writer = imageio.get_writer(path, fps=fps, codec="libx264", quality=7, macro_block_size=2)
+    with writer:
+        writer.append_data(first)
+        for frame in rest:
+            writer.append_data(frame)
+    return path
+
+
+def _frames(
+    env: EnvBase, policy: TensorDictModuleBase, *, steps: int, every: int, seed: int
+) -> Iterator[np.ndarray]:
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        env.set_seed(seed)
+        current_E = env.reset()
+        for step in range(steps):
+            if step % every == 0:
+                yield _picture(env)
+            _, current_E = env.step_and_maybe_reset(policy(current_E))
+
+
+def _picture(env: EnvBase) -> np.ndarray:
+    frame = env.render()  # type: ignore[operator]
+    if frame is None:
+        raise VideoUnavailableError("the env has no render mode: build it with render_mode='rgb_array'")
+    return frame
