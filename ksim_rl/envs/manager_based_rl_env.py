@@ -93,6 +93,7 @@ class ManagerBasedRlEnv(MaskedReset):
         self.view = EnvView(
             self.world,
             step_dt=self.step_dt,
+            max_episode_length=self.max_episode_length,
             soft_joint_pos_limit_factor=cfg.scene.soft_joint_pos_limit_factor,
         )
         self.world.refresh()

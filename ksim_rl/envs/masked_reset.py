@@ -48,7 +48,7 @@ class MaskedReset(EnvBase):
 
     @property
     def dim_names(self) -> list[str | None]:
-        """Labels of the batch dims: the spec's own, else "E" for the first."""
+        """Labels of the batch dims: "E" for the first."""
         names: list[str | None] = [None] * len(self.batch_size)
         if names:
             names[0] = dims.E

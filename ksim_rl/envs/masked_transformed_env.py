@@ -1,12 +1,13 @@
 """`TransformedEnv` with masked resets, labelled specs, one seed for env and transforms, and a complete state dict."""
 
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from tensordict import TensorDict
 from torchrl.data import Composite
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.transforms import Compose, Transform
 
 from ksim_rl import dims
 from ksim_rl.envs.masked_reset import MaskedReset
@@ -18,12 +19,19 @@ _BASE, _TRANSFORM, _ROOT = "base_env.", "transform.", "last_root."
 class MaskedTransformedEnv(MaskedReset, TransformedEnv):
     """A `TransformedEnv` whose step, reset and rollout never make the host wait for the device.
 
-    Trajectories equal those of `torchrl.envs.TransformedEnv`. Construct, append and insert transforms as there. Beyond
-    it: masked resets and `reset(env_ids=...)` (see `MaskedReset`), the label "E" on specs and data, `set_seed` and
+    Trajectories equal those of `torchrl.envs.TransformedEnv`. Construct, append and insert transforms as there; a
+    sequence of transforms will do for a `Compose`. Beyond it: masked resets and `reset(env_ids=...)` (see `MaskedReset`), the label "E" on specs and data, `set_seed` and
     `seed` that reach each transform, and a state dict that holds base env, transforms and the last root values.
 
     It has to be the outermost env: a stock `TransformedEnv` around it is right, but syncs.
     """
+
+    def __init__(
+        self, base_env: EnvBase, transform: Transform | Sequence[Transform] | None = None, **kwargs: Any
+    ) -> None:
+        if isinstance(transform, Sequence):
+            transform = Compose(*transform)
+        super().__init__(base_env, transform, **kwargs)
 
     def _make_output_spec(self) -> Composite:
         return self._labelled_spec(super()._make_output_spec())

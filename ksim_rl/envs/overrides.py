@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import OverrideParseException
+from hydra.errors import HydraException
 
 from ksim_rl.checks import near
 
@@ -20,8 +20,8 @@ def check_overrides(tree: Mapping[str, Any], overrides: Sequence[str]) -> None:
     for text in overrides:
         try:
             override = OverridesParser.create().parse_override(text)
-        except OverrideParseException as error:
-            raise ValueError(f"override {text!r} does not parse: {error.message}") from None
+        except HydraException as error:
+            raise ValueError(f"override {text!r} does not parse: {str(error).splitlines()[0]}") from None
         if not override.is_add():
             check_key(tree, override.key_or_group)
 

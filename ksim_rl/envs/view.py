@@ -47,9 +47,11 @@ class EnvView:
         world: World,
         *,
         step_dt: float,
+        max_episode_length: int = 0,
         soft_joint_pos_limit_factor: float = 1.0,
     ) -> None:
         model = world.mj_model
+        self.max_episode_length = max_episode_length
         self.world = world
         self.num_envs, self.device = world.num_envs, world.device
         self.physics_dt, self.step_dt = float(model.opt.timestep), step_dt

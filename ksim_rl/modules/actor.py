@@ -13,7 +13,7 @@ from torchrl.modules import ProbabilisticActor
 from ksim_rl.checks import check_choice, check_in_range
 from ksim_rl.modules.diagonal_gaussian import DiagonalGaussian
 from ksim_rl.modules.gaussian_head import GaussianHead
-from ksim_rl.modules.mlp import ACTIVATIONS, check_network, mlp
+from ksim_rl.modules.mlp import check_network, trunk
 from ksim_rl.modules.observation_normalizer import ObservationNormalizer
 
 STD_TYPES = ("scalar", "log")
@@ -63,14 +63,9 @@ class GaussianPolicy(nn.Module):
     ) -> None:
         super().__init__()
         self.normalizer = ObservationNormalizer(obs_dim, device=device) if cfg.obs_normalization else None
-        *widths, feature_dim = (obs_dim, *cfg.hidden_dims)
-        trunk: nn.Module = nn.Identity()
-        if widths:
-            layers = mlp(obs_dim, cfg.hidden_dims[:-1], feature_dim, activation=cfg.activation, device=device)
-            trunk = layers.append(ACTIVATIONS[cfg.activation]())
-        self.trunk = trunk
+        self.trunk = trunk(obs_dim, cfg.hidden_dims, activation=cfg.activation, device=device)
         self.head = GaussianHead(
-            feature_dim,
+            cfg.hidden_dims[-1] if cfg.hidden_dims else obs_dim,
             action_dim,
             init_std=cfg.init_std,
             std_type=cfg.std_type,

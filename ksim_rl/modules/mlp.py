@@ -59,14 +59,32 @@ def mlp(
     Returns:
         A module from [..., input_dim] to [..., output_dim].
     """
-    check_network(hidden_dims, activation)
     check_in_range("output_gain", output_gain, low=0.0)
-    layers: list[nn.Module] = []
+    layers = trunk(input_dim, hidden_dims, activation=activation, hidden_gain=hidden_gain, device=device)
+    width = hidden_dims[-1] if hidden_dims else input_dim
+    return layers.append(linear(width, output_dim, gain=output_gain, device=device))
+
+
+def trunk(
+    input_dim: int,
+    hidden_dims: Sequence[int],
+    *,
+    activation: str = "elu",
+    hidden_gain: float = math.sqrt(2.0),
+    device: torch.device | str | None = None,
+) -> nn.Sequential:
+    """Build the hidden layers of an `mlp` alone, each with its activation.
+
+    [..., input_dim] to the last width.
+    """
+    check_network(hidden_dims, activation)
+    layers = nn.Sequential()
     width = input_dim
     for hidden_dim in hidden_dims:
-        layers += [linear(width, hidden_dim, gain=hidden_gain, device=device), ACTIVATIONS[activation]()]
+        layers.append(linear(width, hidden_dim, gain=hidden_gain, device=device))
+        layers.append(ACTIVATIONS[activation]())
         width = hidden_dim
-    return nn.Sequential(*layers, linear(width, output_dim, gain=output_gain, device=device))
+    return layers
 
 
 def linear(

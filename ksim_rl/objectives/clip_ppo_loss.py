@@ -8,7 +8,7 @@ from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.nn import (
     CompositeDistribution,
     ProbabilisticTensorDictSequential,
-    TensorDictModuleBase,
+    TensorDictModule,
     dispatch,
 )
 from tensordict.utils import NestedKey
@@ -52,11 +52,12 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         scale: NestedKey = "scale"
 
     default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys  # type: ignore[assignment]
 
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential | None = None,
-        critic_network: TensorDictModuleBase | None = None,
+        critic_network: TensorDictModule | None = None,
         *,
         clip_epsilon: float | tuple[float, float] = 0.2,
         clip_value: bool | float | None = None,
@@ -93,7 +94,7 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         ]
         return list(dict.fromkeys([*wanted, *critic_keys]))
 
-    @dispatch
+    @dispatch  # type: ignore[arg-type]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the losses and what is logged beside them, all detached but those named `loss_*`.
 
@@ -102,11 +103,13 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
                 rollout, from which the value estimator computes one.
 
         Returns:
-            TensorDict without batch dims: `loss_objective`, `loss_critic`, `loss_entropy`, `entropy`,
-                `kl_approx`,
-            `kl`, `clip_fraction`, `value_clip_fraction`, `explained_variance`.
+            TensorDict without batch dims: `loss_objective`, `loss_critic`, `loss_entropy`, `entropy`, `kl`,
+            `kl_approx`, `clip_fraction`, `value_clip_fraction`, `explained_variance`.
         """
         tensordict = tensordict.clone(False)
+        # Read before the actor runs, which writes its own distribution under the same keys.
+        loc_old = tensordict.get(self.tensor_keys.loc, None)
+        scale_old = tensordict.get(self.tensor_keys.scale, None)
         advantage = self._advantage(tensordict)
         log_weight, dist, kl_approx, log_is_weight = self._log_weight(
             tensordict, adv_shape=advantage.shape[:-1]
@@ -126,18 +129,16 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         gain = torch.minimum(log_behavior_weight.exp() * advantage, log_clipped.exp() * advantage)
 
         losses = {"loss_objective": -gain}
-        logged = {
-            "clip_fraction": clipped.to(gain.dtype),
-            "kl_approx": kl_approx,
-            **self._kl(tensordict, dist),
-        }
+        logged = {"clip_fraction": clipped.to(gain.dtype), "kl_approx": kl_approx}
+        if loc_old is not None and scale_old is not None:
+            logged.update(_kl(loc_old, scale_old, dist))
         out = TensorDict({})
         if self.entropy_bonus:
             entropy = self._get_entropy(dist, adv_shape=advantage.shape[:-1])
             losses["loss_entropy"] = self._weighted_loss_entropy(entropy)
             if is_tensor_collection(entropy):
                 out.set("composite_entropy", entropy.detach())
-                entropy = entropy.sum(dim="feature", reduce=True)
+                entropy = entropy.sum(dim="feature", reduce=True)  # type: ignore[call-overload]
             logged["entropy"] = entropy
         if self._has_critic:
             losses["loss_critic"], value_clip_fraction, explained_variance = self.loss_critic(tensordict)
@@ -147,10 +148,12 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
                 out.set("explained_variance", explained_variance)
         if self.log_ratio_statistics:
             out.update(_ratio_statistics(log_behavior_weight.detach()))
-        for name, loss in losses.items():
-            out.set(name, self._reduce_loss(loss, tensordict).squeeze(-1))
-        for name, quantity in logged.items():
-            out.set(name, self._reduce_loss(quantity.detach(), tensordict, reduction="mean"))
+        if self.reduction != "mean":
+            for name, loss in losses.items():
+                out.set(name, self._reduce_loss(loss, tensordict).squeeze(-1))
+            losses = {}
+        for name, mean in self._means(losses | logged, tensordict).items():
+            out.set(name, mean if name in losses else mean.detach())
         self._clear_weakrefs(
             tensordict,
             out,
@@ -173,12 +176,29 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
             advantage = tensordict.get(self.tensor_keys.advantage)
         return self._maybe_normalize_advantage(advantage, tensordict, update_norm=estimate)
 
-    def _standardize_advantage(self, advantage: Tensor, tensordict: TensorDictBase) -> Tensor:
+    def _means(self, columns: dict[str, Tensor], tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """Return the means over all env states that take part; one reduction for all columns."""
+        table = torch.stack(list(columns.values()))
+        mask = self._mask(tensordict, table[0])
+        if mask is None:
+            means = table.flatten(1).mean(1)
+        else:
+            # A where instead of a product: what is left out may be anything, and zero times infinity is NaN.
+            table = torch.where(mask, table, torch.zeros_like(table))
+            means = table.flatten(1).sum(1) / mask.sum().clamp_min(1)
+        return dict(zip(columns, means.unbind(0), strict=True))
+
+    def _mask(self, tensordict: TensorDictBase, quantity: Tensor) -> Tensor | None:
         masks = [tensordict.get(key, None) for key in self._loss_mask_keys()]
-        masks = [self._expand_loss_mask(mask, advantage) for mask in masks if mask is not None]
-        if not masks or self.normalize_advantage_exclude_dims:
+        masks = [self._expand_loss_mask(mask, quantity) for mask in masks if mask is not None]
+        if len(masks) < 2:
+            return masks[0] if masks else None
+        return torch.stack(masks).all(0)
+
+    def _standardize_advantage(self, advantage: Tensor, tensordict: TensorDictBase) -> Tensor:
+        mask = self._mask(tensordict, advantage)
+        if mask is None or self.normalize_advantage_exclude_dims:
             return super()._standardize_advantage(advantage, tensordict)
-        mask = masks[0] if len(masks) == 1 else torch.stack(masks).all(0)
         zero = torch.zeros_like(advantage)
         count = mask.sum()
         error = advantage - torch.where(mask, advantage, zero).sum() / count.clamp_min(1)
@@ -191,14 +211,13 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         # TorchRL falls back on samples where the entropy is not finite, and asks the host for it.
         return dist.entropy().unsqueeze(-1)
 
-    def _kl(self, tensordict: TensorDictBase, dist: Distribution) -> dict[str, Tensor]:
-        loc_old = tensordict.get(self.tensor_keys.loc, None)
-        scale_old = tensordict.get(self.tensor_keys.scale, None)
-        parameters = gaussian_parameters(dist)
-        if loc_old is None or scale_old is None or parameters is None:
-            return {}
-        with torch.no_grad():
-            return {"kl": kl_divergence(loc_old, scale_old, *parameters)}
+
+def _kl(loc_old: Tensor, scale_old: Tensor, dist: Distribution) -> dict[str, Tensor]:
+    parameters = gaussian_parameters(dist)
+    if parameters is None:
+        return {}
+    with torch.no_grad():
+        return {"kl": kl_divergence(loc_old, scale_old, *parameters).unsqueeze(-1)}
 
 
 def _ratio_statistics(log_weight: Tensor) -> dict[str, Tensor]:

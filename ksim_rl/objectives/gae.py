@@ -110,7 +110,9 @@ class GAE(value.GAE):
         return tensordict
 
     def _resolve_time_dim(self, time_dim: int | None, tensordict: TensorDictBase) -> int:
-        time_dim = self.time_dim if time_dim is None else time_dim
+        if time_dim is None:
+            assert self.time_dim is not None
+            time_dim = self.time_dim
         if not -tensordict.batch_dims <= time_dim < tensordict.batch_dims:
             raise ValueError(
                 f"time_dim={time_dim}: the data has {tensordict.batch_dims} batch dims {tuple(tensordict.batch_size)}"

@@ -1,11 +1,13 @@
 """One gradient step of PPO, and the parts that it needs, built from one config."""
 
 from collections.abc import Callable
+from functools import reduce
+from operator import add
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
 
 from ksim_rl.objectives.adaptive_learning_rate import adapt_learning_rate_
@@ -15,15 +17,13 @@ from ksim_rl.objectives.ppo_cfg import PPOCfg
 from ksim_rl.objectives.step_guard import StepGuard, clip_and_guard
 
 
-def make_gae(cfg: PPOCfg, critic: TensorDictModuleBase) -> GAE:
+def make_gae(cfg: PPOCfg, critic: TensorDictModule) -> GAE:
     """Build the advantage estimator of `cfg`."""
     normalize = cfg.normalize_advantage == "dataset"
     return GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, critic=critic, normalize_advantage=normalize)
 
 
-def make_loss(
-    cfg: PPOCfg, actor: ProbabilisticTensorDictSequential, critic: TensorDictModuleBase
-) -> ClipPPOLoss:
+def make_loss(cfg: PPOCfg, actor: ProbabilisticTensorDictSequential, critic: TensorDictModule) -> ClipPPOLoss:
     """Build the loss of `cfg`. It uses the modules as they are: what changes in them changes in the loss."""
     return ClipPPOLoss(
         actor,
@@ -95,7 +95,7 @@ def ppo_step(
         step), `skipped` (0 or 1), each a tensor [].
     """
     losses = loss(minibatch_B)
-    total = torch.stack([value for name, value in losses.items() if name.startswith("loss_")]).sum()
+    total = reduce(add, [value for name, value in losses.items() if name.startswith("loss_")])
     learning_rate = optimizer.param_groups[0]["lr"]
     if cfg.schedule == "adaptive":
         adapt_learning_rate_(

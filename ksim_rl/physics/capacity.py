@@ -9,12 +9,14 @@ import numpy as np
 from ksim_rl.physics.mujoco_messages import caught_warnings
 from ksim_rl.physics.sim_cfg import SimCfg
 
+# On what the probe saw: half as much again for rows and contacts; less for candidate pairs, which all worlds share.
 MARGIN = 1.5
+PAIR_MARGIN = 1.2
 EXTRA = 4
 MULTIPLE = 8
-RANDOM_STATES = 128
-DROPS = 8
-DROP_STEPS = 60
+RANDOM_STATES = 512
+DROPS = 12
+DROP_STEPS = 50
 # How deep a dropped body may start in the ground, in m.
 DEPTH = 0.02
 
@@ -36,25 +38,25 @@ def probe(mj_model: mujoco.MjModel) -> tuple[int, int]:
     key = hashlib.sha256(buffer.tobytes()).digest()
     if key not in _cache:
         with caught_warnings():
-            rows, contacts = _needed(mj_model)
-        _cache[key] = (with_margin(rows), with_margin(contacts))
+            rows, contacts, pairs = _most(mj_model)
+        nconmax = max(MARGIN * contacts, PAIR_MARGIN * pairs)
+        _cache[key] = (_round_up(MARGIN * rows), _round_up(nconmax))
     return _cache[key]
 
 
-def with_margin(needed: int) -> int:
-    """Return a capacity for a need: half as much again and a little more, rounded up."""
-    return MULTIPLE * math.ceil((MARGIN * needed + EXTRA) / MULTIPLE)
+def _round_up(needed: float) -> int:
+    return MULTIPLE * math.ceil((needed + EXTRA) / MULTIPLE)
 
 
-def _needed(mj_model: mujoco.MjModel) -> tuple[int, int]:
+def _most(mj_model: mujoco.MjModel) -> tuple[int, int, int]:
+    """Return the most constraint rows, contacts and candidate pairs of one world over many states."""
     rng = np.random.default_rng(0)
     mj_data = mujoco.MjData(mj_model)
     pairs = CandidatePairs(mj_model)
-    most = np.zeros(2, dtype=int)
+    most = np.zeros(3, dtype=int)
 
     def measure() -> None:
-        most[0] = max(most[0], mj_data.nefc)
-        most[1] = max(most[1], mj_data.ncon, pairs.count(mj_data))
+        np.maximum(most, (mj_data.nefc, mj_data.ncon, pairs.count(mj_data)), out=most)
 
     for key in range(-1, mj_model.nkey):
         mujoco.mj_resetData(mj_model, mj_data)
@@ -62,9 +64,9 @@ def _needed(mj_model: mujoco.MjModel) -> tuple[int, int]:
             mujoco.mj_resetDataKeyframe(mj_model, mj_data, key)
         mujoco.mj_fwdPosition(mj_model, mj_data)
         measure()
-    for index in range(RANDOM_STATES):
+    for index, qpos in enumerate(random_qpos(mj_model, RANDOM_STATES, rng)):
         mujoco.mj_resetData(mj_model, mj_data)
-        mj_data.qpos[:] = random_qpos(mj_model, mj_data, rng)
+        mj_data.qpos[:] = qpos
         put_in_ground(mj_model, mj_data, depth=DEPTH * rng.random())
         mujoco.mj_fwdPosition(mj_model, mj_data)
         measure()
@@ -73,44 +75,45 @@ def _needed(mj_model: mujoco.MjModel) -> tuple[int, int]:
             for _ in range(DROP_STEPS):
                 mujoco.mj_step(mj_model, mj_data)
                 measure()
-    return int(most[0]), int(most[1])
+    return int(most[0]), int(most[1]), int(most[2])
 
 
-def random_qpos(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.random.Generator) -> np.ndarray:
-    """Draw joints within their limits (else within a turn or a metre), free and ball joints in any orientation."""
-    qpos = mj_data.qpos.copy()
+def random_qpos(mj_model: mujoco.MjModel, num_states: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw poses [num_states, nq]: joints within their limits (else within a turn or a metre), any orientation."""
+    qpos = np.tile(mj_model.qpos0, (num_states, 1))
     for joint in range(mj_model.njnt):
         adr, kind = int(mj_model.jnt_qposadr[joint]), mj_model.jnt_type[joint]
         if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
             start = adr + 3 if kind == mujoco.mjtJoint.mjJNT_FREE else adr
-            quat = rng.normal(size=4)
-            qpos[start : start + 4] = quat / np.linalg.norm(quat)
+            quat = rng.normal(size=(num_states, 4))
+            qpos[:, start : start + 4] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
         elif mj_model.jnt_limited[joint]:
-            qpos[adr] = rng.uniform(*mj_model.jnt_range[joint])
+            qpos[:, adr] = rng.uniform(*mj_model.jnt_range[joint], size=num_states)
         else:
             reach = math.pi if kind == mujoco.mjtJoint.mjJNT_HINGE else 1.0
-            qpos[adr] += rng.uniform(-reach, reach)
+            qpos[:, adr] += rng.uniform(-reach, reach, size=num_states)
     return qpos
 
 
 def random_ctrl(mj_model: mujoco.MjModel, rng: np.random.Generator) -> np.ndarray:
-    """Draw controls within their ranges, else in [-1, 1]."""
+    """Draw controls [nu] within their ranges, else in [-1, 1]."""
     low = np.where(mj_model.actuator_ctrllimited, mj_model.actuator_ctrlrange[:, 0], -1.0)
     high = np.where(mj_model.actuator_ctrllimited, mj_model.actuator_ctrlrange[:, 1], 1.0)
     return rng.uniform(low, high)
 
 
 def put_in_ground(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, *, depth: float) -> None:
-    """Move each free body, with what hangs on it, so that its lowest geom is `depth` (m) below the lowest plane."""
+    """Move each free body, with what hangs on it, so that its lowest geom is `depth` (m) below the highest plane."""
     planes = np.flatnonzero(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
-    if planes.size == 0:
+    free_joints = np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+    if planes.size == 0 or free_joints.size == 0:
         return
     mujoco.mj_kinematics(mj_model, mj_data)
     ground = mj_data.geom_xpos[planes, 2].max()
     lowest = _lowest_points(mj_model, mj_data)
     roots = mj_model.body_rootid[mj_model.geom_bodyid]
     collides = (mj_model.geom_contype | mj_model.geom_conaffinity) != 0
-    for joint in np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+    for joint in free_joints:
         geoms = collides & (roots == mj_model.body_rootid[mj_model.jnt_bodyid[joint]])
         if geoms.any():
             mj_data.qpos[mj_model.jnt_qposadr[joint] + 2] += ground - depth - lowest[geoms].min()
@@ -152,18 +155,17 @@ class CandidatePairs:
         self.first = np.concatenate([first[keep], mj_model.pair_geom1])
         self.second = np.concatenate([second[keep], mj_model.pair_geom2])
         self.margin = np.maximum(mj_model.geom_margin[self.first], mj_model.geom_margin[self.second])
-        self.is_plane = mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        is_plane = mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        self.plane_1, self.plane_2 = is_plane[self.first], is_plane[self.second]
+        self.reach = mj_model.geom_rbound[self.first] + mj_model.geom_rbound[self.second] + self.margin
 
     def count(self, mj_data: mujoco.MjData) -> int:
         """Return the number of pairs that may touch in the present pose."""
         if self.first.size == 0:
             return 0
         offset = mj_data.geom_xpos[self.second] - mj_data.geom_xpos[self.first]
-        radius_1, radius_2 = self.mj_model.geom_rbound[self.first], self.mj_model.geom_rbound[self.second]
-        reach = radius_1 + radius_2 + self.margin
-        normals = mj_data.geom_xmat.reshape(-1, 3, 3)[:, :, 2]
-        plane_1, plane_2 = self.is_plane[self.first], self.is_plane[self.second]
         distance = np.linalg.norm(offset, axis=1)
-        distance = np.where(plane_1, (offset * normals[self.first]).sum(1), distance)
-        distance = np.where(plane_2, -(offset * normals[self.second]).sum(1), distance)
-        return int(np.count_nonzero(distance <= reach))
+        normals = mj_data.geom_xmat[:, [2, 5, 8]]
+        distance = np.where(self.plane_1, (offset * normals[self.first]).sum(1), distance)
+        distance = np.where(self.plane_2, -(offset * normals[self.second]).sum(1), distance)
+        return int(np.count_nonzero(distance <= self.reach))

@@ -79,7 +79,8 @@ def no_collection() -> Iterator[None]:
 
 
 @contextmanager
-def _live(*, capturing: bool) -> Iterator[None]:
+def live_launches(*, capturing: bool = False) -> Iterator[None]:
+    """Let worlds issue launch by launch in this block, as they do inside a capture, and record no graphs of theirs."""
     _phase.live += 1
     _phase.capturing += capturing
     try:
@@ -156,7 +157,7 @@ class Captured:
         with (
             torch.cuda.stream(stream),
             wp.ScopedStream(warp_stream(stream), sync_enter=False, sync_exit=False),
-            _live(capturing=False),
+            live_launches(),
         ):
             self.body()
         caller.wait_stream(stream)
@@ -171,7 +172,7 @@ class Captured:
             no_collection(),
             torch.cuda.stream(stream),
             wp.ScopedStream(warp_side, sync_enter=False, sync_exit=False),
-            _live(capturing=True),
+            live_launches(capturing=True),
         ):
             graph.capture_begin(capture_error_mode="thread_local")
             try:

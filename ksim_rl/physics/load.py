@@ -60,7 +60,12 @@ def load_model(source: Source) -> mujoco.MjModel:
 
 def _parsed(source: Source) -> tuple[mujoco.MjSpec, str, str]:
     """Return the spec, its XML text (for messages), and how to call it in messages."""
-    if isinstance(source, mujoco.MjSpec):
+    if not isinstance(source, (str, Path)):
+        if not isinstance(source, mujoco.MjSpec):
+            kind = type(source).__name__
+            raise ValueError(
+                f"model source is {kind}: expected a path, an XML string, a MjSpec or a menagerie name"
+            )
         return source.copy(), "", f"model {source.modelname!r}"
     path, text, label = _read(source)
     with caught_warnings() as caught:

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 
 from ksim_rl.data import DatasetBuffer, DatasetCfg
@@ -54,7 +54,7 @@ class PPOUpdate:
         cfg: PPOCfg,
         *,
         actor: ProbabilisticTensorDictSequential,
-        critic: TensorDictModuleBase,
+        critic: TensorDictModule,
         data: DatasetCfg,
         seed: int = 0,
         device: torch.device | str = "cpu",
@@ -66,9 +66,9 @@ class PPOUpdate:
         self.optimizer = make_optimizer(cfg, actor, critic)
         self.dataset = DatasetBuffer(data, keys=self.loss.dataset_keys, seed=seed, device=self.device)
         self.guard = StepGuard(device=self.device)
-        self.gradient_steps = cfg.num_epochs * data.num_minibatches
         self._rollout_ET: TensorDictBase | None = None
         self._sums: dict[str, Tensor] = {}
+        self._steps_made = torch.zeros((), device=self.device)
         self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
         self._run = Captured(self._update, device=self.device)
 
@@ -86,8 +86,8 @@ class PPOUpdate:
         self._run()
 
     def metrics(self) -> dict[str, Tensor]:
-        """Return what the last update measured, each a tensor [] on the device; means are over its gradient steps."""
-        means = {name: total / self.gradient_steps for name, total in self._sums.items()}
+        """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
+        means = {name: total / self._steps_made.clamp_min(1.0) for name, total in self._sums.items()}
         return means | {
             "update/learning_rate": self.optimizer.param_groups[0]["lr"],
             "update/skipped_steps": self.guard.skipped,
@@ -111,20 +111,25 @@ class PPOUpdate:
         self.dataset.extend(rollout_ET)
         for _ in range(self.cfg.num_epochs):
             for minibatch_B in self.dataset.epoch():
-                self._measure(ppo_step(self.loss, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard))
+                self._measure(
+                    ppo_step(self.loss, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard)
+                )
         # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
         update_normalizers(rollout_ET, self.actor, self.critic)
 
     def _measure(self, step: Mapping[str, Tensor]) -> None:
+        made = step["skipped"] == 0.0
+        self._steps_made.add_(made)
         for name, logged in LOGGED.items():
             if name in step:
                 # A skipped step is counted; its numbers would spoil the means.
-                value = torch.where(step["skipped"] > 0, 0.0, step[name].detach())
+                value = torch.where(made, step[name].detach(), 0.0)
                 self._sums.setdefault(logged, torch.zeros((), device=self.device)).add_(value)
         torch.maximum(self._longest_skip, self.guard.skipped_in_a_row, out=self._longest_skip)
 
     def _clear_sums(self) -> None:
         self._longest_skip.zero_()
+        self._steps_made.zero_()
         for total in self._sums.values():
             total.zero_()
 
@@ -160,7 +165,9 @@ class PPOUpdate:
         parameters = self.optimizer.param_groups[0]["params"]
         moments = {int(index): entry for index, entry in state["moments"].items()}
         if moments and set(moments) != set(range(len(parameters))):
-            raise ValueError(f"optimizer: {len(moments)} parameters in the checkpoint, {len(parameters)} in this run")
+            raise ValueError(
+                f"optimizer: {len(moments)} parameters in the checkpoint, {len(parameters)} in this run"
+            )
         for index, entry in moments.items():
             for name in ("exp_avg", "exp_avg_sq"):
                 if entry[name].shape != parameters[index].shape:

@@ -19,7 +19,7 @@ from ksim_rl.envs import (
     ObservationTermCfg,
     SceneCfg,
 )
-from ksim_rl.envs.mdp import ActuatorAction, JointPos, JointVel, LastAction, TimeOut
+from ksim_rl.envs.mdp import JointEffortAction, JointPos, JointVel, LastAction, TimeOut
 from ksim_rl.envs.term import CommandTerm, EventTerm, MetricTerm, RewardTerm, TerminationTerm
 
 SUBSTEP_S = 0.005
@@ -132,7 +132,7 @@ def puck_cfg(
         decimation=DECIMATION,
         scene=SceneCfg(robots={"puck": MjcfRobot(source=PUCK_XML)}, num_envs=num_envs),
         observations={"actor": ObservationGroupCfg(terms=terms), "critic": ObservationGroupCfg(terms=terms)},
-        actions={"push": ActuatorAction()},
+        actions={"push": JointEffortAction()},
         events={"launch": Launch()} if events is None else events,
         terminations=terminations,
         episode_length_s=episode_length_s,

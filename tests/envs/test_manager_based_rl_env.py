@@ -259,7 +259,7 @@ def test_step_and_reset_never_make_the_host_wait():
     root_E = env.reset()
     with count_syncs() as syncs:
         glide(env, root_E, 8)
-    assert syncs.count == 0, syncs
+    assert syncs.total == 0, syncs.report()
 
 
 def test_close_twice_is_an_error_unless_told_otherwise():

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
-from ksim_rl.envs.mdp import ActuatorAction, JointVel, TimeOut
+from ksim_rl.envs.mdp import JointEffortAction, JointVel, TimeOut
 from ksim_rl.envs.robots.cartpole import Cartpole
 from ksim_rl.envs.scene import SceneCfg
 from ksim_rl.envs.task import Task
@@ -96,7 +96,7 @@ def _cfg(reset: ResetCartpole) -> ManagerBasedRlEnvCfg:
         decimation=1,
         scene=SceneCfg(robots={"cartpole": Cartpole()}, num_envs=1024),
         observations={"actor": ObservationGroupCfg(terms=terms), "critic": ObservationGroupCfg(terms=terms)},
-        actions={"force": ActuatorAction(actuators="slide")},
+        actions={"force": JointEffortAction(joints="slider")},
         events={"reset": reset},
         rewards={"balance": CartpoleReward()},
         terminations={"time_out": TimeOut(time_out=True)},

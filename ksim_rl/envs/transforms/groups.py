@@ -57,6 +57,9 @@ class ObservationGroups(Transform):
         """Add the vectors' specs and remove the dropped ones."""
         batch_size = observation_spec.shape
         vectors = {}
+        for name in self.groups:
+            if isinstance(observation_spec.get(name, None), Composite):
+                raise ValueError(f"group {name!r} would replace the observations under {name!r}: rename the group")
         for name, terms in self.groups.items():
             specs = [leaf_spec(observation_spec, term, type(self).__name__) for term in terms]
             sizes = tuple(flat_size(spec, len(batch_size)) for spec in specs)
@@ -89,11 +92,20 @@ class ObservationGroups(Transform):
             vectors[name] = flat[0] if len(flat) == 1 else torch.cat(flat, dim=-1)
         for name, vector in vectors.items():
             next_tensordict.set(name, vector)
-        if self.drop:
-            next_tensordict = next_tensordict.exclude(*self.drop, inplace=True)
+        for key in self.drop:
+            _drop(next_tensordict, key)
         return next_tensordict
 
     forward = _call
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)
+
+
+def _drop(tensordict: TensorDictBase, key: NestedKey) -> None:
+    """Remove a leaf, and nested tensordicts that it leaves empty."""
+    tensordict.del_(key)
+    if isinstance(key, tuple) and len(key) > 1:
+        above = key[:-1] if len(key) > 2 else key[0]
+        if tensordict.get(above).is_empty():
+            _drop(tensordict, above)

@@ -1,7 +1,7 @@
 """What transforms with state share: keyed draws, rows of a reset, buffers sized by the env, a copy that is a copy."""
 
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -30,6 +30,9 @@ class KeyedTransform(Transform):
             they are of one class and have the same keys.
     """
 
+    purposes: ClassVar[tuple[str, ...]] = ()
+    """What the class draws, each from a stream of its own."""
+
     def __init__(
         self,
         in_keys: Keys | None = None,
@@ -44,6 +47,7 @@ class KeyedTransform(Transform):
         if stream is None:
             stream = f"{type(self).__name__}{self.in_keys}{self.out_keys}{self.in_keys_inv}{self.out_keys_inv}"
         self.stream = stream
+        self._stream_ids = {purpose: random.stream_id(f"{stream}/{purpose}") for purpose in self.purposes}
         self.num_rows = 0
         self.register_buffer("seed_value", torch.tensor(seed, dtype=torch.int64))
         self.register_buffer("step_count", torch.zeros((), dtype=torch.int64))
@@ -61,17 +65,11 @@ class KeyedTransform(Transform):
             self.reset_count_E.zero_()
         return self
 
-    def _stream_id(self, purpose: str) -> int:
-        known = self.__dict__.setdefault("_stream_ids", {})
-        if purpose not in known:
-            known[purpose] = random.stream_id(f"{self.stream}/{purpose}")
-        return known[purpose]
-
     def _step_keys(self, purpose: str) -> random.RowKeys:
-        return random.row_keys(self.seed_value, self._stream_id(purpose), self.step_count, self.num_rows)
+        return random.row_keys(self.seed_value, self._stream_ids[purpose], self.step_count, self.num_rows)
 
     def _reset_keys(self, purpose: str) -> random.RowKeys:
-        return random.row_keys(self.seed_value, self._stream_id(purpose), self.reset_count_E, self.num_rows)
+        return random.row_keys(self.seed_value, self._stream_ids[purpose], self.reset_count_E, self.num_rows)
 
     def _size_rows(self, num_rows: int, device: torch.device | None) -> None:
         """Make the counters of `num_rows` rows; subclasses make their own buffers beside them."""
@@ -110,7 +108,6 @@ class KeyedTransform(Transform):
         """Copy with buffers of its own: TorchRL rebuilds parts of an env from clones and may run them."""
         copy = super().clone()
         copy._buffers = {name: None if b is None else b.clone() for name, b in self._buffers.items()}
-        copy.__dict__.pop("_stream_ids", None)
         return copy
 
     def _in_env(self) -> bool:

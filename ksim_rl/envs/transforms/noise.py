@@ -10,7 +10,7 @@ from torchrl.data import Composite
 
 from ksim_rl import random
 from ksim_rl.envs.transforms.keyed_transform import KeyedTransform, Keys, as_keys, checked_out_keys
-from ksim_rl.envs.transforms.noise_cfg import NoiseCfg
+from ksim_rl.envs.transforms.noise_cfg import Draw, NoiseCfg
 from ksim_rl.envs.transforms.noise_columns import NoiseColumns, widen
 from ksim_rl.envs.transforms.specs import bounded, bounds, flat_size, leaf_spec, set_leaf_spec
 
@@ -34,6 +34,8 @@ class ObservationNoise(KeyedTransform):
     Example:
         >>> noise = ObservationNoise(["imu"], noise=GaussianNoise(std=0.1, bias=UniformNoise(low=-0.2, high=0.2)))
     """
+
+    purposes = tuple(f"{when}/{d.value}" for when in ("step", "reset", "bias", "forward") for d in Draw)
 
     enabled: Tensor
     bias_EL: Tensor
@@ -122,7 +124,7 @@ class ObservationNoise(KeyedTransform):
         self.step_count.add_(1)
 
         def keys_of(kind: str) -> random.RowKeys:
-            return random.row_keys(self.seed_value, self._stream_id(f"forward/{kind}"), self.step_count, num_rows)
+            return random.row_keys(self.seed_value, self._stream_ids[f"forward/{kind}"], self.step_count, num_rows)
 
         return self._write(tensordict, self._columns.sample(keys_of, num_rows), None)
 

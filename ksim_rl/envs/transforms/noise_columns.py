@@ -7,11 +7,11 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 
 from ksim_rl import random
-from ksim_rl.envs.transforms.noise_cfg import ConstantNoise, GaussianNoise, NoiseCfg, PerDim, UniformNoise
+from ksim_rl.envs.transforms.noise_cfg import ConstantNoise, Draw, NoiseCfg
 from ksim_rl.envs.transforms.specs import add_bounds, multiply_bounds
 
 _NEUTRAL = ConstantNoise(value=0.0)
-_UNIFORM, _GAUSSIAN, _CONSTANT = range(3)
+_ORDER = (Draw.UNIFORM, Draw.GAUSSIAN, Draw.NONE)
 
 
 class NoiseColumns(nn.Module):
@@ -39,18 +39,19 @@ class NoiseColumns(nn.Module):
         offset: list[float] = []
         spread: list[float] = []
         multiply: list[bool] = []
-        kinds: list[int] = []
+        draws: list[Draw] = []
         for cfg, key, size in zip(cfgs, keys, sizes, strict=True):
-            kind, offsets, spreads = _affine(cfg or _NEUTRAL, key, size)
+            cfg = cfg or _NEUTRAL
+            offsets, spreads = _affine(cfg, key, size)
             offset += offsets
             spread += spreads
-            multiply += [(cfg or _NEUTRAL).operation == "multiply"] * size
-            kinds += [kind] * size
-        self.num_uniform, self.num_gaussian = kinds.count(_UNIFORM), kinds.count(_GAUSSIAN)
-        self.size = len(kinds)
+            multiply += [cfg.operation == "multiply"] * size
+            draws += [cfg.draw] * size
+        self.num_uniform, self.num_gaussian = draws.count(Draw.UNIFORM), draws.count(Draw.GAUSSIAN)
+        self.size = len(draws)
         self.all_add, self.all_multiply = not any(multiply), all(multiply)
         # Columns are drawn kind by kind; `order_L` says where in that row each column finds its draw.
-        by_kind = sorted(range(self.size), key=lambda column: kinds[column])
+        by_kind = sorted(range(self.size), key=lambda column: _ORDER.index(draws[column]))
         self.in_order = by_kind == list(range(self.size))
         place = {column: index for index, column in enumerate(by_kind)}
         tensors = {
@@ -63,7 +64,7 @@ class NoiseColumns(nn.Module):
             self.register_buffer(name, tensor.to(device), persistent=False)
 
     def sample(self, keys_of: Callable[[str], random.RowKeys], num_rows: int) -> Tensor:
-        """Return one sample per row and column, float32 [E, L]."""
+        """Return one sample per row and column, float32 [E, L]; `keys_of` gives the keys of a kind of draw."""
         parts = []
         if self.num_uniform:
             parts.append(random.uniform(keys_of("uniform"), self.num_uniform))
@@ -92,45 +93,29 @@ class NoiseColumns(nn.Module):
         return self.multiply_L.to(torch.float32)
 
 
-def widen(cfg: NoiseCfg | None, key: NestedKey, low: Tensor, high: Tensor, batch_dims: int) -> tuple[Tensor, Tensor]:
+def widen(
+    cfg: NoiseCfg | None, key: NestedKey, low: Tensor, high: Tensor, batch_dims: int
+) -> tuple[Tensor, Tensor]:
     """Return the bounds of the noisy observation; they hold the clean one too, as noise can be off."""
     if cfg is None:
         return low, high
-    size = low.shape[batch_dims:].numel()
-    kind, offset, spread = _affine(cfg, key, size)
+    shape = low.shape[batch_dims:]
+    offset, spread = _affine(cfg, key, shape.numel())
     offset_L = torch.tensor(offset, device=low.device)
     spread_L = torch.tensor(spread, device=low.device)
-    if kind == _GAUSSIAN:
+    if cfg.draw is Draw.GAUSSIAN:
         reach_L = torch.where(spread_L > 0, torch.inf, 0.0)
-        noise_low, noise_high = offset_L - reach_L, offset_L + reach_L
+        ends = offset_L - reach_L, offset_L + reach_L
     else:
-        noise_low, noise_high = offset_L, offset_L + spread_L
-    shape = low.shape[batch_dims:]
-    noise = noise_low.reshape(shape).expand(low.shape), noise_high.reshape(shape).expand(low.shape)
+        ends = offset_L, offset_L + spread_L
+    noise = ends[0].reshape(shape).expand(low.shape), ends[1].reshape(shape).expand(low.shape)
     combine = multiply_bounds if cfg.operation == "multiply" else add_bounds
     noisy_low, noisy_high = combine(widen(cfg.bias, key, low, high, batch_dims), noise)
     return torch.minimum(low, noisy_low), torch.maximum(high, noisy_high)
 
 
-def _affine(cfg: NoiseCfg, key: NestedKey, size: int) -> tuple[int, list[float], list[float]]:
-    """Return the kind of draw, and per column the offset and the factor of the draw."""
-    if isinstance(cfg, UniformNoise):
-        low, high = _per_dim(cfg, "low", cfg.low, key, size), _per_dim(cfg, "high", cfg.high, key, size)
-        return _UNIFORM, low, [b - a for a, b in zip(low, high, strict=True)]
-    if isinstance(cfg, GaussianNoise):
-        return _GAUSSIAN, _per_dim(cfg, "mean", cfg.mean, key, size), _per_dim(cfg, "std", cfg.std, key, size)
-    if isinstance(cfg, ConstantNoise):
-        return _CONSTANT, _per_dim(cfg, "value", cfg.value, key, size), [0.0] * size
-    raise ValueError(
-        f"noise of {key!r} is {cfg!r}: expected one of UniformNoise, GaussianNoise, ConstantNoise"
-    )
-
-
-def _per_dim(cfg: NoiseCfg, field: str, value: PerDim, key: NestedKey, size: int) -> list[float]:
-    numbers = [float(number) for number in value] if isinstance(value, Sequence) else [float(value)]
-    if len(numbers) not in (1, size):
-        raise ValueError(
-            f"{type(cfg).__name__}.{field} of {key!r} has {len(numbers)} numbers, "
-            f"but the observation has {size} per env: give 1 or {size}"
-        )
-    return numbers * (size // len(numbers)) if size else []
+def _affine(cfg: NoiseCfg, key: NestedKey, size: int) -> tuple[list[float], list[float]]:
+    try:
+        return cfg.affine(size)
+    except ValueError as error:
+        raise ValueError(f"{type(cfg).__name__} of {key!r}: {error}") from None

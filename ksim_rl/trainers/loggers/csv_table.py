@@ -22,14 +22,18 @@ class CsvTable:
         self._started = False
 
     def log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
-        """Append one row."""
+        """Append one row, or complete the last one."""
         row = {STEP: str(step), **{name: f"{value:.9g}" for name, value in metrics.items()}}
         new_columns = [name for name in row if name not in self._columns]
         if not self._started:
             self._rows = [old for old in self._rows if int(old[STEP]) < step]
-        self._rows.append(row)
+        same_row = bool(self._rows) and int(self._rows[-1][STEP]) == step
+        if same_row:
+            self._rows[-1] |= row
+        else:
+            self._rows.append(row)
         self._columns += new_columns
-        if new_columns or not self._started:
+        if new_columns or same_row or not self._started:
             self._rewrite()
         else:
             with open(self.path, "a", newline="") as file:

@@ -8,6 +8,7 @@ from ksim_rl.envs.robots import edit
 
 ROBOT = """
 <mujoco>
+  <compiler angle="radian"/>
   <option timestep="0.003" cone="elliptic"/>
   <default>
     <joint damping="3" frictionloss="0.5" armature="0.1"/>

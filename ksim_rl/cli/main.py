@@ -1,0 +1,82 @@
+"""`ksim-rl <command>`: finds the command, and turns errors of users into one line."""
+
+import os
+import sys
+from collections.abc import Sequence
+
+USAGE = """\
+usage: ksim-rl <command> [arguments]
+
+  train    train a policy:          ksim-rl train task=cartpole_swingup num_envs=512
+  resume   continue a run:          ksim-rl resume RUN
+  eval     evaluate a policy:       ksim-rl eval RUN --episodes 100
+  play     record a video:          ksim-rl play RUN --seconds 10
+  envs     list the tasks
+
+RUN is a run folder (its newest checkpoint) or one of its checkpoints.
+`ksim-rl <command> --help` tells more. KSIM_RL_TRACEBACK=1 shows the traceback of an error.
+
+exit codes: 0 done (and solved, where a task has a threshold), 1 not solved, 2 refused: the command or its
+configuration is wrong, 3 the run failed, 130 / 143 interrupted and saved (SIGINT / SIGTERM)"""
+
+COMMANDS = ("train", "resume", "eval", "play", "envs")
+REFUSED, FAILED = 2, 3
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line and exit with its code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        code = _dispatch(arguments)
+    except KeyboardInterrupt:
+        _say("interrupted")
+        code = 130
+    except Exception as error:
+        if os.environ.get("KSIM_RL_TRACEBACK"):
+            raise
+        code = _code_for(error)
+        if code is None:
+            raise
+        _say(f"error: {' '.join(str(error).split())}")
+    sys.exit(code)
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(USAGE)
+        return 0 if arguments else REFUSED
+    command, *rest = arguments
+    if command == "--version":
+        from ksim_rl import __version__
+
+        print(f"ksim-rl {__version__}")
+        return 0
+    # Imported here, so that usage and mistyped commands answer at once.
+    if command == "train":
+        from ksim_rl.cli.train import train
+
+        return train(rest)
+    if command in COMMANDS:
+        from ksim_rl.cli import run_commands
+
+        return run_commands.run_command(command, rest)
+    from ksim_rl.checks import unknown_name
+
+    raise unknown_name("command", command, COMMANDS)
+
+
+def _code_for(error: Exception) -> int | None:
+    """Return the exit code for an error that its message explains; None for one that needs its traceback."""
+    if isinstance(error, ValueError):
+        return REFUSED
+    if isinstance(error, (RuntimeError, OSError)) and not isinstance(error, NotImplementedError):
+        return FAILED
+    return None
+
+
+def _say(text: str) -> None:
+    print(f"ksim-rl: {text}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

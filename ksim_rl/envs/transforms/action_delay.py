@@ -1,0 +1,93 @@
+"""Command latency."""
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torchrl.data import Composite
+
+from ksim_rl.envs.transforms.delay_cfg import DelayCfg
+from ksim_rl.envs.transforms.keyed_transform import Keys, as_keys, checked_out_keys
+from ksim_rl.envs.transforms.lagged_transform import LaggedTransform
+from ksim_rl.envs.transforms.specs import leaf_spec, set_leaf_spec
+
+
+class ActionDelay(LaggedTransform):
+    """The env receives the action of some env steps ago; the tensordict keeps the one that the policy chose.
+
+    Until the first action of an episode arrives, the env receives `initial`.
+
+    Args:
+        in_keys_inv: the actions that the env reads.
+        out_keys_inv: where the policy writes them. Default: the same keys.
+        delay: how lags are drawn, in env steps.
+        initial: what every element of the action is before the first one arrives.
+        seed, stream: see `KeyedTransform`.
+
+    Example:
+        >>> delay = ActionDelay(delay=DelayCfg(min_lag=0, max_lag=2))
+    """
+
+    def __init__(
+        self,
+        in_keys_inv: Keys = ("action",),
+        out_keys_inv: Keys | None = None,
+        *,
+        delay: DelayCfg,
+        initial: float = 0.0,
+        seed: int = 0,
+        stream: str | None = None,
+    ) -> None:
+        # ("action",) is the one-key form of "action" in TorchRL too.
+        keys = [key[0] if isinstance(key, tuple) and len(key) == 1 else key for key in as_keys(in_keys_inv)]
+        out_keys = checked_out_keys(keys, out_keys_inv)
+        super().__init__(
+            delay, len(keys), in_keys_inv=keys, out_keys_inv=out_keys, seed=seed, stream=stream
+        )
+        self.initial = initial
+
+    def transform_action_spec(self, action_spec: Composite) -> Composite:
+        """Move the specs to where the policy writes."""
+        specs = [leaf_spec(action_spec, key, type(self).__name__) for key in self.in_keys_inv]
+        for key, out_key, spec in zip(self.in_keys_inv, self.out_keys_inv, specs, strict=True):
+            if key != out_key:
+                del action_spec[key]
+                set_leaf_spec(action_spec, out_key, spec.clone())
+        batch_dims = action_spec.ndim
+        self._size_lags(
+            action_spec.shape.numel(),
+            [spec.shape[batch_dims:] for spec in specs],
+            [spec.dtype for spec in specs],
+            action_spec.device,
+        )
+        return action_spec
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if not self._sized:
+            # The action's shape is in the specs only, and they size the buffers.
+            assert self.container is not None and self.container.input_spec is not None
+        self._restart(self._reset_rows(tensordict))
+        return tensordict_reset
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        assert self._sized, "an env sizes its transforms before it steps"
+        actions = [self._checked(index, tensordict, key) for index, key in enumerate(self.out_keys_inv)]
+        self._advance()
+        arrived_E = self.lag_E < self.age_E
+        for index, (key, action) in enumerate(zip(self.in_keys_inv, actions, strict=True)):
+            action_E = action.reshape(self.num_rows, *action.shape[tensordict.ndim :])
+            self._push(index, action_E)
+            mask = arrived_E.reshape(-1, *[1] * (action_E.ndim - 1))
+            delayed = torch.where(mask, self._read(index, self.lag_E), self.initial)
+            tensordict.set(key, delayed.reshape(action.shape))
+        return tensordict
+
+    def _checked(self, index: int, tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
+        """Return the action, refused here since the env sees it only after the buffer."""
+        action = tensordict.get(key)
+        ring_KE: torch.Tensor = getattr(self, f"ring_{index}")
+        expected = (*tensordict.batch_size, *ring_KE.shape[2:])
+        if tuple(action.shape) != expected or action.dtype != ring_KE.dtype:
+            raise ValueError(
+                f"action {key!r} has shape {tuple(action.shape)} and dtype {action.dtype}: "
+                f"expected {expected} and {ring_KE.dtype}"
+            )
+        return action

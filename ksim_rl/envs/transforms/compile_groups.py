@@ -1,0 +1,94 @@
+"""Observation groups as transforms: the same ones that a user composes by hand."""
+
+from collections.abc import Mapping
+
+from tensordict import NestedKey
+from torchrl.envs.transforms import RenameTransform, Transform
+
+from ksim_rl.envs.transforms.clip import ObservationClip
+from ksim_rl.envs.transforms.delay import ObservationDelay
+from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg, ObservationTermCfg
+from ksim_rl.envs.transforms.groups import ObservationGroups
+from ksim_rl.envs.transforms.history import ObservationHistory
+from ksim_rl.envs.transforms.noise import ObservationNoise
+from ksim_rl.envs.transforms.scale import ObservationScale
+
+
+def compile_groups(groups: Mapping[str, ObservationGroupCfg]) -> list[Transform]:
+    """Return the transforms that write each group's vector under the group's name.
+
+    Per group: noise -> clip -> scale -> delay -> history -> concatenate. A term without any of these goes straight
+    from `("obs", name)` into the vector; the others pass through `("<group>_terms", name)`, which only groups with
+    `keep_terms` keep.
+    """
+    transforms: list[Transform] = []
+    vectors: dict[NestedKey, list[NestedKey]] = {}
+    drop: list[NestedKey] = []
+    for group, cfg in groups.items():
+        terms = {
+            name: term if cfg.enable_noise else _without_noise(term) for name, term in cfg.terms.items()
+        }
+        chained = {name: term for name, term in terms.items() if _has_chain(term)}
+        transforms += _chain(group, chained)
+        plain = [name for name in terms if name not in chained]
+        if cfg.keep_terms and plain:
+            transforms.append(
+                RenameTransform(
+                    [("obs", name) for name in plain],
+                    [_term_key(group, name) for name in plain],
+                    create_copy=True,
+                )
+            )
+        vectors[group] = [_term_key(group, name) if name in chained else ("obs", name) for name in terms]
+        if not cfg.keep_terms:
+            drop += [_term_key(group, name) for name in chained]
+    transforms.append(ObservationGroups(vectors, drop=drop))
+    return transforms
+
+
+def _chain(group: str, terms: Mapping[str, ObservationTermCfg]) -> list[Transform]:
+    """Return the transforms of the terms that need some; each term starts at its clean reading."""
+    transforms: list[Transform] = []
+    current: dict[str, NestedKey] = {name: ("obs", name) for name in terms}
+
+    def advance(names: list[str]) -> tuple[list[NestedKey], list[NestedKey]]:
+        in_keys = [current[name] for name in names]
+        current.update({name: _term_key(group, name) for name in names})
+        return in_keys, [current[name] for name in names]
+
+    noisy = {name: term.noise for name, term in terms.items() if term.noise is not None}
+    if noisy:
+        transforms.append(ObservationNoise(*advance(list(noisy)), noise=list(noisy.values())))
+    clipped = [name for name, term in terms.items() if term.clip is not None]
+    if clipped:
+        in_keys, out_keys = advance(clipped)
+        clips = {key: terms[name].clip for key, name in zip(in_keys, clipped, strict=True)}
+        transforms.append(ObservationClip(in_keys, out_keys, clip=clips))  # pyright: ignore[reportArgumentType]
+    scaled = [name for name, term in terms.items() if term.scale != 1.0]
+    if scaled:
+        in_keys, out_keys = advance(scaled)
+        scales = {key: terms[name].scale for key, name in zip(in_keys, scaled, strict=True)}
+        transforms.append(ObservationScale(in_keys, out_keys, scale=scales))
+    for name, term in terms.items():
+        if term.delay is not None:
+            # One transform per term: each sensor has a lag of its own.
+            transforms.append(ObservationDelay(*advance([name]), delay=term.delay))
+    for length in sorted({term.history_length for term in terms.values()} - {1}):
+        names = [name for name, term in terms.items() if term.history_length == length]
+        transforms.append(ObservationHistory(*advance(names), length=length))
+    return transforms
+
+
+def _has_chain(term: ObservationTermCfg) -> bool:
+    steps = (term.noise, term.clip, term.delay)
+    return any(step is not None for step in steps) or term.scale != 1.0 or term.history_length > 1
+
+
+def _without_noise(term: ObservationTermCfg) -> ObservationTermCfg:
+    return ObservationTermCfg(
+        term=term.term, clip=term.clip, scale=term.scale, delay=term.delay, history=term.history
+    )
+
+
+def _term_key(group: str, name: str) -> NestedKey:
+    return (f"{group}_terms", name)

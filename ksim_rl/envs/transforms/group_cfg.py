@@ -1,0 +1,88 @@
+"""What an observation group is made of, as parameters; `compile_groups` turns it into transforms."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from ksim_rl import checks
+from ksim_rl.envs.transforms.clip import check_clip
+from ksim_rl.envs.transforms.delay_cfg import DelayCfg
+from ksim_rl.envs.transforms.noise_cfg import NoiseCfg, PerDim
+from ksim_rl.envs.transforms.scale import check_scale
+
+
+class Reading(Protocol):
+    """Anything that reads an observation from the env's view: float32 [E, L]."""
+
+    def __call__(self, view: Any) -> Tensor:
+        """Return the clean reading of the current state."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class HistoryCfg:
+    """The last `length` frames, oldest first; in a group they are flattened frame after frame."""
+
+    length: int
+
+    def __post_init__(self) -> None:
+        if isinstance(self.length, bool) or not isinstance(self.length, int) or self.length < 1:
+            raise ValueError(f"length={self.length!r}: expected a whole number of frames of at least 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationTermCfg:
+    """One term of a group; its chain runs in the order of the fields.
+
+    Args:
+        term: what reads the clean observation.
+        noise: sensor noise.
+        clip: (low, high); None is no limit on that side.
+        scale: factor, or one per element.
+        delay: sensor latency in env steps.
+        history: number of frames; 1 and None are the present one alone.
+    """
+
+    term: Reading
+    noise: NoiseCfg | None = None
+    clip: tuple[float | None, float | None] | None = None
+    scale: PerDim = 1.0
+    delay: DelayCfg | None = None
+    history: int | HistoryCfg | None = None
+
+    def __post_init__(self) -> None:
+        if not callable(self.term):
+            raise ValueError(f"term={self.term!r}: expected a callable that reads the env's view")
+        if self.noise is not None and not isinstance(self.noise, NoiseCfg):
+            raise ValueError(f"noise={self.noise!r}: expected UniformNoise, GaussianNoise or ConstantNoise")
+        if self.clip is not None:
+            check_clip("clip", self.clip)
+        check_scale("scale", self.scale)
+        if isinstance(self.history, int):
+            checks.check_in_range("history", self.history, low=1)
+
+    @property
+    def history_length(self) -> int:
+        """Number of frames."""
+        return self.history.length if isinstance(self.history, HistoryCfg) else self.history or 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationGroupCfg:
+    """A vector made of terms, concatenated in order.
+
+    Args:
+        terms: by name; the env writes the clean reading to `("obs", name)`.
+        keep_terms: whether each term, as it stands in the vector, is also written to `("<group>_terms", name)`.
+        enable_noise: False leaves all noise of the group out.
+    """
+
+    terms: Mapping[str, ObservationTermCfg]
+    keep_terms: bool = False
+    enable_noise: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.terms:
+            raise ValueError("terms={}: expected at least one term")

@@ -1,0 +1,112 @@
+"""From a config to the objects of a run."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from torchrl.envs import EnvBase
+
+from ksim_rl import envs
+from ksim_rl.collectors import RolloutCollector
+from ksim_rl.modules import make_actor, make_critic
+from ksim_rl.trainers import state_tree
+from ksim_rl.trainers.episode_metrics import innermost
+from ksim_rl.trainers.evaluation import Evaluator
+from ksim_rl.trainers.loggers import make_loggers
+from ksim_rl.trainers.ppo_update import PPOUpdate
+from ksim_rl.trainers.run_cfg import RunCfg
+from ksim_rl.trainers.trainer import Trainer
+
+# Evaluations see other initial states than training does.
+EVALUATION_SEED_OFFSET = 1_000_003
+# The step limit of an evaluation where episodes have none.
+UNLIMITED_EPISODE_STEPS = 1000
+
+
+def build(cfg: RunCfg, *, run_folder: Path | None = None) -> Trainer:
+    """Build everything that a run needs, with all its memory allocated.
+
+    Torch's global seed and matmul precision are set from the config.
+
+    Args:
+        cfg: of the run.
+        run_folder: takes logs and checkpoints; None writes nothing.
+    """
+    device = cfg.resolved_device()
+    torch.manual_seed(cfg.seed)
+    torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
+
+    env = build_env(cfg, num_envs=cfg.num_envs, seed=cfg.task.seed if cfg.task.seed is not None else cfg.seed)
+    actor, critic = build_networks(cfg, env)
+    update = PPOUpdate(cfg.objective, actor=actor, critic=critic, data=cfg.data, seed=cfg.seed, device=device)
+    collector = RolloutCollector(
+        env,
+        actor,
+        rollout_length=cfg.data.rollout_length(cfg.num_envs),
+        keys=update.rollout_keys,
+        cfg=cfg.collector,
+    )
+    return Trainer(
+        cfg.trainer,
+        collector=collector,
+        update=update,
+        evaluator=build_evaluator(cfg, actor) if cfg.trainer.eval_episodes else None,
+        solved_at=solved_at(cfg),
+        loggers=make_loggers(cfg.logger, run_folder) if run_folder else (),
+        folder=run_folder / "checkpoint" if run_folder else None,
+        config=cfg.to_tree(),
+    )
+
+
+def build_env(cfg: RunCfg, *, num_envs: int, seed: int, render_mode: str | None = None) -> EnvBase:
+    """Build the env of a run, with another number of envs and another seed."""
+    scene = dataclasses.replace(cfg.task.scene, num_envs=num_envs)
+    task = dataclasses.replace(cfg.task, scene=scene, seed=seed)
+    return envs.build(task, device=cfg.resolved_device(), render_mode=render_mode)
+
+
+def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
+    """Build actor and critic for the observation groups and actions of an env."""
+    device = cfg.resolved_device()
+    spec: Any = env.observation_spec
+    actor = make_actor(
+        cfg.modules.actor,
+        obs_dim=spec["actor"].shape[-1],
+        action_dim=env.action_spec.shape[-1],
+        action_spec=env.action_spec,
+        device=device,
+    )
+    critic = make_critic(cfg.modules.critic, obs_dim=spec["critic"].shape[-1], device=device)
+    return actor, critic
+
+
+def load_actor(actor: ProbabilisticTensorDictSequential, state: Mapping[str, Any]) -> None:
+    """Copy a checkpoint's policy into an actor of the same shape.
+
+    Raises:
+        ValueError: naming the tensor that does not fit.
+    """
+    state_tree.copy_into(actor.state_dict(), state["update"]["actor"], what="actor")
+
+
+def build_evaluator(
+    cfg: RunCfg,
+    actor: ProbabilisticTensorDictSequential,
+    *,
+    episodes: int | None = None,
+    seed: int | None = None,
+) -> Evaluator:
+    """Build envs for evaluation, with sensor noise off, and what runs a policy in them."""
+    seed = cfg.seed + EVALUATION_SEED_OFFSET if seed is None else seed
+    env = build_env(cfg, num_envs=episodes or cfg.trainer.eval_episodes, seed=seed)
+    env.eval()
+    max_steps = innermost(env).max_episode_length or UNLIMITED_EPISODE_STEPS
+    return Evaluator(env, actor, max_steps=max_steps, seed=seed)
+
+
+def solved_at(cfg: RunCfg) -> float | None:
+    """Return the evaluation return that counts as solved, or None where the task has no such figure."""
+    return envs.task(cfg.task_name).solved_at if cfg.task_name in envs.names() else None

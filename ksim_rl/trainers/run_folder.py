@@ -1,0 +1,129 @@
+"""A whole run in a folder: config, training, evaluation, learning curves, video."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from omegaconf import OmegaConf
+from tensordict.nn import ProbabilisticTensorDictSequential
+
+from ksim_rl.trainers import checkpoint, curves, video
+from ksim_rl.trainers.build import build, build_env, build_networks, load_actor
+from ksim_rl.trainers.episode_metrics import innermost
+from ksim_rl.trainers.evaluation import Evaluation
+from ksim_rl.trainers.progress import RunProgress
+from ksim_rl.trainers.run_cfg import RunCfg
+from ksim_rl.trainers.trainer import Outcome, Trainer
+
+CONFIG, EVALUATION, CURVES, VIDEO = "config.yaml", "evaluation.json", "curves.png", "video.mp4"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Policy:
+    """A trained policy with the config of its run."""
+
+    cfg: RunCfg
+    actor: ProbabilisticTensorDictSequential
+    iteration: int
+
+
+def run(
+    cfg: RunCfg, run_folder: Path, *, progress: RunProgress, resume_from: checkpoint.Checkpoint | None = None
+) -> Outcome:
+    """Train, and leave in `run_folder` the config, metrics, checkpoints, evaluation, learning curves and a video.
+
+    What cannot be drawn (no OpenGL) is said in one line of `progress`.
+
+    Raises:
+        ValueError: when the checkpoint to resume from belongs to another config.
+    """
+    run_folder.mkdir(parents=True, exist_ok=True)
+    checkpoint.remove_leftovers(run_folder / "checkpoint")
+    (run_folder / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
+    trainer = build(cfg, run_folder=run_folder)
+    if resume_from is not None:
+        trainer.load_state_dict(resume_from.state)
+    outcome = trainer.train(progress)
+    if outcome.evaluation is not None:
+        write_evaluation(
+            run_folder, outcome.evaluation, iteration=outcome.iteration, solved_at=trainer.solved_at
+        )
+    _draw_curves(cfg, run_folder, solved_at=trainer.solved_at, note=progress.note)
+    if cfg.trainer.video and outcome.interrupted_by is None:
+        record_video(cfg, trainer.update.actor, run_folder / VIDEO, note=progress.note)
+    close(trainer)
+    return outcome
+
+
+def load_policy(path: Path, *, device: str = "auto") -> Policy:
+    """Rebuild the policy of a checkpoint, or of the newest one in a run folder.
+
+    Raises:
+        CheckpointError: when there is none, or it is damaged.
+        ValueError: when its config does not fit this version.
+    """
+    saved = checkpoint.load(checkpoint.latest(path))
+    cfg = RunCfg.from_tree({**saved.config, "device": device})
+    env = build_env(cfg, num_envs=1, seed=cfg.seed)
+    actor, _ = build_networks(cfg, env)
+    env.close(raise_if_closed=False)
+    load_actor(actor, saved.state)
+    return Policy(cfg=cfg, actor=actor, iteration=saved.iteration)
+
+
+def write_evaluation(
+    run_folder: Path, evaluation: Evaluation, *, iteration: int, solved_at: float | None
+) -> Path:
+    """Write the figures of an evaluation as JSON."""
+    figures = {"iteration": iteration, **evaluation.as_dict(), "solved_at": solved_at}
+    if solved_at is not None:
+        figures["solved"] = evaluation.return_mean >= solved_at
+    path = run_folder / EVALUATION
+    path.write_text(json.dumps(figures, indent=2) + "\n")
+    return path
+
+
+def record_video(
+    cfg: RunCfg,
+    actor: ProbabilisticTensorDictSequential,
+    path: Path,
+    *,
+    note: Callable[[str], None],
+    seconds: float | None = None,
+    seed: int = 0,
+) -> Path | None:
+    """Record the policy in one env; where that is impossible, say why and how to mend it, and return None."""
+    env = build_env(cfg, num_envs=1, seed=seed, render_mode="rgb_array")
+    env.eval()
+    step_dt = innermost(env).step_dt
+    steps = max(1, round((seconds or cfg.trainer.video_s) / step_dt))
+    try:
+        written = video.record(env, actor, path, steps=steps, fps=1.0 / step_dt, seed=seed)
+    except video.VideoUnavailableError as error:
+        note(f"no video: {error}")
+        return None
+    finally:
+        env.close(raise_if_closed=False)
+    return written
+
+
+def close(trainer: Trainer) -> None:
+    """Free the worlds of a trainer."""
+    trainer.collector.env.close(raise_if_closed=False)
+    if trainer.evaluator is not None:
+        trainer.evaluator.env.close(raise_if_closed=False)
+
+
+def _draw_curves(
+    cfg: RunCfg, run_folder: Path, *, solved_at: float | None, note: Callable[[str], None]
+) -> None:
+    table = run_folder / "metrics.csv"
+    if not table.exists():
+        note("no learning curves: they are drawn from metrics.csv, which needs logger.csv=true")
+        return
+    title = f"{cfg.task_name}: {cfg.num_envs} envs on {cfg.device}, seed {cfg.seed}"
+    try:
+        curves.draw(table, run_folder / CURVES, title=title, solved_at=solved_at)
+    except ValueError as error:
+        note(f"no learning curves: {error}")

@@ -1,0 +1,111 @@
+import gc
+
+import pytest
+import torch
+
+from ksim_rl.physics import Captured, capture
+from tests.physics.models import standing_quadrupeds
+
+
+def test_on_cpu_it_is_a_plain_call():
+    calls = []
+    body = Captured(lambda: calls.append(capture.is_capturing()), device="cpu")
+    for _ in range(5):
+        body()
+    assert calls == [False] * 5
+    assert not body.ready
+
+
+def test_a_call_in_a_live_block_leaves_the_world_bit_identical():
+    graphed, live = standing_quadrupeds(), standing_quadrupeds()
+    with capture.live_launches():
+        for _ in range(3):
+            live.step(2)
+            live.refresh()
+    for _ in range(3):
+        graphed.step(2)
+        graphed.refresh()
+    assert torch.equal(graphed.qpos_EL, live.qpos_EL)
+    assert torch.equal(graphed.sensordata_EL, live.sensordata_EL)
+
+
+def test_collection_is_paused_and_comes_back():
+    assert gc.isenabled()
+    with capture.no_collection():
+        assert not gc.isenabled()
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        with capture.no_collection():
+            pass
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+
+
+def test_warmup_is_checked():
+    with pytest.raises(ValueError, match="warmup=0"):
+        Captured(lambda: None, device="cpu", warmup=0)
+
+
+@pytest.mark.gpu
+def test_captured_physics_and_torch_equal_eager_ones():
+    eager, captured = (standing_quadrupeds(16, device="cuda") for _ in range(2))
+    mask_E = torch.zeros(16, dtype=torch.bool, device="cuda")
+
+    def body_of(world):
+        reward_E = torch.zeros(16, device="cuda")
+
+        def body() -> None:
+            world.ctrl_EL.mul_(0.99)
+            world.step(4)
+            mask_E.copy_(world.qpos_EL[:, 2] < 0.2)
+            world.reset(mask_E)
+            world.refresh()
+            reward_E.add_(world.qpos_EL[:, 2])
+
+        return body, reward_E
+
+    eager_body, eager_reward_E = body_of(eager)
+    body, reward_E = body_of(captured)
+    graph = Captured(body, device="cuda", warmup=2, require_graphs=True)
+    for _ in range(8):
+        eager_body()
+        graph()
+    assert graph.ready
+    torch.testing.assert_close(captured.qpos_EL, eager.qpos_EL, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(reward_E, eager_reward_E, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.gpu
+def test_a_replay_does_not_sync_and_counts_as_one_call():
+    world = standing_quadrupeds(16, device="cuda")
+    count = torch.zeros((), dtype=torch.int64, device="cuda")
+
+    def body() -> None:
+        world.step(2)
+        world.refresh()
+        count.add_(1)
+
+    graph = Captured(body, device="cuda", require_graphs=True)
+    for _ in range(4):
+        graph()
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        graph()
+        world.step(2)
+        world.refresh()
+        world.reset(torch.zeros(16, dtype=torch.bool, device="cuda"))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert count.item() == 5
+
+
+@pytest.mark.gpu
+def test_an_uncapturable_body_says_so():
+    total = torch.zeros((), device="cuda")
+    graph = Captured(lambda: total.add_(total.item()), device="cuda", warmup=1)
+    graph()
+    with pytest.raises(RuntimeError, match="cannot be captured"):
+        graph()
