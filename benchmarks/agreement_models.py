@@ -91,6 +91,7 @@ _PLACES = ((0.2, 0.12), (0.2, -0.12), (-0.2, 0.12), (-0.2, -0.12))
 
 QUADRUPED = f"""
 <mujoco model="quadruped">
+  <compiler angle="radian"/>
   <option timestep="0.005" integrator="implicitfast"/>
   <default>
     <joint damping="0.5" armature="0.01" frictionloss="0.1"/>

@@ -4,29 +4,33 @@ A generator with hidden state gives other numbers as soon as one more reset happ
 hash of its coordinates, as in Salmon et al., "Parallel random numbers: as easy as 1, 2, 3" (SC 2011): one row's reset
 never changes another row's numbers, a masked reset at every step and TorchRL's reset-when-any-done agree exactly, and
 a resumed run needs only the integers. The mixing function is Wellons' two-round 32-bit hash (constants from his
-"hash-prospector" search); all arithmetic is int64 and never exceeds 2^63, so each device gives the same bits.
+"hash-prospector" search), in wrapping 32-bit arithmetic, so that each device gives the same bits.
 
-Draws made at every step are keyed by a step counter; draws made at a reset by a per-env counter of resets.
+Draws made at every step are keyed by a step counter; draws made at a reset by a per-env counter of resets. A draw is
+one Warp kernel, wrapped as a torch operator: it can be captured and compiled.
 """
 
-import math
 import zlib
 from typing import NamedTuple
 
 import torch
+import warp as wp
 from torch import Tensor
 
-_MASK = 0xFFFFFFFF
-# Constants above 2^31 are written as negative numbers: products stay within int64, their low 32 bits are the same.
-_GOLDEN = 0x9E3779B9 - (1 << 32)
-_MUL_1, _MUL_2 = 0x21F0AAAD, 0xD35A2D97 - (1 << 32)
+from ksim_rl.physics.streams import warp_scope
+
+_UNIFORM, _NORMAL = range(2)
+_GOLDEN = wp.constant(wp.uint32(0x9E3779B9))
+_MUL_1, _MUL_2 = wp.constant(wp.uint32(0x21F0AAAD)), wp.constant(wp.uint32(0xD35A2D97))
 
 
 class RowKeys(NamedTuple):
-    """Two 32-bit words per env row, each an int64 tensor of shape [E]."""
+    """The coordinates of one draw, up to the number within the row."""
 
-    first_E: Tensor
-    second_E: Tensor
+    seed: Tensor
+    stream: int
+    counter: Tensor
+    num_rows: int
 
 
 def stream_id(name: str) -> int:
@@ -34,15 +38,8 @@ def stream_id(name: str) -> int:
     return zlib.crc32(name.encode()) & 0x7FFFFFFF
 
 
-def _mix(x: Tensor) -> Tensor:
-    """Scramble 32-bit words held in int64."""
-    x = ((x ^ (x >> 16)) * _MUL_1) & _MASK
-    x = ((x ^ (x >> 15)) * _MUL_2) & _MASK
-    return x ^ (x >> 15)
-
-
 def row_keys(seed: Tensor, stream: int, counter: Tensor, num_rows: int) -> RowKeys:
-    """Derive the keys of one draw for each env row.
+    """Name the coordinates of one draw for each env row.
 
     Args:
         seed: int64, shape [].
@@ -50,18 +47,7 @@ def row_keys(seed: Tensor, stream: int, counter: Tensor, num_rows: int) -> RowKe
         counter: int64, shape [] (all rows at the same count) or [E].
         num_rows: E.
     """
-    row_E = torch.arange(num_rows, device=seed.device, dtype=torch.int64)
-    low, high = counter & _MASK, counter >> 32
-    base = _mix((seed ^ (seed >> 32)) & _MASK ^ stream)
-    first_E = _mix((base + low * _GOLDEN) & _MASK) ^ _mix(row_E + high + 1)
-    second_E = _mix((first_E + row_E * _GOLDEN + _GOLDEN) & _MASK) ^ _mix((low + stream) & _MASK)
-    return RowKeys(_mix(first_E), _mix(second_E))
-
-
-def _bits(keys: RowKeys, n: int) -> Tensor:
-    """Return uniform 32-bit words, int64 [E, n]."""
-    index_L = (torch.arange(1, n + 1, device=keys.first_E.device, dtype=torch.int64) * _GOLDEN) & _MASK
-    return _mix(_mix(keys.first_E[:, None] ^ index_L) ^ keys.second_E[:, None])
+    return RowKeys(seed, stream, counter, num_rows)
 
 
 def uniform(keys: RowKeys, n: int, low: float | Tensor = 0.0, high: float | Tensor = 1.0) -> Tensor:
@@ -74,20 +60,14 @@ def uniform(keys: RowKeys, n: int, low: float | Tensor = 0.0, high: float | Tens
     Returns:
         float32 [E, n].
     """
-    unit_EL = (_bits(keys, n) >> 8).to(torch.float32) * 2.0**-24
-    if isinstance(low, float) and isinstance(high, float) and low == 0.0 and high == 1.0:
-        return unit_EL
-    return low + unit_EL * (high - low)
+    if isinstance(low, Tensor) or isinstance(high, Tensor):
+        return low + _draw(*keys, n, _UNIFORM, 0.0, 1.0) * (high - low)
+    return _draw(*keys, n, _UNIFORM, float(low), float(high))
 
 
 def normal(keys: RowKeys, n: int) -> Tensor:
     """Draw from the standard normal distribution (Box and Muller, 1958), float32 [E, n]."""
-    half = (n + 1) // 2
-    unit_EL = uniform(keys, 2 * half)
-    # 1 - u lies in (0, 1], so that the logarithm is finite.
-    radius_EL = torch.sqrt(-2.0 * torch.log(1.0 - unit_EL[:, :half]))
-    angle_EL = (2.0 * math.pi) * unit_EL[:, half:]
-    return torch.cat((radius_EL * torch.cos(angle_EL), radius_EL * torch.sin(angle_EL)), dim=1)[:, :n]
+    return _draw(*keys, n, _NORMAL, 0.0, 1.0)
 
 
 def integers(keys: RowKeys, n: int, low: int | Tensor, high: int | Tensor) -> Tensor:
@@ -100,6 +80,102 @@ def integers(keys: RowKeys, n: int, low: int | Tensor, high: int | Tensor) -> Te
     Returns:
         int64 [E, n].
     """
-    span = high - low + 1
+    bits_EL = _draw_bits(*keys, n)
     # Scaling keeps the bias below span / 2^32, without the rejection loop that would need a host sync.
-    return low + ((_bits(keys, n) * span) >> 32)
+    return low + ((bits_EL * (high - low + 1)) >> 32)
+
+
+@wp.func
+def _mix(word: wp.uint32) -> wp.uint32:
+    x = word
+    x = (x ^ (x >> wp.uint32(16))) * _MUL_1
+    x = (x ^ (x >> wp.uint32(15))) * _MUL_2
+    return x ^ (x >> wp.uint32(15))
+
+
+@wp.func
+def _bits(seed: wp.int64, stream: wp.uint32, counter: wp.int64, row: wp.uint32, index: wp.uint32) -> wp.uint32:
+    low = wp.uint32(counter & wp.int64(0xFFFFFFFF))
+    high = wp.uint32((counter >> wp.int64(32)) & wp.int64(0xFFFFFFFF))
+    base = _mix(wp.uint32((seed ^ (seed >> wp.int64(32))) & wp.int64(0xFFFFFFFF)) ^ stream)
+    first = _mix(base + low * _GOLDEN) ^ _mix(row + high + wp.uint32(1))
+    second = _mix(first + row * _GOLDEN + _GOLDEN) ^ _mix(low + stream)
+    return _mix(_mix(_mix(first) ^ ((index + wp.uint32(1)) * _GOLDEN)) ^ _mix(second))
+
+
+@wp.func
+def _unit(bits: wp.uint32) -> float:
+    return float(bits >> wp.uint32(8)) * 5.9604644775390625e-08  # 2^-24
+
+
+@wp.kernel(enable_backward=False)
+def _fill(
+    seed: wp.array[wp.int64],
+    stream: wp.uint32,
+    counter: wp.array[wp.int64],
+    counter_stride: int,
+    kind: int,
+    low: float,
+    high: float,
+    out: wp.array2d[float],
+):
+    row, i = wp.tid()
+    count = counter[row * counter_stride]
+    if kind == 0:
+        out[row, i] = low + _unit(_bits(seed[0], stream, count, wp.uint32(row), wp.uint32(i))) * (high - low)
+    else:
+        u = _unit(_bits(seed[0], stream, count, wp.uint32(row), wp.uint32(2 * i)))
+        v = _unit(_bits(seed[0], stream, count, wp.uint32(row), wp.uint32(2 * i + 1)))
+        # 1 - u lies in (0, 1], so that the logarithm is finite.
+        out[row, i] = wp.sqrt(-2.0 * wp.log(1.0 - u)) * wp.cos(6.283185307179586 * v)
+
+
+@wp.kernel(enable_backward=False)
+def _fill_bits(
+    seed: wp.array[wp.int64],
+    stream: wp.uint32,
+    counter: wp.array[wp.int64],
+    counter_stride: int,
+    out: wp.array2d[wp.int64],
+):
+    row, i = wp.tid()
+    count = counter[row * counter_stride]
+    out[row, i] = wp.int64(_bits(seed[0], stream, count, wp.uint32(row), wp.uint32(i)))
+
+
+@torch.library.custom_op("ksim_rl::draw", mutates_args=())
+def _draw(
+    seed: Tensor, stream: int, counter: Tensor, num_rows: int, n: int, kind: int, low: float, high: float
+) -> Tensor:
+    out_EL = torch.empty(num_rows, n, dtype=torch.float32, device=seed.device)
+    _launch(_fill, seed, stream, counter, [kind, low, high], out_EL)
+    return out_EL
+
+
+@torch.library.custom_op("ksim_rl::draw_bits", mutates_args=())
+def _draw_bits(seed: Tensor, stream: int, counter: Tensor, num_rows: int, n: int) -> Tensor:
+    out_EL = torch.empty(num_rows, n, dtype=torch.int64, device=seed.device)
+    _launch(_fill_bits, seed, stream, counter, [], out_EL)
+    return out_EL
+
+
+@_draw.register_fake
+def _(seed: Tensor, stream: int, counter: Tensor, num_rows: int, n: int, kind: int, low: float, high: float) -> Tensor:
+    return seed.new_empty((num_rows, n), dtype=torch.float32)
+
+
+@_draw_bits.register_fake
+def _(seed: Tensor, stream: int, counter: Tensor, num_rows: int, n: int) -> Tensor:
+    return seed.new_empty((num_rows, n), dtype=torch.int64)
+
+
+def _launch(
+    kernel: wp.Kernel, seed: Tensor, stream: int, counter: Tensor, options: list[int | float], out_EL: Tensor
+) -> None:
+    with warp_scope(out_EL.device):
+        stride = int(counter.ndim > 0)
+        seeds = wp.from_torch(seed.reshape(1), dtype=wp.int64, return_ctype=True)
+        counts = wp.from_torch(counter.reshape(-1), dtype=wp.int64, return_ctype=True)
+        out = wp.from_torch(out_EL, return_ctype=True)
+        inputs = [seeds, stream, counts, stride, *options]
+        wp.launch(kernel, dim=tuple(out_EL.shape), inputs=inputs, outputs=[out], device=str(out_EL.device))

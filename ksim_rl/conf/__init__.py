@@ -24,7 +24,14 @@ def compose(overrides: Sequence[str] = ()) -> RunCfg:
     register()
     GlobalHydra.instance().clear()
     with hydra.initialize_config_module(MODULE, version_base="1.3"):
-        return RunCfg.from_tree(_plain(hydra.compose(NAME, overrides=list(overrides))))
+        return compose_within(overrides)
+
+
+def compose_within(overrides: Sequence[str]) -> RunCfg:
+    """Do the same where Hydra is initialized already."""
+    plain = OmegaConf.to_container(hydra.compose(NAME, overrides=list(overrides)), resolve=True)
+    assert isinstance(plain, dict)
+    return RunCfg.from_tree({str(key): value for key, value in plain.items()})
 
 
 @cache
@@ -51,11 +58,5 @@ def training_defaults(name: str) -> dict[str, Any]:
     for key, value in task.training.items():
         OmegaConf.update(tree, key, value)
     plain = OmegaConf.to_container(tree)
-    assert isinstance(plain, dict)
-    return {str(key): value for key, value in plain.items()}
-
-
-def _plain(config: Any) -> dict[str, Any]:
-    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
     return {str(key): value for key, value in plain.items()}

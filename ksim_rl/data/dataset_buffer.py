@@ -103,12 +103,3 @@ class DatasetBuffer(ReplayBuffer):
     def all(self) -> TensorDictBase:
         """Return the dataset `["D"]`: views of the storage, which the next `extend` overwrites."""
         return dims.name(self._dataset.get(slice(None)), dims.D)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the dataset, the sampler's integers and the counter of removed rows."""
-        return super().state_dict() | {"non_finite_count": self.non_finite_count.clone()}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continue where `state_dict` was taken."""
-        super().load_state_dict(state_dict)
-        self.non_finite_count.copy_(state_dict["non_finite_count"])

@@ -71,6 +71,18 @@ class DatasetStorage(TensorStorage):
         self._len = self.max_size
         self._bump_mutation_revision()
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return the content and the counter of removed rows."""
+        return super().state_dict() | {"non_finite_count": self.non_finite_count.clone()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue where `state_dict` was taken."""
+        super().load_state_dict(state_dict)
+        if self.device == "auto" and self.initialized:
+            self.device = self._storage.get(MASK_KEY).device
+            self.non_finite_count = self.non_finite_count.to(self.device)
+        self.non_finite_count.copy_(state_dict["non_finite_count"])
+
     def _allocate(self, leaves: dict[Any, Tensor], batch_dims: int) -> None:
         if self.device == "auto":
             self.device = next(iter(leaves.values())).device

@@ -157,5 +157,6 @@ def permutation(seed: int, epoch: Tensor, size: int) -> Tensor:
     """
     seed_tensor = torch.full((), seed, dtype=torch.int64, device=epoch.device)
     keys = random.row_keys(seed_tensor, _STREAM, epoch, size)
-    # 63 random bits: ties are rare, and the rank of equal keys is still a permutation.
-    return torch.argsort((keys.first_E << 31) ^ keys.second_E, stable=True)
+    high_D, low_D = random.integers(keys, 2, 0, 2**31 - 1).unbind(1)
+    # 62 random bits: ties are rare, and the rank of equal keys is still a permutation.
+    return torch.argsort((high_D << 31) | low_D, stable=True)

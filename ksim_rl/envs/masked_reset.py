@@ -36,15 +36,20 @@ class MaskedReset(EnvBase):
 
     # A reference, so that it costs nothing per step. Inside a captured graph it points to the graph's static output.
     _last_root: TensorDictBase | None = None
+    _masks: bool | None = None
 
     @property
     def last_root(self) -> TensorDictBase | None:
         """The root values that the next action answers to; a caller that replays a graph sets it after a replay."""
-        return self.__dict__.get("_last_root")
+        return self._last_root
 
     @last_root.setter
     def last_root(self, tensordict: TensorDictBase | None) -> None:
-        self.__dict__["_last_root"] = tensordict
+        self._remember(tensordict)
+
+    def _remember(self, root: TensorDictBase | None) -> None:
+        # Past `nn.Module.__setattr__`, which takes longer than the rest of this.
+        object.__setattr__(self, "_last_root", root)
 
     @property
     def dim_names(self) -> list[str | None]:
@@ -56,7 +61,7 @@ class MaskedReset(EnvBase):
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         next_td = self._labelled(super()._step_proc_data(next_tensordict_out))
-        self.__dict__["_last_root"] = next_td
+        self._remember(next_td)
         return next_td
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -67,7 +72,7 @@ class MaskedReset(EnvBase):
         mask_E1 = tensordict.get("done").clone()
         reset_td = TensorDict({_RESET: mask_E1}, batch_size=tensordict.batch_size, device=tensordict.device)
         root = self._merge(tensordict, self._fresh(reset_td), mask_E1)
-        self.__dict__["_last_root"] = root
+        self._remember(root)
         return root
 
     def reset(
@@ -111,7 +116,7 @@ class MaskedReset(EnvBase):
             root = self._labelled(super().reset(tensordict, **kwargs))
         else:
             root = self._masked_reset(tensordict, mask_E1, **kwargs)
-        self.__dict__["_last_root"] = root
+        self._remember(root)
         return root
 
     def seed(self, seed: int = -1) -> int:
@@ -130,14 +135,16 @@ class MaskedReset(EnvBase):
 
     def _masks_resets(self) -> bool:
         """Whether resets go through masks; decided from what never changes, so it costs a dict look-up."""
-        known = self.__dict__.get("_masks_resets_cached")
+        known = self._masks
         if known is None:
             inner: Any = self
             while "base_env" in inner._modules:
                 inner = inner.base_env
             foreign = isinstance(inner, _EnvWrapper | BatchedEnvBase)
-            known = bool(self.batch_size) and not foreign and self.reset_keys == [_RESET] and self._simple_done
-            self.__dict__["_masks_resets_cached"] = known
+            known = (
+                bool(self.batch_size) and not foreign and self.reset_keys == [_RESET] and self._simple_done
+            )
+            object.__setattr__(self, "_masks", known)
         return known
 
     def _masked_reset(
@@ -218,7 +225,9 @@ class MaskedReset(EnvBase):
             )
         return mask.reshape(done_shape)
 
-    def _with_mask_of(self, tensordict: TensorDictBase | None, env_ids: Sequence[int] | Tensor) -> TensorDictBase:
+    def _with_mask_of(
+        self, tensordict: TensorDictBase | None, env_ids: Sequence[int] | Tensor
+    ) -> TensorDictBase:
         """Turn row numbers into the mask before any transform sees them."""
         if tensordict is not None and tensordict.get(_RESET, None) is not None:
             raise ValueError("env_ids= and tensordict['_reset'] were both given: pass one of them")
@@ -241,7 +250,9 @@ def mask_from_env_ids(
         raise ValueError(f"env_ids need one batch dim, and this env has batch_size {tuple(batch_size)}")
     num_envs = batch_size[0]
     if isinstance(env_ids, Tensor) and (env_ids.dtype.is_floating_point or env_ids.dtype == torch.bool):
-        raise ValueError(f"env_ids has dtype {env_ids.dtype}: expected integers; a mask goes to tensordict['_reset']")
+        raise ValueError(
+            f"env_ids has dtype {env_ids.dtype}: expected integers; a mask goes to tensordict['_reset']"
+        )
     ids = env_ids.reshape(-1).tolist() if isinstance(env_ids, Tensor) else list(env_ids)
     if any(isinstance(row, bool) or not hasattr(row, "__index__") for row in ids):
         raise ValueError(f"env_ids={ids!r}: expected integers")

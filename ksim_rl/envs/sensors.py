@@ -27,7 +27,8 @@ class ContactState(NamedTuple):
     found_EN: Tensor
     """1 where the geom touches, else 0."""
     force_EN3: Tensor
-    """Net contact force on the geom, N, [E, N, 3], in the world frame."""
+    """Net contact force of the geom on the body, N, [E, N, 3], in the world frame: MuJoCo's sign, so that a robot's
+    foot that carries weight reads negative z."""
     air_time_EN: Tensor
     """Seconds since the geom left the ground; 0 while it touches."""
     last_air_time_EN: Tensor

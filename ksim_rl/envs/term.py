@@ -18,6 +18,7 @@ from ksim_rl.checks import check_choice, check_in_range, check_pair
 
 if TYPE_CHECKING:
     from ksim_rl.envs.view import EnvView
+    from ksim_rl.envs.visualizer import DebugVisualizer
 
 EVENT_MODES = ("startup", "reset", "interval", "step")
 METRIC_REDUCTIONS = ("mean", "last", "max", "sum")
@@ -122,7 +123,7 @@ class CommandTerm(ABC):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the command of the current state and targets, float32 [E, K]."""
 
-    def draw_debug(self, view: EnvView, visualizer: object, env_index: int) -> None:
+    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw the command of one env (nothing by default)."""
 
 

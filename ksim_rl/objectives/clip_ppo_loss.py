@@ -145,7 +145,7 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
             if value_clip_fraction is not None:
                 out.set("value_clip_fraction", value_clip_fraction)
             if explained_variance is not None:
-                out.set("explained_variance", explained_variance)
+                out.set("explained_variance", explained_variance.squeeze(-1))
         if self.log_ratio_statistics:
             out.update(_ratio_statistics(log_behavior_weight.detach()))
         if self.reduction != "mean":

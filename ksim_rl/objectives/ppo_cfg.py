@@ -75,8 +75,8 @@ class PPOCfg:
             check_in_range("max_grad_norm", self.max_grad_norm, low=0.0, low_open=True)
         for index, beta in enumerate(self.betas):
             check_in_range(f"betas[{index}]", beta, low=0.0, high=1.0)
-        if len(self.betas) != 2:
-            raise ValueError(f"betas={self.betas!r}: expected two numbers")
+        if len(self.betas) != 2 or max(self.betas) >= 1.0:
+            raise ValueError(f"betas={self.betas!r}: expected two numbers in [0, 1)")
         check_choice("schedule", self.schedule, SCHEDULES)
         check_choice("normalize_advantage", self.normalize_advantage, NORMALIZATIONS)
         if self.learning_rate_min > self.learning_rate_max:

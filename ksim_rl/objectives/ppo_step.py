@@ -1,5 +1,6 @@
 """One gradient step of PPO, and the parts that it needs, built from one config."""
 
+import copy
 from collections.abc import Callable
 from functools import reduce
 from operator import add
@@ -59,12 +60,10 @@ def make_optimizer(cfg: PPOCfg, *modules: nn.Module) -> torch.optim.Adam:
 
 
 def load_optimizer_state_(optimizer: torch.optim.Optimizer, state_dict: dict[str, Any]) -> None:
-    """Load a state dict and keep the learning rate a tensor on the device of the parameters, at its address.
-
-    Oad a state dict and keep the learning rate a tensor on the device of the parameters, at its address.
-    """
+    """Load a state dict; the learning rate stays a tensor on the parameters' device, at its address."""
     learning_rates = [group["lr"] for group in optimizer.param_groups]
-    optimizer.load_state_dict(state_dict)
+    # torch takes over the tensors of the state dict themselves, and steps would change them in place.
+    optimizer.load_state_dict(copy.deepcopy(state_dict))
     for group, learning_rate in zip(optimizer.param_groups, learning_rates, strict=True):
         if isinstance(learning_rate, Tensor):
             group["lr"] = learning_rate.copy_(torch.as_tensor(group["lr"]))

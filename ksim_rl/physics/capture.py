@@ -7,7 +7,7 @@ import gc
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import torch
 import warp as wp
@@ -177,11 +177,17 @@ class Captured:
             graph.capture_begin(capture_error_mode="thread_local")
             try:
                 wp.capture_begin(stream=warp_side, external=True)
-                try:
-                    self.body()
-                finally:
-                    # It holds no graph of its own, but keeps the kernels loaded that torch's graph launches.
-                    warp_graph = wp.capture_end(stream=warp_side)
-            finally:
+                self.body()
+                # It holds no graph of its own, but keeps the kernels loaded that torch's graph launches.
+                warp_graph = wp.capture_end(stream=warp_side)
                 graph.capture_end()
+            except Exception as error:
+                # Leave both captures; they complain about the broken graph, which the first error explains.
+                for end in (lambda: wp.capture_end(stream=warp_side), graph.capture_end):
+                    with suppress(RuntimeError):
+                        end()
+                raise RuntimeError(
+                    f"the body cannot be captured in a CUDA graph: {error}. It must not sync with the host (.item(), "
+                    "branching on a tensor, boolean indexing), nor allocate a size that depends on data"
+                ) from error
         return graph, warp_graph

@@ -5,7 +5,7 @@ from collections.abc import Callable, Hashable
 import torch
 import warp as wp
 
-from ksim_rl.physics.capture import no_collection, refuse_or_warn, wants_live_launches
+from ksim_rl.physics.capture import is_capturing, no_collection, refuse_or_warn, wants_live_launches
 from ksim_rl.physics.streams import warp_device, warp_scope, warp_stream
 
 
@@ -21,6 +21,7 @@ class WarpGraphs:
         self._available = refuse_or_warn(device, require_graphs=require_graphs)
         self._graphs: dict[Hashable, wp.Graph] = {}
         self._warm: set[Hashable] = set()
+        self._joined: list[wp.Graph | None] = []
         # The default stream cannot record, so graphs are recorded on a stream of our own and launched on any.
         self._stream = wp.Stream(warp_device(device)) if device.type == "cuda" else None
 
@@ -28,7 +29,7 @@ class WarpGraphs:
         """Run `launches`, in order with torch's current stream. `key` names what it does."""
         with warp_scope(self.device):
             if not self._available or wants_live_launches(self.device):
-                launches()
+                self._launch_live(launches)
                 return
             if key not in self._graphs:
                 if self._stream is not None and key not in self._warm:
@@ -43,6 +44,18 @@ class WarpGraphs:
         """Forget all graphs, and free what they hold."""
         self._graphs.clear()
         self._warm.clear()
+        self._joined.clear()
+
+    def _launch_live(self, launches: Callable[[], None]) -> None:
+        if self._stream is None or is_capturing() or not torch.cuda.is_current_stream_capturing():
+            launches()
+            return
+        # A capture that torch began by itself: Warp must join it, or its loops would sync with the host.
+        stream = warp_stream(torch.cuda.current_stream(self.device))
+        with wp.ScopedCapture(stream=stream, external=True) as joined:
+            launches()
+        # It keeps the kernels loaded that torch's graph launches.
+        self._joined.append(joined.graph)
 
     def _record(self, launches: Callable[[], None]) -> wp.Graph:
         if self._stream is None:

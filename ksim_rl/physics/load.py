@@ -17,6 +17,8 @@ Source = str | Path | mujoco.MjSpec
 _ELEMENT = re.compile(r"Element '(?P<tag>[^']*)', line (?P<line>\d+)")
 _NAMED_ELEMENT = re.compile(r"Element name '(?P<name>[^']*)', id (?P<id>-?\d+)(, line (?P<line>\d+))?")
 _FILE_IN_MESSAGE = re.compile(r"file '(?P<file>[^']+)'")
+_SINGULAR = re.compile(r"Inertia matrix is too close to singular.* DOF (?P<dof>\d+)")
+_NAN_ATTRIBUTE = re.compile(r"=\s*[\"'][^\"']*\b[nN][aA][nN]\b")
 _LINE = re.compile(r"[Ll]ine number=(?P<line>\d+)")
 
 
@@ -30,7 +32,9 @@ def load_spec(source: Source) -> mujoco.MjSpec:
     Raises:
         ValueError: naming the file and the element.
     """
-    return _parsed(source)[0]
+    spec, _, label, caught = _parsed(source)
+    _pass_on(caught, label)
+    return spec
 
 
 def load_model(source: Source) -> mujoco.MjModel:
@@ -42,14 +46,16 @@ def load_model(source: Source) -> mujoco.MjModel:
     Raises:
         ValueError: naming the file and the element, the field and its value, or the unsupported feature.
     """
-    spec, text, label = _parsed(source)
-    with caught_warnings() as caught:
+    spec, text, label, caught = _parsed(source)
+    with caught_warnings() as caught_later:
         try:
             mj_model = spec.compile()
         except (ValueError, mujoco.FatalError) as error:
             raise ValueError(_readable(str(error), label, text)) from None
     check_finite(mj_model, label)
-    _pass_on(caught, label)
+    for message in caught + caught_later:
+        _refuse_serious(message, mj_model, label, text)
+    _pass_on(caught + caught_later, label)
     with wp.ScopedDevice("cpu"):
         try:
             warp_model_of(mj_model)
@@ -58,32 +64,26 @@ def load_model(source: Source) -> mujoco.MjModel:
     return mj_model
 
 
-def _parsed(source: Source) -> tuple[mujoco.MjSpec, str, str]:
-    """Return the spec, its XML text (for messages), and how to call it in messages."""
+def _parsed(source: Source) -> tuple[mujoco.MjSpec, str, str, list[str]]:
+    """Return the spec, its XML text and its name for messages, and MuJoCo's warnings."""
     if not isinstance(source, (str, Path)):
         if not isinstance(source, mujoco.MjSpec):
             kind = type(source).__name__
             raise ValueError(
                 f"model source is {kind}: expected a path, an XML string, a MjSpec or a menagerie name"
             )
-        return source.copy(), "", f"model {source.modelname!r}"
+        return source.copy(), "", f"model {source.modelname!r}", []
     path, text, label = _read(source)
     with caught_warnings() as caught:
         try:
             spec = mujoco.MjSpec.from_string(text) if path is None else mujoco.MjSpec.from_file(str(path))
         except (ValueError, mujoco.FatalError) as error:
             raise ValueError(_readable(str(error), label, text)) from None
-    _pass_on(caught, label)
-    return spec, text, label
+    return spec, text, label, caught
 
 
 def _read(source: str | Path) -> tuple[Path | None, str, str]:
     """Return the path (None for an XML string), the XML text, and how to call the source in messages."""
-    if not isinstance(source, (str, Path)):
-        kind = type(source).__name__
-        raise ValueError(
-            f"model source is {kind}: expected a path, an XML string, a MjSpec or a menagerie name"
-        )
     if isinstance(source, str):
         if not source.strip():
             raise ValueError(
@@ -135,6 +135,18 @@ def _at_line(text: str, number: int) -> str:
     if not 1 <= number <= len(lines):
         return f", line {number}" if number else ""
     return f", line {number}: {lines[number - 1].strip()[:120]}"
+
+
+def _refuse_serious(message: str, mj_model: mujoco.MjModel, label: str, text: str) -> None:
+    """Refuse what MuJoCo only warns of, though no simulation of it can be right."""
+    if found := _SINGULAR.search(message):
+        joint = mj_model.joint(int(mj_model.dof_jntid[int(found["dof"])])).name
+        raise ValueError(
+            f"{label}: the inertia that joint {joint!r} moves is not positive at the initial pose"
+        )
+    if "contains a 'NaN'" in message:
+        lines = [number for number, line in enumerate(text.splitlines(), 1) if _NAN_ATTRIBUTE.search(line)]
+        raise ValueError(f"{label}: a value is NaN{_at_line(text, lines[0]) if lines else ''}")
 
 
 def _pass_on(caught: list[str], label: str) -> None:

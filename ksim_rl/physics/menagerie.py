@@ -6,12 +6,12 @@ from pathlib import Path
 
 from ksim_rl.checks import near
 
-NAME = re.compile(r"[A-Za-z0-9_]+(/[A-Za-z0-9_.]+)?")
+NAME = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)?")
 
 
 def looks_like_name(source: str) -> bool:
     """Whether a string reads as "robot" or "robot/entry" rather than as a file."""
-    return NAME.fullmatch(source) is not None and not source.endswith((".xml", ".mjcf", ".urdf", ".mjb"))
+    return NAME.fullmatch(source) is not None
 
 
 def model_path(name: str) -> Path:
@@ -37,7 +37,7 @@ def _in_folder(root: Path, robot: str, entry: str) -> Path:
             f"menagerie model {robot!r} is not under MENAGERIE_ROOT={root}: {near(robot, found)}; copy its "
             "folder there, or unset MENAGERIE_ROOT to download it with the package mujoco-menagerie"
         )
-    stem = (entry or "scene").removesuffix(".xml")
+    stem = entry or "scene"
     path = root / robot / f"{stem}.xml"
     if not path.is_file():
         found = [path.stem for path in (root / robot).glob("*.xml")]
@@ -54,12 +54,11 @@ def _from_package(robot: str, entry: str) -> Path:
             "model on first use); without one, copy the folder and set MENAGERIE_ROOT to its parent"
         ) from None
     try:
-        known = mujoco_menagerie.get(robot)
-        return known.xml(entry.removesuffix(".xml") or None)
+        return mujoco_menagerie.get(robot).xml(entry or None)
     except LookupError as error:
-        raise ValueError(f"{error} ({near(entry or robot, mujoco_menagerie.names())})") from None
+        raise ValueError(f"menagerie: {error}") from None
     except (mujoco_menagerie.MenagerieError, OSError) as error:
         raise ValueError(
             f"menagerie model {robot!r} could not be downloaded ({error}): with a network, try again; without one, "
             "copy its folder from github.com/google-deepmind/mujoco_menagerie and set MENAGERIE_ROOT to its parent"
-        ) from error
+        ) from None

@@ -29,6 +29,7 @@ OBJECT_TYPES = {
 ELEMENT_WORDS = {"jnt": "joint", "cam": "camera", "mat": "material", "eq": "equality", "key": "keyframe"}
 # The largest number that the float32 of the GPU holds.
 LARGEST = float(np.finfo(np.float32).max)
+DERIVED = ("invweight0", "acc0", "aabb", "rbound", "length0", "subtreemass", "mat0", "pos0", "poscom0")
 # Fields whose enum values tell which elements use a feature that Warp lacks.
 ENUM_FIELDS = {
     "actuator_trntype": mujoco.mjtTrn,
@@ -79,7 +80,8 @@ def _float_fields(mj_model: mujoco.MjModel) -> Iterator[tuple[str, float | np.nd
         value = getattr(mj_model.opt, name)
         if not name.startswith("_") and isinstance(value, (float, np.ndarray)):
             yield f"option.{name}", value
-    for name in dir(mj_model):
+    # What the compiler derives comes last, so that an error names the field that the user wrote.
+    for name in sorted(dir(mj_model), key=lambda name: (name.endswith(DERIVED), name)):
         if name.startswith("_") or name.startswith("tex_"):
             continue
         value = getattr(mj_model, name)

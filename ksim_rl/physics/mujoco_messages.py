@@ -1,5 +1,6 @@
 """Catch MuJoCo's warnings: left alone, they go to the terminal and into a file MUJOCO_LOG.TXT in the present folder."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -8,7 +9,7 @@ import mujoco
 
 @contextmanager
 def caught_warnings() -> Iterator[list[str]]:
-    """Collect the text of MuJoCo's warnings in this block instead of printing them."""
+    """Collect the text of MuJoCo's warnings, from its engine and its bindings, instead of printing them."""
     caught: list[str] = []
 
     def keep(text: bytes | str) -> None:
@@ -17,6 +18,10 @@ def caught_warnings() -> Iterator[list[str]]:
     previous = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(keep)
     try:
-        yield caught
+        with warnings.catch_warnings(record=True) as from_bindings:
+            warnings.simplefilter("always")
+            yield caught
+        for warning in from_bindings:
+            keep(str(warning.message))
     finally:
         mujoco.set_mju_user_warning(previous)

@@ -24,7 +24,7 @@ def check_env(env: EnvBase, *, num_steps: int = 3, check_actions: bool = True) -
         AssertionError: naming what is wrong.
     """
     check_env_specs(env)
-    specs = ("output_spec", "input_spec", "full_observation_spec", "full_action_spec", "full_done_spec")
+    specs = ("full_observation_spec", "full_action_spec", "full_reward_spec", "full_done_spec")
     for which in specs:
         _check_spec_names(getattr(env, which), which, env.batch_dims)
     root = env.reset()
@@ -53,7 +53,7 @@ def _check_spec_names(spec: Composite, where: str, batch_dims: int) -> None:
 def _check_values(tensordict: TensorDictBase, spec: Composite, when: str) -> None:
     for key in spec.keys(True, True):
         value = tensordict[key]
-        if value.dtype.is_floating_point and not bool(torch.isfinite(value).all()):
+        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             rows = (~torch.isfinite(value.reshape(value.shape[0], -1)).all(-1)).nonzero().flatten().tolist()
             raise AssertionError(f"observation {key!r} is not finite at {when}, in the rows {rows}")
         if not spec[key].is_in(value):

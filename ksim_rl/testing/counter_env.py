@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ksim_rl import random
+from ksim_rl import dims, random
 
 
 class CounterEnv(EnvBase):
@@ -27,12 +27,15 @@ class CounterEnv(EnvBase):
     count_E: Tensor
     episode_E: Tensor
     seed_value: Tensor
+    length_E: Tensor
+    row_E: Tensor
+    offset_L: Tensor
 
     def __init__(
         self, lengths: Sequence[int] = (3, 5, 4), *, action_size: int = 2, device: Any = "cpu"
     ) -> None:
-        batch = (len(lengths),) if lengths else ()
-        super().__init__(device=torch.device(device), batch_size=torch.Size(batch))
+        batch = torch.Size([len(lengths)] if lengths else [])
+        super().__init__(device=torch.device(device), batch_size=batch)
         self.num_rows = max(1, len(lengths))
         self.register_buffer("length_E", torch.tensor(list(lengths) or [3], device=device))
         self.register_buffer("count_E", torch.zeros(self.num_rows, dtype=torch.int64, device=device))
@@ -40,22 +43,33 @@ class CounterEnv(EnvBase):
         self.register_buffer("seed_value", torch.zeros((), dtype=torch.int64, device=device))
         self.register_buffer("row_E", torch.arange(self.num_rows, device=device))
         self.register_buffer("offset_L", torch.tensor([0.0, 100.0, 200.0], device=device))
-        scalar = Unbounded((*batch, 1), device=self.device)
+        shape_1 = torch.Size([*batch, 1])
+        scalar = Unbounded(shape_1, device=self.device)
         self.observation_spec = Composite(
             count=scalar.clone(),
             episode=scalar.clone(),
             row=scalar.clone(),
-            drawn=Bounded(0.0, 1.0, (*batch, 1), device=self.device),
-            obs=Composite(vector=Unbounded((*batch, 3), device=self.device), shape=batch, device=self.device),
+            drawn=Bounded(0.0, 1.0, shape_1, device=self.device),
+            obs=Composite(
+                vector=Unbounded(torch.Size([*batch, 3]), device=self.device), shape=batch, device=self.device
+            ),
             shape=batch,
             device=self.device,
         )
-        self.action_spec = Bounded(-1.0, 1.0, (*batch, action_size), device=self.device)
-        self.reward_spec = scalar.clone()
-        done = Binary(1, dtype=torch.bool, shape=(*batch, 1), device=self.device)
+        action = Bounded(-1.0, 1.0, torch.Size([*batch, action_size]), device=self.device)
+        self.full_action_spec = Composite(action=action, shape=batch, device=self.device)
+        self.full_reward_spec = Composite(reward=scalar.clone(), shape=batch, device=self.device)
+        done = Binary(1, dtype=torch.bool, shape=shape_1, device=self.device)
         self.full_done_spec = Composite(
             done=done, terminated=done.clone(), truncated=done.clone(), shape=batch, device=self.device
         )
+        for spec in (
+            self.full_observation_spec,
+            self.full_action_spec,
+            self.full_reward_spec,
+            self.full_done_spec,
+        ):
+            spec.names = [dims.E] * len(batch)
 
     def _observe(self) -> dict[str, Any]:
         keys = random.row_keys(self.seed_value, 1, self.episode_E, self.num_rows)
@@ -67,7 +81,9 @@ class CounterEnv(EnvBase):
             "row": self.row_E.float().reshape(*batch, 1),
             "drawn": random.uniform(keys, 1).reshape(*batch, 1),
             "obs": TensorDict(
-                {"vector": (count_E1 + self.offset_L).reshape(*batch, 3)}, batch_size=batch, device=self.device
+                {"vector": (count_E1 + self.offset_L).reshape(*batch, 3)},
+                batch_size=batch,
+                device=self.device,
             ),
         }
 

@@ -32,7 +32,6 @@ def _assert_dims(td: TensorDictBase, names: list[str], where: str) -> None:
     )
     if where == "the tensordict":
         assert td.batch_dims == len(names), f"{where} has dims {td.names}: expected exactly {names}"
-    for key in td.keys():
-        value = td.get(key)
+    for key, value in td.items():
         if isinstance(value, TensorDictBase):
             _assert_dims(value, names, f"{where}[{key!r}]")

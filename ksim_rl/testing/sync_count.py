@@ -111,7 +111,11 @@ def _why_it_syncs(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> s
         return _ALWAYS[name]
     if name in _INDEXING and any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
         return "indexing by a mask"
-    if name == "aten::repeat_interleave" and kwargs.get("output_size") is None and func._overloadname == "Tensor":
+    if (
+        name == "aten::repeat_interleave"
+        and kwargs.get("output_size") is None
+        and func._overloadname == "Tensor"
+    ):
         return "repeat_interleave without output_size"
     if name == "aten::_to_copy" and _differs(args[0].device, kwargs.get("device")):
         return "copy to another device"

@@ -65,6 +65,7 @@ class Trainer:
         self.loggers, self.folder, self.config = loggers, folder, dict(config or {})
         self.iteration = 0
         self.evaluation: Evaluation | None = None
+        self.progress = RunProgress(cfg.num_iterations, enabled=False)
         self.interrupt = InterruptRequest()
         self.clock = RunClock()
         self._evaluated_at = self._saved_at = -1
@@ -90,13 +91,11 @@ class Trainer:
         Raises:
             NonFiniteStepsError: if gradient steps stay non-finite.
         """
-        self.progress = progress or RunProgress(self.cfg.num_iterations, done=self.iteration, enabled=False)
+        self.progress = progress or self.progress
         with self.interrupt, self.progress:
             try:
                 while not self._is_over():
-                    rollout_ET = self.collector.collect()
-                    self.update(rollout_ET)
-                    self._report(rollout_ET)
+                    self.iterate()
                     self._evaluate_if_due()
                     self._save_if_due()
                 self._finish()
@@ -104,6 +103,12 @@ class Trainer:
                 for logger in self.loggers:
                     logger.close()
         return self._outcome()
+
+    def iterate(self) -> None:
+        """Run one iteration: collect a rollout, learn from it, and report what happened."""
+        rollout_ET = self.collector.collect()
+        self.update(rollout_ET)
+        self._report(rollout_ET)
 
     def _is_over(self) -> bool:
         stop = self.cfg.stop_when_solved and self.solved

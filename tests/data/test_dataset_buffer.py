@@ -152,14 +152,18 @@ def test_other_samplers_and_transforms_of_torchrl_work():
     assert {m["double"].dtype for m in minibatches} == {torch.float32}
 
 
-def test_state_dict_continues_exactly():
+@pytest.mark.parametrize("fresh", [True, False])
+def test_state_dict_continues_exactly(fresh):
     rollout = _rollout()
     rollout["obs"][0, 0] = float("nan")
     dataset, resumed = DatasetBuffer(CFG, seed=4), DatasetBuffer(CFG)
     dataset.extend(rollout)
     dataset.sample()
-    resumed.extend(_rollout())
+    if not fresh:
+        resumed.extend(_rollout())
     resumed.load_state_dict(dataset.state_dict())
     assert int(resumed.non_finite_count) == 1
     for _ in range(9):
         assert (dataset.sample() == resumed.sample()).all()
+    resumed.extend(rollout)
+    assert int(resumed.non_finite_count) == 2

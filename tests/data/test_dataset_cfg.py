@@ -32,7 +32,7 @@ def _suggestions(message, field):
     return [int(number) for number in re.findall(rf"{field}=(\d+)(?: or (\d+))?", message)[-1] if number]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.integers(1, 3000), st.integers(1, 40), st.integers(1, 3000))
 def test_every_suggested_value_works_and_is_the_nearest(per_minibatch, minibatches, envs):
     try:

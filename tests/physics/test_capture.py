@@ -109,3 +109,16 @@ def test_an_uncapturable_body_says_so():
     graph()
     with pytest.raises(RuntimeError, match="cannot be captured"):
         graph()
+
+
+@pytest.mark.gpu
+def test_a_world_joins_a_capture_that_torch_began():
+    world, eager = (standing_quadrupeds(16, device="cuda") for _ in range(2))
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        world.step(4)
+        world.refresh()
+    graph.replay()
+    eager.step(4)
+    eager.refresh()
+    torch.testing.assert_close(world.qpos_EL, eager.qpos_EL, rtol=1e-3, atol=1e-3)

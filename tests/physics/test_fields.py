@@ -11,7 +11,9 @@ from tests.physics.models import cartpole, quadruped, standing_quadrupeds
 SIM = SimCfg(njmax=80, nconmax=40)
 
 
-def with_constants(mj_model: mujoco.MjModel, row: int, world: World, fields: tuple[str, ...]) -> mujoco.MjModel:
+def with_constants(
+    mj_model: mujoco.MjModel, row: int, world: World, fields: tuple[str, ...]
+) -> mujoco.MjModel:
     """The C engine's model with the fields of one world, and all that follows from them."""
     changed = copy.copy(mj_model)
     for field in fields:
@@ -30,7 +32,9 @@ def test_derived_constants_follow_the_field_in_each_world():
         expected = with_constants(quadruped(), row, world, fields)
         for derived in ("body_subtreemass", "dof_invweight0", "body_invweight0", "actuator_acc0"):
             actual = world.field(derived)[row].numpy()
-            np.testing.assert_allclose(actual, getattr(expected, derived), rtol=2e-4, atol=1e-6, err_msg=derived)
+            np.testing.assert_allclose(
+                actual, getattr(expected, derived), rtol=2e-4, atol=1e-6, err_msg=derived
+            )
 
 
 def test_changed_fields_change_the_motion_as_in_the_c_engine():
@@ -67,7 +71,9 @@ def test_friction_and_gravity_need_no_constants():
 
 
 def test_unknown_and_shared_fields_are_named():
-    with pytest.raises(ValueError, match="unknown per-world model field 'body_mas': did you mean 'body_mass'"):
+    with pytest.raises(
+        ValueError, match="unknown per-world model field 'body_mas': did you mean 'body_mass'"
+    ):
         World(cartpole(), num_envs=2, per_world_fields=("body_mas",))
     with pytest.raises(ValueError, match="expected a sequence of names"):
         World(cartpole(), num_envs=2, per_world_fields="body_mass")

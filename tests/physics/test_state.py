@@ -21,9 +21,7 @@ def test_a_restored_world_continues_bit_for_bit():
     straight.refresh()
     saved = {name: tensor.clone() for name, tensor in straight.state_dict().items()}
 
-    fresh = World(
-        quadruped(), num_envs=4, sim=SimCfg(njmax=80, nconmax=40), per_world_fields=("body_mass",)
-    )
+    fresh = World(quadruped(), num_envs=4, sim=SimCfg(njmax=80, nconmax=40), per_world_fields=("body_mass",))
     fresh.load_state_dict(saved)
     for name, tensor in observable(straight).items():
         assert torch.equal(observable(fresh)[name], tensor), f"{name} right after loading"

@@ -60,7 +60,16 @@ def test_refresh_leaves_acceleration_stage_sensors_alone():
 
 def test_reset_touches_only_the_masked_rows_even_row_zero():
     world = standing_quadrupeds()
-    names = ("qpos", "qvel", "qacc", "sensordata", "actuator_force", "qfrc_actuator", "xpos", "qacc_warmstart")
+    names = (
+        "qpos",
+        "qvel",
+        "qacc",
+        "sensordata",
+        "actuator_force",
+        "qfrc_actuator",
+        "xpos",
+        "qacc_warmstart",
+    )
     before = {name: world.view(name).clone() for name in names}
     mask_E = torch.tensor([True, False, True, False])
     world.reset(mask_E)

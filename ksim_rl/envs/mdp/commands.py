@@ -60,11 +60,11 @@ class UniformVelocityCommand(CommandTerm):
 
     def resample(self, view: EnvView, mask_E: Tensor) -> None:
         """Draw velocities, heading targets and kinds for the rows of `mask_E`."""
-        ranges = (self.lin_vel_x, self.lin_vel_y, self.ang_vel_z, self.heading)
-        low_14 = constant([low for low, _ in ranges], view.device)
-        high_14 = constant([high for _, high in ranges], view.device)
-        target_E4 = view.uniform(4, low_14, high_14)
-        kind_E3 = view.uniform(3)
+        # One draw for all: targets in their ranges, then three numbers in [0, 1) that decide the kinds.
+        ranges = (self.lin_vel_x, self.lin_vel_y, self.ang_vel_z, self.heading, *[(0.0, 1.0)] * 3)
+        low_7 = constant([low for low, _ in ranges], view.device)
+        high_7 = constant([high for _, high in ranges], view.device)
+        target_E4, kind_E3 = view.uniform(7, low_7, high_7).split((4, 3), dim=-1)
         standing_E, heading_E = kind_E3[:, 0] < self.rel_standing_envs, kind_E3[:, 1] < self.rel_heading_envs
         is_forward_E1 = kind_E3[:, 2:] < self.rel_forward_envs
         vx_E = target_E4[:, 0].abs().clamp(min=self.forward_min_speed)

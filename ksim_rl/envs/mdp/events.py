@@ -10,6 +10,7 @@ from torch import Tensor
 from ksim_rl.checks import check_choice, check_in_range, check_pair
 from ksim_rl.envs import quaternion
 from ksim_rl.envs.mdp import se3_ranges
+from ksim_rl.envs.mdp.constants import constant
 from ksim_rl.envs.names import Patterns
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
@@ -33,6 +34,7 @@ class ResetRootUniform(EventTerm):
         se3_ranges.check_ranges("velocity_range", self.velocity_range)
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+        """Write the rows of `mask_E`."""
         _require_free_root(view, self)
         offset_E6 = se3_ranges.draw(view, self.pose_range)
         velocity_E6 = se3_ranges.draw(view, self.velocity_range)
@@ -68,6 +70,7 @@ class ResetJoints(EventTerm):
                 check_in_range(f"{name}[1]", getattr(self, name)[1], low=0.0)
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+        """Write the rows of `mask_E`."""
         index = view.joints(self.joints)
         default_EL, limits_L2 = view.default_joint_pos_EL[:, index], view.soft_joint_pos_limits_L2[index]
         count = default_EL.shape[1]
@@ -76,9 +79,12 @@ class ResetJoints(EventTerm):
         view.write_joint_vel(mask_E, self._draw(view, count, self.velocity_range), index)
 
     def _draw(self, view: EnvView, count: int, pair: tuple[float, float]) -> Tensor:
+        first, second = float(pair[0]), float(pair[1])
+        if second == (0.0 if self.distribution == "gaussian" else first):
+            return constant([first] * count, view.device).expand(view.num_envs, count)
         if self.distribution == "gaussian":
-            return pair[0] + pair[1] * view.normal(count)
-        return view.uniform(count, float(pair[0]), float(pair[1]))
+            return first + second * view.normal(count)
+        return view.uniform(count, first, second)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +103,7 @@ class PushByVelocity(EventTerm):
         se3_ranges.check_ranges("velocity_range", self.velocity_range)
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+        """Write the rows of `mask_E`."""
         _require_free_root(view, self)
         kick_E6 = se3_ranges.draw(view, self.velocity_range)
         lin_vel_E3 = view.root_lin_vel_w_EL + kick_E6[:, :3]

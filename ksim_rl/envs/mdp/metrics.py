@@ -16,6 +16,7 @@ class LinearVelocityError(MetricTerm):
     command: str
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the value of the current state, [E]."""
         error_E2 = view.command(self.command)[:, :2] - view.root_lin_vel_b_EL[:, :2]
         return torch.linalg.vector_norm(error_E2, dim=-1)
 
@@ -27,6 +28,7 @@ class AngularVelocityError(MetricTerm):
     command: str
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the value of the current state, [E]."""
         return (view.command(self.command)[:, 2] - view.root_ang_vel_b_EL[:, 2]).abs()
 
 
@@ -35,6 +37,7 @@ class ActionAcceleration(MetricTerm):
     """Mean over columns of |a_t - 2 a_{t-1} + a_{t-2}|; actions before an episode are 0."""
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the value of the current state, [E]."""
         rate_EL = view.action_EL - view.last_action_EL
         last_rate_EL = view.memory("last_rate_EL", rate_EL.shape[-1])
         acceleration_E = (rate_EL - last_rate_EL).abs().mean(-1)

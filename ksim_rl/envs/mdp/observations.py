@@ -20,6 +20,7 @@ class RootPos(ObservationTerm):
     """Position of the root body's frame in the world, m, [E, 3]; position stage."""
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
         return view.root_pos_EL
 
 
@@ -28,6 +29,7 @@ class RootQuat(ObservationTerm):
     """Orientation of the root body, body to world, (w, x, y, z), [E, 4]; position stage."""
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
         return view.root_quat_EL
 
 
@@ -36,6 +38,7 @@ class RootLinVel(ObservationTerm):
     """Linear velocity of the root body's frame origin, in the root's frame, m/s, [E, 3]; velocity stage."""
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
         return view.root_lin_vel_b_EL
 
 
@@ -44,6 +47,7 @@ class RootAngVel(ObservationTerm):
     """Angular velocity of the root body, in the root's frame, rad/s, [E, 3]; velocity stage."""
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
         return view.root_ang_vel_b_EL
 
 
@@ -52,6 +56,7 @@ class ProjectedGravity(ObservationTerm):
     """Direction of gravity (world -z) in the root's frame, a unit vector, [E, 3]; (0, 0, -1) when upright."""
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
         return view.projected_gravity_EL
 
 
@@ -65,6 +70,7 @@ class JointPos(ObservationTerm):
     joints: Patterns = ".*"
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
         return view.joint_pos_EL[:, view.joints(self.joints)]
 
 
@@ -80,6 +86,7 @@ class JointPosRel(ObservationTerm):
     biased: bool = False
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
         index = view.joints(self.joints)
         pos_EL = view.joint_pos_rel_EL[:, index]
         return pos_EL + view.encoder_bias_EL[:, index] if self.biased else pos_EL
@@ -92,6 +99,7 @@ class JointVel(ObservationTerm):
     joints: Patterns = ".*"
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
         return view.joint_vel_EL[:, view.joints(self.joints)]
 
 
@@ -108,6 +116,7 @@ class SensorReading(ObservationTerm):
     sensor: str
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
         return view.sensor(self.sensor)
 
 
@@ -116,6 +125,7 @@ class LastAction(ObservationTerm):
     """The action that led to the current state, as the policy gave it, [E, K]; zero after a reset."""
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
         return view.action_EL
 
 
@@ -126,6 +136,7 @@ class Command(ObservationTerm):
     command: str
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
         return view.command(self.command)
 
 
@@ -139,6 +150,7 @@ class FootHeight(ObservationTerm):
     sites: Patterns
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
         return view.site_pos_w(view.sites(self.sites))[..., 2]
 
 
@@ -149,6 +161,7 @@ class FootAirTime(ObservationTerm):
     sensor: str
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
         return view.contact(self.sensor).air_time_EN
 
 
@@ -159,18 +172,21 @@ class FootContact(ObservationTerm):
     sensor: str
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
         return view.contact(self.sensor).found_EN
 
 
 @dataclass(frozen=True, kw_only=True)
 class FootContactForces(ObservationTerm):
-    """Net ground force on each foot, world frame, as sign(f) log(1 + |f|) of newtons, [E, 3F]; acceleration stage.
+    """Net force of each foot on the ground, world frame, sign(f) log(1 + |f|) of newtons, [E, 3F]; acceleration stage.
 
+    MuJoCo's sign: a foot that stands presses down, z is negative.
     The logarithm keeps an impact of hundreds of newtons in the range of the other observations.
     """
 
     sensor: str
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
         force_EL = view.contact(self.sensor).force_EN3.flatten(start_dim=1)
         return torch.sign(force_EL) * torch.log1p(torch.abs(force_EL))

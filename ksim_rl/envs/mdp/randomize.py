@@ -56,6 +56,7 @@ class RandomizeModelField(EventTerm):
         return (self.field,)
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+        """Draw for the rows of `mask_E`."""
         index = view.resolver.index(self.kind, self.elements)
         ids = view.resolver.ids(self.kind, self.elements)
         nominal = getattr(view.world.mj_model, self.field)
@@ -113,6 +114,7 @@ class RandomizeEncoderBias(EventTerm):
         check_pair("bias_range", self.bias_range)
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+        """Draw for the rows of `mask_E`."""
         index = view.joints(self.joints)
         held_EL = view.encoder_bias_EL[:, index]
         low, high = self.bias_range

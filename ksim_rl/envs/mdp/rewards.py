@@ -15,6 +15,7 @@ class Alive(RewardTerm):
     """1 in every step, [E]."""
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         return torch.ones(view.num_envs, device=view.device)
 
 
@@ -23,6 +24,7 @@ class ActionRateL2(RewardTerm):
     """|a_t - a_{t-1}|^2 of the policy's raw actions, [E]; the action before the first of an episode is 0."""
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         return (view.action_EL - view.last_action_EL).square().sum(-1)
 
 
@@ -33,6 +35,7 @@ class JointVelL2(RewardTerm):
     joints: Patterns = ".*"
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         return view.joint_vel_EL[:, view.joints(self.joints)].square().sum(-1)
 
 
@@ -43,4 +46,5 @@ class ActuatorForceL2(RewardTerm):
     actuators: Patterns = ".*"
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         return view.world.actuator_force_EL[:, view.actuators(self.actuators)].square().sum(-1)

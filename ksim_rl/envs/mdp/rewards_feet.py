@@ -32,6 +32,7 @@ class FootClearance(RewardTerm):
     command_threshold: float
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         index = view.sites(self.sites)
         miss_EF = (view.site_pos_w(index)[..., 2] - self.target_height).abs()
         speed_EF = torch.linalg.vector_norm(view.site_lin_vel_w(index)[..., :2], dim=-1)
@@ -62,6 +63,7 @@ class FootSwingHeight(RewardTerm):
         check_in_range("target_height", self.target_height, low=0.0, low_open=True)
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         contact = view.contact(self.sensor)
         height_EF = view.site_pos_w(view.sites(self.sites))[..., 2]
         memory_EF = view.memory("peak_EF", height_EF.shape[-1])
@@ -86,6 +88,7 @@ class FootSlip(RewardTerm):
     command_threshold: float
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         speed2_EF = view.site_lin_vel_w(view.sites(self.sites))[..., :2].square().sum(-1)
         cost_E = (speed2_EF * view.contact(self.sensor).found_EN).sum(-1)
         return cost_E * is_commanded(view, self.command, self.command_threshold)
@@ -100,6 +103,7 @@ class SoftLanding(RewardTerm):
     command_threshold: float
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         contact = view.contact(self.sensor)
         force_EF = torch.linalg.vector_norm(contact.force_EN3, dim=-1)
         cost_E = (force_EF * contact.first_contact_EN).sum(-1)
@@ -121,6 +125,7 @@ class FeetAirTime(RewardTerm):
         check_in_range("threshold_max", self.threshold_max, low=self.threshold_min)
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         air_time_EF = view.contact(self.sensor).air_time_EN
         inside_EF = (air_time_EF > self.threshold_min) & (air_time_EF < self.threshold_max)
         count_E = inside_EF.to(torch.float32).sum(-1)

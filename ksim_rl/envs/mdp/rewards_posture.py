@@ -31,6 +31,7 @@ class Upright(RewardTerm):
         check_in_range("std", self.std, low=0.0, low_open=True)
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         if self.body is None:
             gravity_E3 = view.projected_gravity_EL
         else:
@@ -68,6 +69,7 @@ class Pose(RewardTerm):
         check_in_range("running_threshold", self.running_threshold, low=self.walking_threshold)
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         speed_E1 = commanded_speed(view, self.command).unsqueeze(-1)
         std_EL = torch.where(
             speed_E1 < self.walking_threshold,
@@ -96,6 +98,7 @@ class JointPosLimits(RewardTerm):
     joints: Patterns = ".*"
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         index = view.joints(self.joints)
         pos_EL, limits_L2 = view.joint_pos_EL[:, index], view.soft_joint_pos_limits_L2[index]
         below_EL = (limits_L2[:, 0] - pos_EL).clamp(min=0.0)
@@ -110,6 +113,7 @@ class BodyAngularVelocity(RewardTerm):
     body: str
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         return view.body_ang_vel_w(view.bodies(self.body))[..., :2].square().sum((-2, -1))
 
 
@@ -120,4 +124,5 @@ class AngularMomentum(RewardTerm):
     sensor: str
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         return view.sensor(self.sensor).square().sum(-1)

@@ -22,6 +22,7 @@ class TrackLinearVelocity(RewardTerm):
         check_in_range("std", self.std, low=0.0, low_open=True)
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         vel_E3 = view.root_lin_vel_b_EL
         error_E2 = view.command(self.command)[:, :2] - vel_E3[:, :2]
         return torch.exp(-(error_E2.square().sum(-1) + vel_E3[:, 2].square()) / self.std**2)
@@ -39,6 +40,7 @@ class TrackAngularVelocity(RewardTerm):
         check_in_range("std", self.std, low=0.0, low_open=True)
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
         vel_E3 = view.root_ang_vel_b_EL
         error_E = view.command(self.command)[:, 2] - vel_E3[:, 2]
         return torch.exp(-(error_E.square() + vel_E3[:, :2].square().sum(-1)) / self.std**2)

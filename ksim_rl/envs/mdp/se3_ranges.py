@@ -28,5 +28,7 @@ def draw(view: EnvView, ranges: Ranges) -> Tensor:
     """Draw x, y, z, roll, pitch, yaw (m and rad, or m/s and rad/s), float32 [E, 6]."""
     pairs = [ranges.get(axis, (0.0, 0.0)) for axis in AXES]
     low_6 = constant([float(low) for low, _ in pairs], view.device)
+    if all(low == high for low, high in pairs):
+        return low_6.expand(view.num_envs, 6)
     high_6 = constant([float(high) for _, high in pairs], view.device)
     return view.uniform(6, low_6, high_6)

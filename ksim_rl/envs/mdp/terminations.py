@@ -17,6 +17,7 @@ class TimeOut(TerminationTerm):
     time_out: bool = True
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return which envs end, bool [E]."""
         return view.episode_step_E >= view.max_episode_length
 
 
@@ -34,6 +35,7 @@ class BadOrientation(TerminationTerm):
         check_in_range("limit_angle", self.limit_angle, low=0.0, high=math.pi, low_open=True)
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return which envs end, bool [E]."""
         # The cosine falls as the angle grows, so comparing cosines needs no acos, which is ill-conditioned at 0.
         return -view.projected_gravity_EL[:, 2] < math.cos(self.limit_angle)
 
@@ -45,4 +47,5 @@ class RootHeightBelow(TerminationTerm):
     minimum_height: float
 
     def __call__(self, view: EnvView) -> Tensor:
+        """Return which envs end, bool [E]."""
         return view.root_pos_EL[:, 2] < self.minimum_height

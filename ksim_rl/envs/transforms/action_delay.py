@@ -5,8 +5,8 @@ from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Composite
 
 from ksim_rl.envs.transforms.delay_cfg import DelayCfg
-from ksim_rl.envs.transforms.keyed_transform import Keys, as_keys, checked_out_keys
 from ksim_rl.envs.transforms.lagged_transform import LaggedTransform
+from ksim_rl.envs.transforms.row_transform import Keys, as_keys, checked_out_keys
 from ksim_rl.envs.transforms.specs import leaf_spec, set_leaf_spec
 
 
@@ -39,9 +39,7 @@ class ActionDelay(LaggedTransform):
         # ("action",) is the one-key form of "action" in TorchRL too.
         keys = [key[0] if isinstance(key, tuple) and len(key) == 1 else key for key in as_keys(in_keys_inv)]
         out_keys = checked_out_keys(keys, out_keys_inv)
-        super().__init__(
-            delay, len(keys), in_keys_inv=keys, out_keys_inv=out_keys, seed=seed, stream=stream
-        )
+        super().__init__(delay, len(keys), in_keys_inv=keys, out_keys_inv=out_keys, seed=seed, stream=stream)
         self.initial = initial
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
@@ -64,7 +62,7 @@ class ActionDelay(LaggedTransform):
         if not self._sized:
             # The action's shape is in the specs only, and they size the buffers.
             assert self.container is not None and self.container.input_spec is not None
-        self._restart(self._reset_rows(tensordict))
+        self._restart(self._reset_rows(tensordict, tensordict_reset))
         return tensordict_reset
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -8,7 +8,7 @@ from torchrl.data import Composite
 from torchrl.envs.transforms import Transform
 
 from ksim_rl import checks
-from ksim_rl.envs.transforms.keyed_transform import Keys, as_keys, checked_out_keys
+from ksim_rl.envs.transforms.row_transform import Keys, as_keys, checked_out_keys
 from ksim_rl.envs.transforms.specs import bounded, bounds, leaf_spec, set_leaf_spec
 
 Range = tuple[float | None, float | None]
@@ -50,7 +50,9 @@ class ObservationClip(Transform):
             next_tensordict.set(out_key, torch.clamp(next_tensordict.get(key), low, high))
         return next_tensordict
 
-    forward = _call
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Do the same to a batch of samples."""
+        return self._call(tensordict)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)

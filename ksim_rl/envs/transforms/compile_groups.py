@@ -25,9 +25,7 @@ def compile_groups(groups: Mapping[str, ObservationGroupCfg]) -> list[Transform]
     vectors: dict[NestedKey, list[NestedKey]] = {}
     drop: list[NestedKey] = []
     for group, cfg in groups.items():
-        terms = {
-            name: term if cfg.enable_noise else _without_noise(term) for name, term in cfg.terms.items()
-        }
+        terms = {name: term if cfg.enable_noise else _without_noise(term) for name, term in cfg.terms.items()}
         chained = {name: term for name, term in terms.items() if _has_chain(term)}
         transforms += _chain(group, chained)
         plain = [name for name in terms if name not in chained]

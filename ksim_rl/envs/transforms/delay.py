@@ -4,8 +4,8 @@ from tensordict import TensorDictBase
 from torchrl.data import Composite
 
 from ksim_rl.envs.transforms.delay_cfg import DelayCfg
-from ksim_rl.envs.transforms.keyed_transform import Keys, as_keys, checked_out_keys
 from ksim_rl.envs.transforms.lagged_transform import LaggedTransform
+from ksim_rl.envs.transforms.row_transform import Keys, as_keys, checked_out_keys
 from ksim_rl.envs.transforms.specs import leaf_spec, set_leaf_spec
 
 
@@ -59,7 +59,7 @@ class ObservationDelay(LaggedTransform):
             shapes = [value.shape[len(batch_size) :] for value in values]
             dtypes = [value.dtype for value in values]
             self._size_lags(batch_size.numel(), shapes, dtypes, tensordict_reset.device)
-        mask_E = self._reset_rows(tensordict)
+        mask_E = self._reset_rows(tensordict, tensordict_reset)
         self._restart(mask_E)
         for index, (out_key, value) in enumerate(zip(self.out_keys, values, strict=True)):
             self._push_rows(index, value.reshape(self.num_rows, *value.shape[len(batch_size) :]), mask_E)

@@ -45,10 +45,10 @@ class GroupSpec:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data for a checkpoint or an export: term name -> [start, stop)."""
-        spelled = {"/".join(k) if isinstance(k, tuple) else k: self.slice(k) for k in self.terms}
+        spelled = {k if isinstance(k, str) else "/".join(map(str, k)): self.slice(k) for k in self.terms}
         return {name: [columns.start, columns.stop] for name, columns in spelled.items()}
 
 
 def last_name(key: NestedKey) -> str:
     """Return the last part of a key."""
-    return key if isinstance(key, str) else key[-1]
+    return key if isinstance(key, str) else str(key[-1])

@@ -4,14 +4,21 @@ from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torchrl.data import Composite
-from torchrl.data.tensor_specs import Unbounded
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.transforms import Transform
 
 from ksim_rl import checks
 from ksim_rl.envs.transforms.group_spec import GroupSpec
-from ksim_rl.envs.transforms.keyed_transform import as_keys
-from ksim_rl.envs.transforms.specs import bounded, bounds, drop_leaf_spec, flat_size, leaf_spec, set_leaf_spec
+from ksim_rl.envs.transforms.row_transform import as_keys
+from ksim_rl.envs.transforms.specs import (
+    Device,
+    bounded,
+    bounds,
+    drop_leaf_spec,
+    flat_size,
+    leaf_spec,
+    set_leaf_spec,
+)
 
 
 class ObservationGroups(Transform):
@@ -57,31 +64,32 @@ class ObservationGroups(Transform):
         """Add the vectors' specs and remove the dropped ones."""
         batch_size = observation_spec.shape
         vectors = {}
-        for name in self.groups:
-            if isinstance(observation_spec.get(name, None), Composite):
-                raise ValueError(f"group {name!r} would replace the observations under {name!r}: rename the group")
         for name, terms in self.groups.items():
-            specs = [leaf_spec(observation_spec, term, type(self).__name__) for term in terms]
-            sizes = tuple(flat_size(spec, len(batch_size)) for spec in specs)
-            ends = [bounds(spec) if spec.dtype.is_floating_point else None for spec in specs]
-            dtype = specs[0].dtype
-            for spec in specs[1:]:
-                dtype = torch.promote_types(dtype, spec.dtype)
-            size = sum(sizes)
-            if all(end is not None for end in ends):
-                low, high = (
-                    torch.cat([e[side].reshape(*batch_size, n) for e, n in zip(ends, sizes, strict=True)], -1)
-                    for side in (0, 1)
+            if isinstance(observation_spec.get(name, None), Composite):
+                raise ValueError(
+                    f"group {name!r} would replace the observations under {name!r}: rename the group"
                 )
-                vectors[name] = bounded(low, high, dtype=dtype, device=observation_spec.device)
-            else:
-                vectors[name] = Unbounded((*batch_size, size), dtype=dtype, device=observation_spec.device)
+            specs = [leaf_spec(observation_spec, term, type(self).__name__) for term in terms]
+            vectors[name] = self._vector_spec(specs, batch_size, observation_spec.device)
+            sizes = tuple(flat_size(spec, len(batch_size)) for spec in specs)
             self.group_specs[name] = GroupSpec(name=name, terms=tuple(terms), sizes=sizes)
         for name, spec in vectors.items():
             set_leaf_spec(observation_spec, name, spec)
         for key in self.drop:
             drop_leaf_spec(observation_spec, key)
         return observation_spec
+
+    def _vector_spec(self, specs: list[TensorSpec], batch_size: torch.Size, device: Device) -> TensorSpec:
+        dtype = specs[0].dtype
+        for spec in specs[1:]:
+            dtype = torch.promote_types(dtype, spec.dtype)
+        if not all(spec.dtype.is_floating_point for spec in specs):
+            size = sum(flat_size(spec, len(batch_size)) for spec in specs)
+            return Unbounded(torch.Size([*batch_size, size]), dtype=dtype, device=device)
+        ends = [bounds(spec) for spec in specs]
+        low = torch.cat([low.reshape(*batch_size, -1) for low, _ in ends], dim=-1)
+        high = torch.cat([high.reshape(*batch_size, -1) for _, high in ends], dim=-1)
+        return bounded(low, high, dtype=dtype, device=device)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         batch_size = next_tensordict.batch_size
@@ -96,7 +104,9 @@ class ObservationGroups(Transform):
             _drop(next_tensordict, key)
         return next_tensordict
 
-    forward = _call
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Do the same to a batch of samples."""
+        return self._call(tensordict)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)

@@ -5,11 +5,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
-from ksim_rl.envs.transforms.keyed_transform import KeyedTransform, Keys, as_keys, checked_out_keys
-from ksim_rl.envs.transforms.specs import bounded, bounds, leaf_spec, set_leaf_spec
+from ksim_rl.envs.transforms.row_transform import Keys, RowTransform, as_keys, checked_out_keys
+from ksim_rl.envs.transforms.specs import Device, bounded, bounds, leaf_spec, set_leaf_spec
 
 
-class ObservationHistory(KeyedTransform):
+class ObservationHistory(RowTransform):
     """The last N frames, oldest first; after a reset all N are the reset observation.
 
     Args:
@@ -28,10 +28,9 @@ class ObservationHistory(KeyedTransform):
         if isinstance(length, bool) or not isinstance(length, int) or length < 1:
             raise ValueError(f"length={length!r}: expected a whole number of frames of at least 1")
         in_keys = as_keys(in_keys)
-        super().__init__(in_keys, checked_out_keys(in_keys, out_keys))
+        buffers = [f"frames_{index}" for index in range(len(in_keys))]
+        super().__init__(in_keys, checked_out_keys(in_keys, out_keys), row_buffers=buffers)
         self.length, self.flat = length, flat
-        for index in range(len(in_keys)):
-            self.register_buffer(f"frames_{index}", None)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Repeat the specs N times."""
@@ -48,25 +47,23 @@ class ObservationHistory(KeyedTransform):
         stacked = spec.unsqueeze(batch_dims).expand(*batch, self.length, *leaf)
         if not self.flat:
             return stacked.clone()
-        shape = (*batch, self.length * leaf.numel())
+        shape = torch.Size([*batch, self.length * leaf.numel()])
         if not isinstance(spec, Bounded) or not spec.dtype.is_floating_point:
             return Unbounded(shape, dtype=spec.dtype, device=spec.device)
         low, high = (end.reshape(shape) for end in bounds(stacked))
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
-    def _size_frames(
-        self, index: int, leaf: torch.Size, dtype: torch.dtype, device: torch.device | None
-    ) -> None:
+    def _size_frames(self, index: int, leaf: torch.Size, dtype: torch.dtype, device: Device) -> None:
         self._size_buffer(f"frames_{index}", (self.num_rows, self.length, *leaf), dtype, device)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         batch_dims = tensordict_reset.ndim
         values = [tensordict_reset.get(key) for key in self.in_keys]
-        if self._buffers["reset_count_E"] is None or self._buffers["frames_0"] is None:
+        if self._buffers["frames_0"] is None or not self.num_rows:
             self._size_rows(tensordict_reset.batch_size.numel(), tensordict_reset.device)
             for index, value in enumerate(values):
                 self._size_frames(index, value.shape[batch_dims:], value.dtype, tensordict_reset.device)
-        mask_E = self._reset_rows(tensordict)
+        mask_E = self._reset_rows(tensordict, tensordict_reset)
         for index, value in enumerate(values):
             frames_EN: Tensor = getattr(self, f"frames_{index}")
             frame_E1 = value.reshape(self.num_rows, 1, *value.shape[batch_dims:])

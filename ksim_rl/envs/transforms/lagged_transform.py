@@ -5,7 +5,9 @@ from torch import Tensor
 
 from ksim_rl import random
 from ksim_rl.envs.transforms.delay_cfg import DelayCfg
-from ksim_rl.envs.transforms.keyed_transform import KeyedTransform, Keys
+from ksim_rl.envs.transforms.keyed_transform import KeyedTransform
+from ksim_rl.envs.transforms.row_transform import Keys
+from ksim_rl.envs.transforms.specs import Device
 
 
 class LaggedTransform(KeyedTransform):
@@ -28,11 +30,10 @@ class LaggedTransform(KeyedTransform):
     def __init__(
         self, delay: DelayCfg, num_signals: int, *, seed: int = 0, stream: str | None = None, **keys: Keys
     ) -> None:
-        super().__init__(**keys, seed=seed, stream=stream)
+        rings = [f"ring_{index}" for index in range(num_signals)]
+        super().__init__(**keys, row_buffers=["lag_E", "age_E", *rings], seed=seed, stream=stream)
         self.delay = delay
         self.num_slots = delay.max_lag + 1
-        for name in ("lag_E", "age_E", *(f"ring_{i}" for i in range(num_signals))):
-            self.register_buffer(name, None)
         for name in ("slot", "shared_count", "shared_age"):
             self.register_buffer(name, torch.zeros((), dtype=torch.int64))
 
@@ -42,7 +43,7 @@ class LaggedTransform(KeyedTransform):
         return super().seed_(seed)
 
     def _size_lags(
-        self, num_rows: int, shapes: list[torch.Size], dtypes: list[torch.dtype], device: torch.device | None
+        self, num_rows: int, shapes: list[torch.Size], dtypes: list[torch.dtype], device: Device
     ) -> None:
         """Make one ring buffer [K, E, ...] per signal, K = max_lag + 1."""
         self._size_rows(num_rows, device)
@@ -53,7 +54,7 @@ class LaggedTransform(KeyedTransform):
 
     @property
     def _sized(self) -> bool:
-        return self._buffers["lag_E"] is not None
+        return self.num_rows > 0
 
     def _advance(self) -> None:
         """Go on by one env step: the next slot, older episodes, and new lags where they are due."""
@@ -65,19 +66,14 @@ class LaggedTransform(KeyedTransform):
             self.shared_age.add_(1)
         if not delay.resample_every:
             return
-        keys = self._step_keys("step/lag")
-        if delay.per_env:
-            lag_E = random.integers(keys, 1, delay.min_lag, delay.max_lag)[:, 0]
-            chance_E = random.uniform(self._step_keys("step/hold"), 1)[:, 0]
-            due_E = self.age_E % delay.resample_every == 0
-        else:
-            # Row 0 draws for all.
-            lag_E = random.integers(keys, 1, delay.min_lag, delay.max_lag)[:1, 0]
-            chance_E = random.uniform(self._step_keys("step/hold"), 1)[:1, 0]
-            due_E = self.shared_age % delay.resample_every == 0
+        # A shared lag is drawn once: a single row broadcasts over all.
+        num_rows, age = (self.num_rows, self.age_E) if delay.per_env else (1, self.shared_age)
+        due = age % delay.resample_every == 0
         if delay.hold_probability:
-            due_E = due_E & (chance_E >= delay.hold_probability)
-        self.lag_E.copy_(torch.where(due_E, lag_E, self.lag_E))
+            chance = random.uniform(self._step_keys("step/hold", num_rows), 1)[:, 0]
+            due = due & (chance >= delay.hold_probability)
+        lag = random.integers(self._step_keys("step/lag", num_rows), 1, delay.min_lag, delay.max_lag)[:, 0]
+        self.lag_E.copy_(torch.where(due, lag, self.lag_E))
 
     def _restart(self, mask_E: Tensor) -> None:
         """Begin the episodes of the masked rows, with new lags."""

@@ -8,11 +8,11 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
-from ksim_rl import random
-from ksim_rl.envs.transforms.keyed_transform import KeyedTransform, Keys, as_keys, checked_out_keys
+from ksim_rl.envs.transforms.keyed_transform import KeyedTransform
 from ksim_rl.envs.transforms.noise_cfg import Draw, NoiseCfg
 from ksim_rl.envs.transforms.noise_columns import NoiseColumns, widen
-from ksim_rl.envs.transforms.specs import bounded, bounds, flat_size, leaf_spec, set_leaf_spec
+from ksim_rl.envs.transforms.row_transform import Keys, as_keys, checked_out_keys
+from ksim_rl.envs.transforms.specs import bounded, bounds, leaf_spec, set_leaf_spec
 
 
 class ObservationNoise(KeyedTransform):
@@ -51,14 +51,14 @@ class ObservationNoise(KeyedTransform):
         stream: str | None = None,
     ) -> None:
         in_keys = as_keys(in_keys)
-        super().__init__(in_keys, checked_out_keys(in_keys, out_keys), seed=seed, stream=stream)
+        out_keys = checked_out_keys(in_keys, out_keys)
+        super().__init__(in_keys, out_keys, row_buffers=["bias_EL"], seed=seed, stream=stream)
         self.noise = _one_per_key(noise, self.in_keys)
         self._wanted = enabled
-        self._shapes: list[torch.Size] | None = None
+        self._layout: tuple[int, list[torch.Size]] | None = None
         self.noise_columns: NoiseColumns | None = None
         self.bias_columns: NoiseColumns | None = None
         self.register_buffer("enabled", torch.tensor(enabled), persistent=False)
-        self.register_buffer("bias_EL", None)
 
     def enable_(self, enabled: bool = True) -> Self:
         """Turn the noise on or off, in place."""
@@ -80,7 +80,9 @@ class ObservationNoise(KeyedTransform):
         specs = [leaf_spec(observation_spec, key, type(self).__name__) for key in self.in_keys]
         for key, spec in zip(self.in_keys, specs, strict=True):
             if not spec.dtype.is_floating_point:
-                raise ValueError(f"ObservationNoise: {key!r} is {spec.dtype}: noise needs floating-point observations")
+                raise ValueError(
+                    f"ObservationNoise: {key!r} is {spec.dtype}: noise needs floating-point observations"
+                )
         for key, out_key, spec, cfg in zip(self.in_keys, self.out_keys, specs, self.noise, strict=True):
             low, high = widen(cfg, key, *bounds(spec), batch_dims)
             set_leaf_spec(observation_spec, out_key, bounded(low, high, dtype=spec.dtype, device=spec.device))
@@ -89,9 +91,9 @@ class ObservationNoise(KeyedTransform):
         return observation_spec
 
     def _size_columns(self, shapes: list[torch.Size]) -> None:
-        if shapes == self._shapes:
+        if self._layout == (self.num_rows, shapes):
             return
-        self._shapes = shapes
+        self._layout = (self.num_rows, shapes)
         sizes, device = [shape.numel() for shape in shapes], self.step_count.device
         self.noise_columns = NoiseColumns(self.noise, self.in_keys, sizes, device)
         if any(cfg.bias is not None for cfg in self.noise):
@@ -100,12 +102,15 @@ class ObservationNoise(KeyedTransform):
             if present is None or present.shape != (self.num_rows, self.bias_columns.size):
                 self._buffers["bias_EL"] = self.bias_columns.neutral().expand(self.num_rows, -1).clone()
 
+    def _size_by(self, tensordict: TensorDictBase) -> None:
+        """Make what the specs have not made yet: TorchRL may reset or resume an env before it asks for them."""
+        if self._layout is None:
+            self._size_rows(tensordict.numel(), tensordict.device)
+            self._size_columns([tensordict.get(key).shape[tensordict.ndim :] for key in self.in_keys])
+
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if self._shapes is None:
-            shape = tensordict_reset.batch_size
-            self._size_rows(shape.numel(), tensordict_reset.device)
-            self._size_columns([tensordict_reset.get(key).shape[len(shape) :] for key in self.in_keys])
-        mask_E = self._reset_rows(tensordict)
+        self._size_by(tensordict_reset)
+        mask_E = self._reset_rows(tensordict, tensordict_reset)
         if self.bias_columns is not None:
             bias_EL = self.bias_columns.sample(lambda kind: self._reset_keys(f"bias/{kind}"), self.num_rows)
             self.bias_EL.copy_(torch.where(mask_E[:, None], bias_EL, self.bias_EL))
@@ -113,6 +118,7 @@ class ObservationNoise(KeyedTransform):
         return self._write(tensordict_reset, sample_EL, self.bias_EL)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._size_by(next_tensordict)
         self.step_count.add_(1)
         sample_EL = self._columns.sample(lambda kind: self._step_keys(f"step/{kind}"), self.num_rows)
         return self._write(next_tensordict, sample_EL, self.bias_EL)
@@ -122,11 +128,8 @@ class ObservationNoise(KeyedTransform):
         num_rows = tensordict.numel()
         self._size_columns([tensordict.get(key).shape[tensordict.ndim :] for key in self.in_keys])
         self.step_count.add_(1)
-
-        def keys_of(kind: str) -> random.RowKeys:
-            return random.row_keys(self.seed_value, self._stream_ids[f"forward/{kind}"], self.step_count, num_rows)
-
-        return self._write(tensordict, self._columns.sample(keys_of, num_rows), None)
+        sample_EL = self._columns.sample(lambda kind: self._step_keys(f"forward/{kind}", num_rows), num_rows)
+        return self._write(tensordict, sample_EL, None)
 
     @property
     def _columns(self) -> NoiseColumns:
@@ -157,7 +160,9 @@ def _one_per_key(
         return [noise] * len(in_keys)
     if isinstance(noise, Mapping):
         if set(noise) != set(in_keys):
-            raise ValueError(f"noise has the keys {list(noise)}, but in_keys={list(in_keys)}: give one per key")
+            raise ValueError(
+                f"noise has the keys {list(noise)}, but in_keys={list(in_keys)}: give one per key"
+            )
         return [noise[key] for key in in_keys]
     if len(noise) != len(in_keys):
         raise ValueError(f"noise has {len(noise)} entries for the {len(in_keys)} of in_keys={list(in_keys)}")

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from ksim_rl import random
 from ksim_rl.envs.transforms.noise_cfg import ConstantNoise, Draw, NoiseCfg
-from ksim_rl.envs.transforms.specs import add_bounds, multiply_bounds
+from ksim_rl.envs.transforms.specs import Device, add_bounds, multiply_bounds
 
 _NEUTRAL = ConstantNoise(value=0.0)
 _ORDER = (Draw.UNIFORM, Draw.GAUSSIAN, Draw.NONE)
@@ -33,7 +33,7 @@ class NoiseColumns(nn.Module):
         cfgs: Sequence[NoiseCfg | None],
         keys: Sequence[NestedKey],
         sizes: Sequence[int],
-        device: torch.device | None,
+        device: Device,
     ) -> None:
         super().__init__()
         offset: list[float] = []

@@ -8,8 +8,8 @@ from torchrl.data import Composite
 from torchrl.envs.transforms import Transform
 
 from ksim_rl import checks
-from ksim_rl.envs.transforms.keyed_transform import Keys, as_keys, checked_out_keys
 from ksim_rl.envs.transforms.noise_cfg import PerDim
+from ksim_rl.envs.transforms.row_transform import Keys, as_keys, checked_out_keys
 from ksim_rl.envs.transforms.specs import bounded, bounds, leaf_spec, multiply_bounds, set_leaf_spec
 
 
@@ -31,11 +31,15 @@ class ObservationScale(Transform):
         in_keys = as_keys(in_keys)
         super().__init__(in_keys, checked_out_keys(in_keys, out_keys))
         if isinstance(scale, Mapping) and set(scale) != set(self.in_keys):
-            raise ValueError(f"scale has the keys {list(scale)}, but in_keys={self.in_keys}: give one per key")
+            raise ValueError(
+                f"scale has the keys {list(scale)}, but in_keys={self.in_keys}: give one per key"
+            )
         for index, key in enumerate(self.in_keys):
             factor = scale[key] if isinstance(scale, Mapping) else scale
             check_scale(f"scale of {key!r}", factor)
-            self.register_buffer(f"factor_{index}", torch.tensor(factor, dtype=torch.float32), persistent=False)
+            self.register_buffer(
+                f"factor_{index}", torch.tensor(factor, dtype=torch.float32), persistent=False
+            )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Scale the bounds."""
@@ -48,7 +52,7 @@ class ObservationScale(Transform):
                     f"{tuple(spec.shape)}: give 1 or one per element of the last dim"
                 )
             low, high = bounds(spec)
-            low, high = multiply_bounds((low, high), (factor.expand(low.shape),) * 2)
+            low, high = multiply_bounds((low, high), (factor.expand(low.shape), factor.expand(low.shape)))
             set_leaf_spec(observation_spec, out_key, bounded(low, high, dtype=spec.dtype, device=spec.device))
         return observation_spec
 
@@ -57,7 +61,9 @@ class ObservationScale(Transform):
             next_tensordict.set(out_key, next_tensordict.get(key) * getattr(self, f"factor_{index}"))
         return next_tensordict
 
-    forward = _call
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Do the same to a batch of samples."""
+        return self._call(tensordict)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)

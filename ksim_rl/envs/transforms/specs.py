@@ -1,11 +1,15 @@
 """Reading and writing of leaf specs and their bounds."""
 
+from typing import Any
+
 import torch
 from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
 from ksim_rl import checks
+
+Device = torch.device | str | int | None
 
 
 def leaf_spec(observation_spec: Composite, key: NestedKey, owner: str) -> TensorSpec:
@@ -25,8 +29,8 @@ def set_leaf_spec(observation_spec: Composite, key: NestedKey, spec: TensorSpec)
     path = key if isinstance(key, tuple) else (key,)
     parent = observation_spec
     for name in path[:-1]:
-        if name not in parent.keys():
-            parent[name] = Composite(shape=parent.shape, device=parent.device)
+        if name not in parent:
+            parent[name] = Composite(shape=parent.shape, device=parent.device)  # pyright: ignore[reportArgumentType]
         parent = parent[name]
     parent[path[-1]] = spec
 
@@ -43,13 +47,13 @@ def drop_leaf_spec(observation_spec: Composite, key: NestedKey) -> None:
 def bounds(spec: TensorSpec) -> tuple[Tensor, Tensor]:
     """Return (low, high) in the spec's shape; infinite where the spec has none."""
     if isinstance(spec, Bounded):
-        space = spec.space
+        space: Any = spec.space
         return space.low.expand(spec.shape).clone(), space.high.expand(spec.shape).clone()
     high = torch.full(spec.shape, torch.inf, device=spec.device)
     return -high, high
 
 
-def bounded(low: Tensor, high: Tensor, *, dtype: torch.dtype, device: torch.device | None) -> TensorSpec:
+def bounded(low: Tensor, high: Tensor, *, dtype: torch.dtype, device: Device) -> TensorSpec:
     """Return a `Bounded` spec, or `Unbounded` where no element has a bound."""
     if bool(torch.isinf(low).all()) and bool(torch.isinf(high).all()):
         return Unbounded(shape=low.shape, dtype=dtype, device=device)
@@ -63,7 +67,9 @@ def add_bounds(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> tuple[Tens
 
 def multiply_bounds(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """Return the range of x * y for x in a, y in b; 0 times infinity is 0, as no finite x exceeds it."""
-    corners = torch.stack([torch.nan_to_num(x * y, nan=0.0, posinf=torch.inf, neginf=-torch.inf) for x in a for y in b])
+    corners = torch.stack(
+        [torch.nan_to_num(x * y, nan=0.0, posinf=torch.inf, neginf=-torch.inf) for x in a for y in b]
+    )
     return corners.amin(0), corners.amax(0)
 
 
@@ -73,4 +79,4 @@ def flat_size(spec: TensorSpec, batch_dims: int) -> int:
 
 
 def _spell(key: NestedKey) -> str:
-    return key if isinstance(key, str) else "/".join(key)
+    return key if isinstance(key, str) else "/".join(map(str, key))

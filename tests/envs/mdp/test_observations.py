@@ -79,10 +79,10 @@ def test_contact_terms_of_resting_and_lifted_boxes(boxes):
     contact = boxes.read(mdp.FootContact(sensor="touch"))
     close(contact, [[1.0, 1.0], [1.0, 0.0]])
     close(boxes.read(mdp.FootAirTime(sensor="touch")), [[0.0, 0.0], [0.0, 0.4]])
-    # A box at rest is held by its weight, upwards: 3 kg and 1 kg at 10 m/s^2.
+    # A box at rest presses on the ground with its weight: 3 kg and 1 kg at 10 m/s^2.
     force = boxes.read(mdp.FootContactForces(sensor="touch")).view(2, 2, 3)
-    close(force[0, :, 2], [math.log(31.0), math.log(11.0)], atol=0.02)
-    close(force[1, :, 2], [math.log(31.0), 0.0], atol=0.02)
+    close(force[0, :, 2], [-math.log(31.0), -math.log(11.0)], atol=0.02)
+    close(force[1, :, 2], [-math.log(31.0), 0.0], atol=0.02)
     close(force[..., :2], 0.0, atol=0.02)
 
 
@@ -91,7 +91,7 @@ def test_contact_forces_keep_their_sign(make_bench):
     for _ in range(20):
         bench.step()
     force = bench.read(mdp.FootContactForces(sensor="touch"))
-    close(force, [[0.0, 0.0, -math.log(31.0)]], atol=0.02)
+    close(force, [[0.0, 0.0, math.log(31.0)]], atol=0.02)
 
 
 def test_unknown_names_list_the_near_ones(free_body):

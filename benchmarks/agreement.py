@@ -1,0 +1,269 @@
+"""Agreement of the batched physics (float32, Warp) with MuJoCo's C engine (float64), per model and quantity.
+
+    python -m benchmarks.agreement [--device cpu] [--worlds 64] [--models quadruped ...]
+
+Both engines start from the same float32 states without a warm start, run the same substeps with the model's own
+settings, and are compared after the last one. The error of a world is its largest deviation, relative to the scale
+of the quantity: the median over worlds of the C engine's largest absolute value (per sensor in `sensordata`).
+`contact_force` counts only worlds with a contact. Menagerie robots take part if MENAGERIE_ROOT is set.
+"""
+
+import argparse
+import dataclasses
+import os
+import sys
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import torch
+
+from benchmarks import report
+from benchmarks.agreement_models import CARTPOLE, DOUBLE_PENDULUM, QUADRUPED, SPINNING_BODY
+from benchmarks.agreement_states import States, anywhere, in_contact
+from ksim_rl.physics import World, load_model, load_spec
+
+SMOOTH_LIMIT = 1e-4
+CONTACT_LIMIT, CONTACT_SHARE, MEDIAN_LIMIT = 1e-3, 0.95, 1e-5
+COMPARED = ("qpos", "qvel", "xpos", "sensordata", "actuator_force", "qfrc_constraint")
+QUANTITIES = (*COMPARED, "contact_force")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Case:
+    """One model: how to get it, how long to run, and how its states are drawn (`spread` None: it touches nothing)."""
+
+    name: str
+    load: Callable[[], mujoco.MjModel]
+    substeps: int
+    spread: float | None = None
+
+    def states(self, mj_model: mujoco.MjModel, num_worlds: int, seed: int = 0) -> States:
+        """Draw the states to start from."""
+        if self.spread is None:
+            return anywhere(mj_model, num_worlds, seed=seed)
+        return in_contact(mj_model, num_worlds, spread=self.spread, seed=seed)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Errors:
+    """Relative errors of one quantity over the worlds."""
+
+    median: float
+    p95: float
+    max: float
+    share_within_1e_3: float
+    scale: float
+    worlds: int
+
+
+def with_contact_sensors(name: str, bodies: tuple[str, ...]) -> mujoco.MjModel:
+    """Load a menagerie robot with a net contact force sensor on each of `bodies`."""
+    spec = load_spec(name)
+    found, force, net_force = 1 << 0, 1 << 1, 3
+    for body in bodies:
+        spec.add_sensor(
+            name=f"{body}_contact",
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            objname=body,
+            intprm=[found | force, net_force, 1],
+        )
+    return load_model(spec)
+
+
+CASES = (
+    Case(name="cartpole", load=lambda: load_model(CARTPOLE), substeps=100),
+    Case(name="double_pendulum", load=lambda: load_model(DOUBLE_PENDULUM), substeps=100),
+    Case(name="spinning_body", load=lambda: load_model(SPINNING_BODY), substeps=100),
+    Case(name="quadruped", load=lambda: load_model(QUADRUPED), substeps=20, spread=0.3),
+    Case(
+        name="unitree_go1",
+        load=lambda: with_contact_sensors("unitree_go1", ("FR_calf", "FL_calf", "RR_calf", "RL_calf")),
+        substeps=20,
+        spread=0.2,
+    ),
+    Case(
+        name="unitree_g1",
+        load=lambda: with_contact_sensors("unitree_g1", ("left_ankle_roll_link", "right_ankle_roll_link")),
+        substeps=20,
+        spread=0.05,
+    ),
+)
+
+
+def run_c_engine(mj_model: mujoco.MjModel, states: States, substeps: int) -> dict[str, np.ndarray]:
+    """Return the quantities [E, ...] after `substeps` of mj_step, in float64, and the number of contacts [E]."""
+    mj_data = mujoco.MjData(mj_model)
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in (*COMPARED, "ncon")}
+    for row in range(len(states.qpos_EL)):
+        states.put(mj_data, row)
+        for _ in range(substeps):
+            mujoco.mj_step(mj_model, mj_data)
+        for name, values in rows.items():
+            values.append(np.array(getattr(mj_data, name), dtype=np.float64).reshape(-1))
+    return {name: np.stack(values) for name, values in rows.items()}
+
+
+def run_warp(
+    mj_model: mujoco.MjModel, states: States, substeps: int, device: torch.device
+) -> dict[str, np.ndarray]:
+    """Return the same quantities from a world on `device`.
+
+    Raises:
+        RuntimeError: if contacts or constraints did not fit, since the comparison would be of something else.
+    """
+    world = World(mj_model, num_envs=len(states.qpos_EL), device=device)
+    for view, values in (
+        (world.qpos_EL, states.qpos_EL),
+        (world.qvel_EL, states.qvel_EL),
+        (world.ctrl_EL, states.ctrl_EL),
+    ):
+        view.copy_(torch.from_numpy(values))
+    world.step(substeps)
+    overflow = world.overflow_report()
+    if not overflow.ok:
+        raise RuntimeError("; ".join(overflow.messages))
+    found = {
+        name: world.view(name).cpu().numpy().astype(np.float64).reshape(world.num_envs, -1)
+        for name in COMPARED
+    }
+    owners = world.view("contact.worldid")[: int(world.view("nacon").item())].cpu().numpy()
+    found["ncon"] = np.bincount(owners, minlength=world.num_envs)[:, None].astype(np.float64)
+    world.close()
+    return found
+
+
+def errors(actual: np.ndarray, expected: np.ndarray) -> Errors:
+    """Compare one quantity [E, L]."""
+    scale = _scale(expected)
+    return _errors(np.abs(actual - expected).max(axis=1) / scale, scale)
+
+
+def sensor_errors(mj_model: mujoco.MjModel, actual: np.ndarray, expected: np.ndarray) -> Errors:
+    """Compare sensordata: the error of a world is that of its worst sensor, each relative to its own scale."""
+    worst = np.zeros(len(expected))
+    for columns in sensor_columns(mj_model):
+        scale = _scale(expected[:, columns])
+        worst = np.maximum(worst, np.abs(actual[:, columns] - expected[:, columns]).max(axis=1) / scale)
+    return _errors(worst, 1.0)
+
+
+def contact_columns(mj_model: mujoco.MjModel) -> np.ndarray:
+    """Return the columns of all contact sensors in sensordata."""
+    columns = [
+        np.arange(columns.start, columns.stop)
+        for kind, columns in zip(mj_model.sensor_type, sensor_columns(mj_model), strict=True)
+        if kind == mujoco.mjtSensor.mjSENS_CONTACT
+    ]
+    return np.concatenate(columns) if columns else np.zeros(0, dtype=int)
+
+
+def sensor_columns(mj_model: mujoco.MjModel) -> list[slice]:
+    """Return the columns of each sensor in sensordata."""
+    return [
+        slice(int(adr), int(adr + dim))
+        for adr, dim in zip(mj_model.sensor_adr, mj_model.sensor_dim, strict=True)
+    ]
+
+
+def measure(case: Case, *, num_worlds: int, device: torch.device) -> tuple[dict[str, Errors], float]:
+    """Return the errors per quantity, and the share of worlds in which the engines found other numbers of contacts."""
+    mj_model = case.load()
+    states = case.states(mj_model, num_worlds)
+    expected = run_c_engine(mj_model, states, case.substeps)
+    actual = run_warp(mj_model, states, case.substeps, device)
+    found = {}
+    for name in COMPARED:
+        if not np.any(expected[name]):
+            continue
+        if name == "sensordata":
+            found[name] = sensor_errors(mj_model, actual[name], expected[name])
+        else:
+            found[name] = errors(actual[name], expected[name])
+    columns = contact_columns(mj_model)
+    touching = np.abs(expected["sensordata"][:, columns]).max(axis=1, initial=0.0) > 0.0
+    if touching.any():
+        rows = np.ix_(touching, columns)
+        found["contact_force"] = errors(actual["sensordata"][rows], expected["sensordata"][rows])
+    return found, float(np.mean(actual["ncon"] != expected["ncon"]))
+
+
+def agrees(case: Case, found: Errors) -> bool:
+    """Whether the errors of a quantity are within the limits of its kind of model."""
+    if case.spread is None:
+        return found.max <= SMOOTH_LIMIT
+    return found.share_within_1e_3 >= CONTACT_SHARE and found.median <= MEDIAN_LIMIT
+
+
+def _scale(expected: np.ndarray) -> float:
+    largest = np.abs(expected).max(axis=1)
+    return float(np.median(largest) or largest.max() or 1.0)
+
+
+def _errors(relative: np.ndarray, scale: float) -> Errors:
+    return Errors(
+        median=float(np.median(relative)),
+        p95=float(np.percentile(relative, 95)),
+        max=float(relative.max()),
+        share_within_1e_3=float(np.mean(relative <= CONTACT_LIMIT)),
+        scale=scale,
+        worlds=len(relative),
+    )
+
+
+def chosen_cases(names: list[str] | None) -> list[Case]:
+    """Return the cases to run; menagerie robots only where MENAGERIE_ROOT names their folder."""
+    offline = "MENAGERIE_ROOT" not in os.environ
+    cases = [case for case in CASES if not (offline and case.name.startswith("unitree"))]
+    return [case for case in cases if names is None or case.name in names]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print the table, write the results, and return 1 if anything disagrees."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.agreement", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--worlds", type=int, default=64)
+    parser.add_argument("--models", nargs="+", choices=[case.name for case in CASES])
+    options = parser.parse_args(arguments)
+    device = torch.device(options.device)
+    label = report.device_label(device)
+    figures, all_agree = {}, True
+    header = (
+        f"{'model':16s}{'quantity':17s}{'scale':>9s}{'median':>10s}{'95 %':>10s}{'max':>10s}{'<= 1e-3':>9s}"
+    )
+    print(header, "-" * len(header), sep="\n")
+    for case in chosen_cases(options.models):
+        found, other_contacts = measure(case, num_worlds=options.worlds, device=device)
+        for quantity, values in found.items():
+            verdict = "" if agrees(case, values) else "  DISAGREES"
+            all_agree &= not verdict
+            print(
+                f"{case.name:16s}{quantity:17s}{values.scale:9.3g}{values.median:10.1e}{values.p95:10.1e}"
+                f"{values.max:10.1e}{values.share_within_1e_3:8.1%}{verdict}"
+            )
+            figures |= {
+                f"{label}/{case.name}/{quantity}/{key}": value
+                for key, value in dataclasses.asdict(values).items()
+            }
+        figures[f"{label}/{case.name}/other_contacts_share"] = other_contacts
+        if case.spread is not None:
+            print(
+                f"{case.name:16s}{'':17s}{other_contacts:.1%} of worlds: the engines differ in number of contacts"
+            )
+    limits = {
+        "smooth models, 100 substeps, all worlds": SMOOTH_LIMIT,
+        "robots in contact, 20 substeps, 95 % of worlds": CONTACT_LIMIT,
+        "robots in contact, 20 substeps, median": MEDIAN_LIMIT,
+    }
+    path = report.write(
+        "agreement", figures=figures, device=device, module="benchmarks.agreement", limits=limits
+    )
+    print(f"written: {path}")
+    return 0 if all_agree else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,107 @@
+"""Write what a benchmark measured into benchmarks/results/<name>.json, beside what was measured before."""
+
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+RESULTS = Path(__file__).parent / "results"
+PACKAGES = ("ksim_rl", "torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
+
+
+def device_label(device: torch.device) -> str:
+    """Return the word that a device's figures start with: "cpu", or the GPU's short name, such as "h200"."""
+    if device.type == "cpu":
+        return "cpu"
+    words = torch.cuda.get_device_name(device).lower().replace("-", " ").split()
+    return next((word for word in words if any(letter.isdigit() for letter in word)), words[-1])
+
+
+def device_name(device: torch.device) -> str:
+    """Return the full name of a device."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that the figures depend on."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    if torch.version.cuda:
+        found["cuda"] = torch.version.cuda
+    return found
+
+
+def commit() -> str:
+    """Return the commit that ran, with "-dirty" if files differ from it, or "unknown" outside a repository."""
+
+    def git(*words: str) -> str:
+        found = subprocess.run(
+            ["git", *words], cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        )
+        return found.stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def command(module: str) -> str:
+    """Return the command line that ran this benchmark."""
+    return shlex.join(["python", "-m", module, *sys.argv[1:]])
+
+
+def write(
+    name: str,
+    *,
+    figures: Mapping[str, float],
+    device: torch.device,
+    module: str,
+    folder: Path = RESULTS,
+    **measured: Any,
+) -> Path:
+    """Merge a run into `<folder>/<name>.json`, replacing the file in one step.
+
+    Args:
+        name: of the benchmark.
+        figures: flat; each key starts with the device's label. Figures of earlier runs that are not in here stay.
+        device: where the run was.
+        module: the benchmark's module, for the command line.
+        folder: where the results are.
+        measured: whatever else was measured; a mapping is merged like the figures, anything else replaces.
+
+    Returns:
+        The path of the file.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}.json"
+    saved = json.loads(path.read_text()) if path.exists() else {}
+    saved |= {
+        "command": command(module),
+        "commit": commit(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "device": device_name(device),
+        "versions": versions(),
+        "figures": {**saved.get("figures", {}), **figures},
+    }
+    for key, value in measured.items():
+        saved[key] = {**saved.get(key, {}), **value} if isinstance(value, Mapping) else value
+    unfinished = path.with_suffix(".json.part")
+    unfinished.write_text(json.dumps(saved, indent=2) + "\n")
+    os.replace(unfinished, path)
+    return path

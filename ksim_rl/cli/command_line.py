@@ -1,0 +1,99 @@
+"""Checks a `ksim-rl train` command line as a whole, before anything is built or written."""
+
+import itertools
+from collections.abc import Iterator, Sequence
+
+import hydra
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from ksim_rl import conf
+from ksim_rl.checks import unknown_name
+from ksim_rl.envs.overrides import check_key
+
+# A sweep over more combinations than this is checked in part here; each job checks its own config again.
+MAX_CHECKED_JOBS = 50
+
+
+def check_command_line(texts: Sequence[str], *, multirun: bool, values: bool) -> None:
+    """Refuse overrides that name an unknown group, choice or field, or (with `values`) give a field a bad value.
+
+    Args:
+        texts: Hydra overrides.
+        multirun: whether sweeps such as `seed=1,2` are allowed.
+        values: also build the run's config, of each job of a sweep.
+
+    Raises:
+        ValueError: one line that names what is wrong, and the near names or the valid values.
+    """
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_module(conf.MODULE, version_base="1.3"):
+            loader = GlobalHydra.instance().config_loader()
+            overrides = [_parse(text, loader) for text in texts]
+            sweeps = [override.input_line for override in overrides if override.is_sweep_override()]
+            if sweeps and not multirun:
+                raise ValueError(
+                    f"override {sweeps[0]!r} has several values: add --multirun to run one job for each"
+                )
+            _check_names(overrides, loader)
+            for job in itertools.islice(_jobs(overrides), MAX_CHECKED_JOBS if values else 0):
+                conf.compose_within(job)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ValueError(f"the overrides do not compose: {' '.join(str(error).split())}") from error
+
+
+def _parse(text: str, loader: ConfigLoader) -> Override:
+    try:
+        return OverridesParser.create(config_loader=loader).parse_override(text)
+    except HydraException as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(
+            f"override {text!r} does not parse (expected group=name or field=value): {reason}"
+        ) from error
+
+
+def _check_names(overrides: Sequence[Override], loader: ConfigLoader) -> None:
+    groups = _groups(loader)
+    choices, fields = [], []
+    for override in overrides:
+        if override.key_or_group in groups:
+            options = loader.get_group_options(override.key_or_group)
+            for choice in _values(override):
+                if choice not in options:
+                    raise unknown_name(override.key_or_group, choice, options)
+            choices.append(f"{override.key_or_group}={_values(override)[0]}")
+        elif not override.is_add() and not override.is_hydra_override():
+            fields.append(override.key_or_group)
+    tree = OmegaConf.to_container(hydra.compose(conf.NAME, overrides=choices))
+    assert isinstance(tree, dict)
+    for field in fields:
+        known = tree if "." in field else {**tree, **dict.fromkeys(groups)}
+        check_key({str(key): value for key, value in known.items()}, field)
+
+
+def _groups(loader: ConfigLoader) -> list[str]:
+    top = [group for group in loader.list_groups("") if group != "hydra"]
+    return [*top, *(f"{group}/{child}" for group in top for child in loader.list_groups(group))]
+
+
+def _jobs(overrides: Sequence[Override]) -> Iterator[list[str]]:
+    """Yield the overrides of each job, as Hydra's sweeper would."""
+    axes = [
+        [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()]
+        if override.is_discrete_sweep()
+        else [override.input_line or ""]
+        for override in overrides
+    ]
+    return (list(job) for job in itertools.product(*axes))
+
+
+def _values(override: Override) -> list[str]:
+    if override.is_discrete_sweep():
+        return list(override.sweep_string_iterator())
+    return [str(override.value())]

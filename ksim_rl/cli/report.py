@@ -1,0 +1,61 @@
+"""What a command says about a run."""
+
+import os
+from pathlib import Path
+
+from ksim_rl.physics import compile_notice
+from ksim_rl.trainers import Checkpoint, Evaluation, Outcome, RunCfg, RunProgress, run
+from ksim_rl.trainers.build import solved_at
+
+
+def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None = None) -> int:
+    """Train with progress on the terminal, say how it ended, and return the exit code."""
+    progress = RunProgress(
+        cfg.trainer.num_iterations, done=0 if resume_from is None else resume_from.iteration
+    )
+    progress.note(
+        f"{cfg.task_name}: {cfg.num_envs} envs x {cfg.data.rollout_length(cfg.num_envs)} steps = "
+        f"{cfg.data.num_env_states} env states per iteration, on {cfg.device}; run folder {shown(folder)}"
+    )
+    with compile_notice(progress.status):
+        outcome = run(cfg, folder, progress=progress, resume_from=resume_from)
+    for line in _summary(cfg, outcome, folder):
+        progress.note(line)
+    if outcome.interrupted_by is not None:
+        return 128 + int(outcome.interrupted_by)
+    return 1 if outcome.solved is False else 0
+
+
+def verdict(evaluation: Evaluation, threshold: float | None) -> str:
+    """Say how good an evaluation is, against the threshold of the task if it has one."""
+    text = (
+        f"evaluation over {evaluation.episodes} episodes (deterministic, fresh envs): return "
+        f"{evaluation.return_mean:.1f} +- {evaluation.return_std:.1f}, length {evaluation.length_mean:.0f} steps"
+    )
+    if evaluation.unfinished:
+        text += f" ({evaluation.unfinished} cut at the step limit)"
+    if threshold is None:
+        return text
+    solved = evaluation.return_mean >= threshold
+    return f"{text}: {'SOLVED' if solved else 'NOT SOLVED'} (threshold {threshold:g})"
+
+
+def shown(path: Path) -> str:
+    """Return a path as short as it can be written from here."""
+    relative = os.path.relpath(path)
+    return str(path) if relative.startswith("..") else relative
+
+
+def _summary(cfg: RunCfg, outcome: Outcome, folder: Path) -> list[str]:
+    speed = outcome.env_states / outcome.seconds if outcome.seconds else 0.0
+    lines = [
+        f"{outcome.iteration} iterations, {outcome.env_states:,} env states in {outcome.seconds:.0f} s "
+        f"({speed:,.0f} per s, evaluations included)"
+    ]
+    if outcome.interrupted_by is not None:
+        name = outcome.interrupted_by.name
+        lines.append(f"{name}: everything is saved; continue with: ksim-rl resume {shown(folder)}")
+    elif outcome.evaluation is not None:
+        lines.append(verdict(outcome.evaluation, solved_at(cfg)))
+    lines.append(f"{shown(folder)}: {', '.join(sorted(entry.name for entry in folder.iterdir()))}")
+    return lines

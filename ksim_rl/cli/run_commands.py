@@ -1,0 +1,103 @@
+"""The commands that take no Hydra overrides: resume, eval, play, envs."""
+
+import argparse
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from ksim_rl import envs
+from ksim_rl.cli.report import run_and_report, shown, verdict
+from ksim_rl.physics import compile_notice
+from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, load_policy, record_video
+from ksim_rl.trainers.build import build_evaluator, solved_at
+
+
+def run_command(command: str, arguments: list[str]) -> int:
+    """Run one of the commands and return its exit code."""
+    return {"resume": _resume, "eval": _evaluate, "play": _play, "envs": _envs}[command](arguments)
+
+
+def _resume(arguments: list[str]) -> int:
+    parser = _parser("resume", "Continue a run from its newest checkpoint, in the same folder.")
+    parser.add_argument("--num-iterations", type=int, help="of the whole run; default: as it was configured")
+    parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:<index> or auto")
+    options = parser.parse_args(arguments)
+    saved = checkpoint.load(checkpoint.latest(options.run))
+    tree = {**saved.config, "device": options.device}
+    if options.num_iterations is not None:
+        tree["trainer"] = {**tree["trainer"], "num_iterations": options.num_iterations}
+    cfg = RunCfg.from_tree({**tree, "device": str(RunCfg.from_tree(tree).resolved_device())})
+    # A checkpoint lies in <run folder>/checkpoint/<iteration>.
+    return run_and_report(cfg, saved.path.resolve().parent.parent, resume_from=saved)
+
+
+def _evaluate(arguments: list[str]) -> int:
+    parser = _parser("eval", "Evaluate a policy: deterministic actions, fresh envs, whole episodes.")
+    parser.add_argument("--episodes", type=int, help="default: as the run was configured")
+    parser.add_argument("--seed", type=int, help="of the initial states; default: the run's evaluation seed")
+    parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:<index> or auto")
+    options = parser.parse_args(arguments)
+    if options.episodes is not None and options.episodes < 1:
+        raise ValueError(f"--episodes {options.episodes}: expected at least 1")
+    with compile_notice(RunProgress(1).status):
+        policy = load_policy(options.run, device=options.device)
+        episodes = options.episodes or policy.cfg.trainer.eval_episodes or 100
+        evaluate = build_evaluator(policy.cfg, policy.actor, episodes=episodes, seed=options.seed)
+        evaluation = evaluate()
+    threshold = solved_at(policy.cfg)
+    print(f"{policy.cfg.task_name}, iteration {policy.iteration}: {verdict(evaluation, threshold)}")
+    return 0 if threshold is None or evaluation.return_mean >= threshold else 1
+
+
+def _play(arguments: list[str]) -> int:
+    parser = _parser("play", "Record a video of a policy.")
+    parser.add_argument("--seconds", type=float, help="of simulated time; default: as the run was configured")
+    parser.add_argument(
+        "--output", type=Path, help="an .mp4 or .gif file; default: play.mp4 in the run folder"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the initial state")
+    parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:<index> or auto")
+    options = parser.parse_args(arguments)
+    if options.seconds is not None and not options.seconds > 0:
+        raise ValueError(f"--seconds {options.seconds}: expected more than 0")
+    progress = RunProgress(1)
+    with compile_notice(progress.status):
+        policy = load_policy(options.run, device=options.device)
+        path = options.output or checkpoint.latest(options.run).resolve().parent.parent / "play.mp4"
+        written = record_video(
+            policy.cfg, policy.actor, path, note=progress.note, seconds=options.seconds, seed=options.seed
+        )
+    if written is None:
+        return 3
+    print(f"{policy.cfg.task_name}, iteration {policy.iteration}: {shown(written)}")
+    return 0
+
+
+def _envs(arguments: list[str]) -> int:
+    argparse.ArgumentParser(prog="ksim-rl envs", description="List the tasks.").parse_args(arguments)
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in ("task", "robot", "episode", "observations", "solved at", "description"):
+        table.add_column(column, no_wrap=column == "task")
+    for name in envs.names():
+        task = envs.task(name)
+        cfg = task.cfg()
+        groups = ", ".join(f"{group} ({len(spec.terms)} terms)" for group, spec in cfg.observations.items())
+        table.add_row(
+            name,
+            ", ".join(cfg.scene.robots),
+            f"{cfg.episode_length_s:g} s" if cfg.episode_length_s else "no limit",
+            groups,
+            "-" if task.solved_at is None else f"return {task.solved_at:g}",
+            task.description,
+        )
+    console = Console(highlight=False)
+    # In a pipe nothing is wrapped, so that each task stays one line.
+    Console(highlight=False, width=None if console.is_terminal else 240).print(table)
+    return 0
+
+
+def _parser(command: str, description: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog=f"ksim-rl {command}", description=description)
+    parser.add_argument("run", type=Path, metavar="RUN", help="a run folder, or one of its checkpoints")
+    return parser

@@ -1,0 +1,161 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Composite, Unbounded
+from torchrl.envs.transforms import RenameTransform
+
+from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
+from ksim_rl.envs.transforms import (
+    DelayCfg,
+    GaussianNoise,
+    HistoryCfg,
+    ObservationClip,
+    ObservationDelay,
+    ObservationGroupCfg,
+    ObservationGroups,
+    ObservationHistory,
+    ObservationNoise,
+    ObservationScale,
+    ObservationTermCfg,
+    UniformNoise,
+    compile_groups,
+)
+from ksim_rl.testing import CounterEnv, check_env
+from tests.envs.transforms.chains import assert_same, fixed_rollout
+
+
+class TermEnv(CounterEnv):
+    """The counter env with the key layout of our envs: every observation under "obs"."""
+
+    def __init__(self):
+        super().__init__((3, 5, 4))
+        leaves = {name: Unbounded((3, 1)) for name in ("count", "episode", "row", "drawn")}
+        leaves["vector"] = Unbounded((3, 3))
+        self.observation_spec = Composite(obs=Composite(leaves, shape=(3,)), shape=(3,))
+
+    def _observe(self):
+        observed = super()._observe()
+        leaves = {name: observed[name] for name in ("count", "episode", "row", "drawn")}
+        return {
+            "obs": TensorDict(
+                {
+                    **leaves,
+                    "vector": observed["obs", "vector"]
+                    if ("obs", "vector") in observed
+                    else observed["obs"]["vector"],
+                },
+                batch_size=3,
+            )
+        }
+
+
+def read(view):
+    raise AssertionError("transforms read no term")
+
+
+def term(**chain) -> ObservationTermCfg:
+    return ObservationTermCfg(term=read, **chain)
+
+
+GROUPS = {
+    "actor": ObservationGroupCfg(
+        terms={
+            "vector": term(
+                noise=GaussianNoise(std=0.1, bias=UniformNoise(low=-1.0, high=1.0)),
+                clip=(-5.0, 150.0),
+                scale=(1.0, 0.1, 0.01),
+                delay=DelayCfg(max_lag=2),
+                history=3,
+            ),
+            "row": term(),
+            "count": term(noise=UniformNoise(low=-0.5, high=0.5), history=HistoryCfg(length=2)),
+        }
+    ),
+    "critic": ObservationGroupCfg(terms={"count": term(), "vector": term(scale=0.5)}, keep_terms=True),
+}  # fmt: skip
+
+
+def by_hand():
+    a, c = "actor_terms", "critic_terms"
+    return [
+        ObservationNoise(
+            [("obs", "vector"), ("obs", "count")],
+            [(a, "vector"), (a, "count")],
+            noise=[
+                GaussianNoise(std=0.1, bias=UniformNoise(low=-1.0, high=1.0)),
+                UniformNoise(low=-0.5, high=0.5),
+            ],
+        ),
+        ObservationClip([(a, "vector")], clip=(-5.0, 150.0)),
+        ObservationScale([(a, "vector")], scale=(1.0, 0.1, 0.01)),
+        ObservationDelay([(a, "vector")], delay=DelayCfg(max_lag=2)),
+        ObservationHistory([(a, "count")], length=2),
+        ObservationHistory([(a, "vector")], length=3),
+        ObservationScale([("obs", "vector")], [(c, "vector")], scale=0.5),
+        RenameTransform([("obs", "count")], [(c, "count")], create_copy=True),
+        ObservationGroups(
+            {
+                "actor": [(a, "vector"), ("obs", "row"), (a, "count")],
+                "critic": [("obs", "count"), (c, "vector")],
+            },
+            drop=[(a, "vector"), (a, "count")],
+        ),
+    ]
+
+
+def test_config_and_hand_written_chain_give_identical_rollouts():
+    envs = [MaskedTransformedEnv(TermEnv(), chain) for chain in (compile_groups(GROUPS), by_hand())]
+    for env in envs:
+        env.set_seed(2)
+    ours, theirs = (fixed_rollout(env, 15) for env in envs)
+    assert_same(ours, theirs)
+    assert ours["actor"].shape == (3, 15, 9 + 1 + 2)
+
+
+def test_the_env_passes_all_checks():
+    check_env(MaskedTransformedEnv(TermEnv(), compile_groups(GROUPS)), num_steps=8)
+
+
+def test_kept_terms_are_what_the_vector_holds_and_others_are_gone():
+    env = MaskedTransformedEnv(TermEnv(), compile_groups(GROUPS))
+    root = env.reset()
+    assert "actor_terms" not in root
+    kept = root["critic_terms"]
+    assert torch.equal(torch.cat([kept["count"], kept["vector"]], -1), root["critic"])
+    assert torch.equal(root["obs", "vector"] * 0.5, kept["vector"])
+
+
+def test_terms_without_a_chain_go_straight_into_the_vector():
+    plain = ObservationGroupCfg(terms={"count": term(), "row": term()})
+    assert [type(t) for t in compile_groups({"actor": plain, "critic": plain})] == [ObservationGroups]
+
+
+def test_noise_of_one_group_leaves_the_other_clean():
+    noisy = ObservationGroupCfg(terms={"count": term(noise=UniformNoise(low=1.0, high=2.0))})
+    clean = ObservationGroupCfg(terms=noisy.terms, enable_noise=False)
+    root = MaskedTransformedEnv(TermEnv(), compile_groups({"actor": noisy, "critic": clean})).reset()
+    assert bool((root["actor"] >= 1).all())
+    assert torch.equal(root["critic"], root["obs", "count"])
+
+
+def test_two_noisy_groups_draw_apart():
+    noisy = ObservationGroupCfg(terms={"count": term(noise=GaussianNoise(std=1.0))})
+    root = MaskedTransformedEnv(TermEnv(), compile_groups({"actor": noisy, "critic": noisy})).reset()
+    assert not (root["actor"] == root["critic"]).any()
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: ObservationGroupCfg(terms={}), "terms"),
+        (lambda: ObservationTermCfg(term=3), "term=3"),
+        (lambda: term(clip=(1.0, 0.0)), "clip"),
+        (lambda: term(scale=float("nan")), "scale"),
+        (lambda: term(history=0), "history"),
+        (lambda: term(history=HistoryCfg(length=0)), "length"),
+        (lambda: term(noise=1.0), "noise"),
+    ],
+)
+def test_wrong_configs_are_refused(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()

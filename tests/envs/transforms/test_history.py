@@ -1,0 +1,63 @@
+import pytest
+import torch
+from torchrl.envs.transforms import CatFrames, Compose
+
+from ksim_rl.envs.transforms import ObservationHistory
+from tests.envs.transforms.chains import VECTOR, counter, fixed_rollout
+
+
+@pytest.mark.parametrize("length", [1, 2, 4])
+def test_frames_are_the_last_ones_oldest_first(length):
+    env = counter(ObservationHistory("count", "frames", length=length), lengths=(3, 6, 1))
+    rollout_ET = fixed_rollout(env, 14)
+    for part in (rollout_ET, rollout_ET["next"]):
+        for frame in range(length):
+            age = length - 1 - frame
+            assert torch.equal(part["frames"][..., frame : frame + 1], (part["count"] - age).clamp(min=0))
+
+
+def test_after_a_reset_all_frames_are_the_reset_observation():
+    env = counter(ObservationHistory("drawn", "frames", length=5))
+    root = env.reset()
+    assert torch.equal(root["frames"], root["drawn"].expand(3, 5))
+
+
+def test_stacked_and_flat_agree():
+    env = counter(
+        ObservationHistory([VECTOR], ["flat"], length=3),
+        ObservationHistory([VECTOR], ["stacked"], length=3, flat=False),
+    )
+    rollout_ET = fixed_rollout(env, 9)
+    assert rollout_ET["stacked"].shape == (3, 9, 3, 3)
+    assert torch.equal(rollout_ET["stacked"].flatten(-2), rollout_ET["flat"])
+
+
+def test_it_equals_catframes():
+    """TorchRL's transform with padding "same" does the same, where nobody resets part of the rows by hand."""
+    chain = Compose(
+        ObservationHistory([VECTOR], ["ours"], length=4),
+        CatFrames(4, -1, in_keys=[VECTOR], out_keys=["theirs"], padding="same"),
+    )
+    rollout_ET = fixed_rollout(counter(chain, stock=True), 15)
+    assert torch.equal(rollout_ET["ours"], rollout_ET["theirs"])
+    assert torch.equal(rollout_ET["next", "ours"], rollout_ET["next", "theirs"])
+
+
+def test_what_it_gives_out_does_not_change_later():
+    env = counter(ObservationHistory("count", "frames", length=3))
+    root = env.reset()
+    before = root["frames"].clone()
+    env.step_and_maybe_reset(root.clone().set("action", torch.zeros(3, 2)))
+    assert torch.equal(root["frames"], before)
+
+
+def test_bounds_are_repeated():
+    spec = counter(ObservationHistory("drawn", length=3)).observation_spec["drawn"]
+    assert spec.shape == (3, 3)
+    assert bool((spec.space.low == 0).all()) and bool((spec.space.high == 1).all())
+
+
+@pytest.mark.parametrize("length", [0, -1, 2.0, True])
+def test_wrong_lengths_are_refused(length):
+    with pytest.raises(ValueError, match="length="):
+        ObservationHistory("count", length=length)

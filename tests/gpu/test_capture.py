@@ -1,0 +1,113 @@
+"""What only a GPU can show: no host sync, and graphs that do what eager code does."""
+
+import pytest
+import torch
+
+from ksim_rl import conf, envs
+from ksim_rl.collectors import RolloutCollector
+from ksim_rl.trainers import build
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+
+TASKS = ("cartpole_balance", "cartpole_swingup", "go1_velocity_flat")
+
+
+def make(name, **kwargs):
+    try:
+        return envs.make(name, num_envs=64, device="cuda", seed=1, **kwargs)
+    except (FileNotFoundError, ValueError) as error:
+        if "menagerie" in str(error).lower():
+            pytest.skip(f"no menagerie: {error}")
+        raise
+
+
+@pytest.fixture
+def no_syncs():
+    """Make each host sync an error inside the block that the test opens."""
+
+    class Mode:
+        def __enter__(self):
+            torch.cuda.synchronize()
+            torch.cuda.set_sync_debug_mode("error")
+
+        def __exit__(self, *_):
+            torch.cuda.set_sync_debug_mode("default")
+
+    return Mode()
+
+
+def random_policy(td):
+    return td.set("action", 0.3 * torch.randn(td["actor"].shape[0], random_policy.size, device="cuda"))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_step_and_reset_make_no_host_sync(name, no_syncs):
+    env = make(name)
+    random_policy.size = env.action_spec.shape[-1]
+    root_E = env.reset()
+    for _ in range(3):
+        _, root_E = env.step_and_maybe_reset(random_policy(root_E))
+    with no_syncs:
+        for _ in range(5):
+            _, root_E = env.step_and_maybe_reset(random_policy(root_E))
+        env.reset()
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_captured_rollout_equals_the_eager_one(name):
+    def rollouts(captured):
+        env = make(name, overrides=["task.sim.deterministic=true"])
+        random_policy.size = env.action_spec.shape[-1]
+        collector = RolloutCollector(env, random_policy, rollout_length=8)
+        if not captured:
+            collector._run._eager_for_ever = True
+            collector._run._stream = None
+        torch.manual_seed(0)
+        results = []
+        for _ in range(5):
+            results.append(collector.collect().clone())
+        assert collector._run.ready is captured
+        return results
+
+    for actual, expected in zip(rollouts(True), rollouts(False), strict=True):
+        for key in expected.keys(True, True):
+            torch.testing.assert_close(actual[key], expected[key], rtol=1e-4, atol=1e-4, msg=str(key))
+
+
+def test_whole_iterations_make_no_host_sync_and_learn(no_syncs):
+    cfg = conf.compose(
+        [
+            "task=cartpole_balance",
+            "num_envs=256",
+            "device=cuda",
+            "data.num_env_states_per_minibatch=1024",
+            "data.num_minibatches=4",
+            "logger=none",
+            "trainer.eval_episodes=0",
+        ]
+    )
+    trainer = build(cfg)
+    before = [p.detach().clone() for p in trainer.update.actor.parameters()]
+    for _ in range(4):
+        trainer.update(trainer.collector.collect())
+    with no_syncs:
+        for _ in range(5):
+            trainer.update(trainer.collector.collect())
+    assert trainer.collector._run.ready and trainer.update._run.ready
+    after = list(trainer.update.actor.parameters())
+    assert all(torch.isfinite(p).all() for p in after)
+    assert any(not torch.equal(a, b) for a, b in zip(after, before, strict=True))
+
+
+def test_a_failed_world_is_reset_inside_the_graph():
+    env = make("cartpole_balance")
+    random_policy.size = 1
+    collector = RolloutCollector(env, random_policy, rollout_length=4)
+    for _ in range(4):
+        collector.collect()
+    env.base_env.episode_log_reset_()
+    env.base_env.world.qvel_EL[3] = torch.nan
+    rollout_ET = collector.collect()
+    assert rollout_ET["next", "terminated"][3, 0] and not rollout_ET["next", "terminated"][:3, 0].any()
+    assert all(torch.isfinite(leaf).all() for leaf in rollout_ET.values(True, True))
+    assert env.base_env.episode_log()["termination/non_finite"] == 1

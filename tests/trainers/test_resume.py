@@ -1,0 +1,79 @@
+"""N iterations at a stretch equal N/2, a checkpoint, and N/2 in new objects: every tensor, bit for bit."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from ksim_rl.trainers import checkpoint, state_tree
+from tests.trainers.target_env import make_trainer
+
+
+def parts(trainer):
+    tensors, values = state_tree.split(trainer.state_dict())
+    del values["/seconds"]
+    return tensors, values
+
+
+def trained(*args, **options):
+    """Make and train; torch's global generator starts anew with each."""
+    trainer = make_trainer(*args, **options)
+    trainer.train()
+    return trainer
+
+
+def assert_same(one, other):
+    (tensors, values), (other_tensors, other_values) = parts(one), parts(other)
+    assert values == other_values
+    assert tensors.keys() == other_tensors.keys()
+    differ = [name for name in tensors if not torch.equal(tensors[name], other_tensors[name])]
+    assert differ == []
+
+
+def test_a_resumed_run_is_bit_identical(tmp_path):
+    straight = trained(iterations=6)
+    trained(tmp_path, iterations=3)
+    resumed = make_trainer(iterations=6, seed=123)  # another seed: all of it must come from the checkpoint
+    resumed.load(tmp_path)
+    assert resumed.iteration == 3
+    resumed.train()
+    assert_same(straight, resumed)
+
+
+IN_A_NEW_PROCESS = """
+import pathlib, sys
+from tests.trainers.target_env import make_trainer
+folder = pathlib.Path(sys.argv[1])
+trainer = make_trainer(folder, iterations=4, seed=9)
+trainer.load(folder)
+trainer.train()
+"""
+
+
+def test_a_run_resumed_in_a_new_process_is_bit_identical(tmp_path):
+    straight = trained(iterations=4)
+    trained(tmp_path, iterations=2)
+    subprocess.run([sys.executable, "-c", IN_A_NEW_PROCESS, str(tmp_path)], check=True)
+    resumed = make_trainer(seed=77)
+    resumed.load(tmp_path)
+    assert_same(straight, resumed)
+
+
+def test_saving_does_not_change_the_run(tmp_path):
+    assert_same(trained(iterations=3), trained(tmp_path, iterations=3, checkpoint_interval=1))
+
+
+def test_evaluating_does_not_change_the_run():
+    assert_same(trained(iterations=3), trained(iterations=3, eval_interval=1))
+
+
+def test_a_checkpoint_of_another_network_is_refused_with_both_shapes(tmp_path):
+    make_trainer(tmp_path, iterations=1).train()
+    saved = checkpoint.load(checkpoint.latest(tmp_path))
+    name = next(name for name, tensor in saved.state["update"]["actor"].items() if tensor.shape == (16, 1))
+    saved.state["update"]["actor"][name] = torch.zeros(32, 1)
+    with pytest.raises(
+        ValueError, match=r"actor: .* float32\[32, 1\] in the checkpoint and float32\[16, 1\]"
+    ):
+        make_trainer().load_state_dict(saved.state)
