@@ -9,10 +9,13 @@ class CollectorCfg:
 
     Attributes:
         require_graphs: on CUDA, fail where CUDA graphs are unavailable instead of running slower with a warning.
+        stagger_episodes: at the first reset, spread the time-outs of the envs over an episode's length, where the env
+            offers it, so that not all episodes are in the same phase.
         warmup: on CUDA, how many rollouts run eagerly before one is captured; they are ordinary rollouts.
     """
 
     require_graphs: bool = False
+    stagger_episodes: bool = False
     warmup: int = 2
 
     def __post_init__(self) -> None:

@@ -42,8 +42,7 @@ class DatasetStorage(TensorStorage):
 
     @torch.no_grad()
     def write(self, data: TensorDictBase) -> None:
-        """Replace the content by `data`, whose batch dims of D elements in all are flattened in row-major
-        order.
+        """Replace the content by `data`, whose batch dims are flattened, the last one running fastest.
 
         Raises:
             ValueError: if `data` has not D elements, or its leaves are not those of the first write.
@@ -65,7 +64,7 @@ class DatasetStorage(TensorStorage):
         mask_D1: Tensor = self._storage.get(MASK_KEY)
         mask_D1.copy_(finite_D1)
         if mask is not None:
-            mask_D1.logical_and_(mask.reshape(-1, 1))
+            mask_D1.logical_and_(mask.reshape(-1, 1).to(mask_D1.device))
         _replace_rows(stored.values(), keep_D1=finite_D1, donor_D1=mask_D1)
         self.non_finite_count.add_((~finite_D1).sum())
         self._len = self.max_size

@@ -291,6 +291,17 @@ class ManagerBasedRlEnv(MaskedReset):
         self.event_manager.startup()
         self._recompute(*self.event_manager.fields("startup"))
 
+    def stagger_episodes_(self) -> None:
+        """Let the running episodes time out at random steps, so that the time-outs of different envs spread out.
+
+        Without it all envs that start together also end together, and each rollout shows one phase of an episode
+        only. Later episodes have their full length.
+        """
+        if self.max_episode_length:
+            with self.view.scope("stagger_episodes", self.view.reset_count_E):
+                share_E = self.view.uniform(1)[:, 0]
+            self.view.time_out_offset_E.copy_((share_E * self.max_episode_length).long())
+
     # -- what trainers read --------------------------------------------------------------------------------------
 
     def episode_log(self) -> dict[str, Tensor]:

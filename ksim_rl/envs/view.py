@@ -84,6 +84,7 @@ class EnvView:
         self.default_qpos_L = default_qpos
         self.default_joint_pos_EL = default_qpos[self._qpos_index].expand(self.num_envs, -1).clone()
         self.soft_joint_pos_limits_L2 = self._soft_limits(joints, soft_joint_pos_limit_factor)
+        self.time_out_offset_E = self.memories.get("time_out_offset_E", dtype=torch.int64)
         self.encoder_bias_EL = self.memories.get("encoder_bias_EL", self.num_joints, keep=True)
 
         zero = torch.zeros((), dtype=torch.int64, device=self.device)

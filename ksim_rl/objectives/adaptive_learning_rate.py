@@ -17,8 +17,7 @@ def adapt_learning_rate_(
     """Divide `lr` by `factor` if `kl` exceeds twice the desired one, multiply it if below half, in place.
 
     The rule of rsl_rl, on the device: no host sync, so it can be captured in a CUDA graph. A divergence of
-        zero (the
-    first step on a dataset), or one that is not finite, changes nothing.
+    exactly zero (the policy has not moved yet), or one that is NaN, changes nothing.
 
     Args:
         lr: float32 [], the learning rate of the optimizer.
@@ -32,6 +31,7 @@ def adapt_learning_rate_(
     """
     slower = (lr / factor).clamp_min(lr_min)
     faster = (lr * factor).clamp_max(lr_max)
-    too_far = (kl > 2.0 * desired_kl) & kl.isfinite()
+    # Comparisons with NaN are False.
+    too_far = kl > 2.0 * desired_kl
     too_near = (kl < 0.5 * desired_kl) & (kl > 0.0)
     return lr.copy_(torch.where(too_far, slower, torch.where(too_near, faster, lr)))

@@ -27,6 +27,8 @@ class SimCfg:
         solver: "newton" or "cg".
         cone: friction cones, "pyramidal" or "elliptic".
         impratio: ratio of frictional to normal constraint impedance.
+        tolerance: at which the constraint solver stops. MuJoCo Warp raises the model's own to 1e-6 at least, since its
+            numbers are float32; a value given here is taken as it is.
         iterations: most iterations of the constraint solver.
         ls_iterations: most iterations of its line search.
         ccd_iterations: most iterations of convex collision detection.
@@ -46,6 +48,7 @@ class SimCfg:
     solver: str | None = None
     cone: str | None = None
     impratio: float | None = None
+    tolerance: float | None = None
     iterations: int | None = None
     ls_iterations: int | None = None
     ccd_iterations: int | None = None
@@ -55,7 +58,7 @@ class SimCfg:
     require_graphs: bool = False
 
     def __post_init__(self) -> None:
-        for field in ("timestep", "impratio"):
+        for field in ("timestep", "impratio", "tolerance"):
             value = getattr(self, field)
             if value is not None:
                 check_in_range(field, value, low=0.0, low_open=True)
@@ -78,7 +81,7 @@ class SimCfg:
     def apply_to(self, target: mujoco.MjSpec | mujoco.MjModel) -> None:
         """Write the settings that are not `None` into the options of a spec or a model, in place."""
         option = target.option if isinstance(target, mujoco.MjSpec) else target.opt
-        for field in ("timestep", "impratio", "iterations", "ls_iterations", "ccd_iterations"):
+        for field in ("timestep", "impratio", "tolerance", "iterations", "ls_iterations", "ccd_iterations"):
             value = getattr(self, field)
             if value is not None:
                 setattr(option, field, value)

@@ -63,6 +63,8 @@ class World(views.DataViews):
             self.warp_model = warp_model_of(self.mj_model, dict.fromkeys(expanded, num_envs))
             self.warp_model.opt.warn_overflow = 0
             self.warp_model.opt.deterministic = self.sim.deterministic
+            if self.sim.tolerance is not None:
+                self.warp_model.opt.tolerance.fill_(self.sim.tolerance)
             if self.device.type == "cuda" and not wp.is_conditional_graph_supported():
                 self.warp_model.opt.graph_conditional = False
             self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim)
@@ -164,6 +166,8 @@ class World(views.DataViews):
 
     def close(self) -> None:
         """Free the graphs and arrays. Views that are still held keep their memory."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
         self._graphs.clear()
         for name in ("warp_data_E", "warp_model", "_substeps", "_overflow", "_zeroed_at_reset", "_fields"):
             if hasattr(self, name):

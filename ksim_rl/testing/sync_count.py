@@ -17,6 +17,8 @@ _ALWAYS = {
     "aten::nonzero_static": "nonzero_static",
     "aten::masked_select": "masked_select",
     "aten::equal": "torch.equal",
+    "aten::allclose": "torch.allclose",
+    "aten::_linalg_check_errors": "the error check of a torch.linalg function",
     "aten::is_nonzero": "a tensor used as a condition",
     "aten::_unique": "unique",
     "aten::_unique2": "unique",
@@ -38,7 +40,7 @@ _METHODS = {
     Tensor.cuda: "cuda",
 }
 _INDEXING = {"aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_"}
-_INTERNAL = ("/torch/", "/contextlib.py", "sync_count.py")
+_INTERNAL = ("/torch/", "/contextlib.py", __file__)
 
 
 @dataclass(kw_only=True)

@@ -5,6 +5,7 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from ksim_rl.trainers.loggers.csv_table import STEP, read_table
 
@@ -84,6 +85,7 @@ def _draw_panel(
         labelled += 1
     axes.set_title(name, fontsize=10.5)
     axes.set_xlabel("env states", fontsize=9)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.tick_params(labelsize=8)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)

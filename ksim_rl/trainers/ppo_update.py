@@ -69,6 +69,7 @@ class PPOUpdate:
         self._rollout_ET: TensorDictBase | None = None
         self._sums: dict[str, Tensor] = {}
         self._steps_made = torch.zeros((), device=self.device)
+        self._std = torch.zeros((), device=self.device)
         self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
         self._run = Captured(self._update, device=self.device)
 
@@ -89,6 +90,7 @@ class PPOUpdate:
         """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
         means = {name: total / self._steps_made.clamp_min(1.0) for name, total in self._sums.items()}
         return means | {
+            "policy/std": self._std,
             "update/learning_rate": self.optimizer.param_groups[0]["lr"],
             "update/skipped_steps": self.guard.skipped,
             "update/skipped_in_a_row": self._longest_skip,
@@ -108,6 +110,7 @@ class PPOUpdate:
         assert self._rollout_ET is not None
         self._clear_sums()
         rollout_ET = self.advantage(self._rollout_ET)
+        self._std.copy_(rollout_ET.get("scale").mean())
         self.dataset.extend(rollout_ET)
         for _ in range(self.cfg.num_epochs):
             for minibatch_B in self.dataset.epoch():

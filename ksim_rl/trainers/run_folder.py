@@ -1,6 +1,7 @@
 """A whole run in a folder: config, training, evaluation, learning curves, video."""
 
 import json
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,7 +100,10 @@ def record_video(
     step_dt = innermost(env).step_dt
     steps = max(1, round((seconds or cfg.trainer.video_s) / step_dt))
     try:
-        written = video.record(env, actor, path, steps=steps, fps=1.0 / step_dt, seed=seed)
+        with warnings.catch_warnings():
+            # Each OpenGL platform that fails warns on its own; the error says it once, with the fix.
+            warnings.filterwarnings("ignore", module="glfw")
+            written = video.record(env, actor, path, steps=steps, fps=1.0 / step_dt, seed=seed)
     except video.VideoUnavailableError as error:
         note(f"no video: {error}")
         return None

@@ -19,27 +19,28 @@ def networks(*, obs_normalization=True, **actor_options):
     return actor, critic
 
 
-def rollout(actor, *, num_envs=8, length=6, end_probability=0.15):
+def rollout(actor, *, num_envs=8, length=6, end_probability=0.15, device="cpu"):
     """Return random env states `["E","T"]` with terminations, truncations, and both at once."""
     shape = (num_envs, length)
     terminated = torch.rand(*shape, 1) < end_probability
     truncated = torch.rand(*shape, 1) < end_probability
     data = TensorDict(
-        {"actor": torch.randn(*shape, ACTOR_DIM), "critic": torch.randn(*shape, CRITIC_DIM)}, shape
-    )
-    with torch.no_grad():
-        actor(data)
-    data["next"] = TensorDict(
         {
             "actor": torch.randn(*shape, ACTOR_DIM),
             "critic": torch.randn(*shape, CRITIC_DIM),
-            "reward": torch.randn(*shape, 1),
-            "terminated": terminated,
-            "truncated": truncated,
-            "done": terminated | truncated,
+            "next": {
+                "actor": torch.randn(*shape, ACTOR_DIM),
+                "critic": torch.randn(*shape, CRITIC_DIM),
+                "reward": torch.randn(*shape, 1),
+                "terminated": terminated,
+                "truncated": truncated,
+                "done": terminated | truncated,
+            },
         },
         shape,
-    )
+    ).to(device)
+    with torch.no_grad():
+        actor(data)
     return dims.name(data, dims.E, dims.T)
 
 

@@ -54,7 +54,7 @@ def _compare(ours, stock, data):
         gradients.append(torch.autograd.grad(_total(out), parameters, allow_unused=True))
         outs.append(out)
     assert set(outs[1].keys()) <= set(outs[0].keys())
-    for key in outs[1].keys():  # noqa: SIM118
+    for key in outs[1].keys():
         torch.testing.assert_close(
             outs[0][key],
             _like_ours(key, outs[1][key]),
@@ -101,7 +101,7 @@ def test_equals_stock_for_a_squashed_policy():
     ours = ClipPPOLoss(squashed, critic)(data.clone())
     torch.manual_seed(1)
     stock = objectives.ClipPPOLoss(squashed, critic)(data.clone())
-    for key in stock.keys():  # noqa: SIM118
+    for key in stock.keys():
         torch.testing.assert_close(ours[key], _like_ours(key, stock[key]), atol=1e-6, rtol=1e-6)
     assert ours["kl"] > 0
 
@@ -194,31 +194,38 @@ def test_no_row_left_gives_zero_loss_and_finite_gradients():
     assert all(parameter.grad.abs().sum() == 0.0 for parameter in loss.parameters())
 
 
-@pytest.mark.parametrize(
-    ("options", "functional"),
-    [
-        ({"clip_value": 0.2, "loss_critic_type": "l2"}, True),
-        (
-            {
-                "clip_value": 0.2,
-                "normalize_advantage": True,
-                "log_ratio_statistics": False,
-                "log_explained_variance": False,
-            },
-            False,
-        ),
-    ],
-    ids=["functional", "not functional"],
-)
-def test_no_host_sync_and_no_compiler_break(options, functional):
-    actor, critic = networks()
-    loss = ClipPPOLoss(actor, critic, functional=functional, **options)
+def _masked_minibatch(actor, critic):
     data = minibatch(actor, critic)
     data["collector", "mask"] = torch.rand(64, 1) < 0.9
+    return data
+
+
+@pytest.mark.parametrize("functional", [True, False])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"clip_value": 0.2, "loss_critic_type": "l2"},
+        {"normalize_advantage": True, "log_ratio_statistics": False, "log_explained_variance": False},
+    ],
+    ids=["clip_value", "normalize"],
+)
+def test_no_host_sync(options, functional):
+    actor, critic = networks()
+    data = _masked_minibatch(actor, critic)
+    loss = ClipPPOLoss(actor, critic, functional=functional, **options)
     with count_syncs() as syncs:
-        expected = loss(data.clone())
-        _total(expected).backward()
+        _total(loss(data)).backward()
     assert syncs.total == 0, syncs.report()
+
+
+# TorchRL's functional parameters take the compiler long to trace.
+@pytest.mark.parametrize("functional", [False, pytest.param(True, marks=pytest.mark.full)])
+def test_compiles_without_a_break(functional):
+    actor, critic = networks()
+    data = _masked_minibatch(actor, critic)
+    loss = ClipPPOLoss(actor, critic, functional=functional, clip_value=0.2, normalize_advantage=True)
+    expected = loss(data.clone())
+    _total(expected).backward()
     gradients = [parameter.grad.clone() for parameter in loss.parameters()]
     loss.zero_grad()
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")(data.clone())

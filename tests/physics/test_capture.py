@@ -87,16 +87,20 @@ def test_a_replay_does_not_sync_and_counts_as_one_call():
         world.refresh()
         count.add_(1)
 
+    no_row_E = torch.zeros(16, dtype=torch.bool, device="cuda")
     graph = Captured(body, device="cuda", require_graphs=True)
     for _ in range(4):
         graph()
+        world.step(2)
+        world.refresh()
+        world.reset(no_row_E)
     torch.cuda.synchronize()
     torch.cuda.set_sync_debug_mode("error")
     try:
         graph()
         world.step(2)
         world.refresh()
-        world.reset(torch.zeros(16, dtype=torch.bool, device="cuda"))
+        world.reset(no_row_E)
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert count.item() == 5

@@ -128,7 +128,10 @@ def test_without_a_network_one_line_says_what_to_do(tmp_path: Path, monkeypatch)
     monkeypatch.delenv("MENAGERIE_ROOT", raising=False)
     monkeypatch.setenv("MENAGERIE_CACHE_DIR", str(tmp_path))
     monkeypatch.setenv("MENAGERIE_BASE_URL", "http://127.0.0.1:9/nothing")
-    with pytest.raises(ValueError, match="could not be downloaded.*without one, copy.*MENAGERIE_ROOT") as caught:
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    with pytest.raises(
+        ValueError, match="could not be downloaded.*without one, copy.*MENAGERIE_ROOT"
+    ) as caught:
         load_model("unitree_go1")
     assert "\n" not in str(caught.value)
 

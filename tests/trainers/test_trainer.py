@@ -40,7 +40,7 @@ def test_it_counts_env_states_and_ends_after_the_iterations():
 
 
 def test_it_stops_when_solved_and_goes_on_when_told_so():
-    anything_solves = dict(iterations=4, eval_interval=2, solved_at=-1e9)
+    anything_solves = {"iterations": 4, "eval_interval": 2, "solved_at": -1e9}
     assert make_trainer(**anything_solves).train().iteration == 2
     assert make_trainer(stop_when_solved=False, **anything_solves).train().iteration == 4
 

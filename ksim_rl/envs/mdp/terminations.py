@@ -18,7 +18,7 @@ class TimeOut(TerminationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return which envs end, bool [E]."""
-        return view.episode_step_E >= view.max_episode_length
+        return view.episode_step_E + view.time_out_offset_E >= view.max_episode_length
 
 
 @dataclass(frozen=True, kw_only=True)

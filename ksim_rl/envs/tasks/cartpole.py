@@ -17,7 +17,7 @@ from ksim_rl.envs.mdp import JointEffortAction, JointVel, TimeOut
 from ksim_rl.envs.robots.cartpole import Cartpole
 from ksim_rl.envs.scene import SceneCfg
 from ksim_rl.envs.task import Task
-from ksim_rl.envs.term import EventTerm, ObservationTerm, RewardTerm
+from ksim_rl.envs.term import EventTerm, ObservationTerm, RewardTerm, TerminationTerm
 from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.envs.view import EnvView
 from ksim_rl.envs.viewer_cfg import ViewerCfg
@@ -50,6 +50,22 @@ class CartpoleReward(RewardTerm):
         small_control_E = (4.0 + (1.0 - view.action_EL[:, 0].clamp(-1.0, 1.0).square())) / 5.0
         small_velocity_E = (1.0 + _closeness(velocity_E, margin=5.0)) / 2.0
         return upright_E * centered_E * small_control_E * small_velocity_E
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoleFallen(TerminationTerm):
+    """The pole is further than `limit` rad from upright."""
+
+    limit: float
+
+    def __post_init__(self) -> None:
+        """Refuse angles that do not exist."""
+        check_in_range("limit", self.limit, low=0.0, high=math.pi, low_open=True)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return which poles have fallen, bool [E]."""
+        angle_E = view.joint_pos_EL[:, view.joints("hinge")][:, 0]
+        return torch.cos(angle_E) < math.cos(self.limit)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +103,7 @@ def _closeness(value_E: Tensor, *, margin: float) -> Tensor:
     return torch.exp((value_E / margin).square() * math.log(0.1))
 
 
-def _cfg(reset: ResetCartpole) -> ManagerBasedRlEnvCfg:
+def _cfg(reset: ResetCartpole, **terminations: TerminationTerm) -> ManagerBasedRlEnvCfg:
     terms = {
         "position": ObservationTermCfg(term=CartpolePosition()),
         "velocity": ObservationTermCfg(term=JointVel(joints=("slider", "hinge"))),
@@ -99,7 +115,7 @@ def _cfg(reset: ResetCartpole) -> ManagerBasedRlEnvCfg:
         actions={"force": JointEffortAction(joints="slider")},
         events={"reset": reset},
         rewards={"balance": CartpoleReward()},
-        terminations={"time_out": TimeOut(time_out=True)},
+        terminations={"time_out": TimeOut(time_out=True), **terminations},
         episode_length_s=10.0,
         scale_rewards_by_dt=False,
         viewer=ViewerCfg(body="cart", distance=4.0, elevation=-10.0, azimuth=90.0),
@@ -107,8 +123,9 @@ def _cfg(reset: ResetCartpole) -> ManagerBasedRlEnvCfg:
 
 
 def cartpole_balance() -> ManagerBasedRlEnvCfg:
-    """Return the config of keeping the pole up from a start near upright."""
-    return _cfg(ResetCartpole(cart_range=0.1, angle=0.0, angle_range=0.034))
+    """Return the config of keeping the pole up from a start near upright; unlike dm_control's, it ends with a fall."""
+    reset = ResetCartpole(cart_range=0.1, angle=0.0, angle_range=0.034)
+    return _cfg(reset, fallen=PoleFallen(limit=0.5))
 
 
 def cartpole_swingup() -> ManagerBasedRlEnvCfg:

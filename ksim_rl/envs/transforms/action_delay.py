@@ -69,12 +69,12 @@ class ActionDelay(LaggedTransform):
         assert self._sized, "an env sizes its transforms before it steps"
         actions = [self._checked(index, tensordict, key) for index, key in enumerate(self.out_keys_inv)]
         self._advance()
-        arrived_E = self.lag_E < self.age_E
+        waiting_E = self.lag_E >= self.age_E
         for index, (key, action) in enumerate(zip(self.in_keys_inv, actions, strict=True)):
             action_E = action.reshape(self.num_rows, *action.shape[tensordict.ndim :])
             self._push(index, action_E)
-            mask = arrived_E.reshape(-1, *[1] * (action_E.ndim - 1))
-            delayed = torch.where(mask, self._read(index, self.lag_E), self.initial)
+            waiting = waiting_E.reshape(-1, *[1] * (action_E.ndim - 1))
+            delayed = self._read(index, self.lag_E).masked_fill_(waiting, self.initial)
             tensordict.set(key, delayed.reshape(action.shape))
         return tensordict
 

@@ -59,7 +59,7 @@ class LaggedTransform(KeyedTransform):
     def _advance(self) -> None:
         """Go on by one env step: the next slot, older episodes, and new lags where they are due."""
         self.step_count.add_(1)
-        self.slot.copy_((self.slot + 1) % self.num_slots)
+        self.slot.add_(1).remainder_(self.num_slots)
         self.age_E.add_(1)
         delay = self.delay
         if not delay.per_env:
@@ -78,14 +78,14 @@ class LaggedTransform(KeyedTransform):
     def _restart(self, mask_E: Tensor) -> None:
         """Begin the episodes of the masked rows, with new lags."""
         delay = self.delay
-        self.age_E.copy_(torch.where(mask_E, 0, self.age_E))
+        self.age_E.masked_fill_(mask_E, 0)
         if delay.per_env:
             lag_E = random.integers(self._reset_keys("reset/lag"), 1, delay.min_lag, delay.max_lag)[:, 0]
             self.lag_E.copy_(torch.where(mask_E, lag_E, self.lag_E))
             return
         together = mask_E.all()
         self.shared_count.add_(together)
-        self.shared_age.copy_(torch.where(together, 0, self.shared_age))
+        self.shared_age.masked_fill_(together, 0)
         keys = random.row_keys(self.seed_value, self._stream_ids["reset/lag"], self.shared_count, 1)
         lag_1 = random.integers(keys, 1, delay.min_lag, delay.max_lag)[:, 0]
         self.lag_E.copy_(torch.where(together, lag_1, self.lag_E))

@@ -53,7 +53,7 @@ class RowTransform(Transform):
     def _reset_rows(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
         """Return which rows reset, bool [E]; all of them where there is no mask."""
         masks = [
-            mask.reshape(self.num_rows, -1).any(-1)
+            _per_row(mask, self.num_rows)
             for key, mask in tensordict.items(True, True)
             if key == "_reset" or key[-1] == "_reset"
         ]
@@ -91,9 +91,14 @@ class RowTransform(Transform):
             if present is None and loaded is not None:
                 self._buffers[name] = torch.empty_like(loaded)
         super()._load_from_state_dict(state_dict, prefix, *args)
-        sized = [self._buffers[name] for name in self._row_buffers if self._buffers[name] is not None]
-        if sized and not self.num_rows:
-            self.num_rows = sized[0].shape[0]
+        first = self._buffers[self._row_buffers[0]]
+        if first is not None and not self.num_rows:
+            self.num_rows = first.shape[0]
+
+
+def _per_row(mask: Tensor, num_rows: int) -> Tensor:
+    flat = mask.reshape(num_rows, -1)
+    return flat[:, 0] if flat.shape[1] == 1 else flat.any(-1)
 
 
 def as_keys(keys: Keys) -> list[NestedKey]:

@@ -69,7 +69,7 @@ def seed_all(env: TransformedEnv, seed: int) -> None:
 def actions(num_steps: int, env: EnvBase) -> Tensor:
     """Return fixed actions [T, E, A]."""
     generator = torch.Generator().manual_seed(7)
-    return torch.rand((num_steps, *env.action_spec.shape), generator=generator) * 2 - 1
+    return torch.rand((num_steps, *env.full_action_spec[env.action_key].shape), generator=generator) * 2 - 1
 
 
 def fixed_rollout(env: EnvBase, num_steps: int, root: TensorDictBase | None = None) -> TensorDictBase:

@@ -36,17 +36,8 @@ class TermEnv(CounterEnv):
     def _observe(self):
         observed = super()._observe()
         leaves = {name: observed[name] for name in ("count", "episode", "row", "drawn")}
-        return {
-            "obs": TensorDict(
-                {
-                    **leaves,
-                    "vector": observed["obs", "vector"]
-                    if ("obs", "vector") in observed
-                    else observed["obs"]["vector"],
-                },
-                batch_size=3,
-            )
-        }
+        leaves["vector"] = observed["obs"]["vector"]
+        return {"obs": TensorDict(leaves, batch_size=3)}
 
 
 def read(view):

@@ -33,7 +33,9 @@ KINDS = {
         ["count", VECTOR, "row"],
         noise=[UNIFORM, GaussianNoise(std=1.0, operation="multiply"), ConstantNoise(value=2.0, bias=UNIFORM)],
     ),
-    "clip": lambda: ObservationClip([VECTOR, "count"], [NEW, "count"], clip={VECTOR: (None, 150.0), "count": (1.0, 2.0)}),
+    "clip": lambda: ObservationClip(
+        [VECTOR, "count"], [NEW, "count"], clip={VECTOR: (None, 150.0), "count": (1.0, 2.0)}
+    ),
     "scale": lambda: ObservationScale([VECTOR, "count"], scale={VECTOR: (1.0, 0.0, -2.0), "count": 3.0}),
     "delay": lambda: ObservationDelay(VECTOR, NEW, delay=DelayCfg(max_lag=3)),
     "delay_resampled": lambda: ObservationDelay(

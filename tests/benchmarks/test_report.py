@@ -1,0 +1,41 @@
+import json
+from pathlib import Path
+
+import torch
+
+from benchmarks import report
+
+CPU = torch.device("cpu")
+
+
+def write(folder: Path, figures: dict[str, float], **measured) -> dict:
+    path = report.write(
+        "speed", figures=figures, device=CPU, module="benchmarks.speed", folder=folder, **measured
+    )
+    return json.loads(path.read_text())
+
+
+def test_a_run_merges_its_figures_in_and_drops_no_other(tmp_path: Path):
+    write(tmp_path, {"h200/a/ms": 1.0, "cpu/a/ms": 2.0}, curves={"a": [1, 2]}, note="first")
+    saved = write(tmp_path, {"cpu/a/ms": 3.0, "cpu/b/ms": 4.0}, curves={"b": [3]}, note="second")
+    assert saved["figures"] == {"h200/a/ms": 1.0, "cpu/a/ms": 3.0, "cpu/b/ms": 4.0}
+    assert saved["curves"] == {"a": [1, 2], "b": [3]}
+    assert saved["note"] == "second"
+    assert [path.name for path in tmp_path.iterdir()] == ["speed.json"]
+
+
+def test_a_report_says_what_ran_where_and_with_what(tmp_path: Path):
+    saved = write(tmp_path, {"cpu/a/ms": 2.0})
+    assert saved["command"].startswith("python -m benchmarks.speed")
+    assert saved["commit"]
+    assert saved["date"].endswith("+00:00")
+    assert "cores" in saved["device"]
+    assert saved["versions"]["torch"] == torch.__version__.split("+")[0] or "torch" in saved["versions"]
+    assert "not installed" not in (saved["versions"]["mujoco"], saved["versions"]["warp-lang"])
+
+
+def test_labels_are_short(monkeypatch):
+    assert report.device_label(CPU) == "cpu"
+    for name, label in (("NVIDIA H200", "h200"), ("NVIDIA A100-SXM4-80GB", "a100"), ("Tesla T4", "t4")):
+        monkeypatch.setattr(torch.cuda, "get_device_name", lambda device, name=name: name)
+        assert report.device_label(torch.device("cuda:0")) == label

@@ -1,0 +1,115 @@
+"""The commands end to end on a small cartpole: what a run leaves, how it is evaluated, continued and interrupted."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+
+import imageio.v2 as imageio
+import pytest
+
+from ksim_rl.cli import main
+from ksim_rl.trainers import checkpoint
+
+SMALL = (
+    "num_envs=16",
+    "data.num_env_states_per_minibatch=32",
+    "modules.actor.hidden_dims=[16]",
+    "modules.critic.hidden_dims=[16]",
+    "task.episode_length_s=0.3",
+    "trainer.eval_episodes=4",
+    "trainer.video_s=0.2",
+)
+
+
+def run(*arguments):
+    with pytest.raises(SystemExit) as stopped:
+        main.main(list(arguments))
+    return stopped.value.code
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Train two iterations, and return the exit code, the run folder and what was printed."""
+    folder = tmp_path_factory.mktemp("work")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(sys, "argv", ["ksim-rl"])
+        code = run("train", *SMALL, "trainer.num_iterations=2", f"hydra.run.dir={folder / 'run'}")
+    return code, folder / "run"
+
+
+def rows(folder):
+    with open(folder / "metrics.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_an_unsolved_run_exits_with_1_and_leaves_a_whole_run_folder(trained):
+    code, folder = trained
+    assert code == 1
+    names = {entry.name for entry in folder.iterdir()} - {"video.mp4", "video.gif"}
+    assert names == {
+        "checkpoint",
+        "config.yaml",
+        "curves.png",
+        "evaluation.json",
+        "metrics.csv",
+        "tensorboard",
+    }
+    assert [row["iteration"] for row in rows(folder)] == ["1", "2"]
+    assert imageio.imread(folder / "curves.png").shape[0] > 300
+    figures = json.loads((folder / "evaluation.json").read_text())
+    assert (figures["episodes"], figures["solved"]) == (4, False)
+    assert checkpoint.load(checkpoint.latest(folder)).iteration == 2
+
+
+def test_eval_repeats_the_evaluation_of_the_run(trained, capsys):
+    _, folder = trained
+    figures = json.loads((folder / "evaluation.json").read_text())
+    assert run("eval", str(folder)) == 1
+    assert f"return {figures['return_mean']:.1f} +- {figures['return_std']:.1f}" in capsys.readouterr().out
+
+
+def test_play_records_a_video_or_says_why_not(trained, capsys, tmp_path):
+    _, folder = trained
+    code = run("play", str(folder), "--seconds", "0.1", "--output", str(tmp_path / "clip.mp4"))
+    output = capsys.readouterr().out
+    if code == 0:
+        assert list(tmp_path.glob("clip.*"))
+    else:
+        assert code == 3
+        assert "no video: " in output
+        assert "MUJOCO_GL=" in output
+
+
+def test_resume_continues_in_the_same_folder(trained):
+    _, folder = trained
+    assert run("resume", str(folder), "--num-iterations", "3") == 1
+    assert [row["iteration"] for row in rows(folder)] == ["1", "2", "3"]
+    assert checkpoint.load(checkpoint.latest(folder)).iteration == 3
+
+
+def test_a_damaged_checkpoint_is_one_line(trained, capsys, tmp_path):
+    _, folder = trained
+    copy = tmp_path / "00000002"
+    copy.mkdir()
+    for entry in checkpoint.saved(folder / "checkpoint")[0].iterdir():
+        (copy / entry.name).write_bytes(entry.read_bytes()[:-1])
+    assert run("eval", str(copy)) == 2
+    assert "damaged" in capsys.readouterr().err
+
+
+def test_ctrl_c_saves_and_exits_with_130(tmp_path):
+    command = [sys.executable, "-m", "ksim_rl.cli.main", "train", *SMALL, "trainer.num_iterations=100000"]
+    process = subprocess.Popen(
+        [*command, "trainer.eval_interval=0", f"hydra.run.dir={tmp_path}"], stdout=subprocess.PIPE, text=True
+    )
+    for line in process.stdout:
+        if line.startswith("iteration 2/"):
+            process.send_signal(signal.SIGINT)
+            break
+    rest = process.stdout.read()
+    assert process.wait(timeout=60) == 130
+    assert "SIGINT: everything is saved; continue with: ksim-rl resume" in rest
+    assert checkpoint.load(checkpoint.latest(tmp_path)).iteration >= 2

@@ -1,0 +1,99 @@
+"""Sensors that refresh must recompute, and those that it must leave alone."""
+
+import functools
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import torch
+import warp as wp
+
+from ksim_rl.physics import SimCfg, World, load_model
+from tests.physics.models import forwarded, sensor
+
+PENDULUM = """
+<mujoco model="pendulum">
+  <option timestep="0.01"/>
+  <compiler angle="radian"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 0.1" contype="0" conaffinity="0"/>
+    <geom name="post" type="sphere" size="0.05" pos="0.6 0 1" contype="0" conaffinity="0"/>
+    <body name="arm" pos="0 0 1">
+      <joint name="pivot" axis="0 1 0" range="-2 2" limited="true" damping="0.1"/>
+      <geom name="arm" type="capsule" fromto="0 0 0 0.4 0 0" size="0.02" mass="1" contype="0" conaffinity="0"/>
+      <geom name="ball" type="sphere" pos="0.4 0 0" size="0.05" mass="0.2" contype="0" conaffinity="0"/>
+      <site name="eye" pos="0.4 0 -0.1" euler="3.14159 0 0"/>
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="cable"><joint joint="pivot" coef="2"/></fixed>
+  </tendon>
+  <actuator>
+    <motor name="torque" joint="pivot" gear="3"/>
+  </actuator>
+  <sensor>
+    <rangefinder name="height" site="eye"/>
+    <tendonvel name="cable_vel" tendon="cable"/>
+    <actuatorvel name="torque_vel" actuator="torque"/>
+    <distance name="gap" geom1="ball" geom2="post" cutoff="2"/>
+    <jointlimitpos name="room" joint="pivot"/>
+    <jointpos name="late" joint="pivot" nsample="10" delay="0.03"/>
+    <jointpos name="present" joint="pivot"/>
+  </sensor>
+</mujoco>
+"""
+REFRESHED = ("height", "cable_vel", "torque_vel", "present")
+LEFT_ALONE = ("gap", "room", "late")
+
+
+@functools.cache
+def pendulum() -> mujoco.MjModel:
+    return load_model(PENDULUM)
+
+
+def swinging() -> World:
+    world = World(pendulum(), num_envs=3, sim=SimCfg(njmax=8, nconmax=8))
+    world.qpos_EL[:, 0] = torch.tensor([0.1, 0.3, -0.2])
+    world.qvel_EL[:, 0] = 2.0
+    for _ in range(4):
+        world.step(4)
+    return world
+
+
+def test_refreshed_sensors_are_those_of_the_c_engine():
+    world = swinging()
+    world.refresh()
+    for row in range(3):
+        expected = forwarded(world, row)
+        for name in REFRESHED:
+            columns = sensor(world, name)
+            np.testing.assert_allclose(
+                world.sensordata_EL[row, columns], expected.sensordata[columns], atol=1e-5, err_msg=name
+            )
+
+
+def test_sensors_that_read_the_last_collision_pass_are_left_alone():
+    world = swinging()
+    before = world.sensordata_EL.clone()
+    assert (before[:, sensor(world, "gap")] < 2.0).all()
+    world.reset(torch.tensor([True, False, False]))
+    world.refresh()
+    for name in LEFT_ALONE:
+        columns = sensor(world, name)
+        assert torch.equal(world.sensordata_EL[1:, columns], before[1:, columns]), name
+        assert world.sensordata_EL[0, columns].abs().max() == 0, name
+
+
+def test_a_delayed_sensor_samples_every_substep():
+    world = swinging()
+    with wp.ScopedDevice("cpu"):
+        m = mjw.put_model(world.mj_model)
+        m.opt.warn_overflow = 0
+        d = mjw.make_data(world.mj_model, nworld=3, nconmax=8, njmax=8)
+        wp.to_torch(d.qpos)[:, 0] = torch.tensor([0.1, 0.3, -0.2])
+        wp.to_torch(d.qvel).fill_(2.0)
+        for _ in range(16):
+            mjw.step(m, d)
+    late, present = sensor(world, "late"), sensor(world, "present")
+    assert torch.equal(world.sensordata_EL[:, late], wp.to_torch(d.sensordata)[:, late])
+    assert not torch.equal(world.sensordata_EL[:, late], world.sensordata_EL[:, present])

@@ -1,0 +1,106 @@
+"""What is installed elsewhere is whole: sdist -> wheel -> another folder -> import."""
+
+import os
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """Build the sdist, and from it the wheel, without network."""
+    folder = tmp_path_factory.mktemp("dist")
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(ROOT)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
+    return sdist, wheel
+
+
+def sources(folder, suffixes=(".py", ".yaml", ".xml")):
+    return {
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / folder).rglob("*")
+        if path.suffix in suffixes and path.is_file() and "__pycache__" not in path.parts
+    }
+
+
+def test_the_sdist_has_the_package_the_tests_and_what_builds_them(built):
+    with tarfile.open(built[0]) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert sources("ksim_rl") <= names
+    assert sources("tests", (".py",)) <= names
+    assert {"README.md", "LICENSE", "Makefile", "constraints.txt", "pyproject.toml"} <= names
+    assert not [name for name in names if name.split("/")[0] in ("envs", "objectives", ".venv", "runs")]
+
+
+def test_the_wheel_that_is_built_from_the_sdist_has_every_source_and_data_file(built):
+    with zipfile.ZipFile(built[1]) as archive:
+        names = {name for name in archive.namelist() if ".dist-info/" not in name}
+    assert names >= sources("ksim_rl")
+    assert {name.split("/")[0] for name in names} == {"ksim_rl"}
+
+
+IMPORT_ALL = """
+import importlib, pathlib, sys
+import ksim_rl
+here = pathlib.Path(ksim_rl.__file__).parent
+assert str(here).startswith(sys.argv[1]), here
+for path in sorted(here.rglob("*.py")):
+    parts = path.relative_to(here.parent).with_suffix("").parts
+    importlib.import_module(".".join(parts[:-1] if parts[-1] == "__init__" else parts))
+from ksim_rl import conf, envs
+assert len(envs.names()) >= 2
+for name in envs.names():
+    conf.compose([f"task={name}"])
+assert list(here.rglob("*.xml"))
+print(ksim_rl.__version__)
+"""
+
+
+def test_an_installed_wheel_imports_from_elsewhere(built, tmp_path):
+    target = tmp_path / "site"
+    install = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+        "--target",
+        str(target),
+    ]
+    subprocess.run([*install, str(built[1])], check=True)
+    environment = {**os.environ, "PYTHONPATH": str(target)}
+    command = [sys.executable, "-P", "-c", IMPORT_ALL, str(target)]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (
+        done.stdout.splitlines()[-1]
+        == tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    )
+    assert (target / "bin" / "ksim-rl").exists()
+
+
+def test_the_links_at_the_root_lead_into_the_package():
+    for name in ("envs", "objectives"):
+        assert (ROOT / name).is_symlink()
+        assert (ROOT / name).resolve() == (ROOT / "ksim_rl" / name).resolve()
+
+
+def test_each_dependency_is_pinned_for_the_tested_environment():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    names = {entry.split("[")[0].split(">")[0].split("<")[0].strip().lower() for entry in wanted}
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pinned = {line.split("==")[0].lower() for line in lines if "==" in line}
+    assert names <= pinned
+    assert not [line for line in lines if "/" in line or "@" in line or "+" in line]

@@ -1,0 +1,70 @@
+"""The config of a run: plain data and back, refused with the full path of what is wrong."""
+
+import dataclasses
+
+import pytest
+
+from ksim_rl import conf
+from ksim_rl.trainers import RunCfg
+
+
+@pytest.fixture(scope="module")
+def cfg():
+    return conf.compose(["task=cartpole_balance", "num_envs=64", "data.num_env_states_per_minibatch=64"])
+
+
+def test_plain_data_rebuilds_an_equal_config(cfg):
+    assert RunCfg.from_tree(cfg.to_tree()) == cfg
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ("num_envs", 0, r"num_envs=0: expected a whole number >= 1"),
+        ("num_envs", "many", r"num_envs='many': expected int"),
+        ("seed", -1, r"seed=-1: expected a whole number >= 0"),
+        ("device", "gpu", r"device='gpu': expected 'auto', 'cpu', 'cuda' or"),
+        ("trainer.num_iterations", 0, r"trainer.num_iterations=0: expected a whole number >= 1"),
+        ("trainer.matmul_precision", "hig", r"trainer.matmul_precision='hig': did you mean 'high'"),
+        ("trainer.video_s", -1.0, r"trainer.video_s=-1.0: expected a finite number in \(0"),
+        ("objective.gamma", 1.5, r"objective.gamma=1.5: expected a finite number in"),
+        ("modules.actor.hidden_dims", [64, "x"], r"modules.actor.hidden_dims\[1\]='x': expected int"),
+        (
+            "modules.actor.activatio",
+            "elu",
+            r"unknown field 'modules.actor.activatio' of ActorCfg: did you mean",
+        ),
+        ("task.decimation", 0, r"task.decimation=0: expected a whole number"),
+        (
+            "task.rewards.balance._target_",
+            "os.system",
+            r"task.rewards.balance._target_='os.system': only classes of",
+        ),
+    ],
+)
+def test_a_wrong_value_is_refused_by_its_path(cfg, path, value, message):
+    tree = cfg.to_tree()
+    *parents, last = path.split(".")
+    node = tree
+    for key in parents:
+        node = node[key]
+    node[last] = value
+    with pytest.raises(ValueError, match=message):
+        RunCfg.from_tree(tree)
+
+
+def test_a_dataset_that_the_envs_cannot_share_is_refused_with_working_numbers(cfg):
+    with pytest.raises(ValueError, match=r"num_minibatches=4 = 256 .* num_envs=48.* num_envs=32 or 64"):
+        scene = dataclasses.replace(cfg.task.scene, num_envs=48)
+        dataclasses.replace(cfg, num_envs=48, task=dataclasses.replace(cfg.task, scene=scene))
+
+
+def test_the_env_has_as_many_envs_as_the_run(cfg):
+    with pytest.raises(ValueError, match="task.scene.num_envs=64 differs from num_envs=32: set num_envs"):
+        dataclasses.replace(cfg, num_envs=32)
+
+
+def test_the_networks_groups_must_be_there(cfg):
+    task = dataclasses.replace(cfg.task, observations={"actor": cfg.task.observations["actor"]})
+    with pytest.raises(ValueError, match="task.observations has no group 'critic'"):
+        dataclasses.replace(cfg, task=task)

@@ -1,0 +1,76 @@
+"""Videos of what `env.render()` shows."""
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+from ksim_rl.trainers.video import VideoUnavailableError, record
+from tests.trainers.target_env import make_env
+
+
+def filmed(render):
+    env = make_env(1)
+    env.base_env.__dict__["render"] = render
+    env.__dict__["render"] = render
+    return env
+
+
+def still():
+    return TensorDictModule(torch.zeros_like, in_keys=["actor"], out_keys=["action"])
+
+
+class Camera:
+    """Gives frames that brighten."""
+
+    def __init__(self):
+        self.count = 0
+
+    def __call__(self):
+        self.count += 1
+        return np.full((48, 64, 3), min(255, 20 * self.count), np.uint8)
+
+
+def test_an_mp4_has_a_frame_per_step(tmp_path):
+    path = record(filmed(Camera()), still(), tmp_path / "video.mp4", steps=10, fps=25.0)
+    frames = imageio.mimread(path)
+    assert path.name == "video.mp4"
+    assert len(frames) == 10
+    assert frames[0].shape == (48, 64, 3)
+    assert frames[8].mean() > frames[0].mean() + 100
+
+
+def test_fast_steps_are_thinned_out_at_real_speed(tmp_path):
+    camera = Camera()
+    path = record(filmed(camera), still(), tmp_path / "video.mp4", steps=20, fps=100.0)
+    assert camera.count == 10
+    assert imageio.get_reader(path).get_meta_data()["fps"] == pytest.approx(50.0)
+
+
+def test_without_an_encoder_there_is_a_gif(tmp_path, monkeypatch):
+    real = imageio.get_writer
+
+    def no_ffmpeg(path, **options):
+        if str(path).endswith(".mp4"):
+            raise RuntimeError("No ffmpeg exe could be found")
+        return real(path, **options)
+
+    monkeypatch.setattr(imageio, "get_writer", no_ffmpeg)
+    path = record(filmed(Camera()), still(), tmp_path / "video.mp4", steps=4, fps=25.0)
+    assert path.name == "video.gif"
+    assert len(imageio.mimread(path)) == 4
+
+
+def test_without_opengl_the_reason_and_the_fix_are_passed_on(tmp_path):
+    def blind():
+        raise RuntimeError("no OpenGL platform for off-screen rendering. Fixes: ...")
+
+    with pytest.raises(VideoUnavailableError, match="Fixes"):
+        record(filmed(blind), still(), tmp_path / "video.mp4", steps=4, fps=25.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_env_without_render_mode_is_named(tmp_path):
+    with pytest.raises(VideoUnavailableError, match="render_mode='rgb_array'"):
+        record(filmed(lambda: None), still(), tmp_path / "video.mp4", steps=4, fps=25.0)
