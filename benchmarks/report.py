@@ -47,7 +47,7 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str:
-    """Return the commit that ran, with "-dirty" if files differ from it, or "unknown" outside a repository."""
+    """Return the commit that ran, with "-dirty" if files differ from it; outside a repository GIT_COMMIT names it."""
 
     def git(*words: str) -> str:
         found = subprocess.run(
@@ -58,7 +58,7 @@ def commit() -> str:
     try:
         return git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain") else "")
     except (OSError, subprocess.CalledProcessError):
-        return "unknown"
+        return os.environ.get("GIT_COMMIT", "unknown")
 
 
 def command(module: str) -> str:

@@ -1,6 +1,7 @@
 """The commands that take no Hydra overrides: resume, eval, play, envs."""
 
 import argparse
+import dataclasses
 from pathlib import Path
 
 from rich.console import Console
@@ -24,10 +25,11 @@ def _resume(arguments: list[str]) -> int:
     parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:<index> or auto")
     options = parser.parse_args(arguments)
     saved = checkpoint.load(checkpoint.latest(options.run))
-    tree = {**saved.config, "device": options.device}
+    cfg = RunCfg.from_tree({**saved.config, "device": options.device})
+    cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
     if options.num_iterations is not None:
-        tree["trainer"] = {**tree["trainer"], "num_iterations": options.num_iterations}
-    cfg = RunCfg.from_tree({**tree, "device": str(RunCfg.from_tree(tree).resolved_device())})
+        longer = dataclasses.replace(cfg.trainer, num_iterations=options.num_iterations)
+        cfg = dataclasses.replace(cfg, trainer=longer)
     # A checkpoint lies in <run folder>/checkpoint/<iteration>.
     return run_and_report(cfg, saved.path.resolve().parent.parent, resume_from=saved)
 
@@ -45,6 +47,7 @@ def _evaluate(arguments: list[str]) -> int:
         episodes = options.episodes or policy.cfg.trainer.eval_episodes or 100
         evaluate = build_evaluator(policy.cfg, policy.actor, episodes=episodes, seed=options.seed)
         evaluation = evaluate()
+    assert evaluation is not None
     threshold = solved_at(policy.cfg)
     print(f"{policy.cfg.task_name}, iteration {policy.iteration}: {verdict(evaluation, threshold)}")
     return 0 if threshold is None or evaluation.return_mean >= threshold else 1

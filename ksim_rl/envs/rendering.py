@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 
 import mujoco
 import numpy as np
 
 from ksim_rl.checks import near
+from ksim_rl.envs.gl_platform import FIXES, choose_gl_platform
 from ksim_rl.envs.viewer_cfg import ViewerCfg
 from ksim_rl.envs.visualizer import DebugVisualizer, SceneVisualizer, add_geoms
 from ksim_rl.physics import World
-
-NO_OPENGL = (
-    "no OpenGL platform for off-screen rendering. Fixes: a GPU or Mesa EGL with MUJOCO_GL=egl (Debian: libegl1), "
-    "software rendering with MUJOCO_GL=osmesa (Debian: libosmesa6), or a display, real or virtual "
-    "(Xvfb :1 & DISPLAY=:1 MUJOCO_GL=glfw)"
-)
-
 
 class OffscreenRenderer:
     """Draws one env, or several side by side, with the camera of a `ViewerCfg`.
@@ -84,13 +77,13 @@ class OffscreenRenderer:
 
     def _open(self) -> mujoco.Renderer:
         if self._renderer is None:
+            platform = choose_gl_platform()
             try:
                 self._renderer = mujoco.Renderer(
                     _with_buffer(self._model, self._cfg), self._cfg.height, self._cfg.width, max_geom=20_000
                 )
             except Exception as error:  # MuJoCo's platforms raise whatever their loader raises
-                platform = os.environ.get("MUJOCO_GL", "default")
-                raise RuntimeError(f"{NO_OPENGL}. MUJOCO_GL is {platform!r}; it said: {error}") from error
+                raise RuntimeError(f"{FIXES}. MUJOCO_GL is {platform!r}, and it said: {error}") from error
         return self._renderer
 
 

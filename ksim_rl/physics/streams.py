@@ -51,6 +51,7 @@ def warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
     """Return the one Warp wrapper of a torch stream; both live for ever."""
     key = (stream.device_index, stream.cuda_stream)
     if key not in _warp_streams:
+        wp.init()  # without a world there was no need for Warp so far, and its stream look-up does not start it
         _warp_streams[key] = (stream, wp.stream_from_torch(stream))
     return _warp_streams[key][1]
 

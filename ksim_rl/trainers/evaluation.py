@@ -1,5 +1,6 @@
 """How good a policy is: its deterministic actions in envs of their own, one whole episode in each."""
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
 import torch
@@ -47,11 +48,13 @@ class Evaluator:
         self._current_E: TensorDictBase | None = None
         self._step = Captured(self._count_one_step, device=device)
 
-    def __call__(self) -> Evaluation:
-        """Evaluate, reading the device once at the end."""
+    def __call__(self, *, stop: Callable[[], bool] = lambda: False) -> Evaluation | None:
+        """Evaluate, reading the device once at the end; None if `stop` says so before that."""
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             self._start()
             for _ in range(self.max_steps):
+                if stop():
+                    return None
                 self._step()
         std, mean = torch.std_mean(self._return_E, correction=0)
         figures = torch.stack([mean, std, self._length_E.mean(), self._running_E.sum().to(torch.float64)])

@@ -3,6 +3,7 @@
 import json
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,8 +42,13 @@ def run(
     """
     run_folder.mkdir(parents=True, exist_ok=True)
     checkpoint.remove_leftovers(run_folder / "checkpoint")
+    try:
+        trainer = build(cfg, run_folder=run_folder)
+    except Exception:
+        with suppress(OSError):
+            run_folder.rmdir()  # only where nothing is in it yet
+        raise
     (run_folder / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
-    trainer = build(cfg, run_folder=run_folder)
     if resume_from is not None:
         trainer.load_state_dict(resume_from.state)
     outcome = trainer.train(progress)

@@ -68,6 +68,7 @@ class Trainer:
         self.progress = RunProgress(cfg.num_iterations, enabled=False)
         self.interrupt = InterruptRequest()
         self.clock = RunClock()
+        self.progress = RunProgress(cfg.num_iterations, enabled=False)
         self._evaluated_at = self._saved_at = -1
         self._warned: set[str] = set()
 
@@ -170,14 +171,12 @@ class Trainer:
 
     def _evaluate(self, evaluator: Evaluator) -> None:
         with self.clock.paused():
-            self.evaluation = evaluator()
-        self._evaluated_at = self.iteration
-        self._log(
-            {
-                "iteration": self.iteration,
-                **{f"evaluation/{k}": v for k, v in self.evaluation.as_dict().items()},
-            }
-        )
+            evaluation = evaluator(stop=self.interrupt.__bool__)
+        if evaluation is None:
+            return
+        self.evaluation, self._evaluated_at = evaluation, self.iteration
+        figures = {f"evaluation/{name}": value for name, value in evaluation.as_dict().items()}
+        self._log({"iteration": self.iteration, **figures})
 
     def _save_if_due(self) -> None:
         interval = self.cfg.checkpoint_interval

@@ -10,6 +10,10 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+# Why rendering failed in this process, once it did. MuJoCo aborts the process when it tries a second time without a
+# working OpenGL platform.
+_failed: list[str] = []
+
 
 class VideoUnavailableError(RuntimeError):
     """There is no video; the message says why and how to get one."""
@@ -33,11 +37,16 @@ def record(
     Raises:
         VideoUnavailableError: when nothing can be rendered, with the reason and the fix.
     """
+    if _failed:
+        raise VideoUnavailableError(_failed[0])
     every = max(1, round(fps / 50))
     frames = _frames(env, policy, steps=steps, every=every, seed=seed)
     try:
         first = next(frames)
+    except VideoUnavailableError:
+        raise
     except RuntimeError as error:
+        _failed.append(str(error))
         raise VideoUnavailableError(str(error)) from error
     path.parent.mkdir(parents=True, exist_ok=True)
     try:

@@ -90,6 +90,17 @@ def test_resume_continues_in_the_same_folder(trained):
     assert checkpoint.load(checkpoint.latest(folder)).iteration == 3
 
 
+def test_a_sweep_runs_one_job_for_each_combination(tmp_path):
+    quick = ("trainer.num_iterations=1", "trainer.eval_episodes=0", "trainer.video=false")
+    assert run("train", "--multirun", *SMALL, *quick, "seed=1,2", f"hydra.sweep.dir={tmp_path}") == 0
+    seeds = {
+        folder.name: checkpoint.load(checkpoint.latest(folder)).config["seed"]
+        for folder in tmp_path.iterdir()
+        if folder.is_dir()
+    }
+    assert seeds == {"0_cartpole_balance": 1, "1_cartpole_balance": 2}
+
+
 def test_a_damaged_checkpoint_is_one_line(trained, capsys, tmp_path):
     _, folder = trained
     copy = tmp_path / "00000002"

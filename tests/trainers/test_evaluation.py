@@ -64,3 +64,14 @@ def test_sensor_noise_is_off_in_an_env_in_eval_mode():
     assert noisy().return_mean < LENGTH - 0.5
     noisy.env.eval()
     assert noisy().return_mean == pytest.approx(LENGTH)
+
+
+def test_an_evaluation_can_be_stopped_between_steps():
+    asked = []
+
+    def stop():
+        asked.append(1)
+        return len(asked) > 3
+
+    assert evaluator(exact)(stop=stop) is None
+    assert len(asked) == 4

@@ -6,7 +6,8 @@ import sys
 import pytest
 import torch
 
-from ksim_rl.trainers import checkpoint, state_tree
+from ksim_rl import conf
+from ksim_rl.trainers import build, checkpoint, state_tree
 from tests.trainers.target_env import make_trainer
 
 
@@ -77,3 +78,29 @@ def test_a_checkpoint_of_another_network_is_refused_with_both_shapes(tmp_path):
         ValueError, match=r"actor: .* float32\[32, 1\] in the checkpoint and float32\[16, 1\]"
     ):
         make_trainer().load_state_dict(saved.state)
+
+
+def test_a_resumed_run_in_real_physics_is_bit_identical(tmp_path):
+    overrides = [
+        "task=cartpole_swingup",
+        "num_envs=8",
+        "data.num_env_states_per_minibatch=32",
+        "trainer.eval_episodes=0",
+    ]
+    overrides += [
+        "modules.actor.hidden_dims=[8]",
+        "modules.critic.hidden_dims=[8]",
+        "task.episode_length_s=0.1",
+    ]
+
+    def run(iterations, *, seed=1, load=None, folder=None):
+        trainer = build(conf.compose([*overrides, f"seed={seed}", f"trainer.num_iterations={iterations}"]))
+        trainer.folder = folder
+        if load is not None:
+            trainer.load(load)
+        trainer.train()
+        return trainer
+
+    straight = run(4)
+    run(2, folder=tmp_path)
+    assert_same(straight, run(4, seed=5, load=tmp_path))

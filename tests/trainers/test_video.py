@@ -6,8 +6,14 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
+from ksim_rl.trainers import video
 from ksim_rl.trainers.video import VideoUnavailableError, record
 from tests.trainers.target_env import make_env
+
+
+@pytest.fixture(autouse=True)
+def _nothing_failed_yet(monkeypatch):
+    monkeypatch.setattr(video, "_failed", [])
 
 
 def filmed(render):
@@ -69,6 +75,19 @@ def test_without_opengl_the_reason_and_the_fix_are_passed_on(tmp_path):
     with pytest.raises(VideoUnavailableError, match="Fixes"):
         record(filmed(blind), still(), tmp_path / "video.mp4", steps=4, fps=25.0)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_platform_that_failed_is_not_tried_again(tmp_path):
+    calls = []
+
+    def blind():
+        calls.append(1)
+        raise RuntimeError("no OpenGL platform")
+
+    for _ in range(2):
+        with pytest.raises(VideoUnavailableError, match="no OpenGL platform"):
+            record(filmed(blind), still(), tmp_path / "video.mp4", steps=4, fps=25.0)
+    assert len(calls) == 1
 
 
 def test_an_env_without_render_mode_is_named(tmp_path):

@@ -133,15 +133,48 @@ def cartpole_swingup() -> ManagerBasedRlEnvCfg:
     return _cfg(ResetCartpole(cart_range=0.02, angle=math.pi, angle_range=0.02))
 
 
+_SMALL_NETWORKS = {
+    "modules.actor.hidden_dims": [64, 64],
+    "modules.critic.hidden_dims": [64, 64],
+    # Values reach 100 here: clipping their change to 0.2 would stop the critic from learning.
+    "objective.clip_value": False,
+    "objective.schedule": "fixed",
+}
+
 BALANCE = Task(
     name="cartpole_balance",
     description="keep a pole upright on a cart",
     cfg=cartpole_balance,
-    solved_at=900.0,
+    training=_SMALL_NETWORKS
+    | {
+        "num_envs": 512,
+        "data.num_env_states_per_minibatch": 4096,
+        "data.num_minibatches": 4,
+        "objective.learning_rate": 1e-3,
+        "objective.num_epochs": 4,
+        "objective.entropy_coeff": 0.0,
+        "trainer.num_iterations": 120,
+        "trainer.eval_interval": 10,
+    },
+    # Upright, centered and at rest with little force gives 1 per step for 1000 steps; 950 leaves half a second of that.
+    solved_at=950.0,
 )
 SWINGUP = Task(
     name="cartpole_swingup",
     description="swing a hanging pole up and keep it upright",
     cfg=cartpole_swingup,
-    solved_at=750.0,
+    training=_SMALL_NETWORKS
+    | {
+        "num_envs": 256,
+        "data.num_env_states_per_minibatch": 2048,
+        "data.num_minibatches": 8,
+        "objective.learning_rate": 5e-4,
+        "objective.num_epochs": 8,
+        "objective.gamma": 0.995,
+        "objective.entropy_coeff": 0.003,
+        "trainer.num_iterations": 300,
+        "trainer.eval_interval": 20,
+    },
+    # What a pole gives that is up, centered and at rest from 2 s on (800 of 1000 steps), with nothing before that.
+    solved_at=800.0,
 )
