@@ -33,7 +33,9 @@ def measure(cfg: RunCfg, picture: Path) -> list[dict[str, float]]:
         _, rows = read_table(table)
     wanted = [name for name in rows[0] if name in KEPT or name.startswith("reward/")]
     points = [
-        {name: float(row[name]) for name in wanted if row.get(name)} for row in rows if row.get("episode/return")
+        {name: float(row[name]) for name in wanted if row.get(name)}
+        for row in rows
+        if row.get("episode/return")
     ]
     if outcome.evaluation is not None:
         points[-1]["evaluation/return_mean"] = outcome.evaluation.return_mean
@@ -42,7 +44,9 @@ def measure(cfg: RunCfg, picture: Path) -> list[dict[str, float]]:
 
 def main() -> None:
     """Train, print the curve at some points, and write it."""
-    cfg = conf.compose([*sys.argv[1:], "logger=local", "trainer.checkpoint_interval=0", "trainer.video=false"])
+    cfg = conf.compose(
+        [*sys.argv[1:], "logger=local", "trainer.checkpoint_interval=0", "trainer.video=false"]
+    )
     device = cfg.resolved_device()
     prefix = f"{report.device_label(device)}/{cfg.task_name}/{cfg.num_envs}"
     points = measure(cfg, report.RESULTS / f"learning_curve_{cfg.task_name}.png")

@@ -162,7 +162,10 @@ def _physics_ms(trainer: Trainer, steps: list[RecordedStep], device: torch.devic
 
         times.append(
             milliseconds(
-                lambda: _launch(capture.graph, device), device=device, repeats=max(1, repeats // 3), before=restore
+                lambda: _launch(capture.graph, device),
+                device=device,
+                repeats=max(1, repeats // 3),
+                before=restore,
             )
         )
     return statistics.mean(times)
@@ -188,7 +191,9 @@ def _table(cfg: RunCfg, figures: dict[str, float], device: torch.device) -> Tabl
     )
     for label, key, env_states in rows:
         per_s = 1000.0 * env_states / figures[key]
-        table.add_row(label, f"{figures[key]:.3f}", str(env_states), f"{per_s:,.0f}", f"{per_s / physics_per_s:.3f}")
+        table.add_row(
+            label, f"{figures[key]:.3f}", str(env_states), f"{per_s:,.0f}", f"{per_s / physics_per_s:.3f}"
+        )
     return table
 
 

@@ -94,7 +94,9 @@ def _mix(word: wp.uint32) -> wp.uint32:
 
 
 @wp.func
-def _bits(seed: wp.int64, stream: wp.uint32, counter: wp.int64, row: wp.uint32, index: wp.uint32) -> wp.uint32:
+def _bits(
+    seed: wp.int64, stream: wp.uint32, counter: wp.int64, row: wp.uint32, index: wp.uint32
+) -> wp.uint32:
     low = wp.uint32(counter & wp.int64(0xFFFFFFFF))
     high = wp.uint32((counter >> wp.int64(32)) & wp.int64(0xFFFFFFFF))
     base = _mix(wp.uint32((seed ^ (seed >> wp.int64(32))) & wp.int64(0xFFFFFFFF)) ^ stream)
@@ -160,7 +162,9 @@ def _draw_bits(seed: Tensor, stream: int, counter: Tensor, num_rows: int, n: int
 
 
 @_draw.register_fake
-def _(seed: Tensor, stream: int, counter: Tensor, num_rows: int, n: int, kind: int, low: float, high: float) -> Tensor:
+def _(
+    seed: Tensor, stream: int, counter: Tensor, num_rows: int, n: int, kind: int, low: float, high: float
+) -> Tensor:
     return seed.new_empty((num_rows, n), dtype=torch.float32)
 
 

@@ -35,7 +35,6 @@ class RolloutCollector:
         rollout_length: T.
         keys: the leaves to store; None stores all. Fewer leaves cost less memory and time.
         cfg: options of the capture.
-        exploration: whether the policy samples or acts deterministically.
 
     Raises:
         ValueError: if T is no positive whole number or `keys` names a leaf that no step produces.
@@ -49,7 +48,6 @@ class RolloutCollector:
         rollout_length: int,
         keys: Sequence[NestedKey] | None = None,
         cfg: CollectorCfg | None = None,
-        exploration: ExplorationType = ExplorationType.RANDOM,
     ) -> None:
         if isinstance(rollout_length, bool) or not isinstance(rollout_length, int) or rollout_length < 1:
             raise ValueError(f"rollout_length={rollout_length!r}: expected a whole number of at least 1")
@@ -62,7 +60,6 @@ class RolloutCollector:
             )
         self.env, self.policy, self.rollout_length = env, policy, rollout_length
         self._keys = None if keys is None else list(keys)
-        self._exploration = exploration
         self._root: TensorDict | None = None
         self._storage_TE: TensorDict | None = None
         self._leaves: list[tuple[NestedKey, Tensor]] = []
@@ -132,7 +129,7 @@ class RolloutCollector:
         assert self._root is not None
         root_keys = list(self._root.keys(True, True))
         root_E = self._root.copy()
-        with set_exploration_type(self._exploration):
+        with set_exploration_type(ExplorationType.RANDOM):
             for t in range(self.rollout_length):
                 env_state_E, root_E = self.env.step_and_maybe_reset(self.policy(root_E))
                 self._store(t, env_state_E)
@@ -149,8 +146,10 @@ class RolloutCollector:
     def _allocate(self, env_state_E: TensorDictBase) -> None:
         produced = list(env_state_E.keys(True, True))
         for key in self._keys or []:
-            if key not in produced and (not isinstance(key, tuple) or len(key) > 1 or key[0] not in produced):
-                raise ValueError(f"keys: no step produces {key!r}; it produces {sorted(map(_flat, produced))}")
+            if key not in produced:
+                raise ValueError(
+                    f"keys: no step produces {key!r}; it produces {sorted(map(_flat, produced))}"
+                )
         kept_E = env_state_E.select(*(self._keys or produced))
         self._storage_TE = TensorDict(
             {
@@ -170,4 +169,4 @@ def _innermost(env: EnvBase) -> Any:
 
 
 def _flat(key: NestedKey) -> str:
-    return key if isinstance(key, str) else ".".join(key)
+    return key if isinstance(key, str) else ".".join(map(str, key))

@@ -124,7 +124,7 @@ def _build_key(annotation: Any, key: object, path: str) -> Any:
 
 def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> Any:
     if TARGET in tree:
-        cls = _resolve_target(tree[TARGET], path)
+        cls: Any = _resolve_target(tree[TARGET], path)
         bases = [c for c in classes if not getattr(c, "_is_protocol", False)]
         if bases and not issubclass(cls, tuple(bases)):
             raise ValueError(f"{path}.{TARGET}={tree[TARGET]!r}: expected a kind of {_describe(Union[tuple(bases)])}")

@@ -15,9 +15,9 @@ import torch
 import warp
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Composite, Unbounded
 
 from ksim_rl import dims
+from ksim_rl.envs import specs
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.managers import (
     ActionManager,
@@ -67,7 +67,7 @@ class ManagerBasedRlEnv(MaskedReset):
     ) -> None:
         if render_mode not in RENDER_MODES:
             raise ValueError(f"render_mode={render_mode!r}: expected one of {RENDER_MODES}")
-        super().__init__(device=torch.device(device), batch_size=[cfg.scene.num_envs])
+        super().__init__(device=torch.device(device), batch_size=torch.Size([cfg.scene.num_envs]))
         self.cfg = cfg
         self.render_mode = render_mode
         self.metadata = {
@@ -168,41 +168,11 @@ class ManagerBasedRlEnv(MaskedReset):
         return math.ceil(round(self.cfg.episode_length_s / self.step_dt, 6))
 
     def _make_specs(self) -> None:
-        num_envs, device = self.num_envs, self.device
-
-        def vectors(values: Mapping[str, Tensor]) -> Composite:
-            leaves = {name: Unbounded(shape=value.shape, device=device) for name, value in values.items()}
-            return Composite(leaves, shape=[num_envs], device=device)
-
-        observation = {"obs": vectors(self.observation_manager.read())}
-        if self.command_manager.values:
-            observation["command"] = vectors(self.command_manager.values)
-        flag = Binary(n=1, shape=(num_envs, 1), dtype=torch.bool, device=device)
-        self.observation_spec = self._named(Composite(observation, shape=[num_envs], device=device))
-        self.full_action_spec = self._named(
-            Composite(
-                action=Unbounded(shape=(num_envs, self.action_manager.size), device=device),
-                shape=[num_envs],
-                device=device,
-            )
-        )
-        self.full_reward_spec = self._named(
-            Composite(reward=Unbounded(shape=(num_envs, 1), device=device), shape=[num_envs], device=device)
-        )
-        self.full_done_spec = self._named(
-            Composite(
-                done=flag,
-                terminated=flag.clone(),
-                truncated=flag.clone(),
-                shape=[num_envs],
-                device=device,
-            )
-        )
-
-    @staticmethod
-    def _named(spec: Composite) -> Composite:
-        spec.names = [dims.E]
-        return spec
+        readings = {"obs": self.observation_manager.read(), "command": self.command_manager.values}
+        self.observation_spec = specs.observation(readings, self.batch_size, self.device)
+        self.full_action_spec = specs.action(self.action_manager.size, self.batch_size, self.device)
+        self.full_reward_spec = specs.reward(self.batch_size, self.device)
+        self.full_done_spec = specs.done(self.batch_size, self.device)
 
     # -- step and reset ------------------------------------------------------------------------------------------
 

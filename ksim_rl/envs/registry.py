@@ -87,7 +87,9 @@ def build(
     """Build the env of a config, with the transforms that its observation groups ask for."""
     base_env = ManagerBasedRlEnv(cfg, device=device, render_mode=render_mode)
     env = MaskedTransformedEnv(base_env, compile_groups(cfg.observations))
-    env.seed(base_env.cfg.seed)
+    seed = base_env.cfg.seed
+    assert seed is not None  # an env stores the seed that it drew
+    env.seed(seed)
     return env
 
 

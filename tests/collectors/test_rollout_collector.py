@@ -45,7 +45,9 @@ class RandomPolicy(torch.nn.Module):
 
 
 def assert_same(actual: TensorDictBase, expected: TensorDictBase, ignore=()):
-    keys = {key for key in expected.keys(True, True) if (key if isinstance(key, str) else key[0]) not in ignore}
+    keys = {
+        key for key in expected.keys(True, True) if (key if isinstance(key, str) else key[0]) not in ignore
+    }
     assert keys <= set(actual.keys(True, True))
     for key in keys:
         assert torch.equal(actual[key], expected[key]), key

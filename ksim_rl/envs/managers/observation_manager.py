@@ -4,7 +4,6 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg
 from ksim_rl.envs.view import EnvView
 
@@ -14,7 +13,7 @@ class ObservationManager:
 
     def __init__(self, groups: Mapping[str, ObservationGroupCfg], view: EnvView) -> None:
         self._view = view
-        self.terms: dict[str, ObservationTerm] = {
+        self.terms = {
             name: cfg.term for group in groups.values() for name, cfg in group.terms.items()
         }
         for name, reading_EL in self.read().items():
