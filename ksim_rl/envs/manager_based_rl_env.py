@@ -112,7 +112,8 @@ class ManagerBasedRlEnv(MaskedReset):
         """
         cfg, view = self.cfg, self.view
         self._contact_trackers = [
-            ContactTracker(name, sensor, view) for name, sensor in cfg.scene.sensors.items()
+            ContactTracker(name, sensor, world=self.world, memories=view.memories, step_dt=view.step_dt)
+            for name, sensor in cfg.scene.sensors.items()
         ]
         view.contacts.update(zip(cfg.scene.sensors, self._contact_trackers, strict=True))
         self.event_manager = EventManager(self._events_cfg, view)

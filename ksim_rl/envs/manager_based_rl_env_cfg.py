@@ -69,6 +69,10 @@ class ManagerBasedRlEnvCfg:
         check_in_range("episode_length_s", self.episode_length_s, low=0.0)
         if self.seed is not None:
             check_in_range("seed", self.seed, low=0, high=2**63 - 1)
+        if self.viewer.env_index >= self.scene.num_envs:
+            raise ValueError(
+                f"viewer.env_index={self.viewer.env_index}: expected less than scene.num_envs={self.scene.num_envs}"
+            )
         if not self.actions:
             raise ValueError("actions={}: name at least one action term")
         timed = [name for name, term in self.terminations.items() if term.time_out]

@@ -10,7 +10,7 @@ import mujoco
 
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.sensors import ContactSensor
-from ksim_rl.physics import load_spec
+from ksim_rl.physics import load_model, load_spec
 
 
 @runtime_checkable
@@ -80,7 +80,8 @@ class SceneCfg:
     """What is in each world.
 
     Attributes:
-        robots: by name. The elements of a single robot keep their names; those of several get the prefix "<name>/".
+        robots: by name. The elements of a single robot keep their names; those of several get the prefix "<name>/". All
+            start at their own default poses; gravity and the other options are the first robot's.
         terrain: the ground, or None if the robot's own model has what it needs.
         sensors: contact sensors by name, for `view.contact(name)`. Sensors of the MJCF need no entry here.
         num_envs: E, the number of worlds.
@@ -114,11 +115,27 @@ def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
         (robot,) = cfg.robots.values()
         spec = robot.spec()
     else:
-        spec = mujoco.MjSpec()
-        for name, robot in cfg.robots.items():
-            spec.attach(robot.spec(), prefix=f"{name}/", frame=spec.worldbody.add_frame())
+        spec = _joined({name: robot.spec() for name, robot in cfg.robots.items()})
     if cfg.terrain is not None:
         cfg.terrain.add_to(spec)
     for name, sensor in cfg.sensors.items():
         sensor.add_to(spec, name)
+    return spec
+
+
+def _joined(robots: Mapping[str, mujoco.MjSpec]) -> mujoco.MjSpec:
+    """Put robots into one spec, with one keyframe that holds the default pose of each."""
+    spec = mujoco.MjSpec()
+    first = next(iter(robots.values()))
+    spec.option = first.option
+    pose: list[float] = []
+    for name, robot in robots.items():
+        robot.option = first.option
+        model = load_model(robot)
+        pose += list(model.key_qpos[0] if model.nkey else model.qpos0)
+        # An attached keyframe would cover its own robot only.
+        for key in list(robot.keys):
+            robot.delete(key)
+        spec.attach(robot, prefix=f"{name}/", frame=spec.worldbody.add_frame())
+    spec.add_key(name="default", qpos=pose)
     return spec

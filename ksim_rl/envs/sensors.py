@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checks import near
+from ksim_rl.envs.memory import Memory
 from ksim_rl.envs.names import as_index
-from ksim_rl.envs.view import EnvView
+from ksim_rl.physics import World
 
 # Bits of MuJoCo's contact sensor (mjtConDataField) and its reduction "netforce".
 _FOUND, _FORCE, _NET_FORCE = 1 << 0, 1 << 1, 3
@@ -81,20 +82,22 @@ class ContactSensor:
 class ContactTracker:
     """Reads one `ContactSensor` once per env step and runs its clocks."""
 
-    def __init__(self, name: str, sensor: ContactSensor, view: EnvView) -> None:
-        self._view = view
+    def __init__(
+        self, name: str, sensor: ContactSensor, *, world: World, memories: Memory, step_dt: float
+    ) -> None:
+        self._world, self._step_dt = world, step_dt
         self._found = self._columns([f"{name}_{geom}_found" for geom in sensor.geoms])
         self._force = self._columns([f"{name}_{geom}_force" for geom in sensor.geoms])
         count = len(sensor.geoms)
         self._clocks = {
-            key: view.memories.get(f"contact/{name}.{key}", count)
+            key: memories.get(f"contact/{name}.{key}", count)
             for key in ("found", "air_time", "last_air_time", "contact_time", "first_contact")
         }
 
     def update(self) -> None:
         """Advance the clocks by one env step, from the sensors of the last substep."""
-        clock, dt = self._clocks, self._view.step_dt
-        touches = self._view.world.sensordata_EL[:, self._found] > 0
+        clock, dt = self._clocks, self._step_dt
+        touches = self._world.sensordata_EL[:, self._found] > 0
         lands = touches & (clock["found"] == 0)
         flight_EN = clock["air_time"] + dt
         clock["last_air_time"].copy_(torch.where(lands, flight_EN, clock["last_air_time"]))
@@ -107,7 +110,7 @@ class ContactTracker:
     def state(self) -> ContactState:
         """The contacts of the last env step."""
         clock = self._clocks
-        force_EL = self._view.world.sensordata_EL[:, self._force]
+        force_EL = self._world.sensordata_EL[:, self._force]
         return ContactState(
             found_EN=clock["found"],
             force_EN3=force_EL.reshape(force_EL.shape[0], -1, 3),
@@ -118,9 +121,9 @@ class ContactTracker:
         )
 
     def _columns(self, names: Sequence[str]) -> slice | Tensor:
-        model = self._view.world.mj_model
+        model = self._world.mj_model
         columns = []
         for name in names:
             sensor = model.sensor(name)
             columns.extend(range(int(sensor.adr[0]), int(sensor.adr[0] + sensor.dim[0])))
-        return as_index(columns, self._view.device)
+        return as_index(columns, self._world.device)

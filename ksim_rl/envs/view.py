@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import torch
@@ -15,10 +15,8 @@ from ksim_rl.checks import near
 from ksim_rl.envs import quaternion
 from ksim_rl.envs.memory import Memory
 from ksim_rl.envs.names import Index, NameResolver, Patterns, as_index, scalar_joint_ids
+from ksim_rl.envs.sensors import ContactState, ContactTracker
 from ksim_rl.physics import World
-
-if TYPE_CHECKING:
-    from ksim_rl.envs.sensors import ContactState, ContactTracker
 
 
 def quantity(compute: Callable[[Any], Tensor]) -> property:

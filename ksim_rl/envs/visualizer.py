@@ -8,6 +8,8 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
+from ksim_rl.physics.mujoco_messages import caught_warnings
+
 Vector = Sequence[float] | np.ndarray
 Rgba = tuple[float, float, float, float]
 
@@ -37,7 +39,9 @@ class DebugVisualizer(Protocol):
 class SceneVisualizer:
     """Draws into a `mujoco.MjvScene`; what exceeds the scene's capacity is refused, not dropped."""
 
-    def __init__(self, model: mujoco.MjModel, scene: mujoco.MjvScene, offset: Vector = (0.0, 0.0, 0.0)) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, scene: mujoco.MjvScene, offset: Vector = (0.0, 0.0, 0.0)
+    ) -> None:
         self._model, self._scene = model, scene
         self._offset = np.asarray(offset, dtype=np.float64)
 
@@ -77,7 +81,7 @@ class SceneVisualizer:
 
     def _next(self, kind: mujoco.mjtGeom, size: np.ndarray, position: Vector, rgba: Rgba) -> mujoco.MjvGeom:
         if self._scene.ngeom >= self._scene.maxgeom:
-            raise RuntimeError(f"the scene is full: {self._scene.maxgeom} geoms")
+            raise RuntimeError(_full(self._scene))
         geom = self._scene.geoms[self._scene.ngeom]
         center = np.asarray(position, dtype=np.float64) + self._offset
         mujoco.mjv_initGeom(geom, kind, size, center, np.eye(3).ravel(), np.asarray(rgba, dtype=np.float32))
@@ -91,10 +95,21 @@ class SceneVisualizer:
 
 
 def add_geoms(model: mujoco.MjModel, data: mujoco.MjData, scene: mujoco.MjvScene, offset: np.ndarray) -> None:
-    """Add the moving geoms of `data` to the scene, shifted by `offset` (m)."""
+    """Add the moving geoms of `data` to the scene, shifted by `offset` (m).
+
+    Raises:
+        RuntimeError: if they do not all fit.
+    """
     first = scene.ngeom
-    mujoco.mjv_addGeoms(
-        model, data, mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.mjtCatBit.mjCAT_DYNAMIC.value, scene
-    )
+    with caught_warnings():
+        mujoco.mjv_addGeoms(
+            model, data, mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.mjtCatBit.mjCAT_DYNAMIC.value, scene
+        )
+    if scene.status:
+        raise RuntimeError(_full(scene))
     for index in range(first, scene.ngeom):
         scene.geoms[index].pos[:] += offset
+
+
+def _full(scene: mujoco.MjvScene) -> str:
+    return f"the scene is full: {scene.maxgeom} geoms; draw fewer envs (viewer.num_envs) or fewer marks"

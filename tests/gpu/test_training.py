@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ksim_rl import conf, envs
-from ksim_rl.collectors import RolloutCollector
+from ksim_rl.collectors import CollectorCfg, RolloutCollector
 from ksim_rl.trainers import build
 
 pytestmark = [
@@ -56,27 +56,32 @@ def test_step_and_reset_make_no_host_sync(name, no_syncs):
         env.reset()
 
 
-@pytest.mark.parametrize("name", TASKS)
-def test_a_captured_rollout_equals_the_eager_one(name):
-    def rollouts(captured):
-        env = make(name, overrides=["task.sim.deterministic=true"])
-        random_policy.size = env.action_spec.shape[-1]
-        collector = RolloutCollector(env, random_policy, rollout_length=8)
-        if not captured:
-            collector._run._eager_for_ever = True
-            collector._run._stream = None
-        torch.manual_seed(0)
-        results = []
-        for _ in range(5):
-            results.append(collector.collect().clone())
-        assert collector._run.ready is captured
-        return results
+def rollouts(name, *, captured, count=3):
+    """Collect rollouts with a random policy: one eager, then captured ones, or all of them eager."""
+    env = make(name)
+    random_policy.size = env.action_spec.shape[-1]
+    cfg = CollectorCfg(warmup=1 if captured else count)
+    collector = RolloutCollector(env, random_policy, rollout_length=8, cfg=cfg)
+    torch.manual_seed(0)
+    return [collector.collect().clone() for _ in range(count)]
 
-    for actual, expected in zip(rollouts(True), rollouts(False), strict=True):
+
+@pytest.mark.parametrize("name", ("cartpole_balance", "cartpole_swingup"))
+def test_captured_rollouts_equal_eager_ones(name):
+    for actual, expected in zip(rollouts(name, captured=True), rollouts(name, captured=False), strict=True):
         for key in expected.keys(True, True):
-            error = (actual[key].float() - expected[key].float()).abs() / (1.0 + expected[key].float().abs())
-            # Atomic adds make a rare grazing contact come or go: two eager runs differ in the same way.
-            assert error.quantile(0.99) < 1e-3, f"{key}: {error.quantile(0.99)}"
+            torch.testing.assert_close(actual[key], expected[key], rtol=1e-5, atol=1e-5, msg=str(key))
+
+
+def test_captured_rollouts_in_contact_differ_from_eager_ones_no_more_than_eager_ones_do():
+    # Atomic adds make the physics of contacts differ from run to run; a wrong capture would differ far more.
+    name = "go1_velocity_flat"
+    first, second = rollouts(name, captured=False), rollouts(name, captured=False)
+    for actual, expected, again in zip(rollouts(name, captured=True), first, second, strict=True):
+        for key in (("obs", "joint_pos"), ("obs", "joint_vel"), ("obs", "base_lin_vel"), ("next", "reward")):
+            error = (actual[key] - expected[key]).abs().quantile(0.9)
+            noise = (again[key] - expected[key]).abs().quantile(0.9)
+            assert error <= 10.0 * noise + 1e-4, f"{key}: {error} against {noise}"
 
 
 def test_whole_iterations_make_no_host_sync_and_learn(no_syncs):

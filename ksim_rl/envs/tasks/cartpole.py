@@ -148,8 +148,8 @@ BALANCE = Task(
     training=_SMALL_NETWORKS
     | {
         "num_envs": 512,
-        "data.num_env_states_per_minibatch": 4096,
-        "data.num_minibatches": 4,
+        "data.num_env_states_per_minibatch": 2048,
+        "data.num_minibatches": 8,
         "objective.learning_rate": 1e-3,
         "objective.num_epochs": 4,
         "objective.entropy_coeff": 0.0,

@@ -79,7 +79,8 @@ class Bench:
         self.per_world = ("geom_friction", "body_ipos")
         self.world = World(load_model(spec), num_envs=num_envs, per_world_fields=self.per_world)
         self.view = EnvView(self.world, step_dt=0.02, **view)
-        self.trackers = [ContactTracker(name, sensor, self.view) for name, sensor in contacts.items()]
+        clocks = {"world": self.world, "memories": self.view.memories, "step_dt": self.view.step_dt}
+        self.trackers = [ContactTracker(name, sensor, **clocks) for name, sensor in contacts.items()]
         self.view.contacts.update(zip(contacts, self.trackers, strict=True))
         self.everybody_E = torch.ones(num_envs, dtype=torch.bool)
 
