@@ -182,6 +182,7 @@ class ManagerBasedRlEnv(MaskedReset):
         action_EL = self._checked_action(tensordict.get("action"))
         view.step_count.add_(1)
         self.event_manager.step()
+        self._recompute(*self.event_manager.fields("interval", "step"))
         finite_E = self.action_manager.apply(action_EL)
 
         world.step(self.cfg.decimation)
@@ -218,7 +219,7 @@ class ManagerBasedRlEnv(MaskedReset):
         view.memories.clear(mask_E)
         view.episode_step_E.masked_fill_(mask_E, 0)
         self.event_manager.reset(mask_E)
-        self._recompute(*self.event_manager.fields("reset", "interval", "step"))
+        self._recompute(*self.event_manager.fields("reset"))
         self.command_manager.resample(mask_E)
         self.world.refresh()
         view.refreshed()

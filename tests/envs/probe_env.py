@@ -116,7 +116,10 @@ def puck_cfg(
     seed: int = 0,
     **fields: object,
 ) -> ManagerBasedRlEnvCfg:
-    """Return the config of the puck env; a time-out comes with a positive `episode_length_s`."""
+    """Return the config of the puck env; a time-out comes with a positive `episode_length_s`.
+
+    `fields` are those of `ManagerBasedRlEnvCfg`.
+    """
     terminations: dict[str, TerminationTerm] = {}
     if limit is not None:
         terminations["beyond"] = Beyond(limit=limit)
@@ -127,14 +130,19 @@ def puck_cfg(
         "velocity": ObservationTermCfg(term=JointVel()),
         "last_action": ObservationTermCfg(term=LastAction()),
     }
-    defaults: dict[str, object] = {"rewards": {"position": Position()}}
+    defaults: dict[str, object] = {
+        "decimation": DECIMATION,
+        "scene": SceneCfg(robots={"puck": MjcfRobot(source=PUCK_XML)}, num_envs=num_envs),
+        "observations": {
+            "actor": ObservationGroupCfg(terms=terms),
+            "critic": ObservationGroupCfg(terms=terms),
+        },
+        "actions": {"push": JointEffortAction()},
+        "rewards": {"position": Position()},
+        "terminations": terminations,
+    }
     return ManagerBasedRlEnvCfg(
-        decimation=DECIMATION,
-        scene=SceneCfg(robots={"puck": MjcfRobot(source=PUCK_XML)}, num_envs=num_envs),
-        observations={"actor": ObservationGroupCfg(terms=terms), "critic": ObservationGroupCfg(terms=terms)},
-        actions={"push": JointEffortAction()},
         events={"launch": Launch()} if events is None else events,
-        terminations=terminations,
         episode_length_s=episode_length_s,
         seed=seed,
         **(defaults | fields),  # pyright: ignore[reportArgumentType]

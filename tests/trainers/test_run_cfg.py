@@ -10,7 +10,14 @@ from ksim_rl.trainers import RunCfg
 
 @pytest.fixture(scope="module")
 def cfg():
-    return conf.compose(["task=cartpole_balance", "num_envs=64", "data.num_env_states_per_minibatch=64"])
+    return conf.compose(
+        [
+            "task=cartpole_balance",
+            "num_envs=64",
+            "data.num_env_states_per_minibatch=64",
+            "data.num_minibatches=4",
+        ]
+    )
 
 
 def test_plain_data_rebuilds_an_equal_config(cfg):

@@ -10,7 +10,10 @@ from ksim_rl.envs.view import EnvView
 
 
 class CommandManager:
-    """Holds one command vector per term, [E, K], and one resampling clock per env and term."""
+    """Holds one command vector per term, [E, K], and one resampling clock per env and term.
+
+    Clocks count down in seconds and run out at the env step that is nearest.
+    """
 
     def __init__(self, terms: Mapping[str, CommandTerm], view: EnvView) -> None:
         self._view = view
@@ -20,8 +23,13 @@ class CommandManager:
         for name, term in terms.items():
             with view.scope(f"commands/{name}"):
                 term.resample(view, nobody_E)
-                width = term(view).shape[1]
-            view.commands[name] = view.memories.get(f"commands/{name}.value_EK", width)
+                value_EK = term(view)
+            if value_EK.ndim != 2 or value_EK.shape[0] != view.num_envs:
+                raise ValueError(
+                    f"command term {name!r} returns shape {tuple(value_EK.shape)}: expected [{view.num_envs}, K], one "
+                    "row per env"
+                )
+            view.commands[name] = view.memories.get(f"commands/{name}.value_EK", value_EK.shape[1])
 
     @property
     def values(self) -> dict[str, Tensor]:
@@ -50,7 +58,9 @@ class CommandManager:
         for name, term in self._terms.items():
             clock_E = self._clocks[name]
             clock_E.sub_(self._view.step_dt)
-            self._draw(name, term, (clock_E <= 0.0) & going_on_E, "step", self._view.step_count)
+            self._draw(
+                name, term, (clock_E < 0.5 * self._view.step_dt) & going_on_E, "step", self._view.step_count
+            )
         self.refresh(going_on_E)
 
     def _draw(self, name: str, term: CommandTerm, mask_E: Tensor, moment: str, counter: Tensor) -> None:

@@ -17,9 +17,15 @@ class CurriculumManager:
         self._terms = dict(terms)
         self.names = tuple(terms)
         self.levels_C = torch.zeros(len(self.names), device=view.device)
+        self.reset(torch.zeros(view.num_envs, dtype=torch.bool, device=view.device))
 
     def reset(self, mask_E: Tensor) -> None:
         """Adapt to the episodes that just ended in the rows of `mask_E`."""
         for index, (name, term) in enumerate(self._terms.items()):
             with self._view.scope(f"curriculum/{name}", self._view.reset_count_E):
-                self.levels_C[index].copy_(term(self._view, mask_E))
+                level = term(self._view, mask_E)
+            if level.shape != ():
+                raise ValueError(
+                    f"curriculum term {name!r} returns shape {tuple(level.shape)}: expected (), one level for all envs"
+                )
+            self.levels_C[index].copy_(level)

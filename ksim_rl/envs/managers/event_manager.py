@@ -12,7 +12,8 @@ from ksim_rl.envs.view import EnvView
 class EventManager:
     """Runs each event in its mode.
 
-    Interval clocks count down in seconds, one per env and event, and start anew when a row resets.
+    Interval clocks count down in seconds, one per env and event, and start anew when a row resets. They run out at the
+    env step that is nearest, so that an interval of n steps ends at the n-th, whatever the subtractions round to.
     """
 
     def __init__(self, terms: Mapping[str, EventTerm], view: EnvView) -> None:
@@ -56,7 +57,7 @@ class EventManager:
         for scope, term in self._by_mode.get("interval", []):
             clock_E = self._clocks[scope]
             clock_E.sub_(view.step_dt)
-            due_E = clock_E <= 0.0
+            due_E = clock_E < 0.5 * view.step_dt
             with view.scope(f"{scope}/interval"):
                 self._restart(scope, term, due_E)
             with view.scope(scope):

@@ -31,7 +31,12 @@ class MetricManager:
         values = []
         for name, term in self._terms.items():
             with self._view.scope(f"metrics/{name}"):
-                values.append(term(self._view))
+                value_E = term(self._view)
+            if value_E.shape != finite_E.shape:
+                raise ValueError(
+                    f"metric term {name!r} returns shape {tuple(value_E.shape)}: expected {tuple(finite_E.shape)}"
+                )
+            values.append(value_E)
         if not values:
             return
         value_EM = torch.where(finite_E[:, None], torch.stack(values, dim=-1), 0.0)

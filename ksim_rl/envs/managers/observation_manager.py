@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg
@@ -13,14 +14,13 @@ class ObservationManager:
 
     def __init__(self, groups: Mapping[str, ObservationGroupCfg], view: EnvView) -> None:
         self._view = view
-        self.terms = {
-            name: cfg.term for group in groups.values() for name, cfg in group.terms.items()
-        }
+        self.terms = {name: cfg.term for group in groups.values() for name, cfg in group.terms.items()}
         for name, reading_EL in self.read().items():
-            if reading_EL.ndim != 2 or reading_EL.shape[0] != view.num_envs:
+            has_rows = reading_EL.ndim == 2 and reading_EL.shape[0] == view.num_envs
+            if not has_rows or reading_EL.dtype != torch.float32:
                 raise ValueError(
-                    f"observation term {name!r} returns shape {tuple(reading_EL.shape)}: expected "
-                    f"[{view.num_envs}, L], one row per env"
+                    f"observation term {name!r} returns {reading_EL.dtype} {tuple(reading_EL.shape)}: expected "
+                    f"torch.float32 [{view.num_envs}, L], one row per env"
                 )
 
     def read(self) -> dict[str, Tensor]:

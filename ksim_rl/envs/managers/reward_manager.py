@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from ksim_rl.checks import near
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 
@@ -19,6 +20,9 @@ class RewardManager:
     def __init__(
         self, terms: Mapping[str, RewardTerm], view: EnvView, *, scale: float, adapted: frozenset[str]
     ) -> None:
+        unknown = sorted(adapted - terms.keys())
+        if unknown:
+            raise ValueError(f"a curriculum adapts the unknown reward {unknown[0]!r}: {near(unknown[0], terms)}")
         self._view = view
         self._scale = scale
         self._terms = {name: term for name, term in terms.items() if term.weight != 0.0 or name in adapted}
