@@ -10,6 +10,7 @@ import warp as wp
 from ksim_rl.physics import menagerie
 from ksim_rl.physics.model_checks import check_finite, warp_model_of
 from ksim_rl.physics.mujoco_messages import caught_warnings
+from ksim_rl.physics.warp_start import start_warp
 
 SUFFIXES = (".xml", ".mjcf", ".urdf")
 Source = str | Path | mujoco.MjSpec
@@ -56,6 +57,7 @@ def load_model(source: Source) -> mujoco.MjModel:
     for message in caught + caught_later:
         _refuse_serious(message, mj_model, label, text)
     _pass_on(caught + caught_later, label)
+    start_warp()
     with wp.ScopedDevice("cpu"):
         try:
             warp_model_of(mj_model)

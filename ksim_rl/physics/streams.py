@@ -12,6 +12,8 @@ from contextlib import contextmanager
 import torch
 import warp as wp
 
+from ksim_rl.physics.warp_start import start_warp
+
 CPU_LOCK = threading.RLock()
 
 _warp_streams: dict[tuple[int, int], tuple[torch.cuda.Stream, wp.Stream]] = {}
@@ -23,6 +25,7 @@ def checked_device(device: str | torch.device) -> torch.device:
     Raises:
         ValueError: if it is no device, is of a kind that Warp does not run on, or is not there.
     """
+    start_warp()
     try:
         checked = torch.device(device)
     except (RuntimeError, TypeError) as error:
@@ -51,7 +54,7 @@ def warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
     """Return the one Warp wrapper of a torch stream; both live for ever."""
     key = (stream.device_index, stream.cuda_stream)
     if key not in _warp_streams:
-        wp.init()  # without a world there was no need for Warp so far, and its stream look-up does not start it
+        start_warp()  # without a world there was no need for Warp so far, and its stream look-up does not start it
         _warp_streams[key] = (stream, wp.stream_from_torch(stream))
     return _warp_streams[key][1]
 
@@ -60,6 +63,7 @@ def warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
 def warp_scope(device: torch.device) -> Iterator[None]:
     """Send the Warp work of this block to `device`, ordered with torch's current stream there."""
     if device.type == "cpu":
+        start_warp()
         with CPU_LOCK, wp.ScopedDevice("cpu"):
             yield
     else:

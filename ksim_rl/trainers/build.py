@@ -1,6 +1,7 @@
 """From a config to the objects of a run."""
 
 import dataclasses
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ UNLIMITED_EPISODE_STEPS = 1000
 def build(cfg: RunCfg, *, run_folder: Path | None = None) -> Trainer:
     """Build everything that a run needs, with all its memory allocated.
 
-    Torch's global seed and matmul precision are set from the config.
+    Torch's global seed, matmul precision and number of CPU threads are set from the config.
 
     Args:
         cfg: of the run.
@@ -38,6 +39,7 @@ def build(cfg: RunCfg, *, run_folder: Path | None = None) -> Trainer:
     device = cfg.resolved_device()
     torch.manual_seed(cfg.seed)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
+    torch.set_num_threads(cfg.trainer.num_threads or max(1, (os.cpu_count() or 1) - 1))
 
     env = build_env(cfg, num_envs=cfg.num_envs, seed=cfg.task.seed if cfg.task.seed is not None else cfg.seed)
     actor, critic = build_networks(cfg, env)

@@ -19,6 +19,8 @@ class TrainerCfg:
         checkpoint_interval: between checkpoints; the last iteration is always saved.
         keep_checkpoints: how many of the newest checkpoints stay.
         log_interval: between rows of the logs and lines of progress.
+        num_threads: torch's threads on the CPU; None leaves one core free. A thread that has to wait for a core that is
+            busy elsewhere stalls all others: on two cores that made runs beside other work twenty times slower.
         matmul_precision: of float32 products on CUDA; "high" is TF32.
         video: record the final policy.
         video_s: seconds of it.
@@ -31,6 +33,7 @@ class TrainerCfg:
     checkpoint_interval: int = 20
     keep_checkpoints: int = 3
     log_interval: int = 1
+    num_threads: int | None = None
     matmul_precision: str = "high"
     video: bool = True
     video_s: float = 10.0
@@ -48,5 +51,7 @@ class TrainerCfg:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < low:
                 raise ValueError(f"{name}={value!r}: expected a whole number >= {low}")
+        if self.num_threads is not None:
+            check_in_range("num_threads", self.num_threads, low=1)
         check_choice("matmul_precision", self.matmul_precision, MATMUL_PRECISIONS)
         check_in_range("video_s", self.video_s, low=0.0, low_open=True)

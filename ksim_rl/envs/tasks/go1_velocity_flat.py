@@ -150,7 +150,7 @@ def go1_velocity_flat() -> ManagerBasedRlEnvCfg:
             ccd_iterations=50,
         ),
         scene=SceneCfg(
-            robots={"robot": ROBOT},
+            robots={"go1": ROBOT},
             terrain=PlaneTerrain(),
             sensors={FEET: ContactSensor(geoms=ROBOT.foot_geoms)},
             num_envs=4096,

@@ -14,7 +14,7 @@ from ksim_rl.envs.transforms.noise_cfg import UniformNoise
 from tests.envs.robots.reference import loaded_spec, reference_figures
 
 CFG = envs.task("go1_velocity_flat").cfg()
-ROBOT = CFG.scene.robots["robot"]
+ROBOT = CFG.scene.robots["go1"]
 TRAINING = envs.task("go1_velocity_flat").training
 SENSORS = {"feet_ground_contact": "feet_ground_contact", "robot/root_angmom": "root_angmom"}
 
