@@ -91,13 +91,18 @@ def write(
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.json"
     saved = json.loads(path.read_text()) if path.exists() else {}
-    saved |= {
+    run = {
         "command": command(module),
         "commit": commit(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "device": device_name(device),
         "versions": versions(),
+    }
+    # The file's own entries are those of the last run; `runs` keeps which run each group of figures came from.
+    runs = {key.rpartition("/")[0]: run for key in figures}
+    saved |= run | {
         "figures": {**saved.get("figures", {}), **figures},
+        "runs": {**saved.get("runs", {}), **runs},
     }
     for key, value in measured.items():
         saved[key] = {**saved.get(key, {}), **value} if isinstance(value, Mapping) else value

@@ -3,8 +3,10 @@
 import importlib.machinery
 import importlib.util
 import inspect
+import os
 import sys
 import typing
+from pathlib import Path
 from types import FunctionType, ModuleType
 
 import beartype
@@ -12,6 +14,11 @@ import jaxtyping
 import pytest
 import torch
 from jaxtyping import AbstractArray
+
+# Robots that lie beside the checkout are used; tests that need one skip where there is none.
+_MENAGERIE = Path(__file__).parents[2] / "shared" / "menagerie"
+if _MENAGERIE.is_dir():
+    os.environ.setdefault("MENAGERIE_ROOT", str(_MENAGERIE))
 
 
 def _names_a_shape(annotation: object) -> bool:

@@ -122,7 +122,7 @@ class ManagerBasedRlEnv(MaskedReset):
         self.action_manager = ActionManager(cfg.actions, view)
         self.observation_manager = ObservationManager(cfg.observations, view)
         adapted = frozenset(
-            name for term in cfg.curriculum.values() for name in getattr(term, "adapted_rewards", ())
+            name for term in cfg.curriculum.values() for name in term.adapted_rewards
         )
         self.reward_manager = RewardManager(
             cfg.rewards, view, scale=self.step_dt if cfg.scale_rewards_by_dt else 1.0, adapted=adapted
@@ -253,7 +253,7 @@ class ManagerBasedRlEnv(MaskedReset):
     # -- seeds ---------------------------------------------------------------------------------------------------
 
     def _set_seed(self, seed: int | None) -> None:
-        """Seed all draws and redo the startup events: what follows is a function of the seed alone."""
+        """Seed all draws and redo the startup events. What curricula have learned stays."""
         seed = secrets.randbelow(2**31) if seed is None else seed
         self.cfg = dataclasses.replace(self.cfg, seed=seed)
         view = self.view

@@ -10,7 +10,7 @@ import numpy as np
 from ksim_rl.checks import near
 from ksim_rl.envs.gl_platform import FIXES, choose_gl_platform
 from ksim_rl.envs.viewer_cfg import ViewerCfg
-from ksim_rl.envs.visualizer import DebugVisualizer, SceneVisualizer, add_geoms
+from ksim_rl.envs.visualizer import DebugVisualizer, SceneVisualizer, add_geoms, visible_groups
 from ksim_rl.physics import World
 
 class OffscreenRenderer:
@@ -48,7 +48,7 @@ class OffscreenRenderer:
         self._pose(qpos_EL[0])
         target = self._cfg.lookat if self._body is None else self._data.xpos[self._body]
         self._camera.lookat[:] = target
-        renderer.update_scene(self._data, self._camera)
+        renderer.update_scene(self._data, self._camera, visible_groups(self._model))
         draw(SceneVisualizer(self._model, renderer.scene))
         columns = int(np.ceil(np.sqrt(len(qpos_EL))))
         for index, qpos in enumerate(qpos_EL[1:], start=1):

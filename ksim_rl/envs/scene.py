@@ -52,7 +52,17 @@ class PlaneTerrain:
             check_in_range(f"friction[{index}]", value, low=0.0)
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
-        """Add the plane to the world body, with a checker pattern for rendering."""
+        """Add the plane to the world body, with a checker pattern and a sky for rendering."""
+        if not any(texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
+            spec.add_texture(
+                name="terrain_sky",
+                type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+                builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+                rgb1=[0.75, 0.82, 0.9],
+                rgb2=[0.95, 0.97, 1.0],
+                width=64,
+                height=384,
+            )
         spec.add_texture(
             name="terrain",
             type=mujoco.mjtTexture.mjTEXTURE_2D,

@@ -100,7 +100,9 @@ class ContactTracker:
         touches = self._world.sensordata_EL[:, self._found] > 0
         lands = touches & (clock["found"] == 0)
         flight_EN = clock["air_time"] + dt
-        clock["last_air_time"].copy_(torch.where(lands, flight_EN, clock["last_air_time"]))
+        # What stands on the ground at the start of an episode has not flown.
+        ends_flight = lands & (clock["air_time"] > 0)
+        clock["last_air_time"].copy_(torch.where(ends_flight, flight_EN, clock["last_air_time"]))
         clock["air_time"].copy_(torch.where(touches, 0.0, flight_EN))
         clock["contact_time"].copy_(torch.where(touches, clock["contact_time"] + dt, 0.0))
         clock["found"].copy_(touches)

@@ -142,7 +142,16 @@ class ActionTerm(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class CurriculumTerm(ABC):
-    """A rule that adapts difficulty; it runs for the rows that reset, before the reset events."""
+    """A rule that adapts difficulty; it runs for the rows that reset, before the reset events.
+
+    It may write `view.reward_weights[name]`, a tensor [] per reward term, for the rewards that it names in
+    `adapted_rewards`: those are computed even while their weight is 0.
+    """
+
+    @property
+    def adapted_rewards(self) -> tuple[str, ...]:
+        """The reward terms whose weights this curriculum changes."""
+        return ()
 
     @abstractmethod
     def __call__(self, view: EnvView, mask_E: Tensor) -> Tensor:

@@ -94,6 +94,19 @@ class SceneVisualizer:
         mujoco.mjv_connector(geom, kind, width, begin, finish)
 
 
+def visible_groups(model: mujoco.MjModel) -> mujoco.MjvOption:
+    """Return drawing options that show something of the robot.
+
+    MuJoCo hides geom groups 3 to 5, where collision geoms are by custom. A robot without visual geoms would be
+    invisible, so for such a model they are shown.
+    """
+    option = mujoco.MjvOption()
+    moving = model.geom_group[model.body_weldid[model.geom_bodyid] != 0]
+    if moving.size and moving.min() > 2:
+        option.geomgroup[moving.min()] = 1
+    return option
+
+
 def add_geoms(model: mujoco.MjModel, data: mujoco.MjData, scene: mujoco.MjvScene, offset: np.ndarray) -> None:
     """Add the moving geoms of `data` to the scene, shifted by `offset` (m).
 
@@ -101,10 +114,9 @@ def add_geoms(model: mujoco.MjModel, data: mujoco.MjData, scene: mujoco.MjvScene
         RuntimeError: if they do not all fit.
     """
     first = scene.ngeom
+    moving = mujoco.mjtCatBit.mjCAT_DYNAMIC.value
     with caught_warnings():
-        mujoco.mjv_addGeoms(
-            model, data, mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.mjtCatBit.mjCAT_DYNAMIC.value, scene
-        )
+        mujoco.mjv_addGeoms(model, data, visible_groups(model), mujoco.MjvPerturb(), moving, scene)
     if scene.status:
         raise RuntimeError(_full(scene))
     for index in range(first, scene.ngeom):

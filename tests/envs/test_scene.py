@@ -101,7 +101,9 @@ def test_sensors_of_several_robots_use_the_prefixed_names():
         "touch_b/puck_found",
         "touch_b/puck_force",
     ]
-    with pytest.raises(ValueError, match=r"scene\.sensors\.touch: no geom 'puck': did you mean 'b/puck' or 'a/puck'"):
+    with pytest.raises(
+        ValueError, match=r"scene\.sensors\.touch: no geom 'puck': did you mean 'b/puck' or 'a/puck'"
+    ):
         scene(robots=robots, terrain=terrain, sensors={"touch": ContactSensor(geoms=("puck",))})
 
 

@@ -134,6 +134,13 @@ def test_at_rest_the_force_is_the_weight():
     assert state.contact_time_EN.gt(1.0).all() and state.air_time_EN.eq(0.0).all()
 
 
+def test_a_start_on_the_ground_is_a_contact_but_no_flight():
+    state = contacts(falling_env(heights=(0.0, 0.0)), 1)[0]
+    assert state.found_EN.eq(1.0).all() and state.first_contact_EN.eq(1.0).all()
+    assert state.last_air_time_EN.eq(0.0).all() and state.air_time_EN.eq(0.0).all()
+    torch.testing.assert_close(state.contact_time_EN, torch.full((2, 2), DT))
+
+
 def test_a_lift_takes_weight_off():
     state = contacts(falling_env(heights=(0.0, 0.0)), 100, effort=5.0)[-1]
     torch.testing.assert_close(state.force_EN3[..., 2], 5.0 - WEIGHT.expand(2, 2), atol=0.05, rtol=0)

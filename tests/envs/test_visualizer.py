@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from ksim_rl.envs.visualizer import SceneVisualizer, add_geoms
+from ksim_rl.envs.visualizer import SceneVisualizer, add_geoms, visible_groups
 from tests.envs.probe_env import PUCK_XML
 
 RED = (1.0, 0.0, 0.0, 1.0)
@@ -104,3 +104,10 @@ def test_moving_geoms_are_added_without_the_fixed_ones():
     add_geoms(model, data, scene, np.array([0.0, 3.0, 0.0]))
     assert scene.ngeom == 1
     np.testing.assert_allclose(scene.geoms[0].pos, (0, 3, 0), atol=1e-6)
+
+
+@pytest.mark.parametrize(("group", "shown"), [(0, 0), (2, 0), (3, 1)])
+def test_a_robot_without_visual_geoms_is_drawn_by_its_collision_geoms(group, shown):
+    xml = f"""<mujoco><worldbody><geom type="plane" size="1 1 1"/>
+    <body><freejoint/><geom size="0.1" group="{group}"/></body></worldbody></mujoco>"""
+    assert visible_groups(mujoco.MjModel.from_xml_string(xml)).geomgroup[3] == shown

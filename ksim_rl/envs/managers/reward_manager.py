@@ -22,7 +22,9 @@ class RewardManager:
     ) -> None:
         unknown = sorted(adapted - terms.keys())
         if unknown:
-            raise ValueError(f"a curriculum adapts the unknown reward {unknown[0]!r}: {near(unknown[0], terms)}")
+            raise ValueError(
+                f"a curriculum adapts the unknown reward {unknown[0]!r}: {near(unknown[0], terms)}"
+            )
         self._view = view
         self._scale = scale
         self._terms = {name: term for name, term in terms.items() if term.weight != 0.0 or name in adapted}
