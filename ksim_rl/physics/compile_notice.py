@@ -81,8 +81,9 @@ install()
 
 @contextmanager
 def compile_notice(hook: CompileHook) -> Iterator[None]:
-    """Call `hook` with one line of text after each kernel module that Warp compiles in this block."""
+    """Call `hook` with one line of text after each kernel module that Warp compiles in this block, counted from 1."""
     saved, _logger.hook = _logger.hook, hook
+    _logger.last_time = -BURST_GAP_S
     try:
         yield
     finally:

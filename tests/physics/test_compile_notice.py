@@ -38,3 +38,11 @@ def test_a_loaded_kernel_is_told_in_the_format_that_the_notice_reads(tmp_path):
     finally:
         wp.config.kernel_cache_dir = cache
     assert len(lines) == 1
+
+
+def test_each_block_counts_from_one():
+    for _ in range(2):
+        lines: list[str] = []
+        with compile_notice(lines.append):
+            wp.get_logger().info(LINE.format(ms="2000.00", how="compiled"))
+        assert lines[0].endswith("1 modules, 2 s")
