@@ -8,11 +8,12 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl import dims
 from ksim_rl.collectors.collector_cfg import CollectorCfg
+from ksim_rl.envs.innermost import innermost
 from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.physics.capture import Captured
 
@@ -54,9 +55,9 @@ class RolloutCollector:
         if len(env.batch_size) != 1:
             raise ValueError(f"env.batch_size={tuple(env.batch_size)}: expected one dim, [E]")
         self._cfg = cfg = cfg or CollectorCfg()
-        if cfg.stagger_episodes and not hasattr(_innermost(env), "stagger_episodes_"):
+        if cfg.stagger_episodes and not hasattr(innermost(env), "stagger_episodes_"):
             raise ValueError(
-                f"stagger_episodes=True, but {type(_innermost(env)).__name__} has no stagger_episodes_: set it to False"
+                f"stagger_episodes=True, but {type(innermost(env)).__name__} has no stagger_episodes_: set it to False"
             )
         self.env, self.policy, self.rollout_length = env, policy, rollout_length
         self._keys = None if keys is None else list(keys)
@@ -98,7 +99,7 @@ class RolloutCollector:
         else:
             self._root.update_(root_E)
         if self._cfg.stagger_episodes:
-            _innermost(self.env).stagger_episodes_()
+            innermost(self.env).stagger_episodes_()
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the EnvState from which the next rollout starts, by flat key."""
@@ -160,12 +161,6 @@ class RolloutCollector:
             device=env_state_E.device,
         )
         self._leaves = list(self._storage_TE.items(True, True))
-
-
-def _innermost(env: EnvBase) -> Any:
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
-    return env
 
 
 def _flat(key: NestedKey) -> str:

@@ -12,9 +12,9 @@ from torchrl.envs import EnvBase
 
 from ksim_rl import envs
 from ksim_rl.collectors import RolloutCollector
+from ksim_rl.envs.innermost import innermost
 from ksim_rl.modules import make_actor, make_critic
 from ksim_rl.trainers import state_tree
-from ksim_rl.trainers.episode_metrics import innermost
 from ksim_rl.trainers.evaluation import Evaluator
 from ksim_rl.trainers.loggers import make_loggers
 from ksim_rl.trainers.ppo_update import PPOUpdate

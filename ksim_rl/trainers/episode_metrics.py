@@ -1,18 +1,12 @@
 """What the env says about episodes and physics, as metrics."""
 
 from collections.abc import Mapping
-from typing import Any
 
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
-
-def innermost(env: EnvBase) -> Any:
-    """Return the env inside all `TransformedEnv`s."""
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
-    return env
+from ksim_rl.envs.innermost import innermost
 
 
 def read_episode_sums(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Tensor]:

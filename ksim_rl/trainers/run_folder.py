@@ -10,9 +10,9 @@ from pathlib import Path
 from omegaconf import OmegaConf
 from tensordict.nn import ProbabilisticTensorDictSequential
 
+from ksim_rl.envs.innermost import innermost
 from ksim_rl.trainers import checkpoint, curves, video
 from ksim_rl.trainers.build import build, build_env, build_networks, load_actor
-from ksim_rl.trainers.episode_metrics import innermost
 from ksim_rl.trainers.evaluation import Evaluation
 from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_cfg import RunCfg

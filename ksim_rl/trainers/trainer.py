@@ -9,8 +9,9 @@ from typing import Any
 from tensordict import TensorDictBase
 
 from ksim_rl.collectors import RolloutCollector
+from ksim_rl.envs.innermost import innermost
 from ksim_rl.trainers import checkpoint
-from ksim_rl.trainers.episode_metrics import episode_means, innermost, overflow_report, read_episode_sums
+from ksim_rl.trainers.episode_metrics import episode_means, overflow_report, read_episode_sums
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
 from ksim_rl.trainers.interrupt import InterruptRequest
 from ksim_rl.trainers.loggers import MetricLogger
