@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -81,6 +82,8 @@ class EnvView:
         )
         self.default_qpos_L = default_qpos
         self.default_joint_pos_EL = default_qpos[self._qpos_index].expand(self.num_envs, -1).clone()
+        ctrl_range = torch.tensor(model.actuator_ctrlrange, device=self.device, dtype=torch.float32)
+        self.ctrl_limits_L2 = self._limited(ctrl_range.view(-1, 2), model.actuator_ctrllimited)
         self.soft_joint_pos_limits_L2 = self._soft_limits(joints, soft_joint_pos_limit_factor)
         self.time_out_offset_E = self.memories.get("time_out_offset_E", dtype=torch.int64)
         self.encoder_bias_EL = self.memories.get("encoder_bias_EL", self.num_joints, keep=True)
@@ -372,7 +375,9 @@ class EnvView:
         model = self.world.mj_model
         limits = torch.tensor(model.jnt_range[joints], device=self.device, dtype=torch.float32).view(-1, 2)
         middle, half = limits.mean(-1), (limits[:, 1] - limits[:, 0]) / 2 * factor
-        soft = torch.stack((middle - half, middle + half), dim=-1)
-        limited = torch.tensor(model.jnt_limited[joints], device=self.device, dtype=torch.bool).view(-1, 1)
-        infinite = torch.tensor([-torch.inf, torch.inf], device=self.device)
-        return torch.where(limited, soft, infinite)
+        return self._limited(torch.stack((middle - half, middle + half), dim=-1), model.jnt_limited[joints])
+
+    def _limited(self, limits_L2: Tensor, is_limited: np.ndarray) -> Tensor:
+        """Make the limits of what has none infinite, [L, 2]."""
+        mask_L1 = torch.tensor(is_limited, device=self.device, dtype=torch.bool).view(-1, 1)
+        return torch.where(mask_L1, limits_L2, torch.tensor([-torch.inf, torch.inf], device=self.device))

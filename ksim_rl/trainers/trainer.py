@@ -66,7 +66,6 @@ class Trainer:
         self.loggers, self.folder, self.config = loggers, folder, dict(config or {})
         self.iteration = 0
         self.evaluation: Evaluation | None = None
-        self.progress = RunProgress(cfg.num_iterations, enabled=False)
         self.interrupt = InterruptRequest()
         self.clock = RunClock()
         self.progress = RunProgress(cfg.num_iterations, enabled=False)

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -80,14 +79,5 @@ class JointEffortAction(ActionTerm):
     def __call__(self, view: EnvView, action_EK: Tensor) -> None:
         """Write the controls."""
         index = view.resolver.actuators_of_joints(self.joints)
-        low_L, high_L = _ctrl_limits(view)
-        view.write_ctrl(index, torch.clamp(action_EK * self.scale, low_L[index], high_L[index]))
-
-
-def _ctrl_limits(view: EnvView) -> tuple[Tensor, Tensor]:
-    """Bounds of all controls, infinite where an actuator has none, [nu] each."""
-    model = view.world.mj_model
-    limited = model.actuator_ctrllimited.astype(bool)
-    low = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf)
-    high = np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
-    return constant(low.tolist(), view.device), constant(high.tolist(), view.device)
+        limits_K2 = view.ctrl_limits_L2[index]
+        view.write_ctrl(index, torch.clamp(action_EK * self.scale, limits_K2[:, 0], limits_K2[:, 1]))
