@@ -1,0 +1,96 @@
+"""An env as rsl_rl's `VecEnv`, so that rsl_rl's runners train on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from tensordict import NestedKey, TensorDict
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ksim_rl.adapters.stepper import Stepper
+from ksim_rl.envs.innermost import innermost
+from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
+
+try:
+    from rsl_rl.env import VecEnv
+except ImportError as error:
+    raise ImportError('rsl_rl is not installed: pip install "ksim_rl[rsl_rl]"') from error
+
+
+class RslRlVecEnv(VecEnv):
+    """Steps a `ManagerBasedRlEnv`, transformed or not, for rsl_rl.
+
+    Observations are a TensorDict [E] of the env's groups, which `obs_groups` of the runner's config refers to by name
+    (`{"actor": ["actor"], "critic": ["critic"]}`). `extras["time_outs"]` marks truncations, which rsl_rl bootstraps;
+    `extras["log"]` holds, every `log_interval` steps, what the episodes that ended since then came to: per-term reward
+    sums, metrics and shares of each termination.
+
+    Args:
+        env: what `envs.make` returns.
+        keys: the observations to give; see `Stepper`.
+        log_interval: env steps between two entries of `extras["log"]`; best the runner's `num_steps_per_env`.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        *,
+        keys: Mapping[str, NestedKey] | Sequence[NestedKey] | None = None,
+        log_interval: int = 24,
+    ) -> None:
+        base_env = innermost(env)
+        if not isinstance(base_env, ManagerBasedRlEnv):
+            raise ValueError(
+                f"env is a {type(base_env).__name__} inside: rsl_rl needs a ManagerBasedRlEnv, which has episode clocks"
+            )
+        if log_interval < 1:
+            raise ValueError(f"log_interval={log_interval}: expected at least 1")
+        self.env, self.unwrapped = env, base_env
+        self.num_envs, self.device, self.cfg = base_env.num_envs, base_env.device, base_env.cfg
+        self.num_actions = int(env.full_action_spec[env.action_key].shape[-1])
+        self.max_episode_length = base_env.max_episode_length
+        self._stepper = Stepper(env, keys)
+        self._log_interval, self._steps = log_interval, 0
+
+    @property
+    def episode_length_buf(self) -> Tensor:
+        """Env steps since each episode's start, int64 [E]; rsl_rl writes it to spread the time-outs."""
+        return self.unwrapped.view.episode_step_E
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps_E: Tensor) -> None:
+        self.unwrapped.view.episode_step_E.copy_(steps_E)
+
+    def get_observations(self) -> TensorDict:
+        """Return the observations that the next action answers to, [E]."""
+        return self._tensordict(self._stepper.read(self._stepper.root))
+
+    def reset(self) -> tuple[TensorDict, dict[str, Any]]:
+        """Reset all envs."""
+        return self._tensordict(self._stepper.reset()), {}
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+        """Step all envs; rows that ended come back with the first observation of their next episode."""
+        step = self._stepper.step(actions)
+        extras: dict[str, Any] = {"time_outs": step.truncated_E}
+        self._steps += 1
+        if self._steps % self._log_interval == 0:
+            extras["log"] = self._episode_means()
+        done_E = step.terminated_E | step.truncated_E
+        return self._tensordict(step.obs), step.reward_E, done_E.long(), extras
+
+    def close(self) -> None:
+        """Free the env's memory."""
+        self.env.close()
+
+    def _tensordict(self, obs: Mapping[str, Tensor]) -> TensorDict:
+        return TensorDict(dict(obs), batch_size=[self.num_envs], device=self.device)
+
+    def _episode_means(self) -> dict[str, Tensor]:
+        """Return means over the episodes that ended since the last call; zeros where none has."""
+        sums = {name: total.clone() for name, total in self.unwrapped.episode_log().items()}
+        self.unwrapped.episode_log_reset_()
+        episodes = sums.pop("episodes").clamp(min=1.0)
+        return {f"Episode/{name.removesuffix('_sum')}": total / episodes for name, total in sums.items()}

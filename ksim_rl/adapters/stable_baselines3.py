@@ -1,0 +1,124 @@
+"""An env as stable-baselines3's `VecEnv`, so that its algorithms train on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ksim_rl.adapters.stepper import Stepper
+from ksim_rl.checks import check_in_range
+from ksim_rl.envs.innermost import innermost
+
+try:
+    from gymnasium import spaces
+    from stable_baselines3.common.vec_env import VecEnv
+
+    from ksim_rl.adapters.spaces import box
+except ImportError as error:
+    raise ImportError(
+        'stable-baselines3 is not installed: pip install "ksim_rl[stable_baselines3]"'
+    ) from error
+
+
+class StableBaselines3VecEnv(VecEnv):
+    """Steps an env for stable-baselines3, with NumPy arrays.
+
+    With one observation the space is a `Box` ("MlpPolicy"), with several a `Dict` ("MultiInputPolicy"). Where an
+    episode ended, `infos[row]` has `"terminal_observation"` and `"TimeLimit.truncated"`.
+
+    Args:
+        env: what `envs.make` returns, or any env of batch size [E] with a continuous action.
+        keys: the observations to give; see `Stepper`.
+        action_limit: bound of an action that has none in the env's spec, since stable-baselines3 wants finite ones.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        *,
+        keys: Mapping[str, NestedKey] | Sequence[NestedKey] | None = None,
+        action_limit: float = 1.0,
+    ) -> None:
+        check_in_range("action_limit", action_limit, low=0.0, low_open=True)
+        self.env, self._stepper = env, Stepper(env, keys)
+        self.render_mode = getattr(innermost(env), "render_mode", None)
+        boxes = {name: box(env.full_observation_spec[key]) for name, key in self._stepper.keys.items()}
+        self._single = next(iter(boxes)) if len(boxes) == 1 else None
+        action = box(env.full_action_spec[env.action_key])
+        low, high = (np.clip(bound, -action_limit, action_limit) for bound in (action.low, action.high))
+        super().__init__(
+            num_envs=env.batch_size[0],
+            observation_space=spaces.Dict(dict(boxes)) if self._single is None else boxes[self._single],
+            action_space=spaces.Box(low, high, dtype=np.float32),
+        )
+        self._action_EL: Tensor | None = None
+
+    def reset(self) -> np.ndarray | dict[str, np.ndarray]:
+        """Reset all envs, with the seed that `seed` was given, if any."""
+        seed = self._seeds[0]
+        obs = self._stepper.reset(seed)
+        self._reset_seeds()
+        self._reset_options()
+        return self._out(obs)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Take the actions of the next `step_wait`."""
+        self._action_EL = torch.as_tensor(actions, dtype=torch.float32, device=self._stepper.device)
+
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Step all envs."""
+        if self._action_EL is None:
+            raise RuntimeError("step_wait without actions: call step_async first")
+        step, self._action_EL = self._stepper.step(self._action_EL), None
+        terminated_E, truncated_E = step.terminated_E.cpu().numpy(), step.truncated_E.cpu().numpy()
+        done_E = terminated_E | truncated_E
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        if done_E.any():
+            final = {name: value.cpu().numpy() for name, value in step.final_obs.items()}
+            for row in np.flatnonzero(done_E):
+                last = {name: value[row] for name, value in final.items()}
+                infos[row] = {
+                    "terminal_observation": last if self._single is None else last[self._single],
+                    "TimeLimit.truncated": bool(truncated_E[row] and not terminated_E[row]),
+                }
+        return self._out(step.obs), step.reward_E.cpu().numpy(), done_E, infos
+
+    def close(self) -> None:
+        """Free the env's memory."""
+        self.env.close()
+
+    def get_images(self) -> list[np.ndarray | None]:
+        """Return one picture of the envs that `cfg.viewer` shows."""
+        return [innermost(self.env).render()]
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return an attribute of the env, once per index: all rows are one env."""
+        value = self.render_mode if attr_name == "render_mode" else getattr(self.env, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Refuse: all rows are one env, whose attributes are its config."""
+        raise NotImplementedError(
+            f"set_attr({attr_name!r}): the rows are one env; change its config and build it"
+        )
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of the env once, and return its result once per index."""
+        result = getattr(self.env, method_name)(*method_args, **method_kwargs)
+        return [result for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        """Return False for each index: there are no Gymnasium wrappers inside."""
+        return [False for _ in self._get_indices(indices)]
+
+    def _out(self, obs: Mapping[str, Tensor]) -> np.ndarray | dict[str, np.ndarray]:
+        arrays = {name: value.cpu().numpy() for name, value in obs.items()}
+        return arrays if self._single is None else arrays[self._single]

@@ -1,0 +1,144 @@
+"""What all adapters share: an env that is driven by actions alone and resets itself, one graph per step on CUDA."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ksim_rl.checks import near
+from ksim_rl.envs.masked_reset import MaskedReset
+from ksim_rl.physics.capture import Captured
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step:
+    """One env step of E envs; rows that ended have been reset already.
+
+    Attributes:
+        obs: the next root observations by name, [E, L] each: after a reset, those of the new episode.
+        final_obs: the observations of the states reached, [E, L] each; they differ from `obs` in rows that ended.
+        reward_E: float32 [E].
+        terminated_E: bool [E].
+        truncated_E: bool [E].
+    """
+
+    obs: dict[str, Tensor]
+    final_obs: dict[str, Tensor]
+    reward_E: Tensor
+    terminated_E: Tensor
+    truncated_E: Tensor
+
+
+class Stepper:
+    """Drives an env of batch size [E] and returns copies, which later steps do not change.
+
+    Args:
+        env: an env such as `envs.make` returns.
+        keys: the observations to return, by the name to return them under, or as a list of keys. None: every leaf that
+            is not nested (`"actor"`, `"critic"`), or all leaves where there is no such.
+
+    Raises:
+        ValueError: if a key names no observation of the env.
+    """
+
+    def __init__(
+        self, env: EnvBase, keys: Mapping[str, NestedKey] | Sequence[NestedKey] | None = None
+    ) -> None:
+        if len(env.batch_size) != 1:
+            raise ValueError(f"env.batch_size={tuple(env.batch_size)}: expected one dim, [E]")
+        self.env = env
+        self.device = env.device or torch.device("cpu")
+        self.keys = _named(env, keys)
+        self._root: TensorDictBase | None = None
+        self._out: dict[str, TensorDictBase] = {}
+        self._action = env.full_action_spec[env.action_key].zero()
+        self._run = Captured(self._step, device=self.device)
+
+    @property
+    def root(self) -> TensorDictBase:
+        """The root of the next step; the env is reset if it has not been."""
+        if self._root is None:
+            self.reset()
+        assert self._root is not None
+        return self._root
+
+    @torch.no_grad()
+    def reset(self, seed: int | None = None) -> dict[str, Tensor]:
+        """Reset all envs and return their observations."""
+        root_E = self.env.reset(seed=seed) if isinstance(self.env, MaskedReset) else self._reset_foreign(seed)
+        if self._root is None:
+            self._root = root_E.clone()
+        else:
+            self._root.update_(root_E)
+        return self.read(self._root)
+
+    @torch.no_grad()
+    def step(self, action_EL: Tensor) -> Step:
+        """Step all envs.
+
+        Raises:
+            ValueError: if the action's shape or dtype is not the env's.
+        """
+        if action_EL.shape != self._action.shape or action_EL.dtype != self._action.dtype:
+            raise ValueError(
+                f"action is {action_EL.dtype} of shape {tuple(action_EL.shape)}: expected {self._action.dtype} of "
+                f"shape {tuple(self._action.shape)}"
+            )
+        root = self.root
+        self._action.copy_(action_EL)
+        self._run()
+        next_E = self._out["next"]
+        root.update_(self._out["root"])
+        if isinstance(self.env, MaskedReset):
+            # The env's own reference points into the graph's memory, which the next replay overwrites.
+            self.env.last_root = root
+        reward_E, terminated_E, truncated_E = (
+            next_E.get(key).flatten().clone() for key in ("reward", "terminated", "truncated")
+        )
+        return Step(
+            obs=self.read(root),
+            final_obs=self.read(next_E),
+            reward_E=reward_E,
+            terminated_E=terminated_E,
+            truncated_E=truncated_E,
+        )
+
+    def read(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """Return copies of the observations by name."""
+        return {name: tensordict.get(key).clone() for name, key in self.keys.items()}
+
+    def _step(self) -> None:
+        assert self._root is not None
+        td = self._root.copy().set(self.env.action_key, self._action)
+        env_state_E, root_E = self.env.step_and_maybe_reset(td)
+        # Outputs of a replay stay where they were recorded.
+        self._out = {"next": env_state_E.get("next"), "root": root_E.select(*self._root.keys(True, True))}
+
+    def _reset_foreign(self, seed: int | None) -> TensorDictBase:
+        if seed is not None:
+            self.env.set_seed(seed)
+        return self.env.reset()
+
+
+def _named(env: EnvBase, keys: Mapping[str, NestedKey] | Sequence[NestedKey] | None) -> dict[str, NestedKey]:
+    spec = env.full_observation_spec
+    present = list(spec.keys(True, True))
+    if keys is None:
+        flat = [key for key in present if isinstance(key, str)]
+        keys = flat or present
+    named = dict(keys) if isinstance(keys, Mapping) else {_flat(key): key for key in keys}
+    for key in named.values():
+        if key not in present:
+            raise ValueError(
+                f"keys: the env has no observation {key!r}: {near(_flat(key), map(_flat, present))}"
+            )
+    return named
+
+
+def _flat(key: NestedKey) -> str:
+    return key if isinstance(key, str) else ".".join(map(str, key))
