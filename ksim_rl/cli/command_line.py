@@ -67,7 +67,9 @@ def _check_names(overrides: Sequence[Override], loader: ConfigLoader) -> None:
             for choice in _values(override):
                 if choice not in options:
                     raise unknown_name(override.key_or_group, choice, options)
-            choices.append(f"{override.key_or_group}={_values(override)[0]}")
+            # A group that is not in the defaults list, such as another package's, is added with "+".
+            added = "+" if override.is_add() else ""
+            choices.append(f"{added}{override.key_or_group}={_values(override)[0]}")
         elif not override.is_add() and not override.is_hydra_override():
             fields.append(override.key_or_group)
     tree = OmegaConf.to_container(hydra.compose(conf.NAME, overrides=choices))

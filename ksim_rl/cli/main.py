@@ -11,7 +11,7 @@ usage: ksim-rl <command> [arguments]
   resume   continue a run:          ksim-rl resume RUN
   eval     evaluate a policy:       ksim-rl eval RUN --episodes 100
   play     record a video:          ksim-rl play RUN --seconds 10
-  envs     list the tasks
+  envs     list the tasks, or print what one is made of: ksim-rl envs cartpole_swingup
 
 RUN is a run folder (its newest checkpoint) or one of its checkpoints.
 `ksim-rl <command> --help` tells more. KSIM_RL_TRACEBACK=1 shows the traceback of an error.

@@ -9,6 +9,7 @@ from rich.table import Table
 
 from ksim_rl import envs
 from ksim_rl.cli.report import run_and_report, shown, verdict
+from ksim_rl.envs.innermost import innermost
 from ksim_rl.physics import compile_notice
 from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, load_policy, record_video
 from ksim_rl.trainers.build import build_evaluator, solved_at
@@ -78,7 +79,16 @@ def _play(arguments: list[str]) -> int:
 
 
 def _envs(arguments: list[str]) -> int:
-    argparse.ArgumentParser(prog="ksim-rl envs", description="List the tasks.").parse_args(arguments)
+    parser = argparse.ArgumentParser(
+        prog="ksim-rl envs", description="List the tasks, or print what one of them is made of."
+    )
+    parser.add_argument("task", nargs="?", help="build this one and print its managers as tables")
+    options = parser.parse_args(arguments)
+    if options.task is not None:
+        with compile_notice(RunProgress(1).status):
+            env = envs.make(options.task, num_envs=1)
+        print(innermost(env).explain(), end="")
+        return 0
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("task", "robot", "episode", "observations", "solved at", "description"):
         table.add_column(column, no_wrap=column == "task")

@@ -10,6 +10,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from ksim_rl import envs
+from ksim_rl.conf import search_path
 from ksim_rl.trainers import RunCfg
 
 MODULE, NAME = "ksim_rl.conf", "train"
@@ -36,7 +37,11 @@ def compose_within(overrides: Sequence[str]) -> RunCfg:
 
 @cache
 def register() -> None:
-    """Store the registered tasks in Hydra's group `task`, and their training defaults in `task/training`."""
+    """Let Hydra find other packages' configs, and store the tasks and their training defaults.
+
+    They go to the groups `task` and `task/training`.
+    """
+    search_path.register()
     envs.register_configs()
     for name in envs.names():
         ConfigStore.instance().store(

@@ -1,29 +1,37 @@
 """The env, its terms, its transforms and its tasks."""
 
 from ksim_rl.envs.config_tree import allow_package, from_tree, to_tree
+from ksim_rl.envs.entity import Entity
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
+from ksim_rl.envs.placement import Placement
 from ksim_rl.envs.registry import build, make, make_cfg, names, register_configs, task
-from ksim_rl.envs.scene import MjcfRobot, PlaneTerrain, SceneCfg
-from ksim_rl.envs.sensors import ContactSensor
+from ksim_rl.envs.scene import MjcfRobot, SceneCfg
+from ksim_rl.envs.sensors import CameraSensor, ContactSensor, ImuSensor
 from ksim_rl.envs.task import Task
+from ksim_rl.envs.terrains import PlaneTerrain, TerrainGrid
 from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.envs.view import EnvView
 from ksim_rl.envs.viewer_cfg import ViewerCfg
 
 __all__ = [
+    "CameraSensor",
     "ContactSensor",
+    "Entity",
     "EnvView",
+    "ImuSensor",
     "ManagerBasedRlEnv",
     "ManagerBasedRlEnvCfg",
     "MaskedTransformedEnv",
     "MjcfRobot",
     "ObservationGroupCfg",
     "ObservationTermCfg",
+    "Placement",
     "PlaneTerrain",
     "SceneCfg",
     "Task",
+    "TerrainGrid",
     "ViewerCfg",
     "allow_package",
     "build",

@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeVar, Union
 
 from ksim_rl.checks import near
+from ksim_rl.envs import plugins
 
 TARGET = "_target_"
 _allowed_packages = {"ksim_rl"}
@@ -160,11 +161,11 @@ def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> 
 def _resolve_target(target: object, path: str) -> type:
     """Import the dataclass that a `_target_` names, if its package is allowed."""
     module_name, _, class_name = str(target).rpartition(".")
-    if module_name.split(".")[0] not in _allowed_packages:
-        allowed = ", ".join(sorted(_allowed_packages))
+    allowed = _allowed_packages | plugins.packages()
+    if module_name.split(".")[0] not in allowed:
         raise ValueError(
-            f"{path}.{TARGET}={target!r}: only classes of these packages are built: {allowed}. "
-            "`ksim_rl.envs.allow_package` adds one"
+            f"{path}.{TARGET}={target!r}: only classes of these packages are built: {', '.join(sorted(allowed))}. "
+            "`ksim_rl.envs.allow_package` or an entry point (see `ksim_rl.envs.plugins`) adds one"
         )
     try:
         module = importlib.import_module(module_name)

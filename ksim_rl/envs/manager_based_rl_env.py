@@ -18,6 +18,9 @@ from torch import Tensor
 
 from ksim_rl import dims
 from ksim_rl.envs import specs
+from ksim_rl.envs.actuators import JointDrives
+from ksim_rl.envs.drawing import Drawing, drawings
+from ksim_rl.envs.explain import explain
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.managers import (
     ActionManager,
@@ -34,10 +37,9 @@ from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.envs.rendering import OffscreenRenderer
 from ksim_rl.envs.reset_to_default import ResetToDefault
 from ksim_rl.envs.scene import build_spec
-from ksim_rl.envs.sensors import ContactTracker
 from ksim_rl.envs.view import EnvView
 from ksim_rl.envs.visualizer import DebugVisualizer
-from ksim_rl.physics import World, load_model
+from ksim_rl.physics import World, load_model, prepare_spec
 
 RENDER_MODES = (None, "rgb_array")
 
@@ -76,25 +78,30 @@ class ManagerBasedRlEnv(MaskedReset):
             "mujoco_warp_version": mujoco_warp.__version__,
             "render_modes": list(RENDER_MODES),
         }
+        events = {"reset": ResetToDefault()} if cfg.events is None else dict(cfg.events)
+        fields = [field for term in events.values() for field in term.per_world_fields]
+        if cfg.scene.terrain is not None:
+            fields += cfg.scene.terrain.per_world_fields
         spec = build_spec(cfg.scene)
         cfg.sim.apply_to(spec)
+        prepare_spec(spec, fields)
         model = load_model(spec)
         self._renderer = OffscreenRenderer(model, cfg.viewer, spacing=cfg.scene.spacing) if render_mode else None
         self._is_closed = False
 
-        events = {"reset": ResetToDefault()} if cfg.events is None else dict(cfg.events)
         self.world = World(
             model,
             num_envs=cfg.scene.num_envs,
             device=device,
             sim=cfg.sim,
-            per_world_fields=tuple({field for term in events.values() for field in term.per_world_fields}),
+            per_world_fields=tuple(dict.fromkeys(fields)),
         )
         self.view = EnvView(
             self.world,
             step_dt=self.step_dt,
             max_episode_length=self.max_episode_length,
             soft_joint_pos_limit_factor=cfg.scene.soft_joint_pos_limit_factor,
+            entities=tuple(cfg.scene.entities),
         )
         self.world.refresh()
         self._events_cfg: Mapping[str, Any] = events
@@ -111,11 +118,16 @@ class ManagerBasedRlEnv(MaskedReset):
         Each term runs once here, so that names that match nothing are errors before the first step.
         """
         cfg, view = self.cfg, self.view
-        self._contact_trackers = [
-            ContactTracker(name, sensor, world=self.world, memories=view.memories, step_dt=view.step_dt)
-            for name, sensor in cfg.scene.sensors.items()
-        ]
-        view.contacts.update(zip(cfg.scene.sensors, self._contact_trackers, strict=True))
+        if cfg.scene.terrain is not None:
+            view.terrain = cfg.scene.terrain.ground(view)
+        view.sensors.update((name, sensor.track(name, view)) for name, sensor in cfg.scene.sensors.items())
+        self.joint_drives = JointDrives(
+            {
+                view.entity(name).prefix: getattr(robot, "actuators", ())
+                for name, robot in cfg.scene.entities.items()
+            },
+            view,
+        )
         self.event_manager = EventManager(self._events_cfg, view)
         view.refreshed()
         self.command_manager = CommandManager(cfg.commands, view)
@@ -129,6 +141,9 @@ class ManagerBasedRlEnv(MaskedReset):
         )
         view.reward_weights = dict(
             zip(self.reward_manager.names, self.reward_manager.weights_R.unbind(), strict=True)
+        )
+        view.episode_rewards = dict(
+            zip(self.reward_manager.names, self.reward_manager.episode_sums_ER.unbind(-1), strict=True)
         )
         self.termination_manager = TerminationManager(
             cfg.terminations, view, is_finite_horizon=cfg.is_finite_horizon
@@ -182,10 +197,14 @@ class ManagerBasedRlEnv(MaskedReset):
         action_EL = self._checked_action(tensordict.get("action"))
         view.step_count.add_(1)
         self.event_manager.step()
-        self._recompute(*self.event_manager.fields("interval", "step"))
         finite_E = self.action_manager.apply(action_EL)
 
-        world.step(self.cfg.decimation)
+        world.step(
+            self.cfg.decimation,
+            before=view.before_substep,
+            after=view.after_substep,
+            sensors=view.substep_sensors,
+        )
         finite_E = finite_E & torch.isfinite(world.qpos_EL.sum(-1) + world.qvel_EL.sum(-1))
         # Clearing failed worlds at once keeps everything that is computed from here on finite.
         world.reset(~finite_E)
@@ -193,7 +212,7 @@ class ManagerBasedRlEnv(MaskedReset):
         view.refreshed()
 
         view.episode_step_E.add_(1)
-        for tracker in self._contact_trackers:
+        for tracker in view.sensors.values():
             tracker.update()
         terminated_E, truncated_E = self.termination_manager.step(finite_E)
         done_E = terminated_E | truncated_E
@@ -217,9 +236,10 @@ class ManagerBasedRlEnv(MaskedReset):
         self.curriculum_manager.reset(mask_E)
         self.world.reset(mask_E)
         view.memories.clear(mask_E)
+        view.targets.reset(mask_E)
+        self.joint_drives.reset(mask_E)
         view.episode_step_E.masked_fill_(mask_E, 0)
         self.event_manager.reset(mask_E)
-        self._recompute(*self.event_manager.fields("reset"))
         self.command_manager.resample(mask_E)
         self.world.refresh()
         view.refreshed()
@@ -246,10 +266,6 @@ class ManagerBasedRlEnv(MaskedReset):
             )
         return action_EL
 
-    def _recompute(self, *fields: str) -> None:
-        if fields:
-            self.world.set_const(fields)
-
     # -- seeds ---------------------------------------------------------------------------------------------------
 
     def _set_seed(self, seed: int | None) -> None:
@@ -261,7 +277,6 @@ class ManagerBasedRlEnv(MaskedReset):
         view.step_count.zero_()
         view.reset_count_E.zero_()
         self.event_manager.startup()
-        self._recompute(*self.event_manager.fields("startup"))
 
     def stagger_episodes_(self) -> None:
         """Let the running episodes time out at random steps, so that the time-outs of different envs spread out.
@@ -291,6 +306,21 @@ class ManagerBasedRlEnv(MaskedReset):
     def curriculum_levels(self) -> dict[str, Tensor]:
         """Return the latest level of each curriculum, float32 [] on the device."""
         return dict(zip(self.curriculum_manager.names, self.curriculum_manager.levels_C.unbind(), strict=True))
+
+    def command_levels(self) -> dict[str, Tensor]:
+        """Return the ranges that commands are drawn from now, float32 [] on the device.
+
+        Keys: `<command>/<field>_low` and `<command>/<field>_high`. Without a curriculum they do not change, and the
+        dict is empty.
+        """
+        if not self.cfg.curriculum:
+            return {}
+        return {
+            f"{command}/{field}_{end}": value
+            for command, ranges in self.view.command_ranges.items()
+            for field, pair_2 in ranges.items()
+            for end, value in zip(("low", "high"), pair_2.unbind(), strict=True)
+        }
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """Return all that the env needs to continue bit-exactly: physics, clocks, commands, counters, memories."""
@@ -336,19 +366,25 @@ class ManagerBasedRlEnv(MaskedReset):
             "curriculum_levels_C": self.curriculum_manager.levels_C,
             "episode_log_N": self._log.totals_N,
         }
-        return counters | view.memories.buffers()
+        shared = {f"shared/{name}": tensor for name, tensor in view.shared_values.tensors().items()}
+        return counters | shared | view.memories.buffers()
+
+    def explain(self) -> str:
+        """Return what the env is made of: a table per manager with index, name, shape, weight, mode and parameters."""
+        return explain(self)
 
     # -- pictures and the end ------------------------------------------------------------------------------------
 
-    def setup_manager_visualizers(self) -> dict[str, Any]:
-        """Return the terms that draw themselves, by name."""
-        return {f"commands/{name}": term for name, term in self.cfg.commands.items()}
+    def setup_manager_visualizers(self) -> dict[str, Drawing]:
+        """Return the commands, rewards and sensors that draw themselves and that `viewer.draw` names, by name."""
+        return drawings(self.cfg, self.view.sensors, self.reward_manager.names)
 
-    def update_visualizers(self, visualizer: DebugVisualizer) -> None:
-        """Let each term of `setup_manager_visualizers` draw the env that the viewer shows."""
-        for scope, term in self.setup_manager_visualizers().items():
+    def update_visualizers(self, visualizer: DebugVisualizer, env_index: int | None = None) -> None:
+        """Let each part of `setup_manager_visualizers` draw one env: the one that the viewer shows, unless given."""
+        shown = self.cfg.viewer.env_index if env_index is None else env_index
+        for scope, part in self.setup_manager_visualizers().items():
             with self.view.scope(scope):
-                term.draw_debug(self.view, visualizer, self.cfg.viewer.env_index)
+                part.draw_debug(self.view, visualizer, shown)
 
     def render(self) -> np.ndarray | None:
         """Return a picture of the current state, uint8 [H, W, 3], or None without a render mode.

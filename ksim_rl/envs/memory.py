@@ -15,11 +15,27 @@ class Memory:
         self._num_envs = num_envs
         self._device = device
         self._buffers: dict[str, Tensor] = {}
-        self._cleared: list[Tensor] = []
+        self._initial: dict[str, Tensor] = {}
+        self._kept: set[str] = set()
         self._frozen = False
 
-    def get(self, name: str, *shape: int, dtype: torch.dtype = torch.float32, keep: bool = False) -> Tensor:
-        """Return the buffer `name`, zeros [E, *shape] at first; `keep` leaves it alone when rows reset.
+    def get(
+        self,
+        name: str,
+        *shape: int,
+        dtype: torch.dtype = torch.float32,
+        keep: bool = False,
+        initial: Tensor | None = None,
+    ) -> Tensor:
+        """Return the buffer `name`, [E, *shape].
+
+        Args:
+            name: its name; the buffer is made at the first call.
+            shape: beyond the env dim.
+            dtype: of its elements.
+            keep: leaves it alone when rows reset.
+            initial: what it holds at first and after a reset, broadcast to its shape; None means zeros. The tensor is
+                read each time, so it may change.
 
         Raises:
             ValueError: if the buffer exists with another shape or dtype, or is new after construction.
@@ -27,25 +43,45 @@ class Memory:
         buffer = self._buffers.get(name)
         if buffer is None:
             if self._frozen:
-                raise ValueError(f"memory {name!r} is new after construction: create it on every path of the term")
+                raise ValueError(
+                    f"memory {name!r} is new after construction: create it on every path of the term"
+                )
             buffer = torch.zeros(self._num_envs, *shape, dtype=dtype, device=self._device)
             self._buffers[name] = buffer
-            if not keep:
-                self._cleared.append(buffer)
+            if keep:
+                self._kept.add(name)
+            if initial is not None:
+                self._initial[name] = initial
+                buffer.copy_(initial.expand_as(buffer))
         elif tuple(buffer.shape[1:]) != shape or buffer.dtype != dtype:
-            raise ValueError(f"memory {name!r} is {buffer.dtype} {tuple(buffer.shape[1:])}, asked for {dtype} {shape}")
+            raise ValueError(
+                f"memory {name!r} is {buffer.dtype} {tuple(buffer.shape[1:])}, asked for {dtype} {shape}"
+            )
         return buffer
 
+    @property
+    def is_frozen(self) -> bool:
+        """Whether new buffers are refused."""
+        return self._frozen
+
     def freeze(self) -> None:
-        """Refuse new buffers from now on, and zero the existing ones."""
+        """Refuse new buffers from now on, and let the existing ones start anew."""
         self._frozen = True
-        for buffer in self._buffers.values():
+        for name, buffer in self._buffers.items():
             buffer.zero_()
+            if name in self._initial:
+                buffer.copy_(self._initial[name].expand_as(buffer))
 
     def clear(self, mask_E: Tensor) -> None:
-        """Zero the rows of `mask_E`, bool [E], in each buffer that is not kept."""
-        for buffer in self._cleared:
-            buffer.masked_fill_(mask_E.view(-1, *[1] * (buffer.ndim - 1)), 0)
+        """Let the rows of `mask_E`, bool [E], start anew in each buffer that is not kept."""
+        for name, buffer in self._buffers.items():
+            if name in self._kept:
+                continue
+            mask = mask_E.view(-1, *[1] * (buffer.ndim - 1))
+            if name in self._initial:
+                buffer.copy_(torch.where(mask, self._initial[name], buffer))
+            else:
+                buffer.masked_fill_(mask, 0)
 
     def buffers(self) -> dict[str, Tensor]:
         """Return the buffers by name."""

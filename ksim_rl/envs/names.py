@@ -47,7 +47,7 @@ class NameResolver:
         """Return the ids that the patterns match; a joint's id counts hinges and slides only."""
         key = (kind, (patterns,) if isinstance(patterns, str) else tuple(patterns))
         if key not in self._ids:
-            self._ids[key] = _match(kind, key[1], self._tables[kind])
+            self._ids[key] = match_names(kind, key[1], self._tables[kind])
         return self._ids[key]
 
     def index(self, kind: str, patterns: Patterns) -> Index:
@@ -91,7 +91,12 @@ def _names(mj_model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> list[st
     return [mujoco.mj_id2name(mj_model, kind, i) or "" for i in range(count)]
 
 
-def _match(kind: str, patterns: tuple[str, ...], table: list[str]) -> tuple[int, ...]:
+def match_names(kind: str, patterns: Sequence[str], table: Sequence[str]) -> tuple[int, ...]:
+    """Return the places in `table` that the patterns match in full: each pattern's matches in the table's order.
+
+    Raises:
+        ValueError: if a pattern matches nothing (with the near names), or two patterns match the same name.
+    """
     found: list[int] = []
     for pattern in patterns:
         try:

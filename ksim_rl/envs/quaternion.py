@@ -38,6 +38,13 @@ def rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
     return v - w * t + torch.linalg.cross(u, t)
 
 
+def angle_between(a: Tensor, b: Tensor) -> Tensor:
+    """Return the angle of the rotation that turns orientation `a` into `b`, [..., 4] each: rad in [0, pi], [...]."""
+    # By the chord, which unlike the cosine is well-conditioned at 0. `b` and `-b` are the same orientation.
+    chord = torch.minimum(torch.linalg.vector_norm(a - b, dim=-1), torch.linalg.vector_norm(a + b, dim=-1))
+    return 4.0 * torch.asin((0.5 * chord).clamp(max=1.0))
+
+
 def yaw(q: Tensor) -> Tensor:
     """Return the heading of quaternions [..., 4]: the angle of the rotated x axis in the xy plane, rad, [...]."""
     w, x, y, z = q.unbind(-1)

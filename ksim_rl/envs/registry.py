@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
+from types import ModuleType
 
 import torch
 from hydra import compose, initialize
@@ -14,6 +15,7 @@ from omegaconf import OmegaConf
 
 import ksim_rl.envs.tasks
 from ksim_rl.checks import unknown_name
+from ksim_rl.envs import plugins
 from ksim_rl.envs.config_tree import from_tree, to_tree
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
@@ -27,14 +29,21 @@ _CONFIG = "ksim_rl_env"
 
 @cache
 def _tasks() -> dict[str, Task]:
-    """Import all task modules once and collect their `Task`s."""
-    found: dict[str, Task] = {}
-    for module_info in pkgutil.iter_modules(ksim_rl.envs.tasks.__path__, "ksim_rl.envs.tasks."):
-        module = importlib.import_module(module_info.name)
+    """Import all task modules once, ours and those of other packages, and collect their `Task`s."""
+    found: dict[str, tuple[str, Task]] = {}
+    for origin, module in (*_own_modules(), *plugins.task_modules()):
         for value in vars(module).values():
-            if isinstance(value, Task):
-                found[value.name] = value
-    return dict(sorted(found.items()))
+            if not isinstance(value, Task):
+                continue
+            first, known = found.setdefault(value.name, (origin, value))
+            if known is not value:
+                raise ValueError(f"two tasks are called {value.name!r}: in {first} and in {origin}; rename one")
+    return {name: task for name, (_, task) in sorted(found.items())}
+
+
+def _own_modules() -> Iterator[tuple[str, ModuleType]]:
+    for module_info in pkgutil.iter_modules(ksim_rl.envs.tasks.__path__, "ksim_rl.envs.tasks."):
+        yield module_info.name, importlib.import_module(module_info.name)
 
 
 def names() -> list[str]:

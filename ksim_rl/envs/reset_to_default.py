@@ -11,9 +11,19 @@ from ksim_rl.envs.view import EnvView
 
 @dataclass(frozen=True, kw_only=True)
 class ResetToDefault(EventTerm):
-    """Put rows that reset into the model's first keyframe or, without one, its default pose, at rest."""
+    """Put rows that reset into the model's first keyframe or, without one, its default pose, at rest.
+
+    On a terrain the pose stands at the env's origin.
+    """
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
         """Write positions; the masked reset has already zeroed the velocities."""
-        view.write_qpos(mask_E, view.default_qpos_L.expand(view.num_envs, -1))
+        qpos_EL = view.default_qpos_L.expand(view.num_envs, -1)
+        if not view.terrain.is_flat:
+            qpos_EL = qpos_EL.clone()
+            for entity in view.entities.values():
+                if entity.free_root:
+                    start = entity.root_qpos.start
+                    qpos_EL[:, start : start + 3] += view.terrain.origins_E3
+        view.write_qpos(mask_E, qpos_EL)
         view.write_qvel(mask_E, torch.zeros_like(view.world.qvel_EL))

@@ -12,10 +12,13 @@ from ksim_rl import dims
 def observation(
     readings: Mapping[str, Mapping[str, Tensor]], batch_size: torch.Size, device: torch.device | None
 ) -> Composite:
-    """Return the spec of the readings by group and name, float32 [E, L] each; empty groups are left out."""
+    """Return the spec of the readings by group and name, [E, ...] each; empty groups are left out."""
     groups = {
         group: Composite(
-            {name: Unbounded(shape=value.shape, device=device) for name, value in values.items()},
+            {
+                name: Unbounded(shape=value.shape, dtype=value.dtype, device=device)
+                for name, value in values.items()
+            },
             shape=batch_size,
             device=device,
         )

@@ -9,8 +9,9 @@ allocate sizes that depend on data: the step that calls it is captured into a CU
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from torch import Tensor
 
@@ -26,11 +27,17 @@ METRIC_REDUCTIONS = ("mean", "last", "max", "sum")
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationTerm(ABC):
-    """A clean reading: float32 [E, L]. Noise, delay and history are transforms, not part of the term."""
+    """A clean reading: float32 [E, L]. Noise, delay and history are transforms, not part of the term.
+
+    A term with `is_image` gives float32, int32 or uint8 of shape [E, H, W] or [E, H, W, C] instead, and stands alone in
+    its observation group, whose value is then the image itself.
+    """
+
+    is_image: ClassVar[bool] = False
 
     @abstractmethod
     def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading of the current state, float32 [E, L]."""
+        """Return the reading of the current state, float32 [E, L], or an image."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +55,9 @@ class RewardTerm(ABC):
     @abstractmethod
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward of the current state, float32 [E]."""
+
+    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
+        """Draw what the reward of one env looks at (nothing by default)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,12 +118,22 @@ class EventTerm(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class CommandTerm(ABC):
-    """A generator of commands with a per-env clock that resamples."""
+    """A generator of commands with a per-env clock that resamples; None as its range draws at resets only."""
 
-    resampling_time_range_s: tuple[float, float]
+    resampling_time_range_s: tuple[float, float] | None
 
     def __post_init__(self) -> None:
-        check_pair("resampling_time_range_s", self.resampling_time_range_s, low=0.0)
+        if self.resampling_time_range_s is not None:
+            check_pair("resampling_time_range_s", self.resampling_time_range_s, low=0.0)
+
+    @property
+    def ranges(self) -> Mapping[str, tuple[float, float]]:
+        """The ranges by field that `resample` draws from and that a curriculum may change: see `shared_ranges`."""
+        return {}
+
+    def shared_ranges(self, view: EnvView) -> Tensor:
+        """Return the present ranges, (low, high) [2, N] in the order of `ranges`; they start at those."""
+        return view.shared("ranges_2N", tuple(zip(*self.ranges.values(), strict=True)))
 
     @abstractmethod
     def resample(self, view: EnvView, mask_E: Tensor) -> None:
@@ -122,6 +142,14 @@ class CommandTerm(ABC):
     @abstractmethod
     def __call__(self, view: EnvView) -> Tensor:
         """Return the command of the current state and targets, float32 [E, K]."""
+
+    def set(self, view: EnvView, value_EK: Tensor, mask_E: Tensor) -> None:
+        """Take values from outside for the rows of `mask_E`, bool [E].
+
+        Raises:
+            ValueError: if this kind of command is drawn instead.
+        """
+        raise ValueError(f"a {type(self).__name__} draws its values; a JoystickCommand takes them from outside")
 
     def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw the command of one env (nothing by default)."""
@@ -145,13 +173,20 @@ class CurriculumTerm(ABC):
     """A rule that adapts difficulty; it runs for the rows that reset, before the reset events.
 
     It may write `view.reward_weights[name]`, a tensor [] per reward term, for the rewards that it names in
-    `adapted_rewards`: those are computed even while their weight is 0.
+    `adapted_rewards`: those are computed even while their weight is 0. It may write
+    `view.command_ranges[command][field]`, (low, high) [2], and one curriculum may write `view.level`. Rows of
+    `mask_E` with `view.episode_step_E == 0` have not lived; where `mask_E` is empty, nothing may change.
     """
 
     @property
     def adapted_rewards(self) -> tuple[str, ...]:
         """The reward terms whose weights this curriculum changes."""
         return ()
+
+    @property
+    def first_level(self) -> float | None:
+        """What `view.level` starts at, if this curriculum drives it; else None."""
+        return None
 
     @abstractmethod
     def __call__(self, view: EnvView, mask_E: Tensor) -> Tensor:

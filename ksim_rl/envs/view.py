@@ -2,43 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Literal, TypeVar
 
-import mujoco
 import numpy as np
 import torch
 from torch import Tensor
 
 from ksim_rl import random
 from ksim_rl.checks import near
-from ksim_rl.envs import quaternion
+from ksim_rl.envs.actuators import ActuatorParams, JointTargets
+from ksim_rl.envs.bodies_and_sites import BodiesAndSites
+from ksim_rl.envs.entity import Entity
+from ksim_rl.envs.guarded_state import GuardedState
 from ksim_rl.envs.memory import Memory
+from ksim_rl.envs.motion import ReferenceMotion, load_motion
 from ksim_rl.envs.names import Index, NameResolver, Patterns, as_index, scalar_joint_ids
-from ksim_rl.envs.sensors import ContactState, ContactTracker
+from ksim_rl.envs.quantity import quantity
+from ksim_rl.envs.sensors import (
+    CameraTracker,
+    ContactState,
+    ContactTracker,
+    ImuState,
+    ImuTracker,
+    RayTracker,
+    SensorTracker,
+)
+from ksim_rl.envs.shared_values import SharedValues
+from ksim_rl.envs.terrains.ground import Ground
 from ksim_rl.physics import World
 
-
-def quantity(compute: Callable[[Any], Tensor]) -> property:
-    """Make a property that is computed at most once between two changes of the state."""
-    name = compute.__name__
-
-    def read(view: EnvView) -> Tensor:
-        value = view.cache.get(name)
-        if value is None:
-            value = view.cache[name] = compute(view)
-        return value
-
-    return property(read, doc=compute.__doc__)
+Tracker = TypeVar("Tracker", bound=SensorTracker)
 
 
-class EnvView:
+class EnvView(BodiesAndSites):
     """A typed view of the world for terms.
 
     Position- and velocity-stage quantities (poses, velocities, most sensors) are those of the current state.
     Acceleration-stage ones (contact sensors, accelerometers, actuator forces) belong to the last physics substep, and
     read zero in rows that were just reset. All values are float32 on the env's device unless stated otherwise.
+
+    Attributes:
+        level: the difficulty in [0, 1] that a curriculum drives, [] on the device; 1 where none does. It is one tensor
+            for the life of the env, changed in place, so that what scales with difficulty may hold on to it.
+        reward_weights: by term, [] each; a curriculum may write them.
+        episode_rewards: by term, the weighted sum over the episode so far, [E] each.
+        command_ranges: by command and field, (low, high) [2] each; a curriculum may write them.
+        terminations: by term, and "non_finite": which envs end, bool [E], as the step found it.
+        terminated_E, truncated_E: which envs the step found to end by a condition that is no time-out, and by a
+            time-out, bool [E]; `is_finite_horizon` does not matter here.
+        command_cache: what is computed from commands alone; emptied when they change.
     """
 
     def __init__(
@@ -48,6 +62,7 @@ class EnvView:
         step_dt: float,
         max_episode_length: int = 0,
         soft_joint_pos_limit_factor: float = 1.0,
+        entities: Sequence[str] = (),
     ) -> None:
         model = world.mj_model
         self.max_episode_length = max_episode_length
@@ -55,19 +70,31 @@ class EnvView:
         self.num_envs, self.device = world.num_envs, world.device
         self.physics_dt, self.step_dt = float(model.opt.timestep), step_dt
         self.resolver = NameResolver(model, world.device)
-        self.cache: dict[str, Tensor] = {}
+        self._state = GuardedState(world)
+        self.cache = self._state.new_cache()
+        self.command_cache = self._state.new_cache()
         self.memories = Memory(world.num_envs, world.device)
-        self.contacts: dict[str, ContactTracker] = {}
+        self.shared_values = SharedValues(world.device)
+        self.level = self.shared_values.get("curriculum.level", 1.0)
+        self.terrain = Ground(world.num_envs, world.device)
+        self.sensors: dict[str, SensorTracker] = {}
         self.commands: dict[str, Tensor] = {}
         self.reward_weights: dict[str, Tensor] = {}
+        self.episode_rewards: dict[str, Tensor] = {}
+        self.command_ranges: dict[str, dict[str, Tensor]] = {}
+        self.terminations: dict[str, Tensor] = {}
+        self._motions: dict[str, ReferenceMotion] = {}
+        self.terminated_E = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self.truncated_E = torch.zeros_like(self.terminated_E)
+        # Called around each physics substep (see `World.step`); they read the world, whose state is on its way.
+        self.before_substep: list[Callable[[], None]] = []
+        self.after_substep: list[Callable[[], None]] = []
+        self.substep_sensors: Literal["last", "every"] = "last"
 
         joints = scalar_joint_ids(model)
         self._qpos_index = as_index([model.jnt_qposadr[j] for j in joints], self.device)
         self._qvel_index = as_index([model.jnt_dofadr[j] for j in joints], self.device)
         self.num_joints = len(joints)
-        self._free = bool(model.njnt) and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
-        self._root_body = int(model.jnt_bodyid[0]) if self._free else min(1, model.nbody - 1)
-        self._body_root = torch.tensor(model.body_rootid, device=self.device, dtype=torch.int64)
         self._site_body = torch.tensor(model.site_bodyid, device=self.device, dtype=torch.int64)
         self._sensor_slices = {
             model.sensor(i).name: slice(
@@ -75,13 +102,26 @@ class EnvView:
             )
             for i in range(model.nsensor)
         }
-        self._gravity_direction = torch.tensor([0.0, 0.0, -1.0], device=self.device)
 
         default_qpos = torch.tensor(
             model.key_qpos[0] if model.nkey else model.qpos0, device=self.device, dtype=torch.float32
         )
         self.default_qpos_L = default_qpos
-        self.default_joint_pos_EL = default_qpos[self._qpos_index].expand(self.num_envs, -1).clone()
+        several = len(entities) > 1
+        self.entities = {
+            name: Entity(
+                self._state, name=name, prefix=f"{name}/" if several else "", default_qpos_L=default_qpos
+            )
+            for name in entities or ("robot",)
+        }
+        self.robot = next(iter(self.entities.values()))
+        self.default_joint_pos_EL = self.memories.get(
+            "default_joint_pos_EL", self.num_joints, keep=True, initial=default_qpos[self._qpos_index]
+        )
+        self.targets = JointTargets(
+            world, self.resolver, self.memories, default_joint_pos_EL=self.default_joint_pos_EL
+        )
+        self.actuator_params = ActuatorParams(self.memories, self.resolver.names("joint"), self.device)
         ctrl_range = torch.tensor(model.actuator_ctrlrange, device=self.device, dtype=torch.float32)
         self.ctrl_limits_L2 = self._limited(ctrl_range.view(-1, 2), model.actuator_ctrllimited)
         self.soft_joint_pos_limits_L2 = self._soft_limits(joints, soft_joint_pos_limit_factor)
@@ -97,7 +137,6 @@ class EnvView:
         self.last_action_EL = torch.zeros(self.num_envs, 0, device=self.device)
         self.startup_counter = zero
         self._counter: Tensor = zero
-        self._stale = False
         self._persistent: set[int] = set()
         self._scope, self._draw_scope, self._draws = "", "", 0
 
@@ -146,84 +185,73 @@ class EnvView:
         return self.world.qacc_EL[:, self._qvel_index]
 
     @quantity
+    def joint_effort_EL(self) -> Tensor:
+        """What actuators exert on the hinges (N m) and slides (N), behind the gears; acceleration stage, [E, L]."""
+        return self.world.qfrc_actuator_EL[:, self._qvel_index]
+
+    @quantity
     def joint_pos_rel_EL(self) -> Tensor:
         """Joint positions minus the default pose, [E, L]."""
         return self.joint_pos_EL - self.default_joint_pos_EL
 
     # -- root ----------------------------------------------------------------------------------------------------
 
-    @quantity
+    def entity(self, name: str = "") -> Entity:
+        """Return a robot or object of the scene by name; "" is the first robot.
+
+        Raises:
+            ValueError: if there is none of this name, with the near names.
+        """
+        if not name:
+            return self.robot
+        if name not in self.entities:
+            raise ValueError(f"no entity {name!r} in scene.robots and scene.objects: {near(name, self.entities)}")
+        return self.entities[name]
+
+    @property
     def root_pos_EL(self) -> Tensor:
-        """Position of the root body's frame in the world, m, [E, 3]."""
-        return self.world.qpos_EL[:, 0:3] if self._free else self._derived().xpos_EL[:, self._root_body]
+        """Position of the first robot's root body frame in the world, m, [E, 3]."""
+        return self.robot.root_pos_EL
 
-    @quantity
+    @property
     def root_quat_EL(self) -> Tensor:
-        """Orientation of the root body, body to world, (w, x, y, z), [E, 4]."""
-        return self.world.qpos_EL[:, 3:7] if self._free else self._derived().xquat_EL[:, self._root_body]
+        """Orientation of the first robot's root body, body to world, (w, x, y, z), [E, 4]."""
+        return self.robot.root_quat_EL
 
-    @quantity
+    @property
     def root_lin_vel_w_EL(self) -> Tensor:
-        """Linear velocity of the root body's frame origin, world frame, m/s, [E, 3]."""
-        return self.world.qvel_EL[:, 0:3] if self._free else self.body_lin_vel_w(self._root_slice)[:, 0]
+        """Linear velocity of the first robot's root body frame origin, world frame, m/s, [E, 3]."""
+        return self.robot.root_lin_vel_w_EL
 
-    @quantity
+    @property
     def root_ang_vel_w_EL(self) -> Tensor:
-        """Angular velocity of the root body, world frame, rad/s, [E, 3]."""
-        if self._free:
-            return quaternion.rotate(self.root_quat_EL, self.root_ang_vel_b_EL)
-        return self._derived().cvel_EL[:, self._root_body, 0:3]
+        """Angular velocity of the first robot's root body, world frame, rad/s, [E, 3]."""
+        return self.robot.root_ang_vel_w_EL
 
-    @quantity
+    @property
     def root_lin_vel_b_EL(self) -> Tensor:
-        """Linear velocity of the root body's frame origin, body frame, m/s, [E, 3]."""
-        return quaternion.rotate_inverse(self.root_quat_EL, self.root_lin_vel_w_EL)
+        """Linear velocity of the first robot's root body frame origin, body frame, m/s, [E, 3]."""
+        return self.robot.root_lin_vel_b_EL
 
-    @quantity
+    @property
     def root_ang_vel_b_EL(self) -> Tensor:
-        """Angular velocity of the root body, body frame, rad/s, [E, 3]."""
-        if self._free:  # MuJoCo keeps a free joint's angular velocity in the body frame
-            return self.world.qvel_EL[:, 3:6]
-        return quaternion.rotate_inverse(self.root_quat_EL, self.root_ang_vel_w_EL)
+        """Angular velocity of the first robot's root body, body frame, rad/s, [E, 3]."""
+        return self.robot.root_ang_vel_b_EL
 
-    @quantity
+    @property
     def projected_gravity_EL(self) -> Tensor:
-        """Unit vector of gravity (world -z) in the root body's frame, [E, 3]."""
-        return quaternion.rotate_inverse(self.root_quat_EL, self._gravity_direction.expand(self.num_envs, 3))
+        """Unit vector of gravity (world -z) in the first robot's root body frame, [E, 3]."""
+        return self.robot.projected_gravity_EL
 
-    @quantity
+    @property
     def heading_E(self) -> Tensor:
-        """Yaw of the root body, rad in [-pi, pi], [E]."""
-        return quaternion.yaw(self.root_quat_EL)
+        """Yaw of the first robot's root body, rad in [-pi, pi], [E]."""
+        return self.robot.heading_E
 
-    # -- bodies and sites ----------------------------------------------------------------------------------------
-
-    def body_pos_w(self, index: Index) -> Tensor:
-        """Return positions of body frames in the world, m, [E, N, 3]."""
-        return self._derived().xpos_EL[:, index]
-
-    def body_lin_vel_w(self, index: Index) -> Tensor:
-        """Return linear velocities of body frame origins, world frame, m/s, [E, N, 3]."""
-        return self._point_velocity(self._derived().xpos_EL[:, index], index, self._body_root[index])
-
-    def body_ang_vel_w(self, index: Index) -> Tensor:
-        """Return angular velocities of bodies, world frame, rad/s, [E, N, 3]."""
-        return self._derived().cvel_EL[:, index, 0:3]
-
-    def site_pos_w(self, index: Index) -> Tensor:
-        """Return positions of sites in the world, m, [E, N, 3]."""
-        return self._derived().site_xpos_EL[:, index]
-
-    def site_lin_vel_w(self, index: Index) -> Tensor:
-        """Return linear velocities of sites, world frame, m/s, [E, N, 3]."""
-        body = self._site_body[index]
-        return self._point_velocity(self._derived().site_xpos_EL[:, index], body, self._body_root[body])
-
-    def _point_velocity(self, point_EN3: Tensor, body: Index, root: Tensor) -> Tensor:
-        # MuJoCo's cvel is (angular, linear) about the centre of mass of the body's kinematic tree.
-        cvel_EN6 = self.world.cvel_EL[:, body]
-        lever_EN3 = point_EN3 - self.world.subtree_com_EL[:, root]
-        return cvel_EN6[..., 3:] + torch.linalg.cross(cvel_EN6[..., :3], lever_EN3)
+    @property
+    def free_root(self) -> bool:
+        """Whether the first robot's root floats freely."""
+        return self.robot.free_root
 
     # -- sensors, commands, actions, time ------------------------------------------------------------------------
 
@@ -231,13 +259,43 @@ class EnvView:
         """Return the reading of an MJCF sensor, [E, dim]."""
         if name not in self._sensor_slices:
             raise ValueError(f"no sensor {name!r}: {near(name, self._sensor_slices)}")
-        return self._derived().sensordata_EL[:, self._sensor_slices[name]]
+        return self._state.derived().sensordata_EL[:, self._sensor_slices[name]]
 
     def contact(self, name: str) -> ContactState:
         """Return the state of a contact sensor of `cfg.scene.sensors`."""
-        if name not in self.contacts:
-            raise ValueError(f"no contact sensor {name!r} in scene.sensors: {near(name, self.contacts)}")
-        return self.contacts[name].state
+        return self.tracker(name, ContactTracker, "contact sensor").state
+
+    def imu(self, name: str) -> ImuState:
+        """Return the readings of an `ImuSensor` of `cfg.scene.sensors`."""
+        return self.tracker(name, ImuTracker, "IMU").state
+
+    def rays(self, name: str) -> RayTracker:
+        """Return a `RayCaster` of `cfg.scene.sensors`; its rays are cast when they are read."""
+        return self.tracker(name, RayTracker, "ray caster")
+
+    def camera(self, name: str) -> CameraTracker:
+        """Return a `CameraSensor` of `cfg.scene.sensors`; its pictures are drawn when they are read."""
+        return self.tracker(name, CameraTracker, "camera")
+
+    def derived(self) -> World:
+        """Return the world for reading what derives from the state.
+
+        Raises:
+            RuntimeError: if state was written in the same moment, which has made that stale.
+        """
+        return self._state.derived()
+
+    def tracker(self, name: str, kind: type[Tracker], described: str) -> Tracker:
+        """Return the reader of a sensor of `cfg.scene.sensors`.
+
+        Raises:
+            ValueError: if there is no such sensor of this kind.
+        """
+        tracker = self.sensors.get(name)
+        if not isinstance(tracker, kind):
+            names = [other for other, present in self.sensors.items() if isinstance(present, kind)]
+            raise ValueError(f"no {described} {name!r} in scene.sensors: {near(name, names)}")
+        return tracker
 
     def command(self, name: str) -> Tensor:
         """Return the command that the policy saw before this step, [E, K]."""
@@ -245,10 +303,48 @@ class EnvView:
             raise ValueError(f"no command {name!r} in commands: {near(name, self.commands)}")
         return self.commands[name]
 
+    def motion(self, file: str) -> ReferenceMotion:
+        """Return the reference motion of an .npz file; it is read once, while the env is constructed."""
+        if file not in self._motions:
+            self._motions[file] = load_motion(file, self.world.mj_model, self.device)
+        return self._motions[file]
+
     @quantity
     def episode_time_E(self) -> Tensor:
         """Time since the episode's start, s, [E]."""
         return self.episode_step_E.to(torch.float32) * self.step_dt
+
+    # -- actuators -----------------------------------------------------------------------------------------------
+
+    @property
+    def joint_pos_target_EL(self) -> Tensor:
+        """Positions that joints are asked for, rad or m, [E, L]; the default pose until an action asks otherwise."""
+        return self.targets.pos_EL
+
+    @property
+    def joint_vel_target_EL(self) -> Tensor:
+        """Velocities that joints are asked for, rad/s or m/s, [E, L]."""
+        return self.targets.vel_EL
+
+    @property
+    def joint_effort_target_EL(self) -> Tensor:
+        """Efforts that joints are asked for, N m or N, [E, L]."""
+        return self.targets.effort_EL
+
+    def actuator_param(self, name: str, joints: Patterns | None = None) -> Tensor:
+        """Return a number of explicit actuators, [E, L], such as "stiffness", to be read or written in place.
+
+        `joints` names those that must have it. What an event writes holds from the next substep on, and until it is
+        written again: resets leave it alone. Built-in actuators have model fields instead (`actuators.builtin`).
+
+        Raises:
+            ValueError: if there is no such number, or one of `joints` does not have it.
+        """
+        return self.actuator_params.get(name, () if joints is None else self.resolver.ids("joint", joints))
+
+    def nominal_actuator_param(self, name: str) -> Tensor:
+        """Return the numbers of `actuator_param` as the config gives them, [L]."""
+        return self.actuator_params.nominal(name)
 
     # -- what terms keep and draw --------------------------------------------------------------------------------
 
@@ -260,15 +356,20 @@ class EnvView:
         counters may coincide.
         """
         self._scope, self._draw_scope, self._draws = name, f"{name}@{draws}", 0
+        self._state.reader = name
         self._counter = self.step_count if counter is None else counter
         try:
             yield
         finally:
-            self._scope = ""
+            self._scope = self._state.reader = ""
 
     def memory(self, name: str, *shape: int, dtype: torch.dtype = torch.float32, keep: bool = False) -> Tensor:
         """Return a buffer [E, *shape] that belongs to the calling term; rows that reset are zeroed unless `keep`."""
         return self.memories.get(f"{self._scope}.{name}", *shape, dtype=dtype, keep=keep)
+
+    def shared(self, name: str, initial: float | Sequence[float] | Sequence[Sequence[float]]) -> Tensor:
+        """Return a float32 tensor of the calling term that all envs share; it starts at `initial` and is saved."""
+        return self.shared_values.get(f"{self._scope}.{name}", initial)
 
     def uniform(self, n: int, low: float | Tensor = 0.0, high: float | Tensor = 1.0) -> Tensor:
         """Draw float32 [E, n] from [low, high); the numbers depend on seed, term, env and moment only."""
@@ -277,6 +378,10 @@ class EnvView:
     def normal(self, n: int) -> Tensor:
         """Draw float32 [E, n] from the standard normal distribution."""
         return random.normal(self._next_keys(), n)
+
+    def integers(self, n: int, low: int, high: int) -> Tensor:
+        """Draw int64 [E, n] from {low, ..., high}, both included."""
+        return random.integers(self._next_keys(), n, low, high)
 
     def _next_keys(self) -> random.RowKeys:
         stream = random.stream_id(f"{self._draw_scope}#{self._draws}")
@@ -287,28 +392,53 @@ class EnvView:
 
     def write_qpos(self, mask_E: Tensor, qpos_EL: Tensor) -> None:
         """Set all generalized positions, MuJoCo's layout, in the rows of `mask_E`."""
-        self._write(self.world.qpos_EL, mask_E, qpos_EL)
+        self._state.write(self.world.qpos_EL, mask_E, qpos_EL)
 
     def write_qvel(self, mask_E: Tensor, qvel_EL: Tensor) -> None:
         """Set all generalized velocities, MuJoCo's layout, in the rows of `mask_E`."""
-        self._write(self.world.qvel_EL, mask_E, qvel_EL)
+        self._state.write(self.world.qvel_EL, mask_E, qvel_EL)
 
     def write_root_pose(self, mask_E: Tensor, pos_EL: Tensor, quat_EL: Tensor) -> None:
-        """Set position (m) and orientation (w, x, y, z) of the free root body in the rows of `mask_E`."""
-        self._write(self.world.qpos_EL[:, 0:7], mask_E, torch.cat((pos_EL, quat_EL), dim=-1))
+        """Set position (m) and orientation (w, x, y, z) of the first robot's free root in the rows of `mask_E`."""
+        self.robot.write_root_pose(mask_E, pos_EL, quat_EL)
 
     def write_root_velocity(self, mask_E: Tensor, lin_vel_w_EL: Tensor, ang_vel_w_EL: Tensor) -> None:
-        """Set the velocities (m/s, rad/s, world frame) of the free root body in the rows of `mask_E`."""
-        ang_vel_b_EL = quaternion.rotate_inverse(self.world.qpos_EL[:, 3:7], ang_vel_w_EL)
-        self._write(self.world.qvel_EL[:, 0:6], mask_E, torch.cat((lin_vel_w_EL, ang_vel_b_EL), dim=-1))
+        """Set velocities (m/s, rad/s, world frame) of the first robot's free root in the rows of `mask_E`."""
+        self.robot.write_root_velocity(mask_E, lin_vel_w_EL, ang_vel_w_EL)
 
     def write_joint_pos(self, mask_E: Tensor, pos_EL: Tensor, joints: Index = slice(None)) -> None:
         """Set positions (rad or m) of the joints of `joints` in the rows of `mask_E`."""
-        self._write_columns(self.world.qpos_EL, self._qpos_index, joints, mask_E, pos_EL)
+        self._state.write_columns(self.world.qpos_EL, self._qpos_index, joints, mask_E, pos_EL)
 
     def write_joint_vel(self, mask_E: Tensor, vel_EL: Tensor, joints: Index = slice(None)) -> None:
         """Set velocities (rad/s or m/s) of the joints of `joints` in the rows of `mask_E`."""
-        self._write_columns(self.world.qvel_EL, self._qvel_index, joints, mask_E, vel_EL)
+        self._state.write_columns(self.world.qvel_EL, self._qvel_index, joints, mask_E, vel_EL)
+
+    def write_joint_pos_target(self, joints: Patterns, target_EK: Tensor) -> None:
+        """Ask joints for positions, rad or m, in all rows; one column per joint, in the order of `joints`.
+
+        Raises:
+            ValueError: if a joint has no actuator that takes positions.
+        """
+        self.targets.write("pos", joints, target_EK)
+
+    def write_joint_vel_target(self, joints: Patterns, target_EK: Tensor) -> None:
+        """Ask joints for velocities, rad/s or m/s, in all rows; one column per joint, in the order of `joints`.
+
+        Raises:
+            ValueError: if a joint has no actuator that takes velocities.
+        """
+        self.targets.write("vel", joints, target_EK)
+
+    def write_joint_effort_target(self, joints: Patterns, target_EK: Tensor) -> None:
+        """Ask joints for efforts, N m or N, in all rows; one column per joint, in the order of `joints`.
+
+        The control ranges of motors clamp them. A motor of the MJCF multiplies them by its gear and gain.
+
+        Raises:
+            ValueError: if a joint has no actuator that takes efforts.
+        """
+        self.targets.write("effort", joints, target_EK)
 
     def write_ctrl(self, actuators: Index, ctrl_EK: Tensor) -> None:
         """Set the controls of `actuators` in all rows."""
@@ -318,28 +448,11 @@ class EnvView:
         """Return a model field with one row per world, to be written in place (see `EventTerm.per_world_fields`)."""
         return self.world.field(name)
 
-    def _write_columns(self, state_EL: Tensor, address: Index, joints: Index, mask_E: Tensor, value: Tensor) -> None:
-        if isinstance(address, slice) and isinstance(joints, slice):
-            self._write(state_EL[:, address][:, joints], mask_E, value)
-            return
-        if isinstance(address, slice):
-            address = torch.arange(address.start, address.stop, device=self.device)
-        columns = address[joints]
-        state_EL[:, columns] = torch.where(mask_E[:, None], value, state_EL[:, columns])
-        self.cache.clear()
-        self._stale = True
-
-    def _write(self, target_EL: Tensor, mask_E: Tensor, value_EL: Tensor) -> None:
-        target_EL.copy_(torch.where(mask_E[:, None], value_EL, target_EL))
-        self.cache.clear()
-        self._stale = True
-
     # -- internals -----------------------------------------------------------------------------------------------
 
     def refreshed(self) -> None:
         """Forget computed quantities: the state has changed, and the world has refreshed what derives from it."""
-        self.cache.clear()
-        self._stale = False
+        self._state.refreshed()
 
     def detached(self, value: Tensor) -> Tensor:
         """Return `value`, copied if it shares memory with something that later steps overwrite."""
@@ -348,27 +461,11 @@ class EnvView:
     def freeze(self) -> None:
         """End construction: no new memory, and all that lives on is known to `detached`."""
         self.memories.freeze()
+        self.shared_values.freeze()
         lasting = [*self.memories.buffers().values(), *self.world.views().values()]
+        lasting += self.shared_values.tensors().values()
         lasting += [self.episode_step_E, self.default_joint_pos_EL, self.default_qpos_L]
         self._persistent = {tensor.untyped_storage().data_ptr() for tensor in lasting}
-
-    def _derived(self) -> World:
-        """Return the world for reading what derives from the state, unless a write has made that stale."""
-        if self._stale:
-            raise RuntimeError(
-                f"{self._scope or 'a term'} reads a derived quantity (pose of a body or site, sensor) after state was "
-                "written in the same moment: read it before writing, or from the joint state"
-            )
-        return self.world
-
-    @property
-    def free_root(self) -> bool:
-        """Whether the first joint is a free joint."""
-        return self._free
-
-    @property
-    def _root_slice(self) -> slice:
-        return slice(self._root_body, self._root_body + 1)
 
     def _soft_limits(self, joints: list[int], factor: float) -> Tensor:
         """Shrink the joint ranges about their middles; unlimited joints get infinite limits. [L, 2]."""

@@ -1,5 +1,6 @@
 """The camera of `render()`."""
 
+import re
 from dataclasses import dataclass
 
 from ksim_rl.checks import check_in_range
@@ -17,6 +18,8 @@ class ViewerCfg:
         width, height: pixels.
         env_index: the env that is drawn.
         num_envs: how many envs are drawn in the picture, `scene.spacing` apart, from `env_index` on.
+        draw: which of the commands, rewards and sensors that can draw themselves do so: regular expressions for
+            "commands/<name>", "rewards/<name>" and "sensors/<name>" that match in full; () for none.
     """
 
     body: str | None = None
@@ -28,6 +31,7 @@ class ViewerCfg:
     height: int = 480
     env_index: int = 0
     num_envs: int = 1
+    draw: tuple[str, ...] = (".*",)
 
     def __post_init__(self) -> None:
         check_in_range("distance", self.distance, low=0.0, low_open=True)
@@ -36,3 +40,8 @@ class ViewerCfg:
         for field in ("width", "height", "num_envs"):
             check_in_range(field, getattr(self, field), low=1)
         check_in_range("env_index", self.env_index, low=0)
+        for index, pattern in enumerate(self.draw):
+            try:
+                re.compile(pattern)
+            except re.error as error:
+                raise ValueError(f"draw[{index}]={pattern!r}: no regular expression: {error}") from None

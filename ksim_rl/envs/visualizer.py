@@ -68,7 +68,7 @@ class SceneVisualizer:
         """Draw the robot in another pose, transparently."""
         data = mujoco.MjData(self._model)
         data.qpos[:] = qpos
-        mujoco.mj_forward(self._model, data)
+        place(self._model, data)
         first = self._scene.ngeom
         add_geoms(self._model, data, self._scene, self._offset)
         for index in range(first, self._scene.ngeom):
@@ -94,6 +94,14 @@ class SceneVisualizer:
         mujoco.mjv_connector(geom, kind, width, begin, finish)
 
 
+def place(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Compute from `data.qpos` and the mocap poses what a picture shows."""
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_camlight(model, data)
+    mujoco.mj_tendon(model, data)
+
+
 def visible_groups(model: mujoco.MjModel) -> mujoco.MjvOption:
     """Return drawing options that show something of the robot.
 
@@ -107,16 +115,22 @@ def visible_groups(model: mujoco.MjModel) -> mujoco.MjvOption:
     return option
 
 
-def add_geoms(model: mujoco.MjModel, data: mujoco.MjData, scene: mujoco.MjvScene, offset: np.ndarray) -> None:
-    """Add the moving geoms of `data` to the scene, shifted by `offset` (m).
+def add_geoms(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    scene: mujoco.MjvScene,
+    offset: np.ndarray,
+    *,
+    category: mujoco.mjtCatBit = mujoco.mjtCatBit.mjCAT_DYNAMIC,
+) -> None:
+    """Add the geoms of a category (those that move, by default) of `data` to the scene, shifted by `offset` (m).
 
     Raises:
         RuntimeError: if they do not all fit.
     """
     first = scene.ngeom
-    moving = mujoco.mjtCatBit.mjCAT_DYNAMIC.value
     with caught_warnings():
-        mujoco.mjv_addGeoms(model, data, visible_groups(model), mujoco.MjvPerturb(), moving, scene)
+        mujoco.mjv_addGeoms(model, data, visible_groups(model), mujoco.MjvPerturb(), category.value, scene)
     if scene.status:
         raise RuntimeError(_full(scene))
     for index in range(first, scene.ngeom):

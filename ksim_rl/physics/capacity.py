@@ -1,7 +1,9 @@
 """Room for constraints and contacts: tight, but safe, from a probe of the model with MuJoCo's C engine."""
 
+import copy
 import hashlib
 import math
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -23,12 +25,25 @@ DEPTH = 0.02
 _cache: dict[bytes, tuple[int, int]] = {}
 
 
-def capacities(mj_model: mujoco.MjModel, sim: SimCfg) -> tuple[int, int]:
+def capacities(
+    mj_model: mujoco.MjModel, sim: SimCfg, per_world_fields: Sequence[str] = ()
+) -> tuple[int, int]:
     """Return (njmax, nconmax) per world: those of `sim`, or the probe's where they are None."""
     if sim.njmax is not None and sim.nconmax is not None:
         return sim.njmax, sim.nconmax
+    if "dof_frictionloss" in per_world_fields:
+        mj_model = _with_dry_friction(mj_model)
     njmax, nconmax = probe(mj_model)
     return sim.njmax or njmax, sim.nconmax or nconmax
+
+
+def _with_dry_friction(mj_model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return the model with some dry friction in each hinge and slide, which is a constraint row each."""
+    rubbing = copy.copy(mj_model)
+    kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    scalar = np.isin(mj_model.jnt_type[mj_model.dof_jntid], kinds)
+    rubbing.dof_frictionloss[scalar & (rubbing.dof_frictionloss == 0.0)] = 1e-3
+    return rubbing
 
 
 def probe(mj_model: mujoco.MjModel) -> tuple[int, int]:
@@ -62,11 +77,15 @@ def _most(mj_model: mujoco.MjModel) -> tuple[int, int, int]:
         mujoco.mj_resetData(mj_model, mj_data)
         if key >= 0:
             mujoco.mj_resetDataKeyframe(mj_model, mj_data, key)
+        if np.isin(mujoco.mjtGeom.mjGEOM_HFIELD, mj_model.geom_type):
+            # A height field may be above the pose, which the model has no way to know.
+            put_in_ground(mj_model, mj_data, depth=0.0)
         mujoco.mj_fwdPosition(mj_model, mj_data)
         measure()
     for index, qpos in enumerate(random_qpos(mj_model, RANDOM_STATES, rng)):
         mujoco.mj_resetData(mj_model, mj_data)
         mj_data.qpos[:] = qpos
+        scatter(mj_model, mj_data, rng)
         put_in_ground(mj_model, mj_data, depth=DEPTH * rng.random())
         mujoco.mj_fwdPosition(mj_model, mj_data)
         measure()
@@ -102,21 +121,54 @@ def random_ctrl(mj_model: mujoco.MjModel, rng: np.random.Generator) -> np.ndarra
     return rng.uniform(low, high)
 
 
+def scatter(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.random.Generator) -> None:
+    """Move free bodies to random places of the first height field, if there is one: its middle may be flat."""
+    fields = np.flatnonzero(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)
+    if fields.size == 0:
+        return
+    half = mj_model.hfield_size[mj_model.geom_dataid[fields[0]], :2]
+    for joint in np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+        address = mj_model.jnt_qposadr[joint]
+        mj_data.qpos[address : address + 2] = rng.uniform(-0.9 * half, 0.9 * half)
+
+
 def put_in_ground(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, *, depth: float) -> None:
-    """Move each free body, with what hangs on it, so that its lowest geom is `depth` (m) below the highest plane."""
-    planes = np.flatnonzero(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    """Move each free body, with what hangs on it, so that one of its geoms is `depth` (m) deep in the ground.
+
+    That is the highest plane, and the highest of the height field below a geom.
+    """
+    ground_types = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
     free_joints = np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-    if planes.size == 0 or free_joints.size == 0:
+    if not np.isin(mj_model.geom_type, ground_types).any() or free_joints.size == 0:
         return
     mujoco.mj_kinematics(mj_model, mj_data)
-    ground = mj_data.geom_xpos[planes, 2].max()
-    lowest = _lowest_points(mj_model, mj_data)
+    depths = _ground_heights(mj_model, mj_data) - _lowest_points(mj_model, mj_data)
     roots = mj_model.body_rootid[mj_model.geom_bodyid]
     collides = (mj_model.geom_contype | mj_model.geom_conaffinity) != 0
     for joint in free_joints:
         geoms = collides & (roots == mj_model.body_rootid[mj_model.jnt_bodyid[joint]])
-        if geoms.any():
-            mj_data.qpos[mj_model.jnt_qposadr[joint] + 2] += ground - depth - lowest[geoms].min()
+        deepest = depths[geoms].max(initial=-np.inf)
+        if np.isfinite(deepest):
+            mj_data.qpos[mj_model.jnt_qposadr[joint] + 2] += deepest - depth
+
+
+def _ground_heights(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndarray:
+    """Return the height of the ground below each geom (the highest of 9 points), m; -inf where there is none."""
+    ground = np.full(mj_model.ngeom, -np.inf)
+    planes = np.flatnonzero(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    if planes.size:
+        ground[:] = mj_data.geom_xpos[planes, 2].max()
+    down = np.array([0.0, 0.0, -1.0])
+    for field in np.flatnonzero(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD):
+        above = mj_data.geom_xpos[field, 2] + mj_model.hfield_size[mj_model.geom_dataid[field], 2] + 1.0
+        for geom, (x, y, _) in enumerate(mj_data.geom_xpos):
+            reach = mj_model.geom_rbound[geom]
+            for dx, dy in np.ndindex(3, 3):
+                start = np.array([x + (dx - 1) * reach, y + (dy - 1) * reach, above])
+                distance = mujoco.mj_rayHfield(mj_model, mj_data, int(field), start, down, None)
+                if distance >= 0:
+                    ground[geom] = max(ground[geom], above - distance)
+    return ground
 
 
 def _lowest_points(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndarray:

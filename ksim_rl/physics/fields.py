@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Iterable, Sequence
 
+import mujoco
 import mujoco_warp as mjw
 import torch
 import warp as wp
@@ -17,10 +18,12 @@ GROUPS_OF_FIELD = {
     "qpos0": KIN0 | INERT0,
     "body_mass": ALL,
     "body_inertia": INERT0,
-    "body_ipos": ALL,
-    "body_iquat": ALL,
+    "body_ipos": KIN0 | INERT0,
+    "body_iquat": INERT0,
     "body_pos": KIN0 | INERT0,
     "body_quat": KIN0 | INERT0,
+    "jnt_pos": KIN0 | INERT0,
+    "jnt_axis": KIN0 | INERT0,
     "dof_armature": INERT0,
     "tendon_armature": INERT0,
     "actuator_armature": INERT0,
@@ -67,6 +70,11 @@ def const_groups(fields: Iterable[str]) -> int:
     return groups
 
 
+def derived_fields(groups: int) -> tuple[str, ...]:
+    """Return the names of the constants of these `SetConstGroup` bits."""
+    return tuple(name for group, names in DERIVED_FIELDS.items() if groups & group for name in names)
+
+
 def fields_to_expand(fields: Sequence[str]) -> tuple[str, ...]:
     """Return `fields` and, after them, the fields that are derived from them and so must differ as well.
 
@@ -79,9 +87,19 @@ def fields_to_expand(fields: Sequence[str]) -> tuple[str, ...]:
     for field in fields:
         if field != GRAVITY and field not in valid:
             raise unknown_name("per-world model field", field, (*valid, GRAVITY))
-    groups = const_groups(fields)
-    derived = [name for group, names in DERIVED_FIELDS.items() if groups & group for name in names]
+    derived = derived_fields(const_groups(fields))
     return tuple(dict.fromkeys([*(field for field in fields if field != GRAVITY), *derived]))
+
+
+def prepare_spec(spec: mujoco.MjSpec, per_world_fields: Iterable[str]) -> None:
+    """Switch off what MuJoCo's compiler would specialize on a field that is to differ between worlds.
+
+    A body that floats about its centre of mass is compiled as "simple", with a diagonal inertia matrix, which a moved
+    centre of mass makes wrong.
+    """
+    if {"body_ipos", "body_iquat"} & set(per_world_fields):
+        for body in spec.bodies:
+            body.simple = False
 
 
 def expand_gravity(warp_model: mjw.Model, num_envs: int) -> torch.Tensor:

@@ -1,7 +1,7 @@
 """What a compiled model must satisfy before kernels are compiled for it: finite numbers, features that Warp has."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import mujoco
 import mujoco_warp as mjw
@@ -73,6 +73,22 @@ def warp_model_of(mj_model: mujoco.MjModel, batch_sizes: dict[str, int] | None =
         raise ValueError(
             f"MuJoCo Warp cannot simulate this model: {_with_elements(mj_model, str(error))}"
         ) from error
+
+
+def check_not_simple(mj_model: mujoco.MjModel, per_world_fields: Iterable[str]) -> None:
+    """Refuse moving centres of mass of bodies whose inertia was compiled as diagonal: Warp would keep it so.
+
+    Raises:
+        ValueError: naming the body and the fix.
+    """
+    moving = sorted({"body_ipos", "body_iquat"} & set(per_world_fields))
+    simple = np.flatnonzero(mj_model.body_simple[1:]) + 1
+    if moving and simple.size:
+        raise ValueError(
+            f"per_world_fields has {moving[0]!r}, but {_element(mj_model, 'body', int(simple[0]))} is compiled as "
+            "simple, with its centre of mass fixed at its origin: call prepare_spec(spec, per_world_fields) before "
+            'compiling, or set simple="false" in its XML'
+        )
 
 
 def _float_fields(mj_model: mujoco.MjModel) -> Iterator[tuple[str, float | np.ndarray]]:

@@ -5,6 +5,7 @@ import dataclasses
 import mujoco
 
 from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.physics.nan_guard_cfg import NanGuardCfg
 
 INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
@@ -38,6 +39,7 @@ class SimCfg:
             (large for scenes with many contacts). With MuJoCo Warp 4.0 it narrows the differences between runs and does
             not remove all of them (Go1 on an H200: 5e-7 in qpos after a step). On the CPU results are always the same.
         require_graphs: refuse to run where graphs are unavailable, instead of a warning and a slow run.
+        nan_guard: where to save what led to a non-finite state; `None` keeps nothing and costs nothing.
 
     See https://mujoco.readthedocs.io/en/stable/XMLreference.html#option
 
@@ -58,6 +60,7 @@ class SimCfg:
     nconmax: int | None = None
     deterministic: bool = False
     require_graphs: bool = False
+    nan_guard: NanGuardCfg | None = None
 
     def __post_init__(self) -> None:
         for field in ("timestep", "impratio", "tolerance"):

@@ -37,6 +37,7 @@ class Substeps:
         )
         self._needs_transmission = bool(np.isin(sensor_type, TRANSMISSION_SENSORS).any())
         self._needs_tendon_velocity = bool(np.isin(sensor_type, TENDON_VELOCITY_SENSORS).any())
+        self.refreshes_subtree_velocities = bool(warp_model.sensor_subtree_vel)
 
     def advance(self, *, sensors: bool) -> None:
         """Launch one physics step. Sensors never change the state that it reaches."""
@@ -69,6 +70,8 @@ class Substeps:
                 inputs=[d.moment_rownnz, d.moment_rowadr, d.moment_colind, d.actuator_moment, d.qvel],
                 outputs=[d.actuator_velocity],
             )
+        if self.refreshes_subtree_velocities and not m.sensor_subtree_vel:  # else they come with their sensors
+            mjw.subtree_vel(m, d)
         mjw.sensor_pos(m, d)
         mjw.sensor_vel(m, d)
 

@@ -1,7 +1,8 @@
 """One model, many worlds: batched physics on MuJoCo Warp with zero-copy torch views."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
+from typing import Literal
 
 import mujoco
 import mujoco_warp as mjw
@@ -9,11 +10,21 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ksim_rl.checks import unknown_name
+from ksim_rl.checks import check_choice, unknown_name
 from ksim_rl.physics import capacity, kernels, state, views
-from ksim_rl.physics.fields import GRAVITY, const_groups, expand_gravity, fields_to_expand
+from ksim_rl.physics.fields import (
+    FIXED,
+    GRAVITY,
+    const_groups,
+    derived_fields,
+    expand_gravity,
+    fields_to_expand,
+)
 from ksim_rl.physics.graphs import WarpGraphs
-from ksim_rl.physics.model_checks import warp_model_of
+from ksim_rl.physics.height_fields import take_over_height_fields
+from ksim_rl.physics.masked_constants import MaskedConstants
+from ksim_rl.physics.model_checks import check_not_simple, warp_model_of
+from ksim_rl.physics.nan_guard import NanGuard, NanReport
 from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
 from ksim_rl.physics.sim_cfg import SimCfg
 from ksim_rl.physics.streams import checked_device, warp_scope
@@ -58,16 +69,18 @@ class World(views.DataViews):
         self.mj_model = copy.copy(mj_model)
         self.sim.apply_to(self.mj_model)
         expanded = fields_to_expand(per_world_fields)
+        check_not_simple(self.mj_model, expanded)
         self._graphs = WarpGraphs(self.device, require_graphs=self.sim.require_graphs)
         with warp_scope(self.device):
             self.warp_model = warp_model_of(self.mj_model, dict.fromkeys(expanded, num_envs))
+            take_over_height_fields(self.warp_model)
             self.warp_model.opt.warn_overflow = 0
             self.warp_model.opt.deterministic = self.sim.deterministic
             if self.sim.tolerance is not None:
                 self.warp_model.opt.tolerance.fill_(self.sim.tolerance)
             if self.device.type == "cuda" and not wp.is_conditional_graph_supported():
                 self.warp_model.opt.graph_conditional = False
-            self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim)
+            self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
             self.warp_data_E = mjw.make_data(
                 self.mj_model, nworld=num_envs, nconmax=self.nconmax, njmax=self.njmax
             )
@@ -76,9 +89,14 @@ class World(views.DataViews):
             self._reset_mask = wp.zeros(num_envs, dtype=bool)
             self._zeroed_at_reset = views.float_rows(self.warp_data_E, views.ACCELERATION_STAGE)
             self._substeps = Substeps(self.mj_model, self.warp_model, self.warp_data_E)
+            self._masked_constants = self._prepare_constants(expanded)
         self._reset_mask_E = wp.to_torch(self._reset_mask)
         self._fields = {name: wp.to_torch(getattr(self.warp_model, name)) for name in expanded}
         self._fields[GRAVITY] = gravity_EL
+        self._nan_guard: NanGuard | None = None
+        if self.sim.nan_guard is not None:
+            with warp_scope(self.device):
+                self._nan_guard = NanGuard(self.sim.nan_guard, self.mj_model, self.warp_data_E, self._fields)
         self.gravity_EL = gravity_EL
         super().__init__(self.warp_data_E)
         self.refresh()
@@ -88,11 +106,41 @@ class World(views.DataViews):
         """Duration of one substep, in s."""
         return float(self.mj_model.opt.timestep)
 
-    def step(self, n: int = 1) -> None:
-        """Advance all worlds by `n` substeps under the present `ctrl`; sensors are computed on the last one only."""
+    def step(
+        self,
+        n: int = 1,
+        *,
+        before: Sequence[Callable[[], None]] = (),
+        after: Sequence[Callable[[], None]] = (),
+        sensors: Literal["last", "every"] = "last",
+    ) -> None:
+        """Advance all worlds by `n` substeps under the present `ctrl`.
+
+        Args:
+            n: number of substeps.
+            before: called, in order, before each substep, such as a motor model that writes `ctrl`.
+            after: called, in order, after each substep. `refresh` has not run by then: `qpos` and `qvel` are those of
+                the state reached, poses and sensors those that the substep computed on its way.
+            sensors: "last" computes them on the last substep only, "every" on each one.
+
+        With hooks the substeps are launches of their own, with the hooks' torch work in between; without, all of them
+        are one. Inside an outer capture both become part of its graph.
+        """
         if n < 1:
             raise ValueError(f"n={n}: expected at least 1 substep")
-        self._graphs.run(("step", n), lambda: self._launch_substeps(n))
+        check_choice("sensors", sensors, ("last", "every"))
+        if not before and not after:
+            self._graphs.run(("step", n, sensors), lambda: self._launch_substeps(n, sensors))
+        else:
+            for substep in range(n):
+                for hook in before:
+                    hook()
+                reads = sensors == "every" or substep == n - 1
+                self._graphs.run(("substep", reads), lambda reads=reads: self._launch_substep(sensors=reads))
+                for hook in after:
+                    hook()
+        if self._nan_guard is not None:
+            self._nan_guard.keep_fields()
 
     def refresh(self) -> None:
         """Recompute position- and velocity-stage quantities and sensors from the present `qpos` and `qvel`.
@@ -102,18 +150,25 @@ class World(views.DataViews):
         """
         self._graphs.run("refresh", self._substeps.refresh)
 
+    @property
+    def has_subtree_velocities(self) -> bool:
+        """Whether `refresh` computes `subtree_linvel` and `subtree_angmom`."""
+        return self._substeps.refreshes_subtree_velocities
+
+    def refresh_subtree_velocities(self) -> None:
+        """Let `refresh` compute `subtree_linvel` and `subtree_angmom` from now on. Call it before any outer capture."""
+        if not self._substeps.refreshes_subtree_velocities:
+            self._substeps.refreshes_subtree_velocities = True
+            self._graphs.clear()
+            self.refresh()
+
     def reset(self, mask_E: Tensor) -> None:
         """Put the worlds where `mask_E` (bool [E]) is true back to the model's `qpos0`, at rest, time 0.
 
         Their acceleration-stage quantities and sensors read zero until the next step; the other rows do not change.
         Call `refresh` afterwards (and after writing another pose), before reading poses.
         """
-        if mask_E.dtype != torch.bool or mask_E.shape != (self.num_envs,):
-            raise ValueError(
-                f"mask_E is {mask_E.dtype} of shape {tuple(mask_E.shape)}: expected torch.bool of shape "
-                f"({self.num_envs},)"
-            )
-        self._reset_mask_E.copy_(mask_E)
+        self._take_mask(mask_E)
         self._graphs.run("reset", self._launch_reset)
 
     def field(self, name: str) -> Tensor:
@@ -131,13 +186,48 @@ class World(views.DataViews):
             raise unknown_name("per-world model field", name, self._fields)
         return self._fields[name]
 
-    def set_const(self, fields: Sequence[str]) -> None:
-        """Recompute, in all worlds, the constants that MuJoCo derives from `fields` (after writing into them)."""
+    def set_const(self, fields: Sequence[str], mask_E: Tensor | None = None) -> None:
+        """Recompute the constants that MuJoCo derives from `fields`, after writing into them.
+
+        Args:
+            fields: model fields that have changed, by MuJoCo's names; those that nothing derives from cost nothing.
+            mask_E: bool [E], the worlds in which they have changed; the others keep their constants bit for bit. On
+                most robots this is much cheaper than all worlds. On models with tendons or flexes, with actuators on
+                anything but hinges and slides, or with moved frames of bodies that equality constraints tie, it costs
+                as much.
+        """
         groups = const_groups(fields)
-        if groups:
-            self._graphs.run(
-                ("set_const", groups), lambda: mjw.set_const(self.warp_model, self.warp_data_E, groups)
-            )
+        if not groups:
+            return
+        everywhere = lambda: mjw.set_const(self.warp_model, self.warp_data_E, groups)  # noqa: E731
+        if mask_E is None:
+            self._graphs.run(("set_const", groups), everywhere)
+            return
+        self._take_mask(mask_E)
+        constants = self._masked_constants
+        if constants is not None and constants.covers(fields):
+            self._graphs.run(("set_const of rows", groups), lambda: constants.launch(groups))
+            return
+        held = {name: self._fields[name].clone() for name in derived_fields(groups)}
+        self._graphs.run(("set_const", groups), everywhere)
+        for name, before in held.items():
+            rows = mask_E.view(-1, *[1] * (before.ndim - 1))
+            self._fields[name].copy_(torch.where(rows, self._fields[name], before))
+
+    def launch(self, key: Hashable, launches: Callable[[], None]) -> None:
+        """Run Warp launches of the caller's own, such as a camera's, in order with the world's.
+
+        They are recorded once and replayed from then on, so they must use arrays that keep their addresses.
+
+        Args:
+            key: names what they do; it is recorded once.
+            launches: issues them.
+        """
+        self._graphs.run(("of others", key), launches)
+
+    def per_world_fields(self) -> dict[str, Tensor]:
+        """Return the views [E, ...] of the model fields that differ between worlds, by name."""
+        return dict(self._fields)
 
     def overflow_report(self, *, clear: bool = True) -> OverflowReport:
         """Read what the physics needed since the last report; one transfer to the host. Call it once per rollout."""
@@ -145,6 +235,13 @@ class World(views.DataViews):
         if clear:
             self._overflow.clear()
         return report
+
+    def nan_report(self) -> NanReport:
+        """Write the worlds that became non-finite since the last report to files; reads the device.
+
+        Call it once per rollout. Without `sim.nan_guard` there is nothing to read, and the report is empty.
+        """
+        return NanReport() if self._nan_guard is None else self._nan_guard.report()
 
     def state_dict(self) -> dict[str, Tensor]:
         """Copy everything that the next steps depend on, so that a restored world continues bit for bit on CPU."""
@@ -165,14 +262,35 @@ class World(views.DataViews):
         return (views.nbytes(self.warp_data_E) + fields) // self.num_envs
 
     def close(self) -> None:
-        """Free the graphs and arrays. Views that are still held keep their memory."""
+        """Free the graphs and arrays, after a last `nan_report`. Views that are still held keep their memory."""
+        if hasattr(self, "_fields"):
+            self.nan_report()
+        self._nan_guard = None
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         self._graphs.clear()
-        for name in ("warp_data_E", "warp_model", "_substeps", "_overflow", "_zeroed_at_reset", "_fields"):
+        parts = ("_substeps", "_masked_constants", "_overflow", "_zeroed_at_reset", "_fields")
+        for name in ("warp_data_E", "warp_model", *parts):
             if hasattr(self, name):
                 delattr(self, name)
         self.drop_views()
+
+    def _prepare_constants(self, expanded: Sequence[str]) -> MaskedConstants | None:
+        groups = const_groups(expanded)
+        if not groups:
+            return None
+        if groups & FIXED:
+            # From now on the same bits, however often they are recomputed.
+            mjw.set_const(self.warp_model, self.warp_data_E, FIXED)
+        return MaskedConstants(self.mj_model, self.warp_model, self._reset_mask, expanded)
+
+    def _take_mask(self, mask_E: Tensor) -> None:
+        if mask_E.dtype != torch.bool or mask_E.shape != (self.num_envs,):
+            raise ValueError(
+                f"mask_E is {mask_E.dtype} of shape {tuple(mask_E.shape)}: expected torch.bool of shape "
+                f"({self.num_envs},)"
+            )
+        self._reset_mask_E.copy_(mask_E)
 
     def _state_tensors(self) -> dict[str, Tensor]:
         tensors = state.data_tensors(self.warp_data_E)
@@ -184,10 +302,18 @@ class World(views.DataViews):
         }
         return tensors
 
-    def _launch_substeps(self, n: int) -> None:
+    def _launch_substeps(self, n: int, sensors: str) -> None:
         for substep in range(n):
-            self._substeps.advance(sensors=substep == n - 1)
-            self._overflow.record()
+            self._launch_substep(sensors=sensors == "every" or substep == n - 1)
+
+    def _launch_substep(self, *, sensors: bool) -> None:
+        guard = self._nan_guard
+        if guard is not None:
+            guard.before_substep()
+        self._substeps.advance(sensors=sensors)
+        self._overflow.record()
+        if guard is not None:
+            guard.after_substep()
 
     def _launch_reset(self) -> None:
         mjw.reset_data(self.warp_model, self.warp_data_E, reset=self._reset_mask)

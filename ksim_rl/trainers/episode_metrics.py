@@ -13,7 +13,7 @@ def read_episode_sums(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Ten
     """Return what happened in this rollout, each a tensor [] on the device, and start the env's sums anew.
 
     Any env gives the mean reward per step; one with an `episode_log` also its sums over the episodes that ended, and
-    one with `curriculum_levels` those.
+    one with `curriculum_levels` and `command_levels` those.
     """
     sums = {"rollout/reward": rollout_ET.get(("next", "reward")).mean()}
     base_env = innermost(env)
@@ -23,6 +23,8 @@ def read_episode_sums(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Ten
         base_env.episode_log_reset_()
     if hasattr(base_env, "curriculum_levels"):
         sums |= {f"curriculum/{name}": level for name, level in base_env.curriculum_levels().items()}
+    if hasattr(base_env, "command_levels"):
+        sums |= {f"command/{name}": level for name, level in base_env.command_levels().items()}
     return sums
 
 
@@ -59,3 +61,11 @@ def overflow_report(env: EnvBase) -> tuple[dict[str, float], tuple[str, ...]]:
         return {}, ()
     report = world.overflow_report()
     return {f"physics/{name}": value for name, value in report.metrics.items()}, tuple(report.messages)
+
+
+def nan_messages(env: EnvBase) -> tuple[str, ...]:
+    """Return what the physics' NaN guard saved since the last call, one line each; reads the device if it is on."""
+    world = getattr(innermost(env), "world", None)
+    if world is None or not hasattr(world, "nan_report"):
+        return ()
+    return world.nan_report().messages

@@ -11,7 +11,12 @@ from tensordict import TensorDictBase
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.envs.innermost import innermost
 from ksim_rl.trainers import checkpoint
-from ksim_rl.trainers.episode_metrics import episode_means, overflow_report, read_episode_sums
+from ksim_rl.trainers.episode_metrics import (
+    episode_means,
+    nan_messages,
+    overflow_report,
+    read_episode_sums,
+)
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
 from ksim_rl.trainers.interrupt import InterruptRequest
 from ksim_rl.trainers.loggers import MetricLogger
@@ -121,11 +126,14 @@ class Trainer:
             read_episode_sums(env, rollout_ET) | self.update.metrics(), device=self.update.device
         )
         physics, losses = overflow_report(env)
+        saved = nan_messages(env)
         metrics = pending.read()
         self.iteration += 1
         seconds = self.clock.lap()
 
         self._warn(losses, metrics)
+        for text in saved:
+            self.progress.note(f"NaN guard: {text}")
         self.update.check(metrics)
         metrics = episode_means(
             metrics, max_episode_length_s=getattr(innermost(env), "max_episode_length_s", 0.0)

@@ -67,7 +67,7 @@ def test_cfg_job_prints_the_composed_config(capsys, tmp_path, monkeypatch):
 def test_help_lists_the_tasks_and_the_groups(capsys):
     code, output = run(capsys, "train", "--help")
     assert code == 0
-    assert "task: cartpole_balance, cartpole_swingup" in output.out
+    assert "cartpole_balance, cartpole_swingup" in output.out
     for group in ("collector", "data", "objective", "modules", "trainer", "logger"):
         assert f"\n{group}: " in output.out
 
@@ -91,6 +91,15 @@ def test_envs_lists_each_task_in_one_line(capsys):
     assert code == 0
     assert lines[0].split()[:2] == ["task", "robot"]
     assert any(line.startswith("cartpole_swingup") and "swing" in line for line in lines)
+
+
+def test_envs_prints_what_one_task_is_made_of(capsys):
+    code, output = run(capsys, "envs", "cartpole_balance")
+    assert code == 0
+    assert "episodes of 10 s = 1000 steps" in output.out.splitlines()[0]
+    assert " ".join(output.out.split()).count("0 balance 1 CartpoleReward()") == 1
+    code, output = run(capsys, "envs", "cartpole_balanse")
+    assert code == 2 and "did you mean 'cartpole_balance'" in output.err
 
 
 @pytest.mark.parametrize("command", ["eval", "play", "resume"])

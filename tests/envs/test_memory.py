@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from ksim_rl.envs.memory import Memory
 from tests.envs.mdp.bench import FREE_BODY, Bench
 
 E = 16
@@ -99,3 +100,20 @@ def test_what_observations_return_shares_no_memory_with_the_state():
     assert view.detached(computed) is computed
     aliased = view.joint_pos_EL
     assert view.detached(aliased).data_ptr() != aliased.data_ptr()
+
+
+def test_a_buffer_starts_at_its_initial_value_whenever_it_starts():
+    memory = Memory(3, torch.device("cpu"))
+    pose_L = torch.tensor([1.0, 2.0])
+    target_EL = memory.get("target", 2, initial=pose_L)
+    gain_EL = memory.get("gain", 2, keep=True, initial=pose_L)
+    assert target_EL.tolist() == [[1.0, 2.0]] * 3
+    target_EL.fill_(9.0)
+    memory.freeze()
+    assert target_EL.tolist() == gain_EL.tolist() == [[1.0, 2.0]] * 3
+    target_EL.fill_(9.0)
+    gain_EL.fill_(8.0)
+    pose_L[0] = 5.0
+    memory.clear(torch.tensor([False, True, False]))
+    assert target_EL.tolist() == [[9.0, 9.0], [5.0, 2.0], [9.0, 9.0]], "what it is now"
+    assert gain_EL.tolist() == [[8.0, 8.0]] * 3

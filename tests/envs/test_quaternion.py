@@ -33,7 +33,9 @@ def test_rotate_is_mju_rotvecquat_and_its_inverse_undoes_it(pairs):
     rotated = quaternion.rotate(torch.tensor(q), torch.tensor(v))
     torch.testing.assert_close(rotated, torch.tensor(expected))
     torch.testing.assert_close(quaternion.rotate_inverse(torch.tensor(q), rotated), torch.tensor(v))
-    torch.testing.assert_close(quaternion.rotate(quaternion.conjugate(torch.tensor(q)), rotated), torch.tensor(v))
+    torch.testing.assert_close(
+        quaternion.rotate(quaternion.conjugate(torch.tensor(q)), rotated), torch.tensor(v)
+    )
 
 
 def test_euler_angles_compose_as_mju_euler2quat_xyz():
@@ -46,7 +48,9 @@ def test_euler_angles_compose_as_mju_euler2quat_xyz():
 
 def test_yaw_is_the_heading_of_the_x_axis(pairs):
     (q, _), _ = pairs
-    x_axis = quaternion.rotate(torch.tensor(q), torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64).expand(50, 3))
+    x_axis = quaternion.rotate(
+        torch.tensor(q), torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64).expand(50, 3)
+    )
     torch.testing.assert_close(quaternion.yaw(torch.tensor(q)), torch.atan2(x_axis[:, 1], x_axis[:, 0]))
 
 
@@ -54,3 +58,20 @@ def test_wrap_to_pi():
     angles = torch.tensor([0.0, math.pi + 0.1, -math.pi - 0.1, 7.0])
     expected = torch.atan2(torch.sin(angles), torch.cos(angles))
     torch.testing.assert_close(quaternion.wrap_to_pi(angles), expected)
+
+
+def test_angle_between_is_the_length_of_mju_subquat(pairs):
+    (a, b), _ = pairs
+    difference, expected = np.zeros(3), np.zeros(50)
+    for i in range(50):
+        mujoco.mju_subQuat(difference, a[i], b[i])
+        expected[i] = np.linalg.norm(difference)
+    a, b, expected = torch.tensor(a), torch.tensor(b), torch.tensor(expected)
+    torch.testing.assert_close(quaternion.angle_between(a, b), expected)
+    torch.testing.assert_close(quaternion.angle_between(a, -b), expected)
+    assert quaternion.angle_between(a, -a).abs().max() < 1e-7
+    # A thousandth of a degree is still seen in float32.
+    small = math.radians(1e-3)
+    tilted = torch.tensor([math.cos(small / 2), math.sin(small / 2), 0.0, 0.0])
+    angle = quaternion.angle_between(tilted, torch.tensor([1.0, 0.0, 0.0, 0.0]))
+    assert angle.item() == pytest.approx(small, rel=1e-3)

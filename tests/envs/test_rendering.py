@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import pytest
+import torch
 
-from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg, ViewerCfg, rendering
-from tests.envs.probe_env import DT, Launch, Target, puck_cfg, push
+from ksim_rl.envs import ImuSensor, ManagerBasedRlEnv, ManagerBasedRlEnvCfg, ViewerCfg, rendering
+from tests.envs.probe_env import DT, Launch, Position, Target, puck_cfg, push
 
 WIDTH, HEIGHT = 64, 48
 # From above, 0.1 m of radius in a picture that shows about 0.8 m of height.
@@ -128,6 +129,39 @@ def test_terms_draw_into_the_picture(gl):
     assert red_pixels({"target": Target(resampling_time_range_s=times)}) == 0
 
 
+def test_each_env_of_the_picture_is_drawn_with_its_marks(gl):
+    wide = dataclasses.replace(TOP, lookat=(0.25, 0.25, 0.0), distance=1.8, num_envs=4)
+    cfg = drawing_cfg(viewer=wide, num_envs=4, events={"launch": Launch(speed=0.0)})
+    cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, spacing=0.5))
+    env = ManagerBasedRlEnv(cfg, render_mode="rgb_array")
+    place(env, *[0.0] * 4)
+    picture = env.render().astype(int)
+    assert blobs(picture[..., 1] > picture[..., [0, 2]].max(-1) + 60) == (2, 2), "a green ball over each puck"
+    assert blobs(picture[..., 0] > picture[..., 1:].max(-1) + 60) == (2, 2), "a red one beside it"
+    env.close()
+
+
+def test_the_picture_shows_the_envs_own_model_fields(gl):
+    @dataclass(frozen=True, kw_only=True)
+    class Grow(Launch):
+        per_world_fields = ("geom_size",)
+
+        def __call__(self, view, mask_E):
+            super().__call__(view, mask_E)
+            view.field("geom_size")[:, 0, 0] = torch.tensor([0.05, 0.2])
+
+    def area(env_index):
+        viewer = dataclasses.replace(TOP, env_index=env_index)
+        cfg = puck_cfg(limit=None, events={"grow": Grow(speed=0.0)}, viewer=viewer, num_envs=2)
+        env = ManagerBasedRlEnv(cfg, render_mode="rgb_array")
+        place(env, 0.0, 0.0)
+        picture = env.render()
+        env.close()
+        return lit(picture).sum()
+
+    assert area(1) > 6 * area(0), "four times the radius"
+
+
 def test_a_closed_renderer_opens_again_for_the_next_env(gl):
     for _ in range(2):
         env = filmed()
@@ -217,3 +251,46 @@ def test_update_visualizers_calls_the_terms_that_draw():
     ((center, radius),) = recorder.spheres
     assert center == pytest.approx((2.0 * DT, 0.25, 0.0)) and radius == 0.08, "env 1 moves at 2 m/s"
     assert list(env.setup_manager_visualizers()) == ["commands/target"]
+    env.update_visualizers(recorder, env_index=0)
+    assert recorder.spheres[1][0] == pytest.approx((1.0 * DT, 0.25, 0.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawnPosition(Position):
+    """Draws a ball above the puck."""
+
+    def draw_debug(self, view, visualizer, env_index):
+        x = float(view.joint_pos_EL[env_index, 0])
+        visualizer.sphere((x, 0.0, 0.3), radius=0.05, rgba=(0.0, 1.0, 0.0, 1.0))
+
+
+def drawing_cfg(**fields) -> ManagerBasedRlEnvCfg:
+    cfg = puck_cfg(
+        limit=None,
+        commands={
+            "target": DrawnTarget(resampling_time_range_s=(DT, DT)),
+            "other": Target(resampling_time_range_s=(DT, DT)),
+        },
+        rewards={"position": DrawnPosition(), "unused": DrawnPosition(weight=0.0), "plain": Position()},
+        **fields,
+    )
+    unit = ImuSensor(body="puck")
+    return dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, sensors={"imu": unit}))
+
+
+@pytest.mark.parametrize(
+    ("draw", "names"),
+    [
+        ((".*",), ["commands/target", "rewards/position", "sensors/imu"]),
+        (("rewards/.*", "sensors/im."), ["rewards/position", "sensors/imu"]),
+        ((), []),
+    ],
+)
+def test_commands_rewards_and_sensors_draw_if_the_viewer_asks_for_them(draw, names):
+    env = ManagerBasedRlEnv(drawing_cfg(viewer=ViewerCfg(draw=draw)))
+    assert list(env.setup_manager_visualizers()) == names
+
+
+def test_a_pattern_that_is_none_is_refused():
+    with pytest.raises(ValueError, match=r"draw\[0\]='\(': no regular expression"):
+        ViewerCfg(draw=("(",))

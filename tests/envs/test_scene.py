@@ -1,12 +1,14 @@
 """Scenes: robots, prefixes, terrain, refusals."""
 
 import dataclasses
+import math
 
 import mujoco
+import numpy as np
 import pytest
 import torch
 
-from ksim_rl.envs import ContactSensor, ManagerBasedRlEnv, MjcfRobot, PlaneTerrain, SceneCfg
+from ksim_rl.envs import ContactSensor, ManagerBasedRlEnv, MjcfRobot, Placement, PlaneTerrain, SceneCfg
 from ksim_rl.envs.mdp import JointEffortAction
 from ksim_rl.envs.scene import Robot, build_spec
 from tests.envs.probe_env import PUCK_XML, SUBSTEP_S, puck_cfg, push
@@ -25,6 +27,21 @@ CART = """
   <keyframe><key name="start" qpos="0.25 0.5"/><key name="other" qpos="9 9"/></keyframe>
 </mujoco>
 """
+
+CUBE = """
+<mujoco><worldbody><body pos="0 0 0.1"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body></worldbody></mujoco>
+"""
+TABLE = """
+<mujoco>
+  <worldbody>
+    <geom name="top" size="0.1" pos="1 0 0.5"/>
+    <frame pos="0.5 0 0"><body name="lamp"><geom size="0.1"/></body></frame>
+    <body name="ball"><freejoint/><geom size="0.1"/></body>
+  </worldbody>
+  <keyframe><key name="start" qpos="1 2 3 1 0 0 0"/></keyframe>
+</mujoco>
+"""
+"""A fixed geom, a fixed body inside a frame, and a free ball."""
 
 
 def scene(**fields) -> mujoco.MjModel:
@@ -53,6 +70,43 @@ def test_several_robots_all_start_at_their_default_poses():
     cart, puck = MjcfRobot(source=CART), MjcfRobot(source=PUCK_XML)
     model = scene(robots={"a": cart, "b": puck, "c": cart})
     assert model.nkey == 1 and model.key_qpos.tolist() == [[0.25, 0.5, 0.0, 0.25, 0.5]]
+
+
+def test_objects_come_after_robots_and_are_named_like_them():
+    cart, cube = MjcfRobot(source=CART), MjcfRobot(source=CUBE)
+    model = scene(robots={"cart": cart}, objects={"cube": cube})
+    assert names(model, "body") == ["world", "cart/cart", "cube/body0"], "an unnamed body is named"
+    assert model.key_qpos.tolist() == [[0.25, 0.5, 0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0]]
+
+
+def test_placements_move_bodies_fixed_geoms_and_free_keyframes():
+    quarter_turn = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
+    placement = Placement(pos=(5.0, 0.0, 1.0), quat=quarter_turn)
+    turned = np.array([*quarter_turn])
+    for robots in (
+        {"a": MjcfRobot(source=TABLE)},
+        {"b": MjcfRobot(source=CART), "a": MjcfRobot(source=TABLE)},
+    ):
+        model = scene(robots=robots, placements={"a": placement})
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+        mujoco.mj_forward(model, data)
+        prefix = "a/" if len(robots) > 1 else ""
+        # (x, y, z) turns into (-y, x, z), then moves.
+        np.testing.assert_allclose(data.geom(f"{prefix}top").xpos, [5.0, 1.0, 1.5], atol=1e-9)
+        np.testing.assert_allclose(data.body(f"{prefix}lamp").xpos, [5.0, 0.5, 1.0], atol=1e-9)
+        np.testing.assert_allclose(data.body(f"{prefix}ball").xpos, [3.0, 1.0, 4.0], atol=1e-9)
+        np.testing.assert_allclose(data.body(f"{prefix}ball").xquat, turned, atol=1e-9)
+
+
+def test_entities_have_names_of_their_own():
+    puck = MjcfRobot(source=PUCK_XML)
+    with pytest.raises(ValueError, match="objects: 'puck' is the name of a robot"):
+        SceneCfg(robots={"puck": puck}, objects={"puck": puck})
+    with pytest.raises(ValueError, match="placements: no robot or object 'pick': did you mean 'puck'"):
+        SceneCfg(robots={"puck": puck}, placements={"pick": Placement()})
+    with pytest.raises(ValueError, match=r"quat=\(1\.0, 1\.0, 0\.0, 0\.0\): expected a unit quaternion"):
+        Placement(quat=(1.0, 1.0, 0.0, 0.0))
 
 
 def test_options_of_several_robots_are_those_of_the_first(recwarn):
@@ -88,6 +142,14 @@ def test_the_plane_is_a_body_of_its_own_with_its_friction():
     assert geom.size[:2].tolist() == [0.0, 0.0], "infinite in x and y"
 
 
+def test_the_plane_collides_whatever_the_robots_default_class_says():
+    ghostly = PUCK_XML.replace(
+        "<worldbody>", '<default><geom contype="0" conaffinity="0" condim="6"/></default><worldbody>'
+    )
+    geom = scene(robots={"puck": MjcfRobot(source=ghostly)}, terrain=PlaneTerrain()).geom("terrain")
+    assert (geom.contype, geom.conaffinity, geom.condim) == (1, 1, 3)
+
+
 def test_without_terrain_there_is_none():
     assert "terrain" not in names(scene(robots={"puck": MjcfRobot(source=PUCK_XML)}), "body")
 
@@ -97,12 +159,9 @@ def test_sensors_of_several_robots_use_the_prefixed_names():
     robots, terrain = {"a": puck, "b": puck}, PlaneTerrain()
     sensors = {"touch": ContactSensor(geoms=("b/puck",))}
     model = scene(robots=robots, terrain=terrain, sensors=sensors)
-    assert [model.sensor(i).name for i in range(model.nsensor)] == [
-        "touch_b/puck_found",
-        "touch_b/puck_force",
-    ]
+    assert [model.sensor(i).name for i in range(model.nsensor)] == ["touch_b/puck"]
     with pytest.raises(
-        ValueError, match=r"scene\.sensors\.touch: no geom 'puck': did you mean 'b/puck' or 'a/puck'"
+        ValueError, match=r"scene\.sensors\.touch: no geom matches 'puck': did you mean 'b/puck' or 'a/puck'"
     ):
         scene(robots=robots, terrain=terrain, sensors={"touch": ContactSensor(geoms=("puck",))})
 

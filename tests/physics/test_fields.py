@@ -5,10 +5,55 @@ import numpy as np
 import pytest
 import torch
 
-from ksim_rl.physics import SimCfg, World
+from ksim_rl.physics import SimCfg, World, load_model, prepare_spec
 from tests.physics.models import cartpole, quadruped, standing_quadrupeds
 
 SIM = SimCfg(njmax=80, nconmax=40)
+
+EVERY_JOINT = """
+<mujoco>
+  <worldbody>
+    <light name="sun" pos="0 0 3"/>
+    <camera name="outside" mode="trackcom" pos="0 -2 1"/>
+    <body name="base" pos="0.1 0 1" quat="1 .2 0 .1">
+      <freejoint/>
+      <geom type="box" size=".1 .2 .3" mass="2" pos=".1 0 0"/>
+      <camera name="inside" pos=".1 .2 0" mode="trackcom"/>
+      <body name="arm" pos="0 .2 0">
+        <joint name="ball" type="ball" pos="0 -.05 0"/>
+        <geom type="capsule" size=".05 .2" mass=".7" pos=".1 .2 0"/>
+        <body name="hand" pos=".3 0 0" quat="1 0 .5 0">
+          <joint name="slide" type="slide" axis="1 1 0"/>
+          <joint name="hinge" axis="0 1 1" pos=".1 0 0" armature=".02"/>
+          <geom type="sphere" size=".1" mass=".3" pos="0 0 .1"/>
+          <body name="finger" pos="0 .1 0"><geom size=".04" mass=".2"/></body>
+        </body>
+      </body>
+    </body>
+    <body name="wheel" pos="1 0 0"><joint name="axle"/><geom size=".1" mass="1" pos="0 .1 0"/></body>
+  </worldbody>
+  TENDON
+  <actuator>
+    <position joint="slide" gear="3" kp="2"/>
+    <motor joint="hinge" gear="-2"/>
+  </actuator>
+</mujoco>
+"""
+TENDON = """<tendon><fixed name="pull" limited="true" range="-1 1"><joint joint="slide" coef="1"/>
+  <joint joint="axle" coef="-2"/></fixed></tendon>"""
+CONSTANTS = (
+    *(
+        "body_subtreemass",
+        "dof_invweight0",
+        "body_invweight0",
+        "actuator_acc0",
+        "tendon_length0",
+        "tendon_invweight0",
+    ),
+    *("cam_pos0", "cam_poscom0", "cam_mat0", "light_pos0", "light_poscom0", "light_dir0"),
+)
+INERTIAL = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_armature")
+KINEMATIC = ("body_mass", "body_pos", "body_quat", "jnt_pos", "jnt_axis", "actuator_gear")
 
 
 def with_constants(
@@ -17,7 +62,8 @@ def with_constants(
     """The C engine's model with the fields of one world, and all that follows from them."""
     changed = copy.copy(mj_model)
     for field in fields:
-        getattr(changed, field)[:] = world.field(field)[row].numpy()
+        values = getattr(changed, field)
+        values[:] = world.field(field)[row].numpy().reshape(values.shape)
     mujoco.mj_setConst(changed, mujoco.MjData(changed))
     return changed
 
@@ -80,3 +126,83 @@ def test_unknown_and_shared_fields_are_named():
     world = World(cartpole(), num_envs=2)
     with pytest.raises(ValueError, match="'body_mass' is shared by all worlds: add it to per_world_fields"):
         world.field("body_mass")
+
+
+def every_joint(fields: tuple[str, ...], *, tendon: str = "") -> World:
+    """Three worlds with other numbers in each of the fields; the constants are those of the model as compiled."""
+    spec = mujoco.MjSpec.from_string(EVERY_JOINT.replace("TENDON", tendon))
+    prepare_spec(spec, INERTIAL)
+    world = World(load_model(spec), num_envs=3, per_world_fields=fields, sim=SIM)
+    generator = torch.Generator().manual_seed(0)
+    for name in fields:
+        field = world.field(name)
+        if name.endswith(("pos", "quat", "axis")):
+            field += 0.2 * torch.randn(field.shape, generator=generator)
+        else:
+            field *= 1.0 + torch.rand(field.shape, generator=generator)
+        if name.endswith(("quat", "axis")):
+            field /= field.norm(dim=-1, keepdim=True)
+    return world
+
+
+@pytest.mark.parametrize(
+    ("fields", "tendon"),
+    [(INERTIAL, ""), (KINEMATIC, ""), (INERTIAL, TENDON)],
+    ids=("inertial", "kinematic", "with a tendon"),
+)
+def test_constants_of_masked_rows_are_those_of_the_c_engine_and_others_stay(fields, tendon):
+    world = every_joint(fields, tendon=tendon)
+    world.set_const(fields)
+    before = {name: world.field(name).clone() for name in CONSTANTS}
+    mask_E = torch.tensor([True, False, True])
+    for name in fields:
+        if not name.endswith(("quat", "axis")):
+            world.field(name)[mask_E] *= 1.3
+    world.set_const(fields, mask_E)
+    for row in range(3):
+        expected = with_constants(world.mj_model, row, world, fields)
+        for name in CONSTANTS:
+            actual = world.field(name)[row]
+            if row == 1:
+                assert torch.equal(actual, before[name][row]), name
+                continue
+            wanted = getattr(expected, name)
+            np.testing.assert_allclose(
+                actual.numpy().reshape(wanted.shape), wanted, rtol=2e-5, atol=1e-5, err_msg=name
+            )
+    assert not torch.allclose(world.field("dof_invweight0")[0], before["dof_invweight0"][0], rtol=0.01)
+
+
+def test_masked_constants_equal_those_of_all_rows():
+    world = every_joint(INERTIAL)
+    world.set_const(INERTIAL, torch.ones(3, dtype=torch.bool))
+    masked = {name: world.field(name).clone() for name in CONSTANTS}
+    world.set_const(INERTIAL)
+    for name, values in masked.items():
+        torch.testing.assert_close(values, world.field(name), rtol=5e-6, atol=1e-6)
+
+
+def test_masked_set_const_leaves_the_state_alone():
+    world = standing_quadrupeds(per_world_fields=("body_mass", "body_ipos"))
+    before = {name: view.clone() for name, view in world.views().items()}
+    world.set_const(("body_mass", "body_ipos"), torch.tensor([True, False, True, True]))
+    for name, tensor in before.items():
+        assert torch.equal(world.view(name), tensor), name
+    with pytest.raises(ValueError, match="mask_E is torch.float32"):
+        world.set_const(("body_mass",), torch.ones(4))
+
+
+def test_moved_centres_of_mass_need_bodies_that_are_not_compiled_as_simple():
+    source = '<mujoco><worldbody><body name="ball"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
+    with pytest.raises(ValueError, match="'body_ipos', but body 'ball' is compiled as simple"):
+        World(load_model(source), num_envs=2, per_world_fields=("body_ipos",))
+
+
+def test_room_for_dry_friction_that_the_model_does_not_have():
+    spec = mujoco.MjSpec.from_string(EVERY_JOINT.replace("TENDON", ""))
+    plain = World(load_model(spec), num_envs=1)
+    rubbing = World(load_model(spec), num_envs=1, per_world_fields=("dof_frictionloss",))
+    rubbing.field("dof_frictionloss")[:] = 1.0
+    rubbing.step(1)
+    assert rubbing.njmax >= plain.njmax + 3
+    assert not rubbing.overflow_report().messages

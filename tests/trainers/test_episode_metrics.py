@@ -1,8 +1,13 @@
 """Sums over episodes as means that compare across tasks."""
 
 import pytest
+import torch
 
-from ksim_rl.trainers.episode_metrics import episode_means
+from ksim_rl.envs import mdp
+from ksim_rl.trainers.episode_metrics import episode_means, read_episode_sums
+from ksim_rl.trainers.loggers.csv_table import CsvTable, read_table
+from ksim_rl.trainers.metrics import start_copy
+from tests.envs.probe_env import DT, Position, puck_env
 
 SUMS = {
     "sum/episodes": 4.0,
@@ -44,3 +49,39 @@ def test_an_env_without_episode_log_gives_what_it_has():
     assert episode_means({"rollout/reward": 1.0}, max_episode_length_s=1.0) == pytest.approx(
         {"rollout/reward": 1.0}
     )
+
+
+def test_rewards_ends_and_the_levels_of_curricula_and_commands_reach_the_table(tmp_path):
+    ranges = {"start": {"height": (0.5, 0.5)}, "end": {"height": (0.0, 1.0)}}
+    env = puck_env(
+        limit=0.1,
+        episode_length_s=4 * DT,
+        rewards={"position": Position(), "still": Position(weight=-0.5)},
+        commands={"height": mdp.BaseHeightCommand(resampling_time_range_s=None, height=(0.2, 0.4))},
+        curriculum={
+            "level": mdp.LinearLevel(end_step=16),
+            "heights": mdp.CommandRangesByLevel(command="height", **ranges),
+        },
+    )
+    rollout_ET = env.rollout(4, lambda td: td.set("action", torch.zeros(3, 1)), break_when_any_done=False)
+    env.reset()  # the level moves when envs reset
+    sums = start_copy(read_episode_sums(env, rollout_ET), device=env.device).read()
+    table = CsvTable(tmp_path / "metrics.csv")
+    table.log_metrics(episode_means(sums, max_episode_length_s=env.max_episode_length_s), 12)
+    (row,) = read_table(tmp_path / "metrics.csv")[1]
+    # In four steps: env 0 times out once; 1 is beyond 0.1 m in step 3, 2 in steps 2 and 4.
+    assert float(row["episode/count"]) == 4 and float(row["termination/time_out"]) == 0.25
+    assert float(row["termination/beyond"]) == 0.75 and float(row["termination/non_finite"]) == 0.0
+    assert float(row["reward/still"]) == pytest.approx(-0.5 * float(row["reward/position"])) != 0.0
+    assert float(row["curriculum/level"]) == float(row["curriculum/heights"]) == 0.25
+    assert (
+        float(row["command/height/height_low"]) == 0.375 and float(row["command/height/height_high"]) == 0.625
+    )
+    assert env.episode_log()["episodes"] == 0.0, "and the sums start anew"
+
+
+def test_without_a_curriculum_there_are_no_levels_to_report():
+    env = puck_env(
+        commands={"height": mdp.BaseHeightCommand(resampling_time_range_s=None, height=(0.2, 0.4))}
+    )
+    assert env.command_levels() == {} and env.curriculum_levels() == {}

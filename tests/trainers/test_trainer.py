@@ -139,6 +139,30 @@ def test_lost_contacts_are_said_once_and_stay_in_the_metrics():
     assert [row["physics/nefc_share"] for row in logger.rows if "physics/nefc_share" in row] == [1.5] * 3
 
 
+class GuardedWorld(LossyWorld):
+    """A world whose NaN guard saved something in the first rollout."""
+
+    reports = 0
+
+    def nan_report(self):
+        self.reports += 1
+
+        class Report:
+            messages = ("world 3 became non-finite: see nan-0.safetensors",) if self.reports == 1 else ()
+
+        return Report()
+
+
+def test_what_the_nan_guard_saved_is_said_where_it_happened():
+    env, notes = make_env(), Notes()
+    env.base_env.__dict__["world"] = world = GuardedWorld()
+    make_trainer(iterations=2, env=env).train(notes)
+    assert world.reports == 2, "once per rollout"
+    assert [note for note in notes.notes if "nan-0.safetensors" in note] == [
+        "NaN guard: world 3 became non-finite: see nan-0.safetensors"
+    ]
+
+
 def test_envs_that_became_non_finite_are_reported():
     env, notes = make_env(), Notes()
     env.base_env.totals["termination/non_finite"].fill_(2.0)

@@ -14,11 +14,13 @@ class ActionManager:
 
     def __init__(self, terms: Mapping[str, ActionTerm], view: EnvView) -> None:
         self._view = view
+        self.sizes: dict[str, int] = {}
         self._parts: list[tuple[str, ActionTerm, slice]] = []
         start = 0
         for name, term in terms.items():
             with view.scope(f"actions/{name}"):
-                stop = start + term.size(view)
+                self.sizes[name] = term.size(view)
+            stop = start + self.sizes[name]
             self._parts.append((f"actions/{name}", term, slice(start, stop)))
             start = stop
         self.size = start

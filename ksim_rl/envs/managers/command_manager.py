@@ -1,10 +1,11 @@
 """Keeps the commands: clocks, resampling, and the vectors that policy and rewards see."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
+from ksim_rl.checks import unknown_name
 from ksim_rl.envs.term import CommandTerm
 from ksim_rl.envs.view import EnvView
 
@@ -18,12 +19,20 @@ class CommandManager:
     def __init__(self, terms: Mapping[str, CommandTerm], view: EnvView) -> None:
         self._view = view
         self._terms = dict(terms)
-        self._clocks = {name: view.memories.get(f"commands/{name}.time_left_E") for name in terms}
+        self._clocks = {
+            name: view.memories.get(f"commands/{name}.time_left_E")
+            for name, term in terms.items()
+            if term.resampling_time_range_s is not None
+        }
         nobody_E = torch.zeros(view.num_envs, dtype=torch.bool, device=view.device)
         for name, term in terms.items():
             with view.scope(f"commands/{name}"):
                 term.resample(view, nobody_E)
                 value_EK = term(view)
+                if term.ranges:
+                    # Columns beyond those of `ranges` are the term's own.
+                    columns = term.shared_ranges(view).unbind(-1)
+                    view.command_ranges[name] = dict(zip(term.ranges, columns, strict=False))
             if value_EK.ndim != 2 or value_EK.shape[0] != view.num_envs:
                 raise ValueError(
                     f"command term {name!r} returns shape {tuple(value_EK.shape)}: expected [{view.num_envs}, K], one "
@@ -37,8 +46,32 @@ class CommandManager:
         return self._view.commands
 
     def time_left(self, name: str) -> Tensor:
-        """Return the seconds until each env resamples, [E]."""
-        return self._clocks[name]
+        """Return the seconds until each env resamples, [E]; infinite for a command that resets alone resample."""
+        if name in self._clocks:
+            return self._clocks[name]
+        return torch.full((self._view.num_envs,), torch.inf, device=self._view.device)
+
+    def set(self, name: str, values: Tensor | Sequence[float], env_ids: Sequence[int] | None = None) -> None:
+        """Set a command that takes values from outside (`JoystickCommand`); call it between two steps.
+
+        The next observation shows them. Values are written in place, so that a captured step sees them too.
+
+        Args:
+            name: of the command.
+            values: [K], or a row for each env [E, K].
+            env_ids: the envs that take them; None for all.
+
+        Raises:
+            ValueError: for an unknown name, a command that is drawn, or values that do not fit.
+        """
+        if name not in self._terms:
+            raise unknown_name("command", name, self._terms)
+        view = self._view
+        mask_E = torch.zeros(view.num_envs, dtype=torch.bool)
+        mask_E[slice(None) if env_ids is None else list(env_ids)] = True
+        value_EK = torch.as_tensor(values, dtype=torch.float32, device=view.device)
+        with view.scope(f"commands/{name}"):
+            self._terms[name].set(view, value_EK, mask_E.to(view.device))
 
     def resample(self, mask_E: Tensor) -> None:
         """Draw new targets for the rows of `mask_E` that reset."""
@@ -52,21 +85,23 @@ class CommandManager:
                 value_EK = term(self._view)
             held_EK = self._view.commands[name]
             held_EK.copy_(torch.where(mask_E[:, None], value_EK, held_EK))
+        self._view.command_cache.clear()
 
     def step(self, going_on_E: Tensor) -> None:
         """Run the clocks of the rows that go on, resample where they ran out, and recompute these rows' vectors."""
         for name, term in self._terms.items():
-            clock_E = self._clocks[name]
-            clock_E.sub_(self._view.step_dt)
-            self._draw(
-                name, term, (clock_E < 0.5 * self._view.step_dt) & going_on_E, "step", self._view.step_count
-            )
+            if name in self._clocks:
+                clock_E = self._clocks[name]
+                clock_E.sub_(self._view.step_dt)
+                due_E = (clock_E < 0.5 * self._view.step_dt) & going_on_E
+                self._draw(name, term, due_E, "step", self._view.step_count)
         self.refresh(going_on_E)
 
     def _draw(self, name: str, term: CommandTerm, mask_E: Tensor, moment: str, counter: Tensor) -> None:
-        low, high = term.resampling_time_range_s
-        clock_E = self._clocks[name]
-        with self._view.scope(f"commands/{name}/clock/{moment}", counter):
-            clock_E.copy_(torch.where(mask_E, self._view.uniform(1, low, high)[:, 0], clock_E))
+        if term.resampling_time_range_s is not None:
+            clock_E = self._clocks[name]
+            with self._view.scope(f"commands/{name}/clock/{moment}", counter):
+                drawn_E = self._view.uniform(1, *term.resampling_time_range_s)[:, 0]
+            clock_E.copy_(torch.where(mask_E, drawn_E, clock_E))
         with self._view.scope(f"commands/{name}", counter, draws=moment):
             term.resample(self._view, mask_E)

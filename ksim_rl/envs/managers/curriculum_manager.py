@@ -10,12 +10,21 @@ from ksim_rl.envs.view import EnvView
 
 
 class CurriculumManager:
-    """Keeps the latest level of each curriculum on the device."""
+    """Keeps the latest level of each curriculum on the device.
+
+    Raises:
+        ValueError: if two curricula drive `view.level`, or one does not return a single level.
+    """
 
     def __init__(self, terms: Mapping[str, CurriculumTerm], view: EnvView) -> None:
         self._view = view
         self._terms = dict(terms)
         self.names = tuple(terms)
+        drivers = {name: term.first_level for name, term in terms.items() if term.first_level is not None}
+        if len(drivers) > 1:
+            raise ValueError(f"curriculum: {' and '.join(drivers)} all drive the one level: keep one of them")
+        for level in drivers.values():
+            view.level.fill_(level)
         self.levels_C = torch.zeros(len(self.names), device=view.device)
         self.reset(torch.zeros(view.num_envs, dtype=torch.bool, device=view.device))
 

@@ -10,7 +10,7 @@ from ksim_rl.envs.view import EnvView
 
 
 class EventManager:
-    """Runs each event in its mode.
+    """Runs each event in its mode, then recomputes the model constants that follow from the fields that it wrote.
 
     Interval clocks count down in seconds, one per env and event, and start anew when a row resets. They run out at the
     env step that is nearest, so that an interval of n steps ends at the n-th, whatever the subtractions round to.
@@ -18,6 +18,7 @@ class EventManager:
 
     def __init__(self, terms: Mapping[str, EventTerm], view: EnvView) -> None:
         self._view = view
+        self.terms = dict(terms)
         self._by_mode: dict[str, list[tuple[str, EventTerm]]] = {}
         for name, term in terms.items():
             self._by_mode.setdefault(term.mode, []).append((f"events/{name}", term))
@@ -29,7 +30,7 @@ class EventManager:
             with view.scope(scope):
                 term(view, nobody_E)
 
-    def fields(self, *modes: str) -> tuple[str, ...]:
+    def _fields(self, *modes: str) -> tuple[str, ...]:
         """Return the per-world model fields that the events of these modes write."""
         terms = [term for mode in modes for _, term in self._by_mode.get(mode, [])]
         return tuple(dict.fromkeys(field for term in terms for field in term.per_world_fields))
@@ -40,6 +41,7 @@ class EventManager:
         for scope, term in self._by_mode.get("startup", []):
             with self._view.scope(scope, self._view.startup_counter):
                 term(self._view, everybody_E)
+        self._view.world.set_const(self._fields("startup"))
 
     def reset(self, mask_E: Tensor) -> None:
         """Run the reset events for the rows of `mask_E`, and restart their interval clocks."""
@@ -47,6 +49,7 @@ class EventManager:
         for scope, term in self._by_mode.get("reset", []):
             with view.scope(scope, view.reset_count_E):
                 term(view, mask_E)
+        view.world.set_const(self._fields("reset"), mask_E)
         for scope, term in self._by_mode.get("interval", []):
             with view.scope(f"{scope}/clock", view.reset_count_E):
                 self._restart(scope, term, mask_E)
@@ -54,6 +57,7 @@ class EventManager:
     def step(self) -> None:
         """Run the interval events whose clocks have run out, and the step events."""
         view = self._view
+        written: list[Tensor] = []
         for scope, term in self._by_mode.get("interval", []):
             clock_E = self._clocks[scope]
             clock_E.sub_(view.step_dt)
@@ -62,11 +66,16 @@ class EventManager:
                 self._restart(scope, term, due_E)
             with view.scope(scope):
                 term(view, due_E)
+            if term.per_world_fields:
+                written.append(due_E)
+        if written:
+            view.world.set_const(self._fields("interval"), torch.stack(written).any(0))
         if "step" in self._by_mode:
             everybody_E = torch.ones(view.num_envs, dtype=torch.bool, device=view.device)
             for scope, term in self._by_mode["step"]:
                 with view.scope(scope):
                     term(view, everybody_E)
+            view.world.set_const(self._fields("step"), everybody_E)
 
     def _restart(self, scope: str, term: EventTerm, mask_E: Tensor) -> None:
         assert term.interval_range_s is not None

@@ -8,6 +8,8 @@ from torch import Tensor
 from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg
 from ksim_rl.envs.view import EnvView
 
+IMAGE_DTYPES = (torch.float32, torch.int32, torch.uint8)
+
 
 class ObservationManager:
     """Computes the union of the groups' terms; what groups add to them is done by transforms."""
@@ -15,16 +17,26 @@ class ObservationManager:
     def __init__(self, groups: Mapping[str, ObservationGroupCfg], view: EnvView) -> None:
         self._view = view
         self.terms = {name: cfg.term for group in groups.values() for name, cfg in group.terms.items()}
-        for name, reading_EL in self.read().items():
-            has_rows = reading_EL.ndim == 2 and reading_EL.shape[0] == view.num_envs
-            if not has_rows or reading_EL.dtype != torch.float32:
+        for name, reading in self.read().items():
+            image = getattr(self.terms[name], "is_image", False)
+            fits = reading.ndim in (3, 4) and reading.dtype in IMAGE_DTYPES
+            if not image:
+                fits = reading.ndim == 2 and reading.dtype == torch.float32
+            if not fits or reading.shape[0] != view.num_envs:
+                expected = f"torch.float32 [{view.num_envs}, L], one row per env"
+                if image:
+                    expected = (
+                        f"[{view.num_envs}, H, W] or [{view.num_envs}, H, W, C], float32, int32 or uint8"
+                    )
                 raise ValueError(
-                    f"observation term {name!r} returns {reading_EL.dtype} {tuple(reading_EL.shape)}: expected "
-                    f"torch.float32 [{view.num_envs}, L], one row per env"
+                    f"observation term {name!r} returns {reading.dtype} {tuple(reading.shape)}: expected {expected}"
                 )
 
     def read(self) -> dict[str, Tensor]:
-        """Return the readings of the current state by term, float32 [E, L], none of them aliasing the state."""
+        """Return the readings of the current state by term, none of them aliasing the state.
+
+        They are float32 [E, L], and images [E, H, W] or [E, H, W, C].
+        """
         readings = {}
         for name, term in self.terms.items():
             with self._view.scope(f"observations/{name}"):

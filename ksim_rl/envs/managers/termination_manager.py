@@ -20,6 +20,7 @@ class TerminationManager:
         self._is_finite_horizon = is_finite_horizon
         self.names = (*terms, "non_finite")
         self.flags_EK = torch.zeros(view.num_envs, len(self.names), dtype=torch.bool, device=view.device)
+        view.terminations = dict(zip(self.names, self.flags_EK.unbind(-1), strict=True))
         time_out = [term.time_out for term in terms.values()] + [False]
         self._time_out_K = torch.tensor(time_out, device=view.device)
         self.step(torch.ones(view.num_envs, dtype=torch.bool, device=view.device))
@@ -42,6 +43,7 @@ class TerminationManager:
         self.flags_EK.copy_(torch.stack((*flags, ~finite_E), dim=-1))
         timed_out_E = (self.flags_EK & self._time_out_K).any(-1)
         failed_E = (self.flags_EK & ~self._time_out_K).any(-1)
+        self._view.terminated_E, self._view.truncated_E = failed_E, timed_out_E
         if self._is_finite_horizon:
             return failed_E | timed_out_E, torch.zeros_like(timed_out_E)
         return failed_E, timed_out_E

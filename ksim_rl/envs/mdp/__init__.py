@@ -1,84 +1,330 @@
 """The term library: what observations, rewards, events and the rest of a task are put together from."""
 
-from ksim_rl.envs.mdp.actions import JointEffortAction, JointPositionAction
+from ksim_rl.envs.mdp.actions import (
+    ActuatorAction,
+    JointEffortAction,
+    JointPositionAction,
+    JointPositionVelocityAction,
+    JointVelocityAction,
+    RelativeJointPositionAction,
+)
 from ksim_rl.envs.mdp.commands import UniformVelocityCommand
+from ksim_rl.envs.mdp.commands_gait import SinusoidalGaitCommand
+from ksim_rl.envs.mdp.commands_joystick import JoystickCommand
+from ksim_rl.envs.mdp.commands_pose import (
+    BaseHeightCommand,
+    CartesianCommand,
+    JointPositionCommand,
+    StartPoseCommand,
+)
+from ksim_rl.envs.mdp.curriculum_level import DistanceLevel, EpisodeLengthLevel, LinearLevel, SaturationLevel
+from ksim_rl.envs.mdp.curriculum_scale import (
+    CommandRangesByLevel,
+    CommandRangesByStage,
+    RewardWeightByLevel,
+    RewardWeightByStage,
+)
 from ksim_rl.envs.mdp.events import PushByVelocity, ResetJoints, ResetRootUniform
+from ksim_rl.envs.mdp.events_motion import ResetToMotion
+from ksim_rl.envs.mdp.events_push import Jump, PushByForce
+from ksim_rl.envs.mdp.events_reset import ResetHeading, ResetHeight, ResetJointsByScale
+from ksim_rl.envs.mdp.height_scan import HeightScan
+from ksim_rl.envs.mdp.manipulation import NearBody, OffsetToBody, OffsetToCommand
 from ksim_rl.envs.mdp.metrics import ActionAcceleration, AngularVelocityError, LinearVelocityError
+from ksim_rl.envs.mdp.metrics_effort import CostOfTransport, Power
+from ksim_rl.envs.mdp.metrics_feet import FootSlipSpeed, PeakContactForce, PeakFootHeight
+from ksim_rl.envs.mdp.metrics_success import Success, TargetReached
+from ksim_rl.envs.mdp.motion_tracking import (
+    FarFromMotion,
+    MotionBodyOffset,
+    MotionFinished,
+    MotionJoints,
+    MotionPhase,
+    TrackMotionBodyPos,
+    TrackMotionBodyQuat,
+    TrackMotionJointPos,
+    TrackMotionJointVel,
+)
 from ksim_rl.envs.mdp.observations import (
     Command,
-    FootAirTime,
-    FootContact,
-    FootContactForces,
-    FootHeight,
-    JointPos,
-    JointPosRel,
-    JointVel,
     LastAction,
     ProjectedGravity,
     RootAngVel,
     RootLinVel,
     RootPos,
     RootQuat,
+    RootRotation6d,
     SensorReading,
 )
-from ksim_rl.envs.mdp.randomize import RandomizeBodyCom, RandomizeEncoderBias, RandomizeGeomFriction
-from ksim_rl.envs.mdp.rewards import ActionRateL2, ActuatorForceL2, Alive, JointVelL2
-from ksim_rl.envs.mdp.rewards_feet import FeetAirTime, FootClearance, FootSlip, FootSwingHeight, SoftLanding
-from ksim_rl.envs.mdp.rewards_posture import (
-    AngularMomentum,
-    BodyAngularVelocity,
-    JointPosLimits,
-    Pose,
-    Upright,
+from ksim_rl.envs.mdp.observations_bodies import (
+    BodyAngVel,
+    BodyLinVel,
+    BodyPos,
+    BodyQuat,
+    BodyRotation6d,
+    CenterOfMassPos,
+    CenterOfMassVel,
 )
-from ksim_rl.envs.mdp.rewards_tracking import TrackAngularVelocity, TrackLinearVelocity
-from ksim_rl.envs.mdp.terminations import BadOrientation, RootHeightBelow, TimeOut
+from ksim_rl.envs.mdp.observations_contacts import (
+    Contact,
+    ContactForce,
+    FootAirTime,
+    FootContact,
+    FootContactForces,
+    FootHeight,
+    FootPos,
+)
+from ksim_rl.envs.mdp.observations_joints import (
+    ActuatorForce,
+    JointAcc,
+    JointEffort,
+    JointPos,
+    JointPosRel,
+    JointVel,
+)
+from ksim_rl.envs.mdp.observations_rays import RayDistance, RayHeight
+from ksim_rl.envs.mdp.observations_sensors import CameraImage, ImuReading
+from ksim_rl.envs.mdp.observations_time import Clock, EpisodeTime, RemainingTime
+from ksim_rl.envs.mdp.outside_terrain import OutsideTerrain
+from ksim_rl.envs.mdp.randomize_actuators import RandomizeActuatorGains, RandomizeEffortLimit
+from ksim_rl.envs.mdp.randomize_bodies import RandomizeBodyCom, RandomizeBodyInertia, RandomizeBodyMass
+from ksim_rl.envs.mdp.randomize_geoms import (
+    RandomizeGeomFriction,
+    RandomizeGeomPos,
+    RandomizeGeomQuat,
+    RandomizeGeomSize,
+)
+from ksim_rl.envs.mdp.randomize_gravity import RandomizeGravity
+from ksim_rl.envs.mdp.randomize_joints import (
+    RandomizeDefaultJointPos,
+    RandomizeEncoderBias,
+    RandomizeJointArmature,
+    RandomizeJointDamping,
+    RandomizeJointFrictionLoss,
+    RandomizeJointRange,
+    RandomizeJointStiffness,
+    RandomizeJointZero,
+)
+from ksim_rl.envs.mdp.randomize_pseudo_inertia import RandomizePseudoInertia
+from ksim_rl.envs.mdp.rewards import (
+    ActionAccelerationL2,
+    ActionJerkL2,
+    ActionRateL2,
+    Alive,
+    Terminated,
+)
+from ksim_rl.envs.mdp.rewards_contacts import ContactForceAbove, SelfCollision, UndesiredContacts
+from ksim_rl.envs.mdp.rewards_feet import (
+    FeetAirTime,
+    FootClearance,
+    FootSlip,
+    FootSwingHeight,
+    GaitPhase,
+    SoftLanding,
+)
+from ksim_rl.envs.mdp.rewards_joints import (
+    ActuatorForceL2,
+    Energy,
+    JointAccL2,
+    JointDeviationL1,
+    JointDeviationL2,
+    JointEffortL2,
+    JointEffortLimits,
+    JointPosLimits,
+    JointVelL2,
+    JointVelLimits,
+)
+from ksim_rl.envs.mdp.rewards_motion import (
+    AngularMomentum,
+    AngVelXYL2,
+    BodyAngularVelocity,
+    LinkAccelerationL2,
+    LinVelZL2,
+    MotionlessAtRest,
+)
+from ksim_rl.envs.mdp.rewards_posture import Pose, RootHeightL2, TiltL2, Upright
+from ksim_rl.envs.mdp.rewards_symmetry import ActionSymmetryL2, JointSymmetryL2
+from ksim_rl.envs.mdp.rewards_tracking import (
+    TrackAngularVelocity,
+    TrackJointPosition,
+    TrackLinearVelocity,
+    TrackOrientation,
+    TrackPosition,
+    TrackRootHeight,
+)
+from ksim_rl.envs.mdp.terminations import (
+    BadOrientation,
+    FarFromOrigin,
+    IllegalContact,
+    JointLimitViolated,
+    JointVelocityAbove,
+    NonFiniteState,
+    RootHeightBelow,
+    RootVelocityAbove,
+    TimeOut,
+)
+from ksim_rl.envs.mdp.terrain_levels import TerrainLevels
 
 __all__ = [
     "ActionAcceleration",
+    "ActionAccelerationL2",
+    "ActionJerkL2",
     "ActionRateL2",
+    "ActionSymmetryL2",
+    "ActuatorAction",
+    "ActuatorForce",
     "ActuatorForceL2",
     "Alive",
+    "AngVelXYL2",
     "AngularMomentum",
     "AngularVelocityError",
     "BadOrientation",
+    "BaseHeightCommand",
+    "BodyAngVel",
     "BodyAngularVelocity",
+    "BodyLinVel",
+    "BodyPos",
+    "BodyQuat",
+    "BodyRotation6d",
+    "CameraImage",
+    "CartesianCommand",
+    "CenterOfMassPos",
+    "CenterOfMassVel",
+    "Clock",
     "Command",
+    "CommandRangesByLevel",
+    "CommandRangesByStage",
+    "Contact",
+    "ContactForce",
+    "ContactForceAbove",
+    "CostOfTransport",
+    "DistanceLevel",
+    "Energy",
+    "EpisodeLengthLevel",
+    "EpisodeTime",
+    "FarFromMotion",
+    "FarFromOrigin",
     "FeetAirTime",
     "FootAirTime",
     "FootClearance",
     "FootContact",
     "FootContactForces",
     "FootHeight",
+    "FootPos",
     "FootSlip",
+    "FootSlipSpeed",
     "FootSwingHeight",
+    "GaitPhase",
+    "HeightScan",
+    "IllegalContact",
+    "ImuReading",
+    "JointAcc",
+    "JointAccL2",
+    "JointDeviationL1",
+    "JointDeviationL2",
+    "JointEffort",
     "JointEffortAction",
+    "JointEffortL2",
+    "JointEffortLimits",
+    "JointLimitViolated",
     "JointPos",
     "JointPosLimits",
     "JointPosRel",
     "JointPositionAction",
+    "JointPositionCommand",
+    "JointPositionVelocityAction",
+    "JointSymmetryL2",
     "JointVel",
     "JointVelL2",
+    "JointVelLimits",
+    "JointVelocityAbove",
+    "JointVelocityAction",
+    "JoystickCommand",
+    "Jump",
     "LastAction",
+    "LinVelZL2",
+    "LinearLevel",
     "LinearVelocityError",
+    "LinkAccelerationL2",
+    "MotionBodyOffset",
+    "MotionFinished",
+    "MotionJoints",
+    "MotionPhase",
+    "MotionlessAtRest",
+    "NearBody",
+    "NonFiniteState",
+    "OffsetToBody",
+    "OffsetToCommand",
+    "OutsideTerrain",
+    "PeakContactForce",
+    "PeakFootHeight",
     "Pose",
+    "Power",
     "ProjectedGravity",
+    "PushByForce",
     "PushByVelocity",
+    "RandomizeActuatorGains",
     "RandomizeBodyCom",
+    "RandomizeBodyInertia",
+    "RandomizeBodyMass",
+    "RandomizeDefaultJointPos",
+    "RandomizeEffortLimit",
     "RandomizeEncoderBias",
     "RandomizeGeomFriction",
+    "RandomizeGeomPos",
+    "RandomizeGeomQuat",
+    "RandomizeGeomSize",
+    "RandomizeGravity",
+    "RandomizeJointArmature",
+    "RandomizeJointDamping",
+    "RandomizeJointFrictionLoss",
+    "RandomizeJointRange",
+    "RandomizeJointStiffness",
+    "RandomizeJointZero",
+    "RandomizePseudoInertia",
+    "RayDistance",
+    "RayHeight",
+    "RelativeJointPositionAction",
+    "RemainingTime",
+    "ResetHeading",
+    "ResetHeight",
     "ResetJoints",
+    "ResetJointsByScale",
     "ResetRootUniform",
+    "ResetToMotion",
+    "RewardWeightByLevel",
+    "RewardWeightByStage",
     "RootAngVel",
     "RootHeightBelow",
+    "RootHeightL2",
     "RootLinVel",
     "RootPos",
     "RootQuat",
+    "RootRotation6d",
+    "RootVelocityAbove",
+    "SaturationLevel",
+    "SelfCollision",
     "SensorReading",
+    "SinusoidalGaitCommand",
     "SoftLanding",
+    "StartPoseCommand",
+    "Success",
+    "TargetReached",
+    "Terminated",
+    "TerrainLevels",
+    "TiltL2",
     "TimeOut",
     "TrackAngularVelocity",
+    "TrackJointPosition",
     "TrackLinearVelocity",
-    "Upright",
+    "TrackMotionBodyPos",
+    "TrackMotionBodyQuat",
+    "TrackMotionJointPos",
+    "TrackMotionJointVel",
+    "TrackOrientation",
+    "TrackPosition",
+    "TrackRootHeight",
+    "UndesiredContacts",
     "UniformVelocityCommand",
+    "Upright",
 ]

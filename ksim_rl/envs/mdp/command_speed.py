@@ -1,4 +1,4 @@
-"""How fast a velocity command asks to move: what pose and foot rewards switch on."""
+"""How fast a velocity command asks to move: what pose and foot rewards switch on. Each is computed once per command."""
 
 import torch
 from torch import Tensor
@@ -8,10 +8,20 @@ from ksim_rl.envs.view import EnvView
 
 def commanded_speed(view: EnvView, command: str) -> Tensor:
     """Return |c_xy| + |c_z| of the command (vx, vy, wz), m/s and rad/s added as numbers, [E]."""
-    command_EK = view.command(command)
-    return torch.linalg.vector_norm(command_EK[:, :2], dim=-1) + command_EK[:, 2].abs()
+    key = f"speed of {command}"
+    speed_E = view.command_cache.get(key)
+    if speed_E is None:
+        command_EK = view.command(command)
+        speed_E = torch.linalg.vector_norm(command_EK[:, :2], dim=-1) + command_EK[:, 2].abs()
+        view.command_cache[key] = speed_E
+    return speed_E
 
 
 def is_commanded(view: EnvView, command: str, threshold: float) -> Tensor:
     """Return 1 where the commanded speed exceeds the threshold, else 0, float32 [E]."""
-    return (commanded_speed(view, command) > threshold).to(torch.float32)
+    key = f"speed of {command} > {threshold}"
+    moves_E = view.command_cache.get(key)
+    if moves_E is None:
+        moves_E = (commanded_speed(view, command) > threshold).to(torch.float32)
+        view.command_cache[key] = moves_E
+    return moves_E

@@ -1,6 +1,7 @@
-"""Command generators."""
+"""The command of a velocity task. Others: `commands_pose`, `commands_gait`, `commands_joystick`."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +38,7 @@ class UniformVelocityCommand(CommandTerm):
         heading_stiffness: 1/s.
         rel_standing_envs, rel_heading_envs, rel_forward_envs: probabilities.
         forward_min_speed: m/s.
+        entity: the robot that it is for; "" is the first one.
     """
 
     lin_vel_x: Range
@@ -48,6 +50,7 @@ class UniformVelocityCommand(CommandTerm):
     rel_heading_envs: float = 0.0
     rel_forward_envs: float = 0.0
     forward_min_speed: float = 0.3
+    entity: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -58,13 +61,19 @@ class UniformVelocityCommand(CommandTerm):
         check_in_range("heading_stiffness", self.heading_stiffness, low=0.0)
         check_in_range("forward_min_speed", self.forward_min_speed, low=0.0)
 
+    @property
+    def ranges(self) -> Mapping[str, Range]:
+        """What a curriculum may change."""
+        return {name: getattr(self, name) for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z", "heading")}
+
+    def shared_ranges(self, view: EnvView) -> Tensor:
+        """Return the present ranges, and after them three of [0, 1) for the kinds, (low, high) [2, 7]."""
+        return view.shared("ranges_2N", tuple(zip(*self.ranges.values(), *[(0.0, 1.0)] * 3, strict=True)))
+
     def resample(self, view: EnvView, mask_E: Tensor) -> None:
         """Draw velocities, heading targets and kinds for the rows of `mask_E`."""
         # One draw for all: targets in their ranges, then three numbers in [0, 1) that decide the kinds.
-        ranges = (self.lin_vel_x, self.lin_vel_y, self.ang_vel_z, self.heading, *[(0.0, 1.0)] * 3)
-        low_7 = constant([low for low, _ in ranges], view.device)
-        high_7 = constant([high for _, high in ranges], view.device)
-        target_E4, kind_E3 = view.uniform(7, low_7, high_7).split((4, 3), dim=-1)
+        target_E4, kind_E3 = view.uniform(7, *self.shared_ranges(view).unbind(0)).split((4, 3), dim=-1)
         standing_E, heading_E = kind_E3[:, 0] < self.rel_standing_envs, kind_E3[:, 1] < self.rel_heading_envs
         is_forward_E1 = kind_E3[:, 2:] < self.rel_forward_envs
         vx_E = target_E4[:, 0].abs().clamp(min=self.forward_min_speed)
@@ -79,19 +88,20 @@ class UniformVelocityCommand(CommandTerm):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the command of the current heading and targets, float32 [E, 3]."""
         target_E4, kind_E2 = self._target(view), self._kind(view)
-        error_E = quaternion.wrap_to_pi(target_E4[:, 3] - view.heading_E)
-        steer_E = (self.heading_stiffness * error_E).clamp(*self.ang_vel_z)
+        error_E = quaternion.wrap_to_pi(target_E4[:, 3] - view.entity(self.entity).heading_E)
+        steer_E = (self.heading_stiffness * error_E).clamp(*self.shared_ranges(view)[:, 2].unbind())
         wz_E = torch.where(kind_E2[:, 1], steer_E, target_E4[:, 2])
         command_E3 = torch.cat((target_E4[:, :2], wz_E[:, None]), dim=-1)
         return torch.where(kind_E2[:, :1], 0.0, command_E3)
 
     def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw the commanded (green) and the actual (blue) planar velocity above the root, 0.5 m per m/s."""
-        above = view.root_pos_EL[env_index] + constant((0.0, 0.0, 0.3), view.device)
-        command_E3, actual_E3 = self(view), view.root_lin_vel_b_EL
+        robot = view.entity(self.entity)
+        above = robot.root_pos_EL[env_index] + constant((0.0, 0.0, 0.3), view.device)
+        command_E3, actual_E3 = self(view), robot.root_lin_vel_b_EL
         for velocity_E3, rgba in ((command_E3, _COMMANDED), (actual_E3, _REACHED)):
             planar_E3 = torch.cat((velocity_E3[:, :2], torch.zeros_like(velocity_E3[:, :1])), dim=-1)
-            arrow_E3 = 0.5 * quaternion.rotate(view.root_quat_EL, planar_E3)
+            arrow_E3 = 0.5 * quaternion.rotate(robot.root_quat_EL, planar_E3)
             start = above.cpu().numpy()
             visualizer.arrow(start, start + np.asarray(arrow_E3[env_index].cpu()), rgba=rgba)
 

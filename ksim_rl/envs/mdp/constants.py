@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checks import near
+from ksim_rl.envs.names import as_index
 
 
 def constant(values: Sequence[float], device: torch.device) -> Tensor:
@@ -20,6 +21,17 @@ def _constant(values: tuple[float, ...], device: torch.device) -> Tensor:
     # Made outside of inference mode: the tensor outlives the mode of the call that happens to come first.
     with torch.inference_mode(False):
         return torch.tensor(values, dtype=torch.float32, device=device)
+
+
+def index_constant(ids: Sequence[int], device: torch.device) -> Tensor | slice:
+    """Return `ids` as an index on the device, a slice if they are contiguous; the same for the same ids, for ever."""
+    return _index_constant(tuple(ids), device)
+
+
+@cache
+def _index_constant(ids: tuple[int, ...], device: torch.device) -> Tensor | slice:
+    with torch.inference_mode(False):
+        return as_index(ids, device)
 
 
 def values_by_name(field: str, table: Mapping[str, float], names: Sequence[str]) -> tuple[float, ...]:

@@ -1,4 +1,7 @@
-"""Events that write the state: resets and pushes. Randomization of the model: `randomize`."""
+"""Events that write the state: the resets and the push that most tasks use.
+
+Others: `events_reset`, `events_push`, `events_motion`. Randomization of the model: `randomize`.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,6 +12,7 @@ from torch import Tensor
 
 from ksim_rl.checks import check_choice, check_in_range, check_pair
 from ksim_rl.envs import quaternion
+from ksim_rl.envs.entity import Entity
 from ksim_rl.envs.mdp import se3_ranges
 from ksim_rl.envs.mdp.constants import constant
 from ksim_rl.envs.names import Patterns
@@ -20,13 +24,17 @@ from ksim_rl.envs.view import EnvView
 class ResetRootUniform(EventTerm):
     """Put the free root body at its default pose plus a uniform offset, with a uniform velocity.
 
+    On a terrain the default pose stands at the env's origin.
+
     Attributes:
         pose_range: by axis: x, y, z (m, world frame), roll, pitch, yaw (rad, in the default pose's frame).
         velocity_range: by axis: x, y, z (m/s), roll, pitch, yaw (rad/s), world frame.
+        entity: the robot or object; "" is the first robot.
     """
 
     pose_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     velocity_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    entity: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -35,14 +43,16 @@ class ResetRootUniform(EventTerm):
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
         """Write the rows of `mask_E`."""
-        _require_free_root(view, self)
+        body = free_root_of(view, self, self.entity)
         offset_E6 = se3_ranges.draw(view, self.pose_range)
         velocity_E6 = se3_ranges.draw(view, self.velocity_range)
-        default_17 = view.default_qpos_L[None, :7]
         turn_E4 = quaternion.from_euler_xyz(*offset_E6[:, 3:].unbind(-1))
-        quat_E4 = quaternion.multiply(default_17[:, 3:].expand(view.num_envs, 4), turn_E4)
-        view.write_root_pose(mask_E, default_17[:, :3] + offset_E6[:, :3], quat_E4)
-        view.write_root_velocity(mask_E, velocity_E6[:, :3], velocity_E6[:, 3:])
+        quat_E4 = quaternion.multiply(body.default_root_quat_L.expand(view.num_envs, 4), turn_E4)
+        pos_E3 = body.default_root_pos_L + offset_E6[:, :3]
+        if not view.terrain.is_flat:
+            pos_E3 = pos_E3 + view.terrain.origins_E3
+        body.write_root_pose(mask_E, pos_E3, quat_E4)
+        body.write_root_velocity(mask_E, velocity_E6[:, :3], velocity_E6[:, 3:])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,10 +103,12 @@ class PushByVelocity(EventTerm):
 
     Attributes:
         velocity_range: by axis: x, y, z (m/s), roll, pitch, yaw (rad/s), world frame.
+        entity: the robot or object; "" is the first robot.
     """
 
     velocity_range: Mapping[str, tuple[float, float]]
     mode: Literal["startup", "reset", "interval", "step"] = "interval"
+    entity: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -104,14 +116,21 @@ class PushByVelocity(EventTerm):
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
         """Write the rows of `mask_E`."""
-        _require_free_root(view, self)
+        body = free_root_of(view, self, self.entity)
         kick_E6 = se3_ranges.draw(view, self.velocity_range)
-        lin_vel_E3 = view.root_lin_vel_w_EL + kick_E6[:, :3]
-        view.write_root_velocity(mask_E, lin_vel_E3, view.root_ang_vel_w_EL + kick_E6[:, 3:])
+        lin_vel_E3 = body.root_lin_vel_w_EL + kick_E6[:, :3]
+        body.write_root_velocity(mask_E, lin_vel_E3, body.root_ang_vel_w_EL + kick_E6[:, 3:])
 
 
-def _require_free_root(view: EnvView, term: EventTerm) -> None:
-    if not view.free_root:
+def free_root_of(view: EnvView, term: EventTerm, entity: str) -> Entity:
+    """Return the entity whose root `term` moves.
+
+    Raises:
+        ValueError: if there is no such entity, or its root is fixed.
+    """
+    body = view.entity(entity)
+    if not body.free_root:
         raise ValueError(
-            f"{type(term).__name__} needs a robot whose first joint is free; this one's root is fixed"
+            f"{type(term).__name__} needs a robot whose first joint is free; the root of {body.name!r} is fixed"
         )
+    return body

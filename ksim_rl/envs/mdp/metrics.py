@@ -1,4 +1,7 @@
-"""Values to watch, float32 [E] per step; `reduce` says what of them is reported when an episode ends."""
+"""Values to watch, float32 [E] per step; `reduce` says what of them is reported when an episode ends.
+
+Others: `metrics_effort`, `metrics_feet`, `metrics_success`.
+"""
 
 from dataclasses import dataclass
 
@@ -11,25 +14,37 @@ from ksim_rl.envs.view import EnvView
 
 @dataclass(frozen=True, kw_only=True)
 class LinearVelocityError(MetricTerm):
-    """|c_xy - v_xy| between command and root velocity, both in the root's frame, m/s; velocity stage."""
+    """|c_xy - v_xy| between command and root velocity, both in the root's frame, m/s; velocity stage.
+
+    Attributes:
+        command: (vx, vy, wz), by name.
+        entity: the robot; "" is the first one.
+    """
 
     command: str
+    entity: str = ""
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the value of the current state, [E]."""
-        error_E2 = view.command(self.command)[:, :2] - view.root_lin_vel_b_EL[:, :2]
+        error_E2 = view.command(self.command)[:, :2] - view.entity(self.entity).root_lin_vel_b_EL[:, :2]
         return torch.linalg.vector_norm(error_E2, dim=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class AngularVelocityError(MetricTerm):
-    """|c_z - w_z| between command and root velocity, both in the root's frame, rad/s; velocity stage."""
+    """|c_z - w_z| between command and root velocity, both in the root's frame, rad/s; velocity stage.
+
+    Attributes:
+        command: (vx, vy, wz), by name.
+        entity: the robot; "" is the first one.
+    """
 
     command: str
+    entity: str = ""
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the value of the current state, [E]."""
-        return (view.command(self.command)[:, 2] - view.root_ang_vel_b_EL[:, 2]).abs()
+        return (view.command(self.command)[:, 2] - view.entity(self.entity).root_ang_vel_b_EL[:, 2]).abs()
 
 
 @dataclass(frozen=True, kw_only=True)

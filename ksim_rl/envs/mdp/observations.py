@@ -1,14 +1,18 @@
-"""Observation terms: clean readings, float32 [E, L]. Noise, delay and history are transforms.
+"""Observation terms of the root, of sensors, actions and commands: clean readings, float32 [E, L].
 
-Joints come in the order of the term's `joints`; ".*" is the model's order.
+Noise, delay and history are transforms. Others: `observations_joints`, `observations_bodies`, `observations_contacts`,
+`observations_time`.
 """
 
+import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from ksim_rl.envs.names import Patterns
+from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.envs.mdp.target_pose import FRAMES
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 
@@ -16,91 +20,113 @@ from ksim_rl.envs.view import EnvView
 
 
 @dataclass(frozen=True, kw_only=True)
-class RootPos(ObservationTerm):
+class RootObservation(ObservationTerm):
+    """What the terms of a root share.
+
+    Attributes:
+        entity: the robot or object that is meant; "" is the first robot.
+    """
+
+    entity: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RootPos(RootObservation):
     """Position of the root body's frame in the world, m, [E, 3]; position stage."""
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return view.root_pos_EL
+        return view.entity(self.entity).root_pos_EL
 
 
 @dataclass(frozen=True, kw_only=True)
-class RootQuat(ObservationTerm):
+class RootQuat(RootObservation):
     """Orientation of the root body, body to world, (w, x, y, z), [E, 4]; position stage."""
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return view.root_quat_EL
+        return view.entity(self.entity).root_quat_EL
 
 
 @dataclass(frozen=True, kw_only=True)
-class RootLinVel(ObservationTerm):
-    """Linear velocity of the root body's frame origin, in the root's frame, m/s, [E, 3]; velocity stage."""
+class RootRotation6d(RootObservation):
+    """The root body's x axis, then its y axis, in the world, [E, 6]; position stage.
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
-        return view.root_lin_vel_b_EL
-
-
-@dataclass(frozen=True, kw_only=True)
-class RootAngVel(ObservationTerm):
-    """Angular velocity of the root body, in the root's frame, rad/s, [E, 3]; velocity stage."""
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
-        return view.root_ang_vel_b_EL
-
-
-@dataclass(frozen=True, kw_only=True)
-class ProjectedGravity(ObservationTerm):
-    """Direction of gravity (world -z) in the root's frame, a unit vector, [E, 3]; (0, 0, -1) when upright."""
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
-        return view.projected_gravity_EL
-
-
-# -- joints ------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True)
-class JointPos(ObservationTerm):
-    """Positions of joints, rad or m, [E, L]; position stage."""
-
-    joints: Patterns = ".*"
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
-        return view.joint_pos_EL[:, view.joints(self.joints)]
-
-
-@dataclass(frozen=True, kw_only=True)
-class JointPosRel(ObservationTerm):
-    """Positions of joints minus the default pose, rad or m, [E, L]; position stage.
-
-    Attributes:
-        biased: add the encoders' bias (`RandomizeEncoderBias`), as the robot itself would read them.
+    An orientation without jumps (Zhou et al. 2019).
     """
 
-    joints: Patterns = ".*"
-    biased: bool = False
-
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        index = view.joints(self.joints)
-        pos_EL = view.joint_pos_rel_EL[:, index]
-        return pos_EL + view.encoder_bias_EL[:, index] if self.biased else pos_EL
+        return view.body_axes_w(view.entity(self.entity).root_index)[:, 0, :2].flatten(start_dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointVel(ObservationTerm):
-    """Velocities of joints, rad/s or m/s, [E, L]; velocity stage."""
+class RootLinVel(RootObservation):
+    """Linear velocity of the root body's frame origin, m/s, [E, 3]; velocity stage.
 
-    joints: Patterns = ".*"
+    Attributes:
+        frame: the axes in which it is given: the root's own, or the world's.
+    """
+
+    frame: Literal["root", "world"] = "root"
+
+    def __post_init__(self) -> None:
+        check_choice("frame", self.frame, FRAMES)
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return view.joint_vel_EL[:, view.joints(self.joints)]
+        entity = view.entity(self.entity)
+        return entity.root_lin_vel_b_EL if self.frame == "root" else entity.root_lin_vel_w_EL
+
+
+@dataclass(frozen=True, kw_only=True)
+class RootAngVel(RootObservation):
+    """Angular velocity of the root body, rad/s, [E, 3]; velocity stage.
+
+    Attributes:
+        frame: the axes in which it is given: the root's own, or the world's.
+    """
+
+    frame: Literal["root", "world"] = "root"
+
+    def __post_init__(self) -> None:
+        check_choice("frame", self.frame, FRAMES)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
+        entity = view.entity(self.entity)
+        return entity.root_ang_vel_b_EL if self.frame == "root" else entity.root_ang_vel_w_EL
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectedGravity(RootObservation):
+    """Direction of gravity (world -z) in the root's frame, a unit vector, [E, 3]; (0, 0, -1) when upright.
+
+    Position stage. Dead time, as of a bus, is the business of the group's delay.
+
+    Attributes:
+        time_constant: s, of a first-order lag, as the attitude filter of an IMU has; 0 for none. A reset fills the
+            filter with the new orientation.
+    """
+
+    time_constant: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_in_range("time_constant", self.time_constant, low=0.0)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
+        gravity_E3 = view.entity(self.entity).projected_gravity_EL
+        if self.time_constant == 0.0:
+            return gravity_E3
+        # Readings are also taken when other rows reset: the filter moves on only if an env step has passed.
+        steps_E, filtered_E3 = view.memory("steps_E", dtype=torch.int64), view.memory("filtered_E3", 3)
+        now_E = view.episode_step_E + 1
+        gain = 1.0 - math.exp(-view.step_dt / self.time_constant)
+        gain_E = torch.where(steps_E == 0, 1.0, torch.where(steps_E == now_E, 0.0, gain))
+        filtered_E3.lerp_(gravity_E3, gain_E[:, None])
+        steps_E.copy_(now_E)
+        return torch.nn.functional.normalize(filtered_E3, dim=-1)
 
 
 # -- sensors, action, command ------------------------------------------------------------------------------------
@@ -122,7 +148,10 @@ class SensorReading(ObservationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class LastAction(ObservationTerm):
-    """The action that led to the current state, as the policy gave it, [E, K]; zero after a reset."""
+    """The action that led to the current state, as the policy gave it, [E, K]; zero after a reset.
+
+    Earlier ones: the history of the group's term.
+    """
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
@@ -138,55 +167,3 @@ class Command(ObservationTerm):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
         return view.command(self.command)
-
-
-# -- feet --------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True)
-class FootHeight(ObservationTerm):
-    """Heights of sites above flat ground (z = 0), m, [E, F]; position stage."""
-
-    sites: Patterns
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
-        return view.site_pos_w(view.sites(self.sites))[..., 2]
-
-
-@dataclass(frozen=True, kw_only=True)
-class FootAirTime(ObservationTerm):
-    """Seconds since each foot left the ground, 0 while it touches, [E, F]; acceleration stage."""
-
-    sensor: str
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
-        return view.contact(self.sensor).air_time_EN
-
-
-@dataclass(frozen=True, kw_only=True)
-class FootContact(ObservationTerm):
-    """1 where a foot touches the ground, else 0, [E, F]; acceleration stage."""
-
-    sensor: str
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
-        return view.contact(self.sensor).found_EN
-
-
-@dataclass(frozen=True, kw_only=True)
-class FootContactForces(ObservationTerm):
-    """Net force of each foot on the ground, world frame, sign(f) log(1 + |f|) of newtons, [E, 3F]; acceleration stage.
-
-    MuJoCo's sign: a foot that stands presses down, z is negative.
-    The logarithm keeps an impact of hundreds of newtons in the range of the other observations.
-    """
-
-    sensor: str
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
-        force_EL = view.contact(self.sensor).force_EN3.flatten(start_dim=1)
-        return torch.sign(force_EL) * torch.log1p(torch.abs(force_EL))

@@ -1,122 +1,204 @@
-"""Events that make each world's model differ: domain randomization."""
+"""Events that make each world's model differ: domain randomization. What all of them share.
+
+Each draw starts from the model's own values, so that neither the order of resets nor their number matters.
+"""
 
 import math
-from collections.abc import Mapping
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import ClassVar, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ksim_rl.checks import check_choice, check_in_range, check_pair
 from ksim_rl.envs.mdp.constants import constant
-from ksim_rl.envs.names import Patterns
+from ksim_rl.envs.names import Index, Patterns, as_index
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 
+Pair = tuple[float, float]
 Mode = Literal["startup", "reset", "interval", "step"]
+Operation = Literal["abs", "add", "scale"]
+Distribution = Literal["uniform", "log_uniform", "gaussian"]
+OPERATIONS = ("abs", "add", "scale")
+DISTRIBUTIONS = ("uniform", "log_uniform", "gaussian")
+# Where a gaussian draw is cut, in standard deviations, so that its reach can be checked.
+CUT = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeModelField(EventTerm):
+class Randomize(EventTerm):
+    """Draw values per world: once at startup, for the rows that reset, or at intervals.
+
+    Attributes:
+        operation: "abs" replaces the model's own value, "add" and "scale" start from it, not from the last draw.
+        distribution: "uniform" and "log_uniform" draw between the numbers (low, high) of a range; log_uniform needs
+            positive ones. "gaussian" takes the pair as (mean, standard deviation), and is cut at three of these.
+        shared: one draw for all elements of a world, instead of one for each.
+    """
+
+    operation: Operation = "abs"
+    distribution: Distribution = "uniform"
+    shared: bool = False
+    mode: Mode = "startup"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("operation", self.operation, OPERATIONS)
+        check_choice("distribution", self.distribution, DISTRIBUTIONS)
+
+    def check_range(self, name: str, pair: object) -> None:
+        """Refuse a range that the distribution cannot draw from.
+
+        Raises:
+            ValueError: naming the field, the value and what would be valid.
+        """
+        if self.distribution == "gaussian":
+            check_pair(name, (0.0, 0.0) if _is_pair(pair) else pair)
+            mean, deviation = pair  # pyright: ignore[reportGeneralTypeIssues]
+            check_in_range(f"{name}[0] (mean)", mean)
+            check_in_range(f"{name}[1] (standard deviation)", deviation, low=0.0)
+            return
+        check_pair(name, pair)
+        if self.distribution == "log_uniform":
+            check_in_range(f"{name}[0] (log_uniform)", pair[0], low=0.0, low_open=True)  # pyright: ignore
+
+    def draw(self, view: EnvView, count: int, pairs: Sequence[Pair]) -> Tensor:
+        """Draw float32 [E, count, C], one column per range; [E, 1, C] if shared."""
+        size = (1 if self.shared else count) * len(pairs)
+        first = [float(pair[0]) for pair in pairs]
+        second = [float(pair[1]) for pair in pairs]
+        if self.distribution == "gaussian":
+            mean_C, deviation_C = constant(first, view.device), constant(second, view.device)
+            drawn_ENC = view.normal(size).view(view.num_envs, -1, len(pairs)).clamp(-CUT, CUT)
+            return torch.addcmul(mean_C, drawn_ENC, deviation_C)
+        if self.distribution == "log_uniform":
+            first, second = [math.log(low) for low in first], [math.log(high) for high in second]
+        low_C = constant(first, view.device)
+        width_C = constant([high - low for low, high in zip(first, second, strict=True)], view.device)
+        drawn_ENC = view.uniform(size).view(view.num_envs, -1, len(pairs))
+        drawn_ENC = torch.addcmul(low_C, drawn_ENC, width_C)
+        return torch.exp(drawn_ENC) if self.distribution == "log_uniform" else drawn_ENC
+
+    def combine(self, nominal: Tensor, drawn: Tensor) -> Tensor:
+        """Return the values that the draws make of the model's own."""
+        if self.operation == "abs":
+            return drawn
+        return nominal + drawn if self.operation == "add" else nominal * drawn
+
+    def reach(self, nominal: np.ndarray, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lowest and the highest values that the draws can make of the model's own, shaped like these."""
+        low, high = pair
+        if self.distribution == "gaussian":
+            mean, deviation = pair
+            low, high = mean - CUT * deviation, mean + CUT * deviation
+        if self.operation == "add":
+            return nominal + low, nominal + high
+        if self.operation == "scale":
+            return np.minimum(nominal * low, nominal * high), np.maximum(nominal * low, nominal * high)
+        return np.full_like(nominal, low), np.full_like(nominal, high)
+
+    @abstractmethod
+    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+        """Draw for the rows of `mask_E`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeModelField(Randomize):
     """Draw entries of a model field per world. Subclasses name the field; its rows are elements of one kind.
 
     Attributes:
         elements: names or patterns of what is randomized.
-        ranges: by column of the field, what to draw from.
-        operation: "abs" replaces the entry, "add" and "scale" start from the model's own value, not from the last draw.
-        distribution: over the range, in the same unit; "log_uniform" needs positive bounds.
-        shared: one draw per column for all elements of a world, instead of one for each.
+        ranges: what to draw from, by column of the field; one pair is drawn from for every column.
     """
 
     elements: Patterns
-    ranges: Mapping[int, tuple[float, float]]
-    operation: Literal["abs", "add", "scale"] = "abs"
-    distribution: Literal["uniform", "log_uniform"] = "uniform"
-    shared: bool = False
-    mode: Mode = "startup"
+    ranges: Pair | Mapping[int, Pair]
 
     field: ClassVar[str]
     kind: ClassVar[str]
-    columns: ClassVar[int]
+    columns: ClassVar[int] = 1
+    lowest: ClassVar[float | None] = None
+    """What a value must exceed or equal to make sense, if anything."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_choice("operation", self.operation, ("abs", "add", "scale"))
-        check_choice("distribution", self.distribution, ("uniform", "log_uniform"))
+        if not isinstance(self.ranges, Mapping):
+            self.check_range("ranges", self.ranges)
+            return
         for column, pair in self.ranges.items():
             check_choice("ranges", column, range(self.columns))
-            check_pair(f"ranges[{column}]", pair)
-            if self.distribution == "log_uniform":
-                check_in_range(f"ranges[{column}][0] (log_uniform)", pair[0], low=0.0, low_open=True)
+            self.check_range(f"ranges[{column}]", pair)
 
     @property
     def per_world_fields(self) -> tuple[str, ...]:
         """The one field that this event writes."""
         return (self.field,)
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        """Draw for the rows of `mask_E`."""
-        index = view.resolver.index(self.kind, self.elements)
-        ids = view.resolver.ids(self.kind, self.elements)
-        nominal = getattr(view.world.mj_model, self.field)
-        for column, (low, high) in sorted(self.ranges.items()):
-            drawn_EN = self._draw(view, 1 if self.shared else len(ids), float(low), float(high))
-            own_N = constant(tuple(float(nominal[i, column]) for i in ids), view.device)
-            if self.operation == "add":
-                drawn_EN = own_N + drawn_EN
-            elif self.operation == "scale":
-                drawn_EN = own_N * drawn_EN
-            entries_EN = view.field(self.field)[..., column]
-            entries_EN[:, index] = torch.where(mask_E[:, None], drawn_EN, entries_EN[:, index])
+    def ids(self, view: EnvView) -> tuple[int, ...]:
+        """Return the rows of the field that are meant."""
+        return view.resolver.ids(self.kind, self.elements)
 
-    def _draw(self, view: EnvView, count: int, low: float, high: float) -> Tensor:
-        if self.distribution == "log_uniform":
-            return torch.exp(view.uniform(count, math.log(low), math.log(high)))
-        return view.uniform(count, low, high)
+    def nominal(self, view: EnvView) -> np.ndarray:
+        """Return the model's own values of the rows that are meant, [N, columns]."""
+        values = np.asarray(getattr(view.world.mj_model, self.field), dtype=np.float64)
+        return values.reshape(-1, self.columns)[list(self.ids(view))]
 
-
-@dataclass(frozen=True, kw_only=True)
-class RandomizeGeomFriction(RandomizeModelField):
-    """Friction of geoms; columns: 0 sliding, 1 torsional (m), 2 rolling (m)."""
-
-    field: ClassVar[str] = "geom_friction"
-    kind: ClassVar[str] = "geom"
-    columns: ClassVar[int] = 3
-
-
-@dataclass(frozen=True, kw_only=True)
-class RandomizeBodyCom(RandomizeModelField):
-    """Centre of mass of bodies in the body's frame, m; columns x, y, z."""
-
-    field: ClassVar[str] = "body_ipos"
-    kind: ClassVar[str] = "body"
-    columns: ClassVar[int] = 3
-
-
-@dataclass(frozen=True, kw_only=True)
-class RandomizeEncoderBias(EventTerm):
-    """Offset between a joint's position and what its encoder reads, uniform, per joint and world.
-
-    Observations show it where they ask for it (`JointPosRel(biased=True)`); nothing else feels it.
-
-    Attributes:
-        bias_range: rad or m.
-        joints: names or patterns.
-    """
-
-    bias_range: tuple[float, float]
-    joints: Patterns = ".*"
-    mode: Mode = "startup"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_pair("bias_range", self.bias_range)
+    def pairs(self) -> dict[int, Pair]:
+        """Return the ranges by column, in the order of the columns."""
+        if isinstance(self.ranges, Mapping):
+            return dict(sorted(self.ranges.items()))
+        return dict.fromkeys(range(self.columns), self.ranges)
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
         """Draw for the rows of `mask_E`."""
-        index = view.joints(self.joints)
-        held_EL = view.encoder_bias_EL[:, index]
-        low, high = self.bias_range
-        drawn_EL = view.uniform(held_EL.shape[1], float(low), float(high))
-        view.encoder_bias_EL[:, index] = torch.where(mask_E[:, None], drawn_EL, held_EL)
+        ids, pairs, nominal = self.ids(view), self.pairs(), self.nominal(view)
+        if not pairs:
+            return
+        self._check_reach(view, nominal, pairs)
+        columns = tuple(pairs)
+        own_NC = constant(nominal[:, list(columns)].ravel().tolist(), view.device).view(len(ids), -1)
+        value_ENC = self.combine(own_NC, self.draw(view, len(ids), list(pairs.values())))
+        write_entries(view.field(self.field), ids, columns, mask_E, value_ENC)
+
+    def _check_reach(self, view: EnvView, nominal: np.ndarray, pairs: Mapping[int, Pair]) -> None:
+        if self.lowest is None:
+            return
+        for column, pair in pairs.items():
+            low, _ = self.reach(nominal[:, column], pair)
+            if np.any(low < self.lowest):
+                name = view.resolver.names(self.kind)[
+                    view.resolver.ids(self.kind, self.elements)[int(low.argmin())]
+                ]
+                raise ValueError(
+                    f"{type(self).__name__}.ranges={self.ranges!r}: {self.field} of {self.kind} {name!r} would reach "
+                    f"{low.min():g}; expected at least {self.lowest:g}"
+                )
+
+
+def write_entries(
+    field: Tensor, ids: Sequence[int], columns: Sequence[int], mask_E: Tensor, value_ENC: Tensor
+) -> None:
+    """Write entries of a per-world field [E, rows] or [E, rows, columns] in the worlds of `mask_E`, bool [E]."""
+    entries = field.unsqueeze(-1) if field.ndim == 2 else field
+    rows, across = index(tuple(ids), field.device), index(tuple(columns), field.device)
+    held_ENC = entries[:, rows][..., across]
+    new_ENC = torch.where(mask_E[:, None, None], value_ENC, held_ENC)
+    if isinstance(rows, Tensor) and isinstance(across, Tensor):
+        rows = rows[:, None]
+    entries[:, rows, across] = new_ENC
+
+
+@cache
+def index(ids: tuple[int, ...], device: torch.device) -> Index:
+    """Return ids as a slice where they are contiguous, else as a tensor on the device: the same one each time."""
+    with torch.inference_mode(False):
+        return as_index(ids, device)
+
+
+def _is_pair(value: object) -> bool:
+    return isinstance(value, (tuple, list)) and len(value) == 2

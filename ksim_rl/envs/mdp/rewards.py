@@ -1,11 +1,13 @@
-"""Rewards that any robot can use. Others: `rewards_tracking`, `rewards_posture`, `rewards_feet`."""
+"""Rewards of being alive and of the policy's actions.
+
+Others: `rewards_tracking`, `rewards_posture`, `rewards_motion`, `rewards_joints`, `rewards_contacts`, `rewards_feet`.
+"""
 
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ksim_rl.envs.names import Patterns
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 
@@ -20,6 +22,18 @@ class Alive(RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Terminated(RewardTerm):
+    """1 in the step in which the episode ends by a failure, not by time, [E].
+
+    With `scale_rewards_by_dt` the weight counts `step_dt` times. A world whose physics failed gets no reward at all.
+    """
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return view.terminated_E.to(torch.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
 class ActionRateL2(RewardTerm):
     """|a_t - a_{t-1}|^2 of the policy's raw actions, [E]; the action before the first of an episode is 0."""
 
@@ -29,22 +43,28 @@ class ActionRateL2(RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointVelL2(RewardTerm):
-    """Sum of squared joint velocities, (rad/s)^2 or (m/s)^2, [E]; velocity stage."""
-
-    joints: Patterns = ".*"
+class ActionAccelerationL2(RewardTerm):
+    """|a_t - 2 a_{t-1} + a_{t-2}|^2 of the policy's raw actions, [E]; actions before an episode are 0."""
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        return view.joint_vel_EL[:, view.joints(self.joints)].square().sum(-1)
+        rate_EL = view.action_EL - view.last_action_EL
+        return _change(view, "last_rate_EL", rate_EL).square().sum(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ActuatorForceL2(RewardTerm):
-    """Sum of squared actuator forces, N^2 or (N m)^2, [E]; acceleration stage."""
-
-    actuators: Patterns = ".*"
+class ActionJerkL2(RewardTerm):
+    """|a_t - 3 a_{t-1} + 3 a_{t-2} - a_{t-3}|^2 of the policy's raw actions, [E]; actions before an episode are 0."""
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        return view.world.actuator_force_EL[:, view.actuators(self.actuators)].square().sum(-1)
+        acceleration_EL = _change(view, "last_rate_EL", view.action_EL - view.last_action_EL)
+        return _change(view, "last_acceleration_EL", acceleration_EL).square().sum(-1)
+
+
+def _change(view: EnvView, name: str, value_EL: Tensor) -> Tensor:
+    """Return the change of a value since the last step, and remember the value."""
+    last_EL = view.memory(name, value_EL.shape[-1])
+    change_EL = value_EL - last_EL
+    last_EL.copy_(value_EL)
+    return change_EL

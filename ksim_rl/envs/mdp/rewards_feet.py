@@ -21,7 +21,7 @@ class FootClearance(RewardTerm):
     """active * sum_f |height_f - target_height| * |v_xy,f|, m^2/s, [E]: a foot that moves should be at that height.
 
     Attributes:
-        sites: the feet; heights are above flat ground (z = 0), velocities in the world frame.
+        sites: the feet; heights are above the ground right below them, velocities in the world frame.
         target_height: m.
         command, command_threshold: the term is 0 unless the commanded speed exceeds the threshold.
     """
@@ -34,7 +34,7 @@ class FootClearance(RewardTerm):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
         index = view.sites(self.sites)
-        miss_EF = (view.site_pos_w(index)[..., 2] - self.target_height).abs()
+        miss_EF = (view.site_height(index) - self.target_height).abs()
         speed_EF = torch.linalg.vector_norm(view.site_lin_vel_w(index)[..., :2], dim=-1)
         return (miss_EF * speed_EF).sum(-1) * is_commanded(view, self.command, self.command_threshold)
 
@@ -47,7 +47,7 @@ class FootSwingHeight(RewardTerm):
 
     Attributes:
         sensor: contact sensor, one geom per foot, in the order of `sites`.
-        sites: the feet; heights are above flat ground (z = 0).
+        sites: the feet; heights are above the ground right below them.
         target_height: m.
         command, command_threshold: the term is 0 unless the commanded speed exceeds the threshold.
     """
@@ -65,7 +65,7 @@ class FootSwingHeight(RewardTerm):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
         contact = view.contact(self.sensor)
-        height_EF = view.site_pos_w(view.sites(self.sites))[..., 2]
+        height_EF = view.site_height(view.sites(self.sites))
         memory_EF = view.memory("peak_EF", height_EF.shape[-1])
         peak_EF = torch.where(contact.found_EN > 0, memory_EF, torch.maximum(memory_EF, height_EF))
         memory_EF.copy_(torch.where(contact.first_contact_EN > 0, 0.0, peak_EF))
@@ -130,3 +130,37 @@ class FeetAirTime(RewardTerm):
         inside_EF = (air_time_EF > self.threshold_min) & (air_time_EF < self.threshold_max)
         count_E = inside_EF.to(torch.float32).sum(-1)
         return count_E * is_commanded(view, self.command, self.command_threshold)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaitPhase(RewardTerm):
+    """Fraction of the feet that do what the rhythm asks for: swing where their sine is positive, else stand; [E].
+
+    Attributes:
+        gait: a `SinusoidalGaitCommand`, one offset per foot in the order of `sensor`.
+        sensor: contact sensor, one element per foot.
+        command, command_threshold: the term is 0 unless the commanded speed exceeds the threshold.
+    """
+
+    gait: str
+    sensor: str
+    command: str
+    command_threshold: float
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E].
+
+        Raises:
+            ValueError: if the gait has another number of feet than the sensor.
+        """
+        touches_EF, phase_EL = view.contact(self.sensor).found_EN > 0, view.command(self.gait)
+        feet = touches_EF.shape[-1]
+        if phase_EL.shape[-1] != 2 * feet:
+            raise ValueError(
+                f"gait={self.gait!r} has {phase_EL.shape[-1] // 2} feet, sensor={self.sensor!r} has {feet}: give each "
+                "foot one offset"
+            )
+        matches_EF = touches_EF != (phase_EL[:, :feet] > 0)
+        return matches_EF.to(torch.float32).mean(-1) * is_commanded(
+            view, self.command, self.command_threshold
+        )

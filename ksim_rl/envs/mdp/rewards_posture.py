@@ -1,4 +1,4 @@
-"""Rewards for how the body is held: orientation, pose, joint limits, rotation."""
+"""Rewards for how the body is held: orientation, height, pose."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
-from ksim_rl.envs import quaternion
 from ksim_rl.envs.mdp.command_speed import commanded_speed
 from ksim_rl.envs.mdp.constants import constant, values_by_name
+from ksim_rl.envs.mdp.root_height import root_height
 from ksim_rl.envs.names import Patterns
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
@@ -21,10 +21,12 @@ class Upright(RewardTerm):
 
     Attributes:
         body: the body to hold upright; None is the root.
+        entity: whose root; "" is the first robot.
     """
 
     std: float
     body: str | None = None
+    entity: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -32,13 +34,45 @@ class Upright(RewardTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        if self.body is None:
-            gravity_E3 = view.projected_gravity_EL
-        else:
-            down_13 = constant((0.0, 0.0, -1.0), view.device).unsqueeze(0)
-            quat_E4 = view.world.xquat_EL[:, view.bodies(self.body)].squeeze(1)
-            gravity_E3 = quaternion.rotate_inverse(quat_E4, down_13.expand(view.num_envs, 3))
-        return torch.exp(-gravity_E3[:, :2].square().sum(-1) / self.std**2)
+        return torch.exp(_tilt(view, self.body, self.entity) / -(self.std**2))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TiltL2(RewardTerm):
+    """|g_xy|^2, `g` the direction of gravity in the body's frame, the squared sine of the tilt, [E]; position stage.
+
+    Attributes:
+        body: the body that is meant; None is the root.
+        entity: whose root; "" is the first robot.
+    """
+
+    body: str | None = None
+    entity: str = ""
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return _tilt(view, self.body, self.entity)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RootHeightL2(RewardTerm):
+    """(h - target_height)^2, `h` the height of the root body's frame above the ground, m^2, [E]; position stage.
+
+    Attributes:
+        target_height: m.
+        entity: the robot that is meant; "" is the first one.
+    """
+
+    target_height: float
+    entity: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_in_range("target_height", self.target_height)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return (root_height(view, self.entity) - self.target_height).square()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,41 +122,9 @@ class Pose(RewardTerm):
         return constant(values_by_name(field, getattr(self, field), names), view.device)
 
 
-@dataclass(frozen=True, kw_only=True)
-class JointPosLimits(RewardTerm):
-    """Sum over joints of how far each is beyond its soft limits, rad or m, [E]; position stage.
-
-    Soft limits: `scene.soft_joint_pos_limit_factor` of the range, about its middle.
-    """
-
-    joints: Patterns = ".*"
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
-        index = view.joints(self.joints)
-        pos_EL, limits_L2 = view.joint_pos_EL[:, index], view.soft_joint_pos_limits_L2[index]
-        below_EL = (limits_L2[:, 0] - pos_EL).clamp(min=0.0)
-        above_EL = (pos_EL - limits_L2[:, 1]).clamp(min=0.0)
-        return (below_EL + above_EL).sum(-1)
-
-
-@dataclass(frozen=True, kw_only=True)
-class BodyAngularVelocity(RewardTerm):
-    """|w_xy|^2, `w` a body's angular velocity in the world frame, (rad/s)^2, [E]; velocity stage. Yaw is free."""
-
-    body: str
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
-        return view.body_ang_vel_w(view.bodies(self.body))[..., :2].square().sum((-2, -1))
-
-
-@dataclass(frozen=True, kw_only=True)
-class AngularMomentum(RewardTerm):
-    """|L|^2 of a `subtreeangmom` sensor, about the subtree's centre of mass, (kg m^2/s)^2, [E]; velocity stage."""
-
-    sensor: str
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
-        return view.sensor(self.sensor).square().sum(-1)
+def _tilt(view: EnvView, body: str | None, entity: str) -> Tensor:
+    """Return the squared sine of a body's tilt, [E]."""
+    if body is None:
+        return view.entity(entity).projected_gravity_EL[:, :2].square().sum(-1)
+    # The world's z axis in the body's frame: the z components of the body's x and y axes.
+    return view.body_axes_w(view.bodies(body))[:, 0, :2, 2].square().sum(-1)

@@ -1,6 +1,6 @@
 """Uniform draws of a pose or a velocity: ranges by axis name, 0 for the axes that are left out."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from torch import Tensor
 
@@ -12,15 +12,15 @@ AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 Ranges = Mapping[str, tuple[float, float]]
 
 
-def check_ranges(field: str, ranges: Ranges) -> None:
-    """Refuse axes that do not exist and ranges that are no ordered pairs.
+def check_ranges(field: str, ranges: Ranges, axes: Sequence[str] = AXES) -> None:
+    """Refuse axes that are none of `axes` and ranges that are no ordered pairs.
 
     Raises:
         ValueError: naming the field, the axis and the value.
     """
     for axis, pair in ranges.items():
-        if axis not in AXES:
-            raise unknown_name(f"axis in {field}", axis, AXES)
+        if axis not in axes:
+            raise unknown_name(f"axis in {field}", axis, axes)
         check_pair(f"{field}.{axis}", pair)
 
 

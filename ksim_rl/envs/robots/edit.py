@@ -3,50 +3,16 @@
 A robot file holds tables of the small dataclasses below; adding a robot adds tables, no code here.
 """
 
-import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
 
 from ksim_rl.checks import unknown_name
+from ksim_rl.envs.actuators.builtin import control_kind
+from ksim_rl.envs.names import match_names
 
 Vector = tuple[float, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class PositionServo:
-    """A position controlled motor behind a gear, for all joints that match `joints`.
-
-    The gains make the reflected inertia a second-order system of the given natural frequency and damping ratio:
-    `kp = armature * w^2`, `kd = 2 * damping_ratio * armature * w`, `w = 2 pi * natural_frequency`.
-    """
-
-    joints: tuple[str, ...]
-    effort_limit: float
-    """N m, symmetric."""
-    rotor_inertia: float
-    """kg m^2, before the gear."""
-    gear_ratio: float
-    natural_frequency: float = 10.0
-    """Hz."""
-    damping_ratio: float = 2.0
-
-    @property
-    def armature(self) -> float:
-        """Rotor inertia as the joint feels it, kg m^2."""
-        return self.rotor_inertia * self.gear_ratio**2
-
-    @property
-    def kp(self) -> float:
-        """Stiffness, N m / rad."""
-        return self.armature * (2.0 * math.pi * self.natural_frequency) ** 2
-
-    @property
-    def kd(self) -> float:
-        """Damping, N m s / rad."""
-        return 2.0 * self.damping_ratio * self.armature * 2.0 * math.pi * self.natural_frequency
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,17 +47,65 @@ class Sensor:
     refname: str = ""
 
 
-def match_names(kind: str, patterns: Iterable[str], names: Sequence[str]) -> list[str]:
-    """Return the names that fully match any pattern, in the order of `names`.
+@dataclass(frozen=True, kw_only=True)
+class Site:
+    """A named point of a body, m in its frame; `radius` is for drawing."""
+
+    name: str
+    body: str
+    pos: Vector = (0.0, 0.0, 0.0)
+    radius: float = 0.005
+
+
+def reflected_inertia(inertias: Sequence[float], ratios: Sequence[float]) -> float:
+    """Return what a joint feels of a gear train, kg m^2.
+
+    Args:
+        inertias: of the rotor and of what turns with each stage's output, kg m^2.
+        ratios: of the stages, one fewer than inertias.
+    """
+    total = 0.0
+    for inertia, ratio in zip(inertias, (*ratios, 1.0), strict=True):
+        total = (total + inertia) * ratio**2
+    return total
+
+
+def spread(
+    table: Mapping[str, float], names: Sequence[str], *, default: float | None = None
+) -> dict[str, float]:
+    """Return one value per name: that of the pattern in `table` that fully matches it, else `default`.
 
     Raises:
-        ValueError: if a pattern matches nothing, with the near names.
+        ValueError: if a name matches several patterns, or none and there is no default, or a pattern matches no name.
     """
-    patterns = tuple(patterns)
-    for pattern in patterns:
-        if not any(re.fullmatch(pattern, name) for name in names):
-            raise unknown_name(kind, pattern, names)
-    return [name for name in names if any(re.fullmatch(pattern, name) for pattern in patterns)]
+    owners = {pattern: match_names("name", (pattern,), names) for pattern in table}
+    values = {}
+    for index, name in enumerate(names):
+        found = [table[pattern] for pattern, matches in owners.items() if index in matches]
+        if len(found) > 1 or (not found and default is None):
+            raise ValueError(f"{name!r} matches {len(found)} of the patterns {list(table)}: expected one")
+        values[name] = found[0] if found else default
+    return values
+
+
+def root_sensors(*, imu: str, root: str) -> tuple[Sensor, ...]:
+    """Return what walking tasks read: an IMU at a site, and the angular momentum of all that hangs on the root."""
+    site, body = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY
+    kinds = mujoco.mjtSensor
+    return (
+        Sensor(name="imu_ang_vel", type=kinds.mjSENS_GYRO, objtype=site, objname=imu),
+        Sensor(name="imu_lin_vel", type=kinds.mjSENS_VELOCIMETER, objtype=site, objname=imu),
+        Sensor(name="imu_lin_acc", type=kinds.mjSENS_ACCELEROMETER, objtype=site, objname=imu),
+        Sensor(
+            name="imu_upvector",
+            type=kinds.mjSENS_FRAMEZAXIS,
+            objtype=body,
+            objname="world",
+            reftype=site,
+            refname=imu,
+        ),
+        Sensor(name="root_angmom", type=kinds.mjSENS_SUBTREEANGMOM, objtype=body, objname=root),
+    )
 
 
 def reset_options(spec: mujoco.MjSpec) -> None:
@@ -104,28 +118,6 @@ def set_passive_joints(spec: mujoco.MjSpec, *, damping: float = 0.0, frictionlos
     for joint in _single_dof_joints(spec):
         joint.damping = [damping, 0.0, 0.0]
         joint.frictionloss = frictionloss
-
-
-def set_position_actuators(spec: mujoco.MjSpec, servos: Sequence[PositionServo]) -> None:
-    """Replace all actuators by one position servo per joint, named as its joint, in the order of `servos`.
-
-    The control range is what can still change the force at a joint limit, and does not clip: a clipped target
-    would hide from the policy what it asked for.
-    """
-    for actuator in list(spec.actuators):
-        spec.delete(actuator)
-    joints = {joint.name: joint for joint in _single_dof_joints(spec)}
-    for servo in servos:
-        reach = servo.effort_limit / servo.kp
-        for name in match_names("joint", servo.joints, list(joints)):
-            joint = joints[name]
-            joint.armature = servo.armature
-            actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-            actuator.set_to_position(kp=servo.kp, kv=servo.kd)
-            actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
-            actuator.forcerange = [-servo.effort_limit, servo.effort_limit]
-            actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
-            actuator.ctrlrange = [joint.range[0] - reach, joint.range[1] + reach]
 
 
 def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom]) -> None:
@@ -157,8 +149,10 @@ def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom])
             placed.fromto = geom.fromto
 
 
-def add_sensors(spec: mujoco.MjSpec, sensors: Iterable[Sensor]) -> None:
-    """Append sensors."""
+def replace_sensors(spec: mujoco.MjSpec, sensors: Iterable[Sensor]) -> None:
+    """Delete every sensor and add `sensors`."""
+    for sensor in list(spec.sensors):
+        spec.delete(sensor)
     for sensor in sensors:
         spec.add_sensor(
             name=sensor.name,
@@ -170,6 +164,23 @@ def add_sensors(spec: mujoco.MjSpec, sensors: Iterable[Sensor]) -> None:
         )
 
 
+def set_sites(spec: mujoco.MjSpec, sites: Iterable[Site], *, group: int = 5) -> None:
+    """Move the sites that exist and add the others."""
+    present = {site.name: site for site in spec.sites}
+    bodies = {body.name: body for body in spec.bodies}
+    for site in sites:
+        if site.body not in bodies:
+            raise unknown_name("body", site.body, bodies)
+        placed = present.get(site.name) or bodies[site.body].add_site(name=site.name)
+        placed.pos, placed.size, placed.group = site.pos, [site.radius] * 3, group
+
+
+def exclude_contacts(spec: mujoco.MjSpec, pairs: Iterable[tuple[str, str]]) -> None:
+    """Let pairs of bodies pass through each other."""
+    for first, second in pairs:
+        spec.add_exclude(bodyname1=first, bodyname2=second)
+
+
 def set_keyframe(
     spec: mujoco.MjSpec,
     name: str,
@@ -178,14 +189,18 @@ def set_keyframe(
     init_quat: Vector,
     joint_pos: Mapping[str, float],
 ) -> None:
-    """Replace all keyframes by one: the root pose, `joint_pos`, and controls that hold those joints.
+    """Replace all keyframes by one: the root pose, `joint_pos`, and the controls of servos that hold those joints.
 
     Needs a robot whose first joint is free and whose other joints all have one degree of freedom.
     """
     for key in list(spec.keys):
         spec.delete(key)
     qpos = [*init_pos, *init_quat, *(joint_pos[joint.name] for joint in _single_dof_joints(spec))]
-    spec.add_key(name=name, qpos=qpos, ctrl=[joint_pos[actuator.target] for actuator in spec.actuators])
+    ctrl = [
+        joint_pos[a.target] if control_kind(a.biastype, a.biasprm, a.dyntype) == "pos" else 0.0
+        for a in spec.actuators
+    ]
+    spec.add_key(name=name, qpos=qpos, ctrl=ctrl)
 
 
 def _single_dof_joints(spec: mujoco.MjSpec) -> list[mujoco.MjsJoint]:

@@ -13,16 +13,17 @@ from typing import ClassVar
 
 import mujoco
 
+from ksim_rl.envs.actuators import Actuator, PositionActuator, set_actuators
 from ksim_rl.envs.robots.edit import (
     CollisionGeom,
-    PositionServo,
-    Sensor,
-    add_sensors,
+    Site,
     replace_collision_geoms,
+    replace_sensors,
     reset_options,
+    root_sensors,
     set_keyframe,
     set_passive_joints,
-    set_position_actuators,
+    set_sites,
 )
 from ksim_rl.physics import load_spec
 
@@ -33,17 +34,15 @@ ROTOR_INERTIA = 0.000111842
 """kg m^2 of one motor; the reduction is 6, and another 1.5 at the calf's linkage."""
 
 SERVOS = (
-    PositionServo(
+    PositionActuator.tuned(
         joints=(".*_hip_joint", ".*_thigh_joint"),
         effort_limit=23.7,
-        rotor_inertia=ROTOR_INERTIA,
-        gear_ratio=6.0,
+        armature=ROTOR_INERTIA * 6.0**2,
     ),
-    PositionServo(
+    PositionActuator.tuned(
         joints=(".*_calf_joint",),
         effort_limit=35.55,
-        rotor_inertia=ROTOR_INERTIA,
-        gear_ratio=6.0 * 1.5,
+        armature=ROTOR_INERTIA * (6.0 * 1.5) ** 2,
     ),
 )
 # A unit action moves the target by a quarter of the deflection at which the servo saturates (effort_limit / kp).
@@ -56,13 +55,11 @@ _BOX, _SPHERE, _CAPSULE = (
     mujoco.mjtGeom.mjGEOM_SPHERE,
     mujoco.mjtGeom.mjGEOM_CAPSULE,
 )
-_SITE, _BODY = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY
-IMU_POS = (-0.01592, -0.06659, -0.00617)
-"""m, in the trunk's frame."""
+IMU = Site(name="imu", body="trunk", pos=(-0.01592, -0.06659, -0.00617))
 
 
 def _capsule(name: str, body: str, radius: float, fromto: tuple[float, ...]) -> CollisionGeom:
-    """A frictionless capsule: only feet need friction, and fewer contact dimensions cost less."""
+    """A capsule whose contacts with other parts of the robot are frictionless: fewer dimensions cost less."""
     return CollisionGeom(
         name=name, body=body, type=_CAPSULE, size=(radius,), fromto=fromto, condim=1, solref=_CONTACT_TIME
     )
@@ -113,21 +110,6 @@ COLLISION_GEOMS = (
     *(geom for leg in LEGS for geom in _leg_geoms(leg)),
 )
 
-SENSORS = (
-    Sensor(name="imu_ang_vel", type=mujoco.mjtSensor.mjSENS_GYRO, objtype=_SITE, objname="imu"),
-    Sensor(name="imu_lin_vel", type=mujoco.mjtSensor.mjSENS_VELOCIMETER, objtype=_SITE, objname="imu"),
-    Sensor(name="imu_lin_acc", type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=_SITE, objname="imu"),
-    Sensor(
-        name="imu_upvector",
-        type=mujoco.mjtSensor.mjSENS_FRAMEZAXIS,
-        objtype=_BODY,
-        objname="world",
-        reftype=_SITE,
-        refname="imu",
-    ),
-    Sensor(name="root_angmom", type=mujoco.mjtSensor.mjSENS_SUBTREEANGMOM, objtype=_BODY, objname="trunk"),
-)
-
 
 def _per_joint(value: Mapping[str, float], *, mirrored: str = "") -> dict[str, float]:
     """Spread values per kind of joint over the legs, in policy order; `mirrored` changes sign on the left."""
@@ -147,6 +129,7 @@ class UnitreeGo1:
         default_joint_pos: the stance, rad, by joint name.
         init_pos, init_quat: the root's pose in the stance: m, and a quaternion (w, x, y, z).
         action_scale: rad per unit action, by joint name.
+        actuators: what drives the joints.
         soft_joint_pos_limit_factor: the part of each joint's range, about its middle, that is free of penalty.
     """
 
@@ -154,9 +137,10 @@ class UnitreeGo1:
     init_quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     default_joint_pos: Mapping[str, float] = field(default_factory=lambda: _per_joint(STANCE, mirrored="hip"))
     action_scale: Mapping[str, float] = field(default_factory=lambda: _per_joint(ACTION_SCALE))
+    actuators: tuple[Actuator, ...] = SERVOS
     soft_joint_pos_limit_factor: float = 0.9
 
-    name: ClassVar[str] = "unitree_go1"
+    name: ClassVar[str] = "go1"
     root_body: ClassVar[str] = "trunk"
     joint_names: ClassVar[tuple[str, ...]] = tuple(f"{leg}_{kind}_joint" for leg in LEGS for kind in STANCE)
     foot_geoms: ClassVar[tuple[str, ...]] = tuple(f"{leg}_foot_collision" for leg in LEGS)
@@ -174,11 +158,10 @@ class UnitreeGo1:
                 joint.name = "floating_base_joint"
         reset_options(spec)
         set_passive_joints(spec)
-        set_position_actuators(spec, SERVOS)
+        set_actuators(spec, self.actuators)
         replace_collision_geoms(spec, COLLISION_GEOMS)
-        imu = spec.site("imu")
-        imu.pos, imu.group = IMU_POS, 5
-        add_sensors(spec, SENSORS)
+        set_sites(spec, (IMU,))
+        replace_sensors(spec, root_sensors(imu="imu", root=self.root_body))
         set_keyframe(
             spec,
             "init_state",

@@ -22,6 +22,7 @@ from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg, ObservationTe
 from ksim_rl.envs.view import EnvView
 from ksim_rl.envs.viewer_cfg import ViewerCfg
 
+
 @dataclass(frozen=True, kw_only=True)
 class CartpolePosition(ObservationTerm):
     """Position of the cart, m, and cosine and sine of the pole's angle from upright, [E, 3]; position stage."""

@@ -36,8 +36,7 @@ class ActionDelay(LaggedTransform):
         seed: int = 0,
         stream: str | None = None,
     ) -> None:
-        # ("action",) is the one-key form of "action" in TorchRL too.
-        keys = [key[0] if isinstance(key, tuple) and len(key) == 1 else key for key in as_keys(in_keys_inv)]
+        keys = as_keys(in_keys_inv)
         out_keys = checked_out_keys(keys, out_keys_inv)
         super().__init__(delay, len(keys), in_keys_inv=keys, out_keys_inv=out_keys, seed=seed, stream=stream)
         self.initial = initial

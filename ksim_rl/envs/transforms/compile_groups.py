@@ -15,7 +15,7 @@ from ksim_rl.envs.transforms.scale import ObservationScale
 
 
 def compile_groups(groups: Mapping[str, ObservationGroupCfg]) -> list[Transform]:
-    """Return the transforms that write each group's vector under the group's name.
+    """Return the transforms that write each group's vector, or image, under the group's name.
 
     Per group: noise -> clip -> scale -> delay -> history -> concatenate. A term without any of these goes straight
     from `("obs", name)` into the vector; the others pass through `("<group>_terms", name)`, which only groups with
@@ -23,6 +23,7 @@ def compile_groups(groups: Mapping[str, ObservationGroupCfg]) -> list[Transform]
     """
     transforms: list[Transform] = []
     vectors: dict[NestedKey, list[NestedKey]] = {}
+    images: list[Transform] = []
     drop: list[NestedKey] = []
     for group, cfg in groups.items():
         terms = {name: term if cfg.enable_noise else _without_noise(term) for name, term in cfg.terms.items()}
@@ -37,10 +38,18 @@ def compile_groups(groups: Mapping[str, ObservationGroupCfg]) -> list[Transform]
                     create_copy=True,
                 )
             )
-        vectors[group] = [_term_key(group, name) if name in chained else ("obs", name) for name in terms]
+        keys: list[NestedKey] = [
+            _term_key(group, name) if name in chained else ("obs", name) for name in terms
+        ]
+        if any(term.is_image for term in terms.values()):
+            images.append(RenameTransform(keys, [group], create_copy=bool(plain) or cfg.keep_terms))
+            continue
+        vectors[group] = keys
         if not cfg.keep_terms:
             drop += [_term_key(group, name) for name in chained]
-    transforms.append(ObservationGroups(vectors, drop=drop))
+    transforms += images
+    if vectors:
+        transforms.append(ObservationGroups(vectors, drop=drop))
     return transforms
 
 

@@ -64,6 +64,11 @@ class ObservationTermCfg:
             checks.check_in_range("history", self.history, low=1)
 
     @property
+    def is_image(self) -> bool:
+        """Whether the term reads an image, which is not put into a vector."""
+        return bool(getattr(self.term, "is_image", False))
+
+    @property
     def history_length(self) -> int:
         """Number of frames."""
         return self.history.length if isinstance(self.history, HistoryCfg) else self.history or 1
@@ -71,7 +76,7 @@ class ObservationTermCfg:
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationGroupCfg:
-    """A vector made of terms, concatenated in order.
+    """A vector made of terms, concatenated in order; or one image, which stays one.
 
     Args:
         terms: by name; the env writes the clean reading to `("obs", name)`.
@@ -86,3 +91,9 @@ class ObservationGroupCfg:
     def __post_init__(self) -> None:
         if not self.terms:
             raise ValueError("terms={}: expected at least one term")
+        images = [name for name, cfg in self.terms.items() if cfg.is_image]
+        if images and len(self.terms) > 1:
+            other = next(name for name in self.terms if name != images[0])
+            raise ValueError(
+                f"terms: {images[0]!r} is an image, which is not concatenated with {other!r}: give it a group of its own"
+            )

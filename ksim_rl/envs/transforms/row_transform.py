@@ -102,8 +102,9 @@ def _per_row(mask: Tensor, num_rows: int) -> Tensor:
 
 
 def as_keys(keys: Keys) -> list[NestedKey]:
-    """Return a list of keys from one key or a sequence of them, as TorchRL's constructors do."""
-    return [keys] if isinstance(keys, str | tuple) else list(keys)
+    """Return a list of keys from one key or a list of them; a tuple is one key, and ("a",) is "a"."""
+    listed: list[NestedKey] = [keys] if isinstance(keys, str | tuple) else list(keys)
+    return [key[0] if isinstance(key, tuple) and len(key) == 1 else key for key in listed]
 
 
 def checked_out_keys(in_keys: list[NestedKey], out_keys: Keys | None) -> list[NestedKey]:

@@ -20,7 +20,7 @@ def leaf_spec(observation_spec: Composite, key: NestedKey, owner: str) -> Tensor
     """
     leaves = {_spell(leaf): leaf for leaf in observation_spec.keys(True, True)}
     if _spell(key) not in leaves:
-        raise KeyError(f"{owner}: the env has no observation {key!r}: {checks.near(_spell(key), leaves)}")
+        raise KeyError(f"{owner}: the env has no {key!r}: {checks.near(_spell(key), leaves)}")
     return observation_spec[key]
 
 

@@ -6,9 +6,10 @@ import mujoco
 import torch
 from torch import Tensor
 
-from ksim_rl.envs.sensors import ContactSensor, ContactTracker
+from ksim_rl.envs.sensors import Sensor
+from ksim_rl.envs.terrains.ground import Ground
 from ksim_rl.envs.view import EnvView
-from ksim_rl.physics import World, load_model
+from ksim_rl.physics import World, load_model, prepare_spec
 
 FREE_BODY = """
 <mujoco>
@@ -66,22 +67,42 @@ BOXES = """
 """
 """Two boxes on a plane, at rest or in the air."""
 
+TWO_WHEELS = """
+<mujoco>
+  <option timestep="0.002" gravity="0 0 0"/>
+  <worldbody>
+    <body name="left"><joint name="left" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 .5"/></body>
+    <body name="right"><joint name="right" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 .25"/></body>
+  </worldbody>
+  <actuator><motor name="right" joint="right"/><motor name="left" joint="left" gear="2"/></actuator>
+</mujoco>
+"""
+"""Two wheels of 0.5 and 0.25 kg m^2 without friction; joints and actuators stand in opposite orders."""
+
+
+class Plateau(Ground):
+    """Flat ground that is 0.25 m high."""
+
+    is_flat = False
+
+    def heights(self, points_EN2: Tensor) -> Tensor:
+        return torch.full_like(points_EN2[..., 0], 0.25)
+
 
 class Bench:
     """Worlds and their view, with what the env does around terms."""
 
     def __init__(
-        self, source: str, num_envs: int, contacts: Mapping[str, ContactSensor], **view: float
+        self, source: str, num_envs: int, contacts: Mapping[str, Sensor], **view: float
     ) -> None:
         spec = mujoco.MjSpec.from_string(source)
         for name, sensor in contacts.items():
             sensor.add_to(spec, name)
         self.per_world = ("geom_friction", "body_ipos")
+        prepare_spec(spec, self.per_world)
         self.world = World(load_model(spec), num_envs=num_envs, per_world_fields=self.per_world)
         self.view = EnvView(self.world, step_dt=0.02, **view)
-        clocks = {"world": self.world, "memories": self.view.memories, "step_dt": self.view.step_dt}
-        self.trackers = [ContactTracker(name, sensor, **clocks) for name, sensor in contacts.items()]
-        self.view.contacts.update(zip(contacts, self.trackers, strict=True))
+        self.view.sensors.update((name, sensor.track(name, self.view)) for name, sensor in contacts.items())
         self.everybody_E = torch.ones(num_envs, dtype=torch.bool)
 
     def place(self, qpos=None, qvel=None) -> None:
@@ -98,16 +119,20 @@ class Bench:
     def step(self, substeps: int = 10) -> None:
         """Advance by one env step of 20 ms, contact clocks included."""
         self.view.step_count.add_(1)
-        self.world.step(substeps)
+        view = self.view
+        self.world.step(
+            substeps, before=view.before_substep, after=view.after_substep, sensors=view.substep_sensors
+        )
         self.refresh()
         self.view.episode_step_E.add_(1)
-        for tracker in self.trackers:
+        for tracker in self.view.sensors.values():
             tracker.update()
 
     def command(self, values) -> None:
         """Set the command "twist" [E, 3] or [3]."""
         value = torch.as_tensor(values, dtype=torch.float32)
         self.view.commands["twist"] = value.expand(self.world.num_envs, 3).clone()
+        self.view.command_cache.clear()
 
     def read(self, term, scope: str = "observations/x") -> Tensor:
         with self.view.scope(scope):

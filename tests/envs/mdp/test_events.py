@@ -5,6 +5,7 @@ import torch
 
 from ksim_rl.envs import mdp
 from ksim_rl.envs.quaternion import yaw
+from ksim_rl.envs.terrains.ground import Ground
 from tests.envs.mdp.bench import FREE_BODY
 
 E = 500
@@ -118,3 +119,18 @@ def test_fixed_roots_are_refused(make_bench):
     bench = make_bench(FIXED_ROOT, 2)
     with pytest.raises(ValueError, match="ResetRootUniform needs a robot whose first joint is free"):
         bench.fire(mdp.ResetRootUniform())
+
+
+def test_on_a_terrain_the_default_pose_stands_at_the_envs_origin(crowd):
+    class Hill(Ground):
+        """Ground on which envs start at (5, -3, 0.5)."""
+
+        is_flat = False
+
+        @property
+        def origins_E3(self):
+            return torch.tensor([5.0, -3.0, 0.5]).expand(E, 3)
+
+    crowd.view.terrain = Hill(E, crowd.view.device)
+    crowd.fire(mdp.ResetRootUniform(pose_range={"z": (0.1, 0.1)}))
+    torch.testing.assert_close(crowd.world.qpos_EL[:, :3], torch.tensor([6.0, -1.0, 3.6]).expand(E, 3))

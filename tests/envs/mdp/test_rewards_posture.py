@@ -4,17 +4,7 @@ import pytest
 import torch
 
 from ksim_rl.envs import mdp
-
-HALF = math.sqrt(0.5)
-ROLL_90 = (HALF, HALF, 0.0, 0.0)
-SPINNER = """
-<mujoco>
-  <worldbody>
-    <body name="wheel"><freejoint/><inertial pos="0.5 0 0" mass="2" diaginertia="0.02 0.03 0.04"/></body>
-  </worldbody>
-  <sensor><subtreeangmom name="angmom" body="wheel"/></sensor>
-</mujoco>
-"""
+from tests.envs.mdp.bench import Plateau
 
 
 def pose(**changes):
@@ -75,28 +65,26 @@ def test_pose_needs_one_std_for_each_joint(free_body):
         pose(running_threshold=0.01)
 
 
-def test_joint_limits_count_the_overshoot_of_the_soft_range(free_body):
-    # Half of (-1, 1) is (-0.5, 0.5), half of (0, 2) is (0.5, 1.5).
-    free_body.place(qpos=[(0, 0, 1, 1, 0, 0, 0, *angles) for angles in ((0.4, 1.4), (-0.7, 1.6), (0.8, 0.1))])
-    value = free_body.read(mdp.JointPosLimits(), "rewards/x")
-    torch.testing.assert_close(value, torch.tensor([0.0, 0.3, 0.7]), atol=1e-5, rtol=0)
-    left = free_body.read(mdp.JointPosLimits(joints="left_hip"), "rewards/x")
-    torch.testing.assert_close(left, torch.tensor([0.0, 0.2, 0.3]), atol=1e-5, rtol=0)
+@pytest.mark.parametrize("body", [None, "trunk"])
+def test_tilt_is_the_squared_sine(free_body, body):
+    # Rolled by 0.3 rad, then turned about the vertical, which does not matter.
+    roll, yaw = 0.15, 0.5
+    quat = (
+        math.cos(yaw) * math.cos(roll),
+        math.cos(yaw) * math.sin(roll),
+        math.sin(yaw) * math.sin(roll),
+        math.sin(yaw) * math.cos(roll),
+    )
+    free_body.place(qpos=(0, 0, 1, *quat, 0, 0))
+    value = free_body.read(mdp.TiltL2(body=body), "rewards/x")
+    torch.testing.assert_close(value, torch.full((3,), math.sin(0.3) ** 2), atol=1e-5, rtol=0)
 
 
-def test_body_angular_velocity_is_taken_in_the_world_frame(free_body):
-    # Lying on its side, the trunk spins about its own z axis, which is horizontal.
-    free_body.place(qpos=(0, 0, 1, *ROLL_90, 0, 0), qvel=(0, 0, 0, 0, 0, 2, 0, 0))
-    value = free_body.read(mdp.BodyAngularVelocity(body="trunk"), "rewards/x")
-    torch.testing.assert_close(value, torch.full((3,), 4.0), atol=1e-4, rtol=0)
-    free_body.place(qpos=(0, 0, 1, *ROLL_90, 0, 0), qvel=(0, 0, 0, 0, 2, 0, 0, 0))
-    value = free_body.read(mdp.BodyAngularVelocity(body="trunk"), "rewards/x")
-    torch.testing.assert_close(value, torch.zeros(3), atol=1e-4, rtol=0)
-
-
-def test_angular_momentum_is_about_the_centre_of_mass(make_bench):
-    bench = make_bench(SPINNER, 2)
-    # The frame's origin moves so that the centre of mass, 0.5 m away, rests: only the spin is left.
-    bench.place(qpos=(0, 0, 0, 1, 0, 0, 0), qvel=(0, -1.0, 0, 0, 0, 2.0))
-    value = bench.read(mdp.AngularMomentum(sensor="angmom"), "rewards/x")
-    torch.testing.assert_close(value, torch.full((2,), (0.04 * 2.0) ** 2), atol=1e-6, rtol=0)
+def test_root_height_is_above_the_ground(free_body):
+    term = mdp.RootHeightL2(target_height=0.6)
+    free_body.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0, 0))
+    torch.testing.assert_close(free_body.read(term, "rewards/x"), torch.full((3,), 0.16), atol=1e-5, rtol=0)
+    free_body.view.terrain = Plateau(3, free_body.view.device)
+    torch.testing.assert_close(
+        free_body.read(term, "rewards/x"), torch.full((3,), 0.15**2), atol=1e-5, rtol=0
+    )

@@ -1,9 +1,8 @@
-import math
-
 import mujoco
 import numpy as np
 import pytest
 
+from ksim_rl.envs.actuators import MotorActuator, PositionActuator, set_actuators
 from ksim_rl.envs.robots import edit
 
 ROBOT = """
@@ -31,14 +30,6 @@ ROBOT = """
   <keyframe><key name="home" qpos="0 0 2 1 0 0 0 0.5"/></keyframe>
 </mujoco>
 """
-SERVO = edit.PositionServo(
-    joints=("arm_joint",),
-    effort_limit=5.0,
-    rotor_inertia=1e-4,
-    gear_ratio=10.0,
-    natural_frequency=2.0,
-    damping_ratio=0.5,
-)
 
 
 @pytest.fixture
@@ -46,52 +37,10 @@ def spec():
     return mujoco.MjSpec.from_string(ROBOT)
 
 
-def test_servo_oscillates_at_its_natural_frequency_and_damping(spec):
-    edit.set_passive_joints(spec)
-    edit.set_position_actuators(spec, (SERVO,))
-    edit.reset_options(spec)
-    spec.option.gravity = [0.0, 0.0, 0.0]
-    spec.option.timestep = 1e-4
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    start, angular = 0.1, 2.0 * math.pi * 2.0
-    data.qpos[7] = start
-    seconds = 0.3
-    for _ in range(round(seconds / 1e-4)):
-        mujoco.mj_step(model, data)
-    # Free response of q'' + 2 z w q' + w^2 q = 0 from rest; the light arm leaves only the armature.
-    decay, damped = 0.5 * angular, angular * math.sqrt(1.0 - 0.5**2)
-    expected = (
-        start
-        * math.exp(-decay * seconds)
-        * (math.cos(damped * seconds) + decay / damped * math.sin(damped * seconds))
-    )
-    assert data.qpos[7] == pytest.approx(expected, abs=2e-4)
-
-
-def test_position_actuators_replace_all_and_limit_force_only(spec):
-    edit.set_position_actuators(spec, (SERVO,))
-    model = spec.compile()
-    assert model.nu == 1 and model.actuator(0).name == "arm_joint"
-    assert list(model.actuator_forcerange[0]) == [-5.0, 5.0]
-    assert not model.actuator_ctrllimited[0]
-    data = mujoco.MjData(model)
-    data.ctrl[0] = 100.0
-    mujoco.mj_forward(model, data)
-    assert data.actuator_force[0] == 5.0
-
-
 def test_passive_joints_lose_damping_and_friction(spec):
     edit.set_passive_joints(spec)
     model = spec.compile()
     assert not model.dof_damping.any() and not model.dof_frictionloss.any()
-
-
-def test_unknown_joint_names_the_near_one(spec):
-    servo = edit.PositionServo(joints=("arm_jont",), effort_limit=1.0, rotor_inertia=1.0, gear_ratio=1.0)
-    with pytest.raises(ValueError, match=r"arm_jont.*arm_joint"):
-        edit.set_position_actuators(spec, (servo,))
 
 
 def test_replaced_geoms_ignore_default_classes_and_keep_looks_and_mass(spec):
@@ -122,7 +71,8 @@ def test_geom_on_unknown_body_names_the_near_one(spec):
 
 
 def test_keyframe_holds_pose_and_matching_controls(spec):
-    edit.set_position_actuators(spec, (SERVO,))
+    servo = PositionActuator(joints="arm_joint", stiffness=10.0)
+    set_actuators(spec, (servo,))
     edit.set_keyframe(
         spec, "start", init_pos=(1.0, 2.0, 3.0), init_quat=(1.0, 0.0, 0.0, 0.0), joint_pos={"arm_joint": 0.25}
     )
@@ -132,13 +82,54 @@ def test_keyframe_holds_pose_and_matching_controls(spec):
     assert list(model.key_ctrl[0]) == [0.25]
 
 
+def test_keyframe_asks_motors_for_no_effort(spec):
+    set_actuators(spec, (MotorActuator(joints="arm_joint"),))
+    edit.set_keyframe(
+        spec, "start", init_pos=(0.0, 0.0, 1.0), init_quat=(1.0, 0.0, 0.0, 0.0), joint_pos={"arm_joint": 0.25}
+    )
+    assert list(spec.compile().key_ctrl[0]) == [0.0]
+
+
 def test_options_go_back_to_mujocos_own(spec):
     edit.reset_options(spec)
     assert spec.option.timestep == mujoco.MjSpec().option.timestep
     assert spec.option.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
 
 
-def test_names_keep_the_models_order():
-    names = ["a_1", "b_1", "a_2"]
-    assert edit.match_names("joint", ("b_.*", "a_.*"), names) == names
-    assert edit.match_names("joint", ("a_.*",), names) == ["a_1", "a_2"]
+def test_values_spread_over_names():
+    names = ["a_hip", "a_knee", "b_hip"]
+    assert edit.spread({".*_hip": 0.5, "a_knee": 1.0}, names) == {"a_hip": 0.5, "a_knee": 1.0, "b_hip": 0.5}
+    assert edit.spread({"b_.*": 2.0}, names, default=0.0) == {"a_hip": 0.0, "a_knee": 0.0, "b_hip": 2.0}
+    with pytest.raises(ValueError, match="'a_knee' matches 0 of the patterns"):
+        edit.spread({".*_hip": 0.5}, names)
+    with pytest.raises(ValueError, match="'a_hip' matches 2 of the patterns"):
+        edit.spread({".*_hip": 0.5, "a_.*": 1.0}, names, default=0.0)
+    with pytest.raises(ValueError, match="did you mean 'a_hip'"):
+        edit.spread({"a_hop": 0.5}, names, default=0.0)
+
+
+def test_inertia_of_a_gear_train_keeps_its_kinetic_energy():
+    # At a joint speed of 1 rad/s the rotor turns 4 * 3 times as fast, the first stage's output 3 times.
+    energy = 0.5 * 2e-5 * (4.0 * 3.0) ** 2 + 0.5 * 1e-5 * 3.0**2 + 0.5 * 3e-5
+    assert 0.5 * edit.reflected_inertia((2e-5, 1e-5, 3e-5), (4.0, 3.0)) == pytest.approx(energy, rel=1e-12)
+
+
+def test_sites_are_moved_or_added_and_sensors_replaced(spec):
+    spec.body("base").add_site(name="imu", pos=[9.0, 9.0, 9.0])
+    edit.set_sites(
+        spec, (edit.Site(name="imu", body="base", pos=(0.1, 0.0, 0.0)), edit.Site(name="hand", body="arm"))
+    )
+    edit.replace_sensors(spec, edit.root_sensors(imu="imu", root="base"))
+    edit.replace_sensors(spec, edit.root_sensors(imu="imu", root="base"))
+    model = spec.compile()
+    assert list(model.site("imu").pos) == [0.1, 0.0, 0.0]
+    assert model.body(model.site_bodyid[model.site("hand").id]).name == "arm"
+    assert model.nsensor == 5
+    with pytest.raises(ValueError, match=r"bse.*base"):
+        edit.set_sites(spec, (edit.Site(name="x", body="bse"),))
+
+
+def test_excluded_pairs_reach_the_model(spec):
+    edit.exclude_contacts(spec, (("base", "arm"),))
+    model = spec.compile()
+    assert list(model.exclude_signature) == [(model.body("base").id << 16) + model.body("arm").id]

@@ -7,6 +7,8 @@ substeps. The sensors of an env step are those of its last substep, which starts
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import mujoco
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -63,16 +65,17 @@ class Drop(EventTerm):
 
 
 def falling_env(
-    heights: Sequence[float] = HEIGHTS, geoms=("ball", "box"), body="terrain"
+    heights: Sequence[float] = HEIGHTS, geoms=("ball", "box"), against="terrain", every_substep=False
 ) -> ManagerBasedRlEnv:
     group = ObservationGroupCfg(terms={"height": ObservationTermCfg(term=JointPos())})
+    touch = ContactSensor(geoms=geoms, against=against, every_substep=every_substep)
     return ManagerBasedRlEnv(
         ManagerBasedRlEnvCfg(
             decimation=DECIMATION,
             scene=SceneCfg(
                 robots={"falling": MjcfRobot(source=FALLING)},
                 terrain=PlaneTerrain(),
-                sensors={"touch": ContactSensor(geoms=geoms, body=body)},
+                sensors={"touch": touch},
                 num_envs=len(heights),
             ),
             observations={"actor": group},
@@ -167,7 +170,7 @@ def test_rows_that_reset_read_zero_and_the_others_stay():
     for name, after in env.view.contact("touch")._asdict().items():
         assert after[1].eq(0.0).all(), name
         assert torch.equal(after[0], getattr(before, name)[0]), name
-    assert env.view.sensor("touch_ball_force")[1].eq(0.0).all()
+    assert env.view.sensor("touch_ball")[1].eq(0.0).all()
 
 
 def test_a_lifted_robot_reads_no_contact_after_the_reset():
@@ -189,15 +192,82 @@ def test_columns_follow_the_order_of_geoms():
 
 
 def test_only_contact_with_the_named_body_counts():
-    state = contacts(falling_env(heights=(0.0, 0.0), geoms=("ball",), body="box"), 50)[-1]
+    state = contacts(falling_env(heights=(0.0, 0.0), geoms=("ball",), against="box"), 50)[-1]
     assert state.found_EN.shape == (2, 1) and state.found_EN.eq(0.0).all() and state.force_EN3.eq(0.0).all()
+
+
+def test_with_every_substep_the_flight_is_timed_in_substeps():
+    env = falling_env(every_substep=True)
+    states = contacts(env, 15)
+    for n, state in enumerate(states, start=1):
+        for row, height in enumerate(HEIGHTS):
+            # The sensors of substep k are those of the state before it.
+            first = substeps_in_flight(height) + 1
+            flying, lands = n * DECIMATION < first, (n - 1) * DECIMATION < first <= n * DECIMATION
+            assert state.first_contact_EN[row].eq(float(lands)).all()
+            if flying:
+                torch.testing.assert_close(state.air_time_EN[row], torch.full((2,), n * DT))
+                assert state.last_air_time_EN[row].eq(0.0).all() and state.contact_time_EN[row].eq(0.0).all()
+            if lands:
+                fall = (2 * height / GRAVITY) ** 0.5
+                torch.testing.assert_close(
+                    state.last_air_time_EN[row], torch.full((2,), fall), atol=2 * SUBSTEP_S, rtol=0
+                )
+                landed = torch.full((2,), (n * DECIMATION - first + 1) * SUBSTEP_S)
+                torch.testing.assert_close(state.contact_time_EN[row], landed)
+
+
+def test_the_history_holds_the_force_of_each_substep():
+    env = falling_env(every_substep=True)
+    states = contacts(env, 15)
+    history_ESN3 = torch.cat([state.force_history_ESN3 for state in states], dim=1)
+    model = env.world.mj_model
+    for row, height in enumerate(HEIGHTS):
+        data = mujoco.MjData(model)
+        data.qpos[:] = height
+        expected = []
+        for _ in range(15 * DECIMATION):
+            mujoco.mj_step(model, data)
+            expected.append(
+                np.stack([data.sensor("touch_ball").data[1:4], data.sensor("touch_box").data[1:4]])
+            )
+        expected_SN3 = np.stack(expected)
+        assert np.abs(expected_SN3).max() > 100.0, "an impact"
+        np.testing.assert_allclose(history_ESN3[row], expected_SN3, atol=0.5, rtol=2e-3)
+    assert torch.equal(history_ESN3[:, -1], states[-1].force_EN3)
+    env.reset(env_ids=[0])
+    history_ESN3 = env.view.contact("touch").force_history_ESN3
+    assert history_ESN3[0].eq(0.0).all() and history_ESN3[1].ne(0.0).any()
+
+
+def test_without_it_the_history_is_the_last_substep_and_the_graph_stays_one():
+    env = falling_env(heights=(0.0, 0.0))
+    state = contacts(env, 5)[-1]
+    assert torch.equal(state.force_history_ESN3, state.force_EN3[:, None])
+    assert env.view.after_substep == [] and env.view.substep_sensors == "last"
+
+
+def test_last_contact_time_and_first_air_mark_the_take_off():
+    env = falling_env(heights=(0.0, 0.0))
+    root_E, taken_off = env.reset(), []
+    for n in range(1, 21):
+        effort_E2 = torch.full((2, 2), 0.0 if n <= 10 else 50.0)
+        root_E = env.step(root_E.set("action", effort_E2))["next"]
+        state = env.view.contact("touch")
+        taken_off.append(state.first_air_EN[0, 0].item())
+    assert sum(taken_off) == 1.0
+    stood = taken_off.index(1.0) * DT
+    torch.testing.assert_close(state.last_contact_time_EN, torch.full((2, 2), stood))
 
 
 @pytest.mark.parametrize(
     ("sensor", "message"),
     [
-        (ContactSensor(geoms=("ball", "bx")), r"scene\.sensors\.feet: no geom 'bx': did you mean 'box'"),
-        (ContactSensor(geoms=("ball",), body="terain"), r"no body 'terain': did you mean 'terrain'"),
+        (
+            ContactSensor(geoms=("ball", "bx")),
+            r"scene\.sensors\.feet: no geom matches 'bx': did you mean 'box'",
+        ),
+        (ContactSensor(geoms=("ball",), against="terain"), r"no body 'terain': did you mean 'terrain'"),
     ],
 )
 def test_unknown_geoms_and_bodies_are_refused(sensor, message):
@@ -206,6 +276,7 @@ def test_unknown_geoms_and_bodies_are_refused(sensor, message):
         build_spec(SceneCfg(robots=robots, terrain=PlaneTerrain(), sensors={"feet": sensor}))
 
 
-def test_a_sensor_needs_a_geom():
-    with pytest.raises(ValueError, match=r"geoms=\(\): name at least one geom"):
-        ContactSensor(geoms=())
+@pytest.mark.parametrize("given", [{}, {"geoms": ("ball",), "bodies": ("ball",)}])
+def test_a_sensor_needs_one_kind_of_element(given):
+    with pytest.raises(ValueError, match=r"geoms=.*, bodies=.*, subtrees=.*: give exactly one of them"):
+        ContactSensor(**given)

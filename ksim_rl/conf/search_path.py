@@ -1,0 +1,21 @@
+"""Lets Hydra find the YAML configs of other packages (see `ksim_rl.envs.plugins`)."""
+
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+from ksim_rl.envs import plugins
+
+
+class DeclaredConfigs(SearchPathPlugin):
+    """Appends each package that declares configs; ours come first."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Append them."""
+        for point in plugins.declared(plugins.CONF):
+            search_path.append(provider=f"ksim_rl.conf:{point.name}", path=f"pkg://{point.module}")
+
+
+def register() -> None:
+    """Make Hydra ask `DeclaredConfigs` from now on."""
+    Plugins.instance().register(DeclaredConfigs)

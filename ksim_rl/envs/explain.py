@@ -1,0 +1,148 @@
+"""What an env is made of, as tables to read."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
+
+WIDTH = 120
+
+
+def explain(env: ManagerBasedRlEnv, *, width: int = WIDTH) -> str:
+    """Return one table per manager: index, name, shape, weight, mode and parameters of each term.
+
+    Parameters that have their defaults are left out.
+
+    Args:
+        env: what is explained.
+        width: characters per line.
+    """
+    output = io.StringIO()
+    console = Console(file=output, width=width, highlight=False, markup=False, color_system=None)
+    console.print(_summary(env))
+    for table in _tables(env):
+        console.print(table)
+    return "\n".join(line.rstrip() for line in output.getvalue().splitlines()) + "\n"
+
+
+def _summary(env: ManagerBasedRlEnv) -> str:
+    length = f"{env.max_episode_length_s:g} s = {env.max_episode_length} steps"
+    return (
+        f"{env.num_envs} envs on {env.device}, "
+        f"{env.step_dt:g} s per step = {env.cfg.decimation} x {env.physics_dt:g} s, "
+        f"episodes of {length if env.max_episode_length else 'any length'}"
+    )
+
+
+def _tables(env: ManagerBasedRlEnv) -> Iterable[Table]:
+    cfg = env.cfg
+    for group, group_cfg in cfg.observations.items():
+        rows, total = [], 0
+        for name, term_cfg in group_cfg.terms.items():
+            size = int(env.observation_spec["obs", name].shape[-1]) * term_cfg.history_length
+            total += size
+            chain = _parameters(term_cfg, without=("term",))
+            rows.append((name, f"({size},)", chain, _described(term_cfg.term)))
+        yield _table(f"observations/{group} ({total},)", ("term", "shape", "chain", "parameters"), rows)
+
+    sizes = env.action_manager.sizes
+    rows = [(name, f"({sizes[name]},)", _described(term)) for name, term in cfg.actions.items()]
+    yield _table(f"actions ({env.action_manager.size},)", ("term", "shape", "parameters"), rows)
+
+    rows = [
+        (name, f"({env.command_manager.values[name].shape[-1]},)", _seconds(term.resampling_time_range_s, "at resets"),
+         _described(term, without=("resampling_time_range_s",)))
+        for name, term in cfg.commands.items()
+    ]  # fmt: skip
+    yield _table("commands", ("term", "shape", "resampled every", "parameters"), rows)
+
+    weights = env.view.reward_weights
+    rows = [
+        (
+            name,
+            f"{float(weights[name]):g}" if name in weights else "0: not computed",
+            _described(term, ("weight",)),
+        )
+        for name, term in cfg.rewards.items()
+    ]
+    scaled = f"times {env.step_dt:g} s" if cfg.scale_rewards_by_dt else "per step"
+    yield _table(f"rewards ({scaled})", ("term", "weight", "parameters"), rows)
+
+    ends = "terminated" if cfg.is_finite_horizon else "truncated"
+    rows = [
+        (name, ends if term.time_out else "terminated", _described(term, ("time_out",)))
+        for name, term in cfg.terminations.items()
+    ]
+    rows.append(("non_finite", "terminated", "always: the physics or the action is not finite"))
+    yield _table("terminations", ("term", "marks", "parameters"), rows)
+
+    rows = [
+        (name, term.mode, _seconds(term.interval_range_s, ""), _described(term, ("mode", "interval_range_s")))
+        for name, term in env.event_manager.terms.items()
+    ]
+    yield _table("events", ("term", "mode", "every", "parameters"), rows)
+
+    levels = env.curriculum_levels()
+    rows = [(name, f"{float(levels[name]):g}", _described(term)) for name, term in cfg.curriculum.items()]
+    yield _table("curriculum", ("term", "level", "parameters"), rows)
+
+    rows = [(name, term.reduce, _described(term, ("reduce",))) for name, term in cfg.metrics.items()]
+    yield _table("metrics", ("term", "reduced by", "parameters"), rows)
+
+
+def _table(title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:
+    table = Table(title=title, title_justify="left", title_style="", box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("index", justify="right", no_wrap=True)
+    for column in columns:
+        table.add_column(column, no_wrap=column == "term", overflow="fold")
+    for index, row in enumerate(rows):
+        table.add_row(str(index), *row)
+    if not rows:
+        table.add_row("-", "none", *[""] * (len(columns) - 1))
+    return table
+
+
+def _described(term: Any, without: tuple[str, ...] = ()) -> str:
+    """Return the class of a term and its parameters."""
+    if not dataclasses.is_dataclass(term):
+        return repr(term)
+    return f"{type(term).__name__}({_parameters(term, without=without)})"
+
+
+def _parameters(value: Any, *, without: tuple[str, ...] = ()) -> str:
+    """Return the fields of a dataclass that differ from their defaults."""
+    parts = []
+    for field in dataclasses.fields(value):
+        given = getattr(value, field.name)
+        default = field.default
+        if field.default_factory is not dataclasses.MISSING:
+            default = field.default_factory()
+        if field.name not in without and given != default:
+            parts.append(f"{field.name}={_shown(given)}")
+    return ", ".join(parts)
+
+
+def _shown(value: Any) -> str:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return f"{type(value).__name__}({_parameters(value)})"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key}: {_shown(entry)}" for key, entry in value.items()) + "}"
+    if isinstance(value, (tuple, list)):
+        return "(" + ", ".join(_shown(entry) for entry in value) + ")"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _seconds(pair: tuple[float, float] | None, otherwise: str) -> str:
+    if pair is None:
+        return otherwise
+    low, high = pair
+    return f"{low:g} s" if low == high else f"{low:g} to {high:g} s"

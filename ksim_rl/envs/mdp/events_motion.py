@@ -1,0 +1,42 @@
+"""Episodes that begin somewhere in a reference motion."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import check_pair
+from ksim_rl.envs.motion import motion_start_time
+from ksim_rl.envs.term import EventTerm
+from ksim_rl.envs.view import EnvView
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResetToMotion(EventTerm):
+    """Put the whole scene into a state of a reference motion, and remember its time for `motion.motion_time`.
+
+    On a terrain the motion is moved to the env's origin.
+
+    Attributes:
+        file: what `view.motion` reads.
+        start_range: of the motion's duration, both in [0, 1]: where episodes begin.
+    """
+
+    file: str
+    start_range: tuple[float, float] = (0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_pair("start_range", self.start_range, low=0.0, high=1.0)
+
+    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+        """Write the rows of `mask_E`."""
+        motion, start_E = view.motion(self.file), motion_start_time(view, self.file)
+        drawn_E = view.uniform(1, *self.start_range)[:, 0] * motion.duration_s
+        start_E.copy_(torch.where(mask_E, drawn_E, start_E))
+        qpos_EL, qvel_EL = motion.sample(start_E)
+        if not view.terrain.is_flat:
+            columns = view.robot.root_qpos
+            qpos_EL[:, columns.start : columns.start + 3] += view.terrain.origins_E3
+        view.write_qpos(mask_E, qpos_EL)
+        view.write_qvel(mask_E, qvel_EL)

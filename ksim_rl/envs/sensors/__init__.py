@@ -1,0 +1,29 @@
+"""Sensors of a scene, one file each; terms read them by name through the view."""
+
+from ksim_rl.envs.sensors.camera import CameraSensor, CameraTracker
+from ksim_rl.envs.sensors.contact import ContactSensor
+from ksim_rl.envs.sensors.contact_tracker import ContactState, ContactTracker
+from ksim_rl.envs.sensors.imu import ImuSensor, ImuState, ImuTracker
+from ksim_rl.envs.sensors.ray_caster import RayCaster, RayState, RayTracker
+from ksim_rl.envs.sensors.ray_patterns import GridPattern, PinholePattern, RayPattern, RingPattern
+from ksim_rl.envs.sensors.sensor import Sensor, SensorTracker
+
+__all__ = [
+    "CameraSensor",
+    "CameraTracker",
+    "ContactSensor",
+    "ContactState",
+    "ContactTracker",
+    "GridPattern",
+    "ImuSensor",
+    "ImuState",
+    "ImuTracker",
+    "PinholePattern",
+    "RayCaster",
+    "RayPattern",
+    "RayState",
+    "RayTracker",
+    "RingPattern",
+    "Sensor",
+    "SensorTracker",
+]

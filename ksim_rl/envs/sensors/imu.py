@@ -1,0 +1,117 @@
+"""Inertial measurement units: gyroscope, accelerometer and orientation at a place on a body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import mujoco
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import check_in_range, near
+from ksim_rl.envs import quaternion
+from ksim_rl.envs.sensors.sensor import Sensor, SensorTracker
+
+if TYPE_CHECKING:
+    from ksim_rl.envs.view import EnvView
+    from ksim_rl.envs.visualizer import DebugVisualizer
+
+_SENSORS = {
+    "gyro": mujoco.mjtSensor.mjSENS_GYRO,
+    "accelerometer": mujoco.mjtSensor.mjSENS_ACCELEROMETER,
+    "orientation": mujoco.mjtSensor.mjSENS_FRAMEQUAT,
+}
+
+
+class ImuState(NamedTuple):
+    """What an inertial measurement unit reads, float32, in its own axes."""
+
+    ang_vel_EL: Tensor
+    """Angular velocity, rad/s, [E, 3]; velocity stage."""
+    lin_acc_EL: Tensor
+    """Acceleration minus gravity, m/s^2, [E, 3]: at rest it points up and is 9.81, in free fall it is zero.
+    Acceleration stage: of the last physics substep, and zero in rows that were just reset."""
+    quat_EL: Tensor
+    """Orientation, from the unit's axes to the world's, (w, x, y, z), [E, 4]; position stage."""
+    projected_gravity_EL: Tensor
+    """Unit vector of world -z, [E, 3]; position stage."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuSensor(Sensor):
+    """An inertial measurement unit at a site of the model, or at a place on a body, whose axes it then has.
+
+    Noise, bias and lag are transforms of the observations that read it.
+
+    Attributes:
+        site: a site of the model, or None.
+        body: a body of the model, or None; exactly one of the two is given.
+        pos: with `body`, where on it, in its frame, m.
+    """
+
+    site: str | None = None
+    body: str | None = None
+    pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if (self.site is None) == (self.body is None):
+            raise ValueError(f"site={self.site!r}, body={self.body!r}: give exactly one of them")
+        for index, value in enumerate(self.pos):
+            check_in_range(f"pos[{index}]", value)
+        if self.site is not None and any(self.pos):
+            raise ValueError(
+                f"pos={self.pos!r} with site={self.site!r}: a site has its own place; give a body"
+            )
+
+    def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
+        """Add the MJCF sensors `<name>_gyro`, `<name>_accelerometer` and `<name>_orientation`, and a site if needed.
+
+        Raises:
+            ValueError: if the model has no such site or body.
+        """
+        elements = spec.sites if self.body is None else spec.bodies
+        wanted = self.site if self.body is None else self.body
+        present = [element.name for element in elements]
+        if wanted not in present:
+            kind = "site" if self.body is None else "body"
+            raise ValueError(
+                f"scene.sensors.{name}: no {kind} {wanted!r}: {near(str(wanted), filter(None, present))}"
+            )
+        site = self.site
+        if self.body is not None:
+            site = f"{name}_imu"
+            spec.body(self.body).add_site(name=site, pos=list(self.pos))
+        for suffix, kind in _SENSORS.items():
+            spec.add_sensor(
+                name=f"{name}_{suffix}", type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site
+            )
+
+    def track(self, name: str, view: EnvView) -> ImuTracker:
+        """Return the reader of this sensor in the worlds of `view`."""
+        return ImuTracker(name, view, self.site or f"{name}_imu")
+
+
+class ImuTracker(SensorTracker):
+    """Reads one inertial measurement unit."""
+
+    def __init__(self, name: str, view: EnvView, site: str) -> None:
+        self._name, self._view, self._site = name, view, site
+        self._down = torch.tensor([0.0, 0.0, -1.0], device=view.device)
+
+    @property
+    def state(self) -> ImuState:
+        """The readings of the current state."""
+        ang_vel_EL, lin_acc_EL, quat_EL = (self._view.sensor(f"{self._name}_{suffix}") for suffix in _SENSORS)
+        key = f"imu/{self._name}.projected_gravity"
+        gravity_EL = self._view.cache.get(key)
+        if gravity_EL is None:
+            gravity_EL = quaternion.rotate_inverse(quat_EL, self._down.expand(self._view.num_envs, 3))
+            self._view.cache[key] = gravity_EL
+        return ImuState(ang_vel_EL, lin_acc_EL, quat_EL, gravity_EL)
+
+    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
+        """Draw the unit's axes at its place."""
+        site = view.world.mj_model.site(self._site).id
+        origin = view.world.site_xpos_EL[env_index, site].cpu().numpy()
+        visualizer.frame(origin, view.world.site_xmat_EL[env_index, site].cpu().numpy().reshape(3, 3))

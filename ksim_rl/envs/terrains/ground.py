@@ -1,0 +1,58 @@
+"""The ground of E worlds as terms read it: where envs start, and how high it is at any place."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+
+class Ground:
+    """Flat ground at z = 0, without end. Terrains that differ between worlds refine it."""
+
+    is_flat: bool = True
+    """Whether all heights and origins are zero."""
+    half_width: float = math.inf
+    """m from a world's origin to the edge of its ground, along x and y; beyond it there is nothing to stand on."""
+    num_levels: int = 1
+    """How many levels of difficulty there are."""
+
+    def __init__(self, num_envs: int, device: torch.device) -> None:
+        self._origins_E3 = torch.zeros(num_envs, 3, device=device)
+        self._zeros_E = torch.zeros(num_envs, dtype=torch.int64, device=device)
+
+    @property
+    def origins_E3(self) -> Tensor:
+        """Where each env starts: a point on the ground, world frame, m, [E, 3]."""
+        return self._origins_E3
+
+    @property
+    def levels_E(self) -> Tensor:
+        """The level of difficulty of each env, int64 [E] in [0, num_levels)."""
+        return self._zeros_E
+
+    @property
+    def types_E(self) -> Tensor:
+        """The kind of ground of each env, as an index into the terrain's kinds, int64 [E]."""
+        return self._zeros_E
+
+    def heights(self, points_EN2: Tensor) -> Tensor:
+        """Return the height of the ground at x, y (world frame, m, [E, N, 2]), m, [E, N].
+
+        Beyond the edge it is that of the nearest point within.
+        """
+        return torch.zeros_like(points_EN2[..., 0])
+
+    def clearance(self, points_EN3: Tensor) -> Tensor:
+        """Return how high points [E, N, 3] (world frame, m) are above the ground right below them, m, [E, N]."""
+        height_EN = points_EN3[..., 2]
+        return height_EN if self.is_flat else height_EN - self.heights(points_EN3[..., :2])
+
+    def set_levels(self, mask_E: Tensor, levels_E: Tensor) -> None:
+        """Move the rows of `mask_E` (bool [E]) to other levels (int64 [E]), before their reset.
+
+        Raises:
+            ValueError: if the terrain has no levels.
+        """
+        raise ValueError("the scene's terrain has no levels: use a TerrainGrid in scene.terrain")

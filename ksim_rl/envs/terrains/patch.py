@@ -1,0 +1,93 @@
+"""What a kind of ground is: a rule that gives the heights of a square patch at a difficulty."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ksim_rl.checks import check_in_range
+
+TIE = 1e-6
+"""m. Lattice points that lie on an edge of a pattern belong to its inside, whatever the coordinates round to."""
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """The points of a square patch at which heights are given; between them the ground is made of triangles.
+
+    Attributes:
+        size: edge of the patch, m; its centre is the origin.
+        cell: wanted distance between neighbouring points, m; the nearest that divides `size` is taken.
+    """
+
+    size: float
+    cell: float
+
+    @property
+    def num_cells(self) -> int:
+        """Cells along one edge."""
+        return max(1, round(self.size / self.cell))
+
+    @property
+    def spacing(self) -> float:
+        """Distance between neighbouring points, m."""
+        return self.size / self.num_cells
+
+    @cached_property
+    def x_RC(self) -> np.ndarray:
+        """Return x of each point, m, [R, C]; columns run along x."""
+        line = np.linspace(-self.size / 2, self.size / 2, self.num_cells + 1)
+        return np.broadcast_to(line, (line.size, line.size))
+
+    @property
+    def y_RC(self) -> np.ndarray:
+        """Return y of each point, m, [R, C]; rows run along y."""
+        return self.x_RC.T
+
+    @cached_property
+    def ring_RC(self) -> np.ndarray:
+        """Distance of each point to the centre, m, [R, C], in the norm whose circles are squares: max(|x|, |y|)."""
+        return np.maximum(np.abs(self.x_RC), np.abs(self.y_RC))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TerrainPatch(ABC):
+    """A kind of ground. Pairs are values at difficulty 0 and at difficulty 1, with a straight line between them.
+
+    Attributes:
+        proportion: share of the envs on this kind, relative to the other kinds.
+        cell: m between the points at which heights are given. What costs is the number of triangles under a foot, so
+            take the coarsest that shows the shape.
+    """
+
+    proportion: float = 1.0
+    cell: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_in_range("proportion", self.proportion, low=0.0, low_open=True)
+        check_in_range("cell", self.cell, low=0.01)
+
+    @abstractmethod
+    def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
+        """Return the heights at the points of `lattice`, m, float64 [R, C], for a difficulty in [0, 1].
+
+        Only differences count: a `TerrainGrid` puts the lowest point at z = 0.
+        """
+
+
+def between(pair: tuple[float, float], difficulty: float) -> float:
+    """Return the value of a pair at a difficulty in [0, 1]."""
+    return pair[0] + difficulty * (pair[1] - pair[0])
+
+
+def check_ends(field: str, pair: tuple[float, float], *, low: float, low_open: bool = False) -> None:
+    """Refuse a pair (at difficulty 0, at difficulty 1) with a number below `low`; either may be the greater one.
+
+    Raises:
+        ValueError: naming the field, the value and the valid range.
+    """
+    for index, value in enumerate(pair):
+        check_in_range(f"{field}[{index}]", value, low=low, low_open=low_open)

@@ -1,0 +1,35 @@
+"""What every terrain has: a config that edits the model, and the ground that terms read."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+
+from ksim_rl.envs.terrains.ground import Ground
+
+if TYPE_CHECKING:
+    from ksim_rl.envs.view import EnvView
+
+BODY = "terrain"
+"""Name of the body, and of the geom, that a terrain adds to the world."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Terrain(ABC):
+    """The ground of a scene: one static body with one geom, both called "terrain"."""
+
+    @property
+    def per_world_fields(self) -> tuple[str, ...]:
+        """The MuJoCo model fields that differ between worlds."""
+        return ()
+
+    @abstractmethod
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Add body, geom and looks to the scene's spec."""
+
+    def ground(self, view: EnvView) -> Ground:
+        """Return the ground of the worlds of `view` (flat, at z = 0, by default)."""
+        return Ground(view.num_envs, view.device)

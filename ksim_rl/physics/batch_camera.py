@@ -1,0 +1,104 @@
+"""One camera of the model, drawn for all worlds at once by MuJoCo Warp's ray-casting renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import mujoco_warp as mjw
+import torch
+import warp as wp
+from mujoco_warp._src.bvh import build_hfield_bvh
+from torch import Tensor
+
+from ksim_rl.physics.streams import warp_scope
+from ksim_rl.physics.world import World
+
+
+class BatchCamera:
+    """Pictures of a camera in each world, as `render` drew them last.
+
+    Args:
+        world: the worlds; `refresh` must have run since their state changed.
+        camera: name of a camera of the model.
+        width, height: pixels.
+        rgb, depth, segmentation: what to draw.
+        geom_groups: which geoms are visible.
+        textures, shadows: drawn or left out; the model's sky counts as a texture.
+
+    Raises:
+        ValueError: if the model has no such camera.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        camera: str,
+        *,
+        width: int,
+        height: int,
+        rgb: bool = True,
+        depth: bool = False,
+        segmentation: bool = False,
+        geom_groups: Sequence[int] = (0, 1, 2),
+        textures: bool = True,
+        shadows: bool = False,
+    ) -> None:
+        self._world, self._camera = world, camera
+        model, fields = world.mj_model, world.per_world_fields()
+        with warp_scope(world.device):
+            self._context = mjw.create_render_context(
+                model,
+                nworld=world.num_envs,
+                cam_res=(width, height),
+                render_rgb=rgb,
+                render_depth=depth,
+                render_seg=segmentation,
+                use_textures=textures,
+                use_shadows=shadows,
+                render_skybox=textures,
+                enabled_geom_groups=list(geom_groups),
+                cam_active=[camera],
+                use_precomputed_rays=not {"cam_fovy", "cam_intrinsic"} & fields.keys(),
+            )
+            if "geom_dataid" in fields:
+                self._add_height_fields(model)
+        self._shape = (world.num_envs, height, width)
+
+    def render(self) -> None:
+        """Draw the present state of all worlds."""
+        self._world.launch(self, self._launch)
+
+    @property
+    def rgb_EHW3(self) -> Tensor:
+        """Colors, uint8 [E, H, W, 3]."""
+        # Four bytes per pixel, the lowest first: blue, green, red, alpha.
+        bytes_EHW4 = wp.to_torch(self._context.rgb_data).view(torch.uint8).view(*self._shape, 4)
+        return bytes_EHW4[..., :3].flip(-1)
+
+    @property
+    def depth_EHW(self) -> Tensor:
+        """Distance along the camera's axis (not along the ray), m, 0 where nothing is hit, float32 [E, H, W]."""
+        return wp.to_torch(self._context.depth_data).view(self._shape)
+
+    @property
+    def segmentation_EHW2(self) -> Tensor:
+        """MuJoCo's object id and object type of what is hit, -1 for nothing, int32 [E, H, W, 2]."""
+        return wp.to_torch(self._context.seg_data).view(*self._shape, 2)
+
+    def _launch(self) -> None:
+        m, d = self._world.warp_model, self._world.warp_data_E
+        mjw.refit_bvh(m, d, self._context)
+        mjw.render(m, d, self._context)
+
+    def _add_height_fields(self, model: mujoco.MjModel) -> None:
+        """Prepare the height fields that only other worlds than the model's own collide with."""
+        context = self._context
+        ids, bounds = context.hfield_bvh_id.numpy(), context.hfield_bounds_size.numpy()
+        for field in range(model.nhfield):
+            if not ids[field]:
+                mesh, bounds[field] = build_hfield_bvh(model, field, constructor="cubql")
+                context.hfield_registry[mesh.id] = mesh
+                ids[field] = mesh.id
+        context.hfield_bvh_id = wp.array(ids, dtype=wp.uint64)
+        context.hfield_bounds_size = wp.array(bounds, dtype=wp.vec3)

@@ -1,0 +1,80 @@
+"""Principal moments and axes of many inertia matrices at once, without a host sync."""
+
+# Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
+# pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ksim_rl.physics.streams import warp_scope
+
+SWEEPS = wp.constant(6)
+
+
+@wp.kernel(enable_backward=False)
+def _jacobi(matrices: wp.array[wp.mat33], moments: wp.array[wp.vec3], quats: wp.array[wp.vec4]):
+    i = wp.tid()
+    a = matrices[i]
+    axes = wp.identity(n=3, dtype=float)
+    for _ in range(SWEEPS):
+        for pair in range(3):
+            p = wp.where(pair < 2, 0, 1)
+            q = wp.where(pair < 1, 1, 2)
+            off = a[p, q]
+            if off != 0.0:
+                ratio = (a[q, q] - a[p, p]) / (2.0 * off)
+                t = 1.0 / (wp.abs(ratio) + wp.sqrt(ratio * ratio + 1.0))
+                if ratio < 0.0:
+                    t = -t
+                c = 1.0 / wp.sqrt(t * t + 1.0)
+                s = t * c
+                turn = wp.identity(n=3, dtype=float)
+                turn[p, p] = c
+                turn[q, q] = c
+                turn[p, q] = s
+                turn[q, p] = -s
+                a = wp.transpose(turn) @ a @ turn
+                a[p, q] = 0.0
+                a[q, p] = 0.0
+                axes = axes @ turn
+    moments[i] = wp.get_diag(a)
+    quat = wp.normalize(wp.quat_from_matrix(axes))
+    quats[i] = wp.vec4(quat[3], quat[0], quat[1], quat[2])
+
+
+@torch.library.custom_op("ksim_rl::principal_axes", mutates_args=())
+def _principal_axes(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    moments, quats = matrices.new_empty(matrices.shape[0], 3), matrices.new_empty(matrices.shape[0], 4)
+    with warp_scope(matrices.device):
+        wp.launch(
+            _jacobi,
+            dim=matrices.shape[0],
+            inputs=[wp.from_torch(matrices.contiguous(), dtype=wp.mat33, return_ctype=True)],
+            outputs=[
+                wp.from_torch(moments, dtype=wp.vec3, return_ctype=True),
+                wp.from_torch(quats, dtype=wp.vec4, return_ctype=True),
+            ],
+            device=str(matrices.device),
+        )
+    return moments, quats
+
+
+@_principal_axes.register_fake
+def _(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    return matrices.new_empty(matrices.shape[0], 3), matrices.new_empty(matrices.shape[0], 4)
+
+
+def principal_axes(inertia: Tensor) -> tuple[Tensor, Tensor]:
+    """Diagonalize symmetric matrices by cyclic Jacobi rotations (Golub and Van Loan, section 8.5).
+
+    Args:
+        inertia: float32 [..., 3, 3].
+
+    Returns:
+        The principal moments [..., 3], and the orientation of their axes, a unit quaternion (w, x, y, z) [..., 4]. A
+        diagonal matrix keeps its order and its axes.
+    """
+    moments, quats = _principal_axes(inertia.reshape(-1, 3, 3))
+    return moments.view(*inertia.shape[:-2], 3), quats.view(*inertia.shape[:-2], 4)

@@ -1,0 +1,124 @@
+"""Exact running mean and variance, in one process or over all ranks."""
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+from ksim_rl.checks import check_in_range
+
+
+class RunningMoments(nn.Module):
+    """Mean and population variance of all rows counted so far.
+
+    Batches are merged as in Chan, Golub and LeVeque, "Updating formulae and a pairwise algorithm for computing sample
+    variances" (1979), in float64, and equal the two-pass mean and variance of everything seen. No method makes the
+    host wait or moves a buffer, so all can be captured in a CUDA graph.
+
+    With several ranks, each keeps the moments of its own rows, and `publish` merges those of all ranks into `mean` and
+    `var`: bit-identical everywhere, and equal to one process that saw all the rows.
+
+    Attributes:
+        mean, var: float32 [L], of all ranks; 0 and 1 before the first `publish`.
+        count: int64 []; rows counted so far, on this rank.
+
+    Args:
+        dim: L, size of the last dim of what is counted.
+        until: stop once this rank has counted so many rows; None never stops.
+    """
+
+    mean: Tensor
+    var: Tensor
+    count: Tensor
+    exact_mean: Tensor
+    exact_sum_of_squares: Tensor
+
+    def __init__(
+        self, dim: int, *, until: int | None = None, device: torch.device | str | int | None = None
+    ) -> None:
+        super().__init__()
+        if until is not None:
+            check_in_range("until", until, low=1)
+        self.dim = dim
+        self.until = until
+        self.register_buffer("mean", torch.zeros(dim, device=device))
+        self.register_buffer("var", torch.ones(dim, device=device))
+        self.register_buffer("count", torch.zeros((), dtype=torch.int64, device=device))
+        # Of squared deviations from the mean. float32 would stop growing after some 10^7 rows.
+        self.register_buffer("exact_mean", torch.zeros(dim, dtype=torch.float64, device=device))
+        self.register_buffer("exact_sum_of_squares", torch.zeros(dim, dtype=torch.float64, device=device))
+
+    @torch.no_grad()
+    def update(self, values: Tensor, valid: Tensor | None = None) -> None:
+        """Count every row of `values` once, and publish.
+
+        Rows with a non-finite element, and rows that `valid` marks False, are left out.
+
+        Args:
+            values: [..., L].
+            valid: bool, [...] or [..., 1].
+
+        Raises:
+            ValueError: if the last dim is not L, or `valid` does not have one element per row.
+        """
+        self.count_rows(values, valid)
+        self.publish()
+
+    @torch.no_grad()
+    def count_rows(self, values: Tensor, valid: Tensor | None = None) -> None:
+        """Count every row of `values` once, as `update` does, and leave `mean` and `var` as they are."""
+        if values.shape[-1] != self.dim:
+            raise ValueError(f"obs has shape {tuple(values.shape)}: the last dim must be {self.dim}")
+        valid_1 = values.isfinite().all(-1, keepdim=True)
+        if valid is not None:
+            if valid.numel() != valid_1.numel():
+                raise ValueError(
+                    f"valid has shape {tuple(valid.shape)}: expected one element per row of obs, "
+                    f"whose shape is {tuple(values.shape)}"
+                )
+            valid_1 = valid_1 & valid.reshape(valid_1.shape)
+        if self.until is not None:
+            valid_1 = valid_1 & (self.count < self.until)
+
+        batch_dims = tuple(range(values.ndim - 1))
+        exact = values.to(torch.float64)
+        zero = torch.zeros((), dtype=torch.float64, device=values.device)
+        added = valid_1.sum()
+        mean = torch.where(valid_1, exact, zero).sum(batch_dims) / added.clamp_min(1)
+        sum_of_squares = torch.where(valid_1, exact - mean, zero).square().sum(batch_dims)
+
+        merged = _merge((self.count, self.exact_mean, self.exact_sum_of_squares), (added, mean, sum_of_squares))
+        self.count.copy_(merged[0])
+        self.exact_mean.copy_(merged[1])
+        self.exact_sum_of_squares.copy_(merged[2])
+
+    @torch.no_grad()
+    def publish(self) -> None:
+        """Set `mean` and `var` from all that was counted; with several ranks all of them have to call it."""
+        moments = self.count, self.exact_mean, self.exact_sum_of_squares
+        if has_ranks():
+            own = torch.cat((self.count.to(torch.float64).reshape(1), self.exact_mean, self.exact_sum_of_squares))
+            parts = [torch.empty_like(own) for _ in range(dist.get_world_size())]
+            dist.all_gather(parts, own)
+            split = [part.split((1, self.dim, self.dim)) for part in parts]
+            moments = split[0][0][0], split[0][1], split[0][2]
+            for count, mean, sum_of_squares in split[1:]:
+                moments = _merge(moments, (count[0], mean, sum_of_squares))
+        count, mean, sum_of_squares = moments
+        self.mean.copy_(mean)
+        self.var.copy_(torch.where(count > 0, sum_of_squares / count.clamp_min(1), 1.0))
+
+
+def has_ranks() -> bool:
+    """Whether several processes train together."""
+    return dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1
+
+
+Moments = tuple[Tensor, Tensor, Tensor]
+
+
+def _merge(one: Moments, other: Moments) -> Moments:
+    """Return count, mean and sum of squared deviations of the union of two sets."""
+    total = one[0] + other[0]
+    share = other[0].to(torch.float64) / total.clamp_min(1)
+    delta = other[1] - one[1]
+    return total, one[1] + delta * share, one[2] + (other[2] + delta.square() * share * one[0])

@@ -1,0 +1,114 @@
+"""Findings about reproducibility, about what a partial reset touches, and about the end of an episode."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ksim_rl.testing.replays import Replays, copy_of, differing, end_episodes_at_next_step, reset_rows
+
+
+def check_determinism(env: EnvBase, num_steps: int) -> None:
+    """The same seed and actions give the same EnvStates, bit for bit (on the CPU, where physics is deterministic)."""
+    if env.device is not None and env.device.type != "cpu":
+        return
+    replays = Replays(env, num_steps)
+    rows = range(env.batch_size[0])
+    for step, (one, other) in enumerate(zip(replays.run(), replays.run(), strict=True)):
+        _refuse(
+            differing(one, other, rows),
+            f"differ at step {step} between two runs of the same seed and actions. Draw all random numbers from "
+            "`view.uniform` and `view.normal` (or another generator that `set_seed` seeds), and keep what changes from "
+            "step to step in `view.memory`, so that `state_dict` has it",
+        )
+
+
+def check_partial_reset(env: EnvBase, num_steps: int) -> None:
+    """A reset of row 0 leaves every bit of the other rows as it was: state, clocks, commands, histories, roots."""
+    num_envs = env.batch_size[0]
+    if num_envs < 2:
+        raise AssertionError(
+            f"the env has {num_envs} row: build it with at least 2, so that one can stay untouched"
+        )
+    others = range(1, num_envs)
+    replays = Replays(env, num_steps)
+    root = replays.start()
+    for index in range(num_steps):
+        _, root = replays.step(root, index)
+    before, root_before = _rows_of_state(env), root.clone()
+    root = reset_rows(env, root, [0])
+    after = _rows_of_state(env)
+    changed = [key for key, value in before.items() if not torch.equal(value[1:], after[key][1:])]
+    advice = "Write through the mask only: `torch.where(mask, new, old)`, or `view.write_*(mask_E, ...)`"
+    _refuse(changed, f"of the state change in rows that a reset of row 0 should leave alone. {advice}")
+    kept = root_before.select(*root.keys(True, True), strict=False)
+    _refuse(
+        differing(kept, root, others),
+        f"of the root change in rows that a reset of row 0 should leave alone. {advice}",
+    )
+    if env.device is not None and env.device.type != "cpu":
+        return
+    undisturbed, disturbed = replays.run(), replays.run(reset_at=num_steps // 2, rows=[0])
+    for step, (one, other) in enumerate(zip(undisturbed, disturbed, strict=True)):
+        _refuse(
+            differing(one, other, others),
+            f"differ at step {step} in rows that were never reset, if row 0 is reset before step {num_steps // 2}. "
+            "Rows share something: a generator (draw through the view, which keys draws by row), a counter or a sum",
+        )
+
+
+def check_episode_end(env: EnvBase, num_steps: int) -> None:
+    """`next` holds the observation of the state reached, also where the episode ended; roots begin the next episode."""
+    replays = Replays(env, num_steps)
+    root = replays.start()
+    for index in range(num_steps):
+        if index == num_steps // 2:
+            end_episodes_at_next_step(env)
+        env_state_E, root = replays.step(root, index)
+        next_E = env_state_E.get("next")
+        _check_end(
+            next_E,
+            root,
+            [key for key in next_E.keys(True, True) if key in env.full_observation_spec.keys(True, True)],
+        )
+
+
+def _check_end(next_E: TensorDictBase, root: TensorDictBase, keys: list[NestedKey]) -> None:
+    ended_E = next_E.get("done").flatten()
+    going = (~ended_E).nonzero().flatten().tolist()
+    ended = ended_E.nonzero().flatten().tolist()
+    next_obs, root_obs = next_E.select(*keys), root.select(*keys)
+    _refuse(
+        differing(next_obs, root_obs, going),
+        "differ between `next` and the next root in rows that go on. Compute each observation once per step: noise, "
+        "delay and history must not advance again in `_reset`",
+    )
+    for row in ended:
+        if keys and len(differing(next_obs, root_obs, [row])) == 0:
+            raise AssertionError(
+                f"row {row} ended, and its `next` observation is that of the new episode. `_step` must return the "
+                "observation of the state reached; leave resets to `_reset`, which `maybe_reset` calls with `done`"
+            )
+    if ended and bool(root.get("done")[ended].any()):
+        raise AssertionError(
+            f"rows {ended} ended and are still done after their reset. `_reset` must return done=False"
+        )
+
+
+def _rows_of_state(env: EnvBase) -> dict[str, Tensor]:
+    """Return copies of the entries of the state that have one row per env."""
+    return {
+        key: copy_of(value)
+        for key, value in env.state_dict().items()
+        if isinstance(value, Tensor) and value.ndim and value.shape[0] == env.batch_size[0]
+    }
+
+
+def _refuse(keys: list[NestedKey] | list[str], message: str) -> None:
+    if keys:
+        shown = ", ".join(repr(key) for key in keys[:5]) + (
+            f", ... ({len(keys)} in all)" if len(keys) > 5 else ""
+        )
+        raise AssertionError(f"{shown} {message}")

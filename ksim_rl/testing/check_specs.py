@@ -1,0 +1,91 @@
+"""Findings about specs, dim names and values, and about actions that should be refused."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import Composite
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import check_env_specs
+
+from ksim_rl import dims
+from ksim_rl.testing.dims import assert_dims
+
+SPECS = ("full_observation_spec", "full_action_spec", "full_reward_spec", "full_done_spec")
+
+
+def check_names(env: EnvBase, num_steps: int) -> None:
+    """Specs and data carry the label "E", rollouts ("E", "T"); TorchRL's own check looks at no names."""
+    for which in SPECS:
+        _check_spec_names(getattr(env, which), which, env.batch_dims)
+    root = env.reset()
+    assert_dims(root, dims.E)
+    stepped = env.step(env.rand_action(root))
+    assert_dims(stepped["next"], dims.E)
+    _, root = env.step_and_maybe_reset(env.rand_action(env.reset()))
+    assert_dims(root, dims.E)
+    assert_dims(env.rollout(num_steps, break_when_any_done=False), dims.E, dims.T)
+
+
+def check_values(env: EnvBase, num_steps: int) -> None:
+    """Observations are finite and inside their specs."""
+    _check_values(env.reset(), env.full_observation_spec, "reset")
+    rollout_ET = env.rollout(num_steps, break_when_any_done=False)
+    for step in range(num_steps):
+        _check_values(rollout_ET[:, step]["next"], env.full_observation_spec, f"step {step}")
+
+
+def check_torchrl(env: EnvBase, num_steps: int) -> None:
+    """What TorchRL's own `check_env_specs` asks for."""
+    check_env_specs(env)
+
+
+def check_actions(env: EnvBase, num_steps: int) -> None:
+    """Actions of a wrong shape or dtype are refused."""
+    action = env.rand_action(env.reset())[env.action_key]
+    wrong = {
+        "one element more": torch.cat((action, action[..., :1]), dim=-1),
+        "no leaf dim": action[..., 0],
+        "dtype float64": action.double() if action.dtype != torch.float64 else action.float(),
+    }
+    for what, bad in wrong.items():
+        td = env.reset()
+        try:
+            env.step(td.set(env.action_key, bad))
+        except (ValueError, RuntimeError, TypeError):
+            continue
+        raise AssertionError(
+            f"step accepted an action with {what}: {tuple(bad.shape)} {bad.dtype} "
+            f"for {tuple(action.shape)} {action.dtype}. Compare shape and dtype with the spec in `_step`: a wrong "
+            "shape broadcasts silently"
+        )
+    env.reset()
+
+
+def _check_spec_names(spec: Composite, where: str, batch_dims: int) -> None:
+    if spec.ndim == batch_dims and spec.names != [dims.E]:
+        raise AssertionError(
+            f"{where} has the names {spec.names}: expected ['{dims.E}']. "
+            f"Set `spec.names = ['{dims.E}']` where it is made"
+        )
+    for key, child in spec.items():
+        if isinstance(child, Composite):
+            _check_spec_names(child, f"{where}[{key!r}]", batch_dims)
+
+
+def _check_values(tensordict: TensorDictBase, spec: Composite, when: str) -> None:
+    for key in spec.keys(True, True):
+        value = tensordict.get(key, None)
+        if value is None:  # `check_env_specs` lists what is missing and what is too much
+            continue
+        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+            rows = (~torch.isfinite(value.reshape(value.shape[0], -1)).all(-1)).nonzero().flatten().tolist()
+            raise AssertionError(
+                f"observation {key!r} is not finite at {when}, in the rows {rows}. Look for a division by zero, a root "
+                "of a negative number or an uninitialized buffer in the term that computes it"
+            )
+        if not spec[key].is_in(value):
+            raise AssertionError(
+                f"observation {key!r} leaves its spec at {when}: values {value.min()} to {value.max()}, {spec[key]}. "
+                "Widen the spec, or clip the value"
+            )

@@ -1,0 +1,83 @@
+"""The same actions from the same start, as often as a check needs them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ksim_rl.envs.innermost import innermost
+from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
+
+SEED = 11
+
+
+class Replays:
+    """Remembers an env's state; each replay starts there, with the same seed and the same random actions.
+
+    What a curriculum has learned outlives a seed, so that a seed alone would not bring the start back.
+    """
+
+    def __init__(self, env: EnvBase, num_steps: int) -> None:
+        self.env, self.num_steps = env, num_steps
+        self._state = {key: copy_of(value) for key, value in env.state_dict().items()}
+        torch.manual_seed(SEED)
+        root = env.reset()
+        self._actions = [env.rand_action(root)[env.action_key].clone() for _ in range(num_steps)]
+
+    def start(self) -> TensorDictBase:
+        """Return to the start, and return its root."""
+        self.env.load_state_dict({key: copy_of(value) for key, value in self._state.items()})
+        self.env.set_seed(SEED)
+        return self.env.reset()
+
+    def step(self, root: TensorDictBase, index: int) -> tuple[TensorDictBase, TensorDictBase]:
+        """Step with the action of this index, and reset what ended."""
+        return self.env.step_and_maybe_reset(root.set(self.env.action_key, self._actions[index]))
+
+    def run(self, *, reset_at: int = -1, rows: Sequence[int] = ()) -> list[TensorDictBase]:
+        """Run all steps, and return a copy of each EnvState; `rows` are reset before step `reset_at`."""
+        root, env_states = self.start(), []
+        for index in range(self.num_steps):
+            if index == reset_at:
+                root = reset_rows(self.env, root, rows)
+            env_state_E, root = self.step(root, index)
+            env_states.append(env_state_E.clone())
+        return env_states
+
+
+def reset_rows(env: EnvBase, root: TensorDictBase, rows: Sequence[int]) -> TensorDictBase:
+    """Reset some rows only, by the mask that TorchRL knows."""
+    mask = torch.zeros_like(root.get("done"))
+    mask[list(rows)] = True
+    return env.reset(root.set("_reset", mask))
+
+
+def end_episodes_at_next_step(env: EnvBase) -> None:
+    """Let the episodes of a `ManagerBasedRlEnv` with a time limit end at the next step; other envs do not change."""
+    base_env = innermost(env)
+    if isinstance(base_env, ManagerBasedRlEnv) and base_env.max_episode_length:
+        view = base_env.view
+        view.time_out_offset_E.copy_(base_env.max_episode_length - view.episode_step_E - 1)
+
+
+def copy_of(value: Any) -> Any:
+    """Return a copy of a tensor; anything else as it is."""
+    return value.clone() if isinstance(value, Tensor) else value
+
+
+def differing(one: TensorDictBase, other: TensorDictBase, rows: Sequence[int]) -> list[NestedKey]:
+    """Return the keys whose values differ by a single bit in any of `rows` (NaN equals NaN)."""
+    return [
+        key
+        for key in one.keys(True, True)
+        if not torch.equal(_bits(one.get(key)[list(rows)]), _bits(other.get(key)[list(rows)]))
+    ]
+
+
+def _bits(value: Tensor) -> Tensor:
+    return value.contiguous().view(torch.int32) if value.dtype == torch.float32 else value

@@ -1,0 +1,75 @@
+"""The guide to a robot of one's own, followed to the letter: it is installed, looked at, checked and trained."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.docs.guide import DOCS, write_files
+
+REPOSITORY = Path(__file__).parents[2]
+GUIDE = "add_a_robot.md"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that the guide's reader has after step 4, with its package installed beside it."""
+    folder = tmp_path_factory.mktemp("stool")
+    write_files(GUIDE, folder)
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-build-isolation",
+        "--no-index",
+    ]
+    subprocess.run([*pip, "--target", folder / "site", folder], check=True)
+    return folder
+
+
+def run(folder: Path, *command: str) -> str:
+    paths = os.pathsep.join([str(folder / "site"), str(REPOSITORY)])
+    environment = os.environ | {"PYTHONPATH": paths, "COLUMNS": "150"}
+    done = subprocess.run(
+        [sys.executable, *command], capture_output=True, text=True, check=False, cwd=folder, env=environment
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def commands(prefix: str) -> list[str]:
+    """The guide's commands that begin so, without that beginning."""
+    return re.findall(rf"^    {prefix} (.*)$", (DOCS / GUIDE).read_text(), re.MULTILINE)
+
+
+def test_the_robot_stands_and_is_drawn(folder: Path) -> None:
+    (script,) = commands("python")
+    heights = re.findall(r"0\.\d+", run(folder, script).split("upright")[0])
+    assert len(heights) == 4 and all(0.2 < float(height) < 0.3 for height in heights)
+    picture = np.asarray(Image.open(folder / "stool.png"))
+    seat = (picture[..., 0] > 1.5 * picture[..., 2]) & (picture[..., 0] > 60)
+    assert seat.sum() > 500  # the red cushions
+
+
+def test_its_unit_tests_pass(folder: Path) -> None:
+    assert "2 passed" in run(folder, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_stool.py")
+
+
+def test_it_trains(folder: Path) -> None:
+    (command,) = (command for command in commands("ksim-rl train") if "device=cuda" not in command)
+    run(folder, "-m", "ksim_rl.cli.main", "train", *command.split())
+    assert list(folder.glob("**/checkpoint"))
+
+
+@pytest.mark.full
+def test_it_is_explained(folder: Path) -> None:
+    (command,) = commands("ksim-rl envs")
+    assert "foot_clearance" in run(folder, "-m", "ksim_rl.cli.main", "envs", *command.split())

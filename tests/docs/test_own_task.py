@@ -1,0 +1,108 @@
+"""The guide to a task of one's own, followed to the letter: its package is installed and its task trained."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.docs.guide import write_files
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+class Installed:
+    """A copy of the guide's package, installed where only `run` sees it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.site = folder / "puck_rink", folder / "site"
+        write_files("own_task.md", self.folder)
+        self.install()
+
+    def install(self) -> None:
+        pip = [
+            sys.executable,
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            "--no-deps",
+            "--no-build-isolation",
+            "--no-index",
+        ]
+        subprocess.run([*pip, "--upgrade", "--target", self.site, self.folder], check=True)
+
+    def run(self, *command: str | Path) -> subprocess.CompletedProcess[str]:
+        paths = os.pathsep.join([str(self.site), str(REPOSITORY)])
+        return subprocess.run(
+            [sys.executable, *command],
+            capture_output=True,
+            text=True,
+            check=False,
+            cwd=self.folder.parent,
+            env=os.environ | {"PYTHONPATH": paths, "COLUMNS": "150"},
+        )
+
+    def ksim_rl(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        return self.run("-m", "ksim_rl.cli.main", *arguments)
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    return Installed(tmp_path_factory.mktemp("own_task"))
+
+
+def test_the_task_is_listed_with_ours(installed: Installed) -> None:
+    done = installed.ksim_rl("envs")
+    assert done.returncode == 0, done.stderr
+    assert "puck_center" in done.stdout and "cartpole_balance" in done.stdout
+
+
+def test_its_unit_test_passes(installed: Installed) -> None:
+    done = installed.run("-m", "pytest", "-q", "-p", "no:cacheprovider", installed.folder / "test_puck.py")
+    assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout + done.stderr
+
+
+def test_training_takes_overrides_of_its_terms_and_its_own_configs(installed: Installed) -> None:
+    done = installed.ksim_rl(
+        "train", "task=puck_center", "+experiment=heavy", "task.rewards.near_center.std=0.3", "--cfg", "job"
+    )
+    assert done.returncode == 0, done.stderr
+    assert "mass: 2.0" in done.stdout and "std: 0.3" in done.stdout and "num_iterations: 60" in done.stdout
+    unknown = installed.ksim_rl("train", "task=puck_center", "task.rewards.near_center.sdt=0.3")
+    assert unknown.returncode == 2 and "did you mean" in unknown.stderr
+    lacking = installed.ksim_rl("train", "task=puck_center", "+experiment=light")
+    assert lacking.returncode == 2 and "heavy" in lacking.stderr
+
+
+@pytest.mark.full
+def test_it_trains_until_solved(installed: Installed) -> None:
+    done = installed.ksim_rl("train", "task=puck_center", "trainer.video=false", "seed=1")
+    assert done.returncode == 0 and "SOLVED" in done.stdout, done.stdout + done.stderr
+
+
+def test_without_the_package_its_classes_are_not_built() -> None:
+    tree = {"_target_": "puck_rink.robot.Puck"}
+    code = f"from ksim_rl.envs import config_tree; config_tree.from_tree(object, {tree}, 'x')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "only classes of these packages are built: ksim_rl" in done.stderr
+
+
+def test_a_broken_package_is_named(tmp_path: Path) -> None:
+    broken = Installed(tmp_path)
+    (broken.folder / "puck_rink" / "tasks.py").write_text("import no_such_module\n")
+    broken.install()
+    done = broken.ksim_rl("envs")
+    assert done.returncode == 2
+    assert "puck_rink" in done.stderr and "no_such_module" in done.stderr and "uninstall" in done.stderr
+
+
+def test_a_name_that_is_taken_is_refused(tmp_path: Path) -> None:
+    rival = Installed(tmp_path)
+    tasks = rival.folder / "puck_rink" / "tasks.py"
+    tasks.write_text(tasks.read_text().replace('name="puck_center"', 'name="cartpole_balance"'))
+    rival.install()
+    done = rival.ksim_rl("envs")
+    assert done.returncode == 2
+    assert "two tasks are called 'cartpole_balance'" in done.stderr and "rename one" in done.stderr

@@ -1,0 +1,82 @@
+"""The tables that say what an env is made of."""
+
+import math
+
+from ksim_rl.envs import ObservationGroupCfg, ObservationTermCfg, mdp
+from ksim_rl.envs.explain import explain
+from ksim_rl.envs.transforms.noise_cfg import UniformNoise
+from tests.envs.probe_env import DT, Kick, Launch, Position, Speed, Target, puck_env
+
+
+def explained():
+    terms = {
+        "position": ObservationTermCfg(
+            term=mdp.JointPos(), noise=UniformNoise(low=-0.1, high=0.1), history=3
+        ),
+        "target": ObservationTermCfg(term=mdp.Command(command="target")),
+    }
+    return puck_env(
+        limit=0.25,
+        episode_length_s=5 * DT,
+        observations={"actor": ObservationGroupCfg(terms=terms)},
+        commands={"target": Target(resampling_time_range_s=(1.0, 2.5))},
+        rewards={"position": Position(weight=0.5), "idle": Position(weight=0.0)},
+        events={"launch": Launch(speed=2.0), "kick": Kick(mode="interval", interval_range_s=(1.0, 1.0))},
+        curriculum={"level": mdp.LinearLevel(end_step=8, initial_level=0.25)},
+        metrics={"speed": Speed(reduce="max")},
+    ).explain()
+
+
+def tables(text):
+    """Return the tables by title, each a list of rows without its heads."""
+    found: dict[str, list[str]] = {}
+    title = ""
+    for line in text.splitlines()[1:]:
+        if line and not line.startswith(" "):
+            title = line
+            found[title] = []
+        elif line.strip() and line.split()[0] != "index" and set(line.strip()) != {"─"}:
+            found[title].append(" ".join(line.split()))
+    return found
+
+
+def test_each_manager_is_a_table_of_its_terms():
+    assert tables(explained()) == {
+        "observations/actor (4,)": [
+            "0 position (3,) noise=UniformNoise(low=-0.1, high=0.1), history=3 JointPos()",
+            "1 target (1,) Command(command=target)",
+        ],
+        "actions (1,)": ["0 push (1,) JointEffortAction()"],
+        "commands": ["0 target (1,) 1 to 2.5 s Target()"],
+        "rewards (times 0.02 s)": ["0 position 0.5 Position()", "1 idle 0: not computed Position()"],
+        "terminations": [
+            "0 beyond terminated Beyond(limit=0.25)",
+            "1 time_out truncated TimeOut()",
+            "2 non_finite terminated always: the physics or the action is not finite",
+        ],
+        "events": ["0 launch reset Launch(speed=2)", "1 kick interval 1 s Kick()"],
+        "curriculum": ["0 level 0.25 LinearLevel(initial_level=0.25, end_step=8)"],
+        "metrics": ["0 speed max Speed()"],
+    }
+
+
+def test_the_first_line_says_how_many_and_how_long():
+    line = explained().splitlines()[0]
+    assert line == "3 envs on cpu, 0.02 s per step = 4 x 0.005 s, episodes of 0.1 s = 5 steps"
+    assert puck_env(limit=None).explain().splitlines()[0].endswith("episodes of any length")
+
+
+def test_an_empty_manager_says_none_and_lines_stay_within_the_width():
+    env = puck_env(limit=None, commands={"reach": reach()})
+    text = explain(env, width=90)
+    assert max(len(line) for line in text.splitlines()) <= 90
+    assert tables(text)["metrics"] == ["- none"]
+    env.view.reward_weights["position"].fill_(7.0)
+    assert tables(env.explain())["rewards (times 0.02 s)"] == ["0 position 7 Position()"], (
+        "the present weight"
+    )
+
+
+def reach():
+    axes = dict.fromkeys(("x", "y", "z"), (-math.pi, math.pi))
+    return mdp.CartesianCommand(resampling_time_range_s=None, position=axes, frame="world")
