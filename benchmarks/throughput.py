@@ -16,22 +16,17 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-import mujoco_warp as mjw
 import torch
-import warp as wp
 from rich.console import Console
 from rich.table import Table
-from torch import Tensor
 
 from benchmarks import report
+from benchmarks.raw_physics import physics_ms, record_steps
 from benchmarks.stopwatch import milliseconds
 from ksim_rl import conf
 from ksim_rl.physics import World
 from ksim_rl.physics.capture import Captured
-from ksim_rl.physics.streams import warp_scope
 from ksim_rl.trainers import RunCfg, Trainer, build
-
-RECORDED_STEPS = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,14 +44,6 @@ SCHEDULES = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class RecordedStep:
-    """One env step of a run: the physics state before it, and the controls that it applied."""
-
-    state: dict[str, Tensor]
-    ctrl_EL: Tensor
-
-
 def measure(cfg: RunCfg) -> dict[str, float]:
     """Train some iterations of `cfg` and return the figures, ms and env states/s."""
     trainer = build(cfg)
@@ -70,19 +57,19 @@ def measure(cfg: RunCfg) -> dict[str, float]:
     rollout_ms = milliseconds(collector.collect, device=device, repeats=schedule.repeats)
     rollout_ET = collector.collect()
     update_ms = milliseconds(lambda: update(rollout_ET), device=device, repeats=schedule.repeats)
-    steps = _record_steps(trainer)
+    steps = record_steps(collector)
     env_step_ms = _env_step_ms(trainer, device, schedule.repeats)
-    physics_ms = _physics_ms(trainer, steps, device, schedule.repeats)
+    raw_ms = physics_ms(_world(trainer), cfg.task.decimation, steps, repeats=max(1, schedule.repeats // 3))
 
     env_states_per_s = 1000.0 * cfg.data.num_env_states / iteration_ms
     return {
-        "physics_ms": physics_ms,
+        "physics_ms": raw_ms,
         "env_step_ms": env_step_ms,
         "rollout_ms": rollout_ms,
         "update_ms": update_ms,
         "iteration_ms": iteration_ms,
         "env_states_per_s": env_states_per_s,
-        "iteration_over_physics": env_states_per_s / (1000.0 * cfg.num_envs / physics_ms),
+        "iteration_over_physics": env_states_per_s / (1000.0 * cfg.num_envs / raw_ms),
     }
 
 
@@ -106,20 +93,6 @@ def _world(trainer: Trainer) -> World:
 
 
 @torch.no_grad()
-def _record_steps(trainer: Trainer) -> list[RecordedStep]:
-    """Run the policy on, and record what each step's physics starts from."""
-    env, policy, world = trainer.collector.env, trainer.collector.policy, _world(trainer)
-    root_E, steps = env.reset(), []
-    # Episodes have to be under way: just reset robots stand still, or fall.
-    for index in range(2 * RECORDED_STEPS):
-        state = world.state_dict()
-        _, root_E = env.step_and_maybe_reset(policy(root_E))
-        if index >= RECORDED_STEPS:
-            steps.append(RecordedStep(state=state, ctrl_EL=world.ctrl_EL.clone()))
-    return steps
-
-
-@torch.no_grad()
 def _env_step_ms(trainer: Trainer, device: torch.device, repeats: int) -> float:
     """Time one env step, with transforms and masked reset and without the policy, as one graph."""
     env = trainer.collector.env
@@ -133,47 +106,6 @@ def _env_step_ms(trainer: Trainer, device: torch.device, repeats: int) -> float:
     for _ in range(4):
         captured()
     return milliseconds(captured, device=device, repeats=4 * repeats)
-
-
-def _physics_ms(trainer: Trainer, steps: list[RecordedStep], device: torch.device, repeats: int) -> float:
-    """Time the substeps of one env step alone, all sensors in each, over the recorded steps."""
-    world = _world(trainer)
-    decimation: int = trainer.collector.env.base_env.cfg.decimation  # pyright: ignore
-    warp_device = wp.get_device(str(device))
-
-    def substeps() -> None:
-        for _ in range(decimation):
-            mjw.step(world.warp_model, world.warp_data_E)
-
-    with warp_scope(device):
-        substeps()
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    with wp.ScopedDevice(warp_device), wp.ScopedCapture(device=warp_device) as capture:
-        substeps()
-    times = []
-    for step in steps:
-
-        def restore(step: RecordedStep = step) -> None:
-            world.load_state_dict(step.state)
-            world.ctrl_EL.copy_(step.ctrl_EL)
-            if device.type == "cuda":
-                torch.cuda.synchronize(device)
-
-        times.append(
-            milliseconds(
-                lambda: _launch(capture.graph, device),
-                device=device,
-                repeats=max(1, repeats // 3),
-                before=restore,
-            )
-        )
-    return statistics.mean(times)
-
-
-def _launch(graph: wp.Graph, device: torch.device) -> None:
-    with warp_scope(device):
-        wp.capture_launch(graph)
 
 
 def _table(cfg: RunCfg, figures: dict[str, float], device: torch.device) -> Table:

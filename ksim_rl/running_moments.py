@@ -86,7 +86,9 @@ class RunningMoments(nn.Module):
         mean = torch.where(valid_1, exact, zero).sum(batch_dims) / added.clamp_min(1)
         sum_of_squares = torch.where(valid_1, exact - mean, zero).square().sum(batch_dims)
 
-        merged = _merge((self.count, self.exact_mean, self.exact_sum_of_squares), (added, mean, sum_of_squares))
+        merged = _merge(
+            (self.count, self.exact_mean, self.exact_sum_of_squares), (added, mean, sum_of_squares)
+        )
         self.count.copy_(merged[0])
         self.exact_mean.copy_(merged[1])
         self.exact_sum_of_squares.copy_(merged[2])
@@ -96,7 +98,9 @@ class RunningMoments(nn.Module):
         """Set `mean` and `var` from all that was counted; with several ranks all of them have to call it."""
         moments = self.count, self.exact_mean, self.exact_sum_of_squares
         if has_ranks():
-            own = torch.cat((self.count.to(torch.float64).reshape(1), self.exact_mean, self.exact_sum_of_squares))
+            own = torch.cat(
+                (self.count.to(torch.float64).reshape(1), self.exact_mean, self.exact_sum_of_squares)
+            )
             parts = [torch.empty_like(own) for _ in range(dist.get_world_size())]
             dist.all_gather(parts, own)
             split = [part.split((1, self.dim, self.dim)) for part in parts]

@@ -38,8 +38,8 @@ def check_c_engine(env: EnvBase, num_steps: int) -> None:
     if np.median(error_E) > TOLERANCE:
         raise AssertionError(
             f"after one substep qvel differs from the C engine's by {np.median(error_E):.2g} of its scale in the "
-            f"median row (allowed {TOLERANCE}). Look for a model feature that Warp treats otherwise, for too few solver "
-            "iterations (`sim.iterations`), and for contacts that did not fit (`world.overflow_report()`)"
+            f"median row (allowed {TOLERANCE}). Look for a model feature that Warp treats otherwise, for too few "
+            "solver iterations (`sim.iterations`), and for contacts that did not fit (`world.overflow_report()`)"
         )
 
 

@@ -2,21 +2,14 @@
 
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
-from ksim_rl.envs.tasks import velocity, velocity_rough
-from ksim_rl.envs.tasks.go1_velocity_flat import FEET, FOOT_FRICTION, POSE, ROBOT, SIM, VIEWER
+from ksim_rl.envs.tasks import velocity
+from ksim_rl.envs.tasks.go1_velocity_flat import ROBOT, go1_velocity_flat
+from ksim_rl.envs.tasks.velocity_rough import on_rough_ground
 
 
 def go1_velocity_rough() -> ManagerBasedRlEnvCfg:
     """Return the config."""
-    return velocity_rough.velocity_rough_cfg(
-        ROBOT,
-        sim=velocity_rough.with_room(SIM, njmax=160, nconmax=48),
-        feet=FEET,
-        rewards=velocity.rewards(ROBOT, pose=POSE),
-        events=velocity.events(ROBOT) | FOOT_FRICTION,
-        viewer=VIEWER,
-        root_height=ROBOT.init_pos[2],
-    )
+    return on_rough_ground(go1_velocity_flat(), root_height=ROBOT.init_pos[2], njmax=160, nconmax=48)
 
 
 TASK = Task(

@@ -1,14 +1,11 @@
-"""What velocity tasks on rough ground share: the flat task's managers, a terrain in levels, and a scan of it."""
+"""What velocity tasks on rough ground share: the flat task, a terrain in levels, and a scan of it."""
 
 import dataclasses
 from collections.abc import Mapping
 
 from ksim_rl.envs import mdp
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
-from ksim_rl.envs.robots.legged_robot import LeggedRobot
-from ksim_rl.envs.sensors import ContactSensor
 from ksim_rl.envs.tasks import velocity
-from ksim_rl.envs.term import EventTerm, RewardTerm
 from ksim_rl.envs.terrains import (
     DiscreteObstacles,
     FlatPatch,
@@ -19,9 +16,7 @@ from ksim_rl.envs.terrains import (
     TerrainPatch,
     Waves,
 )
-from ksim_rl.envs.transforms.group_cfg import ObservationTermCfg
-from ksim_rl.envs.viewer_cfg import ViewerCfg
-from ksim_rl.physics import SimCfg
+from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg, ObservationTermCfg
 
 PATCHES: Mapping[str, TerrainPatch] = {
     "flat": FlatPatch(),
@@ -33,51 +28,40 @@ PATCHES: Mapping[str, TerrainPatch] = {
     "obstacles": DiscreteObstacles(),
     "waves": Waves(),
 }
-"""For robots of about Go1's size. A pyramid's top is where envs start, so that they walk down."""
+"""Up to 20 cm of step and 27 degrees of slope. A pyramid's top is where envs start, so that they walk down."""
 
 
-def with_room(sim: SimCfg, *, njmax: int, nconmax: int) -> SimCfg:
-    """Return the settings with room for more constraints and contacts: on edges a foot touches in several places."""
-    return dataclasses.replace(sim, njmax=njmax, nconmax=nconmax)
-
-
-def velocity_rough_cfg(
-    robot: LeggedRobot,
+def on_rough_ground(
+    flat: ManagerBasedRlEnvCfg,
     *,
-    sim: SimCfg,
-    feet: ContactSensor,
-    rewards: Mapping[str, RewardTerm],
-    events: Mapping[str, EventTerm],
-    viewer: ViewerCfg,
     root_height: float,
+    njmax: int,
+    nconmax: int,
     patches: Mapping[str, TerrainPatch] = PATCHES,
 ) -> ManagerBasedRlEnvCfg:
-    """Return the config of `velocity.velocity_cfg` on rough ground.
+    """Return the config of a flat velocity task on rough ground.
 
     Actor and critic see the heights around the robot, episodes also end (as truncations) at the edge of the patch, and
     envs move through the levels by how far their robots walk.
 
     Args:
-        root_height: m, of the robot as it stands; the heights are seen relative to its soles.
+        root_height: m, of the robot as it stands; heights are seen relative to its soles.
+        njmax, nconmax: room for constraints and contacts; on edges a foot touches in several places.
     """
     scan, terrain = mdp.HeightScan(offset=root_height), TerrainGrid(patches=patches)
-    cfg = velocity.velocity_cfg(
-        robot,
-        sim=sim,
-        feet=feet,
-        observations=velocity.observations(
-            robot,
-            actor={"height_scan": velocity.noisy(scan, 0.1)},
-            critic={"height_scan": ObservationTermCfg(term=scan)},
-        ),
-        rewards=rewards,
-        events=events,
-        viewer=viewer,
-        terrain=terrain,
-        curriculum={"terrain_level": mdp.TerrainLevels(command=velocity.COMMAND)},
-    )
+    groups = {
+        "actor": _with(flat.observations["actor"], velocity.noisy(scan, 0.1)),
+        "critic": _with(flat.observations["critic"], ObservationTermCfg(term=scan)),
+    }
     return dataclasses.replace(
-        cfg,
-        scene=dataclasses.replace(cfg.scene, spacing=terrain.size),
-        terminations={**cfg.terminations, "outside_terrain": mdp.OutsideTerrain()},
+        flat,
+        sim=dataclasses.replace(flat.sim, njmax=njmax, nconmax=nconmax),
+        scene=dataclasses.replace(flat.scene, terrain=terrain, spacing=terrain.size),
+        observations={**flat.observations, **groups},
+        terminations={**flat.terminations, "outside_terrain": mdp.OutsideTerrain()},
+        curriculum={**flat.curriculum, "terrain_level": mdp.TerrainLevels(command=velocity.COMMAND)},
     )
+
+
+def _with(group: ObservationGroupCfg, scan: ObservationTermCfg) -> ObservationGroupCfg:
+    return dataclasses.replace(group, terms={**group.terms, "height_scan": scan})

@@ -1,27 +1,47 @@
-"""Transforms for any TorchRL env: noise, delay, history, limits, units, groups."""
+"""Transforms for any TorchRL env: noise, delay, history, limits, units, statistics, mirrors, groups."""
 
+from ksim_rl.envs.transforms.action_clip import ActionClip
 from ksim_rl.envs.transforms.action_delay import ActionDelay
+from ksim_rl.envs.transforms.action_low_pass import ActionLowPass
+from ksim_rl.envs.transforms.action_scale import ActionScale
 from ksim_rl.envs.transforms.clip import ObservationClip
+from ksim_rl.envs.transforms.command_curriculum import RandomCommandCurriculum
 from ksim_rl.envs.transforms.compile_groups import compile_groups
 from ksim_rl.envs.transforms.delay import ObservationDelay
 from ksim_rl.envs.transforms.delay_cfg import DelayCfg
+from ksim_rl.envs.transforms.episode_tracker import EpisodeTracker
 from ksim_rl.envs.transforms.group_cfg import HistoryCfg, ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.envs.transforms.group_spec import GroupSpec
 from ksim_rl.envs.transforms.groups import ObservationGroups
 from ksim_rl.envs.transforms.history import ObservationHistory
 from ksim_rl.envs.transforms.keyed_transform import KeyedTransform
+from ksim_rl.envs.transforms.mirror import Mirror, mirrored
+from ksim_rl.envs.transforms.mirror_map import AXIAL, PLANAR_VELOCITY, POLAR, QUATERNION, MirrorMap
 from ksim_rl.envs.transforms.noise import ObservationNoise
 from ksim_rl.envs.transforms.noise_cfg import ConstantNoise, GaussianNoise, NoiseCfg, UniformNoise
+from ksim_rl.envs.transforms.normalization import ObservationNormalization
+from ksim_rl.envs.transforms.reward_clip import RewardClip
+from ksim_rl.envs.transforms.reward_scale import RewardScale
+from ksim_rl.envs.transforms.robot_mirror import mirror_by_name, mirror_group, mirror_joints, mirror_name
 from ksim_rl.envs.transforms.scale import ObservationScale
+from ksim_rl.envs.transforms.success_tracker import SuccessTracker
+from ksim_rl.envs.transforms.time_aware import TimeAwareObservation
 
 __all__ = [
+    "AXIAL",
+    "ActionClip",
     "ActionDelay",
+    "ActionLowPass",
+    "ActionScale",
     "ConstantNoise",
     "DelayCfg",
+    "EpisodeTracker",
     "GaussianNoise",
     "GroupSpec",
     "HistoryCfg",
     "KeyedTransform",
+    "Mirror",
+    "MirrorMap",
     "NoiseCfg",
     "ObservationClip",
     "ObservationDelay",
@@ -29,8 +49,22 @@ __all__ = [
     "ObservationGroups",
     "ObservationHistory",
     "ObservationNoise",
+    "ObservationNormalization",
     "ObservationScale",
     "ObservationTermCfg",
+    "PLANAR_VELOCITY",
+    "POLAR",
+    "QUATERNION",
+    "RandomCommandCurriculum",
+    "RewardClip",
+    "RewardScale",
+    "SuccessTracker",
+    "TimeAwareObservation",
     "UniformNoise",
     "compile_groups",
+    "mirror_by_name",
+    "mirror_group",
+    "mirror_joints",
+    "mirror_name",
+    "mirrored",
 ]

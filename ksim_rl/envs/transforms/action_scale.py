@@ -92,7 +92,9 @@ class ActionScale(Transform):
         for index, (key, out_key) in enumerate(zip(self.in_keys_inv, self.out_keys_inv, strict=True)):
             scale, offset = self._buffers[f"scale_{index}"], self._buffers[f"offset_{index}"]
             if scale is None or offset is None:
-                raise RuntimeError("ActionScale knows its numbers once an env holds it and has made its specs")
+                raise RuntimeError(
+                    "ActionScale knows its numbers once an env holds it and has made its specs"
+                )
             tensordict.set(key, tensordict.get(out_key) * scale + offset)
         return tensordict
 

@@ -7,7 +7,14 @@ from torchrl.envs.transforms import Transform
 
 from ksim_rl import checks
 from ksim_rl.envs.transforms.row_transform import Keys, as_keys, checked_out_keys
-from ksim_rl.envs.transforms.specs import add_bounds, bounded, bounds, leaf_spec, multiply_bounds, set_leaf_spec
+from ksim_rl.envs.transforms.specs import (
+    add_bounds,
+    bounded,
+    bounds,
+    leaf_spec,
+    multiply_bounds,
+    set_leaf_spec,
+)
 
 
 class RewardScale(Transform):

@@ -91,7 +91,7 @@ class RowTransform(Transform):
             if present is None and loaded is not None:
                 self._buffers[name] = torch.empty_like(loaded)
         super()._load_from_state_dict(state_dict, prefix, *args)
-        first = self._buffers[self._row_buffers[0]]
+        first = self._buffers[self._row_buffers[0]] if self._row_buffers else None
         if first is not None and not self.num_rows:
             self.num_rows = first.shape[0]
 

@@ -133,14 +133,16 @@ def test_a_walk_over_the_edge_ends_in_a_truncation_and_a_higher_level(env):
 
 
 def test_levels_and_patches_survive_a_checkpoint(env):
-    env.view.terrain.set_levels(torch.ones(NUM_ENVS, dtype=torch.bool), torch.arange(NUM_ENVS) % 3)
-    root_E = step(env, env.reset(), 3)
-    state = env.state_dict()
+    root_E = env.reset()
+    env.view.terrain.set_levels(torch.ones(NUM_ENVS, dtype=torch.bool), 2 - torch.arange(NUM_ENVS) % 3)
+    root_E = step(env, root_E, 3)
+    levels, state = env.view.terrain.levels_E.tolist(), env.state_dict()
     expected = step(env, root_E.clone(), 5)
     other = walker_env()
     other.reset()
+    assert other.view.terrain.levels_E.tolist() != levels
     other.load_state_dict(state)
-    assert other.view.terrain.levels_E.tolist() == [row % 3 for row in range(NUM_ENVS)]
+    assert other.view.terrain.levels_E.tolist() == levels
     resumed = step(other, root_E.clone(), 5)
     assert torch.equal(resumed["obs", "pos"], expected["obs", "pos"])
     assert torch.equal(resumed["obs", "scan"], expected["obs", "scan"])
