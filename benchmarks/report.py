@@ -6,7 +6,7 @@ import platform
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -106,7 +106,32 @@ def write(
     }
     for key, value in measured.items():
         saved[key] = {**saved.get(key, {}), **value} if isinstance(value, Mapping) else value
+    _replace(path, saved)
+    return path
+
+
+def merge(name: str, sources: Sequence[Path], *, folder: Path = RESULTS) -> Path:
+    """Merge `<source>/<name>.json` of each source into `<folder>/<name>.json`; of two entries, the later run's stays.
+
+    Returns:
+        The path of the file.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}.json"
+    reports = [json.loads((source / f"{name}.json").read_text()) for source in sources]
+    if path.exists():
+        reports.append(json.loads(path.read_text()))
+    merged: dict[str, Any] = {}
+    for saved in sorted(reports, key=lambda saved: saved["date"]):
+        for key, value in saved.items():
+            # What a run was made with is its own; everything else that is a mapping has entries of many runs.
+            many = isinstance(value, Mapping) and key != "versions"
+            merged[key] = {**merged.get(key, {}), **value} if many else value
+    _replace(path, merged)
+    return path
+
+
+def _replace(path: Path, saved: Mapping[str, Any]) -> None:
     unfinished = path.with_suffix(".json.part")
     unfinished.write_text(json.dumps(saved, indent=2) + "\n")
     os.replace(unfinished, path)
-    return path

@@ -16,6 +16,9 @@ from ksim_rl.testing.replays import Replays
 # Of the scale of a velocity, per substep: float32 and a solver that stops early stay far below; a field or an option
 # that one engine does not know of goes far beyond.
 TOLERANCE = 1e-2
+# The C engine finds several contacts of a geom with neighbouring triangles of a height field where we find the one that
+# a plane would have: the same place, but stiffer.
+HEIGHT_FIELD_TOLERANCE = 1e-1
 _INPUTS = ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat", "time")
 
 
@@ -35,10 +38,12 @@ def check_c_engine(env: EnvBase, num_steps: int) -> None:
     env.reset()
     scale = 1.0 + np.abs(expected_EL).max(axis=-1)
     error_E = np.abs(actual_EL - expected_EL).max(axis=-1) / scale
-    if np.median(error_E) > TOLERANCE:
+    on_height_field = np.isin(mujoco.mjtGeom.mjGEOM_HFIELD, world.mj_model.geom_type)
+    tolerance = HEIGHT_FIELD_TOLERANCE if on_height_field else TOLERANCE
+    if np.median(error_E) > tolerance:
         raise AssertionError(
             f"after one substep qvel differs from the C engine's by {np.median(error_E):.2g} of its scale in the "
-            f"median row (allowed {TOLERANCE}). Look for a model feature that Warp treats otherwise, for too few "
+            f"median row (allowed {tolerance}). Look for a model feature that Warp treats otherwise, for too few "
             "solver iterations (`sim.iterations`), and for contacts that did not fit (`world.overflow_report()`)"
         )
 

@@ -101,8 +101,13 @@ def build_evaluator(
     episodes: int | None = None,
     seed: int | None = None,
 ) -> Evaluator:
-    """Build envs for evaluation, with sensor noise off, and what runs a policy in them."""
+    """Build envs for evaluation, and what runs a policy in them.
+
+    Sensor noise is off, and so are curricula: their weights and ranges are those of the config, whatever training has
+    come to.
+    """
     seed = cfg.seed + EVALUATION_SEED_OFFSET if seed is None else seed
+    cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, curriculum={}))
     env = build_env(cfg, num_envs=episodes or cfg.trainer.eval_episodes, seed=seed)
     env.eval()
     max_steps = innermost(env).max_episode_length or UNLIMITED_EPISODE_STEPS

@@ -24,6 +24,23 @@ def test_a_run_merges_its_figures_in_and_drops_no_other(tmp_path: Path):
     assert [path.name for path in tmp_path.iterdir()] == ["speed.json"]
 
 
+def test_reports_of_several_processes_merge_and_the_later_run_wins(tmp_path: Path):
+    one, other, folder = tmp_path / "one", tmp_path / "other", tmp_path / "all"
+    folder.mkdir()
+    for where, date, figures in (
+        (folder, "2026-01-01", {"cpu/a/ms": 1.0, "cpu/c/ms": 5.0}),
+        (other, "2026-01-03", {"cpu/a/ms": 3.0}),
+        (one, "2026-01-02", {"cpu/a/ms": 2.0, "cpu/b/ms": 4.0}),
+    ):
+        saved = write(where, figures, notes={key: date for key in figures})
+        (where / "speed.json").write_text(json.dumps({**saved, "date": date, "versions": {date: "1"}}))
+    merged = json.loads(report.merge("speed", [one, other], folder=folder).read_text())
+    assert merged["figures"] == {"cpu/a/ms": 3.0, "cpu/b/ms": 4.0, "cpu/c/ms": 5.0}
+    assert merged["notes"] == {"cpu/a/ms": "2026-01-03", "cpu/b/ms": "2026-01-02", "cpu/c/ms": "2026-01-01"}
+    assert set(merged["runs"]) == {"cpu/a", "cpu/b", "cpu/c"}
+    assert (merged["date"], merged["versions"]) == ("2026-01-03", {"2026-01-03": "1"})
+
+
 def test_a_report_says_what_ran_where_and_with_what(tmp_path: Path):
     saved = write(tmp_path, {"cpu/a/ms": 2.0})
     assert saved["command"].startswith("python -m benchmarks.speed")

@@ -9,7 +9,7 @@ from ksim_rl.envs.tasks.velocity_rough import on_rough_ground
 
 def go1_velocity_rough() -> ManagerBasedRlEnvCfg:
     """Return the config."""
-    return on_rough_ground(go1_velocity_flat(), root_height=ROBOT.init_pos[2], njmax=160, nconmax=48)
+    return on_rough_ground(go1_velocity_flat(), root_height=ROBOT.init_pos[2], njmax=120, nconmax=40)
 
 
 TASK = Task(

@@ -127,6 +127,7 @@ class TerrainGrid(Terrain):
             name=BODY,
             type=mujoco.mjtGeom.mjGEOM_HFIELD,
             hfieldname=steepest,
+            mass=0,  # as planes have none
             friction=list(self.friction),
             material=MATERIAL,
             # The robot's default class would apply otherwise, which may collide with nothing.

@@ -4,6 +4,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Composite
 
+from ksim_rl.envs.transforms.actions import checked_action
 from ksim_rl.envs.transforms.delay_cfg import DelayCfg
 from ksim_rl.envs.transforms.lagged_transform import LaggedTransform
 from ksim_rl.envs.transforms.row_transform import Keys, as_keys, checked_out_keys
@@ -13,7 +14,8 @@ from ksim_rl.envs.transforms.specs import leaf_spec, set_leaf_spec
 class ActionDelay(LaggedTransform):
     """The env receives the action of some env steps ago; the tensordict keeps the one that the policy chose.
 
-    Until the first action of an episode arrives, the env receives `initial`.
+    Until the first action of an episode arrives, the env receives `initial`. With `by_level` the range of the lag
+    follows `follow_level_`. A delay of the targets in physics substeps is `ksim_rl.envs.actuators.DelayedActuator`.
 
     Args:
         in_keys_inv: the actions that the env reads.
@@ -61,30 +63,21 @@ class ActionDelay(LaggedTransform):
         if not self._sized:
             # The action's shape is in the specs only, and they size the buffers.
             assert self.container is not None and self.container.input_spec is not None
-        self._restart(self._reset_rows(tensordict, tensordict_reset))
+        mask_E = self._reset_rows(tensordict, tensordict_reset)
+        self._restart(mask_E)
+        for index in range(len(self.in_keys_inv)):
+            self._begin(index, torch.full_like(self._ring(index)[:, 0], self.initial), mask_E)
         return tensordict_reset
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        assert self._sized, "an env sizes its transforms before it steps"
         actions = [self._checked(index, tensordict, key) for index, key in enumerate(self.out_keys_inv)]
         self._advance()
-        waiting_E = self.lag_E >= self.age_E
         for index, (key, action) in enumerate(zip(self.in_keys_inv, actions, strict=True)):
             action_E = action.reshape(self.num_rows, *action.shape[tensordict.ndim :])
-            self._push(index, action_E)
-            waiting = waiting_E.reshape(-1, *[1] * (action_E.ndim - 1))
-            delayed = self._read(index, self.lag_E).masked_fill_(waiting, self.initial)
-            tensordict.set(key, delayed.reshape(action.shape))
+            tensordict.set(key, self._push(index, action_E).reshape(action.shape))
         return tensordict
 
     def _checked(self, index: int, tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
         """Return the action, refused here since the env sees it only after the buffer."""
-        action = tensordict.get(key)
         ring_KE: torch.Tensor = getattr(self, f"ring_{index}")
-        expected = (*tensordict.batch_size, *ring_KE.shape[2:])
-        if tuple(action.shape) != expected or action.dtype != ring_KE.dtype:
-            raise ValueError(
-                f"action {key!r} has shape {tuple(action.shape)} and dtype {action.dtype}: "
-                f"expected {expected} and {ring_KE.dtype}"
-            )
-        return action
+        return checked_action(tensordict, key, ring_KE.shape[2:], ring_KE.dtype)

@@ -6,6 +6,7 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from ksim_rl import checks
+from ksim_rl.envs.transforms.actions import checked_action
 from ksim_rl.envs.transforms.row_transform import Keys, RowTransform, as_keys, checked_out_keys
 from ksim_rl.envs.transforms.specs import drop_leaf_spec, leaf_spec, set_leaf_spec
 
@@ -74,12 +75,7 @@ class ActionLowPass(RowTransform):
             raise RuntimeError("ActionLowPass has state per env: use it in an env, not on a batch of samples")
         for index, (key, out_key) in enumerate(zip(self.in_keys_inv, self.out_keys_inv, strict=True)):
             filtered_E: Tensor = getattr(self, f"filtered_{index}")
-            action = tensordict.get(out_key)
-            if action.shape != (*tensordict.batch_size, *filtered_E.shape[1:]):
-                raise ValueError(
-                    f"action {out_key!r} has shape {tuple(action.shape)}: "
-                    f"expected {(*tensordict.batch_size, *filtered_E.shape[1:])}"
-                )
+            action = checked_action(tensordict, out_key, filtered_E.shape[1:], filtered_E.dtype)
             action_E = action.reshape(filtered_E.shape)
             fresh_E = self.fresh_E.reshape(-1, *[1] * (action_E.ndim - 1))
             before_E = torch.where(fresh_E, action_E if self.initial is None else self.initial, filtered_E)

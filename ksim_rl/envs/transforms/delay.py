@@ -13,7 +13,8 @@ class ObservationDelay(LaggedTransform):
     """Observations as they were some env steps ago; an env that just reset sees its reset observation until then.
 
     All keys of one transform share the lag. A larger lag than before shows older readings again, a smaller one skips
-    some.
+    some. With `by_level` the range of the lag follows `follow_level_`. Delays in physics substeps are those of
+    `ksim_rl.envs.actuators.DelayedActuator`.
 
     Args:
         in_keys: observations, of any shape and dtype; nested keys as tuples.
@@ -62,16 +63,14 @@ class ObservationDelay(LaggedTransform):
         mask_E = self._reset_rows(tensordict, tensordict_reset)
         self._restart(mask_E)
         for index, (out_key, value) in enumerate(zip(self.out_keys, values, strict=True)):
-            self._push_rows(index, value.reshape(self.num_rows, *value.shape[len(batch_size) :]), mask_E)
-            tensordict_reset.set(out_key, value)
+            value_E = value.reshape(self.num_rows, *value.shape[len(batch_size) :])
+            tensordict_reset.set(out_key, self._begin(index, value_E, mask_E).reshape(value.shape))
         return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        assert self._sized, "an env sizes its transforms before it steps"
         self._advance()
-        lag_E = self.lag_E.minimum(self.age_E)
         for index, (key, out_key) in enumerate(zip(self.in_keys, self.out_keys, strict=True)):
             value = next_tensordict.get(key)
-            self._push(index, value.reshape(self.num_rows, *value.shape[next_tensordict.ndim :]))
-            next_tensordict.set(out_key, self._read(index, lag_E).reshape(value.shape))
+            value_E = value.reshape(self.num_rows, *value.shape[next_tensordict.ndim :])
+            next_tensordict.set(out_key, self._push(index, value_E).reshape(value.shape))
         return next_tensordict

@@ -16,6 +16,8 @@ class DelayCfg:
         resample_every: env steps after which a new lag is drawn within an episode; 0 keeps it. Counted per env since
             its reset, or since all envs last reset together.
         hold_probability: chance that such a draw leaves the lag as it is.
+        by_level: whether the transform's level (see `FollowsLevel`) sets the reach: lags are drawn from
+            {min_lag, ..., min_lag + round(level * (max_lag - min_lag))}.
     """
 
     min_lag: int = 0
@@ -23,6 +25,7 @@ class DelayCfg:
     per_env: bool = True
     resample_every: int = 0
     hold_probability: float = 0.0
+    by_level: bool = False
 
     def __post_init__(self) -> None:
         for field in ("min_lag", "max_lag", "resample_every"):

@@ -9,20 +9,30 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from ksim_rl.envs.transforms.keyed_transform import KeyedTransform
-from ksim_rl.envs.transforms.noise_cfg import Draw, NoiseCfg
+from ksim_rl.envs.transforms.level import FollowsLevel
+from ksim_rl.envs.transforms.noise_cfg import NoiseCfg
 from ksim_rl.envs.transforms.noise_columns import NoiseColumns, widen
+from ksim_rl.envs.transforms.noise_kernel import (
+    HAS_BIAS,
+    HAS_DROPOUT,
+    HAS_WALK,
+    NoiseState,
+    add_noise,
+    reset_noise,
+    step_noise,
+)
 from ksim_rl.envs.transforms.row_transform import Keys, as_keys, checked_out_keys
 from ksim_rl.envs.transforms.specs import bounded, bounds, leaf_spec, set_leaf_spec
 
 
-class ObservationNoise(KeyedTransform):
+class ObservationNoise(FollowsLevel, KeyedTransform):
     """Noise on floating-point observations, drawn once per env step, for the reset observation too.
 
     Given other `out_keys`, the clean reading stays beside the noisy one (for an asymmetric critic). All keys of one
-    transform share one draw, so one transform with many keys is cheaper than many with one.
+    transform share one kernel, so one transform with many keys is cheaper than many with one.
 
     `env.eval()` turns it off and `env.train()` on again, `enable_` does the same for one transform; both write a device
-    flag, so a captured or compiled step follows.
+    flag, so a captured or compiled step follows. Noise with `by_level` follows `follow_level_`.
 
     Args:
         in_keys: observations, of any shape; nested keys as tuples.
@@ -35,10 +45,12 @@ class ObservationNoise(KeyedTransform):
         >>> noise = ObservationNoise(["imu"], noise=GaussianNoise(std=0.1, bias=UniformNoise(low=-0.2, high=0.2)))
     """
 
-    purposes = tuple(f"{when}/{d.value}" for when in ("step", "reset", "bias", "forward") for d in Draw)
+    purposes = ("step", "reset", "forward")
 
     enabled: Tensor
-    bias_EL: Tensor
+    bias_EL: Tensor | None
+    walk_EL: Tensor | None
+    last_EL: Tensor | None
 
     def __init__(
         self,
@@ -52,13 +64,15 @@ class ObservationNoise(KeyedTransform):
     ) -> None:
         in_keys = as_keys(in_keys)
         out_keys = checked_out_keys(in_keys, out_keys)
-        super().__init__(in_keys, out_keys, row_buffers=["bias_EL"], seed=seed, stream=stream)
+        super().__init__(
+            in_keys, out_keys, row_buffers=["bias_EL", "walk_EL", "last_EL"], seed=seed, stream=stream
+        )
         self.noise = _one_per_key(noise, self.in_keys)
         self._wanted = enabled
         self._layout: tuple[int, list[torch.Size]] | None = None
         self.noise_columns: NoiseColumns | None = None
-        self.bias_columns: NoiseColumns | None = None
         self.register_buffer("enabled", torch.tensor(enabled), persistent=False)
+        self._register_level(is_used=any(cfg.by_level for cfg in self.noise))
 
     def enable_(self, enabled: bool = True) -> Self:
         """Turn the noise on or off, in place."""
@@ -94,13 +108,18 @@ class ObservationNoise(KeyedTransform):
         if self._layout == (self.num_rows, shapes):
             return
         self._layout = (self.num_rows, shapes)
-        sizes, device = [shape.numel() for shape in shapes], self.step_count.device
-        self.noise_columns = NoiseColumns(self.noise, self.in_keys, sizes, device)
-        if any(cfg.bias is not None for cfg in self.noise):
-            self.bias_columns = NoiseColumns([cfg.bias for cfg in self.noise], self.in_keys, sizes, device)
+        device = self.step_count.device
+        columns = NoiseColumns(self.noise, self.in_keys, [shape.numel() for shape in shapes], device)
+        self.noise_columns = columns
+        shape = (self.num_rows, columns.size)
+        if columns.has(HAS_BIAS):
             present = self._buffers["bias_EL"]
-            if present is None or present.shape != (self.num_rows, self.bias_columns.size):
-                self._buffers["bias_EL"] = self.bias_columns.neutral().expand(self.num_rows, -1).clone()
+            if present is None or present.shape != shape:
+                self._buffers["bias_EL"] = columns.neutral_bias().expand(shape).clone()
+        if columns.has(HAS_WALK):
+            self._size_buffer("walk_EL", shape, torch.float32, device)
+        if columns.has(HAS_DROPOUT):
+            self._size_buffer("last_EL", shape, torch.float32, device)
 
     def _size_by(self, tensordict: TensorDictBase) -> None:
         """Make what the specs have not made yet: TorchRL may reset or resume an env before it asks for them."""
@@ -111,44 +130,75 @@ class ObservationNoise(KeyedTransform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         self._size_by(tensordict_reset)
         mask_E = self._reset_rows(tensordict, tensordict_reset)
-        if self.bias_columns is not None:
-            bias_EL = self.bias_columns.sample(lambda kind: self._reset_keys(f"bias/{kind}"), self.num_rows)
-            self.bias_EL.copy_(torch.where(mask_E[:, None], bias_EL, self.bias_EL))
-        sample_EL = self._columns.sample(lambda kind: self._reset_keys(f"reset/{kind}"), self.num_rows)
-        return self._write(tensordict_reset, sample_EL, self.bias_EL)
+        clean_EL = self._read(tensordict_reset, self.num_rows)
+        noisy_EL = reset_noise(
+            clean_EL,
+            self._state(),
+            self._columns.features,
+            mask_E,
+            seed=self.seed_value,
+            stream=self._stream_ids["reset"],
+            counter_E=self.reset_count_E,
+        )
+        return self._write(tensordict_reset, noisy_EL)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._size_by(next_tensordict)
         self.step_count.add_(1)
-        sample_EL = self._columns.sample(lambda kind: self._step_keys(f"step/{kind}"), self.num_rows)
-        return self._write(next_tensordict, sample_EL, self.bias_EL)
+        noisy_EL = step_noise(
+            self._read(next_tensordict, self.num_rows),
+            self._state(),
+            self._columns.features,
+            seed=self.seed_value,
+            stream=self._stream_ids["step"],
+            counter=self.step_count,
+        )
+        return self._write(next_tensordict, noisy_EL)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Add fresh noise to a batch of samples (no bias: samples belong to no episode)."""
-        num_rows = tensordict.numel()
+        """Add fresh noise to a batch of samples; they belong to no episode, so there is no bias, walk or dropout."""
         self._size_columns([tensordict.get(key).shape[tensordict.ndim :] for key in self.in_keys])
         self.step_count.add_(1)
-        sample_EL = self._columns.sample(lambda kind: self._step_keys(f"forward/{kind}", num_rows), num_rows)
-        return self._write(tensordict, sample_EL, None)
+        noisy_EL = add_noise(
+            self._read(tensordict, tensordict.numel()),
+            self._state(),
+            self._columns.features,
+            seed=self.seed_value,
+            stream=self._stream_ids["forward"],
+            counter=self.step_count,
+        )
+        return self._write(tensordict, noisy_EL)
 
     @property
     def _columns(self) -> NoiseColumns:
         assert self.noise_columns is not None, "an env sizes its transforms before it steps"
         return self.noise_columns
 
-    def _write(self, tensordict: TensorDictBase, sample_EL: Tensor, bias_EL: Tensor | None) -> TensorDictBase:
-        values = [tensordict.get(key) for key in self.in_keys]
-        flat = [value.reshape(sample_EL.shape[0], -1) for value in values]
+    def _state(self) -> NoiseState:
+        buffers = self._buffers
+        return NoiseState(
+            self._columns.table_PL,
+            self._columns.flags_L,
+            self.enabled,
+            self.level,
+            buffers["bias_EL"],
+            buffers["walk_EL"],
+            buffers["last_EL"],
+        )
+
+    def _read(self, tensordict: TensorDictBase, num_rows: int) -> Tensor:
+        """Return the clean readings side by side, float32 [E, L]."""
+        flat = [tensordict.get(key).reshape(num_rows, -1) for key in self.in_keys]
         clean_EL = flat[0] if len(flat) == 1 else torch.cat(flat, dim=1)
-        biased_EL = clean_EL
-        if bias_EL is not None and self.bias_columns is not None:
-            biased_EL = self.bias_columns.apply_to(clean_EL, bias_EL)
-        noisy_EL = torch.where(self.enabled, self._columns.apply_to(biased_EL, sample_EL), clean_EL)
+        return clean_EL if clean_EL.dtype == torch.float32 else clean_EL.float()
+
+    def _write(self, tensordict: TensorDictBase, noisy_EL: Tensor) -> TensorDictBase:
         start = 0
-        for out_key, value, part in zip(self.out_keys, values, flat, strict=True):
-            size = part.shape[1]
-            noisy = noisy_EL[:, start : start + size].reshape(value.shape)
-            tensordict.set(out_key, noisy.to(value.dtype))
+        values = [tensordict.get(key) for key in self.in_keys]
+        for out_key, value in zip(self.out_keys, values, strict=True):
+            size = value.shape[tensordict.ndim :].numel()
+            noisy = noisy_EL if size == noisy_EL.shape[1] else noisy_EL[:, start : start + size]
+            tensordict.set(out_key, noisy.reshape(value.shape).to(value.dtype))
             start += size
         return tensordict
 

@@ -24,19 +24,39 @@ class Draw(Enum):
 class NoiseCfg(ABC):
     """What all noise has in common: a sample is offset + spread * draw.
 
+    A reading goes through it in this order: bias, walk, the noise itself, resolution, dropout.
+
     Args:
         operation: "add" (observation + sample) or "multiply" (observation * sample).
-        bias: a further noise, drawn at each reset and held for the episode (an encoder's offset); its own operation
-            applies, before the noise.
+        bias: a further noise, drawn at each reset and held for the episode (an encoder's offset), with an operation of
+            its own; it has none of the fields below.
+        walk_std: std of the steps of a random walk that is added (an IMU's drift), one step per env step. It begins
+            at 0 at each reset.
+        resolution: the reading is rounded to a multiple of this; 0 does not round.
+        dropout: chance per env step that the reading is lost, all its elements at once; that of a reset never is.
+        lost: what stands in for a lost reading: "last" is the one of the step before, "zero" is 0.
+        by_level: whether the transform's level (see `FollowsLevel`) scales all of it: a sample s becomes
+            level * s ("multiply": 1 + level * (s - 1)), and walk, resolution and dropout are multiplied by the level.
     """
 
     operation: Literal["add", "multiply"] = "add"
     bias: "NoiseCfg | None" = None
+    walk_std: PerDim = 0.0
+    resolution: PerDim = 0.0
+    dropout: float = 0.0
+    lost: Literal["last", "zero"] = "last"
+    by_level: bool = False
 
     def __post_init__(self) -> None:
         checks.check_choice("operation", self.operation, ("add", "multiply"))
-        if self.bias is not None and self.bias.bias is not None:
-            raise ValueError(f"bias={self.bias!r}: a bias has no bias of its own")
+        _checked("walk_std", self.walk_std, low=0.0)
+        _checked("resolution", self.resolution, low=0.0)
+        checks.check_in_range("dropout", self.dropout, low=0.0, high=1.0)
+        checks.check_choice("lost", self.lost, ("last", "zero"))
+        if self.bias is not None:
+            for field in ("bias", "walk_std", "resolution", "dropout", "by_level"):
+                if getattr(self.bias, field) not in (None, 0.0):
+                    raise ValueError(f"bias={self.bias!r}: a bias has no {field} of its own")
 
     @property
     @abstractmethod
@@ -75,7 +95,7 @@ class UniformNoise(NoiseCfg):
 
     def affine(self, size: int) -> tuple[list[float], list[float]]:
         """Offset low, spread high - low."""
-        low, high = _per_dim("low", self.low, size), _per_dim("high", self.high, size)
+        low, high = per_dim("low", self.low, size), per_dim("high", self.high, size)
         return low, [b - a for a, b in zip(low, high, strict=True)]
 
 
@@ -98,14 +118,14 @@ class GaussianNoise(NoiseCfg):
 
     def affine(self, size: int) -> tuple[list[float], list[float]]:
         """Offset mean, spread std."""
-        return _per_dim("mean", self.mean, size), _per_dim("std", self.std, size)
+        return per_dim("mean", self.mean, size), per_dim("std", self.std, size)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ConstantNoise(NoiseCfg):
-    """The same value always."""
+    """The same value always; the default suits a sensor that only drifts, rounds or loses readings."""
 
-    value: PerDim
+    value: PerDim = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -118,7 +138,21 @@ class ConstantNoise(NoiseCfg):
 
     def affine(self, size: int) -> tuple[list[float], list[float]]:
         """Offset value, spread 0."""
-        return _per_dim("value", self.value, size), [0.0] * size
+        return per_dim("value", self.value, size), [0.0] * size
+
+
+def per_dim(field: str, value: PerDim, size: int) -> list[float]:
+    """Return one number for each of `size` elements.
+
+    Raises:
+        ValueError: if there is neither one number nor `size`.
+    """
+    numbers = [float(number) for number in _numbers(value)]
+    if len(numbers) not in (1, size):
+        raise ValueError(
+            f"{field} has {len(numbers)} numbers, but the observation has {size} per env: give 1 or {size}"
+        )
+    return numbers * size if len(numbers) == 1 else numbers
 
 
 def _numbers(value: PerDim) -> tuple[float, ...]:
@@ -130,12 +164,3 @@ def _checked(field: str, value: PerDim, *, low: float | None = None) -> tuple[fl
     for index, number in enumerate(numbers):
         checks.check_in_range(field if len(numbers) == 1 else f"{field}[{index}]", number, low=low)
     return numbers
-
-
-def _per_dim(field: str, value: PerDim, size: int) -> list[float]:
-    numbers = [float(number) for number in _numbers(value)]
-    if len(numbers) not in (1, size):
-        raise ValueError(
-            f"{field} has {len(numbers)} numbers, but the observation has {size} per env: give 1 or {size}"
-        )
-    return numbers * size if len(numbers) == 1 else numbers

@@ -1,121 +1,127 @@
 """The noise of several observations side by side, so that one draw serves all of them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
 
-from ksim_rl import random
-from ksim_rl.envs.transforms.noise_cfg import ConstantNoise, Draw, NoiseCfg
+from ksim_rl.envs.transforms import noise_kernel
+from ksim_rl.envs.transforms.noise_cfg import Draw, NoiseCfg, per_dim
 from ksim_rl.envs.transforms.specs import Device, add_bounds, multiply_bounds
-
-_NEUTRAL = ConstantNoise(value=0.0)
-_ORDER = (Draw.UNIFORM, Draw.GAUSSIAN, Draw.NONE)
 
 
 class NoiseColumns(nn.Module):
-    """Parameters of the noise per column; a sample is `offset + spread * draw`.
+    """Parameters of the noise, column by column, as `noise_kernel` reads them.
+
+    Attributes:
+        features: which of bias, walk, resolution, dropout and normal draws any column has.
 
     Args:
-        cfgs: one per observation; None leaves its columns as they are.
+        cfgs: one per observation.
         keys: their names, for errors.
         sizes: their numbers of columns.
     """
 
-    offset_L: Tensor
-    spread_L: Tensor
-    multiply_L: Tensor
-    order_L: Tensor
+    table_PL: Tensor
+    flags_L: Tensor
 
     def __init__(
-        self,
-        cfgs: Sequence[NoiseCfg | None],
-        keys: Sequence[NestedKey],
-        sizes: Sequence[int],
-        device: Device,
+        self, cfgs: Sequence[NoiseCfg], keys: Sequence[NestedKey], sizes: Sequence[int], device: Device
     ) -> None:
         super().__init__()
-        offset: list[float] = []
-        spread: list[float] = []
-        multiply: list[bool] = []
-        draws: list[Draw] = []
-        for cfg, key, size in zip(cfgs, keys, sizes, strict=True):
-            cfg = cfg or _NEUTRAL
-            offsets, spreads = _affine(cfg, key, size)
-            offset += offsets
-            spread += spreads
-            multiply += [cfg.operation == "multiply"] * size
-            draws += [cfg.draw] * size
-        self.num_uniform, self.num_gaussian = draws.count(Draw.UNIFORM), draws.count(Draw.GAUSSIAN)
-        self.size = len(draws)
-        self.all_add, self.all_multiply = not any(multiply), all(multiply)
-        # Columns are drawn kind by kind; `order_L` says where in that row each column finds its draw.
-        by_kind = sorted(range(self.size), key=lambda column: _ORDER.index(draws[column]))
-        self.in_order = by_kind == list(range(self.size))
-        place = {column: index for index, column in enumerate(by_kind)}
-        tensors = {
-            "offset_L": torch.tensor(offset, dtype=torch.float32),
-            "spread_L": torch.tensor(spread, dtype=torch.float32),
-            "multiply_L": torch.tensor(multiply),
-            "order_L": torch.tensor([place[column] for column in range(self.size)]),
+        self.size = sum(sizes)
+        table = torch.zeros(noise_kernel.NUM_PARAMETERS, self.size)
+        flags = torch.zeros(self.size, dtype=torch.int32)
+        start = 0
+        for index, (cfg, key, size) in enumerate(zip(cfgs, keys, sizes, strict=True)):
+            columns = slice(start, start + size)
+            table[:, columns] = torch.tensor(_parameters(cfg, key, size))
+            flags[columns] = _flags(cfg) | index << noise_kernel.KEY_SHIFT
+            start += size
+        found = {
+            noise_kernel.HAS_GAUSSIAN: any(_is_gaussian(cfg) or _is_gaussian(cfg.bias) for cfg in cfgs),
+            noise_kernel.HAS_BIAS: any(cfg.bias is not None for cfg in cfgs),
+            noise_kernel.HAS_WALK: bool(table[noise_kernel.WALK_STD].any()),
+            noise_kernel.HAS_RESOLUTION: bool(table[noise_kernel.RESOLUTION].any()),
+            noise_kernel.HAS_DROPOUT: bool(table[noise_kernel.DROPOUT].any()),
         }
-        for name, tensor in tensors.items():
-            self.register_buffer(name, tensor.to(device), persistent=False)
+        self.features = sum(feature for feature, is_there in found.items() if is_there)
+        self.by_level = any(cfg.by_level for cfg in cfgs)
+        self.register_buffer("table_PL", table.to(device), persistent=False)
+        self.register_buffer("flags_L", flags.to(device), persistent=False)
 
-    def sample(self, keys_of: Callable[[str], random.RowKeys], num_rows: int) -> Tensor:
-        """Return one sample per row and column, float32 [E, L]; `keys_of` gives the keys of a kind of draw."""
-        parts = []
-        if self.num_uniform:
-            parts.append(random.uniform(keys_of("uniform"), self.num_uniform))
-        if self.num_gaussian:
-            parts.append(random.normal(keys_of("gaussian"), self.num_gaussian))
-        rest = self.size - self.num_uniform - self.num_gaussian
-        if not parts:
-            return self.offset_L.expand(num_rows, -1)
-        if rest:
-            parts.append(torch.zeros(num_rows, rest, device=self.offset_L.device))
-        draw_EL = parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
-        if not self.in_order:
-            draw_EL = draw_EL.index_select(1, self.order_L)
-        return torch.addcmul(self.offset_L, self.spread_L, draw_EL)
+    def has(self, feature: int) -> bool:
+        """Whether any column has it."""
+        return bool(self.features & feature)
 
-    def apply_to(self, obs_EL: Tensor, sample_EL: Tensor) -> Tensor:
-        """Add or multiply, column by column."""
-        if self.all_add:
-            return obs_EL + sample_EL
-        if self.all_multiply:
-            return obs_EL * sample_EL
-        return torch.where(self.multiply_L, obs_EL * sample_EL, obs_EL + sample_EL)
+    def neutral_bias(self) -> Tensor:
+        """Return the bias that changes nothing, [L]."""
+        return (self.flags_L & noise_kernel.BIAS_MULTIPLY != 0).to(torch.float32)
 
-    def neutral(self) -> Tensor:
-        """Return the sample that changes nothing, [L]."""
-        return self.multiply_L.to(torch.float32)
+
+def _parameters(cfg: NoiseCfg, key: NestedKey, size: int) -> list[list[float]]:
+    """Return the parameters of one observation, one row per kind."""
+    try:
+        bias = cfg.bias.affine(size) if cfg.bias is not None else ([0.0] * size, [0.0] * size)
+        rows = {
+            noise_kernel.OFFSET: cfg.affine(size)[0],
+            noise_kernel.SPREAD: cfg.affine(size)[1],
+            noise_kernel.BIAS_OFFSET: bias[0],
+            noise_kernel.BIAS_SPREAD: bias[1],
+            noise_kernel.WALK_STD: per_dim("walk_std", cfg.walk_std, size),
+            noise_kernel.RESOLUTION: per_dim("resolution", cfg.resolution, size),
+            noise_kernel.DROPOUT: [cfg.dropout] * size,
+        }
+    except ValueError as error:
+        raise ValueError(f"{type(cfg).__name__} of {key!r}: {error}") from None
+    return [rows[row] for row in range(noise_kernel.NUM_PARAMETERS)]
+
+
+def _flags(cfg: NoiseCfg) -> int:
+    flags = {
+        noise_kernel.GAUSSIAN: _is_gaussian(cfg),
+        noise_kernel.MULTIPLY: cfg.operation == "multiply",
+        noise_kernel.BIAS_GAUSSIAN: _is_gaussian(cfg.bias),
+        noise_kernel.BIAS_MULTIPLY: cfg.bias is not None and cfg.bias.operation == "multiply",
+        noise_kernel.BY_LEVEL: cfg.by_level,
+        noise_kernel.HOLD: cfg.lost == "last",
+    }
+    return sum(flag for flag, is_set in flags.items() if is_set)
+
+
+def _is_gaussian(cfg: NoiseCfg | None) -> bool:
+    return cfg is not None and cfg.draw is Draw.GAUSSIAN
 
 
 def widen(
-    cfg: NoiseCfg | None, key: NestedKey, low: Tensor, high: Tensor, batch_dims: int
+    cfg: NoiseCfg, key: NestedKey, low: Tensor, high: Tensor, batch_dims: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the bounds of the noisy observation; they hold the clean one too, as noise can be off."""
-    if cfg is None:
-        return low, high
+    """Return the bounds of the noisy observation; they hold the clean one too, as noise can be off or weaker."""
     shape = low.shape[batch_dims:]
-    offset, spread = _affine(cfg, key, shape.numel())
-    offset_L = torch.tensor(offset, device=low.device)
-    spread_L = torch.tensor(spread, device=low.device)
+    rows = [torch.tensor(row, device=low.device).reshape(shape) for row in _parameters(cfg, key, shape.numel())]
+    ends = low, high
+    if cfg.bias is not None:
+        ends = _noisy(cfg.bias, rows[noise_kernel.BIAS_OFFSET], rows[noise_kernel.BIAS_SPREAD], ends)
+    drift = torch.where(rows[noise_kernel.WALK_STD] > 0, torch.inf, 0.0)
+    ends = ends[0] - drift, ends[1] + drift
+    ends = _noisy(cfg, rows[noise_kernel.OFFSET], rows[noise_kernel.SPREAD], ends)
+    half = rows[noise_kernel.RESOLUTION] / 2
+    lowest, highest = torch.minimum(low, ends[0] - half), torch.maximum(high, ends[1] + half)
+    if cfg.dropout and cfg.lost == "zero":
+        lowest, highest = lowest.clamp(max=0.0), highest.clamp(min=0.0)
+    return lowest, highest
+
+
+def _noisy(
+    cfg: NoiseCfg, offset: Tensor, spread: Tensor, ends: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Return the bounds after a noise of any strength from none to full."""
+    low, high = ends
     if cfg.draw is Draw.GAUSSIAN:
-        reach_L = torch.where(spread_L > 0, torch.inf, 0.0)
-        ends = offset_L - reach_L, offset_L + reach_L
+        reach = torch.where(spread > 0, torch.inf, 0.0)
+        noise = (offset - reach).expand(low.shape), (offset + reach).expand(low.shape)
     else:
-        ends = offset_L, offset_L + spread_L
-    noise = ends[0].reshape(shape).expand(low.shape), ends[1].reshape(shape).expand(low.shape)
-    combine = multiply_bounds if cfg.operation == "multiply" else add_bounds
-    noisy_low, noisy_high = combine(widen(cfg.bias, key, low, high, batch_dims), noise)
+        noise = offset.expand(low.shape), (offset + spread).expand(low.shape)
+    noisy_low, noisy_high = (multiply_bounds if cfg.operation == "multiply" else add_bounds)(ends, noise)
     return torch.minimum(low, noisy_low), torch.maximum(high, noisy_high)
-
-
-def _affine(cfg: NoiseCfg, key: NestedKey, size: int) -> tuple[list[float], list[float]]:
-    try:
-        return cfg.affine(size)
-    except ValueError as error:
-        raise ValueError(f"{type(cfg).__name__} of {key!r}: {error}") from None

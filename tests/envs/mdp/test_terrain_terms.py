@@ -40,7 +40,7 @@ def adapt(bench, mask_E, count=0):
 
 
 def walked(bench, distances, *, levels, steps=100, speed=0.2):
-    """Give five envs levels, an episode of `steps` and a command of `speed` m/s, and robots that far from their origins.
+    """Give five envs levels, episodes of `steps` and commands of `speed` m/s, and robots that far from their origins.
 
     Half a patch is 2 m, so 1.6 m are enough to go up; in 10 s of 0.2 m/s a robot should walk 2 m, so less than 1 m is
     too little.

@@ -151,7 +151,9 @@ def test_readings_follow_the_state_and_are_the_readers_own():
 
 def test_patterns_are_what_they_say():
     start, direction = GridPattern(size=(1.0, 0.5), resolution=0.5, height=0.2, direction=(0, 0, -2)).rays()
-    assert np.allclose(start[:, :2], [[-0.5, -0.25], [0, -0.25], [0.5, -0.25], [-0.5, 0.25], [0, 0.25], [0.5, 0.25]])
+    assert np.allclose(
+        start[:, :2], [[-0.5, -0.25], [0, -0.25], [0.5, -0.25], [-0.5, 0.25], [0, 0.25], [0.5, 0.25]]
+    )
     assert np.allclose(start[:, 2], 0.2) and np.allclose(direction, [0, 0, -1])
     start, direction = PinholePattern(width=2, height=2, fovy=90.0).rays()
     assert np.allclose(start, 0.0)

@@ -62,7 +62,8 @@ def test_mujoco_has_each_patch_with_its_heights(mj_model):
         heights = mj_model.hfield_data[first : first + rows * columns] * mj_model.hfield_size[number, 2]
         assert np.allclose(heights.reshape(rows, columns), expected, atol=1e-6)
         assert np.allclose(mj_model.hfield_size[number, :2], 2.0)
-    assert mj_model.body("terrain").id > 0 and mj_model.geom("terrain").type == mujoco.mjtGeom.mjGEOM_HFIELD
+    assert mj_model.body("terrain").id > 0 and mj_model.body("terrain").mass == 0.0
+    assert mj_model.geom("terrain").type == mujoco.mjtGeom.mjGEOM_HFIELD
 
 
 def test_friction_reaches_the_geom():

@@ -1,0 +1,323 @@
+"""Noise on all observations of a transform as one kernel, which is also a torch operator.
+
+Each column's draws are a hash of (seed, stream, counter, row, column), with the hash of `ksim_rl.random`. A normal is
+the inverse of the normal distribution's cumulative function at a uniform (Giles, "Approximating the erfinv function",
+2010): one hash per number and no branch, so that the CPU's compiler turns a row into vector instructions.
+"""
+
+from typing import NamedTuple
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ksim_rl.physics.streams import warp_scope
+
+GAUSSIAN, MULTIPLY, BIAS_GAUSSIAN, BIAS_MULTIPLY, BY_LEVEL, HOLD = (1 << bit for bit in range(6))
+"""What a column's flags say; the bits above them are the number of its observation."""
+KEY_SHIFT = 6
+
+HAS_BIAS, HAS_WALK, HAS_RESOLUTION, HAS_DROPOUT, HAS_GAUSSIAN = (1 << bit for bit in range(5))
+"""What any column of the transform has; the common combinations have loops of their own in the kernel."""
+
+OFFSET, SPREAD, BIAS_OFFSET, BIAS_SPREAD, WALK_STD, RESOLUTION, DROPOUT = range(7)
+"""The rows of the table of parameters."""
+NUM_PARAMETERS = 7
+
+_PLAIN, _STEP, _RESET = range(3)
+
+_COLUMNS = r"""
+    const float* clean = (const float*)clean_ + (long long)row * n;
+    float* out = (float*)out_ + (long long)row * n;
+    float* bias = (float*)bias_ + (long long)row * n;
+    float* walk = (float*)walk_ + (long long)row * n;
+    float* last = (float*)last_ + (long long)row * n;
+    const float* table = (const float*)table_;
+    const int* flags = (const int*)flags_;
+    if (mask_ && !((const unsigned char*)mask_)[row]) {
+        for (int i = begin; i < end; ++i) out[i] = clean[i];
+        return;
+    }
+    const long long seed = *(const long long*)seed_;
+    const long long count = ((const long long*)counter_)[row * counter_stride];
+    const float enabled = *(const unsigned char*)enabled_ ? 1.0f : 0.0f;
+    const float levelled = enabled * *(const float*)level_;
+    const bool resets = mode == 2;
+
+    const unsigned golden = 0x9E3779B9u;
+    auto mix = [](unsigned x) {
+        x = (x ^ (x >> 16)) * 0x21F0AAADu;
+        x = (x ^ (x >> 15)) * 0xD35A2D97u;
+        return x ^ (x >> 15);
+    };
+    const unsigned low = (unsigned)count, high = (unsigned)((unsigned long long)count >> 32);
+    const unsigned base = mix((unsigned)(seed ^ (seed >> 32)) ^ stream);
+    const unsigned first_key = mix(base + low * golden) ^ mix((unsigned)row + high + 1u);
+    const unsigned second_key = mix(first_key + (unsigned)row * golden + golden) ^ mix(low + stream);
+    const unsigned first = mix(first_key), second = mix(second_key);
+    auto bits = [=](unsigned index) { return mix(mix(first ^ ((index + 1u) * golden)) ^ second); };
+
+    auto unit = [](unsigned b) { return (float)(b >> 8) * 5.9604644775390625e-08f; };
+    auto normal = [](unsigned b) {
+        const float x = ((float)((int)(b >> 8) - 8388608) + 0.5f) * 1.1920928955078125e-07f;
+        const float t = (1.0f - x) * (1.0f + x);
+        unsigned word;
+        memcpy(&word, &t, 4);
+        int exponent = (int)(word >> 23) - 127;
+        word = (word & 0x7FFFFFu) | 0x3F800000u;
+        float mantissa;
+        memcpy(&mantissa, &word, 4);
+        const bool is_large = mantissa > 1.41421356f;
+        exponent += is_large;
+        const float f = (is_large ? 0.5f * mantissa : mantissa) - 1.0f;
+        float s = 7.0376836292e-2f;
+        s = s * f - 1.1514610310e-1f;
+        s = s * f + 1.1676998740e-1f;
+        s = s * f - 1.2420140846e-1f;
+        s = s * f + 1.4249322787e-1f;
+        s = s * f - 1.6668057665e-1f;
+        s = s * f + 2.0000714765e-1f;
+        s = s * f - 2.4999993993e-1f;
+        s = s * f + 3.3333331174e-1f;
+        const float w = -(f + f * f * (s * f - 0.5f) + (float)exponent * 0.693147180559945f);
+        const float c = w - 2.5f;
+        float p = 2.81022636e-08f;
+        p = p * c + 3.43273939e-07f;
+        p = p * c - 3.5233877e-06f;
+        p = p * c - 4.39150654e-06f;
+        p = p * c + 2.1858087e-04f;
+        p = p * c - 1.25372503e-03f;
+        p = p * c - 4.17768164e-03f;
+        p = p * c + 2.46640727e-01f;
+        p = p * c + 1.50140941f;
+        const float d = sqrtf(w < 5.0f ? 5.0f : w) - 3.0f;
+        float q = -2.00214257e-04f;
+        q = q * d + 1.00950558e-04f;
+        q = q * d + 1.34934322e-03f;
+        q = q * d - 3.67342844e-03f;
+        q = q * d + 5.73950773e-03f;
+        q = q * d - 7.6224613e-03f;
+        q = q * d + 9.43887047e-03f;
+        q = q * d + 1.00167406f;
+        q = q * d + 2.83297682f;
+        return 1.41421356237f * x * (w < 5.0f ? p : q);
+    };
+    auto sample = [&](int i, unsigned index, int parameter, bool is_normal, int features) {
+        const unsigned b = bits(index);
+        const float u = unit(b), z = features & 16 ? normal(b) : u;
+        return table[parameter * n + i] + table[(parameter + 1) * n + i] * (is_normal ? z : u);
+    };
+    auto apply = [](float x, float noise, float strength, bool multiplies) {
+        return x * (multiplies ? strength * noise + (1.0f - strength) : 1.0f) + (multiplies ? 0.0f : strength * noise);
+    };
+
+    auto column = [&](int i, int features) {
+        const int flag = flags[i];
+        const float strength = flag & 16 ? levelled : enabled;
+        float x = clean[i];
+        if (features & 1) {
+            if (resets) bias[i] = sample(i, (unsigned)i + 0x40000000u, 2, flag & 4, features);
+            x = apply(x, bias[i], strength, flag & 8);
+        }
+        if (features & 2) {
+            const float drift = resets ? 0.0f : walk[i] + table[4 * n + i] * normal(bits((unsigned)i + 0x80000000u));
+            walk[i] = drift;
+            x += strength * drift;
+        }
+        x = apply(x, sample(i, (unsigned)i, 0, flag & 1, features), strength, flag & 2);
+        if (features & 4) {
+            const float step = strength * table[5 * n + i];
+            x = step > 0.0f ? rintf(x / step) * step : x;
+        }
+        if (features & 8) {
+            const float chance = resets ? 0.0f : strength * table[6 * n + i];
+            const bool is_lost = unit(bits((unsigned)(flag >> 6) + 0xC0000000u)) < chance;
+            x = is_lost ? (flag & 32 ? last[i] : 0.0f) : x;
+            last[i] = x;
+        }
+        out[i] = x;
+    };
+    switch (features) {
+        case 0:
+            for (int i = begin; i < end; ++i) column(i, 0);
+            break;
+        case 16:
+            for (int i = begin; i < end; ++i) column(i, 16);
+            break;
+        case 17:
+            for (int i = begin; i < end; ++i) column(i, 17);
+            break;
+        default:
+            for (int i = begin; i < end; ++i) column(i, features);
+    }
+"""
+
+
+# Addresses instead of arrays: wrapping ten tensors takes longer than the launch itself.
+@wp.func_native(_COLUMNS)
+def _columns(
+    row: int,
+    begin: int,
+    end: int,
+    n: int,
+    mode: int,
+    features: int,
+    stream: wp.uint32,
+    counter_stride: int,
+    seed_: wp.uint64,
+    counter_: wp.uint64,
+    enabled_: wp.uint64,
+    level_: wp.uint64,
+    mask_: wp.uint64,
+    table_: wp.uint64,
+    flags_: wp.uint64,
+    clean_: wp.uint64,
+    bias_: wp.uint64,
+    walk_: wp.uint64,
+    last_: wp.uint64,
+    out_: wp.uint64,
+): ...
+
+
+@wp.kernel(enable_backward=False)
+def _apply_noise(
+    width: int,
+    n: int,
+    mode: int,
+    features: int,
+    stream: wp.uint32,
+    counter_stride: int,
+    seed: wp.uint64,
+    counter: wp.uint64,
+    enabled: wp.uint64,
+    level: wp.uint64,
+    mask: wp.uint64,
+    table: wp.uint64,
+    flags: wp.uint64,
+    clean: wp.uint64,
+    bias: wp.uint64,
+    walk: wp.uint64,
+    last: wp.uint64,
+    out: wp.uint64,
+):
+    row, part = wp.tid()
+    begin = part * width
+    _columns(
+        row,
+        begin,
+        wp.min(begin + width, n),
+        n,
+        mode,
+        features,
+        stream,
+        counter_stride,
+        seed,
+        counter,
+        enabled,
+        level,
+        mask,
+        table,
+        flags,
+        clean,
+        bias,
+        walk,
+        last,
+        out,
+    )
+
+
+class NoiseState(NamedTuple):
+    """What the noise of a transform depends on, beside the readings.
+
+    Attributes:
+        table_PL: parameters of each column, float32; its rows are `OFFSET`, `SPREAD`, ...
+        flags_L: what kind of noise a column has, int32.
+        enabled: bool [].
+        level: float32 []; the strength of the columns with `BY_LEVEL`.
+        bias_EL, walk_EL, last_EL: what lasts from step to step, float32; None where no column has it.
+    """
+
+    table_PL: Tensor
+    flags_L: Tensor
+    enabled: Tensor
+    level: Tensor
+    bias_EL: Tensor | None = None
+    walk_EL: Tensor | None = None
+    last_EL: Tensor | None = None
+
+
+def add_noise(
+    clean_EL: Tensor, state: NoiseState, features: int, *, seed: Tensor, stream: int, counter: Tensor
+) -> Tensor:
+    """Return the noisy readings of samples, which belong to no episode: no bias, drift or dropout, float32 [E, L]."""
+    return _run(clean_EL, *state, features & (HAS_GAUSSIAN | HAS_RESOLUTION), _PLAIN, None, seed, stream, counter)
+
+
+def step_noise(
+    clean_EL: Tensor, state: NoiseState, features: int, *, seed: Tensor, stream: int, counter: Tensor
+) -> Tensor:
+    """Go on by one env step and return the noisy readings, float32 [E, L]."""
+    return _run(clean_EL, *state, features, _STEP, None, seed, stream, counter)
+
+
+def reset_noise(
+    clean_EL: Tensor,
+    state: NoiseState,
+    features: int,
+    mask_E: Tensor,
+    *,
+    seed: Tensor,
+    stream: int,
+    counter_E: Tensor,
+) -> Tensor:
+    """Begin the episodes of the masked rows; return their noisy readings and the others' clean ones, float32 [E, L]."""
+    return _run(clean_EL, *state, features, _RESET, mask_E, seed, stream, counter_E)
+
+
+def _run(*arguments: object) -> Tensor:
+    # Eager code goes past torch's dispatcher, which takes longer than the launch.
+    if torch.compiler.is_compiling():
+        return _noise(*arguments)  # pyright: ignore[reportArgumentType]
+    return _launch(*arguments)  # pyright: ignore[reportArgumentType]
+
+
+def _launch(
+    clean_EL: Tensor,
+    table_PL: Tensor,
+    flags_L: Tensor,
+    enabled: Tensor,
+    level: Tensor,
+    bias_EL: Tensor | None,
+    walk_EL: Tensor | None,
+    last_EL: Tensor | None,
+    features: int,
+    mode: int,
+    mask_E: Tensor | None,
+    seed: Tensor,
+    stream: int,
+    counter: Tensor,
+) -> Tensor:
+    clean_EL = clean_EL.contiguous()
+    num_rows, num_columns = clean_EL.shape
+    out_EL = torch.empty_like(clean_EL)
+    device = clean_EL.device
+    width = max(num_columns, 1) if device.type == "cpu" else 1
+    tensors = (seed, counter, enabled, level, mask_E, table_PL, flags_L, clean_EL, bias_EL, walk_EL, last_EL, out_EL)
+    inputs = [width, num_columns, mode, features, stream, counter.ndim, *(_address(t) for t in tensors)]
+    with warp_scope(device):
+        wp.launch(_apply_noise, (num_rows, -(-num_columns // width)), inputs=inputs, device=str(device))
+    return out_EL
+
+
+_noise = torch.library.custom_op(
+    "ksim_rl::noise", _launch, mutates_args=("bias_EL", "walk_EL", "last_EL")
+)
+
+
+@_noise.register_fake
+def _(clean_EL: Tensor, *others: object) -> Tensor:
+    return clean_EL.new_empty(clean_EL.shape)
+
+
+def _address(tensor: Tensor | None) -> int:
+    return 0 if tensor is None else tensor.data_ptr()

@@ -1,0 +1,166 @@
+"""The last values of a signal, in a ring of slots per env, as one kernel that is also a torch operator.
+
+A step writes one value per env and reads the values of some steps ago; a reset writes the value that the masked rows
+begin with, and no lag reaches back beyond it. Where the ring stands is a counter on the device, so that a captured step
+goes on correctly.
+"""
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ksim_rl.physics.streams import warp_scope
+
+# Rows of the ring are bytes, so that one kernel serves every dtype; on the GPU each thread copies one word.
+_COPY = r"""
+    const long long now = *(const long long*)clock_;
+    const bool resets = mask_ != 0;
+    const bool begins = resets && ((const unsigned char*)mask_)[row];
+    unsigned char* ring = (unsigned char*)ring_ + (long long)row * num_slots * num_bytes + part * width;
+    const unsigned char* value = (const unsigned char*)value_ + (long long)row * num_bytes + part * width;
+    unsigned char* out = (unsigned char*)out_ + ((long long)row * num_frames + frame) * num_bytes + part * width;
+    long long* start = (long long*)start_ + row;
+
+    auto copy = [=](unsigned char* to, const unsigned char* from) {
+        if (width == 4) *(unsigned*)to = *(const unsigned*)from;
+        else memcpy(to, from, width);
+    };
+    // The newest value is read from where it comes from: other threads may not have written it yet.
+    if (frame == 0 && (begins || !resets)) copy(ring + (now % num_slots) * num_bytes, value);
+    if (begins && frame == 0 && part == 0) *start = now;
+    long long lag = 0;
+    if (!resets) {
+        const long long age = now - *start;
+        lag = ((const long long*)lag_)[row * lag_row_stride + frame * lag_frame_stride];
+        lag = lag < age ? lag : age;
+    }
+    copy(out, lag == 0 ? value : ring + ((now - lag) % num_slots) * num_bytes);
+"""
+
+
+@wp.func_native(_COPY)
+def _copy(
+    row: int,
+    frame: int,
+    part: int,
+    width: int,
+    num_bytes: int,
+    num_slots: int,
+    num_frames: int,
+    lag_row_stride: int,
+    lag_frame_stride: int,
+    clock_: wp.uint64,
+    start_: wp.uint64,
+    lag_: wp.uint64,
+    mask_: wp.uint64,
+    value_: wp.uint64,
+    ring_: wp.uint64,
+    out_: wp.uint64,
+): ...
+
+
+@wp.kernel(enable_backward=False)
+def _push_and_read(
+    width: int,
+    num_bytes: int,
+    num_slots: int,
+    num_frames: int,
+    lag_row_stride: int,
+    lag_frame_stride: int,
+    clock: wp.uint64,
+    start: wp.uint64,
+    lag: wp.uint64,
+    mask: wp.uint64,
+    value: wp.uint64,
+    ring: wp.uint64,
+    out: wp.uint64,
+):
+    row, frame, part = wp.tid()
+    _copy(
+        row,
+        frame,
+        part,
+        width,
+        num_bytes,
+        num_slots,
+        num_frames,
+        lag_row_stride,
+        lag_frame_stride,
+        clock,
+        start,
+        lag,
+        mask,
+        value,
+        ring,
+        out,
+    )
+
+
+def push_and_read(ring_EM: Tensor, start_E: Tensor, clock: Tensor, value_E: Tensor, lag_EN: Tensor) -> Tensor:
+    """Write the values of this step and return those of some steps ago.
+
+    Args:
+        ring_EM: M slots per env, [E, M, ...].
+        start_E: what the clock showed when each env last reset, int64.
+        clock: env steps so far, int64 [].
+        value_E: [E, ...], in the dtype of the ring.
+        lag_EN: env steps, int64, each below M; the tensor may be an expanded one.
+
+    Returns:
+        [E, N, ...]. A lag that reaches back beyond the last reset gives the value of that.
+    """
+    return _run(ring_EM, start_E, clock, value_E, lag_EN, None, lag_EN.shape[1])
+
+
+def begin(
+    ring_EM: Tensor, start_E: Tensor, clock: Tensor, value_E: Tensor, mask_E: Tensor, num_frames: int = 1
+) -> Tensor:
+    """Let the masked rows begin with these values, and return each row's value `num_frames` times, [E, N, ...]."""
+    return _run(ring_EM, start_E, clock, value_E, None, mask_E, num_frames)
+
+
+def _run(*arguments: object) -> Tensor:
+    # Eager code goes past torch's dispatcher, which takes longer than the launch.
+    if torch.compiler.is_compiling():
+        return _ring(*arguments)  # pyright: ignore[reportArgumentType]
+    return _launch(*arguments)  # pyright: ignore[reportArgumentType]
+
+
+def _launch(
+    ring_EM: Tensor,
+    start_E: Tensor,
+    clock: Tensor,
+    value_E: Tensor,
+    lag_EN: Tensor | None,
+    mask_E: Tensor | None,
+    num_frames: int,
+) -> Tensor:
+    value_E = value_E.contiguous()
+    device = value_E.device
+    out_EN = value_E.new_empty((value_E.shape[0], num_frames, *value_E.shape[1:]))
+    num_bytes = value_E.shape[1:].numel() * value_E.element_size()
+    width = num_bytes if device.type == "cpu" else 4 if num_bytes % 4 == 0 else 1
+    row_stride, frame_stride = (0, 0) if lag_EN is None else lag_EN.stride()
+    tensors = (clock, start_E, lag_EN, mask_E, value_E, ring_EM, out_EN)
+    addresses = [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
+    inputs = [width, num_bytes, ring_EM.shape[1], num_frames, row_stride, frame_stride, *addresses]
+    with warp_scope(device):
+        dim = (value_E.shape[0], num_frames, num_bytes // max(width, 1))
+        wp.launch(_push_and_read, dim, inputs=inputs, device=str(device))
+    return out_EN
+
+
+_ring = torch.library.custom_op("ksim_rl::ring", _launch, mutates_args=("ring_EM", "start_E"))
+
+
+@_ring.register_fake
+def _(
+    ring_EM: Tensor,
+    start_E: Tensor,
+    clock: Tensor,
+    value_E: Tensor,
+    lag_EN: Tensor | None,
+    mask_E: Tensor | None,
+    num_frames: int,
+) -> Tensor:
+    return value_E.new_empty((value_E.shape[0], num_frames, *value_E.shape[1:]))

@@ -1,0 +1,162 @@
+"""The table of tasks says what the tasks' configs and their measurements say.
+
+To write it anew: python -m tests.docs.test_tasks. It builds every task once, for the sizes, and needs all robots.
+"""
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import pytest
+
+from benchmarks import report, tasks
+from ksim_rl import envs
+from ksim_rl.envs.scene import SceneCfg
+
+PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
+RESULTS = report.RESULTS / "tasks.json"
+NUM_ENVS = 4096
+COLUMNS = (
+    "task",
+    "what",
+    "robot",
+    "actions",
+    "action",
+    "actor",
+    "critic",
+    "episode",
+    "solved at",
+    "env states/s",
+    "of physics",
+    "syncs",
+    "`check_env`",
+)
+SIZES = ("action", "actor", "critic")
+NOTHING = "–"
+HEAD = f"""# Tasks
+
+All tasks that come with the package: `ksim-rl train task=<task>`, or `envs.make("<task>", num_envs=...)`.
+
+* **robot**: what is in the scene. Robots marked (m) come from the MuJoCo Menagerie, which `pip install mujoco-menagerie`
+  downloads on first use, or `MENAGERIE_ROOT` names; all others are in the package.
+* **actions**, **action**: the action terms, and the length of `"action"`.
+* **actor**, **critic**: the lengths of the observations of these groups.
+* **episode**: its length in s of simulated time, and in env steps; it may end earlier.
+* **solved at**: the mean evaluation return at which training may stop, where the task has one.
+* **env states/s**: of captured rollouts of {NUM_ENVS} envs on one GPU, with the actor that training gives the task, its
+  first random actions, and resets. **of physics**: that, relative to the physics alone: the substeps of an env step as
+  one graph, from states of the same run.
+* **syncs**: times that the host waits for the device in a step with its reset. **`check_env`**: the result of
+  `ksim_rl.testing.check_env`.
+"""
+TAIL = """The last four are measured: `python -m benchmarks.tasks device=cuda num_envs=4096`."""
+
+
+def robots(scene: SceneCfg) -> str:
+    """The classes of what is in a scene; those that cannot be made without the menagerie are marked."""
+    return ", ".join(
+        f"`{type(entity).__name__}`" + (" (m)" if needs_menagerie(entity) else "")
+        for entity in scene.entities.values()
+    )
+
+
+def needs_menagerie(robot: Any) -> bool:
+    with tempfile.TemporaryDirectory() as empty, mock.patch.dict(os.environ, MENAGERIE_ROOT=empty):
+        try:
+            robot.spec()
+        except ValueError as error:
+            assert "menagerie" in str(error)
+            return True
+    return False
+
+
+def episode(cfg: envs.ManagerBasedRlEnvCfg) -> str:
+    if not cfg.episode_length_s:
+        return "no limit"
+    return f"{cfg.episode_length_s:g} s"
+
+
+def measured(name: str, saved: Mapping[str, Any]) -> tuple[str, ...]:
+    """The GPU's figures of a task, of the last run if there are several."""
+    runs = {
+        prefix: run
+        for prefix, run in saved.get("runs", {}).items()
+        if prefix.split("/")[1:] == [name, str(NUM_ENVS)] and not prefix.startswith("cpu/")
+    }
+    if not runs:
+        return (NOTHING,) * 4
+    prefix = max(runs, key=lambda prefix: runs[prefix]["date"])
+    outcome, figures = saved["outcomes"][prefix], saved["figures"]
+    forms = (("env_states_per_s", "{:,.0f}"), ("rollout_over_physics", "{:.2f}"), ("syncs", "{:.0f}"))
+    values = [form.format(figures[f"{prefix}/{key}"]) for key, form in forms]
+    return (*values, outcome["check_env"])
+
+
+def row(name: str, size: Mapping[str, str], saved: Mapping[str, Any]) -> str:
+    task = envs.task(name)
+    cfg = task.cfg()
+    actions = ", ".join(f"`{type(term).__name__}`" for term in cfg.actions.values())
+    cells = (
+        f"`{name}`",
+        task.description,
+        robots(cfg.scene),
+        actions,
+        *(size[column] for column in SIZES),
+        episode(cfg),
+        NOTHING if task.solved_at is None else f"{task.solved_at:g}",
+        *measured(name, saved),
+    )
+    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
+
+
+def page(sizes: Mapping[str, Mapping[str, str]], saved: Mapping[str, Any]) -> str:
+    head = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
+    rows = [row(name, sizes[name], saved) for name in envs.names()]
+    return f"{HEAD}\n" + "\n".join([*head, *rows]) + f"\n\n{TAIL}\n"
+
+
+def built_sizes() -> dict[str, dict[str, str]]:
+    """The sizes of all tasks, from their envs."""
+    found = {}
+    for name in envs.names():
+        env = envs.make(name, num_envs=1)
+        found[name] = {key.removesuffix("_size"): str(int(value)) for key, value in tasks.sizes(env).items()}
+        env.close()
+    return found
+
+
+def written_sizes() -> dict[str, dict[str, str]]:
+    """The sizes that the page gives."""
+    found = {}
+    for line in PAGE.read_text().splitlines():
+        if line.startswith("| `"):
+            cells = [cell.strip() for cell in line.strip("|").split(" | ")]
+            found[cells[0].strip("`")] = {column: cells[COLUMNS.index(column)] for column in SIZES}
+    return found
+
+
+def results() -> dict[str, Any]:
+    return json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+
+
+OUT_OF_DATE = "docs/tasks.md is out of date: python -m tests.docs.test_tasks"
+
+
+def test_the_table_of_tasks_lists_all_tasks_as_they_are():
+    sizes = written_sizes()
+    assert list(sizes) == envs.names(), OUT_OF_DATE
+    assert all(size.isdecimal() for task in sizes.values() for size in task.values())
+    assert PAGE.read_text().splitlines() == page(sizes, results()).splitlines(), OUT_OF_DATE
+
+
+@pytest.mark.full
+def test_the_sizes_are_those_of_the_envs():
+    assert written_sizes() == built_sizes(), OUT_OF_DATE
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(built_sizes(), results()))
