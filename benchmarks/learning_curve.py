@@ -123,7 +123,9 @@ def _train_all(seeds: list[int]) -> list[list[Point]]:
 
 def _start(words: list[str], seed: int, points: Path, gpu: int) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "benchmarks.learning_curve", *words, f"seed={seed}", f"points={points}"]
-    return subprocess.Popen(command, env=os.environ | {"CUDA_VISIBLE_DEVICES": str(gpu)})
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+    own = visible.split(",")[gpu] if visible else str(gpu)
+    return subprocess.Popen(command, env=os.environ | {"CUDA_VISIBLE_DEVICES": own})
 
 
 def _run_cfg(overrides: list[str], own: dict[str, str]) -> RunCfg:

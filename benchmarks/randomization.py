@@ -98,8 +98,8 @@ def _inertial_events(bodies: tuple[str, ...], variant: str) -> dict[str, EventTe
     if variant == "none":
         return {}
     mode: Mode = "startup" if variant == "startup" else "reset"
-    mass = mdp.RandomizeBodyMass(elements=bodies, ranges=(1.0, 1.0), mode=mode)
-    com = mdp.RandomizeBodyCom(elements=bodies, ranges=(0.0, 0.0), operation="add", mode=mode)
+    mass = mdp.RandomizeBodyMass(bodies=bodies, ranges=(1.0, 1.0), mode=mode)
+    com = mdp.RandomizeBodyCom(bodies=bodies, ranges=(0.0, 0.0), operation="add", mode=mode)
     return {"benchmark_mass": mass, "benchmark_com": com}
 
 

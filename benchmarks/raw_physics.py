@@ -17,6 +17,7 @@ from benchmarks.stopwatch import milliseconds
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.envs.innermost import innermost
 from ksim_rl.physics import World
+from ksim_rl.physics.capture import no_collection
 from ksim_rl.physics.streams import warp_scope
 
 RECORDED_STEPS = 16
@@ -54,7 +55,7 @@ def physics_ms(world: World, decimation: int, steps: Sequence[RecordedStep], *, 
     with warp_scope(device):
         substeps()
     _synchronize(device)
-    with wp.ScopedDevice(warp_device), wp.ScopedCapture(device=warp_device) as capture:
+    with no_collection(), wp.ScopedDevice(warp_device), wp.ScopedCapture(device=warp_device) as capture:
         substeps()
     times = []
     for step in steps:

@@ -118,9 +118,9 @@ def merge(name: str, sources: Sequence[Path], *, folder: Path = RESULTS) -> Path
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.json"
-    reports = [json.loads((source / f"{name}.json").read_text()) for source in sources]
-    if path.exists():
-        reports.append(json.loads(path.read_text()))
+    # The sort keeps this order where dates are equal: what is merged in goes over what was there.
+    files = ([path] if path.exists() else []) + [source / f"{name}.json" for source in sources]
+    reports = [json.loads(file.read_text()) for file in files]
     merged: dict[str, Any] = {}
     for saved in sorted(reports, key=lambda saved: saved["date"]):
         for key, value in saved.items():

@@ -43,6 +43,8 @@ from ksim_rl.trainers.build import build_env, build_networks
 NAME = "tasks"
 CHECKED_ENVS = 4
 SEED = 1
+EAGER_WARMUP = 3
+"""Steps that may compile, record graphs and fill caches before syncs are counted."""
 KEPT = ["actor", "critic", "action", "action_log_prob", ("next", "reward"), ("next", "done")]
 """What of the rollouts is stored: about what training stores."""
 COLUMNS = (
@@ -140,7 +142,10 @@ def shard(names: Sequence[str], which: str) -> tuple[str, ...]:
     """Return part "i/n" of the names: neighbours, since they mostly share a robot, and so the kernels to compile."""
     index, count = (int(part) for part in which.split("/"))
     check_choice("shard", index, range(count))
-    return tuple(names[index * len(names) // count : (index + 1) * len(names) // count])
+    part = tuple(names[index * len(names) // count : (index + 1) * len(names) // count])
+    if not part:
+        raise ValueError(f"shard={which}: there are {len(names)} tasks; use as many shards at most")
+    return part
 
 
 def measure(name: str, options: Options) -> tuple[dict[str, float], Outcome]:
@@ -148,7 +153,6 @@ def measure(name: str, options: Options) -> tuple[dict[str, float], Outcome]:
     figures: dict[str, float] = {}
     outcome = Outcome()
     try:
-        _free_memory(options.device)
         if options.check_device is not None:
             _check(name, options.check_device, outcome)
         _time(name, options, figures, outcome)
@@ -159,7 +163,7 @@ def measure(name: str, options: Options) -> tuple[dict[str, float], Outcome]:
 
 
 def _free_memory(device: torch.device) -> None:
-    """Give back what the last task held, its graphs included."""
+    """Give back what the last env held, its graphs included."""
     gc.collect()
     if device.type == "cuda":
         torch.cuda.empty_cache()
@@ -171,14 +175,19 @@ def _check(name: str, device: torch.device, outcome: Outcome) -> None:
     try:
         check_env(env)
         outcome.check_env = "passed"
-    except AssertionError as findings:
+    except AssertionError as error:
         outcome.check_env = "failed"
-        outcome.findings += str(findings).splitlines()[1:]
+        outcome.findings += str(error).splitlines()[1:]
+    except Exception as error:  # the task can be timed all the same
+        outcome.check_env = "failed"
+        outcome.findings.append(f"[check_env] {type(error).__name__}: {_first_line(error)}")
+        traceback.print_exc()
     finally:
         env.close()
 
 
 def _time(name: str, options: Options, figures: dict[str, float], outcome: Outcome) -> None:
+    _free_memory(options.device)
     device, num_envs, schedule = options.device, options.num_envs, SCHEDULES[options.device.type]
     cfg = conf.compose([f"task={name}", f"device={device}", "logger=none"])
     torch.manual_seed(SEED)
@@ -223,7 +232,8 @@ def host_syncs(collector: RolloutCollector, device: torch.device) -> list[str]:
     def step() -> None:
         env.step_and_maybe_reset(collector.policy(root_E.copy()))
 
-    step()  # the first one may fill caches
+    for _ in range(EAGER_WARMUP):
+        step()
     with count_syncs() as counted:
         step()
     if device.type != "cuda":

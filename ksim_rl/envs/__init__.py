@@ -7,30 +7,61 @@ from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
 from ksim_rl.envs.placement import Placement
 from ksim_rl.envs.registry import build, make, make_cfg, names, register_configs, task
-from ksim_rl.envs.scene import MjcfRobot, SceneCfg
-from ksim_rl.envs.sensors import CameraSensor, ContactSensor, ImuSensor
+from ksim_rl.envs.scene import MjcfRobot, Robot, SceneCfg
+from ksim_rl.envs.sensors import (
+    CameraSensor,
+    ContactSensor,
+    GridPattern,
+    ImuSensor,
+    PinholePattern,
+    RayCaster,
+    RingPattern,
+)
 from ksim_rl.envs.task import Task
+from ksim_rl.envs.term import (
+    ActionTerm,
+    CommandTerm,
+    CurriculumTerm,
+    EventTerm,
+    MetricTerm,
+    ObservationTerm,
+    RewardTerm,
+    TerminationTerm,
+)
 from ksim_rl.envs.terrains import PlaneTerrain, TerrainGrid
 from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.envs.view import EnvView
 from ksim_rl.envs.viewer_cfg import ViewerCfg
 
 __all__ = [
+    "ActionTerm",
     "CameraSensor",
+    "CommandTerm",
     "ContactSensor",
+    "CurriculumTerm",
     "Entity",
     "EnvView",
+    "EventTerm",
+    "GridPattern",
     "ImuSensor",
     "ManagerBasedRlEnv",
     "ManagerBasedRlEnvCfg",
     "MaskedTransformedEnv",
+    "MetricTerm",
     "MjcfRobot",
     "ObservationGroupCfg",
+    "ObservationTerm",
     "ObservationTermCfg",
+    "PinholePattern",
     "Placement",
     "PlaneTerrain",
+    "RayCaster",
+    "RewardTerm",
+    "RingPattern",
+    "Robot",
     "SceneCfg",
     "Task",
+    "TerminationTerm",
     "TerrainGrid",
     "ViewerCfg",
     "allow_package",

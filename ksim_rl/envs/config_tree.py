@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import collections.abc
 import dataclasses
+import functools
 import importlib
+import operator
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -93,7 +95,10 @@ def _match(option: Any, value: Any, path: str) -> Any:
             return tuple(_build(arguments[0], entry, f"{path}[{i}]") for i, entry in enumerate(value))
         if len(arguments) != len(value):
             return _NO_MATCH
-        return tuple(_build(a, entry, f"{path}[{i}]") for i, (a, entry) in enumerate(zip(arguments, value)))
+        return tuple(
+            _build(a, entry, f"{path}[{i}]")
+            for i, (a, entry) in enumerate(zip(arguments, value, strict=True))
+        )
     if origin is collections.abc.Sequence:
         if not isinstance(value, (list, tuple)):
             return _NO_MATCH
@@ -128,7 +133,8 @@ def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> 
         cls: Any = _resolve_target(tree[TARGET], path)
         bases = [c for c in classes if not getattr(c, "_is_protocol", False)]
         if bases and not issubclass(cls, tuple(bases)):
-            raise ValueError(f"{path}.{TARGET}={tree[TARGET]!r}: expected a kind of {_describe(Union[tuple(bases)])}")
+            kinds = _describe(functools.reduce(operator.or_, bases))
+            raise ValueError(f"{path}.{TARGET}={tree[TARGET]!r}: expected a kind of {kinds}")
     else:
         cls = next(c for c in classes if dataclasses.is_dataclass(c))
         if getattr(cls, "__abstractmethods__", None):
@@ -151,7 +157,9 @@ def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> 
         and field.default_factory is dataclasses.MISSING
     ]
     if missing:
-        raise ValueError(f"{path}: {cls.__name__} needs the field {missing[0]!r}: {_describe(hints[missing[0]])}")
+        raise ValueError(
+            f"{path}: {cls.__name__} needs the field {missing[0]!r}: {_describe(hints[missing[0]])}"
+        )
     try:
         return cls(**given)
     except ValueError as error:
@@ -174,7 +182,9 @@ def _resolve_target(target: object, path: str) -> type:
     cls = getattr(module, class_name, None)
     if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
         names = [n for n, v in vars(module).items() if isinstance(v, type) and dataclasses.is_dataclass(v)]
-        raise ValueError(f"{path}.{TARGET}={target!r}: no dataclass {class_name!r} there: {near(class_name, names)}")
+        raise ValueError(
+            f"{path}.{TARGET}={target!r}: no dataclass {class_name!r} there: {near(class_name, names)}"
+        )
     return cls
 
 

@@ -46,13 +46,17 @@ def _summary(env: ManagerBasedRlEnv) -> str:
 def _tables(env: ManagerBasedRlEnv) -> Iterable[Table]:
     cfg = env.cfg
     for group, group_cfg in cfg.observations.items():
-        rows, total = [], 0
+        rows, shapes = [], []
         for name, term_cfg in group_cfg.terms.items():
-            size = int(env.observation_spec["obs", name].shape[-1]) * term_cfg.history_length
-            total += size
+            shape = tuple(env.observation_spec["obs", name].shape[1:])
+            if len(shape) == 1:
+                shape = (shape[0] * group_cfg.num_frames(name),)
+            shapes.append(shape)
             chain = _parameters(term_cfg, without=("term",))
-            rows.append((name, f"({size},)", chain, _described(term_cfg.term)))
-        yield _table(f"observations/{group} ({total},)", ("term", "shape", "chain", "parameters"), rows)
+            rows.append((name, str(shape), chain, _described(term_cfg.term)))
+        # An image stands alone in its group; vectors are concatenated.
+        whole = shapes[0] if len(shapes) == 1 else (sum(shape[0] for shape in shapes),)
+        yield _table(f"observations/{group} {whole}", ("term", "shape", "chain", "parameters"), rows)
 
     sizes = env.action_manager.sizes
     rows = [(name, f"({sizes[name]},)", _described(term)) for name, term in cfg.actions.items()]

@@ -86,7 +86,9 @@ class ManagerBasedRlEnv(MaskedReset):
         cfg.sim.apply_to(spec)
         prepare_spec(spec, fields)
         model = load_model(spec)
-        self._renderer = OffscreenRenderer(model, cfg.viewer, spacing=cfg.scene.spacing) if render_mode else None
+        self._renderer = (
+            OffscreenRenderer(model, cfg.viewer, spacing=cfg.scene.spacing) if render_mode else None
+        )
         self._is_closed = False
 
         self.world = World(
@@ -133,9 +135,7 @@ class ManagerBasedRlEnv(MaskedReset):
         self.command_manager = CommandManager(cfg.commands, view)
         self.action_manager = ActionManager(cfg.actions, view)
         self.observation_manager = ObservationManager(cfg.observations, view)
-        adapted = frozenset(
-            name for term in cfg.curriculum.values() for name in term.adapted_rewards
-        )
+        adapted = frozenset(name for term in cfg.curriculum.values() for name in term.adapted_rewards)
         self.reward_manager = RewardManager(
             cfg.rewards, view, scale=self.step_dt if cfg.scale_rewards_by_dt else 1.0, adapted=adapted
         )
@@ -251,9 +251,7 @@ class ManagerBasedRlEnv(MaskedReset):
         data: dict[str, Any] = {"obs": self.observation_manager.read()}
         if self.command_manager.values:
             data["command"] = {name: value.clone() for name, value in self.command_manager.values.items()}
-        return TensorDict(
-            data | leaves, batch_size=self.batch_size, device=self.device, names=[dims.E]
-        )
+        return TensorDict(data | leaves, batch_size=self.batch_size, device=self.device, names=[dims.E])
 
     def _checked_action(self, action_EL: Tensor | None) -> Tensor:
         expected = (self.num_envs, self.action_manager.size)
@@ -305,7 +303,9 @@ class ManagerBasedRlEnv(MaskedReset):
 
     def curriculum_levels(self) -> dict[str, Tensor]:
         """Return the latest level of each curriculum, float32 [] on the device."""
-        return dict(zip(self.curriculum_manager.names, self.curriculum_manager.levels_C.unbind(), strict=True))
+        return dict(
+            zip(self.curriculum_manager.names, self.curriculum_manager.levels_C.unbind(), strict=True)
+        )
 
     def command_levels(self) -> dict[str, Tensor]:
         """Return the ranges that commands are drawn from now, float32 [] on the device.
@@ -328,14 +328,18 @@ class ManagerBasedRlEnv(MaskedReset):
         state |= {f"env.{name}": tensor.clone() for name, tensor in self._buffers_to_save().items()}
         return state
 
-    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> None:
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> None:
         """Continue from a `state_dict`.
 
         Raises:
             ValueError: if entries are missing or unknown, or shapes differ: the state is of another env.
         """
         own = self._buffers_to_save()
-        given = {name.removeprefix("env."): value for name, value in state_dict.items() if name.startswith("env.")}
+        given = {
+            name.removeprefix("env."): value for name, value in state_dict.items() if name.startswith("env.")
+        }
         if own.keys() != given.keys():
             raise ValueError(
                 f"state of another env: missing {sorted(own.keys() - given.keys())}, "
@@ -349,7 +353,11 @@ class ManagerBasedRlEnv(MaskedReset):
             buffer.copy_(given[name])
         prefix = "world."
         self.world.load_state_dict(
-            {name.removeprefix(prefix): value for name, value in state_dict.items() if name.startswith(prefix)}
+            {
+                name.removeprefix(prefix): value
+                for name, value in state_dict.items()
+                if name.startswith(prefix)
+            }
         )
         self.world.refresh()
         self.view.refreshed()

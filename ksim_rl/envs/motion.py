@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ksim_rl.checks import near
 from ksim_rl.envs.motions import motion_path
-from ksim_rl.envs.names import Index, scalar_joint_ids
+from ksim_rl.envs.names import Index, Patterns, scalar_joint_ids
 
 if TYPE_CHECKING:
     from ksim_rl.envs.view import EnvView
@@ -67,17 +67,21 @@ class ReferenceMotion:
     def sample_joints(self, time_E: Tensor, joints: Index) -> tuple[Tensor, Tensor]:
         """Return positions and velocities of hinges and slides, [E, L] each, at times, s, [E]."""
         low_E, share_E1 = self._between(time_E)
-        pos_FL, vel_FL = self.joint_pos_FL[:, joints], self.joint_vel_FL[:, joints]
-        pos_EL = torch.lerp(pos_FL[low_E], pos_FL[low_E + 1], share_E1)
-        return pos_EL, torch.lerp(vel_FL[low_E], vel_FL[low_E + 1], share_E1)
+        pos_EL, vel_EL = (
+            torch.lerp(_entries(table_FL, low_E, joints), _entries(table_FL, low_E + 1, joints), share_E1)
+            for table_FL in (self.joint_pos_FL, self.joint_vel_FL)
+        )
+        return pos_EL, vel_EL
 
     def sample_bodies(self, time_E: Tensor, bodies: Index) -> tuple[Tensor, Tensor]:
         """Return the poses of bodies, [E, N, 3] and [E, N, 4], at times, s, [E]; between frames as in `sample`."""
         low_E, share_E1 = self._between(time_E)
+        (pos_EN3, next_pos_EN3), (quat_EN4, next_quat_EN4) = (
+            (_entries(table, low_E, bodies), _entries(table, low_E + 1, bodies))
+            for table in (self.body_pos_FN3, self.body_quat_FN4)
+        )
         share_E11 = share_E1[:, None]
-        pos_FN3, quat_FN4 = self.body_pos_FN3[:, bodies], self.body_quat_FN4[:, bodies]
-        pos_EN3 = torch.lerp(pos_FN3[low_E], pos_FN3[low_E + 1], share_E11)
-        return pos_EN3, _blend(quat_FN4[low_E], quat_FN4[low_E + 1], share_E11)
+        return torch.lerp(pos_EN3, next_pos_EN3, share_E11), _blend(quat_EN4, next_quat_EN4, share_E11)
 
     def _between(self, time_E: Tensor) -> tuple[Tensor, Tensor]:
         """Return the frame before each time, [E], and the part of the way to the next one, [E, 1]."""
@@ -151,6 +155,34 @@ def motion_time(view: EnvView, file: str) -> Tensor:
     return motion_start_time(view, file) + view.episode_time_E
 
 
+def motion_joints(view: EnvView, file: str, joints: Patterns) -> tuple[Tensor, Tensor]:
+    """Return positions and velocities that joints have in the motion now, [E, L] each; computed once per state."""
+    keys = [f"motion/{file}.{part} of {joints}" for part in ("joint_pos", "joint_vel")]
+    if keys[0] not in view.cache:
+        sampled = view.motion(file).sample_joints(motion_time(view, file), view.joints(joints))
+        view.cache.update(zip(keys, sampled, strict=True))
+    return view.cache[keys[0]], view.cache[keys[1]]
+
+
+def motion_bodies(view: EnvView, file: str, bodies: Patterns) -> tuple[Tensor, Tensor]:
+    """Return the poses that bodies have in the motion now, world frame, [E, N, 3] and [E, N, 4]; once per state.
+
+    On a terrain they are moved as `motion_shift` says.
+    """
+    keys = [f"motion/{file}.{part} of {bodies}" for part in ("body_pos", "body_quat")]
+    if keys[0] not in view.cache:
+        pos_EN3, quat_EN4 = view.motion(file).sample_bodies(motion_time(view, file), view.bodies(bodies))
+        shift_E3 = motion_shift(view)
+        pos_EN3 = pos_EN3 if shift_E3 is None else pos_EN3 + shift_E3[:, None]
+        view.cache.update(zip(keys, (pos_EN3, quat_EN4), strict=True))
+    return view.cache[keys[0]], view.cache[keys[1]]
+
+
+def motion_shift(view: EnvView) -> Tensor | None:
+    """Return how far motions are moved in each env, m, [E, 3]: to its origin, if the robot's root can go there."""
+    return None if view.terrain.is_flat or not view.robot.free_root else view.terrain.origins_E3
+
+
 def _read(path: Path) -> Mapping[str, np.ndarray]:
     try:
         archive = np.load(path, allow_pickle=False)
@@ -180,6 +212,11 @@ def _check_joints(file: str | Path, names: list[str], model: mujoco.MjModel) -> 
         raise ValueError(
             f"motion {file}: joint_names={names}: expected the model's joints in their order, {own}"
         )
+
+
+def _entries(table: Tensor, frame_E: Tensor, columns: Index) -> Tensor:
+    """Return some columns of a table [F, N, ...] in each env's frame, [E, N, ...]."""
+    return table[:, columns][frame_E] if isinstance(columns, slice) else table[frame_E[:, None], columns]
 
 
 def _blend(first: Tensor, second: Tensor, share: Tensor) -> Tensor:

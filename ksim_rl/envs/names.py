@@ -26,7 +26,6 @@ class NameResolver:
     """
 
     def __init__(self, mj_model: mujoco.MjModel, device: torch.device) -> None:
-        self._model = mj_model
         self._device = device
         self._tables: dict[str, list[str]] = {
             "body": _names(mj_model, mujoco.mjtObj.mjOBJ_BODY, mj_model.nbody),
@@ -55,21 +54,6 @@ class NameResolver:
         key = (kind, (patterns,) if isinstance(patterns, str) else tuple(patterns))
         if key not in self._indices:
             self._indices[key] = as_index(self.ids(kind, patterns), self._device)
-        return self._indices[key]
-
-    def actuators_of_joints(self, patterns: Patterns) -> Index:
-        """Return the actuators that drive the joints of `patterns`, in the order of these joints."""
-        joint_names = [self._tables["joint"][i] for i in self.ids("joint", patterns)]
-        key = ("actuator of joint", tuple(joint_names))
-        if key not in self._indices:
-            of_joint = {}
-            for actuator in range(self._model.nu):
-                if self._model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT:
-                    of_joint.setdefault(self._model.joint(self._model.actuator_trnid[actuator, 0]).name, actuator)
-            idle = [name for name in joint_names if name not in of_joint]
-            if idle:
-                raise ValueError(f"no actuator drives joint {idle[0]!r}: {near(idle[0], of_joint)}")
-            self._indices[key] = as_index([of_joint[name] for name in joint_names], self._device)
         return self._indices[key]
 
 
@@ -105,9 +89,13 @@ def match_names(kind: str, patterns: Sequence[str], table: Sequence[str]) -> tup
             raise ValueError(f"{kind} pattern {pattern!r} is no regular expression: {error}") from None
         matches = [i for i, name in enumerate(table) if name and expression.fullmatch(name)]
         if not matches:
-            raise ValueError(f"no {kind} matches {pattern!r}: {near(pattern, [name for name in table if name])}")
+            raise ValueError(
+                f"no {kind} matches {pattern!r}: {near(pattern, [name for name in table if name])}"
+            )
         doubled = [table[i] for i in matches if i in found]
         if doubled:
-            raise ValueError(f"{kind} {doubled[0]!r} is matched by two of the patterns {patterns}: give it once")
+            raise ValueError(
+                f"{kind} {doubled[0]!r} is matched by two of the patterns {patterns}: give it once"
+            )
         found.extend(matches)
     return tuple(found)

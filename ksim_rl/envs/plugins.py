@@ -55,7 +55,9 @@ def task_modules() -> Iterator[tuple[str, ModuleType]]:
 
 def _modules(module: ModuleType) -> list[str]:
     inside = getattr(module, "__path__", None)
-    children = [] if inside is None else [info.name for info in pkgutil.iter_modules(inside, f"{module.__name__}.")]
+    children = (
+        [] if inside is None else [info.name for info in pkgutil.iter_modules(inside, f"{module.__name__}.")]
+    )
     return [module.__name__, *children]
 
 

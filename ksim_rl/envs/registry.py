@@ -37,7 +37,9 @@ def _tasks() -> dict[str, Task]:
                 continue
             first, known = found.setdefault(value.name, (origin, value))
             if known is not value:
-                raise ValueError(f"two tasks are called {value.name!r}: in {first} and in {origin}; rename one")
+                raise ValueError(
+                    f"two tasks are called {value.name!r}: in {first} and in {origin}; rename one"
+                )
     return {name: task for name, (_, task) in sorted(found.items())}
 
 
@@ -95,7 +97,7 @@ def build(
 ) -> MaskedTransformedEnv:
     """Build the env of a config, with the transforms that its observation groups ask for."""
     base_env = ManagerBasedRlEnv(cfg, device=device, render_mode=render_mode)
-    env = MaskedTransformedEnv(base_env, compile_groups(cfg.observations))
+    env = MaskedTransformedEnv(base_env, compile_groups(cfg.observations, level=base_env.view.level))
     seed = base_env.cfg.seed
     assert seed is not None  # an env stores the seed that it drew
     env.seed(seed)

@@ -56,7 +56,9 @@ class RewardTerm(ABC):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward of the current state, float32 [E]."""
 
-    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
+    def draw_debug(  # noqa: B027
+        self, view: EnvView, visualizer: DebugVisualizer, env_index: int
+    ) -> None:
         """Draw what the reward of one env looks at (nothing by default)."""
 
 
@@ -149,9 +151,13 @@ class CommandTerm(ABC):
         Raises:
             ValueError: if this kind of command is drawn instead.
         """
-        raise ValueError(f"a {type(self).__name__} draws its values; a JoystickCommand takes them from outside")
+        raise ValueError(
+            f"a {type(self).__name__} draws its values; a JoystickCommand takes them from outside"
+        )
 
-    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
+    def draw_debug(  # noqa: B027
+        self, view: EnvView, visualizer: DebugVisualizer, env_index: int
+    ) -> None:
         """Draw the command of one env (nothing by default)."""
 
 

@@ -205,7 +205,9 @@ class EnvView(BodiesAndSites):
         if not name:
             return self.robot
         if name not in self.entities:
-            raise ValueError(f"no entity {name!r} in scene.robots and scene.objects: {near(name, self.entities)}")
+            raise ValueError(
+                f"no entity {name!r} in scene.robots and scene.objects: {near(name, self.entities)}"
+            )
         return self.entities[name]
 
     @property
@@ -363,7 +365,9 @@ class EnvView(BodiesAndSites):
         finally:
             self._scope = self._state.reader = ""
 
-    def memory(self, name: str, *shape: int, dtype: torch.dtype = torch.float32, keep: bool = False) -> Tensor:
+    def memory(
+        self, name: str, *shape: int, dtype: torch.dtype = torch.float32, keep: bool = False
+    ) -> Tensor:
         """Return a buffer [E, *shape] that belongs to the calling term; rows that reset are zeroed unless `keep`."""
         return self.memories.get(f"{self._scope}.{name}", *shape, dtype=dtype, keep=keep)
 
@@ -463,7 +467,7 @@ class EnvView(BodiesAndSites):
         self.memories.freeze()
         self.shared_values.freeze()
         lasting = [*self.memories.buffers().values(), *self.world.views().values()]
-        lasting += self.shared_values.tensors().values()
+        lasting += [*self.shared_values.tensors().values(), *self.world.per_world_fields().values()]
         lasting += [self.episode_step_E, self.default_joint_pos_EL, self.default_qpos_L]
         self._persistent = {tensor.untyped_storage().data_ptr() for tensor in lasting}
 

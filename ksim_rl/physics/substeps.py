@@ -70,7 +70,8 @@ class Substeps:
                 inputs=[d.moment_rownnz, d.moment_rowadr, d.moment_colind, d.actuator_moment, d.qvel],
                 outputs=[d.actuator_velocity],
             )
-        if self.refreshes_subtree_velocities and not m.sensor_subtree_vel:  # else they come with their sensors
+        # A model with sensors of them computes them with these.
+        if self.refreshes_subtree_velocities and not m.sensor_subtree_vel:
             mjw.subtree_vel(m, d)
         mjw.sensor_pos(m, d)
         mjw.sensor_vel(m, d)

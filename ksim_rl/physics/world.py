@@ -199,9 +199,8 @@ class World(views.DataViews):
         groups = const_groups(fields)
         if not groups:
             return
-        everywhere = lambda: mjw.set_const(self.warp_model, self.warp_data_E, groups)  # noqa: E731
         if mask_E is None:
-            self._graphs.run(("set_const", groups), everywhere)
+            self._set_const_everywhere(groups)
             return
         self._take_mask(mask_E)
         constants = self._masked_constants
@@ -209,7 +208,7 @@ class World(views.DataViews):
             self._graphs.run(("set_const of rows", groups), lambda: constants.launch(groups))
             return
         held = {name: self._fields[name].clone() for name in derived_fields(groups)}
-        self._graphs.run(("set_const", groups), everywhere)
+        self._set_const_everywhere(groups)
         for name, before in held.items():
             rows = mask_E.view(-1, *[1] * (before.ndim - 1))
             self._fields[name].copy_(torch.where(rows, self._fields[name], before))
@@ -283,6 +282,11 @@ class World(views.DataViews):
             # From now on the same bits, however often they are recomputed.
             mjw.set_const(self.warp_model, self.warp_data_E, FIXED)
         return MaskedConstants(self.mj_model, self.warp_model, self._reset_mask, expanded)
+
+    def _set_const_everywhere(self, groups: int) -> None:
+        self._graphs.run(
+            ("set_const", groups), lambda: mjw.set_const(self.warp_model, self.warp_data_E, groups)
+        )
 
     def _take_mask(self, mask_E: Tensor) -> None:
         if mask_E.dtype != torch.bool or mask_E.shape != (self.num_envs,):

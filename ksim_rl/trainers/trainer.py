@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.envs.innermost import innermost
+from ksim_rl.envs.transforms import observation_columns
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.episode_metrics import (
     episode_means,
@@ -249,11 +250,22 @@ class Trainer:
             "update": self.update.state_dict(),
             "collector": self.collector.state_dict(),
             "env": dict(self.collector.env.state_dict()),
+            "observation_columns": observation_columns(self.collector.env),
             "random": random_state(self.update.device),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue where `state_dict` was taken."""
+        """Continue where `state_dict` was taken.
+
+        Raises:
+            ValueError: if it is of a run whose networks or observations are others.
+        """
+        columns = observation_columns(self.collector.env)
+        if state["observation_columns"] != columns:
+            raise ValueError(
+                f"the checkpoint's observations have the columns {state['observation_columns']}, "
+                f"and this run's {columns}"
+            )
         # A first reset allocates what the collector and the transforms keep, before the saved values go in.
         self.collector.reset()
         self.update.load_state_dict(state["update"])

@@ -32,7 +32,7 @@ def test_reports_of_several_processes_merge_and_the_later_run_wins(tmp_path: Pat
         (other, "2026-01-03", {"cpu/a/ms": 3.0}),
         (one, "2026-01-02", {"cpu/a/ms": 2.0, "cpu/b/ms": 4.0}),
     ):
-        saved = write(where, figures, notes={key: date for key in figures})
+        saved = write(where, figures, notes=dict.fromkeys(figures, date))
         (where / "speed.json").write_text(json.dumps({**saved, "date": date, "versions": {date: "1"}}))
     merged = json.loads(report.merge("speed", [one, other], folder=folder).read_text())
     assert merged["figures"] == {"cpu/a/ms": 3.0, "cpu/b/ms": 4.0, "cpu/c/ms": 5.0}

@@ -33,6 +33,9 @@ def test_what_fails_is_in_its_row_and_the_rest_goes_on(tmp_path, monkeypatch, ca
     def check(env):
         raise AssertionError("TheEnv has 1 findings:\n[values] not finite")
 
+    def broken_check(env):
+        raise RuntimeError("no kernel\nin a traceback")
+
     def time(name, options, figures, outcome):
         if name == "arm_push":
             raise RuntimeError("no such cube\nin a traceback")
@@ -49,6 +52,12 @@ def test_what_fails_is_in_its_row_and_the_rest_goes_on(tmp_path, monkeypatch, ca
     code, saved = run(tmp_path / "checked", "tasks=cartpole_balance")
     assert code == 1
     assert saved["outcomes"]["cpu/cartpole_balance/4"]["findings"] == ["[values] not finite"]
+    monkeypatch.setattr(tasks, "check_env", broken_check)
+    code, saved = run(tmp_path / "broken", "tasks=cartpole_balance")
+    assert code == 1
+    found = saved["outcomes"]["cpu/cartpole_balance/4"]
+    assert (found["check_env"], found["findings"]) == ("failed", ["[check_env] RuntimeError: no kernel"])
+    assert saved["figures"]["cpu/cartpole_balance/4/syncs"] == 0
     assert "cpu/arm_push/4: RuntimeError: no such cube" in capsys.readouterr().out
 
 
@@ -68,12 +77,14 @@ def test_a_policy_that_reads_the_device_is_seen():
 
 def test_shards_share_the_tasks_out():
     names = envs.names()
-    for count in (1, 3, 4, len(names) + 2):
+    for count in (1, 3, 4, len(names)):
         parts = [tasks.shard(names, f"{index}/{count}") for index in range(count)]
         assert [name for part in parts for name in part] == names
         assert max(map(len, parts)) - min(map(len, parts)) <= 1
     with pytest.raises(ValueError, match="shard=4"):
         tasks.shard(names, "4/4")
+    with pytest.raises(ValueError, match="2 tasks"):
+        tasks.shard(["one", "two"], "0/3")
 
 
 def test_unknown_words_are_refused():

@@ -36,16 +36,17 @@ COLUMNS = (
     "`check_env`",
 )
 SIZES = ("action", "actor", "critic")
+MEASURED = (("env_states_per_s", "{:,.0f}"), ("rollout_over_physics", "{:.2f}"), ("syncs", "{:.0f}"))
 NOTHING = "–"
 HEAD = f"""# Tasks
 
 All tasks that come with the package: `ksim-rl train task=<task>`, or `envs.make("<task>", num_envs=...)`.
 
-* **robot**: what is in the scene. Robots marked (m) come from the MuJoCo Menagerie, which `pip install mujoco-menagerie`
-  downloads on first use, or `MENAGERIE_ROOT` names; all others are in the package.
+* **robot**: what is in the scene. Those marked (m) need a model of the MuJoCo Menagerie, which the package
+  `mujoco-menagerie` downloads on first use, or which is under `MENAGERIE_ROOT`; all others come with this package.
 * **actions**, **action**: the action terms, and the length of `"action"`.
 * **actor**, **critic**: the lengths of the observations of these groups.
-* **episode**: its length in s of simulated time, and in env steps; it may end earlier.
+* **episode**: its length in simulated time, if nothing ends it earlier.
 * **solved at**: the mean evaluation return at which training may stop, where the task has one.
 * **env states/s**: of captured rollouts of {NUM_ENVS} envs on one GPU, with the actor that training gives the task, its
   first random actions, and resets. **of physics**: that, relative to the physics alone: the substeps of an env step as
@@ -88,12 +89,13 @@ def measured(name: str, saved: Mapping[str, Any]) -> tuple[str, ...]:
         if prefix.split("/")[1:] == [name, str(NUM_ENVS)] and not prefix.startswith("cpu/")
     }
     if not runs:
-        return (NOTHING,) * 4
+        return (NOTHING,) * (len(MEASURED) + 1)
     prefix = max(runs, key=lambda prefix: runs[prefix]["date"])
-    outcome, figures = saved["outcomes"][prefix], saved["figures"]
-    forms = (("env_states_per_s", "{:,.0f}"), ("rollout_over_physics", "{:.2f}"), ("syncs", "{:.0f}"))
-    values = [form.format(figures[f"{prefix}/{key}"]) for key, form in forms]
-    return (*values, outcome["check_env"])
+    values = (
+        form.format(saved["figures"][f"{prefix}/{key}"]) if f"{prefix}/{key}" in saved["figures"] else NOTHING
+        for key, form in MEASURED
+    )
+    return (*values, saved["outcomes"][prefix]["check_env"])
 
 
 def row(name: str, size: Mapping[str, str], saved: Mapping[str, Any]) -> str:
@@ -153,9 +155,35 @@ def test_the_table_of_tasks_lists_all_tasks_as_they_are():
     assert PAGE.read_text().splitlines() == page(sizes, results()).splitlines(), OUT_OF_DATE
 
 
+def test_the_figures_are_those_of_the_last_run_on_a_gpu():
+    dates = {
+        "cpu/reacher/4096": "3",
+        "h200/reacher/4096": "2",
+        "h100/reacher/4096": "1",
+        "h200/reacher/8": "4",
+    }
+    saved = {
+        "runs": {prefix: {"date": date} for prefix, date in dates.items()},
+        "outcomes": {prefix: {"check_env": f"passed {prefix}"} for prefix in dates},
+        "figures": {
+            "h200/reacher/4096/env_states_per_s": 1234567.8,
+            "h200/reacher/4096/syncs": 0.0,
+            "h100/reacher/4096/rollout_over_physics": 0.5,
+        },
+    }
+    assert measured("reacher", saved) == ("1,234,568", NOTHING, "0", "passed h200/reacher/4096")
+    assert measured("walker_run", saved) == (NOTHING,) * 4
+
+
 @pytest.mark.full
 def test_the_sizes_are_those_of_the_envs():
-    assert written_sizes() == built_sizes(), OUT_OF_DATE
+    try:
+        sizes = built_sizes()
+    except ValueError as error:
+        if "menagerie" not in str(error):
+            raise
+        pytest.skip(str(error))
+    assert written_sizes() == sizes, OUT_OF_DATE
 
 
 if __name__ == "__main__":

@@ -40,7 +40,11 @@ def edited(path, value):
         ("sim.timestep", -1.0, "task.sim.timestep"),
         ("rewards.balance._target_", "os.system", "only classes of these packages"),
         ("rewards.balance._target_", "ksim_rl.envs.tasks.cartpole.CartpoleRewards", "'CartpoleReward'"),
-        ("rewards.balance._target_", "ksim_rl.envs.mdp.observations_joints.JointVel", "expected a kind of RewardTerm"),
+        (
+            "rewards.balance._target_",
+            "ksim_rl.envs.mdp.observations_joints.JointVel",
+            "expected a kind of RewardTerm",
+        ),
         ("episode_length_s", 0.0, "time-out termination 'time_out'"),
     ],
 )

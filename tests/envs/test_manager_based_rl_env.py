@@ -114,7 +114,9 @@ def test_the_constructor_refuses_unknown_keywords():
         ManagerBasedRlEnv(puck_cfg(), num_worlds=3)  # pyright: ignore[reportCallIssue]
 
 
-@pytest.mark.parametrize("action", [torch.zeros(3), torch.zeros(3, 2), torch.zeros(3, 1, dtype=torch.float64)])
+@pytest.mark.parametrize(
+    "action", [torch.zeros(3), torch.zeros(3, 2), torch.zeros(3, 1, dtype=torch.float64)]
+)
 def test_a_wrong_action_is_refused_with_both_shapes(action):
     env = puck_env()
     root_E = env.reset()
@@ -212,7 +214,9 @@ def test_one_rows_reset_does_not_change_anothers_numbers():
     env.reset(), twin.reset()
     twin.reset(env_ids=[0])
     twin.reset(env_ids=[0])
-    assert torch.equal(env.reset(env_ids=[2])["obs", "velocity"][2], twin.reset(env_ids=[2])["obs", "velocity"][2])
+    assert torch.equal(
+        env.reset(env_ids=[2])["obs", "velocity"][2], twin.reset(env_ids=[2])["obs", "velocity"][2]
+    )
 
 
 def test_seed_returns_and_stores_the_seed_used():

@@ -52,9 +52,3 @@ def test_a_double_match_is_refused(resolver):
 def test_a_broken_pattern_is_refused(resolver):
     with pytest.raises(ValueError, match="no regular expression"):
         resolver.ids("joint", "(")
-
-
-def test_actuators_follow_the_order_of_their_joints(resolver):
-    assert torch.equal(resolver.actuators_of_joints(("left_hip", "right_hip")), torch.tensor([1, 0]))
-    with pytest.raises(ValueError, match="no actuator drives joint 'left_knee'"):
-        resolver.actuators_of_joints("left_knee")

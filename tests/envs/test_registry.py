@@ -18,7 +18,12 @@ def test_a_typo_in_a_task_gives_the_near_names():
 def test_overrides_reach_every_level():
     cfg = envs.make_cfg(
         "cartpole_balance",
-        ["task.decimation=2", "task.events.reset.cart_range=0.5", "task.scene.num_envs=7", "task.sim.timestep=0.005"],
+        [
+            "task.decimation=2",
+            "task.events.reset.cart_range=0.5",
+            "task.scene.num_envs=7",
+            "task.sim.timestep=0.005",
+        ],
     )
     assert (cfg.decimation, cfg.scene.num_envs, cfg.sim.timestep) == (2, 7, 0.005)
     assert cfg.events is not None and cfg.events["reset"].cart_range == 0.5  # pyright: ignore

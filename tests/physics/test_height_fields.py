@@ -88,8 +88,8 @@ def lowered(mj_model: mujoco.MjModel, pose_EL: torch.Tensor, body: str, depth: f
 class Contacts:
     """The contacts that one Warp step finds from poses [E, 28], by world and geom."""
 
-    def __init__(self, mj_model: mujoco.MjModel, pose_EL: torch.Tensor) -> None:
-        world = World(mj_model, num_envs=len(pose_EL), sim=SimCfg(njmax=120, nconmax=40))
+    def __init__(self, mj_model: mujoco.MjModel, pose_EL: torch.Tensor, device="cpu") -> None:
+        world = World(mj_model, num_envs=len(pose_EL), device=device, sim=SimCfg(njmax=120, nconmax=40))
         world.qpos_EL.copy_(pose_EL)
         world.refresh()
         world.step()

@@ -1,5 +1,6 @@
 """The numbers of motor models, one row per world."""
 
+import math
 from collections.abc import Collection, Sequence
 
 import torch
@@ -21,7 +22,7 @@ class ActuatorParams:
         self._memories, self._joint_names, self._device = memories, list(joint_names), device
         self._buffers: dict[str, Tensor] = {}
         self._nominal: dict[str, Tensor] = {}
-        self._owners: dict[str, set[int]] = {}
+        self._owners: dict[str, dict[int, float]] = {}
 
     def add(self, name: str, joints: Sequence[int], value: float) -> None:
         """Give some joints a number; during construction only."""
@@ -32,7 +33,7 @@ class ActuatorParams:
             )
         self._nominal[name][list(joints)] = value
         self._buffers[name].copy_(self._nominal[name].expand_as(self._buffers[name]))
-        self._owners.setdefault(name, set()).update(joints)
+        self._owners.setdefault(name, {}).update(dict.fromkeys(joints, value))
 
     def get(self, name: str, joints: Collection[int] = ()) -> Tensor:
         """Return the present numbers, [E, L]; an error if one of `joints` has none."""
@@ -44,9 +45,10 @@ class ActuatorParams:
         self._check(name, ())
         return self._nominal[name]
 
-    def joints(self, name: str) -> frozenset[int]:
-        """Return the joints that have this number; none if no actuator has it."""
-        return frozenset(self._owners.get(name, ()))
+    def joints(self, name: str, *, finite: bool = False) -> frozenset[int]:
+        """Return the joints that have this number; with `finite`, those whose number in the config is finite."""
+        owners = self._owners.get(name, {})
+        return frozenset(joint for joint, value in owners.items() if not finite or math.isfinite(value))
 
     def _check(self, name: str, joints: Collection[int]) -> None:
         if name not in self._buffers:

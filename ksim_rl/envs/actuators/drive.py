@@ -20,14 +20,12 @@ class Drive:
 
     Attributes:
         num_envs, num_joints, device: E, N, and where the buffers live.
-        joint_names: the names of the joints.
     """
 
     def __init__(self, name: str, view: EnvView, joint_ids: Sequence[int]) -> None:
-        model, names = view.world.mj_model, view.joint_names()
+        model = view.world.mj_model
         scalar = scalar_joint_ids(model)
         self.num_envs, self.num_joints, self.device = view.num_envs, len(joint_ids), view.device
-        self.joint_names = [names[i] for i in joint_ids]
         self._name, self._view = name, view
         self._joints = as_index(joint_ids, view.device)
         self._qpos = as_index([model.jnt_qposadr[scalar[i]] for i in joint_ids], view.device)

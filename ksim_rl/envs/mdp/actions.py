@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ksim_rl.checks import check_in_range
 from ksim_rl.envs.mdp.joint_action import JointAction, PerJoint, check_per_joint
 from ksim_rl.envs.names import Patterns
 from ksim_rl.envs.term import ActionTerm
@@ -102,7 +103,7 @@ class ActuatorAction(ActionTerm):
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        check_per_joint("scale", self.scale)
+        check_in_range("scale", self.scale)
 
     def size(self, view: EnvView) -> int:
         """Return the number of actuators."""

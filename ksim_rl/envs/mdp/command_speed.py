@@ -1,9 +1,33 @@
 """How fast a velocity command asks to move: what pose and foot rewards switch on. Each is computed once per command."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
+from ksim_rl.checks import check_in_range
+from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardWhileCommanded(RewardTerm):
+    """A reward that counts only while a velocity command asks to move.
+
+    Attributes:
+        command, command_threshold: the term is 0 unless the commanded speed exceeds the threshold.
+    """
+
+    command: str
+    command_threshold: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_in_range("command_threshold", self.command_threshold, low=0.0)
+
+    def while_commanded(self, view: EnvView, value_E: Tensor) -> Tensor:
+        """Return the value where the command asks to move, else 0, [E]."""
+        return value_E * is_commanded(view, self.command, self.command_threshold)
 
 
 def commanded_speed(view: EnvView, command: str) -> Tensor:

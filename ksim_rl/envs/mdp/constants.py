@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checks import near
-from ksim_rl.envs.names import as_index
+from ksim_rl.envs.names import Index, as_index
 
 
 def constant(values: Sequence[float], device: torch.device) -> Tensor:
@@ -23,13 +23,13 @@ def _constant(values: tuple[float, ...], device: torch.device) -> Tensor:
         return torch.tensor(values, dtype=torch.float32, device=device)
 
 
-def index_constant(ids: Sequence[int], device: torch.device) -> Tensor | slice:
+def index_constant(ids: Sequence[int], device: torch.device) -> Index:
     """Return `ids` as an index on the device, a slice if they are contiguous; the same for the same ids, for ever."""
     return _index_constant(tuple(ids), device)
 
 
 @cache
-def _index_constant(ids: tuple[int, ...], device: torch.device) -> Tensor | slice:
+def _index_constant(ids: tuple[int, ...], device: torch.device) -> Index:
     with torch.inference_mode(False):
         return as_index(ids, device)
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checks import check_pair
-from ksim_rl.envs.motion import motion_start_time
+from ksim_rl.envs.motion import motion_shift, motion_start_time
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 
@@ -15,7 +15,7 @@ from ksim_rl.envs.view import EnvView
 class ResetToMotion(EventTerm):
     """Put the whole scene into a state of a reference motion, and remember its time for `motion.motion_time`.
 
-    On a terrain the motion is moved to the env's origin.
+    On a terrain all free roots are moved with the env's origin.
 
     Attributes:
         file: what `view.motion` reads.
@@ -35,8 +35,11 @@ class ResetToMotion(EventTerm):
         drawn_E = view.uniform(1, *self.start_range)[:, 0] * motion.duration_s
         start_E.copy_(torch.where(mask_E, drawn_E, start_E))
         qpos_EL, qvel_EL = motion.sample(start_E)
-        if not view.terrain.is_flat:
-            columns = view.robot.root_qpos
-            qpos_EL[:, columns.start : columns.start + 3] += view.terrain.origins_E3
+        shift_E3 = motion_shift(view)
+        if shift_E3 is not None:
+            for entity in view.entities.values():
+                if entity.free_root:
+                    start = entity.root_qpos.start
+                    qpos_EL[:, start : start + 3] += shift_E3
         view.write_qpos(mask_E, qpos_EL)
         view.write_qvel(mask_E, qvel_EL)

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from typing import Literal
 
-import torch
 from torch import Tensor
 
-from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.checks import check_choice
+from ksim_rl.envs.mdp.gaussian_reward import GaussianReward
 from ksim_rl.envs.mdp.target_pose import FRAMES, check_one_point, point_pos_w, target_pose_w
-from ksim_rl.envs.term import ObservationTerm, RewardTerm
+from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 
 
@@ -21,7 +21,7 @@ class OffsetToBody(ObservationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return view.body_pos_w(view.bodies(self.body))[:, 0] - view.site_pos_w(view.sites(self.site))[:, 0]
+        return _offset(view, self.site, self.body)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,18 +52,17 @@ class OffsetToCommand(ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class NearBody(RewardTerm):
+class NearBody(GaussianReward):
     """exp(-d^2 / std^2), `d` the distance of a site from a body's origin, m, [E]; position stage."""
 
     site: str
     body: str
-    std: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("std", self.std, low=0.0, low_open=True)
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        offset_E3 = OffsetToBody(site=self.site, body=self.body)(view)
-        return torch.exp(-offset_E3.square().sum(-1) / self.std**2)
+        return self.rate(_offset(view, self.site, self.body).square().sum(-1))
+
+
+def _offset(view: EnvView, site: str, body: str) -> Tensor:
+    """Return the origin of a body minus a site, world frame, m, [E, 3]."""
+    return point_pos_w(view, body=body, site=None) - point_pos_w(view, body=None, site=site)

@@ -12,9 +12,10 @@ from torch import Tensor
 
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs import quaternion
-from ksim_rl.envs.motion import motion_time
+from ksim_rl.envs.mdp.gaussian_reward import GaussianReward
+from ksim_rl.envs.motion import motion_bodies, motion_joints, motion_time
 from ksim_rl.envs.names import Patterns
-from ksim_rl.envs.term import ObservationTerm, RewardTerm, TerminationTerm
+from ksim_rl.envs.term import ObservationTerm, TerminationTerm
 from ksim_rl.envs.view import EnvView
 
 # -- observations ------------------------------------------------------------------------------------------------
@@ -59,6 +60,8 @@ class MotionJoints(ObservationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
+        if self.ahead_s == 0.0:
+            return torch.cat(motion_joints(view, self.file, self.joints), dim=-1)
         time_E = motion_time(view, self.file) + self.ahead_s
         return torch.cat(view.motion(self.file).sample_joints(time_E, view.joints(self.joints)), dim=-1)
 
@@ -79,23 +82,14 @@ class MotionBodyOffset(ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionReward(RewardTerm):
+class MotionReward(GaussianReward):
     """exp(-error^2 / std^2), [E], of an error that is summed over joints or bodies.
 
     Attributes:
         file: the motion.
-        std: in the unit of the error.
     """
 
     file: str
-    std: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("std", self.std, low=0.0, low_open=True)
-
-    def _kernel(self, squares_EL: Tensor) -> Tensor:
-        return torch.exp(-squares_EL.sum(-1) / self.std**2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,9 +100,9 @@ class TrackMotionJointPos(MotionReward):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        index = view.joints(self.joints)
-        pos_EL, _ = view.motion(self.file).sample_joints(motion_time(view, self.file), index)
-        return self._kernel((view.joint_pos_EL[:, index] - pos_EL).square())
+        pos_EL, _ = motion_joints(view, self.file, self.joints)
+        own_EL = view.joint_pos_EL[:, view.joints(self.joints)]
+        return self.rate((own_EL - pos_EL).square().sum(-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,9 +113,9 @@ class TrackMotionJointVel(MotionReward):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        index = view.joints(self.joints)
-        _, vel_EL = view.motion(self.file).sample_joints(motion_time(view, self.file), index)
-        return self._kernel((view.joint_vel_EL[:, index] - vel_EL).square())
+        _, vel_EL = motion_joints(view, self.file, self.joints)
+        own_EL = view.joint_vel_EL[:, view.joints(self.joints)]
+        return self.rate((own_EL - vel_EL).square().sum(-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,7 +126,7 @@ class TrackMotionBodyPos(MotionReward):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        return self._kernel(_body_offset(view, self.file, self.bodies).square().sum(-1))
+        return self.rate(_body_offset(view, self.file, self.bodies).square().sum((-2, -1)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,9 +137,9 @@ class TrackMotionBodyQuat(MotionReward):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        index = view.bodies(self.bodies)
-        _, quat_EN4 = view.motion(self.file).sample_bodies(motion_time(view, self.file), index)
-        return self._kernel(quaternion.angle_between(view.body_quat_w(index), quat_EN4).square())
+        _, quat_EN4 = motion_bodies(view, self.file, self.bodies)
+        own_EN4 = view.body_quat_w(view.bodies(self.bodies))
+        return self.rate(quaternion.angle_between(own_EN4, quat_EN4).square().sum(-1))
 
 
 # -- terminations ------------------------------------------------------------------------------------------------
@@ -182,12 +176,6 @@ class MotionFinished(TerminationTerm):
 
 
 def _body_offset(view: EnvView, file: str, bodies: Patterns) -> Tensor:
-    """Return the motion's positions of bodies minus their own, world frame, m, [E, N, 3].
-
-    On a terrain the motion is moved to the env's origin, as `ResetToMotion` does.
-    """
-    index = view.bodies(bodies)
-    pos_EN3, _ = view.motion(file).sample_bodies(motion_time(view, file), index)
-    if not view.terrain.is_flat:
-        pos_EN3 = pos_EN3 + view.terrain.origins_E3[:, None]
-    return pos_EN3 - view.body_pos_w(index)
+    """Return the motion's positions of bodies minus their own, world frame, m, [E, N, 3]."""
+    pos_EN3, _ = motion_bodies(view, file, bodies)
+    return pos_EN3 - view.body_pos_w(view.bodies(bodies))

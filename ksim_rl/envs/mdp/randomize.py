@@ -7,7 +7,6 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -15,8 +14,8 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checks import check_choice, check_in_range, check_pair
-from ksim_rl.envs.mdp.constants import constant
-from ksim_rl.envs.names import Index, Patterns, as_index
+from ksim_rl.envs.mdp.constants import constant, index_constant
+from ksim_rl.envs.names import Patterns
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 
@@ -112,11 +111,9 @@ class RandomizeModelField(Randomize):
     """Draw entries of a model field per world. Subclasses name the field; its rows are elements of one kind.
 
     Attributes:
-        elements: names or patterns of what is randomized.
         ranges: what to draw from, by column of the field; one pair is drawn from for every column.
     """
 
-    elements: Patterns
     ranges: Pair | Mapping[int, Pair]
 
     field: ClassVar[str]
@@ -133,6 +130,11 @@ class RandomizeModelField(Randomize):
         for column, pair in self.ranges.items():
             check_choice("ranges", column, range(self.columns))
             self.check_range(f"ranges[{column}]", pair)
+
+    @property
+    @abstractmethod
+    def elements(self) -> Patterns:
+        """Names or patterns of what is randomized."""
 
     @property
     def per_world_fields(self) -> tuple[str, ...]:
@@ -171,9 +173,8 @@ class RandomizeModelField(Randomize):
         for column, pair in pairs.items():
             low, _ = self.reach(nominal[:, column], pair)
             if np.any(low < self.lowest):
-                name = view.resolver.names(self.kind)[
-                    view.resolver.ids(self.kind, self.elements)[int(low.argmin())]
-                ]
+                names = view.resolver.names(self.kind)
+                name = names[view.resolver.ids(self.kind, self.elements)[int(low.argmin())]]
                 raise ValueError(
                     f"{type(self).__name__}.ranges={self.ranges!r}: {self.field} of {self.kind} {name!r} would reach "
                     f"{low.min():g}; expected at least {self.lowest:g}"
@@ -185,19 +186,12 @@ def write_entries(
 ) -> None:
     """Write entries of a per-world field [E, rows] or [E, rows, columns] in the worlds of `mask_E`, bool [E]."""
     entries = field.unsqueeze(-1) if field.ndim == 2 else field
-    rows, across = index(tuple(ids), field.device), index(tuple(columns), field.device)
+    rows, across = index_constant(ids, field.device), index_constant(columns, field.device)
     held_ENC = entries[:, rows][..., across]
     new_ENC = torch.where(mask_E[:, None, None], value_ENC, held_ENC)
     if isinstance(rows, Tensor) and isinstance(across, Tensor):
         rows = rows[:, None]
     entries[:, rows, across] = new_ENC
-
-
-@cache
-def index(ids: tuple[int, ...], device: torch.device) -> Index:
-    """Return ids as a slice where they are contiguous, else as a tensor on the device: the same one each time."""
-    with torch.inference_mode(False):
-        return as_index(ids, device)
 
 
 def _is_pair(value: object) -> bool:

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ksim_rl.envs.mdp.constants import constant
-from ksim_rl.envs.mdp.randomize import Operation, Pair, Randomize, index, write_entries
+from ksim_rl.envs.mdp.constants import constant, index_constant
+from ksim_rl.envs.mdp.randomize import Operation, Pair, Randomize, write_entries
 from ksim_rl.envs.names import Patterns, scalar_joint_ids
 from ksim_rl.envs.view import EnvView
 
@@ -17,22 +17,52 @@ _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPA
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeActuatorGains(Randomize):
+class RandomizeActuator(Randomize):
+    """What the events of this file share.
+
+    Attributes:
+        joints: names or patterns of the driven joints.
+    """
+
+    joints: Patterns = ".*"
+    operation: Operation = "scale"
+
+    def _write_explicit(
+        self,
+        view: EnvView,
+        name: str,
+        joints: Sequence[int],
+        mask_E: Tensor,
+        drawn_EN: Tensor,
+        *,
+        finite: bool = False,
+    ) -> list[int]:
+        """Write a number of the explicit actuators among those of `joints`; return the places of the others."""
+        owners = view.actuator_params.joints(name, finite=finite)
+        explicit = [i for i, joint in enumerate(joints) if joint in owners]
+        if explicit:
+            columns = index_constant([joints[i] for i in explicit], view.device)
+            own_N = view.nominal_actuator_param(name)[columns]
+            drawn_EN = drawn_EN[:, index_constant(explicit, view.device)]
+            value_EN, held_EL = self.combine(own_N, drawn_EN).clamp(min=0.0), view.actuator_param(name)
+            held_EL[:, columns] = torch.where(mask_E[:, None], value_EN, held_EL[:, columns])
+        return [i for i, joint in enumerate(joints) if joint not in owners]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeActuatorGains(RandomizeActuator):
     """Gains of the servos that drive joints: stiffness, N m / rad or N / m; damping, N m s / rad or N s / m.
 
     MuJoCo's position servo keeps one stiffness in its gain and its bias, and its velocity servo one damping; both
     places are written. Explicit actuators keep theirs in `EnvView.actuator_param`, never below 0.
 
     Attributes:
-        joints: names or patterns of the driven joints.
         stiffness: what to draw from; None leaves it alone.
         damping: the same.
     """
 
-    joints: Patterns = ".*"
     stiffness: Pair | None = None
     damping: Pair | None = None
-    operation: Operation = "scale"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,11 +83,10 @@ class RandomizeActuatorGains(Randomize):
             if pair is None:
                 continue
             drawn_EN = self.draw(view, len(joints), [pair])[..., 0].expand(-1, len(joints))
-            builtin = write_explicit(self, view, name, joints, pair, mask_E, drawn_EN)
+            builtin = self._write_explicit(view, name, joints, mask_E, drawn_EN)
             if builtin:
-                self._write_servos(
-                    view, name, [joints[i] for i in builtin], pair, mask_E, drawn_EN[:, _of(builtin, view)]
-                )
+                drawn_EN = drawn_EN[:, index_constant(builtin, view.device)]
+                self._write_servos(view, name, [joints[i] for i in builtin], pair, mask_E, drawn_EN)
 
     def _write_servos(
         self, view: EnvView, name: str, joints: Sequence[int], pair: Pair, mask_E: Tensor, drawn_EN: Tensor
@@ -72,27 +101,24 @@ class RandomizeActuatorGains(Randomize):
         write_entries(view.field("actuator_biasprm"), servos, (column,), mask_E, -value_EN1)
         in_gain = [i for i, (_, also_gain) in enumerate(places) if also_gain]
         if in_gain:
-            gains_EN1 = value_EN1[:, _of(in_gain, view)]
+            gains_EN1 = value_EN1[:, index_constant(in_gain, view.device)]
             write_entries(
                 view.field("actuator_gainprm"), [servos[i] for i in in_gain], (0,), mask_E, gains_EN1
             )
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeEffortLimit(Randomize):
+class RandomizeEffortLimit(RandomizeActuator):
     """Largest effort of the actuators of joints, N m or N: one draw for both directions.
 
     It changes what holds the effort: the actuator's force range, the joint's, both, or an explicit actuator's
-    `effort_limit`.
+    `effort_limit`, which stays at 0 or above.
 
     Attributes:
         ranges: what to draw from.
-        joints: names or patterns of the driven joints.
     """
 
     ranges: Pair
-    joints: Patterns = ".*"
-    operation: Operation = "scale"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -107,7 +133,10 @@ class RandomizeEffortLimit(Randomize):
         """Draw for the rows of `mask_E`."""
         joints = view.resolver.ids("joint", self.joints)
         drawn_EN = self.draw(view, len(joints), [self.ranges])[..., 0].expand(-1, len(joints))
-        builtin = write_explicit(self, view, "effort_limit", joints, self.ranges, mask_E, drawn_EN)
+        # A factor or an offset cannot limit what has no limit: there, the limit of the joint itself may be meant.
+        builtin = self._write_explicit(
+            view, "effort_limit", joints, mask_E, drawn_EN, finite=self.operation != "abs"
+        )
         model, ranges = view.world.mj_model, {"actuator_forcerange": {}, "jnt_actfrcrange": {}}
         for i in builtin:
             joint = scalar_joint_ids(model)[joints[i]]
@@ -132,31 +161,10 @@ class RandomizeEffortLimit(Randomize):
         own = getattr(view.world.mj_model, field)[rows] * np.array((-1.0, 1.0))
         check_not_negative(self, "ranges", names, own, self.ranges)
         own_N2 = constant(own.ravel().tolist(), view.device).view(-1, 2)
-        size_EN2 = self.combine(own_N2, drawn_EN[:, _of(list(place_of.values()), view), None])
+        drawn_EN = drawn_EN[:, index_constant(list(place_of.values()), view.device)]
+        size_EN2 = self.combine(own_N2, drawn_EN[..., None])
         signs_2 = constant((-1.0, 1.0), view.device)
         write_entries(view.field(field), rows, (0, 1), mask_E, size_EN2.expand(-1, -1, 2) * signs_2)
-
-
-def write_explicit(
-    term: Randomize,
-    view: EnvView,
-    name: str,
-    joints: Sequence[int],
-    pair: Pair,
-    mask_E: Tensor,
-    drawn_EN: Tensor,
-) -> list[int]:
-    """Write a number of the explicit actuators among those of `joints`; return the places of the others."""
-    owners = view.actuator_params.joints(name)
-    explicit = [i for i, joint in enumerate(joints) if joint in owners]
-    if explicit:
-        columns = index(tuple(joints[i] for i in explicit), view.device)
-        value_EN = term.combine(
-            view.nominal_actuator_param(name)[columns], drawn_EN[:, _of(explicit, view)]
-        ).clamp(min=0.0)
-        held_EL = view.actuator_param(name)
-        held_EL[:, columns] = torch.where(mask_E[:, None], value_EN, held_EL[:, columns])
-    return [i for i, joint in enumerate(joints) if joint not in owners]
 
 
 def check_not_negative(
@@ -174,10 +182,6 @@ def check_not_negative(
             f"{type(term).__name__}.{field}={pair!r}: that of joint {names[row]!r} would reach {low.min():g}; "
             "expected at least 0"
         )
-
-
-def _of(places: Sequence[int], view: EnvView) -> Tensor | slice:
-    return index(tuple(places), view.device)
 
 
 def _actuators(model: mujoco.MjModel, joint: int) -> list[int]:

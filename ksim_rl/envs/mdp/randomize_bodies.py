@@ -8,22 +8,40 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checks import check_choice
-from ksim_rl.envs.mdp.constants import constant
-from ksim_rl.envs.mdp.randomize import Operation, RandomizeModelField, index, write_entries
+from ksim_rl.envs.mdp.constants import constant, index_constant
+from ksim_rl.envs.mdp.randomize import Operation, RandomizeModelField, write_entries
+from ksim_rl.envs.names import Patterns
 from ksim_rl.envs.view import EnvView
 
 _LEAST_MASS = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeBodyMass(RandomizeModelField):
+class RandomizeBodyField(RandomizeModelField):
+    """Draw entries of a field of bodies per world.
+
+    Attributes:
+        bodies: names or patterns.
+    """
+
+    bodies: Patterns
+
+    kind: ClassVar[str] = "body"
+
+    @property
+    def elements(self) -> Patterns:
+        """The bodies."""
+        return self.bodies
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeBodyMass(RandomizeBodyField):
     """Mass of bodies, kg, at constant shape: the inertia about the centre of mass grows in proportion.
 
     Let `RandomizeBodyInertia` of the same bodies run after it, in the same mode.
     """
 
     field: ClassVar[str] = "body_mass"
-    kind: ClassVar[str] = "body"
     lowest: ClassVar[float | None] = _LEAST_MASS
     operation: Operation = "scale"
 
@@ -44,16 +62,15 @@ class RandomizeBodyMass(RandomizeModelField):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeBodyCom(RandomizeModelField):
+class RandomizeBodyCom(RandomizeBodyField):
     """Centre of mass of bodies in the body's frame, m; columns x, y, z. The inertia about it does not change."""
 
     field: ClassVar[str] = "body_ipos"
-    kind: ClassVar[str] = "body"
     columns: ClassVar[int] = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeBodyInertia(RandomizeModelField):
+class RandomizeBodyInertia(RandomizeBodyField):
     """Inertia of bodies at constant mass: how far the mass spreads along each principal axis (columns x, y, z).
 
     Drawn are factors on the second moments of mass, whose sums by pairs are the principal moments, so that these
@@ -62,7 +79,6 @@ class RandomizeBodyInertia(RandomizeModelField):
     """
 
     field: ClassVar[str] = "body_inertia"
-    kind: ClassVar[str] = "body"
     columns: ClassVar[int] = 3
     lowest: ClassVar[float | None] = 0.0
     operation: Operation = "scale"
@@ -81,7 +97,9 @@ class RandomizeBodyInertia(RandomizeModelField):
         ids, pairs = self.ids(view), self.pairs()
         self._check_reach(view, np.ones((len(ids), 3)), pairs)
         factor_EN3 = torch.ones(view.num_envs, 1 if self.shared else len(ids), 3, device=view.device)
-        factor_EN3[..., index(tuple(pairs), view.device)] = self.draw(view, len(ids), list(pairs.values()))
+        factor_EN3[..., index_constant(tuple(pairs), view.device)] = self.draw(
+            view, len(ids), list(pairs.values())
+        )
         own_N3 = constant(second_moments(view, ids).ravel().tolist(), view.device).view(-1, 3)
         spread_EN3 = own_N3 * factor_EN3 * _mass_ratio(view, ids)[..., None]
         inertia_EN3 = spread_EN3.sum(-1, keepdim=True) - spread_EN3
@@ -104,5 +122,7 @@ def _mass_ratio(view: EnvView, ids: tuple[int, ...]) -> Tensor:
     masses = view.world.mj_model.body_mass[list(ids)]
     if np.any(masses <= 0.0):
         name = view.world.mj_model.body(ids[int(masses.argmin())]).name
-        raise ValueError(f"body {name!r} has no mass: leave it out of the elements")
-    return view.field("body_mass")[:, index(ids, view.device)] / constant(masses.tolist(), view.device)
+        raise ValueError(f"body {name!r} has no mass: leave it out")
+    return view.field("body_mass")[:, index_constant(ids, view.device)] / constant(
+        masses.tolist(), view.device
+    )

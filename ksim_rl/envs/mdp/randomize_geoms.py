@@ -27,24 +27,40 @@ ANGLES = ("roll", "pitch", "yaw")
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGeomFriction(RandomizeModelField):
+class RandomizeGeomField(RandomizeModelField):
+    """Draw entries of a field of geoms per world.
+
+    Attributes:
+        geoms: names or patterns.
+    """
+
+    geoms: Patterns
+
+    kind: ClassVar[str] = "geom"
+
+    @property
+    def elements(self) -> Patterns:
+        """The geoms."""
+        return self.geoms
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeGeomFriction(RandomizeGeomField):
     """Friction of geoms; columns: 0 sliding, 1 torsional (m), 2 rolling (m)."""
 
     field: ClassVar[str] = "geom_friction"
-    kind: ClassVar[str] = "geom"
     columns: ClassVar[int] = 3
     lowest: ClassVar[float | None] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGeomSize(RandomizeModelField):
+class RandomizeGeomSize(RandomizeGeomField):
     """Sizes of primitive geoms, m, in MuJoCo's columns: radius, half length; or half sizes x, y, z.
 
     Bounding boxes and spheres follow; mass and inertia do not.
     """
 
     field: ClassVar[str] = "geom_size"
-    kind: ClassVar[str] = "geom"
     columns: ClassVar[int] = 3
 
     def _check_reach(self, view: EnvView, nominal: np.ndarray, pairs: Mapping[int, Pair]) -> None:
@@ -67,11 +83,10 @@ class RandomizeGeomSize(RandomizeModelField):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGeomPos(RandomizeModelField):
+class RandomizeGeomPos(RandomizeGeomField):
     """Position of geoms in the frame of their body, m; columns x, y, z. The body's inertia does not change."""
 
     field: ClassVar[str] = "geom_pos"
-    kind: ClassVar[str] = "geom"
     columns: ClassVar[int] = 3
     operation: Operation = "add"
 
@@ -81,12 +96,12 @@ class RandomizeGeomQuat(Randomize):
     """Orientation of geoms in their body: turned about their own axes. The body's inertia does not change.
 
     Attributes:
-        elements: names or patterns of the geoms.
+        geoms: names or patterns.
         ranges: rad, by angle: "roll", "pitch", "yaw". The turn is Rz(yaw) Ry(pitch) Rx(roll), after the model's own
             orientation ("add"), or in its place, from the axes of the body ("abs").
     """
 
-    elements: Patterns
+    geoms: Patterns
     ranges: Mapping[str, Pair] = field(default_factory=dict)
     operation: Operation = "add"
 
@@ -111,7 +126,7 @@ class RandomizeGeomQuat(Randomize):
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
         """Draw for the rows of `mask_E`."""
-        ids = view.resolver.ids("geom", self.elements)
+        ids = view.resolver.ids("geom", self.geoms)
         pairs = [self.ranges.get(angle, (0.0, 0.0)) for angle in ANGLES]
         turn_EN4 = quaternion.from_euler_xyz(*self.draw(view, len(ids), pairs).unbind(-1))
         if self.operation == "add":

@@ -10,30 +10,34 @@ from torch import Tensor
 
 from ksim_rl.checks import check_choice
 from ksim_rl.envs.mdp.constants import constant
-from ksim_rl.envs.mdp.randomize import (
-    Operation,
-    Pair,
-    Randomize,
-    RandomizeModelField,
-)
+from ksim_rl.envs.mdp.randomize import Operation, Pair, Randomize, RandomizeModelField
 from ksim_rl.envs.names import Patterns, scalar_joint_ids
 from ksim_rl.envs.view import EnvView
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeJointField(RandomizeModelField):
-    """Draw entries of a field of hinges and slides per world; all of them unless `elements` says otherwise."""
+    """Draw entries of a field of hinges and slides per world.
 
-    elements: Patterns = ".*"
+    Attributes:
+        joints: names or patterns.
+    """
+
+    joints: Patterns = ".*"
 
     kind: ClassVar[str] = "joint"
+
+    @property
+    def elements(self) -> Patterns:
+        """The joints."""
+        return self.joints
 
     def ids(self, view: EnvView) -> tuple[int, ...]:
         """Return the rows of the field: by joint, degree of freedom or generalized position, as its name says."""
         model = view.world.mj_model
         places = {"jnt": np.arange(model.njnt), "dof": model.jnt_dofadr, "qpos0": model.jnt_qposadr}
         scalar = scalar_joint_ids(model)
-        joints = [scalar[i] for i in view.resolver.ids("joint", self.elements)]
+        joints = [scalar[i] for i in view.resolver.ids("joint", self.joints)]
         return tuple(int(i) for i in places[self.field.split("_")[0]][joints])
 
 
@@ -86,9 +90,7 @@ class RandomizeJointRange(RandomizeJointField):
         for row, joint in enumerate(self.ids(view)):
             name = view.world.mj_model.joint(joint).name
             if not view.world.mj_model.jnt_limited[joint]:
-                raise ValueError(
-                    f"RandomizeJointRange: joint {name!r} has no limits: leave it out of the elements"
-                )
+                raise ValueError(f"RandomizeJointRange: joint {name!r} has no limits: leave it out")
             if lower[row] >= upper[row]:
                 raise ValueError(
                     f"RandomizeJointRange.ranges={self.ranges!r}: the lower limit of joint {name!r} would reach "
@@ -114,11 +116,11 @@ class RandomizeDefaultJointPos(Randomize):
     In mode "reset" let it run before the event that resets the joints.
 
     Attributes:
-        elements: names or patterns of the joints.
+        joints: names or patterns.
         ranges: what to draw from; the model's own value is that of its first keyframe or, without one, `qpos0`.
     """
 
-    elements: Patterns = ".*"
+    joints: Patterns = ".*"
     ranges: Pair
     operation: Operation = "add"
 
@@ -128,11 +130,11 @@ class RandomizeDefaultJointPos(Randomize):
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
         """Draw for the rows of `mask_E`."""
-        joints = view.joints(self.elements)
+        joints = view.joints(self.joints)
         model = view.world.mj_model
         pose = model.key_qpos[0] if model.nkey else model.qpos0
         own = pose[model.jnt_qposadr[scalar_joint_ids(model)]]
-        ids = view.resolver.ids("joint", self.elements)
+        ids = view.resolver.ids("joint", self.joints)
         drawn_EN = self.draw(view, len(ids), [self.ranges])[..., 0]
         value_EN = self.combine(constant(own[list(ids)].tolist(), view.device), drawn_EN)
         held_EN = view.default_joint_pos_EL[:, joints]
@@ -146,21 +148,21 @@ class RandomizeEncoderBias(Randomize):
     Observations show it where they ask for it (`JointPosRel(biased=True)`); nothing else feels it.
 
     Attributes:
-        bias_range: what to draw from.
+        ranges: what to draw from.
         joints: names or patterns.
     """
 
-    bias_range: Pair
+    ranges: Pair
     joints: Patterns = ".*"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choice("operation", self.operation, ("abs",))
-        self.check_range("bias_range", self.bias_range)
+        self.check_range("ranges", self.ranges)
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
         """Draw for the rows of `mask_E`."""
         joints = view.joints(self.joints)
         held_EN = view.encoder_bias_EL[:, joints]
-        drawn_EN = self.draw(view, held_EN.shape[1], [self.bias_range])[..., 0]
+        drawn_EN = self.draw(view, held_EN.shape[1], [self.ranges])[..., 0]
         view.encoder_bias_EL[:, joints] = torch.where(mask_E[:, None], drawn_EN, held_EN)

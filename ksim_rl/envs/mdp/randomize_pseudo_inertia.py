@@ -28,14 +28,14 @@ class RandomizePseudoInertia(Randomize):
     Wensing, "Smooth Parameterization of Rigid-Body Inertia", IEEE RA-L 7(2), 2022). All zero changes nothing.
 
     Attributes:
-        elements: names or patterns of the bodies.
+        bodies: names or patterns.
         alpha: half the logarithm of the mass's factor.
         stretch: d1, d2, d3: logarithms of how far the mass stretches along each principal axis.
         shear: s12, s13, s23.
         shift: t1, t2, t3: how far the centre of mass moves along each principal axis, m.
     """
 
-    elements: Patterns
+    bodies: Patterns
     alpha: Pair = _NOTHING
     stretch: Pair = _NOTHING
     shear: Pair = _NOTHING
@@ -57,7 +57,7 @@ class RandomizePseudoInertia(Randomize):
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
         """Draw for the rows of `mask_E`."""
-        ids, model = view.resolver.ids("body", self.elements), view.world.mj_model
+        ids, model = view.resolver.ids("body", self.bodies), view.world.mj_model
         rows = list(ids)
         mass_N1, com_N3, axes_N4, spread_N3 = (
             constant(values.ravel().tolist(), view.device).view(len(ids), -1)

@@ -1,4 +1,4 @@
-"""Rewards for how feet move. Most count only while the command asks to move (`is_commanded`).
+"""Rewards for how feet move, 0 unless the commanded speed exceeds `command_threshold` (`active` below).
 
 Foot poses and velocities are of the current state (position and velocity stage); contacts and forces belong to the
 last physics substep (acceleration stage).
@@ -10,37 +10,33 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
-from ksim_rl.envs.mdp.command_speed import is_commanded
+from ksim_rl.envs.mdp.command_speed import RewardWhileCommanded
 from ksim_rl.envs.names import Patterns
-from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 
 
 @dataclass(frozen=True, kw_only=True)
-class FootClearance(RewardTerm):
+class FootClearance(RewardWhileCommanded):
     """active * sum_f |height_f - target_height| * |v_xy,f|, m^2/s, [E]: a foot that moves should be at that height.
 
     Attributes:
         sites: the feet; heights are above the ground right below them, velocities in the world frame.
         target_height: m.
-        command, command_threshold: the term is 0 unless the commanded speed exceeds the threshold.
     """
 
     sites: Patterns
     target_height: float
-    command: str
-    command_threshold: float
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
         index = view.sites(self.sites)
         miss_EF = (view.site_height(index) - self.target_height).abs()
         speed_EF = torch.linalg.vector_norm(view.site_lin_vel_w(index)[..., :2], dim=-1)
-        return (miss_EF * speed_EF).sum(-1) * is_commanded(view, self.command, self.command_threshold)
+        return self.while_commanded(view, (miss_EF * speed_EF).sum(-1))
 
 
 @dataclass(frozen=True, kw_only=True)
-class FootSwingHeight(RewardTerm):
+class FootSwingHeight(RewardWhileCommanded):
     """active * sum_f landed_f * (peak_f / target_height - 1)^2, [E]; `peak` is the swing's greatest height.
 
     The peak starts at 0 after each landing and each reset.
@@ -49,14 +45,11 @@ class FootSwingHeight(RewardTerm):
         sensor: contact sensor, one geom per foot, in the order of `sites`.
         sites: the feet; heights are above the ground right below them.
         target_height: m.
-        command, command_threshold: the term is 0 unless the commanded speed exceeds the threshold.
     """
 
     sensor: str
     sites: Patterns
     target_height: float
-    command: str
-    command_threshold: float
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -70,55 +63,48 @@ class FootSwingHeight(RewardTerm):
         peak_EF = torch.where(contact.found_EN > 0, memory_EF, torch.maximum(memory_EF, height_EF))
         memory_EF.copy_(torch.where(contact.first_contact_EN > 0, 0.0, peak_EF))
         cost_E = ((peak_EF / self.target_height - 1.0).square() * contact.first_contact_EN).sum(-1)
-        return cost_E * is_commanded(view, self.command, self.command_threshold)
+        return self.while_commanded(view, cost_E)
 
 
 @dataclass(frozen=True, kw_only=True)
-class FootSlip(RewardTerm):
+class FootSlip(RewardWhileCommanded):
     """active * sum_f contact_f * |v_xy,f|^2, (m/s)^2, [E]; velocities of the sites in the world frame.
 
     Attributes:
         sensor: contact sensor, one geom per foot, in the order of `sites`.
-        command, command_threshold: the term is 0 unless the commanded speed exceeds the threshold.
     """
 
     sensor: str
     sites: Patterns
-    command: str
-    command_threshold: float
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
         speed2_EF = view.site_lin_vel_w(view.sites(self.sites))[..., :2].square().sum(-1)
         cost_E = (speed2_EF * view.contact(self.sensor).found_EN).sum(-1)
-        return cost_E * is_commanded(view, self.command, self.command_threshold)
+        return self.while_commanded(view, cost_E)
 
 
 @dataclass(frozen=True, kw_only=True)
-class SoftLanding(RewardTerm):
+class SoftLanding(RewardWhileCommanded):
     """active * sum_f landed_f * |force_f|, N, [E]; the net contact force at the end of the step of touch-down."""
 
     sensor: str
-    command: str
-    command_threshold: float
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
         contact = view.contact(self.sensor)
         force_EF = torch.linalg.vector_norm(contact.force_EN3, dim=-1)
         cost_E = (force_EF * contact.first_contact_EN).sum(-1)
-        return cost_E * is_commanded(view, self.command, self.command_threshold)
+        return self.while_commanded(view, cost_E)
 
 
 @dataclass(frozen=True, kw_only=True)
-class FeetAirTime(RewardTerm):
+class FeetAirTime(RewardWhileCommanded):
     """active * number of feet whose present flight has lasted between two thresholds (s), [E]."""
 
     sensor: str
     threshold_min: float
     threshold_max: float
-    command: str
-    command_threshold: float
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -129,23 +115,20 @@ class FeetAirTime(RewardTerm):
         air_time_EF = view.contact(self.sensor).air_time_EN
         inside_EF = (air_time_EF > self.threshold_min) & (air_time_EF < self.threshold_max)
         count_E = inside_EF.to(torch.float32).sum(-1)
-        return count_E * is_commanded(view, self.command, self.command_threshold)
+        return self.while_commanded(view, count_E)
 
 
 @dataclass(frozen=True, kw_only=True)
-class GaitPhase(RewardTerm):
+class GaitPhase(RewardWhileCommanded):
     """Fraction of the feet that do what the rhythm asks for: swing where their sine is positive, else stand; [E].
 
     Attributes:
         gait: a `SinusoidalGaitCommand`, one offset per foot in the order of `sensor`.
         sensor: contact sensor, one element per foot.
-        command, command_threshold: the term is 0 unless the commanded speed exceeds the threshold.
     """
 
     gait: str
     sensor: str
-    command: str
-    command_threshold: float
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E].
@@ -161,6 +144,4 @@ class GaitPhase(RewardTerm):
                 "foot one offset"
             )
         matches_EF = touches_EF != (phase_EL[:, :feet] > 0)
-        return matches_EF.to(torch.float32).mean(-1) * is_commanded(
-            view, self.command, self.command_threshold
-        )
+        return self.while_commanded(view, matches_EF.to(torch.float32).mean(-1))

@@ -16,6 +16,33 @@ from ksim_rl.envs.names import Patterns
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 
+
+@dataclass(frozen=True, kw_only=True)
+class JointLimitReward(RewardTerm):
+    """Sum over joints of how far the size of something is above `soft_factor` of its limit, [E].
+
+    Attributes:
+        limits: by joint, in the unit of what is limited; keys are regular expressions that match each of `joints` once.
+        soft_factor: fraction of the limit that is free of penalty.
+    """
+
+    limits: Mapping[str, float]
+    joints: Patterns = ".*"
+    soft_factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for pattern, limit in self.limits.items():
+            check_in_range(f"limits[{pattern!r}]", limit, low=0.0, low_open=True)
+        check_in_range("soft_factor", self.soft_factor, low=0.0, high=1.0, low_open=True)
+
+    def overshoot(self, view: EnvView, value_EL: Tensor) -> Tensor:
+        """Return the sum for values of all joints, [E]."""
+        limit_L = values_by_name("limits", self.limits, view.joint_names(self.joints))
+        free_L = constant([self.soft_factor * limit for limit in limit_L], view.device)
+        return (value_EL[:, view.joints(self.joints)].abs() - free_L).clamp(min=0.0).sum(-1)
+
+
 # -- position ----------------------------------------------------------------------------------------------------
 
 
@@ -73,25 +100,12 @@ class JointVelL2(RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointVelLimits(RewardTerm):
-    """Sum over joints of how far each is above `soft_factor` of its greatest speed, rad/s or m/s, [E]; velocity stage.
-
-    Attributes:
-        limits: greatest speeds, rad/s or m/s, by joint; keys are regular expressions that match each of `joints` once.
-        soft_factor: fraction of the limit that is free of penalty.
-    """
-
-    limits: Mapping[str, float]
-    joints: Patterns = ".*"
-    soft_factor: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_limits(self.limits, self.soft_factor)
+class JointVelLimits(JointLimitReward):
+    """Sum over joints of how far each speed is above `soft_factor` of its limit, rad/s or m/s, [E]; velocity stage."""
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        return _overshoot(view, view.joint_vel_EL, self.joints, self.limits, self.soft_factor)
+        return self.overshoot(view, view.joint_vel_EL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,27 +134,15 @@ class JointEffortL2(RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointEffortLimits(RewardTerm):
+class JointEffortLimits(JointLimitReward):
     """Sum over joints of how far each effort is above `soft_factor` of its limit, N m or N, [E]; acceleration stage.
 
     Actuators that clamp at their limit never exceed it: there, choose a factor below 1.
-
-    Attributes:
-        limits: N m or N by joint; keys are regular expressions that match each of `joints` once.
-        soft_factor: fraction of the limit that is free of penalty.
     """
-
-    limits: Mapping[str, float]
-    joints: Patterns = ".*"
-    soft_factor: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_limits(self.limits, self.soft_factor)
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        return _overshoot(view, view.joint_effort_EL, self.joints, self.limits, self.soft_factor)
+        return self.overshoot(view, view.joint_effort_EL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,18 +169,3 @@ class Energy(RewardTerm):
         """Return the unweighted reward, [E]."""
         index = view.joints(self.joints)
         return (view.joint_effort_EL[:, index] * view.joint_vel_EL[:, index]).abs().sum(-1)
-
-
-def _check_limits(limits: Mapping[str, float], soft_factor: float) -> None:
-    for pattern, limit in limits.items():
-        check_in_range(f"limits[{pattern!r}]", limit, low=0.0, low_open=True)
-    check_in_range("soft_factor", soft_factor, low=0.0, high=1.0, low_open=True)
-
-
-def _overshoot(
-    view: EnvView, value_EL: Tensor, joints: Patterns, limits: Mapping[str, float], soft_factor: float
-) -> Tensor:
-    """Return the sum over joints of how far |value| is above `soft_factor` of its limit, [E]."""
-    limit_L = values_by_name("limits", limits, view.joint_names(joints))
-    free_L = constant([soft_factor * limit for limit in limit_L], view.device)
-    return (value_EL[:, view.joints(joints)].abs() - free_L).clamp(min=0.0).sum(-1)

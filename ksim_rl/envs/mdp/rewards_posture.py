@@ -9,6 +9,7 @@ from torch import Tensor
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.mdp.command_speed import commanded_speed
 from ksim_rl.envs.mdp.constants import constant, values_by_name
+from ksim_rl.envs.mdp.gaussian_reward import GaussianReward
 from ksim_rl.envs.mdp.root_height import root_height
 from ksim_rl.envs.names import Patterns
 from ksim_rl.envs.term import RewardTerm
@@ -16,7 +17,7 @@ from ksim_rl.envs.view import EnvView
 
 
 @dataclass(frozen=True, kw_only=True)
-class Upright(RewardTerm):
+class Upright(GaussianReward):
     """exp(-|g_xy|^2 / std^2), `g` the direction of gravity in the body's frame, [E]; position stage.
 
     Attributes:
@@ -24,17 +25,12 @@ class Upright(RewardTerm):
         entity: whose root; "" is the first robot.
     """
 
-    std: float
     body: str | None = None
     entity: str = ""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("std", self.std, low=0.0, low_open=True)
-
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        return torch.exp(_tilt(view, self.body, self.entity) / -(self.std**2))
+        return self.rate(_tilt(view, self.body, self.entity))
 
 
 @dataclass(frozen=True, kw_only=True)

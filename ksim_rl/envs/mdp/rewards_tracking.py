@@ -3,27 +3,21 @@
 from dataclasses import dataclass
 from typing import Literal
 
-import torch
 from torch import Tensor
 
-from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.checks import check_choice
 from ksim_rl.envs import quaternion
+from ksim_rl.envs.mdp.gaussian_reward import GaussianReward
 from ksim_rl.envs.mdp.root_height import root_height
-from ksim_rl.envs.mdp.target_pose import (
-    FRAMES,
-    check_one_point,
-    distance_to_target,
-    target_pose_w,
-)
+from ksim_rl.envs.mdp.target_pose import FRAMES, check_one_point, distance_to_target, target_pose_w
 from ksim_rl.envs.names import Patterns
-from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 
 # -- velocity ----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackLinearVelocity(RewardTerm):
+class TrackLinearVelocity(GaussianReward):
     """exp(-(|c_xy - v_xy|^2 + v_z^2) / std^2), `v` the root's linear velocity in its own frame, m/s, [E].
 
     Attributes:
@@ -31,22 +25,17 @@ class TrackLinearVelocity(RewardTerm):
     """
 
     command: str
-    std: float
     entity: str = ""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("std", self.std, low=0.0, low_open=True)
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
         vel_E3 = view.entity(self.entity).root_lin_vel_b_EL
         error_E2 = view.command(self.command)[:, :2] - vel_E3[:, :2]
-        return torch.exp((error_E2.square().sum(-1) + vel_E3[:, 2].square()) / -(self.std**2))
+        return self.rate(error_E2.square().sum(-1) + vel_E3[:, 2].square())
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackAngularVelocity(RewardTerm):
+class TrackAngularVelocity(GaussianReward):
     """exp(-((c_z - w_z)^2 + |w_xy|^2) / std^2), `w` the root's angular velocity in its own frame, rad/s, [E].
 
     Attributes:
@@ -54,25 +43,20 @@ class TrackAngularVelocity(RewardTerm):
     """
 
     command: str
-    std: float
     entity: str = ""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("std", self.std, low=0.0, low_open=True)
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
         vel_E3 = view.entity(self.entity).root_ang_vel_b_EL
         error_E = view.command(self.command)[:, 2] - vel_E3[:, 2]
-        return torch.exp((error_E.square() + vel_E3[:, :2].square().sum(-1)) / -(self.std**2))
+        return self.rate(error_E.square() + vel_E3[:, :2].square().sum(-1))
 
 
 # -- height, pose, joints ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackRootHeight(RewardTerm):
+class TrackRootHeight(GaussianReward):
     """exp(-(c - h)^2 / std^2), `h` the height of the root body's frame above the ground, m, [E]; position stage.
 
     Attributes:
@@ -81,21 +65,16 @@ class TrackRootHeight(RewardTerm):
     """
 
     command: str
-    std: float
     entity: str = ""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("std", self.std, low=0.0, low_open=True)
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
         error_E = view.command(self.command)[:, 0] - root_height(view, self.entity)
-        return torch.exp(error_E.square() / -(self.std**2))
+        return self.rate(error_E.square())
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackPosition(RewardTerm):
+class TrackPosition(GaussianReward):
     """exp(-d^2 / std^2), `d` the distance of a body or site from the commanded position, m, [E]; position stage.
 
     Attributes:
@@ -106,7 +85,6 @@ class TrackPosition(RewardTerm):
     """
 
     command: str
-    std: float
     body: str | None = None
     site: str | None = None
     frame: Literal["root", "world"] = "root"
@@ -114,7 +92,6 @@ class TrackPosition(RewardTerm):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_in_range("std", self.std, low=0.0, low_open=True)
         check_one_point(self.body, self.site)
         check_choice("frame", self.frame, FRAMES)
 
@@ -123,11 +100,11 @@ class TrackPosition(RewardTerm):
         distance_E = distance_to_target(
             view, self.command, frame=self.frame, body=self.body, site=self.site, entity=self.entity
         )
-        return torch.exp(distance_E.square() / -(self.std**2))
+        return self.rate(distance_E.square())
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackOrientation(RewardTerm):
+class TrackOrientation(GaussianReward):
     """exp(-a^2 / std^2), `a` the angle between a body and the commanded orientation, rad, [E]; position stage.
 
     Attributes:
@@ -138,14 +115,12 @@ class TrackOrientation(RewardTerm):
     """
 
     command: str
-    std: float
     body: str
     frame: Literal["root", "world"] = "root"
     entity: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_in_range("std", self.std, low=0.0, low_open=True)
         check_choice("frame", self.frame, FRAMES)
 
     def __call__(self, view: EnvView) -> Tensor:
@@ -161,11 +136,11 @@ class TrackOrientation(RewardTerm):
                 f"command={self.command!r} has {command_EK.shape[1]} numbers: expected position and quaternion"
             )
         quat_E4 = view.body_quat_w(view.bodies(self.body))[:, 0]
-        return torch.exp(quaternion.angle_between(quat_E4, target_E4).square() / -(self.std**2))
+        return self.rate(quaternion.angle_between(quat_E4, target_E4).square())
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackJointPosition(RewardTerm):
+class TrackJointPosition(GaussianReward):
     """exp(-mean_j((c_j - q_j)^2) / std^2), rad or m, [E]; position stage.
 
     Attributes:
@@ -173,14 +148,9 @@ class TrackJointPosition(RewardTerm):
     """
 
     command: str
-    std: float
     joints: Patterns = ".*"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("std", self.std, low=0.0, low_open=True)
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
         error_EL = view.command(self.command) - view.joint_pos_EL[:, view.joints(self.joints)]
-        return torch.exp(error_EL.square().mean(-1) / -(self.std**2))
+        return self.rate(error_EL.square().mean(-1))

@@ -86,20 +86,21 @@ class ContactTracker(SensorTracker):
     def update(self) -> None:
         """Advance the clocks by one env step, unless they ran with the substeps."""
         if self._history_ESN3 is None:
-            self._advance(self._view.step_dt, starts=True)
+            self._advance(self._readings(), self._view.step_dt, starts=True)
 
     @property
     def state(self) -> ContactState:
         """The contacts of the last env step."""
-        clock = self._clocks
-        force_EN3 = self._view.cache.get(self._key)
-        if force_EN3 is None:
-            force_EN3 = self._view.cache[self._key] = self._force()
-        history_ESN3 = self._history_ESN3
+        clock, cache, history_ESN3 = self._clocks, self._view.cache, self._history_ESN3
+        force_EN3, position_EN3 = cache.get(f"{self._key}.force"), cache.get(f"{self._key}.position")
+        if force_EN3 is None or position_EN3 is None:
+            readings = self._readings()
+            force_EN3 = cache[f"{self._key}.force"] = self._force(readings)
+            position_EN3 = cache[f"{self._key}.position"] = readings[..., 4:7]
         return ContactState(
             found_EN=clock["found"],
             force_EN3=force_EN3,
-            position_EN3=self._readings()[..., 4:7],
+            position_EN3=position_EN3,
             air_time_EN=clock["air_time"],
             last_air_time_EN=clock["last_air_time"],
             contact_time_EN=clock["contact_time"],
@@ -122,17 +123,17 @@ class ContactTracker(SensorTracker):
 
     def _read_substep(self) -> None:
         assert self._history_ESN3 is not None
-        self._advance(self._view.physics_dt, starts=self._substep == 0)
+        readings = self._readings()
+        self._advance(readings, self._view.physics_dt, starts=self._substep == 0)
         # A world that fails in this substep must not leave its numbers to the terms that run after it was cleared.
-        self._history_ESN3[:, self._substep] = torch.nan_to_num(
-            self._force(), nan=0.0, posinf=0.0, neginf=0.0
-        )
+        force_EN3 = torch.nan_to_num(self._force(readings), nan=0.0, posinf=0.0, neginf=0.0)
+        self._history_ESN3[:, self._substep] = force_EN3
         self._substep = (self._substep + 1) % self._history_ESN3.shape[1]
 
-    def _advance(self, dt: float, *, starts: bool) -> None:
+    def _advance(self, readings: Tensor, dt: float, *, starts: bool) -> None:
         """Let `dt` seconds pass; `starts` where this begins an env step."""
         clock = self._clocks
-        touches = self._readings()[..., 0] > 0
+        touches = readings[..., 0] > 0
         touched = clock["found"] > 0
         lands, leaves = touches & ~touched, touched & ~touches
         flight_EN = clock["air_time"] + dt
@@ -152,8 +153,7 @@ class ContactTracker(SensorTracker):
         """Return found, force, position and (for the strongest) the contact's first two axes, [E, N, 7 or 13]."""
         return self._world.sensordata_EL[:, self._columns].unflatten(1, (self._count, -1))
 
-    def _force(self) -> Tensor:
-        readings = self._readings()
+    def _force(self, readings: Tensor) -> Tensor:
         if not self._strongest:
             return readings[..., 1:4]
         normal, tangent = readings[..., 7:10], readings[..., 10:13]

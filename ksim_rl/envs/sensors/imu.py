@@ -9,9 +9,9 @@ import mujoco
 import torch
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range, near
 from ksim_rl.envs import quaternion
-from ksim_rl.envs.sensors.sensor import Sensor, SensorTracker
+from ksim_rl.envs.sensors.mount import MountedSensor
+from ksim_rl.envs.sensors.sensor import SensorTracker
 
 if TYPE_CHECKING:
     from ksim_rl.envs.view import EnvView
@@ -39,30 +39,8 @@ class ImuState(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImuSensor(Sensor):
-    """An inertial measurement unit at a site of the model, or at a place on a body, whose axes it then has.
-
-    Noise, bias and lag are transforms of the observations that read it.
-
-    Attributes:
-        site: a site of the model, or None.
-        body: a body of the model, or None; exactly one of the two is given.
-        pos: with `body`, where on it, in its frame, m.
-    """
-
-    site: str | None = None
-    body: str | None = None
-    pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        if (self.site is None) == (self.body is None):
-            raise ValueError(f"site={self.site!r}, body={self.body!r}: give exactly one of them")
-        for index, value in enumerate(self.pos):
-            check_in_range(f"pos[{index}]", value)
-        if self.site is not None and any(self.pos):
-            raise ValueError(
-                f"pos={self.pos!r} with site={self.site!r}: a site has its own place; give a body"
-            )
+class ImuSensor(MountedSensor):
+    """An inertial measurement unit. Noise, bias and lag are transforms of the observations that read it."""
 
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
         """Add the MJCF sensors `<name>_gyro`, `<name>_accelerometer` and `<name>_orientation`, and a site if needed.
@@ -70,26 +48,18 @@ class ImuSensor(Sensor):
         Raises:
             ValueError: if the model has no such site or body.
         """
-        elements = spec.sites if self.body is None else spec.bodies
-        wanted = self.site if self.body is None else self.body
-        present = [element.name for element in elements]
-        if wanted not in present:
-            kind = "site" if self.body is None else "body"
-            raise ValueError(
-                f"scene.sensors.{name}: no {kind} {wanted!r}: {near(str(wanted), filter(None, present))}"
-            )
-        site = self.site
-        if self.body is not None:
-            site = f"{name}_imu"
-            spec.body(self.body).add_site(name=site, pos=list(self.pos))
+        super().add_to(spec, name)
         for suffix, kind in _SENSORS.items():
             spec.add_sensor(
-                name=f"{name}_{suffix}", type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site
+                name=f"{name}_{suffix}",
+                type=kind,
+                objtype=mujoco.mjtObj.mjOBJ_SITE,
+                objname=self.mounting_site(name),
             )
 
     def track(self, name: str, view: EnvView) -> ImuTracker:
         """Return the reader of this sensor in the worlds of `view`."""
-        return ImuTracker(name, view, self.site or f"{name}_imu")
+        return ImuTracker(name, view, self.mounting_site(name))
 
 
 class ImuTracker(SensorTracker):

@@ -9,9 +9,10 @@ import mujoco
 import torch
 from torch import Tensor
 
-from ksim_rl.checks import check_choice, check_in_range, near
+from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.envs.sensors.mount import MountedSensor
 from ksim_rl.envs.sensors.ray_patterns import RayPattern
-from ksim_rl.envs.sensors.sensor import Sensor, SensorTracker
+from ksim_rl.envs.sensors.sensor import SensorTracker
 from ksim_rl.physics.rays import RayBatch
 
 if TYPE_CHECKING:
@@ -33,17 +34,14 @@ class RayState(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RayCaster(Sensor):
-    """Rays against all geoms of some groups, at a site of the model or at a place on a body, whose axes it then has.
+class RayCaster(MountedSensor):
+    """Rays against all geoms of some groups.
 
     They hit whatever is there, moving things too, and cost accordingly: for the shape of the terrain alone,
     `mdp.HeightScan` is much cheaper.
 
     Attributes:
         pattern: the rays in the sensor's axes.
-        site: a site of the model, or None.
-        body: a body of the model, or None; exactly one of the two is given.
-        pos: with `body`, where on it, in its frame, m.
         alignment: how the pattern turns: with the "site", with its "yaw" only, or not at all ("world").
         max_distance: m.
         geom_groups: which of MuJoCo's geom groups are hit; 2 are by custom robots' visual, 3 their collision geoms.
@@ -51,42 +49,17 @@ class RayCaster(Sensor):
     """
 
     pattern: RayPattern
-    site: str | None = None
-    body: str | None = None
-    pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
     alignment: Literal["site", "yaw", "world"] = "site"
     max_distance: float = 10.0
     geom_groups: tuple[int, ...] = (0, 1)
     exclude_body: bool = True
 
     def __post_init__(self) -> None:
-        if (self.site is None) == (self.body is None):
-            raise ValueError(f"site={self.site!r}, body={self.body!r}: give exactly one of them")
-        for index, value in enumerate(self.pos):
-            check_in_range(f"pos[{index}]", value)
-        if self.site is not None and any(self.pos):
-            raise ValueError(
-                f"pos={self.pos!r} with site={self.site!r}: a site has its own place; give a body"
-            )
+        super().__post_init__()
         check_choice("alignment", self.alignment, ("site", "yaw", "world"))
         check_in_range("max_distance", self.max_distance, low=0.0, low_open=True)
         for index, group in enumerate(self.geom_groups):
             check_in_range(f"geom_groups[{index}]", group, low=0, high=mujoco.mjNGROUP - 1)
-
-    def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
-        """Add the site `<name>_rays`, if the sensor is on a body.
-
-        Raises:
-            ValueError: if the model has no such site or body.
-        """
-        kind, wanted = ("site", self.site) if self.body is None else ("body", self.body)
-        present = [element.name for element in (spec.sites if self.body is None else spec.bodies)]
-        if wanted not in present:
-            raise ValueError(
-                f"scene.sensors.{name}: no {kind} {wanted!r}: {near(str(wanted), filter(None, present))}"
-            )
-        if self.body is not None:
-            spec.body(self.body).add_site(name=f"{name}_rays", pos=list(self.pos))
 
     def track(self, name: str, view: EnvView) -> RayTracker:
         """Return the reader of this sensor in the worlds of `view`."""
@@ -98,7 +71,7 @@ class RayTracker(SensorTracker):
 
     def __init__(self, name: str, sensor: RayCaster, view: EnvView) -> None:
         self._sensor, self._view, self._key = sensor, view, f"rays/{name}."
-        site = view.world.mj_model.site(sensor.site or f"{name}_rays")
+        site = view.world.mj_model.site(sensor.mounting_site(name))
         self._site = int(site.id)
         start_N3, direction_N3 = (
             torch.tensor(table, dtype=torch.float32, device=view.device) for table in sensor.pattern.rays()

@@ -14,6 +14,7 @@ from torch import Tensor
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.mdp import JointEffortAction, JointVel, TimeOut
+from ksim_rl.envs.mdp.tolerance import tolerance
 from ksim_rl.envs.robots.cartpole import Cartpole
 from ksim_rl.envs.scene import SceneCfg
 from ksim_rl.envs.task import Task
@@ -38,7 +39,7 @@ class CartpolePosition(ObservationTerm):
 class CartpoleReward(RewardTerm):
     """dm_control's smooth reward: upright x centered x small control x small angular velocity, in [0, 1].
 
-    A factor that rates x against a margin m is 0.1^((x/m)^2): 1 at 0 and 0.1 at the margin (`rewards.tolerance` there).
+    A factor that rates x against a margin m is 0.1^((x/m)^2): 1 at 0 and 0.1 at the margin (see `tolerance`).
     """
 
     def __call__(self, view: EnvView) -> Tensor:
@@ -47,9 +48,9 @@ class CartpoleReward(RewardTerm):
         angle_E = view.joint_pos_EL[:, view.joints("hinge")][:, 0]
         velocity_E = view.joint_vel_EL[:, view.joints("hinge")][:, 0]
         upright_E = (torch.cos(angle_E) + 1.0) / 2.0
-        centered_E = (1.0 + _closeness(cart_E, margin=2.0)) / 2.0
+        centered_E = (1.0 + tolerance(cart_E, low=0.0, high=0.0, margin=2.0)) / 2.0
         small_control_E = (4.0 + (1.0 - view.action_EL[:, 0].clamp(-1.0, 1.0).square())) / 5.0
-        small_velocity_E = (1.0 + _closeness(velocity_E, margin=5.0)) / 2.0
+        small_velocity_E = (1.0 + tolerance(velocity_E, low=0.0, high=0.0, margin=5.0)) / 2.0
         return upright_E * centered_E * small_control_E * small_velocity_E
 
 
@@ -98,10 +99,6 @@ class ResetCartpole(EventTerm):
         angle_E1 = self.angle + spread_EL[:, 1:] * self.angle_range
         view.write_joint_pos(mask_E, torch.cat((cart_E1, angle_E1), dim=-1), view.joints(("slider", "hinge")))
         view.write_joint_vel(mask_E, view.normal(2) * self.velocity_std, view.joints(("slider", "hinge")))
-
-
-def _closeness(value_E: Tensor, *, margin: float) -> Tensor:
-    return torch.exp((value_E / margin).square() * math.log(0.1))
 
 
 def _cfg(reset: ResetCartpole, **terminations: TerminationTerm) -> ManagerBasedRlEnvCfg:

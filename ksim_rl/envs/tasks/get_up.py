@@ -157,7 +157,7 @@ def get_up_cfg(
                 }
             ),
             "bend": mdp.ResetJoints(position_range=(-bend, bend)),
-            "encoder_bias": mdp.RandomizeEncoderBias(bias_range=(-0.015, 0.015)),
+            "encoder_bias": mdp.RandomizeEncoderBias(ranges=(-0.015, 0.015)),
             "foot_friction": velocity.foot_friction(robot, low=0.4, high=1.2),
         },
         terminations={"time_out": mdp.TimeOut()},

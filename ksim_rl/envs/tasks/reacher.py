@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ksim_rl.checks import check_pair
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.mdp import JointEffortAction, JointVel, ResetJoints, TimeOut
 from ksim_rl.envs.mdp.tolerance import tolerance
@@ -32,6 +33,10 @@ class ReacherTarget(CommandTerm):
     """
 
     radius: tuple[float, float] = (0.06, 0.22)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_pair("radius", self.radius, low=0.0)
 
     def resample(self, view: EnvView, mask_E: Tensor) -> None:
         """Draw targets for the rows of `mask_E`."""
@@ -78,7 +83,7 @@ class FingerToTarget(ObservationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading, [E, 2]."""
-        return view.command(self.command) - view.site_pos_w(view.sites("finger"))[:, 0, :2]
+        return _offset(view, self.command)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +94,13 @@ class ReacherReward(RewardTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reward, [E]."""
-        distance_E = torch.linalg.vector_norm(FingerToTarget(command=self.command)(view), dim=-1)
+        distance_E = torch.linalg.vector_norm(_offset(view, self.command), dim=-1)
         return tolerance(distance_E, high=TARGET_RADIUS, margin=0.1)
+
+
+def _offset(view: EnvView, command: str) -> Tensor:
+    """Return target minus finger, x and y in the world frame, m, [E, 2]."""
+    return view.command(command) - view.site_pos_w(view.sites("finger"))[:, 0, :2]
 
 
 def reacher() -> ManagerBasedRlEnvCfg:

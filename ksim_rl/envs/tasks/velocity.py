@@ -185,9 +185,9 @@ def events(robot: LeggedRobot, *, torso: str | None = None) -> dict[str, EventTe
                 "yaw": (-0.78, 0.78),
             },
         ),
-        "encoder_bias": mdp.RandomizeEncoderBias(bias_range=(-0.015, 0.015)),
+        "encoder_bias": mdp.RandomizeEncoderBias(ranges=(-0.015, 0.015)),
         "base_com": mdp.RandomizeBodyCom(
-            elements=(torso or robot.root_body,),
+            bodies=(torso or robot.root_body,),
             operation="add",
             ranges={0: (-0.025, 0.025), 1: (-0.025, 0.025), 2: (-0.03, 0.03)},
         ),
@@ -199,7 +199,7 @@ def foot_friction(
 ) -> mdp.RandomizeGeomFriction:
     """Return the start-up draw of one friction coefficient, the same for all feet of a world."""
     return mdp.RandomizeGeomFriction(
-        elements=robot.foot_geoms,
+        geoms=robot.foot_geoms,
         ranges={axis: (low, high)},
         distribution="log_uniform" if log else "uniform",
         shared=True,

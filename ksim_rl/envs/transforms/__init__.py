@@ -10,11 +10,13 @@ from ksim_rl.envs.transforms.compile_groups import compile_groups
 from ksim_rl.envs.transforms.delay import ObservationDelay
 from ksim_rl.envs.transforms.delay_cfg import DelayCfg
 from ksim_rl.envs.transforms.episode_tracker import EpisodeTracker
-from ksim_rl.envs.transforms.group_cfg import HistoryCfg, ObservationGroupCfg, ObservationTermCfg
+from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.envs.transforms.group_spec import GroupSpec
-from ksim_rl.envs.transforms.groups import ObservationGroups
+from ksim_rl.envs.transforms.groups import ObservationGroups, group_specs, observation_columns
 from ksim_rl.envs.transforms.history import ObservationHistory
+from ksim_rl.envs.transforms.history_cfg import HistoryCfg
 from ksim_rl.envs.transforms.keyed_transform import KeyedTransform
+from ksim_rl.envs.transforms.level import FollowsLevel, follow_level
 from ksim_rl.envs.transforms.mirror import Mirror, mirrored
 from ksim_rl.envs.transforms.mirror_map import AXIAL, PLANAR_VELOCITY, POLAR, QUATERNION, MirrorMap
 from ksim_rl.envs.transforms.noise import ObservationNoise
@@ -36,6 +38,7 @@ __all__ = [
     "ConstantNoise",
     "DelayCfg",
     "EpisodeTracker",
+    "FollowsLevel",
     "GaussianNoise",
     "GroupSpec",
     "HistoryCfg",
@@ -62,9 +65,12 @@ __all__ = [
     "TimeAwareObservation",
     "UniformNoise",
     "compile_groups",
+    "follow_level",
+    "group_specs",
     "mirror_by_name",
     "mirror_group",
     "mirror_joints",
     "mirror_name",
     "mirrored",
+    "observation_columns",
 ]

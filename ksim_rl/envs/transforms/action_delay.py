@@ -70,6 +70,10 @@ class ActionDelay(LaggedTransform):
         return tensordict_reset
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if not self._sized:
+            raise RuntimeError("ActionDelay has state per env: use it in an env, not on a batch of samples")
+        if not self._sized:
+            raise RuntimeError("ActionDelay has state per env: use it in an env, not on a batch of samples")
         actions = [self._checked(index, tensordict, key) for index, key in enumerate(self.out_keys_inv)]
         self._advance()
         for index, (key, action) in enumerate(zip(self.in_keys_inv, actions, strict=True)):

@@ -6,9 +6,9 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from ksim_rl import checks
 from ksim_rl.envs.transforms.clip import check_clip
 from ksim_rl.envs.transforms.delay_cfg import DelayCfg
+from ksim_rl.envs.transforms.history_cfg import HistoryCfg
 from ksim_rl.envs.transforms.noise_cfg import NoiseCfg, PerDim
 from ksim_rl.envs.transforms.scale import check_scale
 
@@ -22,17 +22,6 @@ class Reading(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class HistoryCfg:
-    """The last `length` frames, oldest first; in a group they are flattened frame after frame."""
-
-    length: int
-
-    def __post_init__(self) -> None:
-        if isinstance(self.length, bool) or not isinstance(self.length, int) or self.length < 1:
-            raise ValueError(f"length={self.length!r}: expected a whole number of frames of at least 1")
-
-
-@dataclass(frozen=True, kw_only=True)
 class ObservationTermCfg:
     """One term of a group; its chain runs in the order of the fields.
 
@@ -42,7 +31,7 @@ class ObservationTermCfg:
         clip: (low, high); None is no limit on that side.
         scale: factor, or one per element.
         delay: sensor latency in env steps.
-        history: number of frames; 1 and None are the present one alone.
+        history: number of frames, or these with a stride; 1 and None are the present one alone.
     """
 
     term: Reading
@@ -60,18 +49,16 @@ class ObservationTermCfg:
         if self.clip is not None:
             check_clip("clip", self.clip)
         check_scale("scale", self.scale)
-        if isinstance(self.history, int):
-            checks.check_in_range("history", self.history, low=1)
+        frames = history_cfg(self.history)
+        if frames is not None and not frames.flat:
+            raise ValueError(
+                "history.flat=False: frames in a vector are flat; stack those of the whole group"
+            )
 
     @property
     def is_image(self) -> bool:
         """Whether the term reads an image, which is not put into a vector."""
         return bool(getattr(self.term, "is_image", False))
-
-    @property
-    def history_length(self) -> int:
-        """Number of frames."""
-        return self.history.length if isinstance(self.history, HistoryCfg) else self.history or 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,18 +69,48 @@ class ObservationGroupCfg:
         terms: by name; the env writes the clean reading to `("obs", name)`.
         keep_terms: whether each term, as it stands in the vector, is also written to `("<group>_terms", name)`.
         enable_noise: False leaves all noise of the group out.
+        delay: sensor latency of the terms that have none of their own; these share one lag.
+        history: frames of the terms that have none of their own. With `flat=False` it is the last vectors instead,
+            stacked to [E, N, L].
     """
 
     terms: Mapping[str, ObservationTermCfg]
     keep_terms: bool = False
     enable_noise: bool = True
+    delay: DelayCfg | None = None
+    history: int | HistoryCfg | None = None
 
     def __post_init__(self) -> None:
         if not self.terms:
             raise ValueError("terms={}: expected at least one term")
+        history_cfg(self.history)
         images = [name for name, cfg in self.terms.items() if cfg.is_image]
         if images and len(self.terms) > 1:
             other = next(name for name in self.terms if name != images[0])
             raise ValueError(
-                f"terms: {images[0]!r} is an image, which is not concatenated with {other!r}: give it a group of its own"
+                f"terms: {images[0]!r} is an image, which is not concatenated with {other!r}: "
+                "give it a group of its own"
             )
+
+    def num_frames(self, term: str) -> int:
+        """Return how many frames of a term the vector holds side by side."""
+        for history in (self.terms[term].history, self.history):
+            if history is not None:
+                frames = history_cfg(history)
+                return frames.length if frames is not None and frames.flat else 1
+        return 1
+
+
+def history_cfg(history: int | HistoryCfg | None) -> HistoryCfg | None:
+    """Return what a history is in full, or None where it is the present frame alone.
+
+    Raises:
+        ValueError: if a number of frames is not valid.
+    """
+    if history is None:
+        return None
+    try:
+        cfg = history if isinstance(history, HistoryCfg) else HistoryCfg(length=history)
+    except ValueError as error:
+        raise ValueError(f"history.{error}") from None
+    return cfg if cfg.length > 1 or not cfg.flat else None

@@ -45,10 +45,15 @@ class GroupSpec:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data for a checkpoint or an export: term name -> [start, stop)."""
-        spelled = {k if isinstance(k, str) else "/".join(map(str, k)): self.slice(k) for k in self.terms}
-        return {name: [columns.start, columns.stop] for name, columns in spelled.items()}
+        columns = {spell(key): self.slice(key) for key in self.terms}
+        return {name: [found.start, found.stop] for name, found in columns.items()}
 
 
 def last_name(key: NestedKey) -> str:
     """Return the last part of a key."""
     return key if isinstance(key, str) else str(key[-1])
+
+
+def spell(key: NestedKey) -> str:
+    """Return a key as one string."""
+    return key if isinstance(key, str) else "/".join(map(str, key))

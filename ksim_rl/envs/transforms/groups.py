@@ -1,14 +1,16 @@
 """Concatenation of observations into the vectors that networks read."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 
 from ksim_rl import checks
-from ksim_rl.envs.transforms.group_spec import GroupSpec
+from ksim_rl.envs.transforms.group_spec import GroupSpec, spell
 from ksim_rl.envs.transforms.row_transform import as_keys
 from ksim_rl.envs.transforms.specs import (
     Device,
@@ -119,3 +121,21 @@ def _drop(tensordict: TensorDictBase, key: NestedKey) -> None:
         above = key[:-1] if len(key) > 2 else key[0]
         if tensordict.get(above).is_empty():
             _drop(tensordict, above)
+
+
+def group_specs(env: EnvBase) -> dict[NestedKey, GroupSpec]:
+    """Return which columns of each group's vector belong to which term, of all `ObservationGroups` of an env."""
+    found: dict[NestedKey, GroupSpec] = {}
+    inner: Any = env
+    while isinstance(inner, TransformedEnv):
+        assert inner.output_spec is not None  # making the specs is what counts the columns
+        for module in inner.transform.modules():
+            if isinstance(module, ObservationGroups):
+                found = module.group_specs | found
+        inner = inner.base_env
+    return found
+
+
+def observation_columns(env: EnvBase) -> dict[str, dict[str, list[int]]]:
+    """Return `group_specs` as plain data for a checkpoint or an export: group -> term -> [start, stop)."""
+    return {spell(name): spec.as_dict() for name, spec in group_specs(env).items()}

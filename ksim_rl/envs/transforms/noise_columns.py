@@ -94,12 +94,12 @@ def _is_gaussian(cfg: NoiseCfg | None) -> bool:
     return cfg is not None and cfg.draw is Draw.GAUSSIAN
 
 
-def widen(
-    cfg: NoiseCfg, key: NestedKey, low: Tensor, high: Tensor, batch_dims: int
-) -> tuple[Tensor, Tensor]:
+def widen(cfg: NoiseCfg, key: NestedKey, low: Tensor, high: Tensor, batch_dims: int) -> tuple[Tensor, Tensor]:
     """Return the bounds of the noisy observation; they hold the clean one too, as noise can be off or weaker."""
     shape = low.shape[batch_dims:]
-    rows = [torch.tensor(row, device=low.device).reshape(shape) for row in _parameters(cfg, key, shape.numel())]
+    rows = [
+        torch.tensor(row, device=low.device).reshape(shape) for row in _parameters(cfg, key, shape.numel())
+    ]
     ends = low, high
     if cfg.bias is not None:
         ends = _noisy(cfg.bias, rows[noise_kernel.BIAS_OFFSET], rows[noise_kernel.BIAS_SPREAD], ends)

@@ -250,7 +250,9 @@ def add_noise(
     clean_EL: Tensor, state: NoiseState, features: int, *, seed: Tensor, stream: int, counter: Tensor
 ) -> Tensor:
     """Return the noisy readings of samples, which belong to no episode: no bias, drift or dropout, float32 [E, L]."""
-    return _run(clean_EL, *state, features & (HAS_GAUSSIAN | HAS_RESOLUTION), _PLAIN, None, seed, stream, counter)
+    return _run(
+        clean_EL, *state, features & (HAS_GAUSSIAN | HAS_RESOLUTION), _PLAIN, None, seed, stream, counter
+    )
 
 
 def step_noise(
@@ -302,16 +304,27 @@ def _launch(
     out_EL = torch.empty_like(clean_EL)
     device = clean_EL.device
     width = max(num_columns, 1) if device.type == "cpu" else 1
-    tensors = (seed, counter, enabled, level, mask_E, table_PL, flags_L, clean_EL, bias_EL, walk_EL, last_EL, out_EL)
+    tensors = (
+        seed,
+        counter,
+        enabled,
+        level,
+        mask_E,
+        table_PL,
+        flags_L,
+        clean_EL,
+        bias_EL,
+        walk_EL,
+        last_EL,
+        out_EL,
+    )
     inputs = [width, num_columns, mode, features, stream, counter.ndim, *(_address(t) for t in tensors)]
     with warp_scope(device):
         wp.launch(_apply_noise, (num_rows, -(-num_columns // width)), inputs=inputs, device=str(device))
     return out_EL
 
 
-_noise = torch.library.custom_op(
-    "ksim_rl::noise", _launch, mutates_args=("bias_EL", "walk_EL", "last_EL")
-)
+_noise = torch.library.custom_op("ksim_rl::noise", _launch, mutates_args=("bias_EL", "walk_EL", "last_EL"))
 
 
 @_noise.register_fake

@@ -3,9 +3,9 @@
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Composite
-from torchrl.envs.transforms import Transform
 
 from ksim_rl import checks
+from ksim_rl.envs.transforms.level import FollowsLevel
 from ksim_rl.envs.transforms.row_transform import Keys, as_keys, checked_out_keys
 from ksim_rl.envs.transforms.specs import (
     add_bounds,
@@ -17,13 +17,15 @@ from ksim_rl.envs.transforms.specs import (
 )
 
 
-class RewardScale(Transform):
+class RewardScale(FollowsLevel):
     """Rewards as `scale * reward + offset`.
 
     Args:
         in_keys: rewards; nested keys as tuples.
         out_keys: where the scaled ones go. Default: in place.
         scale, offset: finite numbers.
+        first_scale: the scale at level 0 of `follow_level_`, which moves it linearly to `scale` at level 1; None leaves it
+            at `scale`.
 
     Example:
         >>> scale = RewardScale(scale=0.02)
@@ -36,26 +38,35 @@ class RewardScale(Transform):
         *,
         scale: float,
         offset: float = 0.0,
+        first_scale: float | None = None,
     ) -> None:
         in_keys = as_keys(in_keys)
         super().__init__(in_keys, checked_out_keys(in_keys, out_keys))
         checks.check_in_range("scale", scale)
         checks.check_in_range("offset", offset)
-        self.scale, self.offset = scale, offset
+        if first_scale is not None:
+            checks.check_in_range("first_scale", first_scale)
+        self.scale, self.offset, self.first_scale = scale, offset, first_scale
+        self._register_level(is_used=first_scale is not None)
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
         """Scale and shift the bounds."""
         specs = [leaf_spec(reward_spec, key, type(self).__name__) for key in self.in_keys]
         for out_key, spec in zip(self.out_keys, specs, strict=True):
             low, high = bounds(spec)
-            factor, shift = torch.full_like(low, self.scale), torch.full_like(low, self.offset)
-            low, high = add_bounds(multiply_bounds((low, high), (factor, factor)), (shift, shift))
+            scales = self.scale, self.scale if self.first_scale is None else self.first_scale
+            factors = torch.full_like(low, min(scales)), torch.full_like(low, max(scales))
+            shift = torch.full_like(low, self.offset)
+            low, high = add_bounds(multiply_bounds((low, high), factors), (shift, shift))
             set_leaf_spec(reward_spec, out_key, bounded(low, high, dtype=spec.dtype, device=spec.device))
         return reward_spec
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        scale = self.scale
+        if self.first_scale is not None:
+            scale = self.first_scale + (self.scale - self.first_scale) * self.level
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            next_tensordict.set(out_key, next_tensordict.get(key) * self.scale + self.offset)
+            next_tensordict.set(out_key, next_tensordict.get(key) * scale + self.offset)
         return next_tensordict
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -16,13 +16,16 @@ _SIDES = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "hl": "hr", "bl": "
 _SIDES |= {"lf": "rf", "lh": "rh", "lr": "rr", "lb": "rb", "lm": "rm"}
 # Between the words of a name: anything that is no letter, and the humps of CamelCase.
 _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[^A-Za-z]+")
+_ARM = re.compile(r"[A-Z][LR]")
+_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _TOLERANCE = 1e-3
 
 
 def mirror_name(name: str, names: Sequence[str]) -> str:
     """Return which of `names` is the mirror image of `name`; itself if the name has no side.
 
-    Sides are words of a name: left and right, l and r, and FL, FR, RL, RR, LF, RH and the like, in any case.
+    Sides are words of a name: left and right, l and r, and FL, FR, RL, RR, LF, RH and the like, in any case; and two
+    capitals of which the second is L or R, where that gives another of `names`.
 
     Raises:
         ValueError: if a name has a side and `names` has no counterpart, or more than one.
@@ -32,7 +35,11 @@ def mirror_name(name: str, names: Sequence[str]) -> str:
         "".join(image) for image in itertools.product(*[_counterparts(word) or [word] for word in words])
     ]
     if images == [name]:
-        return name
+        # AL1 and AR1 are arms, but an AR tag has no counterpart.
+        arms = "".join(
+            word[0] + "LR"["RL".index(word[1])] if _ARM.fullmatch(word) else word for word in words
+        )
+        return arms if arms in names else name
     found = [image for image in images if image in names]
     if len(found) != 1:
         hint = f"both {found}" if found else f"none of {images}: {checks.near(images[0], names)}"
@@ -82,7 +89,7 @@ def mirror_joints(model: mujoco.MjModel, joints: Sequence[str] | None = None) ->
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)
-    scalar = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    scalar = (_HINGE, int(mujoco.mjtJoint.mjJNT_SLIDE))
     valid = {model.joint(i).name: i for i in range(model.njnt) if model.jnt_type[i] in scalar}
     names = list(valid) if joints is None else list(joints)
     for name in names:
@@ -100,7 +107,7 @@ def _sign(model: mujoco.MjModel, data: mujoco.MjData, joint: int, other: int) ->
     reflection = np.array([1.0, -1.0, 1.0])
     apart = np.abs(data.xanchor[joint] * reflection - data.xanchor[other]).max()
     # A rotation axis is a pseudovector: its mirror image turns the other way as well.
-    handed = -1.0 if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE else 1.0
+    handed = -1.0 if model.jnt_type[joint] == _HINGE else 1.0
     agreement = float(handed * reflection * data.xaxis[joint] @ data.xaxis[other])
     extent = max(float(model.stat.extent), _TOLERANCE)
     if (

@@ -92,9 +92,7 @@ class Plateau(Ground):
 class Bench:
     """Worlds and their view, with what the env does around terms."""
 
-    def __init__(
-        self, source: str, num_envs: int, contacts: Mapping[str, Sensor], **view: float
-    ) -> None:
+    def __init__(self, source: str, num_envs: int, contacts: Mapping[str, Sensor], **view: float) -> None:
         spec = mujoco.MjSpec.from_string(source)
         for name, sensor in contacts.items():
             sensor.add_to(spec, name)

@@ -23,7 +23,7 @@ def crowd(make_bench):
 
 def test_absolute_friction_is_shared_by_the_geoms_of_a_world(crowd):
     before = crowd.view.field("geom_friction").clone()
-    crowd.fire(mdp.RandomizeGeomFriction(elements=("a", "b"), ranges={0: (0.3, 1.5)}, shared=True))
+    crowd.fire(mdp.RandomizeGeomFriction(geoms=("a", "b"), ranges={0: (0.3, 1.5)}, shared=True))
     friction = crowd.view.field("geom_friction")
     slide = friction[:, 1:, 0]
     assert torch.equal(slide[:, 0], slide[:, 1])
@@ -34,13 +34,13 @@ def test_absolute_friction_is_shared_by_the_geoms_of_a_world(crowd):
 
 
 def test_unshared_draws_differ_between_elements(crowd):
-    crowd.fire(mdp.RandomizeGeomFriction(elements=("a", "b"), ranges={0: (0.3, 1.5)}))
+    crowd.fire(mdp.RandomizeGeomFriction(geoms=("a", "b"), ranges={0: (0.3, 1.5)}))
     slide = crowd.view.field("geom_friction")[:, 1:, 0]
     assert (slide[:, 0] != slide[:, 1]).float().mean() > 0.99
 
 
 def test_log_uniform_spreads_evenly_over_decades(crowd):
-    event = mdp.RandomizeGeomFriction(elements="a", ranges={1: (1e-4, 1e-2)}, distribution="log_uniform")
+    event = mdp.RandomizeGeomFriction(geoms="a", ranges={1: (1e-4, 1e-2)}, distribution="log_uniform")
     crowd.fire(event)
     exponent = torch.log10(crowd.view.field("geom_friction")[:, 1, 1])
     assert exponent.min() >= -4.0 - 1e-5 and exponent.max() <= -2.0 + 1e-5
@@ -48,7 +48,7 @@ def test_log_uniform_spreads_evenly_over_decades(crowd):
 
 
 def test_scale_and_add_start_from_the_model_each_time(crowd):
-    scale = mdp.RandomizeGeomFriction(elements="a", ranges={0: (0.5, 0.5)}, operation="scale")
+    scale = mdp.RandomizeGeomFriction(geoms="a", ranges={0: (0.5, 0.5)}, operation="scale")
     for _ in range(2):
         crowd.fire(scale)
     torch.testing.assert_close(crowd.view.field("geom_friction")[:, 1, 0], torch.full((E,), 0.5))
@@ -57,7 +57,7 @@ def test_scale_and_add_start_from_the_model_each_time(crowd):
 def test_com_offset_moves_the_centre_of_mass_of_rows_that_are_meant(make_bench):
     bench = make_bench(FREE_BODY, 3)
     event = mdp.RandomizeBodyCom(
-        elements=("trunk",), ranges={0: (0.02, 0.02), 2: (-0.03, -0.03)}, operation="add"
+        bodies=("trunk",), ranges={0: (0.02, 0.02), 2: (-0.03, -0.03)}, operation="add"
     )
     bench.fire(event, torch.tensor([True, False, True]))
     bench.world.set_const(event.per_world_fields)
@@ -73,7 +73,7 @@ def test_friction_stops_a_sliding_box_after_its_braking_distance(make_bench):
     bench.view.field("geom_friction")[:, 0, 0] = 0.1
     for friction, row in ((0.4, 0), (0.8, 1)):
         mask = torch.arange(2) == row
-        bench.fire(mdp.RandomizeGeomFriction(elements="a", ranges={0: (friction, friction)}), mask)
+        bench.fire(mdp.RandomizeGeomFriction(geoms="a", ranges={0: (friction, friction)}), mask)
     bench.place(qvel=(1.0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0))
     for _ in range(30):
         bench.step()
@@ -83,11 +83,11 @@ def test_friction_stops_a_sliding_box_after_its_braking_distance(make_bench):
 
 def test_encoder_bias_is_drawn_per_joint_and_world(make_bench):
     bench = make_bench(FREE_BODY, E)
-    bench.fire(mdp.RandomizeEncoderBias(bias_range=(-0.015, 0.015)))
+    bench.fire(mdp.RandomizeEncoderBias(ranges=(-0.015, 0.015)))
     bias = bench.view.encoder_bias_EL
     assert -0.015 <= bias.min() < -0.0148 and 0.0148 < bias.max() <= 0.015
     assert (bias[:, 0] != bias[:, 1]).float().mean() > 0.99
-    bench.fire(mdp.RandomizeEncoderBias(bias_range=(1.0, 1.0), joints="right_hip"), torch.arange(E) < 10)
+    bench.fire(mdp.RandomizeEncoderBias(ranges=(1.0, 1.0), joints="right_hip"), torch.arange(E) < 10)
     assert (bias[:10, 1] == 1.0).all() and bias[10:].abs().max() <= 0.015 and bias[:, 0].abs().max() <= 0.015
 
 
@@ -103,7 +103,7 @@ def moments(values: torch.Tensor) -> tuple[float, float]:
 
 def test_gaussian_draws_have_the_mean_and_the_deviation(herd):
     herd.restart()
-    herd.fire(mdp.RandomizeJointDamping(elements=".*_hip", ranges=(1.0, 0.2), distribution="gaussian"))
+    herd.fire(mdp.RandomizeJointDamping(joints=".*_hip", ranges=(1.0, 0.2), distribution="gaussian"))
     damping = herd.view.field("dof_damping")[:, 6:8]
     mean, deviation = moments(damping)
     assert abs(mean - 1.0) < 4.0 * 0.2 / math.sqrt(2 * E)
@@ -114,7 +114,7 @@ def test_gaussian_draws_have_the_mean_and_the_deviation(herd):
 
 def test_draws_of_elements_and_columns_are_independent(herd):
     herd.restart()
-    herd.fire(mdp.RandomizeGeomPos(elements=".*_foot", ranges=(-0.1, 0.1)))
+    herd.fire(mdp.RandomizeGeomPos(geoms=".*_foot", ranges=(-0.1, 0.1)))
     geoms = [herd.world.mj_model.geom(name).id for name in ("left_foot", "right_foot")]
     columns = herd.view.field("geom_pos")[:, geoms].reshape(E, 6).numpy()
     off_diagonal = np.corrcoef(columns.T) - np.eye(6)
@@ -123,7 +123,7 @@ def test_draws_of_elements_and_columns_are_independent(herd):
 
 def test_shared_draws_are_one_per_world_in_each_kind_of_term(herd):
     herd.restart()
-    herd.fire(mdp.RandomizeBodyMass(elements=".*_leg", ranges=(0.5, 2.0), shared=True))
+    herd.fire(mdp.RandomizeBodyMass(bodies=".*_leg", ranges=(0.5, 2.0), shared=True))
     herd.fire(mdp.RandomizeActuatorGains(joints=("tail", "left_hip"), damping=(0.5, 2.0), shared=True))
     model = herd.world.mj_model
     legs = [model.body("left_leg").id, model.body("right_leg").id]
@@ -137,7 +137,7 @@ def test_shared_draws_are_one_per_world_in_each_kind_of_term(herd):
 
 def test_masses_keep_the_shape_of_their_body(herd):
     herd.restart()
-    herd.fire(mdp.RandomizeBodyMass(elements="trunk", ranges=(1.0, 6.0), operation="abs"))
+    herd.fire(mdp.RandomizeBodyMass(bodies="trunk", ranges=(1.0, 6.0), operation="abs"))
     mass, inertia = herd.view.field("body_mass")[:, 1], herd.view.field("body_inertia")[:, 1]
     assert mass.min() >= 1.0 and mass.max() <= 6.0
     torch.testing.assert_close(inertia / mass[:, None], torch.tensor([[0.02, 0.03, 0.04]]).expand(E, 3) / 3.0)
@@ -146,16 +146,16 @@ def test_masses_keep_the_shape_of_their_body(herd):
 @pytest.mark.parametrize(
     "event",
     [
-        mdp.RandomizeBodyInertia(elements=".*", ranges=(0.05, 20.0), distribution="log_uniform"),
+        mdp.RandomizeBodyInertia(bodies=".*", ranges=(0.05, 20.0), distribution="log_uniform"),
         mdp.RandomizePseudoInertia(
-            elements=".*", alpha=(-1.0, 1.0), stretch=(-1.0, 1.0), shear=(-1.0, 1.0), shift=(-0.2, 0.2)
+            bodies=".*", alpha=(-1.0, 1.0), stretch=(-1.0, 1.0), shear=(-1.0, 1.0), shift=(-0.2, 0.2)
         ),
     ],
     ids=("inertia", "pseudo_inertia"),
 )
 def test_random_inertias_are_those_of_real_bodies(herd, event):
     herd.restart()
-    event = dataclasses.replace(event, elements=("trunk", ".*_leg", "tail"))
+    event = dataclasses.replace(event, bodies=("trunk", ".*_leg", "tail"))
     herd.fire(event)
     inertia = herd.view.field("body_inertia")[:, 1:].double()
     largest = inertia.max(-1).values
@@ -167,7 +167,7 @@ def test_pseudo_inertia_is_the_deformed_one(herd):
     """U J0 U^T in 64 bits, from the drawn numbers, against what the four fields say."""
     herd.restart()
     event = mdp.RandomizePseudoInertia(
-        elements="trunk", alpha=(-0.5, 0.5), stretch=(-0.4, 0.4), shear=(-0.5, 0.5), shift=(-0.1, 0.1)
+        bodies="trunk", alpha=(-0.5, 0.5), stretch=(-0.4, 0.4), shear=(-0.5, 0.5), shift=(-0.1, 0.1)
     )
     with herd.view.scope("events/x", herd.view.reset_count_E):
         drawn = herd.view.uniform(10).double().numpy()
@@ -208,7 +208,7 @@ def pseudo_inertia(model: mujoco.MjModel, herd: Runners | None, row: int = 0) ->
 
 def test_default_joint_pos_moves_what_joint_positions_are_relative_to(herd):
     herd.restart()
-    herd.fire(mdp.RandomizeDefaultJointPos(elements=".*_hip", ranges=(-0.1, 0.1)), torch.arange(E) >= 10)
+    herd.fire(mdp.RandomizeDefaultJointPos(joints=".*_hip", ranges=(-0.1, 0.1)), torch.arange(E) >= 10)
     herd.world.qpos_EL[:, 7:] = torch.tensor((0.1, -0.1, 0.05))
     herd.view.refreshed()
     offset = herd.view.joint_pos_rel_EL
@@ -236,30 +236,30 @@ def test_config_round_trip(name):
 def test_bad_figures_are_refused():
     friction = mdp.RandomizeGeomFriction
     with pytest.raises(ValueError, match="ranges"):
-        friction(elements="a", ranges={3: (0.1, 0.2)})
+        friction(geoms="a", ranges={3: (0.1, 0.2)})
     with pytest.raises(ValueError, match="log_uniform"):
-        friction(elements="a", ranges={0: (0.0, 0.2)}, distribution="log_uniform")
+        friction(geoms="a", ranges={0: (0.0, 0.2)}, distribution="log_uniform")
     with pytest.raises(ValueError, match=r"operation.*scale"):
-        friction(elements="a", ranges={}, operation="scal")
-    assert friction(elements="a", ranges={}).per_world_fields == ("geom_friction",)
-    assert mdp.RandomizeBodyCom(elements="a", ranges={}).per_world_fields == ("body_ipos",)
+        friction(geoms="a", ranges={}, operation="scal")
+    assert friction(geoms="a", ranges={}).per_world_fields == ("geom_friction",)
+    assert mdp.RandomizeBodyCom(bodies="a", ranges={}).per_world_fields == ("body_ipos",)
 
 
 @pytest.mark.parametrize(
     ("event", "message"),
     [
-        (mdp.RandomizeBodyMass(elements="trunkk", ranges=(0.5, 2.0)), "no body matches 'trunkk'.*'trunk'"),
-        (mdp.RandomizeBodyMass(elements="trunk", ranges=(-0.5, 2.0)), "body_mass of body 'trunk' would reach -1.5"),
+        (mdp.RandomizeBodyMass(bodies="trunkk", ranges=(0.5, 2.0)), "no body matches 'trunkk'.*'trunk'"),
+        (mdp.RandomizeBodyMass(bodies="trunk", ranges=(-0.5, 2.0)), "body_mass of body 'trunk' would reach -1.5"),
         (
             mdp.RandomizeJointArmature(
-                elements="left_hip", ranges=(0.0, 0.1), operation="add", distribution="gaussian"
+                joints="left_hip", ranges=(0.0, 0.1), operation="add", distribution="gaussian"
             ),
             "dof_armature of joint 'left_hip' would reach -0.29",
         ),
-        (mdp.RandomizeGeomSize(elements="floor", ranges=(0.5, 2.0)), "geom 'floor', a plane, has 0 sizes"),
-        (mdp.RandomizeGeomSize(elements="left_foot", ranges={1: (0.5, 2.0)}), "'left_foot', a sphere, has 1 sizes"),
-        (mdp.RandomizeJointRange(elements="tail", ranges=(0.0, 0.1)), "joint 'tail' has no limits"),
-        (mdp.RandomizeJointRange(elements="left_hip", ranges={1: (-1.0, 0.0)}), "not below its upper limit -0.7"),
+        (mdp.RandomizeGeomSize(geoms="floor", ranges=(0.5, 2.0)), "geom 'floor', a plane, has 0 sizes"),
+        (mdp.RandomizeGeomSize(geoms="left_foot", ranges={1: (0.5, 2.0)}), "'left_foot', a sphere, has 1 sizes"),
+        (mdp.RandomizeJointRange(joints="tail", ranges=(0.0, 0.1)), "joint 'tail' has no limits"),
+        (mdp.RandomizeJointRange(joints="left_hip", ranges={1: (-1.0, 0.0)}), "not below its upper limit -0.7"),
         (mdp.RandomizeActuatorGains(joints="right_hip", stiffness=(0.5, 2.0)), "'right_hip' has no servo with"),
         (mdp.RandomizeActuatorGains(joints="left_hip", stiffness=(-0.5, 2.0)), "'left_hip' would reach -10"),
         (mdp.RandomizeEffortLimit(joints="tail", ranges=(0.5, 2.0)), "nothing limits the effort on joint 'tail'"),

@@ -70,8 +70,8 @@ def env():
     """Mass anew at each reset, beside a centre of mass from startup and an armature that changes on the way."""
     return runner_env(
         {
-            "com": mdp.RandomizeBodyCom(elements="trunk", ranges=(-0.05, 0.05), operation="add"),
-            "mass": mdp.RandomizeBodyMass(elements=("trunk", ".*_leg"), ranges=(0.5, 2.0), mode="reset"),
+            "com": mdp.RandomizeBodyCom(bodies="trunk", ranges=(-0.05, 0.05), operation="add"),
+            "mass": mdp.RandomizeBodyMass(bodies=("trunk", ".*_leg"), ranges=(0.5, 2.0), mode="reset"),
             "armature": mdp.RandomizeJointArmature(
                 ranges=(0.01, 0.1), mode="interval", interval_range_s=(0.008, 0.008)
             ),

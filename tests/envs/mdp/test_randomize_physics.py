@@ -12,17 +12,15 @@ E = 3
 SUBSTEPS = 60
 
 EVENTS = {
-    "friction": mdp.RandomizeGeomFriction(elements=".*_foot", ranges={0: (0.3, 1.5), 1: (0.005, 0.05)}),
-    "size": mdp.RandomizeGeomSize(elements=".*_foot", ranges={0: (1.1, 1.4)}, operation="scale"),
-    "geom_pos": mdp.RandomizeGeomPos(elements=".*_foot", ranges=(-0.03, 0.03)),
-    "geom_quat": mdp.RandomizeGeomQuat(
-        elements="right_foot", ranges={"pitch": (0.4, 0.8), "roll": (-0.2, 0.2)}
-    ),
-    "mass": mdp.RandomizeBodyMass(elements=("trunk", "left_leg"), ranges=(0.7, 1.5)),
-    "inertia": mdp.RandomizeBodyInertia(elements="trunk", ranges=(0.3, 3.0), distribution="log_uniform"),
-    "com": mdp.RandomizeBodyCom(elements="trunk", ranges=(-0.05, 0.05), operation="add"),
+    "friction": mdp.RandomizeGeomFriction(geoms=".*_foot", ranges={0: (0.3, 1.5), 1: (0.005, 0.05)}),
+    "size": mdp.RandomizeGeomSize(geoms=".*_foot", ranges={0: (1.1, 1.4)}, operation="scale"),
+    "geom_pos": mdp.RandomizeGeomPos(geoms=".*_foot", ranges=(-0.03, 0.03)),
+    "geom_quat": mdp.RandomizeGeomQuat(geoms="right_foot", ranges={"pitch": (0.4, 0.8), "roll": (-0.2, 0.2)}),
+    "mass": mdp.RandomizeBodyMass(bodies=("trunk", "left_leg"), ranges=(0.7, 1.5)),
+    "inertia": mdp.RandomizeBodyInertia(bodies="trunk", ranges=(0.3, 3.0), distribution="log_uniform"),
+    "com": mdp.RandomizeBodyCom(bodies="trunk", ranges=(-0.05, 0.05), operation="add"),
     "pseudo_inertia": mdp.RandomizePseudoInertia(
-        elements=("trunk", "left_leg"),
+        bodies=("trunk", "left_leg"),
         alpha=(-0.2, 0.2),
         stretch=(-0.3, 0.3),
         shear=(-0.3, 0.3),
@@ -32,7 +30,7 @@ EVENTS = {
     "armature": mdp.RandomizeJointArmature(ranges=(0.02, 0.1)),
     "friction_loss": mdp.RandomizeJointFrictionLoss(ranges=(0.1, 1.0)),
     "stiffness": mdp.RandomizeJointStiffness(ranges=(2.0, 20.0)),
-    "range": mdp.RandomizeJointRange(elements="left_hip", ranges={1: (-0.3, -0.05)}),
+    "range": mdp.RandomizeJointRange(joints="left_hip", ranges={1: (-0.3, -0.05)}),
     "zero": mdp.RandomizeJointZero(ranges=(-0.2, 0.2)),
     "gains": mdp.RandomizeActuatorGains(joints=("left_hip", "tail"), damping=(0.5, 3.0)),
     "stiff_gains": mdp.RandomizeActuatorGains(joints="left_hip", stiffness=(0.05, 0.9)),
