@@ -116,6 +116,8 @@ def _train_all(seeds: list[int]) -> list[list[Point]]:
             ]
             for process, seed in running:
                 if process.wait():
+                    for other, _ in running:
+                        other.terminate()
                     raise RuntimeError(f"the run of seed {seed} ended with exit code {process.returncode}")
                 found.append(json.loads((Path(folder) / f"{seed}.json").read_text()))
     return found

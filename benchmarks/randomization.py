@@ -26,9 +26,11 @@ from rich.table import Table
 from benchmarks import report
 from benchmarks.stopwatch import milliseconds
 from ksim_rl import conf, envs
-from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg, mdp
+from ksim_rl.envs import ManagerBasedRlEnvCfg, mdp
 from ksim_rl.envs.mdp.randomize import Mode, Randomize
+from ksim_rl.envs.scene import build_spec
 from ksim_rl.envs.term import EventTerm
+from ksim_rl.physics import load_model
 from ksim_rl.physics.capture import Captured
 from ksim_rl.trainers import RunCfg
 
@@ -83,15 +85,13 @@ def measure(cfg: RunCfg, episode_steps: int) -> dict[str, float]:
 
 def _bodies_and_step(task: ManagerBasedRlEnvCfg) -> tuple[tuple[str, ...], float]:
     """Return patterns of the bodies that have a mass, and the seconds of an env step."""
-    scene = dataclasses.replace(task.scene, num_envs=1)
-    viewer = dataclasses.replace(task.viewer, env_index=0)
-    env = ManagerBasedRlEnv(dataclasses.replace(task, scene=scene, viewer=viewer))
-    model = env.world.mj_model
+    spec = build_spec(task.scene)
+    task.sim.apply_to(spec)
+    model = load_model(spec)
     heavy = [
         model.body(i).name for i in range(model.nbody) if model.body_mass[i] > 0.0 and model.body(i).name
     ]
-    env.close()
-    return tuple(re.escape(name) for name in heavy), env.physics_dt * task.decimation
+    return tuple(re.escape(name) for name in heavy), model.opt.timestep * task.decimation
 
 
 def _inertial_events(bodies: tuple[str, ...], variant: str) -> dict[str, EventTerm]:

@@ -25,6 +25,7 @@ from rich.table import Table
 from benchmarks import report
 from benchmarks.stopwatch import milliseconds
 from ksim_rl import envs
+from ksim_rl.checks import unknown_name
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.scene import build_spec
 from ksim_rl.envs.terrains import Ground, PlaneTerrain, Terrain, TerrainGrid
@@ -46,7 +47,14 @@ FOOTPRINT = 0.35
 def main() -> None:
     """Measure, print the table, and write the figures."""
     given = {"task": "go1_velocity_rough", "num_envs": "4096", "device": "cpu", "variants": "default"}
-    given |= dict(argument.split("=", 1) for argument in sys.argv[1:])
+    for word in sys.argv[1:]:
+        name, _, value = word.partition("=")
+        if name not in given:
+            raise unknown_name("option", name, given)
+        given[name] = value
+    for variant in given["variants"].split(","):
+        if variant not in VARIANTS:
+            raise unknown_name("variant", variant, VARIANTS)
     cfg = envs.make_cfg(given["task"], [f"task.scene.num_envs={given['num_envs']}"])
     device = torch.device(given["device"])
     prefix = f"{report.device_label(device)}/{given['task']}/{given['num_envs']}"

@@ -60,6 +60,8 @@ def uniform(keys: RowKeys, n: int, low: float | Tensor = 0.0, high: float | Tens
     Returns:
         float32 [E, n].
     """
+    if isinstance(low, Tensor) and isinstance(high, Tensor):
+        return torch.lerp(low, high, _draw(*keys, n, _UNIFORM, 0.0, 1.0))
     if isinstance(low, Tensor) or isinstance(high, Tensor):
         return low + _draw(*keys, n, _UNIFORM, 0.0, 1.0) * (high - low)
     return _draw(*keys, n, _UNIFORM, float(low), float(high))

@@ -68,23 +68,23 @@ class RunningMoments(nn.Module):
         """Count every row of `values` once, as `update` does, and leave `mean` and `var` as they are."""
         if values.shape[-1] != self.dim:
             raise ValueError(f"obs has shape {tuple(values.shape)}: the last dim must be {self.dim}")
-        valid_1 = values.isfinite().all(-1, keepdim=True)
+        # A copy: it is changed below. In float64 no sum of finite float32 values overflows.
+        exact_NL = values.reshape(-1, self.dim).to(torch.float64, copy=True)
+        valid_N = torch.isfinite(exact_NL.sum(-1))
         if valid is not None:
-            if valid.numel() != valid_1.numel():
+            if valid.numel() != valid_N.numel():
                 raise ValueError(
                     f"valid has shape {tuple(valid.shape)}: expected one element per row of obs, "
                     f"whose shape is {tuple(values.shape)}"
                 )
-            valid_1 = valid_1 & valid.reshape(valid_1.shape)
+            valid_N = valid_N & valid.reshape(-1)
         if self.until is not None:
-            valid_1 = valid_1 & (self.count < self.until)
+            valid_N = valid_N & (self.count < self.until)
 
-        batch_dims = tuple(range(values.ndim - 1))
-        exact = values.to(torch.float64)
-        zero = torch.zeros((), dtype=torch.float64, device=values.device)
-        added = valid_1.sum()
-        mean = torch.where(valid_1, exact, zero).sum(batch_dims) / added.clamp_min(1)
-        sum_of_squares = torch.where(valid_1, exact - mean, zero).square().sum(batch_dims)
+        exact_NL.masked_fill_(~valid_N[:, None], 0.0)
+        weight_N, added = valid_N.to(torch.float64), valid_N.sum()
+        mean = weight_N @ exact_NL / added.clamp_min(1)
+        sum_of_squares = weight_N @ exact_NL.sub_(mean).square_()
 
         merged = _merge(
             (self.count, self.exact_mean, self.exact_sum_of_squares), (added, mean, sum_of_squares)

@@ -46,11 +46,15 @@ class GuardedState:
         self._forget()
         self._is_stale = False
 
+    def changed(self) -> None:
+        """Forget computed quantities: the state has changed, and what derives from it has not followed yet."""
+        self._forget()
+        self._is_stale = True
+
     def write(self, target_EL: Tensor, mask_E: Tensor, value_EL: Tensor) -> None:
         """Copy the rows of `mask_E` into a view of the state."""
         target_EL.copy_(torch.where(mask_E[:, None], value_EL, target_EL))
-        self._forget()
-        self._is_stale = True
+        self.changed()
 
     def write_columns(
         self, state_EL: Tensor, address: Index, chosen: Index, mask_E: Tensor, value: Tensor
@@ -63,8 +67,7 @@ class GuardedState:
             address = torch.arange(address.start, address.stop, device=self.world.device)
         columns = address[chosen]
         state_EL[:, columns] = torch.where(mask_E[:, None], value, state_EL[:, columns])
-        self._forget()
-        self._is_stale = True
+        self.changed()
 
     def point_velocity(self, point_EN3: Tensor, body: Index) -> Tensor:
         """Return the velocities of points fixed to bodies, world frame, m/s, [E, N, 3]."""

@@ -49,6 +49,18 @@ class NameResolver:
             self._ids[key] = match_names(kind, key[1], self._tables[kind])
         return self._ids[key]
 
+    def one(self, kind: str, pattern: str) -> int:
+        """Return the id of the one element that `pattern` matches.
+
+        Raises:
+            ValueError: if it matches several.
+        """
+        first, *more = self.ids(kind, pattern)
+        if more:
+            names = [self._tables[kind][i] for i in (first, *more)]
+            raise ValueError(f"{kind} pattern {pattern!r} matches {names}: name one of them")
+        return first
+
     def index(self, kind: str, patterns: Patterns) -> Index:
         """Return the ids as a slice if they are contiguous, else as an int64 tensor on the device."""
         key = (kind, (patterns,) if isinstance(patterns, str) else tuple(patterns))

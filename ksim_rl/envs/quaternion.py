@@ -1,4 +1,7 @@
-"""Quaternion algebra on batches: unit quaternions (w, x, y, z), MuJoCo's order, in the last dim."""
+"""Quaternion algebra on batches: unit quaternions (w, x, y, z), MuJoCo's order, in the last dim.
+
+On a GPU each tensor operation is a kernel, and small ones cost the same however little they do: hence the vector forms.
+"""
 
 import torch
 from torch import Tensor
@@ -6,17 +9,9 @@ from torch import Tensor
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
     """Return the Hamilton product of quaternions [..., 4]."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        (
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ),
-        dim=-1,
-    )
+    aw, au, bw, bu = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    vector = torch.addcmul(torch.addcmul(torch.linalg.cross(au, bu), aw, bu), bw, au)
+    return torch.cat((aw * bw - (au * bu).sum(-1, keepdim=True), vector), dim=-1)
 
 
 def conjugate(q: Tensor) -> Tensor:
@@ -27,15 +22,15 @@ def conjugate(q: Tensor) -> Tensor:
 def rotate(q: Tensor, v: Tensor) -> Tensor:
     """Rotate vectors [..., 3] by quaternions [..., 4] (body to world, if `q` is the body's orientation)."""
     w, u = q[..., :1], q[..., 1:]
-    t = 2.0 * torch.linalg.cross(u, v)
-    return v + w * t + torch.linalg.cross(u, t)
+    across = torch.linalg.cross(u, v)
+    return torch.add(v, torch.addcmul(torch.linalg.cross(u, across), w, across), alpha=2.0)
 
 
 def rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
     """Rotate vectors [..., 3] by the inverse of quaternions [..., 4] (world to body)."""
     w, u = q[..., :1], q[..., 1:]
-    t = 2.0 * torch.linalg.cross(u, v)
-    return v - w * t + torch.linalg.cross(u, t)
+    across = torch.linalg.cross(u, v)
+    return torch.add(v, torch.addcmul(torch.linalg.cross(u, across), w, across, value=-1.0), alpha=2.0)
 
 
 def angle_between(a: Tensor, b: Tensor) -> Tensor:
@@ -48,23 +43,19 @@ def angle_between(a: Tensor, b: Tensor) -> Tensor:
 def yaw(q: Tensor) -> Tensor:
     """Return the heading of quaternions [..., 4]: the angle of the rotated x axis in the xy plane, rad, [...]."""
     w, x, y, z = q.unbind(-1)
-    return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return torch.atan2(torch.addcmul(w * z, x, y), 0.5 - torch.addcmul(y * y, z, z))
 
 
 def from_euler_xyz(roll: Tensor, pitch: Tensor, yaw_angle: Tensor) -> Tensor:
     """Return Rz(yaw) Ry(pitch) Rx(roll) as quaternions [..., 4]; angles in rad, [...]."""
-    cr, sr = torch.cos(roll / 2), torch.sin(roll / 2)
-    cp, sp = torch.cos(pitch / 2), torch.sin(pitch / 2)
-    cy, sy = torch.cos(yaw_angle / 2), torch.sin(yaw_angle / 2)
-    return torch.stack(
-        (
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ),
-        dim=-1,
-    )
+    half = 0.5 * torch.stack((roll, pitch, yaw_angle), dim=-1)
+    cos_sin = torch.stack((torch.cos(half), torch.sin(half)), dim=-1)
+    # Ry(pitch) and Rz(yaw) as products cc, cs, sc, ss; then Rx(roll) from the right.
+    products = (cos_sin[..., 1, :, None] * cos_sin[..., 2, None, :]).flatten(-2)
+    cc, cs, sc, ss = products.unbind(-1)
+    _, _, minus_sc, minus_ss = (-products).unbind(-1)
+    by_cos, by_sin = torch.stack((cc, minus_ss, sc, cs), dim=-1), torch.stack((ss, cc, cs, minus_sc), dim=-1)
+    return torch.addcmul(cos_sin[..., 0, :1] * by_cos, cos_sin[..., 0, 1:], by_sin)
 
 
 def wrap_to_pi(angle: Tensor) -> Tensor:

@@ -91,8 +91,8 @@ class MetricTerm(ABC):
 class EventTerm(ABC):
     """A write to the simulation: `startup` once, `reset` for rows that reset, `interval` by per-env clocks, `step`.
 
-    An event must not read a derived quantity (a body or site pose, a sensor) after it wrote state: derived quantities
-    are refreshed after all events of the moment have run.
+    An event must not read a derived quantity (a body or site pose, a sensor) after state was written, as it is before
+    all reset events: derived quantities are refreshed after all events of the moment have run.
     """
 
     mode: Literal["startup", "reset", "interval", "step"] = "reset"

@@ -15,6 +15,7 @@ from ksim_rl.checks import near
 from ksim_rl.envs.actuators import ActuatorParams, JointTargets
 from ksim_rl.envs.bodies_and_sites import BodiesAndSites
 from ksim_rl.envs.entity import Entity
+from ksim_rl.envs.first_robot import FirstRobot
 from ksim_rl.envs.guarded_state import GuardedState
 from ksim_rl.envs.memory import Memory
 from ksim_rl.envs.motion import ReferenceMotion, load_motion
@@ -24,7 +25,6 @@ from ksim_rl.envs.sensors import (
     CameraTracker,
     ContactState,
     ContactTracker,
-    ImuState,
     ImuTracker,
     RayTracker,
     SensorTracker,
@@ -36,7 +36,7 @@ from ksim_rl.physics import World
 Tracker = TypeVar("Tracker", bound=SensorTracker)
 
 
-class EnvView(BodiesAndSites):
+class EnvView(FirstRobot, BodiesAndSites):
     """A typed view of the world for terms.
 
     Position- and velocity-stage quantities (poses, velocities, most sensors) are those of the current state.
@@ -194,7 +194,7 @@ class EnvView(BodiesAndSites):
         """Joint positions minus the default pose, [E, L]."""
         return self.joint_pos_EL - self.default_joint_pos_EL
 
-    # -- root ----------------------------------------------------------------------------------------------------
+    # -- entities -------------------------------------------------------------------------------------------------
 
     def entity(self, name: str = "") -> Entity:
         """Return a robot or object of the scene by name; "" is the first robot.
@@ -210,51 +210,6 @@ class EnvView(BodiesAndSites):
             )
         return self.entities[name]
 
-    @property
-    def root_pos_EL(self) -> Tensor:
-        """Position of the first robot's root body frame in the world, m, [E, 3]."""
-        return self.robot.root_pos_EL
-
-    @property
-    def root_quat_EL(self) -> Tensor:
-        """Orientation of the first robot's root body, body to world, (w, x, y, z), [E, 4]."""
-        return self.robot.root_quat_EL
-
-    @property
-    def root_lin_vel_w_EL(self) -> Tensor:
-        """Linear velocity of the first robot's root body frame origin, world frame, m/s, [E, 3]."""
-        return self.robot.root_lin_vel_w_EL
-
-    @property
-    def root_ang_vel_w_EL(self) -> Tensor:
-        """Angular velocity of the first robot's root body, world frame, rad/s, [E, 3]."""
-        return self.robot.root_ang_vel_w_EL
-
-    @property
-    def root_lin_vel_b_EL(self) -> Tensor:
-        """Linear velocity of the first robot's root body frame origin, body frame, m/s, [E, 3]."""
-        return self.robot.root_lin_vel_b_EL
-
-    @property
-    def root_ang_vel_b_EL(self) -> Tensor:
-        """Angular velocity of the first robot's root body, body frame, rad/s, [E, 3]."""
-        return self.robot.root_ang_vel_b_EL
-
-    @property
-    def projected_gravity_EL(self) -> Tensor:
-        """Unit vector of gravity (world -z) in the first robot's root body frame, [E, 3]."""
-        return self.robot.projected_gravity_EL
-
-    @property
-    def heading_E(self) -> Tensor:
-        """Yaw of the first robot's root body, rad in [-pi, pi], [E]."""
-        return self.robot.heading_E
-
-    @property
-    def free_root(self) -> bool:
-        """Whether the first robot's root floats freely."""
-        return self.robot.free_root
-
     # -- sensors, commands, actions, time ------------------------------------------------------------------------
 
     def sensor(self, name: str) -> Tensor:
@@ -267,9 +222,9 @@ class EnvView(BodiesAndSites):
         """Return the state of a contact sensor of `cfg.scene.sensors`."""
         return self.tracker(name, ContactTracker, "contact sensor").state
 
-    def imu(self, name: str) -> ImuState:
-        """Return the readings of an `ImuSensor` of `cfg.scene.sensors`."""
-        return self.tracker(name, ImuTracker, "IMU").state
+    def imu(self, name: str) -> ImuTracker:
+        """Return an `ImuSensor` of `cfg.scene.sensors`, which has its readings."""
+        return self.tracker(name, ImuTracker, "IMU")
 
     def rays(self, name: str) -> RayTracker:
         """Return a `RayCaster` of `cfg.scene.sensors`; its rays are cast when they are read."""
@@ -402,14 +357,6 @@ class EnvView(BodiesAndSites):
         """Set all generalized velocities, MuJoCo's layout, in the rows of `mask_E`."""
         self._state.write(self.world.qvel_EL, mask_E, qvel_EL)
 
-    def write_root_pose(self, mask_E: Tensor, pos_EL: Tensor, quat_EL: Tensor) -> None:
-        """Set position (m) and orientation (w, x, y, z) of the first robot's free root in the rows of `mask_E`."""
-        self.robot.write_root_pose(mask_E, pos_EL, quat_EL)
-
-    def write_root_velocity(self, mask_E: Tensor, lin_vel_w_EL: Tensor, ang_vel_w_EL: Tensor) -> None:
-        """Set velocities (m/s, rad/s, world frame) of the first robot's free root in the rows of `mask_E`."""
-        self.robot.write_root_velocity(mask_E, lin_vel_w_EL, ang_vel_w_EL)
-
     def write_joint_pos(self, mask_E: Tensor, pos_EL: Tensor, joints: Index = slice(None)) -> None:
         """Set positions (rad or m) of the joints of `joints` in the rows of `mask_E`."""
         self._state.write_columns(self.world.qpos_EL, self._qpos_index, joints, mask_E, pos_EL)
@@ -457,6 +404,10 @@ class EnvView(BodiesAndSites):
     def refreshed(self) -> None:
         """Forget computed quantities: the state has changed, and the world has refreshed what derives from it."""
         self._state.refreshed()
+
+    def changed(self) -> None:
+        """Forget computed quantities: rows were reset, and what derives from the state has not followed yet."""
+        self._state.changed()
 
     def detached(self, value: Tensor) -> Tensor:
         """Return `value`, copied if it shares memory with something that later steps overwrite."""

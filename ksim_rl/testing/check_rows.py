@@ -40,7 +40,7 @@ def check_partial_reset(env: EnvBase, num_steps: int) -> None:
     before, root_before = _rows_of_state(env), root.clone()
     root = reset_rows(env, root, [0])
     after = _rows_of_state(env)
-    changed = [key for key, value in before.items() if not torch.equal(value[1:], after[key][1:])]
+    changed = [key for key, value in before.items() if _others_changed(value, after[key], num_envs)]
     advice = "Write through the mask only: `torch.where(mask, new, old)`, or `view.write_*(mask_E, ...)`"
     _refuse(changed, f"of the state change in rows that a reset of row 0 should leave alone. {advice}")
     kept = root_before.select(*root.keys(True, True), strict=False)
@@ -97,12 +97,20 @@ def _check_end(next_E: TensorDictBase, root: TensorDictBase, keys: list[NestedKe
         )
 
 
+def _others_changed(before: Tensor, after: Tensor, num_envs: int) -> bool:
+    """Whether anything but row 0 changed, for each dim that may be that of the envs (a ring may have E frames)."""
+    dims = [dim for dim, size in enumerate(before.shape) if size == num_envs]
+    return all(
+        not torch.equal(before.narrow(dim, 1, num_envs - 1), after.narrow(dim, 1, num_envs - 1)) for dim in dims
+    )
+
+
 def _rows_of_state(env: EnvBase) -> dict[str, Tensor]:
     """Return copies of the entries of the state that have one row per env."""
     return {
         key: copy_of(value)
         for key, value in env.state_dict().items()
-        if isinstance(value, Tensor) and value.ndim and value.shape[0] == env.batch_size[0]
+        if isinstance(value, Tensor) and env.batch_size[0] in value.shape
     }
 
 

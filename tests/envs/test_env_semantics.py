@@ -156,6 +156,26 @@ def test_a_step_and_a_reset_run_the_managers_in_their_order():
     assert in_order() == ["action", "termination", "reward", "metric", "command", "observation"]
 
 
+def test_reset_events_read_nothing_of_the_episode_that_ended():
+    seen = []
+
+    @dataclass(frozen=True, kw_only=True)
+    class Look(EventTerm):
+        """Notes where the puck is, off the default pose."""
+
+        def __call__(self, view, mask_E):
+            seen.append(view.joint_pos_rel_EL[:, 0].tolist())
+
+    env = puck_env(limit=None, events={"look": Look()})
+    env.reset()
+    env.world.qpos_EL.fill_(2.0)
+    env.world.refresh()
+    env.view.refreshed()
+    assert env.view.joint_pos_rel_EL[:, 0].tolist() == [2.0] * 3
+    env.reset(env_ids=[1])
+    assert seen[-1] == [2.0, 0.0, 2.0]
+
+
 def test_a_reward_of_weight_zero_is_not_computed():
     env = noted_env()
     root_E = env.reset()

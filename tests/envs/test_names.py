@@ -49,6 +49,12 @@ def test_a_double_match_is_refused(resolver):
         resolver.ids("joint", ("left_.*", ".*_hip"))
 
 
+def test_one_is_one(resolver):
+    assert resolver.one("body", "left") == resolver.one("body", "lef.") == 2
+    with pytest.raises(ValueError, match=r"matches \['left', 'right'\]: name one of them"):
+        resolver.one("body", "left|right")
+
+
 def test_a_broken_pattern_is_refused(resolver):
     with pytest.raises(ValueError, match="no regular expression"):
         resolver.ids("joint", "(")

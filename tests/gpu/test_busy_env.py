@@ -5,6 +5,7 @@ import torch
 
 from ksim_rl.physics import Captured, SimCfg
 from tests.envs.mdp.busy_env import NUM_ENVS, busy_env, write_clip
+from tests.gpu.no_syncs import no_syncs
 
 STEPS = 24
 
@@ -50,10 +51,6 @@ def test_steps_and_resets_do_not_synchronize(tmp_path):
     root_E, action = env.reset(), torch.ones(NUM_ENVS, 1, device="cuda")
     for _ in range(3):
         _, root_E = env.step_and_maybe_reset(root_E.set("action", action))
-    torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with no_syncs():
         for _ in range(STEPS):
             _, root_E = env.step_and_maybe_reset(root_E.set("action", action))
-    finally:
-        torch.cuda.set_sync_debug_mode("default")

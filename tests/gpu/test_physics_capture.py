@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from ksim_rl.physics import Captured
+from tests.gpu.no_syncs import no_syncs
 from tests.physics.models import standing_quadrupeds
 
 
@@ -53,15 +54,11 @@ def test_a_replay_does_not_sync_and_counts_as_one_call():
         world.step(2)
         world.refresh()
         world.reset(no_row_E)
-    torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with no_syncs():
         graph()
         world.step(2)
         world.refresh()
         world.reset(no_row_E)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
     assert count.item() == 5
 
 

@@ -9,6 +9,7 @@ from ksim_rl.data import DatasetBuffer, DatasetCfg
 from ksim_rl.modules import update_normalizers
 from ksim_rl.objectives import PPOCfg, StepGuard, make_gae, make_loss, make_optimizer, ppo_step
 from ksim_rl.physics.capture import Captured
+from tests.gpu.no_syncs import no_syncs
 from tests.objectives.problems import networks, rollout
 
 pytestmark = pytest.mark.gpu
@@ -51,12 +52,8 @@ def parts():
 def test_no_host_sync(parts):
     update = _Update(*parts)
     update()
-    torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with no_syncs():
         update()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
 
 
 def test_captured_updates_equal_eager_ones(parts):

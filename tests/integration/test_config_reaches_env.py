@@ -60,8 +60,9 @@ def test_scene_robots():
 
 def test_scene_terrain_and_sensors():
     env = made(
-        "task.scene.terrain={friction: [0.5, 0.1, 0.2]}",
-        "+task.scene.sensors.touch={geoms: [pole], body: terrain}",
+        "task.scene.terrain={_target_: ksim_rl.envs.terrains.plane.PlaneTerrain, friction: [0.5, 0.1, 0.2]}",
+        "+task.scene.sensors.touch={_target_: ksim_rl.envs.sensors.contact.ContactSensor, geoms: [pole], "
+        "against: terrain}",
     ).base_env
     assert env.world.mj_model.geom("terrain").friction.tolist() == [0.5, 0.1, 0.2]
     assert env.view.contact("touch").found_EN.shape == (E, 1)
@@ -151,7 +152,8 @@ SIM = {
 
 
 def test_sim_fields_reach_the_physics():
-    assert set(SIM) == {field.name for field in dataclasses.fields(SimCfg)}
+    # `nan_guard` has its own tests, in tests/envs/test_nan_guard.py.
+    assert {*SIM, "nan_guard"} == {field.name for field in dataclasses.fields(SimCfg)}
     world = made(*(f"task.sim.{name}={value}" for name, value in SIM.items())).base_env.world
     option, warp_option = world.mj_model.opt, world.warp_model.opt
     assert (option.timestep, option.impratio, option.ccd_iterations) == (0.002, 3.0, 7)

@@ -86,11 +86,18 @@ def lowered(mj_model: mujoco.MjModel, pose_EL: torch.Tensor, body: str, depth: f
 
 
 class Contacts:
-    """The contacts that one Warp step finds from poses [E, 28], by world and geom."""
+    """The contacts that the last Warp step found, by world and geom; the first one starts from poses [E, 28]."""
 
     def __init__(self, mj_model: mujoco.MjModel, pose_EL: torch.Tensor, device="cpu") -> None:
-        world = World(mj_model, num_envs=len(pose_EL), device=device, sim=SimCfg(njmax=120, nconmax=40))
+        self.mj_model = mj_model
+        self.world = World(mj_model, num_envs=len(pose_EL), device=device, sim=SimCfg(njmax=120, nconmax=40))
+        self.find(pose_EL)
+
+    def find(self, pose_EL: torch.Tensor) -> None:
+        """Step once from poses, at rest, and read the contacts."""
+        world = self.world
         world.qpos_EL.copy_(pose_EL)
+        world.qvel_EL.zero_()
         world.refresh()
         world.step()
         contact, count = world.warp_data_E.contact, int(world.warp_data_E.nacon.numpy()[0])
@@ -109,8 +116,6 @@ class Contacts:
                 "includemargin",
             )
         }
-        self.mj_model = mj_model
-        self.world = world
 
     def of(self, row: int, geom: str) -> dict[str, np.ndarray]:
         """Return the contacts of a geom in a world, deepest first."""
@@ -137,9 +142,13 @@ def of_the_c_engine(mj_model: mujoco.MjModel, pose_L: torch.Tensor, geom: str) -
 def test_the_deepest_contact_on_rough_ground_is_that_of_the_c_engine(body, depth):
     mj_model = model(noise())
     pose_EL = lowered(mj_model, poses(), body, depth)
-    ours = Contacts(mj_model, pose_EL)
+    check_deepest(Contacts(mj_model, pose_EL), pose_EL, body)
+
+
+def check_deepest(ours: Contacts, pose_EL: torch.Tensor, body: str) -> None:
+    """Compare the deepest contact of a body in each world with the C engine's."""
     for row in range(NUM_ENVS):
-        mine, theirs = ours.of(row, body), of_the_c_engine(mj_model, pose_EL[row], body)[0]
+        mine, theirs = ours.of(row, body), of_the_c_engine(ours.mj_model, pose_EL[row], body)[0]
         assert mine["dist"][0] == pytest.approx(theirs.dist, abs=2e-5), row
         assert np.allclose(mine["frame"][0, 0], theirs.frame[:3], atol=2e-3), row
         if body == "ball":  # a rod that lies on the ground touches it in more than one place equally
@@ -162,7 +171,11 @@ def test_on_an_even_slope_contacts_are_those_with_a_plane(body):
     """A box or rod has as many as corners or ends below it; MuJoCo's plane leaves none of these few out."""
     mj_model = model(tilted())
     pose_EL = lowered(mj_model, poses(1), body, 0.004)
-    ours = Contacts(mj_model, pose_EL)
+    check_on_slope(Contacts(mj_model, pose_EL), pose_EL, body)
+
+
+def check_on_slope(ours: Contacts, pose_EL: torch.Tensor, body: str) -> None:
+    """Compare the contacts of a body on the ground of `tilted` with those of its points below that plane."""
     angle = math.atan2(TOP, 2 * SIDE)
     normal = np.array([-math.sin(angle), 0.0, math.cos(angle)])
     compared = 0

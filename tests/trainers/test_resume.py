@@ -80,6 +80,14 @@ def test_a_checkpoint_of_another_network_is_refused_with_both_shapes(tmp_path):
         make_trainer().load_state_dict(saved.state)
 
 
+def test_a_checkpoint_of_other_observations_is_refused(tmp_path):
+    make_trainer(tmp_path, iterations=1).train()
+    saved = checkpoint.load(checkpoint.latest(tmp_path))
+    saved.state["observation_columns"] = {"actor": {"obs/height": [0, 1]}}
+    with pytest.raises(ValueError, match="observations have the columns .*height"):
+        make_trainer().load_state_dict(saved.state)
+
+
 def test_a_resumed_run_in_real_physics_is_bit_identical(tmp_path):
     overrides = [
         "task=cartpole_swingup",
@@ -103,4 +111,6 @@ def test_a_resumed_run_in_real_physics_is_bit_identical(tmp_path):
 
     straight = run(4)
     run(2, folder=tmp_path)
+    columns = checkpoint.load(checkpoint.latest(tmp_path)).state["observation_columns"]["actor"]
+    assert [start for start, _ in columns.values()][1:] == [stop for _, stop in columns.values()][:-1]
     assert_same(straight, run(4, seed=5, load=tmp_path))

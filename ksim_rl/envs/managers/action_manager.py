@@ -35,7 +35,8 @@ class ActionManager:
             Which rows were finite, bool [E].
         """
         view = self._view
-        finite_E = torch.isfinite(action_EL.sum(-1))
+        # Also false for NaN, and in fewer kernels than `torch.isfinite`.
+        finite_E = action_EL.sum(-1).abs() < torch.inf
         view.last_action_EL.copy_(view.action_EL)
         view.action_EL.copy_(torch.where(finite_E[:, None], action_EL, view.last_action_EL))
         self._run_terms(view.action_EL)

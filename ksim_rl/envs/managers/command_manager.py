@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checks import unknown_name
+from ksim_rl.envs.masked_reset import mask_from_env_ids
 from ksim_rl.envs.term import CommandTerm
 from ksim_rl.envs.view import EnvView
 
@@ -51,7 +52,9 @@ class CommandManager:
             return self._clocks[name]
         return torch.full((self._view.num_envs,), torch.inf, device=self._view.device)
 
-    def set(self, name: str, values: Tensor | Sequence[float], env_ids: Sequence[int] | None = None) -> None:
+    def set(
+        self, name: str, values: Tensor | Sequence[float], env_ids: Sequence[int] | Tensor | None = None
+    ) -> None:
         """Set a command that takes values from outside (`JoystickCommand`); call it between two steps.
 
         The next observation shows them. Values are written in place, so that a captured step sees them too.
@@ -62,16 +65,16 @@ class CommandManager:
             env_ids: the envs that take them; None for all.
 
         Raises:
-            ValueError: for an unknown name, a command that is drawn, or values that do not fit.
+            ValueError: for an unknown name, a command that is drawn, values that do not fit, or envs that do not exist.
         """
         if name not in self._terms:
             raise unknown_name("command", name, self._terms)
         view = self._view
-        mask_E = torch.zeros(view.num_envs, dtype=torch.bool)
-        mask_E[slice(None) if env_ids is None else list(env_ids)] = True
+        rows = range(view.num_envs) if env_ids is None else env_ids
+        mask_E = mask_from_env_ids(rows, torch.Size([view.num_envs]), view.device)
         value_EK = torch.as_tensor(values, dtype=torch.float32, device=view.device)
         with view.scope(f"commands/{name}"):
-            self._terms[name].set(view, value_EK, mask_E.to(view.device))
+            self._terms[name].set(view, value_EK, mask_E)
 
     def resample(self, mask_E: Tensor) -> None:
         """Draw new targets for the rows of `mask_E` that reset."""

@@ -22,18 +22,17 @@ class EventManager:
         self._by_mode: dict[str, list[tuple[str, EventTerm]]] = {}
         for name, term in terms.items():
             self._by_mode.setdefault(term.mode, []).append((f"events/{name}", term))
+        self._fields = {
+            mode: tuple(dict.fromkeys(field for _, term in parts for field in term.per_world_fields))
+            for mode, parts in self._by_mode.items()
+        }
         self._clocks: dict[str, Tensor] = {}
         for scope, _ in self._by_mode.get("interval", []):
             self._clocks[scope] = view.memories.get(f"{scope}.time_left_E")
         nobody_E = torch.zeros(view.num_envs, dtype=torch.bool, device=view.device)
-        for scope, term in ((f"events/{name}", term) for name, term in terms.items()):
-            with view.scope(scope):
+        for name, term in terms.items():
+            with view.scope(f"events/{name}"):
                 term(view, nobody_E)
-
-    def _fields(self, *modes: str) -> tuple[str, ...]:
-        """Return the per-world model fields that the events of these modes write."""
-        terms = [term for mode in modes for _, term in self._by_mode.get(mode, [])]
-        return tuple(dict.fromkeys(field for term in terms for field in term.per_world_fields))
 
     def startup(self) -> None:
         """Run the startup events for all rows; their numbers depend on the seed only."""
@@ -41,7 +40,7 @@ class EventManager:
         for scope, term in self._by_mode.get("startup", []):
             with self._view.scope(scope, self._view.startup_counter):
                 term(self._view, everybody_E)
-        self._view.world.set_const(self._fields("startup"))
+        self._view.world.set_const(self._fields.get("startup", ()))
 
     def reset(self, mask_E: Tensor) -> None:
         """Run the reset events for the rows of `mask_E`, and restart their interval clocks."""
@@ -49,7 +48,7 @@ class EventManager:
         for scope, term in self._by_mode.get("reset", []):
             with view.scope(scope, view.reset_count_E):
                 term(view, mask_E)
-        view.world.set_const(self._fields("reset"), mask_E)
+        view.world.set_const(self._fields.get("reset", ()), mask_E)
         for scope, term in self._by_mode.get("interval", []):
             with view.scope(f"{scope}/clock", view.reset_count_E):
                 self._restart(scope, term, mask_E)
@@ -69,13 +68,13 @@ class EventManager:
             if term.per_world_fields:
                 written.append(due_E)
         if written:
-            view.world.set_const(self._fields("interval"), torch.stack(written).any(0))
+            view.world.set_const(self._fields["interval"], torch.stack(written).any(0))
         if "step" in self._by_mode:
             everybody_E = torch.ones(view.num_envs, dtype=torch.bool, device=view.device)
             for scope, term in self._by_mode["step"]:
                 with view.scope(scope):
                     term(view, everybody_E)
-            view.world.set_const(self._fields("step"), everybody_E)
+            view.world.set_const(self._fields["step"], everybody_E)
 
     def _restart(self, scope: str, term: EventTerm, mask_E: Tensor) -> None:
         assert term.interval_range_s is not None

@@ -5,25 +5,27 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from ksim_rl.envs.term import METRIC_REDUCTIONS, MetricTerm
+from ksim_rl.envs.term import MetricTerm
 from ksim_rl.envs.view import EnvView
 
 
 class MetricManager:
-    """Accumulates each metric over the running episodes as its term asks: mean, last, max or sum."""
+    """Accumulates each metric over the running episodes as its term asks: mean, last, max or sum.
+
+    Which of these occur is known at construction, and the others cost nothing in a step.
+    """
 
     def __init__(self, terms: Mapping[str, MetricTerm], view: EnvView) -> None:
         self._view = view
         self._terms = dict(terms)
         self.names = tuple(terms)
-        count = len(self.names)
-        self._sum_EM = view.memories.get("metrics.sum_EM", count)
-        self._max_EM = view.memories.get("metrics.max_EM", count)
-        self._last_EM = view.memories.get("metrics.last_EM", count)
-        reductions = torch.tensor(
-            [METRIC_REDUCTIONS.index(term.reduce) for term in terms.values()], device=view.device
-        ).long()
-        self._is_mean_M, self._is_last_M, self._is_max_M = (reductions == i for i in range(3))
+        self._held_EM = view.memories.get("metrics.held_EM", len(self.names))
+        reductions = [term.reduce for term in terms.values()]
+        self._occurring = frozenset(reductions)
+        self._is_mean_M, self._is_last_M, self._is_max_M = (
+            torch.tensor([given == kind for given in reductions], dtype=torch.bool, device=view.device)
+            for kind in ("mean", "last", "max")
+        )
         self.step(torch.ones(view.num_envs, dtype=torch.bool, device=view.device))
 
     def step(self, finite_E: Tensor) -> None:
@@ -40,15 +42,20 @@ class MetricManager:
         if not values:
             return
         value_EM = torch.where(finite_E[:, None], torch.stack(values, dim=-1), 0.0)
-        first_E1 = self._view.episode_step_E[:, None] <= 1
-        self._sum_EM.add_(value_EM)
-        self._max_EM.copy_(torch.where(first_E1, value_EM, torch.maximum(self._max_EM, value_EM)))
-        self._last_EM.copy_(value_EM)
+        held_EM = self._held_EM
+        next_EM = held_EM + value_EM
+        if "last" in self._occurring:
+            next_EM = torch.where(self._is_last_M, value_EM, next_EM)
+        if "max" in self._occurring:
+            is_first_E1 = self._view.episode_step_E[:, None] <= 1
+            peak_EM = torch.where(is_first_E1, value_EM, torch.maximum(held_EM, value_EM))
+            next_EM = torch.where(self._is_max_M, peak_EM, next_EM)
+        held_EM.copy_(next_EM)
 
     @property
     def reduced_EM(self) -> Tensor:
         """The reduced values of the episodes so far, float32 [E, M]."""
-        length_E1 = self._view.episode_step_E[:, None].clamp(min=1)
-        mean_or_sum_EM = torch.where(self._is_mean_M, self._sum_EM / length_E1, self._sum_EM)
-        last_or_max_EM = torch.where(self._is_last_M, self._last_EM, self._max_EM)
-        return torch.where(self._is_last_M | self._is_max_M, last_or_max_EM, mean_or_sum_EM)
+        if "mean" not in self._occurring:
+            return self._held_EM
+        mean_EM = self._held_EM / self._view.episode_step_E[:, None].clamp(min=1)
+        return torch.where(self._is_mean_M, mean_EM, self._held_EM)

@@ -23,6 +23,7 @@ class TerminationManager:
         view.terminations = dict(zip(self.names, self.flags_EK.unbind(-1), strict=True))
         time_out = [term.time_out for term in terms.values()] + [False]
         self._time_out_K = torch.tensor(time_out, device=view.device)
+        self._failure_K = ~self._time_out_K
         self.step(torch.ones(view.num_envs, dtype=torch.bool, device=view.device))
 
     def step(self, finite_E: Tensor) -> tuple[Tensor, Tensor]:
@@ -42,7 +43,7 @@ class TerminationManager:
             flags.append(flag_E)
         self.flags_EK.copy_(torch.stack((*flags, ~finite_E), dim=-1))
         timed_out_E = (self.flags_EK & self._time_out_K).any(-1)
-        failed_E = (self.flags_EK & ~self._time_out_K).any(-1)
+        failed_E = (self.flags_EK & self._failure_K).any(-1)
         self._view.terminated_E, self._view.truncated_E = failed_E, timed_out_E
         if self._is_finite_horizon:
             return failed_E | timed_out_E, torch.zeros_like(timed_out_E)

@@ -74,16 +74,16 @@ class UniformVelocityCommand(CommandTerm):
         """Draw velocities, heading targets and kinds for the rows of `mask_E`."""
         # One draw for all: targets in their ranges, then three numbers in [0, 1) that decide the kinds.
         target_E4, kind_E3 = view.uniform(7, *self.shared_ranges(view).unbind(0)).split((4, 3), dim=-1)
-        standing_E, heading_E = kind_E3[:, 0] < self.rel_standing_envs, kind_E3[:, 1] < self.rel_heading_envs
-        is_forward_E1 = kind_E3[:, 2:] < self.rel_forward_envs
-        vx_E = target_E4[:, 0].abs().clamp(min=self.forward_min_speed)
-        forward_E3 = torch.stack((vx_E, torch.zeros_like(vx_E), torch.zeros_like(vx_E)), dim=-1)
-        velocity_E3 = torch.where(is_forward_E1, forward_E3, target_E4[:, :3])
+        shares_3 = (self.rel_standing_envs, self.rel_heading_envs, self.rel_forward_envs)
+        is_kind_E3 = kind_E3 < constant(shares_3, view.device)
+        speed_E1 = target_E4[:, :1].abs().clamp(min=self.forward_min_speed)
+        forward_E3 = speed_E1 * constant((1.0, 0.0, 0.0), view.device)
+        velocity_E3 = torch.where(is_kind_E3[:, 2:], forward_E3, target_E4[:, :3])
 
         drawn_E4 = torch.cat((velocity_E3, target_E4[:, 3:]), dim=-1)
         held_E4, held_E2 = self._target(view), self._kind(view)
         held_E4.copy_(torch.where(mask_E[:, None], drawn_E4, held_E4))
-        held_E2.copy_(torch.where(mask_E[:, None], torch.stack((standing_E, heading_E), dim=-1), held_E2))
+        held_E2.copy_(torch.where(mask_E[:, None], is_kind_E3[:, :2], held_E2))
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the command of the current heading and targets, float32 [E, 3]."""

@@ -47,18 +47,19 @@ class JoystickCommand(CommandTerm):
         """Draw nothing: what was set stays."""
 
     def set(self, view: EnvView, value_EK: Tensor, mask_E: Tensor) -> None:
-        """Take values [E, K] (or what broadcasts to that) for the rows of `mask_E`.
+        """Take values [E, K], or [K] for all alike, for the rows of `mask_E`.
 
         Raises:
             ValueError: if there is not one column per axis, or a value is not finite (read on the host).
         """
-        if value_EK.shape[-1:] != (len(self.axes),):
+        held_EK = self._held(view)
+        if tuple(value_EK.shape) not in (held_EK.shape[1:], held_EK.shape):
             raise ValueError(
-                f"values of shape {tuple(value_EK.shape)}: expected [..., {len(self.axes)}], the axes {list(self.axes)}"
+                f"values of shape {tuple(value_EK.shape)}: expected [{len(self.axes)}], the axes {list(self.axes)}, "
+                f"or {list(held_EK.shape)}"
             )
         if not bool(torch.isfinite(value_EK).all()):
-            raise ValueError("values hold a number that is not finite")
-        held_EK = self._held(view)
+            raise ValueError("values hold a number that is not finite: give finite ones")
         held_EK.copy_(torch.where(mask_E[:, None], value_EK.to(held_EK), held_EK))
 
     def __call__(self, view: EnvView) -> Tensor:

@@ -48,8 +48,7 @@ class PushByForce(EventTerm):
         held_E6.copy_(torch.where(mask_E[:, None], drawn_E6, held_E6))
         # The clock has run out at the env step that is nearest, whatever the subtractions round to.
         wrench_E6 = torch.where((left_E > 0.5 * view.step_dt)[:, None], held_E6, 0.0)
-        (body,) = view.resolver.ids("body", self.body)
-        view.world.xfrc_applied_EL[:, body].add_(wrench_E6 - applied_E6)
+        view.world.xfrc_applied_EL[:, view.resolver.one("body", self.body)].add_(wrench_E6 - applied_E6)
         applied_E6.copy_(wrench_E6)
 
 

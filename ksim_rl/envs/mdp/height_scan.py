@@ -1,6 +1,7 @@
 """The shape of the ground around a robot, looked up in the terrain itself."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -45,8 +46,7 @@ class HeightScan(ObservationTerm):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
         body = view.entity(self.entity)
-        points_N3 = grid_points(self.size, self.resolution)
-        x_N, y_N = (constant(points_N3[:, axis].tolist(), view.device) for axis in (0, 1))
+        x_N, y_N = _grid(tuple(self.size), self.resolution, view.device)
         sin_E1, cos_E1 = torch.sin(body.heading_E)[:, None], torch.cos(body.heading_E)[:, None]
         root_E3 = body.root_pos_EL
         points_EN2 = root_E3[:, None, :2] + torch.stack(
@@ -54,3 +54,10 @@ class HeightScan(ObservationTerm):
         )
         below_EN = root_E3[:, 2:] - view.terrain.heights(points_EN2) - self.offset
         return below_EN.clamp(*self.clip)
+
+
+@cache
+def _grid(size: tuple[float, float], resolution: float, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return x and y of the points about the root, m, [N] each, on the device; made once."""
+    x_N, y_N, _ = grid_points(size, resolution).T.tolist()
+    return constant(x_N, device), constant(y_N, device)

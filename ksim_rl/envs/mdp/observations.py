@@ -61,8 +61,8 @@ class RootRotation6d(RootObservation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RootLinVel(RootObservation):
-    """Linear velocity of the root body's frame origin, m/s, [E, 3]; velocity stage.
+class RootVelocity(RootObservation):
+    """What the terms of a root's velocity share.
 
     Attributes:
         frame: the axes in which it is given: the root's own, or the world's.
@@ -72,6 +72,11 @@ class RootLinVel(RootObservation):
 
     def __post_init__(self) -> None:
         check_choice("frame", self.frame, FRAMES)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RootLinVel(RootVelocity):
+    """Linear velocity of the root body's frame origin, m/s, [E, 3]; velocity stage."""
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
@@ -80,17 +85,8 @@ class RootLinVel(RootObservation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RootAngVel(RootObservation):
-    """Angular velocity of the root body, rad/s, [E, 3]; velocity stage.
-
-    Attributes:
-        frame: the axes in which it is given: the root's own, or the world's.
-    """
-
-    frame: Literal["root", "world"] = "root"
-
-    def __post_init__(self) -> None:
-        check_choice("frame", self.frame, FRAMES)
+class RootAngVel(RootVelocity):
+    """Angular velocity of the root body, rad/s, [E, 3]; velocity stage."""
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""

@@ -1,47 +1,24 @@
 """Observation terms of bodies by name, float32 [E, L]: those of all matching bodies, one after the other."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 from torch import Tensor
 
-from ksim_rl.checks import check_choice
 from ksim_rl.envs import quaternion
-from ksim_rl.envs.mdp.target_pose import FRAMES
+from ksim_rl.envs.mdp.framed_observation import FramedObservation
 from ksim_rl.envs.names import Patterns
-from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 
 
 @dataclass(frozen=True, kw_only=True)
-class BodyObservation(ObservationTerm):
+class BodyObservation(FramedObservation):
     """What the terms of this file share.
 
     Attributes:
         bodies: names or regular expressions.
-        frame: "root": poses are relative to the root's frame, velocities are given in its axes (they remain velocities
-            over the ground, as `RootLinVel` is); "world".
-        entity: whose root; "" is the first robot.
     """
 
     bodies: Patterns
-    frame: Literal["root", "world"] = "root"
-    entity: str = ""
-
-    def __post_init__(self) -> None:
-        check_choice("frame", self.frame, FRAMES)
-
-    def _point(self, view: EnvView, pos_EN3: Tensor) -> Tensor:
-        """Express points of the world in the term's frame, flat, [E, 3N]."""
-        if self.frame == "root":
-            pos_EN3 = pos_EN3 - view.entity(self.entity).root_pos_EL[:, None]
-        return self._vector(view, pos_EN3)
-
-    def _vector(self, view: EnvView, vector_EN3: Tensor) -> Tensor:
-        """Express vectors of the world in the term's axes, flat, [E, 3N]."""
-        if self.frame == "root":
-            vector_EN3 = quaternion.rotate_inverse(view.entity(self.entity).root_quat_EL[:, None], vector_EN3)
-        return vector_EN3.flatten(start_dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +27,7 @@ class BodyPos(BodyObservation):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return self._point(view, view.body_pos_w(view.bodies(self.bodies)))
+        return self.points(view, view.body_pos_w(view.bodies(self.bodies)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +53,7 @@ class BodyRotation6d(BodyObservation):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
         axes_EN23 = view.body_axes_w(view.bodies(self.bodies))[:, :, :2]
-        return self._vector(view, axes_EN23.flatten(start_dim=1, end_dim=2))
+        return self.vectors(view, axes_EN23.flatten(start_dim=1, end_dim=2))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +62,7 @@ class BodyLinVel(BodyObservation):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return self._vector(view, view.body_lin_vel_w(view.bodies(self.bodies)))
+        return self.vectors(view, view.body_lin_vel_w(view.bodies(self.bodies)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +71,7 @@ class BodyAngVel(BodyObservation):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return self._vector(view, view.body_ang_vel_w(view.bodies(self.bodies)))
+        return self.vectors(view, view.body_ang_vel_w(view.bodies(self.bodies)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +80,7 @@ class CenterOfMassPos(BodyObservation):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return self._point(view, view.subtree_com_pos_w(view.bodies(self.bodies)))
+        return self.points(view, view.subtree_com_pos_w(view.bodies(self.bodies)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,4 +89,4 @@ class CenterOfMassVel(BodyObservation):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return self._vector(view, view.subtree_com_vel_w(view.bodies(self.bodies)))
+        return self.vectors(view, view.subtree_com_vel_w(view.bodies(self.bodies)))

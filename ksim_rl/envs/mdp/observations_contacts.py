@@ -10,9 +10,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ksim_rl.checks import check_choice, check_in_range
-from ksim_rl.envs import quaternion
-from ksim_rl.envs.mdp.target_pose import FRAMES
+from ksim_rl.checks import check_in_range
+from ksim_rl.envs.mdp.framed_observation import FramedObservation
 from ksim_rl.envs.names import Patterns
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
@@ -42,58 +41,33 @@ class Contact(ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ContactForce(ObservationTerm):
+class ContactForce(FramedObservation):
     """Net contact forces, N, [E, 3N]; acceleration stage. MuJoCo's sign: what weighs on the ground reads negative z.
 
     Attributes:
         sensor: a contact sensor of `scene.sensors`.
-        frame: the axes in which they are given: the world's, or the root's.
-        entity: whose root; "" is the first robot.
     """
 
     sensor: str
-    frame: Literal["world", "root"] = "world"
-    entity: str = ""
-
-    def __post_init__(self) -> None:
-        check_choice("frame", self.frame, FRAMES)
+    frame: Literal["root", "world"] = "world"
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        force_EN3 = view.contact(self.sensor).force_EN3
-        if self.frame == "root":
-            force_EN3 = quaternion.rotate_inverse(view.entity(self.entity).root_quat_EL[:, None], force_EN3)
-        return force_EN3.flatten(start_dim=1)
+        return self.vectors(view, view.contact(self.sensor).force_EN3)
 
 
 # -- feet --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
-class FootPos(ObservationTerm):
-    """Positions of sites, m, [E, 3F]; position stage.
-
-    Attributes:
-        frame: "root": from the root's origin, in its axes; "world".
-        entity: whose root; "" is the first robot.
-    """
+class FootPos(FramedObservation):
+    """Positions of sites, m, [E, 3F]; position stage."""
 
     sites: Patterns
-    frame: Literal["root", "world"] = "root"
-    entity: str = ""
-
-    def __post_init__(self) -> None:
-        check_choice("frame", self.frame, FRAMES)
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        pos_EF3 = view.site_pos_w(view.sites(self.sites))
-        if self.frame == "root":
-            root = view.entity(self.entity)
-            pos_EF3 = quaternion.rotate_inverse(
-                root.root_quat_EL[:, None], pos_EF3 - root.root_pos_EL[:, None]
-            )
-        return pos_EF3.flatten(start_dim=1)
+        return self.points(view, view.site_pos_w(view.sites(self.sites)))
 
 
 @dataclass(frozen=True, kw_only=True)

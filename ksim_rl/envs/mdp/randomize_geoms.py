@@ -131,5 +131,7 @@ class RandomizeGeomQuat(Randomize):
         turn_EN4 = quaternion.from_euler_xyz(*self.draw(view, len(ids), pairs).unbind(-1))
         if self.operation == "add":
             own = view.world.mj_model.geom_quat[list(ids)]
-            turn_EN4 = quaternion.multiply(constant(own.ravel().tolist(), view.device).view(-1, 4), turn_EN4)
+            turn_EN4 = quaternion.multiply(
+                constant(own.ravel().tolist(), view.device).view(1, -1, 4), turn_EN4
+            )
         write_entries(view.field("geom_quat"), ids, range(4), mask_E, turn_EN4)

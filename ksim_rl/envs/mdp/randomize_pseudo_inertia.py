@@ -12,6 +12,7 @@ from ksim_rl.envs.mdp.constants import constant
 from ksim_rl.envs.mdp.randomize import Pair, Randomize, write_entries
 from ksim_rl.envs.mdp.randomize_bodies import second_moments
 from ksim_rl.envs.names import Patterns
+from ksim_rl.envs.small_matrices import product
 from ksim_rl.envs.view import EnvView
 from ksim_rl.physics.principal_axes import principal_axes
 
@@ -75,7 +76,7 @@ class RandomizePseudoInertia(Randomize):
         map_EN33 = _upper_triangle(torch.exp(drawn[..., 1:4]), drawn[..., 4:7])
 
         # Second moments about the moved centre of mass; the inertia is trace * 1 minus these.
-        spread_EN33 = density_EN1[..., None] * (map_EN33 * spread_N3[:, None, :]) @ map_EN33.mT
+        spread_EN33 = density_EN1[..., None] * product(map_EN33 * spread_N3[:, None, :], map_EN33.mT)
         trace_EN = spread_EN33.diagonal(dim1=-2, dim2=-1).sum(-1)
         inertia_EN33 = torch.diag_embed(trace_EN[..., None].expand(*trace_EN.shape, 3)) - spread_EN33
         moments_EN3, turn_EN4 = principal_axes(inertia_EN33)
@@ -83,7 +84,7 @@ class RandomizePseudoInertia(Randomize):
             "body_mass": mass_N1 * density_EN1,
             "body_ipos": com_N3 + quaternion.rotate(axes_N4[None], shift_EN3),
             "body_inertia": moments_EN3,
-            "body_iquat": quaternion.multiply(axes_N4, turn_EN4),
+            "body_iquat": quaternion.multiply(axes_N4[None], turn_EN4),
         }
         for name, value_ENC in values.items():
             write_entries(view.field(name), ids, range(value_ENC.shape[-1]), mask_E, value_ENC)

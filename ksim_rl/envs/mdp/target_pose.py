@@ -30,11 +30,17 @@ def target_pose_w(
 
 
 def point_pos_w(view: EnvView, *, body: str | None, site: str | None) -> Tensor:
-    """Return the position of the one body or site that is named, world frame, m, [E, 3]; position stage."""
+    """Return the position of the one body or site that is named, world frame, m, [E, 3]; position stage.
+
+    Raises:
+        ValueError: if several match the name.
+    """
     if site is not None:
-        return view.site_pos_w(view.sites(site))[:, 0]
+        place = view.resolver.one("site", site)
+        return view.site_pos_w(slice(place, place + 1))[:, 0]
     assert body is not None
-    return view.body_pos_w(view.bodies(body))[:, 0]
+    place = view.resolver.one("body", body)
+    return view.body_pos_w(slice(place, place + 1))[:, 0]
 
 
 def check_one_point(body: str | None, site: str | None) -> None:

@@ -5,10 +5,12 @@ A robot file holds tables of the small dataclasses below; adding a robot adds ta
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar, Protocol
 
 import mujoco
 
 from ksim_rl.checks import unknown_name
+from ksim_rl.envs.actuators import Actuator, set_actuators
 from ksim_rl.envs.actuators.builtin import control_kind
 from ksim_rl.envs.names import match_names
 
@@ -55,6 +57,63 @@ class Site:
     body: str
     pos: Vector = (0.0, 0.0, 0.0)
     radius: float = 0.005
+
+
+class RobotFacts(Protocol):
+    """The facts of a robot that `rebuild` puts into its model."""
+
+    root_body: ClassVar[str]
+
+    @property
+    def actuators(self) -> Sequence[Actuator]:
+        """What drives the joints."""
+        ...
+
+    @property
+    def init_pos(self) -> Vector:
+        """Position of the root in the default pose, m."""
+        ...
+
+    @property
+    def init_quat(self) -> Vector:
+        """Orientation of the root in the default pose, (w, x, y, z)."""
+        ...
+
+    @property
+    def default_joint_pos(self) -> Mapping[str, float]:
+        """The default pose, rad or m by joint name."""
+        ...
+
+
+def rebuild(
+    spec: mujoco.MjSpec,
+    robot: RobotFacts,
+    *,
+    geoms: Sequence[CollisionGeom],
+    sites: Sequence[Site],
+    imu: str,
+) -> None:
+    """Turn the menagerie's model of a legged robot into that of its facts.
+
+    Options, actuators, collision geoms, sensors (`root_sensors`) and keyframes (one, `init_state`) are replaced, sites
+    moved and added, and the joints' own damping and friction removed; bodies, joints and visual geoms stay.
+
+    Args:
+        imu: the site of the IMU, one of the model or of `sites`.
+    """
+    reset_options(spec)
+    set_passive_joints(spec)
+    set_actuators(spec, robot.actuators)
+    replace_collision_geoms(spec, geoms)
+    set_sites(spec, sites)
+    replace_sensors(spec, root_sensors(imu=imu, root=robot.root_body))
+    set_keyframe(
+        spec,
+        "init_state",
+        init_pos=robot.init_pos,
+        init_quat=robot.init_quat,
+        joint_pos=robot.default_joint_pos,
+    )
 
 
 def reflected_inertia(inertias: Sequence[float], ratios: Sequence[float]) -> float:

@@ -11,20 +11,14 @@ from typing import ClassVar
 
 import mujoco
 
-from ksim_rl.envs.actuators import Actuator, PositionActuator, set_actuators
+from ksim_rl.envs.actuators import Actuator, PositionActuator
 from ksim_rl.envs.robots.edit import (
     CollisionGeom,
     Site,
     Vector,
     exclude_contacts,
+    rebuild,
     reflected_inertia,
-    replace_collision_geoms,
-    replace_sensors,
-    reset_options,
-    root_sensors,
-    set_keyframe,
-    set_passive_joints,
-    set_sites,
     spread,
 )
 from ksim_rl.physics import load_spec
@@ -195,18 +189,6 @@ class UnitreeG1:
             ValueError: in one line, how to get the menagerie's model, if it is not at hand.
         """
         spec = load_spec("unitree_g1/g1")
-        reset_options(spec)
-        set_passive_joints(spec)
-        set_actuators(spec, self.actuators)
-        replace_collision_geoms(spec, COLLISION_GEOMS)
+        rebuild(spec, self, geoms=COLLISION_GEOMS, sites=SITES, imu="imu_in_pelvis")
         exclude_contacts(spec, OVERLAPS)
-        set_sites(spec, SITES)
-        replace_sensors(spec, root_sensors(imu="imu_in_pelvis", root=self.root_body))
-        set_keyframe(
-            spec,
-            "init_state",
-            init_pos=self.init_pos,
-            init_quat=self.init_quat,
-            joint_pos=self.default_joint_pos,
-        )
         return spec

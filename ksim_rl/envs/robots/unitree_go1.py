@@ -13,18 +13,8 @@ from typing import ClassVar
 
 import mujoco
 
-from ksim_rl.envs.actuators import Actuator, PositionActuator, set_actuators
-from ksim_rl.envs.robots.edit import (
-    CollisionGeom,
-    Site,
-    replace_collision_geoms,
-    replace_sensors,
-    reset_options,
-    root_sensors,
-    set_keyframe,
-    set_passive_joints,
-    set_sites,
-)
+from ksim_rl.envs.actuators import Actuator, PositionActuator
+from ksim_rl.envs.robots.edit import CollisionGeom, Site, rebuild
 from ksim_rl.physics import load_spec
 
 LEGS = ("FR", "FL", "RR", "RL")
@@ -156,17 +146,5 @@ class UnitreeGo1:
         for joint in spec.joints:
             if joint.type == mujoco.mjtJoint.mjJNT_FREE:
                 joint.name = "floating_base_joint"
-        reset_options(spec)
-        set_passive_joints(spec)
-        set_actuators(spec, self.actuators)
-        replace_collision_geoms(spec, COLLISION_GEOMS)
-        set_sites(spec, (IMU,))
-        replace_sensors(spec, root_sensors(imu="imu", root=self.root_body))
-        set_keyframe(
-            spec,
-            "init_state",
-            init_pos=self.init_pos,
-            init_quat=self.init_quat,
-            joint_pos=self.default_joint_pos,
-        )
+        rebuild(spec, self, geoms=COLLISION_GEOMS, sites=(IMU,), imu="imu")
         return spec

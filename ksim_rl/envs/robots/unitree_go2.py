@@ -12,20 +12,8 @@ from typing import ClassVar
 
 import mujoco
 
-from ksim_rl.envs.actuators import Actuator, IdealPDActuator, set_actuators
-from ksim_rl.envs.robots.edit import (
-    CollisionGeom,
-    Site,
-    Vector,
-    replace_collision_geoms,
-    replace_sensors,
-    reset_options,
-    root_sensors,
-    set_keyframe,
-    set_passive_joints,
-    set_sites,
-    spread,
-)
+from ksim_rl.envs.actuators import Actuator, IdealPDActuator
+from ksim_rl.envs.robots.edit import CollisionGeom, Site, Vector, rebuild, spread
 from ksim_rl.physics import load_spec
 
 LEGS = ("FR", "FL", "RR", "RL")
@@ -147,17 +135,5 @@ class UnitreeGo2:
             ValueError: in one line, how to get the menagerie's model, if it is not at hand.
         """
         spec = load_spec("unitree_go2/go2")
-        reset_options(spec)
-        set_passive_joints(spec)
-        set_actuators(spec, self.actuators)
-        replace_collision_geoms(spec, COLLISION_GEOMS)
-        set_sites(spec, SITES)
-        replace_sensors(spec, root_sensors(imu="imu", root=self.root_body))
-        set_keyframe(
-            spec,
-            "init_state",
-            init_pos=self.init_pos,
-            init_quat=self.init_quat,
-            joint_pos=self.default_joint_pos,
-        )
+        rebuild(spec, self, geoms=COLLISION_GEOMS, sites=SITES, imu="imu")
         return spec

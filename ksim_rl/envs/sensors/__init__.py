@@ -3,7 +3,7 @@
 from ksim_rl.envs.sensors.camera import CameraSensor, CameraTracker
 from ksim_rl.envs.sensors.contact import ContactSensor
 from ksim_rl.envs.sensors.contact_tracker import ContactState, ContactTracker
-from ksim_rl.envs.sensors.imu import ImuSensor, ImuState, ImuTracker
+from ksim_rl.envs.sensors.imu import ImuSensor, ImuTracker
 from ksim_rl.envs.sensors.ray_caster import RayCaster, RayState, RayTracker
 from ksim_rl.envs.sensors.ray_patterns import GridPattern, PinholePattern, RayPattern, RingPattern
 from ksim_rl.envs.sensors.sensor import Sensor, SensorTracker
@@ -16,7 +16,6 @@ __all__ = [
     "ContactTracker",
     "GridPattern",
     "ImuSensor",
-    "ImuState",
     "ImuTracker",
     "PinholePattern",
     "RayCaster",

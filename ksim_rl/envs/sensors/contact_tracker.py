@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ksim_rl.envs.names import as_index
 from ksim_rl.envs.sensors.sensor import SensorTracker, sensor_columns
+from ksim_rl.envs.small_matrices import product
 
 if TYPE_CHECKING:
     from ksim_rl.envs.view import EnvView
@@ -158,4 +159,4 @@ class ContactTracker(SensorTracker):
             return readings[..., 1:4]
         normal, tangent = readings[..., 7:10], readings[..., 10:13]
         axes = torch.stack((normal, tangent, torch.linalg.cross(normal, tangent)), dim=-1)
-        return (axes @ readings[..., 1:4, None])[..., 0]
+        return product(axes, readings[..., 1:4, None])[..., 0]

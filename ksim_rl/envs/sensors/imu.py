@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import mujoco
 import torch
@@ -22,20 +22,6 @@ _SENSORS = {
     "accelerometer": mujoco.mjtSensor.mjSENS_ACCELEROMETER,
     "orientation": mujoco.mjtSensor.mjSENS_FRAMEQUAT,
 }
-
-
-class ImuState(NamedTuple):
-    """What an inertial measurement unit reads, float32, in its own axes."""
-
-    ang_vel_EL: Tensor
-    """Angular velocity, rad/s, [E, 3]; velocity stage."""
-    lin_acc_EL: Tensor
-    """Acceleration minus gravity, m/s^2, [E, 3]: at rest it points up and is 9.81, in free fall it is zero.
-    Acceleration stage: of the last physics substep, and zero in rows that were just reset."""
-    quat_EL: Tensor
-    """Orientation, from the unit's axes to the world's, (w, x, y, z), [E, 4]; position stage."""
-    projected_gravity_EL: Tensor
-    """Unit vector of world -z, [E, 3]; position stage."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,22 +49,37 @@ class ImuSensor(MountedSensor):
 
 
 class ImuTracker(SensorTracker):
-    """Reads one inertial measurement unit."""
+    """What one inertial measurement unit reads, float32, in its own axes."""
 
     def __init__(self, name: str, view: EnvView, site: str) -> None:
         self._name, self._view, self._site = name, view, site
         self._down = torch.tensor([0.0, 0.0, -1.0], device=view.device)
 
     @property
-    def state(self) -> ImuState:
-        """The readings of the current state."""
-        ang_vel_EL, lin_acc_EL, quat_EL = (self._view.sensor(f"{self._name}_{suffix}") for suffix in _SENSORS)
-        key = f"imu/{self._name}.projected_gravity"
-        gravity_EL = self._view.cache.get(key)
-        if gravity_EL is None:
-            gravity_EL = quaternion.rotate_inverse(quat_EL, self._down.expand(self._view.num_envs, 3))
-            self._view.cache[key] = gravity_EL
-        return ImuState(ang_vel_EL, lin_acc_EL, quat_EL, gravity_EL)
+    def ang_vel_EL(self) -> Tensor:
+        """Angular velocity, rad/s, [E, 3]; velocity stage."""
+        return self._view.sensor(f"{self._name}_gyro")
+
+    @property
+    def lin_acc_EL(self) -> Tensor:
+        """Acceleration minus gravity, m/s^2, [E, 3]: at rest it points up and is 9.81, in free fall it is zero.
+
+        Acceleration stage: of the last physics substep, and zero in rows that were just reset.
+        """
+        return self._view.sensor(f"{self._name}_accelerometer")
+
+    @property
+    def quat_EL(self) -> Tensor:
+        """Orientation, from the unit's axes to the world's, (w, x, y, z), [E, 4]; position stage."""
+        return self._view.sensor(f"{self._name}_orientation")
+
+    @property
+    def projected_gravity_EL(self) -> Tensor:
+        """Unit vector of world -z, [E, 3]; position stage."""
+        cache, key = self._view.cache, f"imu/{self._name}.projected_gravity"
+        if key not in cache:
+            cache[key] = quaternion.rotate_inverse(self.quat_EL, self._down.expand(self._view.num_envs, 3))
+        return cache[key]
 
     def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw the unit's axes at its place."""

@@ -13,6 +13,7 @@ from ksim_rl.checks import check_choice, check_in_range
 from ksim_rl.envs.sensors.mount import MountedSensor
 from ksim_rl.envs.sensors.ray_patterns import RayPattern
 from ksim_rl.envs.sensors.sensor import SensorTracker
+from ksim_rl.envs.small_matrices import product
 from ksim_rl.physics.rays import RayBatch
 
 if TYPE_CHECKING:
@@ -131,4 +132,4 @@ class RayTracker(SensorTracker):
             x_N, y_N, z_N = vectors_N3.unbind(-1)
             turned = (cos_E1 * x_N - sin_E1 * y_N, sin_E1 * x_N + cos_E1 * y_N, z_N.expand(len(cos_E1), -1))
             return torch.stack(turned, dim=-1)
-        return vectors_N3 @ matrix_E33.mT
+        return product(vectors_N3, matrix_E33.mT)

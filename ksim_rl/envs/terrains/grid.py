@@ -13,7 +13,7 @@ import numpy as np
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.terrains.look import MATERIAL, add_look
 from ksim_rl.envs.terrains.patch import TIE, Lattice, TerrainPatch
-from ksim_rl.envs.terrains.patched_ground import PatchedGround
+from ksim_rl.envs.terrains.patched_ground import GEOM_FIELDS, PatchedGround, patch_name
 from ksim_rl.envs.terrains.terrain import BODY, Terrain
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class TerrainGrid(Terrain):
     @property
     def per_world_fields(self) -> tuple[str, ...]:
         """The height field of the geom, and the bounds that follow from it."""
-        return ("geom_dataid", "geom_size", "geom_aabb", "geom_rbound")
+        return GEOM_FIELDS
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -152,4 +152,4 @@ class TerrainGrid(Terrain):
         """Yield name and heights of each patch: all columns of level 0, then those of level 1, and so on."""
         for level in range(self.num_levels):
             for column in range(self.num_columns):
-                yield f"{BODY}_{level}_{column}", self.heights(level, column)
+                yield patch_name(level, column), self.heights(level, column)

@@ -11,15 +11,24 @@ import torch
 from torch import Tensor
 
 from ksim_rl.envs.terrains.ground import Ground
+from ksim_rl.envs.terrains.terrain import BODY
 
 if TYPE_CHECKING:
     from ksim_rl.envs.view import EnvView
+
+GEOM_FIELDS = ("geom_dataid", "geom_size", "geom_aabb", "geom_rbound")
+"""The model fields of the terrain's geom that say which height field it is, and the bounds that follow from that."""
+
+
+def patch_name(level: int, column: int) -> str:
+    """Return the name of a patch's height field."""
+    return f"{BODY}_{level}_{column}"
 
 
 class PatchedGround(Ground):
     """Keeps which height field each world collides with, and looks heights up in them.
 
-    P patches are all height fields of the model, level by level: patch = level * num_columns + column.
+    P patches are consecutive height fields of the model, level by level: patch = level * num_columns + column.
     """
 
     is_flat = False
@@ -36,18 +45,19 @@ class PatchedGround(Ground):
         super().__init__(view.num_envs, view.device)
         model, device = view.world.mj_model, view.device
         self.num_levels, self._num_columns = num_levels, len(kinds_of_columns)
-        self.half_width = float(model.hfield_size[0, 0])
-        self._geom = int(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)[0])
-        self._fields = {
-            name: view.world.field(name) for name in ("geom_dataid", "geom_size", "geom_aabb", "geom_rbound")
-        }
+        # A robot's own model may have height fields too.
+        first = int(model.hfield(patch_name(0, 0)).id)
+        patches = slice(first, first + len(spawn_heights))
+        self.half_width = float(model.hfield_size[first, 0])
+        self._geom = int(model.geom(BODY).id)
+        self._fields = {name: view.world.field(name) for name in GEOM_FIELDS}
         self._of_patch = {
-            name: torch.tensor(value, device=device) for name, value in _geom_fields(model).items()
+            name: torch.tensor(value[patches], device=device) for name, value in _geom_fields(model).items()
         }
         tops = np.repeat(model.hfield_size[:, 2], model.hfield_nrow * model.hfield_ncol)
         self._heights = torch.tensor(model.hfield_data * tops, dtype=torch.float32, device=device)
-        self._address_P = torch.tensor(model.hfield_adr, dtype=torch.int64, device=device)
-        self._columns_P = torch.tensor(model.hfield_ncol, dtype=torch.int64, device=device)
+        self._address_P = torch.tensor(model.hfield_adr[patches], dtype=torch.int64, device=device)
+        self._columns_P = torch.tensor(model.hfield_ncol[patches], dtype=torch.int64, device=device)
         self._spawn_heights_P = torch.tensor(spawn_heights, dtype=torch.float32, device=device)
 
         place_E = torch.arange(view.num_envs, device=device)
@@ -117,7 +127,7 @@ class PatchedGround(Ground):
 
 
 def _geom_fields(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Return the fields of the terrain's geom for each height field of the model, by name, [P, ...].
+    """Return the values of `GEOM_FIELDS` for a geom of each height field of the model, by name, [P, ...].
 
     They are those that MuJoCo's compiler gives a geom of this height field.
     """

@@ -9,7 +9,7 @@ from torchrl.envs.transforms import Transform
 
 from ksim_rl import checks
 from ksim_rl.envs.transforms.row_transform import Keys, as_keys, checked_out_keys
-from ksim_rl.envs.transforms.specs import bounded, bounds, leaf_spec, set_leaf_spec
+from ksim_rl.envs.transforms.specs import bounded, bounds, floating_spec, set_leaf_spec
 
 Range = tuple[float | None, float | None]
 
@@ -39,7 +39,7 @@ class ObservationClip(Transform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Narrow the bounds."""
-        specs = [leaf_spec(observation_spec, key, type(self).__name__) for key in self.in_keys]
+        specs = [floating_spec(observation_spec, key, type(self).__name__) for key in self.in_keys]
         for out_key, spec, (clip_low, clip_high) in zip(self.out_keys, specs, self.ranges, strict=True):
             low, high = (end.clamp(clip_low, clip_high) for end in bounds(spec))
             set_leaf_spec(observation_spec, out_key, bounded(low, high, dtype=spec.dtype, device=spec.device))

@@ -1,12 +1,16 @@
 """Sensor latency."""
 
+from collections.abc import Callable
+
+import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.data import Composite
 
 from ksim_rl.envs.transforms.delay_cfg import DelayCfg
 from ksim_rl.envs.transforms.lagged_transform import LaggedTransform
 from ksim_rl.envs.transforms.row_transform import Keys, as_keys, checked_out_keys
-from ksim_rl.envs.transforms.specs import leaf_spec, set_leaf_spec
+from ksim_rl.envs.transforms.specs import Device, leaf_spec, set_leaf_spec
 
 
 class ObservationDelay(LaggedTransform):
@@ -38,6 +42,8 @@ class ObservationDelay(LaggedTransform):
         in_keys = as_keys(in_keys)
         out_keys = checked_out_keys(in_keys, out_keys)
         super().__init__(delay, len(in_keys), in_keys=in_keys, out_keys=out_keys, seed=seed, stream=stream)
+        self._sizes: list[int] = []
+        self._is_joined = False
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Give the delayed observations the specs of the prompt ones."""
@@ -45,7 +51,7 @@ class ObservationDelay(LaggedTransform):
         for out_key, spec in zip(self.out_keys, specs, strict=True):
             set_leaf_spec(observation_spec, out_key, spec.clone())
         batch_dims = observation_spec.ndim
-        self._size_lags(
+        self._size_signals(
             observation_spec.shape.numel(),
             [spec.shape[batch_dims:] for spec in specs],
             [spec.dtype for spec in specs],
@@ -53,24 +59,49 @@ class ObservationDelay(LaggedTransform):
         )
         return observation_spec
 
+    def _size_signals(
+        self, num_rows: int, shapes: list[torch.Size], dtypes: list[torch.dtype], device: Device
+    ) -> None:
+        """Make one ring for all observations where they are of one dtype, and one for each otherwise."""
+        self._sizes = [shape.numel() for shape in shapes]
+        self._is_joined = len(shapes) > 1 and len(set(dtypes)) == 1
+        if self._is_joined:
+            shapes, dtypes = [torch.Size([sum(self._sizes)])], dtypes[:1]
+        self._size_lags(num_rows, shapes, dtypes, device)
+
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        batch_size = tensordict_reset.batch_size
-        values = [tensordict_reset.get(key) for key in self.in_keys]
-        if not self._sized:
-            shapes = [value.shape[len(batch_size) :] for value in values]
-            dtypes = [value.dtype for value in values]
-            self._size_lags(batch_size.numel(), shapes, dtypes, tensordict_reset.device)
+        values = self._read(tensordict_reset)
         mask_E = self._reset_rows(tensordict, tensordict_reset)
         self._restart(mask_E)
-        for index, (out_key, value) in enumerate(zip(self.out_keys, values, strict=True)):
-            value_E = value.reshape(self.num_rows, *value.shape[len(batch_size) :])
-            tensordict_reset.set(out_key, self._begin(index, value_E, mask_E).reshape(value.shape))
-        return tensordict_reset
+        return self._pass(tensordict_reset, values, lambda index, value: self._begin(index, value, mask_E))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        values = self._read(next_tensordict)
         self._advance()
-        for index, (key, out_key) in enumerate(zip(self.in_keys, self.out_keys, strict=True)):
-            value = next_tensordict.get(key)
-            value_E = value.reshape(self.num_rows, *value.shape[next_tensordict.ndim :])
-            next_tensordict.set(out_key, self._push(index, value_E).reshape(value.shape))
-        return next_tensordict
+        return self._pass(next_tensordict, values, self._push)
+
+    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """Return the prompt observations, and make what the specs have not made yet."""
+        values = [tensordict.get(key) for key in self.in_keys]
+        if not self._sizes:
+            shapes = [value.shape[tensordict.ndim :] for value in values]
+            dtypes = [value.dtype for value in values]
+            self._size_signals(tensordict.numel(), shapes, dtypes, tensordict.device)
+        return values
+
+    def _pass(
+        self, tensordict: TensorDictBase, values: list[Tensor], through: Callable[[int, Tensor], Tensor]
+    ) -> TensorDictBase:
+        """Send the values through the rings and write what comes out."""
+        batch_dims = tensordict.ndim
+        if self._is_joined:
+            joined_EL = torch.cat([value.reshape(self.num_rows, -1) for value in values], dim=1)
+            found = through(0, joined_EL).split(self._sizes, dim=1)
+        else:
+            found = [
+                through(index, value.reshape(self.num_rows, *value.shape[batch_dims:]))
+                for index, value in enumerate(values)
+            ]
+        for out_key, value, delayed in zip(self.out_keys, values, found, strict=True):
+            tensordict.set(out_key, delayed.reshape(value.shape))
+        return tensordict

@@ -48,6 +48,8 @@ class ObservationGroups(Transform):
         super().__init__(in_keys=every, out_keys=list(self.groups))
         self.drop = [] if drop is False else every if drop is True else as_keys(drop)
         self.group_specs: dict[NestedKey, GroupSpec] = {}
+        # Groups whose terms are known to be vectors [E, L] already.
+        self._concatenable: set[NestedKey] = set()
 
     def slice(self, group: NestedKey, term: NestedKey) -> slice:
         """Return the columns of a term in the vector of a group.
@@ -73,6 +75,10 @@ class ObservationGroups(Transform):
                 )
             specs = [leaf_spec(observation_spec, term, type(self).__name__) for term in terms]
             vectors[name] = self._vector_spec(specs, batch_size, observation_spec.device)
+            if all(spec.ndim == len(batch_size) + 1 for spec in specs):
+                self._concatenable.add(name)
+            else:
+                self._concatenable.discard(name)
             sizes = tuple(flat_size(spec, len(batch_size)) for spec in specs)
             self.group_specs[name] = GroupSpec(name=name, terms=tuple(terms), sizes=sizes)
         for name, spec in vectors.items():
@@ -94,13 +100,14 @@ class ObservationGroups(Transform):
         return bounded(low, high, dtype=dtype, device=device)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        batch_size = next_tensordict.batch_size
-        vectors = {}
+        get, ready = next_tensordict.get, self._concatenable
+        vectors = []
         for name, terms in self.groups.items():
-            values = [next_tensordict.get(term) for term in terms]
-            flat = [v if v.ndim == len(batch_size) + 1 else v.reshape(*batch_size, -1) for v in values]
-            vectors[name] = flat[0] if len(flat) == 1 else torch.cat(flat, dim=-1)
-        for name, vector in vectors.items():
+            values = [get(term) for term in terms]
+            if name not in ready:
+                values = [value.reshape(*next_tensordict.batch_size, -1) for value in values]
+            vectors.append(torch.cat(values, -1) if len(values) > 1 else values[0])
+        for name, vector in zip(self.groups, vectors):  # noqa: B905 (strict takes time in every step)
             next_tensordict.set(name, vector)
         for key in self.drop:
             _drop(next_tensordict, key)

@@ -53,8 +53,15 @@ class LaggedTransform(FollowsLevel, KeyedTransform):
         self._size_rows(num_rows, device)
         self._size_buffer("lag_E", (num_rows,), torch.int64, device)
         self._size_buffer("start_E", (num_rows,), torch.int64, device)
+        if self._is_fixed:
+            self.lag_E.fill_(self.delay.min_lag)
         for index, (shape, dtype) in enumerate(zip(shapes, dtypes, strict=True)):
             self._size_buffer(f"ring_{index}", (num_rows, self.num_slots, *shape), dtype, device)
+
+    @property
+    def _is_fixed(self) -> bool:
+        """Whether there is one lag only, and nothing to draw."""
+        return self.delay.min_lag == self.delay.max_lag
 
     @property
     def _sized(self) -> bool:
@@ -64,7 +71,7 @@ class LaggedTransform(FollowsLevel, KeyedTransform):
         """Go on by one env step, with new lags where they are due."""
         delay = self.delay
         self.clock.add_(1)
-        if not delay.resample_every:
+        if not delay.resample_every or self._is_fixed:
             return
         self.step_count.add_(1)
         # A shared lag is drawn once: a single row broadcasts over all.
@@ -77,6 +84,8 @@ class LaggedTransform(FollowsLevel, KeyedTransform):
 
     def _restart(self, mask_E: Tensor) -> None:
         """Draw the lags of the masked rows' new episodes."""
+        if self._is_fixed:
+            return
         if self.delay.per_env:
             lag_E = self._draw(self._reset_keys("reset/lag"))
             self.lag_E.copy_(torch.where(mask_E, lag_E, self.lag_E))

@@ -69,7 +69,8 @@ class Mirror(KeyedTransform):
         # Buffers rather than the maps' own tensors: compiled code would make those anew in each step.
         for index, key in enumerate([*keys, *keys_inv]):
             for name, tensor in zip(("source", "signs"), self.maps[key].tensors(None), strict=True):
-                self.register_buffer(f"{name}_{index}", tensor.clone(), persistent=False)
+                held = None if tensor is None else tensor.clone()
+                self.register_buffer(f"{name}_{index}", held, persistent=False)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Widen the bounds to those of both images."""

@@ -49,8 +49,8 @@ class MirrorMap:
         """Return the mirror image of vectors [..., L]."""
         return image(vector, *self.tensors(vector.device))
 
-    def tensors(self, device: Device) -> tuple[Tensor, Tensor]:
-        """Return source (int64) and signs (float32), [L]."""
+    def tensors(self, device: Device) -> tuple[Tensor | None, Tensor]:
+        """Return source (int64; None if no column moves) and signs (float32), [L]."""
         return _tensors(self, device)
 
     def repeat(self, times: int) -> "MirrorMap":
@@ -58,14 +58,17 @@ class MirrorMap:
         return concatenate([self] * times)
 
 
-def image(vector: Tensor, source_L: Tensor, signs_L: Tensor) -> Tensor:
-    """Return the mirror image of vectors [..., L]."""
-    return vector.index_select(-1, source_L) * signs_L.to(vector.dtype)
+def image(vector: Tensor, source_L: Tensor | None, signs_L: Tensor) -> Tensor:
+    """Return the mirror image of vectors [..., L]; a `source_L` of None leaves the columns in place."""
+    columns = vector if source_L is None else vector.index_select(-1, source_L)
+    return columns * signs_L.to(vector.dtype)
 
 
 @functools.lru_cache(maxsize=256)
-def _tensors(mirror: MirrorMap, device: Device) -> tuple[Tensor, Tensor]:
-    return torch.tensor(mirror.source, device=device), torch.tensor(mirror.signs, device=device)
+def _tensors(mirror: MirrorMap, device: Device) -> tuple[Tensor | None, Tensor]:
+    moves = mirror.source != tuple(range(mirror.size))
+    source_L = torch.tensor(mirror.source, device=device) if moves else None
+    return source_L, torch.tensor(mirror.signs, device=device)
 
 
 def concatenate(maps: Sequence[MirrorMap]) -> MirrorMap:

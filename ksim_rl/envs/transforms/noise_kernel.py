@@ -293,7 +293,7 @@ def _launch(
     walk_EL: Tensor | None,
     last_EL: Tensor | None,
     features: int,
-    mode: int,
+    moment: int,
     mask_E: Tensor | None,
     seed: Tensor,
     stream: int,
@@ -318,7 +318,7 @@ def _launch(
         last_EL,
         out_EL,
     )
-    inputs = [width, num_columns, mode, features, stream, counter.ndim, *(_address(t) for t in tensors)]
+    inputs = [width, num_columns, moment, features, stream, counter.ndim, *(_address(t) for t in tensors)]
     with warp_scope(device):
         wp.launch(_apply_noise, (num_rows, -(-num_columns // width)), inputs=inputs, device=str(device))
     return out_EL

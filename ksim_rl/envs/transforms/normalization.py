@@ -9,7 +9,7 @@ from torchrl.data import Composite, Unbounded
 
 from ksim_rl import checks
 from ksim_rl.envs.transforms.row_transform import Keys, RowTransform, as_keys, checked_out_keys
-from ksim_rl.envs.transforms.specs import Device, leaf_spec, set_leaf_spec
+from ksim_rl.envs.transforms.specs import Device, floating_spec, set_leaf_spec
 from ksim_rl.running_moments import RunningMoments, has_ranks
 
 
@@ -21,7 +21,8 @@ class ObservationNormalization(RowTransform):
 
     `env.eval()` freezes the statistics and `env.train()` goes on, `enable_` does the same for one transform; both write
     a device flag, so a captured or compiled step follows. With `torch.distributed`, the ranks merge their statistics in
-    each step (one collective, not while frozen), so they have to step alike.
+    each step (one collective per key, none while frozen), so they have to step alike; states of resets join in the next
+    step's.
 
     Prefer `obs_normalization` of actor and critic where they fit: those go into the exported policy by themselves.
 
@@ -81,12 +82,8 @@ class ObservationNormalization(RowTransform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Remove the bounds."""
         batch_dims = observation_spec.ndim
-        specs = [leaf_spec(observation_spec, key, type(self).__name__) for key in self.in_keys]
-        for key, out_key, spec in zip(self.in_keys, self.out_keys, specs, strict=True):
-            if not spec.dtype.is_floating_point:
-                raise ValueError(
-                    f"ObservationNormalization: {key!r} is {spec.dtype}: expected floating-point observations"
-                )
+        specs = [floating_spec(observation_spec, key, type(self).__name__) for key in self.in_keys]
+        for out_key, spec in zip(self.out_keys, specs, strict=True):
             set_leaf_spec(
                 observation_spec, out_key, Unbounded(spec.shape, dtype=spec.dtype, device=spec.device)
             )

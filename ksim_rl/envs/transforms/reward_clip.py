@@ -7,7 +7,7 @@ from torchrl.envs.transforms import Transform
 
 from ksim_rl.envs.transforms.clip import Range, check_clip
 from ksim_rl.envs.transforms.row_transform import Keys, as_keys, checked_out_keys
-from ksim_rl.envs.transforms.specs import bounded, bounds, leaf_spec, set_leaf_spec
+from ksim_rl.envs.transforms.specs import bounded, bounds, floating_spec, set_leaf_spec
 
 
 class RewardClip(Transform):
@@ -30,7 +30,7 @@ class RewardClip(Transform):
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
         """Narrow the bounds."""
-        specs = [leaf_spec(reward_spec, key, type(self).__name__) for key in self.in_keys]
+        specs = [floating_spec(reward_spec, key, type(self).__name__) for key in self.in_keys]
         for out_key, spec in zip(self.out_keys, specs, strict=True):
             low, high = (end.clamp(*self.clip) for end in bounds(spec))
             set_leaf_spec(reward_spec, out_key, bounded(low, high, dtype=spec.dtype, device=spec.device))

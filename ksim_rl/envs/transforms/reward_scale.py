@@ -11,7 +11,7 @@ from ksim_rl.envs.transforms.specs import (
     add_bounds,
     bounded,
     bounds,
-    leaf_spec,
+    floating_spec,
     multiply_bounds,
     set_leaf_spec,
 )
@@ -24,7 +24,7 @@ class RewardScale(FollowsLevel):
         in_keys: rewards; nested keys as tuples.
         out_keys: where the scaled ones go. Default: in place.
         scale, offset: finite numbers.
-        first_scale: the scale at level 0 of `follow_level_`, which moves it linearly to `scale` at level 1; None leaves it
+        first_scale: the scale at level 0 of `follow_level_`, linear from there to `scale` at level 1; None leaves it
             at `scale`.
 
     Example:
@@ -51,7 +51,7 @@ class RewardScale(FollowsLevel):
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
         """Scale and shift the bounds."""
-        specs = [leaf_spec(reward_spec, key, type(self).__name__) for key in self.in_keys]
+        specs = [floating_spec(reward_spec, key, type(self).__name__) for key in self.in_keys]
         for out_key, spec in zip(self.out_keys, specs, strict=True):
             low, high = bounds(spec)
             scales = self.scale, self.scale if self.first_scale is None else self.first_scale
@@ -66,7 +66,8 @@ class RewardScale(FollowsLevel):
         if self.first_scale is not None:
             scale = self.first_scale + (self.scale - self.first_scale) * self.level
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            next_tensordict.set(out_key, next_tensordict.get(key) * scale + self.offset)
+            scaled = next_tensordict.get(key) * scale
+            next_tensordict.set(out_key, scaled + self.offset if self.offset else scaled)
         return next_tensordict
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

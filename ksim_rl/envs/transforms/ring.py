@@ -11,40 +11,46 @@ from torch import Tensor
 
 from ksim_rl.physics.streams import warp_scope
 
-# Rows of the ring are bytes, so that one kernel serves every dtype; on the GPU each thread copies one word.
+# Rows of the ring are bytes, so that one kernel serves every dtype.
 _COPY = r"""
     const long long now = *(const long long*)clock_;
+    const int slot = (int)(now % num_slots);
     const bool resets = mask_ != 0;
     const bool begins = resets && ((const unsigned char*)mask_)[row];
     unsigned char* ring = (unsigned char*)ring_ + (long long)row * num_slots * num_bytes + part * width;
-    const unsigned char* value = (const unsigned char*)value_ + (long long)row * num_bytes + part * width;
-    unsigned char* out = (unsigned char*)out_ + ((long long)row * num_frames + frame) * num_bytes + part * width;
+    const unsigned char* value = (const unsigned char*)value_ + (long long)row * value_stride + part * width;
+    unsigned char* out = (unsigned char*)out_ + (long long)row * num_frames * num_bytes + part * width;
     long long* start = (long long*)start_ + row;
 
     auto copy = [=](unsigned char* to, const unsigned char* from) {
         if (width == 4) *(unsigned*)to = *(const unsigned*)from;
         else memcpy(to, from, width);
     };
-    // The newest value is read from where it comes from: other threads may not have written it yet.
-    if (frame == 0 && (begins || !resets)) copy(ring + (now % num_slots) * num_bytes, value);
-    if (begins && frame == 0 && part == 0) *start = now;
-    long long lag = 0;
-    if (!resets) {
-        const long long age = now - *start;
-        lag = ((const long long*)lag_)[row * lag_row_stride + frame * lag_frame_stride];
-        lag = lag < age ? lag : age;
+    if (first_frame == 0 && (begins || !resets)) copy(ring + slot * num_bytes, value);
+    if (begins && first_frame == 0 && part == 0) *start = now;
+    const long long age = resets ? 0 : now - *start;
+    for (int frame = first_frame; frame < end_frame; ++frame) {
+        long long lag = 0;
+        if (!resets) {
+            lag = ((const long long*)lag_)[row * lag_row_stride + frame * lag_frame_stride];
+            lag = lag < age ? lag : age;
+        }
+        const int from = slot - (int)lag;
+        // The newest value is read from where it comes from: other threads may not have written it yet.
+        copy(out + frame * num_bytes, lag == 0 ? value : ring + (from < 0 ? from + num_slots : from) * num_bytes);
     }
-    copy(out, lag == 0 ? value : ring + ((now - lag) % num_slots) * num_bytes);
 """
 
 
 @wp.func_native(_COPY)
 def _copy(
     row: int,
-    frame: int,
+    first_frame: int,
+    end_frame: int,
     part: int,
     width: int,
     num_bytes: int,
+    value_stride: int,
     num_slots: int,
     num_frames: int,
     lag_row_stride: int,
@@ -61,8 +67,10 @@ def _copy(
 
 @wp.kernel(enable_backward=False)
 def _push_and_read(
+    frames_per_thread: int,
     width: int,
     num_bytes: int,
+    value_stride: int,
     num_slots: int,
     num_frames: int,
     lag_row_stride: int,
@@ -75,13 +83,16 @@ def _push_and_read(
     ring: wp.uint64,
     out: wp.uint64,
 ):
-    row, frame, part = wp.tid()
+    row, chunk, part = wp.tid()
+    first_frame = chunk * frames_per_thread
     _copy(
         row,
-        frame,
+        first_frame,
+        wp.min(first_frame + frames_per_thread, num_frames),
         part,
         width,
         num_bytes,
+        value_stride,
         num_slots,
         num_frames,
         lag_row_stride,
@@ -135,19 +146,32 @@ def _launch(
     mask_E: Tensor | None,
     num_frames: int,
 ) -> Tensor:
-    value_E = value_E.contiguous()
+    if not _has_whole_rows(value_E):
+        value_E = value_E.contiguous()
     device = value_E.device
     out_EN = value_E.new_empty((value_E.shape[0], num_frames, *value_E.shape[1:]))
     num_bytes = value_E.shape[1:].numel() * value_E.element_size()
-    width = num_bytes if device.type == "cpu" else 4 if num_bytes % 4 == 0 else 1
+    value_stride = value_E.stride(0) * value_E.element_size()
+    # A thread copies one word on the GPU, and all of an env on the CPU.
+    if device.type == "cpu":
+        frames_per_thread, width = num_frames, num_bytes
+    else:
+        is_aligned = num_bytes % 4 == 0 and value_stride % 4 == 0 and value_E.data_ptr() % 4 == 0
+        frames_per_thread, width = 1, 4 if is_aligned else 1
     row_stride, frame_stride = (0, 0) if lag_EN is None else lag_EN.stride()
     tensors = (clock, start_E, lag_EN, mask_E, value_E, ring_EM, out_EN)
     addresses = [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
-    inputs = [width, num_bytes, ring_EM.shape[1], num_frames, row_stride, frame_stride, *addresses]
+    layout = [frames_per_thread, width, num_bytes, value_stride]
+    inputs = [*layout, ring_EM.shape[1], num_frames, row_stride, frame_stride, *addresses]
     with warp_scope(device):
-        dim = (value_E.shape[0], num_frames, num_bytes // max(width, 1))
+        dim = (value_E.shape[0], num_frames // frames_per_thread, num_bytes // max(width, 1))
         wp.launch(_push_and_read, dim, inputs=inputs, device=str(device))
     return out_EN
+
+
+def _has_whole_rows(value_E: Tensor) -> bool:
+    """Whether each env's value is contiguous, as in columns of a wider tensor."""
+    return value_E.ndim == 1 or value_E.ndim == 2 and value_E.stride(1) == 1 or value_E.is_contiguous()
 
 
 _ring = torch.library.custom_op("ksim_rl::ring", _launch, mutates_args=("ring_EM", "start_E"))

@@ -52,6 +52,8 @@ class RowTransform(Transform):
 
     def _reset_rows(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
         """Return which rows reset, bool [E]; all of them where there is no mask."""
+        if len(tensordict.keys()) == 1 and (only := tensordict.get("_reset", None)) is not None:
+            return _per_row(only, self.num_rows)
         masks = [
             _per_row(mask, self.num_rows)
             for key, mask in tensordict.items(True, True)

@@ -10,7 +10,7 @@ from torchrl.envs.transforms import Transform
 from ksim_rl import checks
 from ksim_rl.envs.transforms.noise_cfg import PerDim
 from ksim_rl.envs.transforms.row_transform import Keys, as_keys, checked_out_keys
-from ksim_rl.envs.transforms.specs import bounded, bounds, leaf_spec, multiply_bounds, set_leaf_spec
+from ksim_rl.envs.transforms.specs import bounded, bounds, floating_spec, multiply_bounds, set_leaf_spec
 
 
 class ObservationScale(Transform):
@@ -43,7 +43,7 @@ class ObservationScale(Transform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Scale the bounds."""
-        specs = [leaf_spec(observation_spec, key, type(self).__name__) for key in self.in_keys]
+        specs = [floating_spec(observation_spec, key, type(self).__name__) for key in self.in_keys]
         for index, (key, out_key, spec) in enumerate(zip(self.in_keys, self.out_keys, specs, strict=True)):
             factor: torch.Tensor = getattr(self, f"factor_{index}").to(spec.device)
             if factor.ndim and (len(spec.shape) == 0 or factor.shape[0] != spec.shape[-1]):
@@ -58,7 +58,8 @@ class ObservationScale(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         for index, (key, out_key) in enumerate(zip(self.in_keys, self.out_keys, strict=True)):
-            next_tensordict.set(out_key, next_tensordict.get(key) * getattr(self, f"factor_{index}"))
+            value = next_tensordict.get(key)
+            next_tensordict.set(out_key, (value * getattr(self, f"factor_{index}")).to(value.dtype))
         return next_tensordict
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -24,6 +24,19 @@ def leaf_spec(observation_spec: Composite, key: NestedKey, owner: str) -> Tensor
     return observation_spec[key]
 
 
+def floating_spec(observation_spec: Composite, key: NestedKey, owner: str) -> TensorSpec:
+    """Return the spec of `key`, which has to be of floating point.
+
+    Raises:
+        KeyError: if there is none; it lists the near names.
+        ValueError: if its dtype is another one.
+    """
+    spec = leaf_spec(observation_spec, key, owner)
+    if not spec.dtype.is_floating_point:
+        raise ValueError(f"{owner}: {key!r} is {spec.dtype}: expected floating-point values")
+    return spec
+
+
 def set_leaf_spec(observation_spec: Composite, key: NestedKey, spec: TensorSpec) -> None:
     """Set the spec of `key`, with the nested specs above it."""
     path = key if isinstance(key, tuple) else (key,)

@@ -26,7 +26,7 @@ class TimeAwareObservation(RowTransform):
         >>> clock = TimeAwareObservation(horizon=500)
     """
 
-    step_E: Tensor
+    left_E: Tensor
 
     def __init__(
         self,
@@ -40,7 +40,7 @@ class TimeAwareObservation(RowTransform):
             raise ValueError(f"out_keys={keys}: expected one key")
         if horizon is not None and (isinstance(horizon, bool) or not isinstance(horizon, int) or horizon < 1):
             raise ValueError(f"horizon={horizon!r}: expected a whole number of env steps of at least 1")
-        super().__init__([], keys, row_buffers=["step_E"])
+        super().__init__([], keys, row_buffers=["left_E"])
         self.horizon, self.normalize = horizon, normalize
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -50,7 +50,7 @@ class TimeAwareObservation(RowTransform):
         spec = Bounded(0.0, high, shape, device=observation_spec.device, dtype=torch.float32)
         set_leaf_spec(observation_spec, self.out_keys[0], spec)
         self._size_rows(observation_spec.shape.numel(), observation_spec.device)
-        self._size_buffer("step_E", (self.num_rows,), torch.int64, observation_spec.device)
+        self._size_buffer("left_E", (self.num_rows,), torch.float32, observation_spec.device)
         return observation_spec
 
     def _horizon(self) -> int:
@@ -69,19 +69,17 @@ class TimeAwareObservation(RowTransform):
         return self.horizon
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if self._buffers["step_E"] is None or not self.num_rows:
+        if self._buffers["left_E"] is None or not self.num_rows:
             self._size_rows(tensordict_reset.numel(), tensordict_reset.device)
-            self._size_buffer("step_E", (self.num_rows,), torch.int64, tensordict_reset.device)
-        self.step_E.masked_fill_(self._reset_rows(tensordict, tensordict_reset), 0)
+            self._size_buffer("left_E", (self.num_rows,), torch.float32, tensordict_reset.device)
+        self.left_E.masked_fill_(self._reset_rows(tensordict, tensordict_reset), self._horizon())
         return self._write(tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self.step_E.add_(1)
+        self.left_E.sub_(1.0).clamp_min_(0.0)
         return self._write(next_tensordict)
 
     def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
-        horizon = self._horizon()
-        left_E = (horizon - self.step_E).clamp_min(0).to(torch.float32)
-        if self.normalize:
-            left_E = left_E / horizon
+        """Give out a copy: the kept one changes in place."""
+        left_E = self.left_E / self._horizon() if self.normalize else self.left_E.clone()
         return tensordict.set(self.out_keys[0], left_E.reshape(*tensordict.batch_size, 1))

@@ -141,6 +141,36 @@ class ByHand:
         }
 
 
+def run_by_hand(
+    model: mujoco.MjModel, start_L: np.ndarray, lags: tuple[int, int], actions_TL: np.ndarray
+) -> tuple[np.ndarray, set[tuple[str, float]]]:
+    """Step the C engine with the laws by hand.
+
+    Args:
+        start_L: joint positions and velocities, [12].
+        lags: of ankle and neck, substeps.
+        actions_TL: what `FILTERED` takes, [T, 6].
+
+    Returns:
+        The joint states reached, [T, 12], and the size of each control that a law wrote, by joint.
+    """
+    share = 1.0 - math.exp(-2.0 * math.pi * CUTOFF_HZ * DECIMATION * TIMESTEP)
+    by_hand, data = ByHand(*lags), mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = start_L[:6], start_L[6:]
+    filtered, states, touched = np.zeros(6), [], set()
+    for action_L in actions_TL:
+        filtered += share * (SCALE * action_L - filtered)
+        target = {name: REST[JOINTS.index(name)] + filtered[i] for i, name in enumerate(COLUMNS)}
+        for _ in range(DECIMATION):
+            q, v = (dict(zip(JOINTS, values, strict=True)) for values in (data.qpos, data.qvel))
+            for name, control in by_hand.controls(q, v, target).items():
+                data.ctrl[model.actuator(name).id] = control
+                touched.add((name, abs(control)))
+            mujoco.mj_step(model, data)
+        states.append(np.concatenate((data.qpos, data.qvel)))
+    return np.stack(states), touched
+
+
 def test_the_trajectory_is_that_of_the_c_engine_with_the_laws_by_hand(env):
     env.seed(5)
     env.reset()
@@ -149,27 +179,13 @@ def test_the_trajectory_is_that_of_the_c_engine_with_the_laws_by_hand(env):
     start = torch.cat((env.world.qpos_EL, env.world.qvel_EL), dim=-1).double().numpy()
     actions_TEL = actions(6)
     reached_TEL = run(env, actions_TEL)
-    share = 1.0 - math.exp(-2.0 * math.pi * CUTOFF_HZ * DECIMATION * TIMESTEP)
-    model = env.world.mj_model
     touched = set()
     for row in range(E):
-        by_hand = ByHand(ankle_lags[row], neck_lags[row])
-        data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:] = start[row, :6], start[row, 6:]
-        filtered = np.zeros(6)
-        for t, action_L in enumerate(actions_TEL[:, row].double().numpy()):
-            filtered += share * (SCALE * action_L - filtered)
-            target = {name: REST[JOINTS.index(name)] + filtered[i] for i, name in enumerate(COLUMNS)}
-            for _ in range(DECIMATION):
-                q, v = (dict(zip(JOINTS, values, strict=True)) for values in (data.qpos, data.qvel))
-                for name, control in by_hand.controls(q, v, target).items():
-                    data.ctrl[model.actuator(name).id] = control
-                    touched.add((name, abs(control)))
-                mujoco.mj_step(model, data)
-            np.testing.assert_allclose(
-                reached_TEL[t, row], np.concatenate((data.qpos, data.qvel)), atol=2e-3, rtol=1e-3
-            )
-            np.testing.assert_allclose(reached_TEL[t, row, :6], data.qpos, atol=2e-5)
+        lags, actions_TL = (ankle_lags[row], neck_lags[row]), actions_TEL[:, row].double().numpy()
+        expected_TL, touched_here = run_by_hand(env.world.mj_model, start[row], lags, actions_TL)
+        np.testing.assert_allclose(reached_TEL[:, row], expected_TL, atol=2e-3, rtol=1e-3)
+        np.testing.assert_allclose(reached_TEL[:, row, :6], expected_TL[:, :6], atol=2e-5)
+        touched |= touched_here
     limits = {("knee", 4.0), ("hip", 4.0), ("neck", 4.0), ("elbow", 3.0), ("wrist", 2.5)}
     assert limits & touched, "some limit was reached"
 

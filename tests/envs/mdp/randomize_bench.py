@@ -106,14 +106,14 @@ class Runners:
         self.world.qvel_EL.copy_(torch.tensor(START_QVEL).expand_as(self.world.qvel_EL))
         self.world.ctrl_EL.copy_(torch.tensor(CTRL).expand_as(self.world.ctrl_EL))
         self.world.step(substeps)
-        return torch.cat((self.world.qpos_EL, self.world.qvel_EL), dim=-1).numpy()
+        return torch.cat((self.world.qpos_EL, self.world.qvel_EL), dim=-1).cpu().numpy()
 
     def c_model(self, row: int, fields: Sequence[str]) -> mujoco.MjModel:
         """The C engine's model with the fields of one world, and all that follows from them."""
         model = copy.copy(self.world.mj_model)
         for field in fields:
             target = model.opt.gravity if field == "gravity" else getattr(model, field)
-            target[:] = self.world.field(field)[row].numpy().reshape(target.shape)
+            target[:] = self.world.field(field)[row].cpu().numpy().reshape(target.shape)
         mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
 

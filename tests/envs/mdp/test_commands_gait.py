@@ -64,6 +64,16 @@ def test_a_reset_begins_the_rhythm_anew_in_its_rows_only():
     assert before is not None and torch.equal(after[[0, 2]], before[[0, 2]])
 
 
+def test_a_reset_without_events_begins_the_rhythm_anew():
+    env = puck_env(
+        limit=None,
+        events={},
+        commands={"gait": mdp.SinusoidalGaitCommand(offsets=TROT, frequency=(1.5, 1.5))},
+    )
+    first = phases(env, 5)
+    assert turned(phases(env, 5) - first).abs().max() < 1e-5
+
+
 def test_it_says_which_feet_should_be_in_the_air():
     env, recorder = gait_env(frequency=(1.0, 1.0)), Recorder()
     phases(env, 3)

@@ -68,13 +68,19 @@ def test_it_has_no_clock(env):
     [
         ("stik", [0.0, 0.0], "unknown command 'stik': did you mean 'stick'"),
         ("target", [0.0], "a Target draws its values; a JoystickCommand takes them"),
-        ("stick", [0.0], r"values of shape \(1,\): expected \[..., 2\], the axes \['vx', 'wz'\]"),
+        ("stick", [0.0], r"values of shape \(1,\): expected \[2\], the axes \['vx', 'wz'\]"),
+        ("stick", [[0.0, 0.0]] * 2, r"values of shape \(2, 2\): expected .* or \[3, 2\]"),
         ("stick", [0.0, math.nan], "not finite"),
     ],
 )
 def test_what_cannot_be_set_is_refused(env, name, values, message):
     with pytest.raises(ValueError, match=message):
         env.command_manager.set(name, values)
+
+
+def test_envs_that_do_not_exist_are_refused(env):
+    with pytest.raises(ValueError, match=r"env_ids holds \[-1, 3\]: valid rows are 0 to 2"):
+        env.command_manager.set("stick", [0.0, 0.0], env_ids=[-1, 3])
 
 
 @pytest.mark.parametrize(

@@ -119,6 +119,12 @@ def test_a_reset_ends_the_push_of_its_rows_only():
     torch.testing.assert_close(gained_E, torch.tensor([0.04, 0.0, 0.04]), atol=1e-6, rtol=0)
 
 
+def test_a_pattern_of_several_bodies_is_refused():
+    push = mdp.PushByForce(body="b.*|knob", wrench_range={}, duration_s=(1, 1), interval_range_s=(1, 1))
+    with pytest.raises(ValueError, match=r"matches \['brick', 'knob'\]: name one of them"):
+        brick_env(push=push)
+
+
 def test_a_jump_reaches_its_height(free_body):
     free_body.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0, 0), qvel=(0.5, 0, 0, 0, 0, 0, 0, 0))
     free_body.fire(mdp.Jump(height_range=(0.3, 0.3), interval_range_s=(1.0, 1.0)))

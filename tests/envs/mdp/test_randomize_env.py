@@ -135,6 +135,9 @@ def test_a_saved_env_goes_on_with_its_own_bodies(env):
     env.load_state_dict(saved)
     for name, values in fields(env).items():
         assert torch.equal(values, held[name]), name
+    # A critic may see them: its observations must not change with the next draw.
+    for name, values in env.world.per_world_fields().items():
+        assert not values.numel() or env.view.detached(values).data_ptr() != values.data_ptr(), name
 
 
 def test_explicit_actuators_take_gains_and_limits_of_their_world():
@@ -156,3 +159,11 @@ def test_explicit_actuators_take_gains_and_limits_of_their_world():
     asked = torch.minimum(0.5 * stiffness, limit)
     actuator = env.world.mj_model.actuator("left_hip").id
     torch.testing.assert_close(env.world.actuator_force_EL[:, actuator], asked, rtol=1e-5, atol=1e-5)
+
+
+def test_a_factor_on_the_limit_of_an_unlimited_motor_is_refused():
+    servo = IdealPDActuator(joints="left_hip", stiffness=20.0, damping=0.0)
+    with pytest.raises(ValueError, match="nothing limits the effort on joint 'left_hip'"):
+        runner_env(
+            {"limit": mdp.RandomizeEffortLimit(joints="left_hip", ranges=(0.1, 1.0))}, actuators=(servo,)
+        )

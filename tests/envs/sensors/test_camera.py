@@ -175,6 +175,7 @@ def test_an_image_is_an_observation_of_its_own_shape():
     assert rollout["image"].shape == (2, 4, 12, 16, 3) and rollout["image"].dtype == torch.uint8
     assert rollout["depth"].shape == (2, 4, 12, 16) and rollout["depth"].dtype == torch.float32
     assert rollout["actor"].shape == (2, 4, 1)
+    assert "observations/image (12, 16, 3)" in base.explain() and "observations/actor (1,)" in base.explain()
     # The puck moves to the right (+x) at 1 and 2 m/s, under a camera whose right is x.
     near = rollout["depth"] < 0.99
     middle = [(near[1, k].float() * torch.arange(16.0)).sum() / near[1, k].sum() for k in (0, 3)]

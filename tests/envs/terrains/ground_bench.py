@@ -54,8 +54,8 @@ ROOM = SimCfg(njmax=120, nconmax=40)
 class GroundBench:
     """Worlds, their view and their ground; `mj_model(row)` is the C engine's model of one of them."""
 
-    def __init__(self, grid: TerrainGrid = GRID, num_envs: int = NUM_ENVS) -> None:
-        spec = mujoco.MjSpec.from_string(THINGS)
+    def __init__(self, grid: TerrainGrid = GRID, num_envs: int = NUM_ENVS, things: str = THINGS) -> None:
+        spec = mujoco.MjSpec.from_string(things)
         grid.add_to(spec)
         self.world = World(
             load_model(spec), num_envs=num_envs, sim=ROOM, per_world_fields=grid.per_world_fields

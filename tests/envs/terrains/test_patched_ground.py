@@ -144,6 +144,21 @@ def test_other_levels_move_the_masked_rows_only():
     assert bench.ground.origins_E3[1, 2] == pytest.approx(GRID.spawn_height(GRID.heights(2, 1)))
 
 
+def test_a_height_field_of_the_robots_own_is_left_alone():
+    own = '<geom name="hat" type="hfield" hfield="hat" pos="0 0 9" contype="0" conaffinity="0"/>'
+    hat = (
+        '<asset><hfield name="hat" size="0.1 0.1 0.2 0.1" nrow="3" ncol="2" elevation="0 1 0 1 0 1"/></asset>'
+    )
+    things = THINGS.replace("<worldbody>", f"{hat}<worldbody>{own}", 1)
+    bench, twin = GroundBench(num_envs=5, things=things), GroundBench(num_envs=5)
+    points_EN2 = torch.rand(5, 20, 2) * 3.0 - 1.5
+    assert bench.ground.half_width == 2.0
+    assert torch.equal(bench.ground.heights(points_EN2), twin.ground.heights(points_EN2))
+    assert bench.world.field("geom_dataid")[:, bench.geom].tolist() == [1, 2, 3, 4, 5]
+    hat_geom = bench.world.mj_model.geom("hat").id
+    assert bench.world.field("geom_dataid")[:, hat_geom].tolist() == [0] * 5
+
+
 def test_flat_ground_is_zero_without_end():
     ground = Ground(3, torch.device("cpu"))
     points = torch.randn(3, 4, 3)

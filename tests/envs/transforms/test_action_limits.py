@@ -70,7 +70,14 @@ def test_alpha_1_filters_nothing():
     assert torch.equal(received(env), sent(env).sum(-1))
 
 
-@pytest.mark.parametrize("build", [lambda: ActionScale("action", "wish"), lambda: ActionClip("action", "wish", clip=(-1.0, 1.0)), lambda: ActionLowPass("action", ("my", "wish"), alpha=1.0)])  # fmt: skip
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: ActionScale("action", "wish"),
+        lambda: ActionClip("action", "wish", clip=(-1.0, 1.0)),
+        lambda: ActionLowPass("action", ("my", "wish"), alpha=1.0),
+    ],
+)
 def test_another_key_for_the_policy(build):
     env = counter(build())
     key = env.action_key

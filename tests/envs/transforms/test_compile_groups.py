@@ -19,6 +19,8 @@ from ksim_rl.envs.transforms import (
     ObservationTermCfg,
     UniformNoise,
     compile_groups,
+    group_specs,
+    observation_columns,
 )
 from ksim_rl.testing import CounterEnv, check_env
 from tests.envs.transforms.chains import assert_same, fixed_rollout
@@ -103,6 +105,77 @@ def test_config_and_hand_written_chain_give_identical_rollouts():
     assert ours["actor"].shape == (3, 15, 9 + 1 + 2)
 
 
+def test_delay_and_history_of_a_whole_group():
+    """Terms without a delay of their own share one lag; those without a history of their own have the group's."""
+    group = ObservationGroupCfg(
+        terms={
+            "count": term(),
+            "row": term(delay=DelayCfg(min_lag=1, max_lag=1)),
+            "vector": term(history=1),
+        },
+        delay=DelayCfg(max_lag=3),
+        history=HistoryCfg(length=3, stride=2),
+    )
+    a = "actor_terms"
+    by_hand = [
+        ObservationDelay([("obs", "row")], [(a, "row")], delay=DelayCfg(min_lag=1, max_lag=1)),
+        ObservationDelay(
+            [("obs", "count"), ("obs", "vector")], [(a, "count"), (a, "vector")], delay=DelayCfg(max_lag=3)
+        ),
+        ObservationHistory([(a, "count"), (a, "row")], length=3, stride=2),
+        ObservationGroups(
+            {"actor": [(a, "count"), (a, "row"), (a, "vector")]},
+            drop=[(a, "count"), (a, "row"), (a, "vector")],
+        ),
+    ]
+    envs = [MaskedTransformedEnv(TermEnv(), chain) for chain in (compile_groups({"actor": group}), by_hand)]
+    for env in envs:
+        env.set_seed(4)
+    ours, theirs = (fixed_rollout(env, 15) for env in envs)
+    assert_same(ours, theirs)
+    assert ours["actor"].shape == (3, 15, 3 + 3 + 3)
+    assert [group.num_frames(name) for name in group.terms] == [3, 3, 1]
+
+
+def test_frames_of_a_whole_group_are_stacked():
+    group = ObservationGroupCfg(
+        terms={"count": term(), "vector": term(scale=0.5)}, history=HistoryCfg(length=3, flat=False)
+    )
+    env = MaskedTransformedEnv(TermEnv(), compile_groups({"actor": group}))
+    check_env(env, num_steps=8)
+    rollout_ET = fixed_rollout(env, 12)
+    assert rollout_ET["actor"].shape == (3, 12, 3, 4)
+    ages = torch.tensor([2, 1, 0])
+    columns = group_specs(env)["actor"].slice("count")
+    expected = (rollout_ET["obs", "count"] - ages).clamp(min=0)
+    assert torch.equal(rollout_ET["actor"][..., columns].squeeze(-1), expected)
+
+
+def test_the_columns_of_each_term_are_plain_data():
+    env = MaskedTransformedEnv(TermEnv(), compile_groups(GROUPS))
+    assert observation_columns(env) == {
+        "actor": {"actor_terms/vector": [0, 9], "obs/row": [9, 10], "actor_terms/count": [10, 12]},
+        "critic": {"obs/count": [0, 1], "critic_terms/vector": [1, 4]},
+    }
+
+
+def test_all_transforms_that_can_follow_the_level_that_is_given():
+    level = torch.zeros(())
+    terms = {
+        "count": term(noise=UniformNoise(low=1.0, high=2.0, by_level=True)),
+        "row": term(noise=UniformNoise(low=1.0, high=2.0)),
+        "vector": term(delay=DelayCfg(max_lag=2, by_level=True)),
+    }
+    groups = {"actor": ObservationGroupCfg(terms=terms)}
+    env = MaskedTransformedEnv(TermEnv(), compile_groups(groups, level=level))
+    root = env.reset()
+    noise = root["actor"][:, :2] - torch.cat([root["obs", "count"], root["obs", "row"]], dim=-1)
+    assert bool((noise[:, 0] == 0).all()) and bool((noise[:, 1] >= 1).all())
+    level.fill_(1.0)
+    root = env.reset()
+    assert bool((root["actor"][:, 0] >= 1).all())
+
+
 def test_the_env_passes_all_checks():
     check_env(MaskedTransformedEnv(TermEnv(), compile_groups(GROUPS)), num_steps=8)
 
@@ -144,6 +217,9 @@ def test_two_noisy_groups_draw_apart():
         (lambda: term(scale=float("nan")), "scale"),
         (lambda: term(history=0), "history"),
         (lambda: term(history=HistoryCfg(length=0)), "length"),
+        (lambda: term(history=HistoryCfg(length=2, stride=0)), "stride"),
+        (lambda: term(history=HistoryCfg(length=2, flat=False)), "flat"),
+        (lambda: ObservationGroupCfg(terms={"row": term()}, history=0), "history.length"),
         (lambda: term(noise=1.0), "noise"),
     ],
 )

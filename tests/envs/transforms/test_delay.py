@@ -66,7 +66,7 @@ cases = given(
 
 
 @cases
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=60, deadline=None, derandomize=True)
 def test_delayed_counts_in_closed_form(delay, lengths, seed):
     check_against_closed_form(delay, lengths, seed)
 

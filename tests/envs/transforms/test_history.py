@@ -1,8 +1,11 @@
 import pytest
 import torch
+from torchrl.data import Unbounded
 from torchrl.envs.transforms import CatFrames, Compose
 
-from ksim_rl.envs.transforms import ObservationHistory
+from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
+from ksim_rl.envs.transforms import DelayCfg, ObservationDelay, ObservationHistory
+from ksim_rl.testing import CounterEnv
 from tests.envs.transforms.chains import VECTOR, counter, fixed_rollout
 
 
@@ -14,6 +17,45 @@ def test_frames_are_the_last_ones_oldest_first(length):
         for frame in range(length):
             age = length - 1 - frame
             assert torch.equal(part["frames"][..., frame : frame + 1], (part["count"] - age).clamp(min=0))
+
+
+@pytest.mark.parametrize(("length", "stride"), [(3, 2), (2, 5), (4, 3), (1, 4)])
+def test_frames_are_a_stride_apart(length, stride):
+    env = counter(ObservationHistory("count", "frames", length=length, stride=stride), lengths=(3, 11, 1, 40))
+    rollout_ET = fixed_rollout(env, 30)
+    ages = torch.tensor([(length - 1 - frame) * stride for frame in range(length)])
+    for part in (rollout_ET, rollout_ET["next"]):
+        assert torch.equal(part["frames"], (part["count"] - ages).clamp(min=0))
+
+
+def test_other_dtypes_and_shapes_have_a_history_too():
+    class Seeing(CounterEnv):
+        def __init__(self):
+            super().__init__((3, 5, 4))
+            spec = self.observation_spec.clone()
+            spec["image"] = Unbounded((3, 2, 5), dtype=torch.uint8)
+            spec["steps"] = Unbounded((3,), dtype=torch.int64)
+            self.observation_spec = spec
+
+        def _observe(self):
+            image = (self.count_E[:, None, None] + torch.arange(10).reshape(2, 5)).to(torch.uint8)
+            return super()._observe() | {"image": image, "steps": self.count_E.clone()}
+
+    env = MaskedTransformedEnv(
+        Seeing(),
+        [
+            ObservationHistory(["image", "steps"], ["images", "many"], length=3, flat=False),
+            ObservationDelay(["image", "steps"], delay=DelayCfg(min_lag=1, max_lag=1)),
+        ],
+    )
+    rollout_ET = fixed_rollout(env, 12)
+    count = rollout_ET["count"].long()
+    ages = (count - torch.tensor([2, 1, 0])).clamp(min=0)
+    assert torch.equal(rollout_ET["many"], ages)
+    pixels = ages[..., None, None] + torch.arange(10).reshape(2, 5)
+    assert torch.equal(rollout_ET["images"], pixels.to(torch.uint8))
+    assert torch.equal(rollout_ET["steps"], (count[..., 0] - 1).clamp(min=0))
+    assert torch.equal(rollout_ET["image"], pixels[:, :, 1].to(torch.uint8))
 
 
 def test_after_a_reset_all_frames_are_the_reset_observation():
@@ -61,3 +103,5 @@ def test_bounds_are_repeated():
 def test_wrong_lengths_are_refused(length):
     with pytest.raises(ValueError, match="length="):
         ObservationHistory("count", length=length)
+    with pytest.raises(ValueError, match="stride="):
+        ObservationHistory("count", length=2, stride=length)

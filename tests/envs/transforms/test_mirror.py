@@ -63,16 +63,11 @@ def test_mirrored_joints_put_the_bodies_where_the_mirror_shows_them(robot):
     assert np.abs(image.xpos - data.xpos).max() > 0.1
 
 
+HUMANOID = mirror_joints(Humanoid().spec().compile())
+
+
 @pytest.mark.parametrize(
-    "mirror",
-    [
-        POLAR,
-        AXIAL,
-        PLANAR_VELOCITY,
-        QUATERNION,
-        mirror_joints(Humanoid().spec().compile()),
-        MirrorMap(source=(1, 0)).repeat(3),
-    ],  # fmt: skip
+    "mirror", [POLAR, AXIAL, PLANAR_VELOCITY, QUATERNION, HUMANOID, MirrorMap(source=(1, 0)).repeat(3)]
 )
 def test_twice_is_the_vector_itself(mirror):
     vector = torch.randn(4, mirror.size)

@@ -113,6 +113,81 @@ def test_bias_is_constant_in_an_episode_and_independent_across_episodes_and_envs
     assert bool((reached - bias).abs().max() < 1e-4)
 
 
+def test_normal_noise_follows_the_normal_distribution():
+    """Kolmogorov and Smirnov's distance to the closed form; 1.95 / sqrt(n) is exceeded once in a thousand times."""
+    _, noise = added(GaussianNoise(std=2.0, mean=-1.0))
+    sorted_N = ((noise.flatten() + 1.0) / 2.0).sort().values.double()
+    steps = torch.arange(1, sorted_N.numel() + 1) / sorted_N.numel()
+    distance = (torch.special.ndtr(sorted_N) - steps).abs().max()
+    assert distance < 1.95 / math.sqrt(sorted_N.numel())
+    assert abs((sorted_N**4).mean() - 3.0) < 4 * math.sqrt(96 / sorted_N.numel())
+
+
+def test_walk_drifts_from_zero_and_begins_anew_at_each_reset():
+    _, drift = added(ConstantNoise(walk_std=0.1), lengths=(25,) * 400, steps=100)
+    per_episode = drift.reshape(1600, 25, 3)
+    assert bool((per_episode[:, 0] == 0).all())
+    steps = per_episode[:, 1:] - per_episode[:, :-1]
+    assert_moments(steps, 0.0, 0.1)
+    assert abs((steps[:, 1:] * steps[:, :-1]).mean()) < 4 * 0.01 / math.sqrt(steps[:, 1:].numel())
+    # After k steps the variance is k std^2; a sample variance of n normals has the standard error sqrt(2 / n).
+    last = per_episode[:, -1]
+    assert abs(last.var() / (24 * 0.01) - 1) < 4 * math.sqrt(2 / last.numel())
+
+
+def test_resolution_rounds_to_the_nearest_multiple():
+    noise = UniformNoise(low=-1.0, high=1.0, resolution=(0.25, 0.0, 0.5))
+    env = counter(ObservationNoise(VECTOR, "noisy", noise=noise), lengths=(50,) * 100)
+    rollout_ET = fixed_rollout(env, 50)
+    noisy = rollout_ET["noisy"]
+    # Uniform numbers in [-1, 1) round to -1, ..., 1 with these variances, the ends half as often as the others.
+    for column, step, variance in ((0, 0.25, 0.34375), (2, 0.5, 0.375)):
+        multiples = noisy[..., column] / step
+        assert torch.equal(multiples, multiples.round())
+        error = noisy[..., column] - rollout_ET[VECTOR][..., column]
+        assert abs(error.var() / variance - 1) < 4 * math.sqrt(2 / error.numel())
+    assert not torch.equal(noisy[..., 1] * 4, (noisy[..., 1] * 4).round())
+
+
+def test_lost_readings_are_the_last_ones_or_zero_and_are_lost_whole():
+    probability = 0.3
+    env = counter(
+        ObservationNoise(VECTOR, "held", noise=ConstantNoise(value=1.0, dropout=probability)),
+        ObservationNoise(VECTOR, "zeroed", noise=ConstantNoise(value=1.0, dropout=probability, lost="zero")),
+        lengths=(20,) * 900,
+    )
+    rollout_ET = fixed_rollout(env, 120)
+    arrived = rollout_ET[VECTOR] + 1.0
+    is_reset = rollout_ET["count"][..., 0] == 0
+    zeroed = (rollout_ET["zeroed"] == 0).all(-1)
+    assert torch.equal(rollout_ET["zeroed"][~zeroed], arrived[~zeroed]), (
+        "a reading arrives whole or not at all"
+    )
+    assert not bool(zeroed[is_reset].any()), "the reading of a reset always arrives"
+    share = zeroed[~is_reset].float()
+    assert abs(share.mean() - probability) < 4 * math.sqrt(probability * (1 - probability) / share.numel())
+    held = rollout_ET["held"]
+    lost = (held != arrived).any(-1)
+    assert not bool(lost[is_reset].any())
+    # Time runs along dim 1: what stands in for a lost reading is what was given out one step before.
+    assert torch.equal(held[:, 1:][lost[:, 1:]], held[:, :-1][lost[:, 1:]])
+    assert abs(lost[~is_reset].float().mean() - probability) < 0.01
+
+
+def test_the_clean_reading_stays_beside_one_that_has_everything():
+    noise = GaussianNoise(
+        std=1.0, bias=UniformNoise(low=1.0, high=2.0), walk_std=0.1, resolution=0.1, dropout=0.2
+    )
+    env = counter(ObservationNoise(VECTOR, "noisy", noise=noise))
+    plain = fixed_rollout(counter(), 12)
+    rollout_ET = fixed_rollout(env, 12)
+    assert torch.equal(rollout_ET[VECTOR], plain[VECTOR])
+    assert (rollout_ET["noisy"] != rollout_ET[VECTOR]).float().mean() > 0.9
+    env.eval()
+    rollout_ET = fixed_rollout(env, 12)
+    assert torch.equal(rollout_ET["noisy"], rollout_ET[VECTOR])
+
+
 def test_bias_has_an_operation_of_its_own_and_comes_first():
     noise = ConstantNoise(value=1.0, bias=ConstantNoise(value=3.0, operation="multiply"))
     rollout_ET = fixed_rollout(counter(ObservationNoise("count", "noisy", noise=noise)), 6)
@@ -196,6 +271,9 @@ def test_noise_is_drawn_afresh_when_it_is_switched_on_again():
         (ConstantNoise(value=-1.0), -1.0, 1.0),
         (UniformNoise(low=-1.0, high=1.0, bias=ConstantNoise(value=5.0)), -1.0, 7.0),
         (GaussianNoise(std=0.0, mean=1.0), 0.0, 2.0),
+        (ConstantNoise(resolution=0.5), -0.25, 1.25),
+        (ConstantNoise(value=3.0, dropout=0.1, lost="zero"), 0.0, 4.0),
+        (ConstantNoise(walk_std=0.1), -math.inf, math.inf),
         (GaussianNoise(std=1.0), -math.inf, math.inf),
     ],
 )

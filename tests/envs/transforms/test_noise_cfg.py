@@ -18,6 +18,11 @@ from ksim_rl.envs.transforms import ConstantNoise, GaussianNoise, NoiseCfg, Unif
             lambda: ConstantNoise(value=1.0, bias=ConstantNoise(value=1.0, bias=ConstantNoise(value=1.0))),
             "bias",
         ),
+        (lambda: ConstantNoise(bias=ConstantNoise(walk_std=0.1)), "a bias has no walk_std of its own"),
+        (lambda: ConstantNoise(walk_std=-0.1), "walk_std=-0.1"),
+        (lambda: ConstantNoise(resolution=(0.1, -0.1)), r"resolution\[1\]=-0.1"),
+        (lambda: ConstantNoise(dropout=1.5), "dropout=1.5"),
+        (lambda: ConstantNoise(lost="hold"), "lost='hold'"),
     ],
 )
 def test_wrong_values_are_refused(build, message):

@@ -6,7 +6,6 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs.transforms import ObservationNorm
 
 from ksim_rl.envs.transforms import ObservationNormalization
-from ksim_rl.running_moments import RunningMoments
 from tests.envs.transforms.chains import VECTOR, counter, fixed_rollout
 
 LENGTHS = (3, 5, 4, 7)
@@ -87,12 +86,6 @@ def test_a_replay_buffer_gets_the_statistics_as_they_are():
     every = (torch.arange(4.0)[:, None] - moments.mean) / (moments.var + 1e-4).sqrt()
     assert all(bool(torch.isclose(value, every).any()) for value in found)
     assert torch.equal(transform.moments[0].count, moments.count)
-
-
-def test_states_that_are_not_finite_do_not_count():
-    moments = RunningMoments(1)
-    moments.update(torch.tensor([[1.0], [torch.nan], [3.0], [torch.inf]]))
-    assert (int(moments.count), moments.mean.item(), moments.var.item()) == (2, 2.0, 1.0)
 
 
 def rank(index, folder):

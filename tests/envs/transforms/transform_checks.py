@@ -51,6 +51,14 @@ KINDS: dict[str, Callable[[], Transform]] = {
         ["count", VECTOR, "row"],
         noise=[UNIFORM, GaussianNoise(std=1.0, operation="multiply"), ConstantNoise(value=2.0, bias=UNIFORM)],
     ),
+    "imu": lambda: ObservationNoise(
+        [VECTOR, "drawn"],
+        [NEW, "drawn"],
+        noise=[
+            GaussianNoise(std=0.1, walk_std=0.2, dropout=0.3, by_level=True),
+            ConstantNoise(value=0.0, resolution=0.25, dropout=0.5, lost="zero"),
+        ],
+    ),
     "clip": lambda: ObservationClip(
         [VECTOR, "count"], [NEW, "count"], clip={VECTOR: (None, 150.0), "count": (1.0, 2.0)}
     ),
@@ -60,8 +68,10 @@ KINDS: dict[str, Callable[[], Transform]] = {
         [VECTOR, "count"], delay=DelayCfg(max_lag=3, resample_every=2, hold_probability=0.5)
     ),
     "delay_shared": lambda: ObservationDelay("drawn", delay=DelayCfg(max_lag=3, per_env=False, resample_every=2)),
+    "delay_by_level": lambda: ObservationDelay([VECTOR], delay=DelayCfg(max_lag=3, resample_every=2, by_level=True)),
     "history": lambda: ObservationHistory([VECTOR, "drawn"], [NEW, "drawn"], length=4),
     "history_stacked": lambda: ObservationHistory([VECTOR, "drawn"], length=4, flat=False),
+    "history_strided": lambda: ObservationHistory([VECTOR, "drawn"], [NEW, "drawn"], length=3, stride=2),
     "groups": lambda: ObservationGroups({"actor": [VECTOR, "count"], ("my", "critic"): ["drawn"]}, drop=[VECTOR]),
     "groups_drop_all": lambda: ObservationGroups({"actor": [VECTOR, "count"]}, drop=True),
     "normalization": lambda: ObservationNormalization([VECTOR, "count"], [NEW, "count"]),

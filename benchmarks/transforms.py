@@ -1,0 +1,363 @@
+"""What each transform costs, beside the nearest one of TorchRL's own, and the usual chain in a robot's control step.
+
+    MENAGERIE_ROOT=... python -m benchmarks.transforms device=cuda num_envs=4096
+
+steps an env that does nothing but hand out 48 numbers, bare and with each transform, and prints one table:
+milliseconds of the env step, of the transform's own step and reset (4 of 4096 rows end), and, on CUDA, of its step as
+a graph. Where TorchRL has no such transform (noise, delays), the nearest one is what people build from its parts:
+`UnaryTransform` with a function that adds noise, and `CatFrames` of as many frames as the delay has to keep. The
+chain is noise -> delay -> history of 10 -> groups. Figures go to benchmarks/results/transforms.json.
+
+`go1=true` (the default on CUDA) also times the captured control step of Unitree Go1, bare and with that chain on its
+observations: `chain_share_of_go1_step` is what the chain adds, relative to the bare step.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.table import Table
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+from torchrl.envs.transforms import (
+    ActionScaling,
+    CatFrames,
+    CatTensors,
+    ClipTransform,
+    Compose,
+    ObservationNorm,
+    RewardClipping,
+    RewardScaling,
+    RewardSum,
+    StepCounter,
+    Transform,
+    UnaryTransform,
+    VecNormV2,
+)
+
+from benchmarks import report
+from benchmarks.stopwatch import milliseconds
+from benchmarks.transforms_env import TERMS, WideEnv
+from ksim_rl import envs
+from ksim_rl.envs import transforms as ours
+from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
+from ksim_rl.envs.transforms import DelayCfg, GaussianNoise, UniformNoise, compile_groups
+from ksim_rl.physics.capture import Captured
+
+NAMES = list(TERMS)
+HISTORY, MAX_LAG = 10, 3
+CALLS = 10
+"""Calls per timing, so that one is long beside the clock's resolution."""
+ROUNDS = {"cuda": 20, "cpu": 15}
+GO1_STEPS = {"cuda": 200, "cpu": 2}
+
+Build = Callable[[], Transform]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Pair:
+    """A transform of ours, and TorchRL's nearest: its name and how it is made."""
+
+    ours: Build
+    nearest: str
+    stock: Build
+
+
+def _noisy(draw: Callable[[Tensor], Tensor]) -> Callable[[], Transform]:
+    return lambda: UnaryTransform(
+        in_keys=["observation"], out_keys=["observation"], fn=lambda x: x + 0.1 * draw(x)
+    )
+
+
+def _frames(length: int) -> Transform:
+    return CatFrames(length, -1, in_keys=["observation"], out_keys=["frames"], padding="same")
+
+
+def _chain() -> Transform:
+    return Compose(
+        ours.ObservationNoise("observation", noise=GaussianNoise(std=0.1)),
+        ours.ObservationDelay("observation", delay=DelayCfg(max_lag=MAX_LAG)),
+        ours.ObservationHistory("observation", "frames", length=HISTORY),
+        ours.ObservationGroups({"actor": ["frames", *NAMES]}),
+    )
+
+
+def _stock_chain() -> Transform:
+    delay = CatFrames(MAX_LAG + 1, -1, in_keys=["observation"], out_keys=["late"], padding="same")
+    return Compose(
+        _noisy(torch.randn_like)(),
+        delay,
+        _frames(HISTORY),
+        CatTensors(["frames", *NAMES], "actor", del_keys=False, sort=False),
+    )
+
+
+PAIRS = {
+    "ObservationNoise, normal": Pair(
+        ours=lambda: ours.ObservationNoise("observation", noise=GaussianNoise(std=0.1)),
+        nearest="UnaryTransform(randn_like)",
+        stock=_noisy(torch.randn_like),
+    ),
+    "ObservationNoise, uniform": Pair(
+        ours=lambda: ours.ObservationNoise("observation", noise=UniformNoise(low=-0.1, high=0.1)),
+        nearest="UnaryTransform(rand_like)",
+        stock=_noisy(torch.rand_like),
+    ),
+    "ObservationDelay": Pair(
+        ours=lambda: ours.ObservationDelay("observation", "late", delay=DelayCfg(max_lag=MAX_LAG)),
+        nearest=f"CatFrames({MAX_LAG + 1})",
+        stock=lambda: _frames(MAX_LAG + 1),
+    ),
+    "ObservationHistory": Pair(
+        ours=lambda: ours.ObservationHistory("observation", "frames", length=HISTORY),
+        nearest=f"CatFrames({HISTORY})",
+        stock=lambda: _frames(HISTORY),
+    ),
+    "ObservationGroups": Pair(
+        ours=lambda: ours.ObservationGroups({"actor": NAMES}),
+        nearest="CatTensors",
+        stock=lambda: CatTensors(NAMES, "actor", del_keys=False, sort=False),
+    ),
+    "ObservationClip": Pair(
+        ours=lambda: ours.ObservationClip("observation", clip=(-1.0, 1.0)),
+        nearest="ClipTransform",
+        stock=lambda: ClipTransform(in_keys=["observation"], low=-1.0, high=1.0),
+    ),
+    "ObservationScale": Pair(
+        ours=lambda: ours.ObservationScale("observation", scale=0.05),
+        nearest="ObservationNorm",
+        stock=lambda: ObservationNorm(loc=0.0, scale=0.05, in_keys=["observation"]),
+    ),
+    "ObservationNormalization": Pair(
+        ours=lambda: ours.ObservationNormalization("observation"),
+        nearest="VecNormV2",
+        stock=lambda: VecNormV2(in_keys=["observation"]),
+    ),
+    "ActionClip": Pair(
+        ours=lambda: ours.ActionClip(clip=(-0.5, 0.5)),
+        nearest="ClipTransform",
+        stock=lambda: ClipTransform(in_keys=[], in_keys_inv=["action"], low=-0.5, high=0.5),
+    ),
+    "ActionScale": Pair(
+        ours=lambda: ours.ActionScale(scale=0.25),
+        nearest="ActionScaling",
+        stock=lambda: ActionScaling(loc=0.0, scale=0.25),
+    ),
+    "RewardScale": Pair(
+        ours=lambda: ours.RewardScale(scale=0.02),
+        nearest="RewardScaling",
+        stock=lambda: RewardScaling(loc=0.0, scale=0.02),
+    ),
+    "RewardClip": Pair(
+        ours=lambda: ours.RewardClip(clip=(-1.0, 1.0)),
+        nearest="RewardClipping",
+        stock=lambda: RewardClipping(-1.0, 1.0),
+    ),
+    "TimeAwareObservation": Pair(
+        ours=lambda: ours.TimeAwareObservation(horizon=1000),
+        nearest="StepCounter",
+        stock=lambda: StepCounter(),
+    ),
+    "EpisodeTracker": Pair(
+        ours=lambda: ours.EpisodeTracker(),
+        nearest="RewardSum and StepCounter",
+        stock=lambda: Compose(RewardSum(), StepCounter()),
+    ),
+    "chain": Pair(ours=_chain, nearest="the same of the parts above", stock=_stock_chain),
+}
+
+
+def measure(num_envs: int, device: torch.device) -> dict[str, dict[str, float | None]]:
+    """Time each transform and its nearest; return ms by row and column."""
+    rounds = ROUNDS[device.type]
+    bare = WideEnv(num_envs, device=device)
+    bare_ms = _least(lambda: _stepper(bare), rounds=rounds, device=device)
+    rows: dict[str, dict[str, float | None]] = {"bare env": {"env_ms": bare_ms}}
+    for name, pair in PAIRS.items():
+        mine, theirs = (_Rig(build, num_envs, device) for build in (pair.ours, pair.stock))
+        row: dict[str, float | None] = {}
+        for what in ("env", "step", "reset"):
+            works = [getattr(rig, what) for rig in (mine, theirs)]
+            row[f"{what}_ms"], row[f"stock_{what}_ms"] = _alternately(works, rounds=rounds, device=device)
+        if device.type == "cuda":
+            graphs = [rig.captured() for rig in (mine, theirs)]
+            for prefix, graph in zip(("", "stock_"), graphs, strict=True):
+                row[f"{prefix}captured_ms"] = (
+                    None if graph is None else milliseconds(graph, device=device, repeats=rounds) / CALLS
+                )
+        rows[name] = row
+    return rows
+
+
+class _Rig:
+    """A transform in an env, ready to be timed."""
+
+    def __init__(self, build: Build, num_envs: int, device: torch.device) -> None:
+        self.device = device
+        self.transformed = TransformedEnv(WideEnv(num_envs, device=device), build())
+        self.root = self.transformed.rand_action(self.transformed.reset())
+        for _ in range(3):
+            self.transformed.step(self.root.copy())
+        self.transform = self.transformed.transform
+        self.reached = self.transformed.base_env.step(self.root.copy())["next"]
+        mask = torch.zeros(num_envs, 1, dtype=torch.bool, device=device)
+        mask[:: max(1, num_envs // 4)] = True
+        self.reset_td = TensorDict({"_reset": mask}, batch_size=[num_envs], device=device)
+
+    @torch.no_grad()
+    def env(self) -> None:
+        """Step the env with the transform."""
+        self.transformed.step(self.root.copy())
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Do what the transform does in a step: with the action, and with what the env answers."""
+        sent = self.transform._inv_call(self.root.copy()) if self.transform.in_keys_inv else self.root
+        self.transform._step(sent, self.reached.copy())
+
+    @torch.no_grad()
+    def reset(self) -> None:
+        """Do what the transform does in a reset of some rows."""
+        self.transform._reset(self.reset_td, self.reached.copy())
+
+    def captured(self) -> Callable[[], object] | None:
+        """Return the steps as a graph, or None where they cannot be captured."""
+
+        def steps() -> None:
+            for _ in range(CALLS):
+                self.step()
+
+        graph = Captured(steps, device=self.device, warmup=2)
+        try:
+            for _ in range(4):
+                graph()
+        except RuntimeError:
+            return None
+        return graph
+
+
+def _stepper(env: Any) -> Callable[[], object]:
+    root = env.rand_action(env.reset())
+    return lambda: env.step(root.copy())
+
+
+def _least(build: Callable[[], Callable[[], object]], *, rounds: int, device: torch.device) -> float:
+    return _alternately([build()], rounds=rounds, device=device)[0]
+
+
+def _alternately(works: list[Callable[[], object]], *, rounds: int, device: torch.device) -> list[float]:
+    """Time works in turn and return the least times, ms per call: whatever else the machine does can only add."""
+    times: list[list[float]] = [[] for _ in works]
+    for _ in range(rounds):
+        for work, found in zip(works, times, strict=True):
+
+            def calls(work: Callable[[], object] = work) -> None:
+                for _ in range(CALLS):
+                    work()
+
+            found.append(milliseconds(calls, device=device, repeats=1) / CALLS)
+    return [min(found) for found in times]
+
+
+def measure_go1(num_envs: int, device: torch.device) -> dict[str, float]:
+    """Time the control step of Go1, bare and with the chain on its observations, in turn."""
+    cfg = envs.make_cfg("go1_velocity_flat", [f"task.scene.num_envs={num_envs}", "task.seed=0"])
+    groups = {
+        name: dataclasses.replace(group, delay=DelayCfg(max_lag=MAX_LAG), history=HISTORY)
+        for name, group in cfg.observations.items()
+        if name == "actor"
+    }
+    rigs = []
+    for transforms in ([], compile_groups(groups)):
+        env = MaskedTransformedEnv(envs.ManagerBasedRlEnv(cfg, device=device), transforms or Compose())
+        env.seed(0)
+        rigs.append(_captured_step(env, device))
+    times: list[list[float]] = [[], []]
+    for _ in range(GO1_STEPS[device.type]):
+        for rig, found in zip(rigs, times, strict=True):
+            found.append(milliseconds(rig, device=device, repeats=1))
+    bare_ms, chained_ms = (statistics.median(found) for found in times)
+    return {
+        "go1_step_ms": bare_ms,
+        "go1_step_with_chain_ms": chained_ms,
+        "chain_share_of_go1_step": chained_ms / bare_ms - 1.0,
+    }
+
+
+@torch.no_grad()
+def _captured_step(env: MaskedTransformedEnv, device: torch.device) -> Captured:
+    root_E: TensorDictBase = env.rand_action(env.reset())
+    action_EL = torch.zeros_like(root_E["action"])
+
+    def step() -> None:
+        env.step_and_maybe_reset(root_E.copy().set("action", action_EL))
+
+    captured = Captured(step, device=device, warmup=2)
+    for _ in range(4):
+        captured()
+    return captured
+
+
+def _ratio(row: dict[str, float | None], column: str) -> float | None:
+    mine, theirs = row.get(column), row.get(f"stock_{column}")
+    return None if mine is None or theirs is None else mine / theirs
+
+
+def _table(rows: dict[str, dict[str, float | None]], num_envs: int, device: torch.device) -> Table:
+    table = Table(title=f"{num_envs} envs, {report.device_name(device)}; ms of ours / of the nearest")
+    columns = ["env_ms", "step_ms", "reset_ms", *(["captured_ms"] if device.type == "cuda" else [])]
+    for heading in ("transform", "nearest", *columns):
+        table.add_column(heading, justify="left" if heading in ("transform", "nearest") else "right")
+    for name, row in rows.items():
+        cells = [
+            " / ".join(_number(row[c]) for c in (column, f"stock_{column}") if c in row) for column in columns
+        ]
+        table.add_row(name, PAIRS[name].nearest if name in PAIRS else "", *cells)
+    return table
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else f"{value:.3f}"
+
+
+def main() -> None:
+    """Measure, print the table, and write the figures."""
+    given = dict(word.split("=", 1) for word in sys.argv[1:])
+    unknown = set(given) - {"device", "num_envs", "go1"}
+    if unknown:
+        raise SystemExit(f"unknown argument {sorted(unknown)[0]!r}: valid: device, num_envs, go1")
+    device = torch.device(given.get("device", "cpu"))
+    num_envs = int(given.get("num_envs", "4096"))
+    rows = measure(num_envs, device)
+    Console(width=140).print(_table(rows, num_envs, device))
+    prefix = f"{report.device_label(device)}/{num_envs}"
+    figures: dict[str, float] = {}
+    for name, row in rows.items():
+        figures |= {f"{prefix}/{name}/{column}": round(ms, 6) for column, ms in row.items() if ms is not None}
+    for column in ("step_ms", "env_ms", "captured_ms"):
+        found = [r for r in (_ratio(row, column) for row in rows.values()) if r is not None]
+        if found:
+            figures[f"{prefix}/largest_{column.removesuffix('_ms')}_ratio"] = round(max(found), 4)
+    if given.get("go1", str(device.type == "cuda")).lower() == "true":
+        go1 = measure_go1(num_envs, device)
+        print({name: round(value, 5) for name, value in go1.items()})
+        figures |= {f"{prefix}/{name}": round(value, 6) for name, value in go1.items()}
+    path = report.write(
+        "transforms",
+        figures=figures,
+        device=device,
+        module="benchmarks.transforms",
+        nearest={name: pair.nearest for name, pair in PAIRS.items()},
+    )
+    print(f"written to {path}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,12 @@
+"""Products of small matrices in full precision."""
+
+from torch import Tensor
+
+
+def product(a: Tensor, b: Tensor) -> Tensor:
+    """Return the matrix product of [..., N, K] and [..., K, M], for small K.
+
+    `a @ b` would keep three digits on a GPU, once a trainer has set `torch.set_float32_matmul_precision("high")` for
+    its networks.
+    """
+    return (a.unsqueeze(-1) * b.unsqueeze(-3)).sum(-2)
