@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 from pathlib import Path
 
+import torch
 from rich.console import Console
 from rich.table import Table
 
@@ -86,7 +87,8 @@ def _envs(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     if options.task is not None:
         with compile_notice(RunProgress(1).status):
-            env = envs.make(options.task, num_envs=1)
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+            env = envs.make(options.task, num_envs=1, device=device)
         print(innermost(env).explain(), end="")
         return 0
     table = Table(box=None, pad_edge=False, header_style="bold")
