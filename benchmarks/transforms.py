@@ -186,13 +186,15 @@ def measure(num_envs: int, device: torch.device) -> dict[str, dict[str, float | 
         for what in ("env", "step", "reset"):
             works = [getattr(rig, what) for rig in (mine, theirs)]
             row[f"{what}_ms"], row[f"stock_{what}_ms"] = _alternately(works, rounds=rounds, device=device)
-        if device.type == "cuda":
-            graphs = [rig.captured() for rig in (mine, theirs)]
-            for prefix, graph in zip(("", "stock_"), graphs, strict=True):
-                row[f"{prefix}captured_ms"] = (
+        rows[name] = row
+    if device.type == "cuda":
+        # Stock ones last: what cannot be captured leaves torch's generator in a bad state.
+        for prefix in ("", "stock_"):
+            for name, pair in PAIRS.items():
+                graph = _Rig(pair.stock if prefix else pair.ours, num_envs, device).captured()
+                rows[name][f"{prefix}captured_ms"] = (
                     None if graph is None else milliseconds(graph, device=device, repeats=rounds) / CALLS
                 )
-        rows[name] = row
     return rows
 
 
@@ -239,8 +241,15 @@ class _Rig:
             for _ in range(4):
                 graph()
         except RuntimeError:
+            _renew_generator(self.device)
             return None
         return graph
+
+
+def _renew_generator(device: torch.device) -> None:
+    """Give torch's generator a new state: after a capture that failed it believes to be in one still."""
+    fresh = torch.Generator(device)
+    torch.cuda.default_generators[torch.cuda.current_device()].graphsafe_set_state(fresh.graphsafe_get_state())
 
 
 def _stepper(env: Any) -> Callable[[], object]:

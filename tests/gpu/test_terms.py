@@ -14,7 +14,7 @@ OF_THE_LAST_SUBSTEP = ("Acc", "Effort", "Force", "Contact", "Energy", "SensorRea
 
 def run(*, captured: bool):
     """Roots before and rewards of each step, on the CPU; `captured` replays a graph from the third step on."""
-    env = every_term_env(16, "cuda", deterministic=True)
+    env = every_term_env(16, "cuda")
     chosen, root_E = actions(STEPS, env).cuda(), env.reset()
     action, rewards_ER = torch.zeros_like(chosen[0]), torch.zeros(16, len(REWARDS), device="cuda")
 
