@@ -1,4 +1,4 @@
-"""The picture of a learning-curve benchmark: all seeds, and a peer's published curve where there is one."""
+"""The picture of a learning-curve benchmark: all seeds, and a peer's curve where one was measured."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ def draw(curves: dict[int, list[dict[str, float]]], picture: Path, *, task_name:
     present = [name for name in PANELS if any(name in point for point in rows)]
     figure = Figure(figsize=(3.9 * len(present), 6.2), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(f"{task_name}: {num_envs} envs, {len(curves)} seeds", fontsize=13)
+    seeds = "1 seed" if len(curves) == 1 else f"{len(curves)} seeds"
+    figure.suptitle(f"{task_name}: {num_envs} envs, {seeds}", fontsize=13)
     for line, (step, label) in enumerate((("env_states", "env states"), ("seconds", "seconds"))):
         for column, name in enumerate(present):
             axes = figure.add_subplot(2, len(present), line * len(present) + column + 1)
@@ -44,7 +45,7 @@ def draw(curves: dict[int, list[dict[str, float]]], picture: Path, *, task_name:
             if name in peer:
                 axes.plot(
                     peer[step], peer[name], color=_PEER_COLOR, marker="o", markersize=4, linestyle="--",
-                    label="mjlab 1.6.0 (published)",
+                    label="mjlab 1.6.0 + rsl_rl",
                 )  # fmt: skip
             axes.set_xlabel(label, fontsize=9)
             if step == "env_states":

@@ -66,6 +66,8 @@ def main() -> None:
         label = prefix if variant == "default" else f"{prefix}/{variant}"
         figures |= {f"{label}/{kind}_ms": value for kind, value in milliseconds_by_kind.items()}
         figures |= {f"{label}/{name}": value for name, value in ratios.items()}
+        if variant == "default":
+            figures["rough_over_flat"] = ratios["rough_over_flat"]
     path = report.write(
         "terrain",
         figures={name: round(value, 6) for name, value in figures.items()},

@@ -249,7 +249,9 @@ class _Rig:
 def _renew_generator(device: torch.device) -> None:
     """Give torch's generator a new state: after a capture that failed it believes to be in one still."""
     fresh = torch.Generator(device)
-    torch.cuda.default_generators[torch.cuda.current_device()].graphsafe_set_state(fresh.graphsafe_get_state())
+    torch.cuda.default_generators[torch.cuda.current_device()].graphsafe_set_state(
+        fresh.graphsafe_get_state()
+    )
 
 
 def _stepper(env: Any) -> Callable[[], object]:
@@ -358,6 +360,7 @@ def main() -> None:
         go1 = measure_go1(num_envs, device)
         print({name: round(value, 5) for name, value in go1.items()})
         figures |= {f"{prefix}/{name}": round(value, 6) for name, value in go1.items()}
+        figures["chain_share_of_go1_step"] = round(go1["chain_share_of_go1_step"], 6)
     path = report.write(
         "transforms",
         figures=figures,

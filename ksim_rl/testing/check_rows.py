@@ -101,7 +101,8 @@ def _others_changed(before: Tensor, after: Tensor, num_envs: int) -> bool:
     """Whether anything but row 0 changed, for each dim that may be that of the envs (a ring may have E frames)."""
     dims = [dim for dim, size in enumerate(before.shape) if size == num_envs]
     return all(
-        not torch.equal(before.narrow(dim, 1, num_envs - 1), after.narrow(dim, 1, num_envs - 1)) for dim in dims
+        not torch.equal(before.narrow(dim, 1, num_envs - 1), after.narrow(dim, 1, num_envs - 1))
+        for dim in dims
     )
 
 

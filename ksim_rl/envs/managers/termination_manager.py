@@ -44,7 +44,8 @@ class TerminationManager:
         self.flags_EK.copy_(torch.stack((*flags, ~finite_E), dim=-1))
         timed_out_E = (self.flags_EK & self._time_out_K).any(-1)
         failed_E = (self.flags_EK & self._failure_K).any(-1)
-        self._view.terminated_E, self._view.truncated_E = failed_E, timed_out_E
+        self._view.terminated_E.copy_(failed_E)
+        self._view.truncated_E.copy_(timed_out_E)
         if self._is_finite_horizon:
             return failed_E | timed_out_E, torch.zeros_like(timed_out_E)
         return failed_E, timed_out_E

@@ -1,0 +1,51 @@
+"""A step must compute all that it reads: inside a graph, what an earlier step computed would stay as it was."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from ksim_rl.envs import ManagerBasedRlEnv
+from tests.envs.mdp.busy_env import busy_env, write_clip
+from tests.envs.mdp.every_term_env import actions, every_term_env
+
+STEPS = 16
+
+
+def spoil_caches(env: ManagerBasedRlEnv) -> None:
+    """Make all quantities that were computed so far useless."""
+    for cache in env.view._state._caches:
+        for name, value in cache.items():
+            # Not in place: a quantity may be a view of the state.
+            cache[name] = ~value if value.dtype == torch.bool else torch.full_like(value, 77)
+
+
+def roots(env: ManagerBasedRlEnv, chosen: Tensor, spoil: Callable[[], None]) -> list[dict[str, Tensor]]:
+    env.seed(3)
+    root, seen = env.reset(), []
+    for action_EL in chosen:
+        spoil()
+        step = env.step(root.set("action", action_EL))
+        spoil()
+        root = env.maybe_reset(step["next"].exclude("reward"))
+        seen.append({str(key): root[key].clone() for key in root.keys(True, True)})
+    return seen
+
+
+@pytest.mark.parametrize("kind", ["every_term", "busy"])
+def test_no_step_reads_what_an_earlier_one_computed(kind, tmp_path):
+    if kind == "every_term":
+        env = every_term_env(4)
+        chosen = actions(STEPS, env)
+    else:
+        env = busy_env(write_clip(tmp_path / "clip.npz"))
+        chosen = torch.sin(torch.arange(STEPS * env.num_envs, dtype=torch.float32)).view(STEPS, -1, 1)
+    start = {key: value.clone() for key, value in env.state_dict().items()}
+    expected = roots(env, chosen, lambda: None)
+    env.load_state_dict(start)
+    actual = roots(env, chosen, lambda: spoil_caches(env))
+    for step, (one, other) in enumerate(zip(actual, expected, strict=True)):
+        for key in other:
+            assert torch.equal(one[key], other[key]), (step, key)
+    env.close()
