@@ -6,6 +6,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ARGS ?=
+# Whole files go to one worker, since their tests share envs and compiled kernels.
+PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
 .PHONY: setup train check lint types imports wheel test test-full clean
 
@@ -34,10 +36,10 @@ imports: setup
 	$(BIN)/lint-imports
 
 test: setup check
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
 
 test-full: setup check
-	$(BIN)/python -m pytest -m "full or not full" $(ARGS)
+	$(BIN)/python -m pytest $(PARALLEL) -m "full or not full" $(ARGS)
 
 clean:
 	rm -rf build dist .pytest_cache .ruff_cache .import_linter_cache
