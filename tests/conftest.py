@@ -13,11 +13,11 @@ from types import FunctionType, ModuleType
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import beartype  # noqa: E402
-import jaxtyping  # noqa: E402
-import pytest  # noqa: E402
-import torch  # noqa: E402
-from jaxtyping import AbstractArray  # noqa: E402
+import beartype
+import jaxtyping
+import pytest
+import torch
+from jaxtyping import AbstractArray
 
 # Robots that lie beside the checkout are used; tests that need one skip where there is none.
 _MENAGERIE = Path(__file__).parents[2] / "shared" / "menagerie"
