@@ -43,12 +43,12 @@ class GuardedState:
 
     def refreshed(self) -> None:
         """Forget computed quantities: the state has changed, and the world has refreshed what derives from it."""
-        self._forget()
+        self.forget()
         self._is_stale = False
 
     def changed(self) -> None:
         """Forget computed quantities: the state has changed, and what derives from it has not followed yet."""
-        self._forget()
+        self.forget()
         self._is_stale = True
 
     def write(self, target_EL: Tensor, mask_E: Tensor, value_EL: Tensor) -> None:
@@ -77,6 +77,7 @@ class GuardedState:
         lever_EN3 = point_EN3 - world.subtree_com_EL[:, self._body_root[body]]
         return cvel_EN6[..., 3:] + torch.linalg.cross(cvel_EN6[..., :3], lever_EN3)
 
-    def _forget(self) -> None:
+    def forget(self) -> None:
+        """Forget computed quantities, whether or not what derives from the state is current."""
         for cache in self._caches:
             cache.clear()

@@ -196,7 +196,7 @@ class ManagerBasedRlEnv(MaskedReset):
         view, world = self.view, self.world
         action_EL = self._checked_action(tensordict.get("action"))
         # A graph would go on reading what the step before it computed, which no replay computes again.
-        view.refreshed()
+        view.forget()
         view.step_count.add_(1)
         self.event_manager.step()
         finite_E = self.action_manager.apply(action_EL)
@@ -236,7 +236,7 @@ class ManagerBasedRlEnv(MaskedReset):
             mask_E = tensordict.get("_reset").view(self.num_envs)
         else:
             mask_E = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        view.refreshed()
+        view.forget()
         view.reset_count_E.add_(mask_E)
         self.curriculum_manager.reset(mask_E)
         self.world.reset(mask_E)

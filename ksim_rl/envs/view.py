@@ -401,6 +401,10 @@ class EnvView(FirstRobot, BodiesAndSites):
 
     # -- internals -----------------------------------------------------------------------------------------------
 
+    def forget(self) -> None:
+        """Forget computed quantities; what may be read does not change."""
+        self._state.forget()
+
     def refreshed(self) -> None:
         """Forget computed quantities: the state has changed, and the world has refreshed what derives from it."""
         self._state.refreshed()

@@ -1,14 +1,18 @@
 """A step must compute all that it reads: inside a graph, what an earlier step computed would stay as it was."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import pytest
 import torch
 from torch import Tensor
 
 from ksim_rl.envs import ManagerBasedRlEnv
+from ksim_rl.envs.term import EventTerm
+from ksim_rl.envs.view import EnvView
 from tests.envs.mdp.busy_env import busy_env, write_clip
 from tests.envs.mdp.every_term_env import actions, every_term_env
+from tests.envs.probe_env import puck_cfg
 
 STEPS = 16
 
@@ -48,4 +52,21 @@ def test_no_step_reads_what_an_earlier_one_computed(kind, tmp_path):
     for step, (one, other) in enumerate(zip(actual, expected, strict=True)):
         for key in other:
             assert torch.equal(one[key], other[key]), (step, key)
+    env.close()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Peek(EventTerm):
+    """Read where a body is."""
+
+    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+        view.body_pos_w(view.bodies("puck"))
+
+
+def test_a_step_still_refuses_to_read_what_a_write_from_outside_made_stale():
+    env = ManagerBasedRlEnv(puck_cfg(events={"peek": Peek(mode="step")}))
+    root, everybody_E = env.reset(), torch.ones(env.num_envs, dtype=torch.bool)
+    env.view.write_joint_pos(everybody_E, torch.ones(env.num_envs, 1))
+    with pytest.raises(RuntimeError, match="events/peek reads a derived quantity"):
+        env.step(env.rand_action(root))
     env.close()
