@@ -1,18 +1,14 @@
 """The guide to a robot of one's own, followed to the letter: it is installed, looked at, checked and trained."""
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from tests.docs.guide import DOCS, write_files
+from tests.docs import guide
 
-REPOSITORY = Path(__file__).parents[2]
 GUIDE = "add_a_robot.md"
 
 
@@ -20,34 +16,20 @@ GUIDE = "add_a_robot.md"
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder that the guide's reader has after step 4, with its package installed beside it."""
     folder = tmp_path_factory.mktemp("stool")
-    write_files(GUIDE, folder)
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--no-build-isolation",
-        "--no-index",
-    ]
-    subprocess.run([*pip, "--target", folder / "site", folder], check=True)
+    guide.write_files(GUIDE, folder)
+    guide.install(folder, folder / "site")
     return folder
 
 
 def run(folder: Path, *command: str) -> str:
-    paths = os.pathsep.join([str(folder / "site"), str(REPOSITORY)])
-    environment = os.environ | {"PYTHONPATH": paths, "COLUMNS": "150"}
-    done = subprocess.run(
-        [sys.executable, *command], capture_output=True, text=True, check=False, cwd=folder, env=environment
-    )
+    done = guide.run(*command, site=folder / "site", cwd=folder)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
 def commands(prefix: str) -> list[str]:
     """The guide's commands that begin so, without that beginning."""
-    return re.findall(rf"^    {prefix} (.*)$", (DOCS / GUIDE).read_text(), re.MULTILINE)
+    return re.findall(rf"^    {prefix} (.*)$", (guide.DOCS / GUIDE).read_text(), re.MULTILINE)
 
 
 def test_the_robot_stands_and_is_drawn(folder: Path) -> None:

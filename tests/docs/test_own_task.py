@@ -1,15 +1,12 @@
 """The guide to a task of one's own, followed to the letter: its package is installed and its task trained."""
 
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.docs.guide import write_files
-
-REPOSITORY = Path(__file__).parents[2]
+from tests.docs import guide
 
 
 class Installed:
@@ -17,32 +14,14 @@ class Installed:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.site = folder / "puck_rink", folder / "site"
-        write_files("own_task.md", self.folder)
+        guide.write_files("own_task.md", self.folder)
         self.install()
 
     def install(self) -> None:
-        pip = [
-            sys.executable,
-            "-m",
-            "pip",
-            "install",
-            "--quiet",
-            "--no-deps",
-            "--no-build-isolation",
-            "--no-index",
-        ]
-        subprocess.run([*pip, "--upgrade", "--target", self.site, self.folder], check=True)
+        guide.install(self.folder, self.site)
 
     def run(self, *command: str | Path) -> subprocess.CompletedProcess[str]:
-        paths = os.pathsep.join([str(self.site), str(REPOSITORY)])
-        return subprocess.run(
-            [sys.executable, *command],
-            capture_output=True,
-            text=True,
-            check=False,
-            cwd=self.folder.parent,
-            env=os.environ | {"PYTHONPATH": paths, "COLUMNS": "150"},
-        )
+        return guide.run(*command, site=self.site, cwd=self.folder.parent)
 
     def ksim_rl(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         return self.run("-m", "ksim_rl.cli.main", *arguments)

@@ -14,11 +14,12 @@ from typing import ClassVar
 import mujoco
 
 from ksim_rl.envs.actuators import Actuator, PositionActuator
-from ksim_rl.envs.robots.edit import CollisionGeom, Site, rebuild
+from ksim_rl.envs.robots.edit import CollisionGeom, Site, rebuild, spread
 from ksim_rl.physics import load_spec
 
 LEGS = ("FR", "FL", "RR", "RL")
 _SIDE = {"FR": -1.0, "FL": 1.0, "RR": -1.0, "RL": 1.0}
+JOINTS = tuple(f"{leg}_{kind}_joint" for leg in LEGS for kind in ("hip", "thigh", "calf"))
 
 ROTOR_INERTIA = 0.000111842
 """kg m^2 of one motor; the reduction is 6, and another 1.5 at the calf's linkage."""
@@ -36,8 +37,8 @@ SERVOS = (
     ),
 )
 # A unit action moves the target by a quarter of the deflection at which the servo saturates (effort_limit / kp).
-ACTION_SCALE = {"hip": 0.37275, "thigh": 0.37275, "calf": 0.2485}
-STANCE = {"hip": 0.1, "thigh": 0.9, "calf": -1.8}
+ACTION_SCALE = {".*_(hip|thigh)_joint": 0.37275, ".*_calf_joint": 0.2485}
+STANCE = {"[FR]R_hip_joint": 0.1, "[FR]L_hip_joint": -0.1, ".*_thigh_joint": 0.9, ".*_calf_joint": -1.8}
 
 _CONTACT_TIME = (0.01, 1.0)
 _BOX, _SPHERE, _CAPSULE = (
@@ -101,15 +102,6 @@ COLLISION_GEOMS = (
 )
 
 
-def _per_joint(value: Mapping[str, float], *, mirrored: str = "") -> dict[str, float]:
-    """Spread values per kind of joint over the legs, in policy order; `mirrored` changes sign on the left."""
-    return {
-        f"{leg}_{kind}_joint": -_SIDE[leg] * number if kind == mirrored else number
-        for leg in LEGS
-        for kind, number in value.items()
-    }
-
-
 @dataclass(frozen=True, kw_only=True)
 class UnitreeGo1:
     """The facts of the robot, and `spec()`, the model that they describe.
@@ -125,14 +117,14 @@ class UnitreeGo1:
 
     init_pos: tuple[float, float, float] = (0.0, 0.0, 0.278)
     init_quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    default_joint_pos: Mapping[str, float] = field(default_factory=lambda: _per_joint(STANCE, mirrored="hip"))
-    action_scale: Mapping[str, float] = field(default_factory=lambda: _per_joint(ACTION_SCALE))
+    default_joint_pos: Mapping[str, float] = field(default_factory=lambda: spread(STANCE, JOINTS))
+    action_scale: Mapping[str, float] = field(default_factory=lambda: spread(ACTION_SCALE, JOINTS))
     actuators: tuple[Actuator, ...] = SERVOS
     soft_joint_pos_limit_factor: float = 0.9
 
     name: ClassVar[str] = "go1"
     root_body: ClassVar[str] = "trunk"
-    joint_names: ClassVar[tuple[str, ...]] = tuple(f"{leg}_{kind}_joint" for leg in LEGS for kind in STANCE)
+    joint_names: ClassVar[tuple[str, ...]] = JOINTS
     foot_geoms: ClassVar[tuple[str, ...]] = tuple(f"{leg}_foot_collision" for leg in LEGS)
     foot_sites: ClassVar[tuple[str, ...]] = LEGS
 

@@ -18,6 +18,7 @@ from ksim_rl.envs.mdp.tolerance import tolerance
 from ksim_rl.envs.robots.cartpole import Cartpole
 from ksim_rl.envs.scene import SceneCfg
 from ksim_rl.envs.task import Task
+from ksim_rl.envs.tasks.small_networks import SMALL_NETWORKS
 from ksim_rl.envs.term import EventTerm, ObservationTerm, RewardTerm, TerminationTerm
 from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.envs.view import EnvView
@@ -131,19 +132,11 @@ def cartpole_swingup() -> ManagerBasedRlEnvCfg:
     return _cfg(ResetCartpole(cart_range=0.02, angle=math.pi, angle_range=0.02))
 
 
-_SMALL_NETWORKS = {
-    "modules.actor.hidden_dims": [64, 64],
-    "modules.critic.hidden_dims": [64, 64],
-    # Values reach 100 here: clipping their change to 0.2 would stop the critic from learning.
-    "objective.clip_value": False,
-    "objective.schedule": "fixed",
-}
-
 BALANCE = Task(
     name="cartpole_balance",
     description="keep a pole upright on a cart",
     cfg=cartpole_balance,
-    training=_SMALL_NETWORKS
+    training=SMALL_NETWORKS
     | {
         "num_envs": 512,
         "data.num_env_states_per_minibatch": 2048,
@@ -161,7 +154,7 @@ SWINGUP = Task(
     name="cartpole_swingup",
     description="swing a hanging pole up and keep it upright",
     cfg=cartpole_swingup,
-    training=_SMALL_NETWORKS
+    training=SMALL_NETWORKS
     | {
         "num_envs": 256,
         "data.num_env_states_per_minibatch": 2048,

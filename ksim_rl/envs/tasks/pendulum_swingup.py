@@ -15,6 +15,7 @@ from ksim_rl.envs.mdp.tolerance import tolerance
 from ksim_rl.envs.robots.pendulum import Pendulum
 from ksim_rl.envs.scene import SceneCfg
 from ksim_rl.envs.task import Task
+from ksim_rl.envs.tasks.small_networks import SMALL_NETWORKS
 from ksim_rl.envs.term import ObservationTerm, RewardTerm
 from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.envs.view import EnvView
@@ -71,14 +72,11 @@ SWINGUP = Task(
     name="pendulum_swingup",
     description="swing a pendulum up with little torque and hold it there",
     cfg=pendulum_swingup,
-    training={
+    training=SMALL_NETWORKS
+    | {
         "num_envs": 256,
-        "modules.actor.hidden_dims": [64, 64],
-        "modules.critic.hidden_dims": [64, 64],
         "data.num_env_states_per_minibatch": 2048,
         "data.num_minibatches": 8,
-        "objective.clip_value": False,
-        "objective.schedule": "fixed",
         "objective.learning_rate": 1e-3,
         "objective.num_epochs": 8,
         "objective.entropy_coeff": 0.0,

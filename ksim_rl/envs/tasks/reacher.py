@@ -15,6 +15,7 @@ from ksim_rl.envs.mdp.tolerance import tolerance
 from ksim_rl.envs.robots.reacher import PLANE_HEIGHT, Reacher
 from ksim_rl.envs.scene import SceneCfg
 from ksim_rl.envs.task import Task
+from ksim_rl.envs.tasks.small_networks import SMALL_NETWORKS
 from ksim_rl.envs.term import CommandTerm, ObservationTerm, RewardTerm
 from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.envs.view import EnvView
@@ -132,14 +133,11 @@ REACHER = Task(
     name="reacher",
     description="a planar arm reaches a point",
     cfg=reacher,
-    training={
+    training=SMALL_NETWORKS
+    | {
         "num_envs": 512,
-        "modules.actor.hidden_dims": [64, 64],
-        "modules.critic.hidden_dims": [64, 64],
         "data.num_env_states_per_minibatch": 4096,
         "data.num_minibatches": 4,
-        "objective.clip_value": False,
-        "objective.schedule": "fixed",
         "objective.learning_rate": 1e-3,
         "objective.num_epochs": 6,
         "objective.entropy_coeff": 0.0,

@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 
 from ksim_rl.checks import check_in_range
-from ksim_rl.envs.terrains.look import MATERIAL, add_look
+from ksim_rl.envs.terrains.look import add_look
 from ksim_rl.envs.terrains.patch import TIE, Lattice, TerrainPatch
 from ksim_rl.envs.terrains.patched_ground import GEOM_FIELDS, PatchedGround, patch_name
-from ksim_rl.envs.terrains.terrain import BODY, Terrain
+from ksim_rl.envs.terrains.terrain import Terrain, add_ground
 
 if TYPE_CHECKING:
     from ksim_rl.envs.view import EnvView
@@ -123,18 +123,12 @@ class TerrainGrid(Terrain):
             gradient = (columns - 1) * float(np.abs(np.diff(heights_RC)).mean())
             if gradient > most:
                 steepest, most = name, gradient
-        spec.worldbody.add_body(name=BODY).add_geom(
-            name=BODY,
+        add_ground(
+            spec,
+            friction=self.friction,
             type=mujoco.mjtGeom.mjGEOM_HFIELD,
             hfieldname=steepest,
             mass=0,  # as planes have none
-            friction=list(self.friction),
-            material=MATERIAL,
-            # The robot's default class would apply otherwise, which may collide with nothing.
-            contype=1,
-            conaffinity=1,
-            condim=3,
-            rgba=[0.5, 0.5, 0.5, 1.0],
         )
 
     def ground(self, view: EnvView) -> PatchedGround:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import mujoco
 
 from ksim_rl.checks import check_in_range
-from ksim_rl.envs.terrains.look import MATERIAL, add_look
-from ksim_rl.envs.terrains.terrain import BODY, Terrain
+from ksim_rl.envs.terrains.look import add_look
+from ksim_rl.envs.terrains.terrain import Terrain, add_ground
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,15 +26,4 @@ class PlaneTerrain(Terrain):
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add the plane to the world body, with a checker pattern and a sky for rendering."""
         add_look(spec, repeat=2)
-        spec.worldbody.add_body(name=BODY).add_geom(
-            name=BODY,
-            type=mujoco.mjtGeom.mjGEOM_PLANE,
-            size=[0, 0, 0.01],
-            friction=list(self.friction),
-            material=MATERIAL,
-            # The robot's default class would apply otherwise, which may collide with nothing.
-            contype=1,
-            conaffinity=1,
-            condim=3,
-            rgba=[0.5, 0.5, 0.5, 1.0],
-        )
+        add_ground(spec, friction=self.friction, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.01])
