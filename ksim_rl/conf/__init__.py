@@ -1,6 +1,6 @@
 """The Hydra configs of `ksim-rl train` as YAML, one folder per group, and their composition in Python."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -14,6 +14,7 @@ from ksim_rl.conf import search_path
 from ksim_rl.trainers import RunCfg
 
 MODULE, NAME = "ksim_rl.conf", "train"
+PPO = "ppo"
 
 
 def compose(overrides: Sequence[str] = ()) -> RunCfg:
@@ -39,29 +40,47 @@ def compose_within(overrides: Sequence[str]) -> RunCfg:
 def register() -> None:
     """Let Hydra find other packages' configs, and store the tasks and their training defaults.
 
-    They go to the groups `task` and `task/training`.
+    They go to the groups `task`, `task/training` (what holds for any objective) and `task/objective_training`.
     """
     search_path.register()
     envs.register_configs()
+    store = ConfigStore.instance().store
     for name in envs.names():
-        ConfigStore.instance().store(
-            group="task/training", name=name, node=training_defaults(name), package="_global_"
-        )
+        store(group="task/training", name=name, node=training_defaults(name), package="_global_")
+        for objective in (PPO, *envs.task(name).training_by_objective):
+            node = objective_defaults(name, objective)
+            store(group="task/objective_training", name=f"{name}_{objective}", node=node, package="_global_")
 
 
 def training_defaults(name: str) -> dict[str, Any]:
-    """Return what a task sets over the groups' defaults, as a config tree."""
+    """Return what a task sets over the groups' defaults whatever the objective is, as a config tree."""
     task = envs.task(name)
     # The env's own number of envs and seed follow the run's.
-    tree = OmegaConf.create(
-        {
-            "task_name": name,
-            "num_envs": task.cfg().scene.num_envs,
-            "task": {"scene": {"num_envs": "${num_envs}"}, "seed": "${seed}"},
-        }
-    )
-    for key, value in task.training.items():
-        OmegaConf.update(tree, key, value)
-    plain = OmegaConf.to_container(tree)
+    tree = {
+        "task_name": name,
+        "num_envs": task.cfg().scene.num_envs,
+        "task": {"scene": {"num_envs": "${num_envs}"}, "seed": "${seed}"},
+    }
+    return _with(tree, {key: value for key, value in task.training.items() if not _is_of_objective(key)})
+
+
+def objective_defaults(name: str, objective: str) -> dict[str, Any]:
+    """Return what a task sets for one objective, as a config tree."""
+    task = envs.task(name)
+    if objective in task.training_by_objective:
+        return _with({}, task.training_by_objective[objective])
+    return _with({}, {key: value for key, value in task.training.items() if _is_of_objective(key)})
+
+
+def _is_of_objective(key: str) -> bool:
+    return key.partition(".")[0] in ("objective", "data", "modules")
+
+
+def _with(tree: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a tree with values set at dotted keys."""
+    config = OmegaConf.create(dict(tree))
+    for key, value in values.items():
+        OmegaConf.update(config, key, value)
+    plain = OmegaConf.to_container(config)
     assert isinstance(plain, dict)
     return {str(key): value for key, value in plain.items()}

@@ -36,7 +36,7 @@ def to_tree(value: Any, annotation: Any = None) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         hints = typing.get_type_hints(type(value))
         tree: dict[str, Any] = {}
-        if type(value) not in _alternatives(annotation):
+        if type(value) is not _default_class(annotation):
             tree[TARGET] = f"{type(value).__module__}.{type(value).__qualname__}"
         for field in dataclasses.fields(value):
             tree[field.name] = to_tree(getattr(value, field.name), hints[field.name])
@@ -129,14 +129,15 @@ def _build_key(annotation: Any, key: object, path: str) -> Any:
 
 
 def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> Any:
+    cls: Any
     if TARGET in tree:
-        cls: Any = _resolve_target(tree[TARGET], path)
+        cls = _resolve_target(tree[TARGET], path)
         bases = [c for c in classes if not getattr(c, "_is_protocol", False)]
         if bases and not issubclass(cls, tuple(bases)):
             kinds = _describe(functools.reduce(operator.or_, bases))
             raise ValueError(f"{path}.{TARGET}={tree[TARGET]!r}: expected a kind of {kinds}")
     else:
-        cls = next(c for c in classes if dataclasses.is_dataclass(c))
+        cls = _default_class(functools.reduce(operator.or_, classes))
         if getattr(cls, "__abstractmethods__", None):
             raise ValueError(f"{path}: needs {TARGET}, the class of this {cls.__name__}")
     hints = typing.get_type_hints(cls)
@@ -192,6 +193,11 @@ def _alternatives(annotation: Any) -> list[Any]:
     if typing.get_origin(annotation) in (Union, types.UnionType):
         return list(typing.get_args(annotation))
     return [annotation]
+
+
+def _default_class(annotation: Any) -> Any:
+    """Return the dataclass that a tree without `_target_` means: the first that the annotation names."""
+    return next((option for option in _alternatives(annotation) if dataclasses.is_dataclass(option)), None)
 
 
 def _is_scalar(option: Any) -> bool:

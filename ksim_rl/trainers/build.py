@@ -7,19 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ksim_rl import envs
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.envs.innermost import innermost
-from ksim_rl.modules import make_actor, make_critic
 from ksim_rl.trainers import state_tree
 from ksim_rl.trainers.evaluation import Evaluator
 from ksim_rl.trainers.loggers import make_loggers
-from ksim_rl.trainers.ppo_update import PPOUpdate
 from ksim_rl.trainers.run_cfg import RunCfg
 from ksim_rl.trainers.trainer import Trainer
+from ksim_rl.trainers.updates import make_update
 
 # Evaluations see other initial states than training does.
 EVALUATION_SEED_OFFSET = 1_000_003
@@ -36,17 +35,15 @@ def build(cfg: RunCfg, *, run_folder: Path | None = None) -> Trainer:
         cfg: of the run.
         run_folder: takes logs and checkpoints; None writes nothing.
     """
-    device = cfg.resolved_device()
     torch.manual_seed(cfg.seed)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
     torch.set_num_threads(cfg.trainer.num_threads or max(1, (os.cpu_count() or 1) - 1))
 
     env = build_env(cfg, num_envs=cfg.num_envs, seed=cfg.task.seed if cfg.task.seed is not None else cfg.seed)
-    actor, critic = build_networks(cfg, env)
-    update = PPOUpdate(cfg.objective, actor=actor, critic=critic, data=cfg.data, seed=cfg.seed, device=device)
+    update = make_update(cfg, env)
     collector = RolloutCollector(
         env,
-        actor,
+        update.behavior,
         rollout_length=cfg.data.rollout_length(cfg.num_envs),
         keys=update.rollout_keys,
         cfg=cfg.collector,
@@ -55,7 +52,7 @@ def build(cfg: RunCfg, *, run_folder: Path | None = None) -> Trainer:
         cfg.trainer,
         collector=collector,
         update=update,
-        evaluator=build_evaluator(cfg, actor) if cfg.trainer.eval_episodes else None,
+        evaluator=build_evaluator(cfg, update.actor) if cfg.trainer.eval_episodes else None,
         solved_at=solved_at(cfg),
         loggers=make_loggers(cfg.logger, run_folder) if run_folder else (),
         folder=run_folder / "checkpoint" if run_folder else None,
@@ -70,22 +67,7 @@ def build_env(cfg: RunCfg, *, num_envs: int, seed: int, render_mode: str | None 
     return envs.build(task, device=cfg.resolved_device(), render_mode=render_mode)
 
 
-def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
-    """Build actor and critic for the observation groups and actions of an env."""
-    device = cfg.resolved_device()
-    spec: Any = env.observation_spec
-    actor = make_actor(
-        cfg.modules.actor,
-        obs_dim=spec["actor"].shape[-1],
-        action_dim=env.action_spec.shape[-1],
-        action_spec=env.action_spec,
-        device=device,
-    )
-    critic = make_critic(cfg.modules.critic, obs_dim=spec["critic"].shape[-1], device=device)
-    return actor, critic
-
-
-def load_actor(actor: ProbabilisticTensorDictSequential, state: Mapping[str, Any]) -> None:
+def load_actor(actor: TensorDictModuleBase, state: Mapping[str, Any]) -> None:
     """Copy a checkpoint's policy into an actor of the same shape.
 
     Raises:
@@ -96,7 +78,7 @@ def load_actor(actor: ProbabilisticTensorDictSequential, state: Mapping[str, Any
 
 def build_evaluator(
     cfg: RunCfg,
-    actor: ProbabilisticTensorDictSequential,
+    actor: TensorDictModuleBase,
     *,
     episodes: int | None = None,
     seed: int | None = None,

@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from ksim_rl.data import DatasetBuffer, DatasetCfg
 from ksim_rl.modules import update_normalizers
@@ -21,6 +22,8 @@ from ksim_rl.objectives import (
 )
 from ksim_rl.physics.capture import Captured
 from ksim_rl.trainers import state_tree
+from ksim_rl.trainers.networks import build_networks
+from ksim_rl.trainers.run_cfg import RunCfg
 
 # Names of the logged means, by the names that `ppo_step` gives them.
 LOGGED = {
@@ -32,6 +35,26 @@ LOGGED = {
     "explained_variance": "update/explained_variance",
     "grad_norm": "update/grad_norm",
 }
+
+
+def make_ppo_update(cfg: RunCfg, env: EnvBase) -> "PPOUpdate":
+    """Build the PPO update of a run."""
+    assert isinstance(cfg.objective, PPOCfg)
+    actor, critic = build_networks(cfg, env)
+    return PPOUpdate(
+        cfg.objective,
+        actor=actor,
+        critic=critic,
+        data=cfg.data,
+        seed=cfg.seed,
+        device=cfg.resolved_device(),
+    )
+
+
+def make_ppo_policy(cfg: RunCfg, env: EnvBase) -> ProbabilisticTensorDictSequential:
+    """Build the policy of a run."""
+    actor, _ = build_networks(cfg, env)
+    return actor
 
 
 class PPOUpdate:
@@ -72,6 +95,16 @@ class PPOUpdate:
         self._std = torch.zeros((), device=self.device)
         self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
         self._run = Captured(self._update, device=self.device)
+
+    @property
+    def behavior(self) -> ProbabilisticTensorDictSequential:
+        """The policy that collects: the actor, which samples."""
+        return self.actor
+
+    @property
+    def num_env_states(self) -> int:
+        """D, the env states of one rollout."""
+        return self.dataset.cfg.num_env_states
 
     @property
     def rollout_keys(self) -> list[Any]:
@@ -157,12 +190,20 @@ class PPOUpdate:
         Raises:
             ValueError: naming the tensor that is missing, unknown or of another shape or type.
         """
-        state_tree.copy_into(self.actor.state_dict(), state["actor"], what="actor")
-        state_tree.copy_into(self.critic.state_dict(), state["critic"], what="critic")
+        self.load_weights(state)
         state_tree.copy_into(self.guard.state_dict(), state["guard"], what="guard")
         self._load_optimizer(state["optimizer"])
         self.dataset.sampler.load_state_dict(state["sampler"])
         self.dataset.non_finite_count.copy_(state["non_finite_env_states"])
+
+    def load_weights(self, state: Mapping[str, Any]) -> None:
+        """Take only the networks of a `state_dict`.
+
+        Raises:
+            ValueError: naming the tensor that is missing, unknown or of another shape or type.
+        """
+        state_tree.copy_into(self.actor.state_dict(), state["actor"], what="actor")
+        state_tree.copy_into(self.critic.state_dict(), state["critic"], what="critic")
 
     def _load_optimizer(self, state: Mapping[str, Any]) -> None:
         parameters = self.optimizer.param_groups[0]["params"]

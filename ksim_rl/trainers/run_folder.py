@@ -8,15 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omegaconf import OmegaConf
-from tensordict.nn import ProbabilisticTensorDictSequential
+from tensordict.nn import TensorDictModuleBase
 
 from ksim_rl.envs.innermost import innermost
 from ksim_rl.trainers import checkpoint, curves, video
-from ksim_rl.trainers.build import build, build_env, build_networks, load_actor
+from ksim_rl.trainers.build import build, build_env, load_actor
 from ksim_rl.trainers.evaluation import Evaluation
 from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_cfg import RunCfg
 from ksim_rl.trainers.trainer import Outcome, Trainer
+from ksim_rl.trainers.updates import make_policy
 
 CONFIG, EVALUATION, CURVES, VIDEO = "config.yaml", "evaluation.json", "curves.png", "video.mp4"
 
@@ -26,7 +27,7 @@ class Policy:
     """A trained policy with the config of its run."""
 
     cfg: RunCfg
-    actor: ProbabilisticTensorDictSequential
+    actor: TensorDictModuleBase
     iteration: int
 
 
@@ -73,7 +74,7 @@ def load_policy(path: Path, *, device: str = "auto") -> Policy:
     saved = checkpoint.load(checkpoint.latest(path))
     cfg = RunCfg.from_tree({**saved.config, "device": device})
     env = build_env(cfg, num_envs=1, seed=cfg.seed)
-    actor, _ = build_networks(cfg, env)
+    actor = make_policy(cfg, env)
     env.close(raise_if_closed=False)
     load_actor(actor, saved.state)
     return Policy(cfg=cfg, actor=actor, iteration=saved.iteration)
@@ -93,7 +94,7 @@ def write_evaluation(
 
 def record_video(
     cfg: RunCfg,
-    actor: ProbabilisticTensorDictSequential,
+    actor: TensorDictModuleBase,
     path: Path,
     *,
     note: Callable[[str], None],

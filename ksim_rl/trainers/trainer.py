@@ -22,11 +22,11 @@ from ksim_rl.trainers.evaluation import Evaluation, Evaluator
 from ksim_rl.trainers.interrupt import InterruptRequest
 from ksim_rl.trainers.loggers import MetricLogger
 from ksim_rl.trainers.metrics import start_copy
-from ksim_rl.trainers.ppo_update import PPOUpdate
 from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_clock import RunClock
 from ksim_rl.trainers.run_state import load_random_state, random_state
 from ksim_rl.trainers.trainer_cfg import TrainerCfg
+from ksim_rl.trainers.update import Update
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class Trainer:
         cfg: TrainerCfg,
         *,
         collector: RolloutCollector,
-        update: PPOUpdate,
+        update: Update,
         evaluator: Evaluator | None = None,
         solved_at: float | None = None,
         loggers: Sequence[MetricLogger] = (),
@@ -81,7 +81,7 @@ class Trainer:
     @property
     def env_states(self) -> int:
         """Env states collected so far."""
-        return self.iteration * self.update.dataset.cfg.num_env_states
+        return self.iteration * self.update.num_env_states
 
     @property
     def solved(self) -> bool | None:
@@ -142,7 +142,7 @@ class Trainer:
         metrics |= physics | {
             "iteration": self.iteration,
             "seconds": self.clock.total,
-            "throughput/env_states_per_s": self.update.dataset.cfg.num_env_states / seconds,
+            "throughput/env_states_per_s": self.update.num_env_states / seconds,
         }
         if self.iteration % self.cfg.log_interval == 0 or self.iteration == self.cfg.num_iterations:
             self._log(metrics)
