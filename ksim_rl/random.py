@@ -7,7 +7,9 @@ a resumed run needs only the integers. The mixing function is Wellons' two-round
 "hash-prospector" search), in wrapping 32-bit arithmetic, so that each device gives the same bits.
 
 Draws made at every step are keyed by a step counter; draws made at a reset by a per-env counter of resets. A draw is
-one Warp kernel, wrapped as a torch operator: it can be captured and compiled.
+one Warp kernel, which is also a torch operator: it can be captured and compiled. A normal is the inverse of the normal
+distribution's cumulative function at a uniform (Giles, "Approximating the erfinv function", 2010): one hash per number
+and no branch, so that the CPU's compiler turns loops into vector instructions.
 """
 
 import zlib
@@ -17,11 +19,75 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ksim_rl.physics.streams import warp_scope
+from ksim_rl.physics.quick_launch import QuickLaunch
 
-_UNIFORM, _NORMAL = range(2)
-_GOLDEN = wp.constant(wp.uint32(0x9E3779B9))
-_MUL_1, _MUL_2 = wp.constant(wp.uint32(0x21F0AAAD)), wp.constant(wp.uint32(0xD35A2D97))
+DRAWS = r"""
+    const unsigned golden = 0x9E3779B9u;
+    auto mix = [](unsigned x) {
+        x = (x ^ (x >> 16)) * 0x21F0AAADu;
+        x = (x ^ (x >> 15)) * 0xD35A2D97u;
+        return x ^ (x >> 15);
+    };
+    struct RowKey { unsigned first, second; };
+    auto key_of = [=](long long seed, unsigned stream, long long count, int row) {
+        const unsigned low = (unsigned)count, high = (unsigned)((unsigned long long)count >> 32);
+        const unsigned base = mix((unsigned)(seed ^ (seed >> 32)) ^ stream);
+        const unsigned first = mix(base + low * golden) ^ mix((unsigned)row + high + 1u);
+        const unsigned second = mix(first + (unsigned)row * golden + golden) ^ mix(low + stream);
+        return RowKey{mix(first), mix(second)};
+    };
+    auto bits_of = [=](RowKey key, unsigned index) {
+        return mix(mix(key.first ^ ((index + 1u) * golden)) ^ key.second);
+    };
+    auto unit = [](unsigned b) { return (float)(b >> 8) * 5.9604644775390625e-08f; };
+    auto normal = [](unsigned b) {
+        const float x = ((float)((int)(b >> 8) - 8388608) + 0.5f) * 1.1920928955078125e-07f;
+        const float t = (1.0f - x) * (1.0f + x);
+        unsigned word;
+        memcpy(&word, &t, 4);
+        int exponent = (int)(word >> 23) - 127;
+        word = (word & 0x7FFFFFu) | 0x3F800000u;
+        float mantissa;
+        memcpy(&mantissa, &word, 4);
+        const bool is_large = mantissa > 1.41421356f;
+        exponent += is_large;
+        const float f = (is_large ? 0.5f * mantissa : mantissa) - 1.0f;
+        float s = 7.0376836292e-2f;
+        s = s * f - 1.1514610310e-1f;
+        s = s * f + 1.1676998740e-1f;
+        s = s * f - 1.2420140846e-1f;
+        s = s * f + 1.4249322787e-1f;
+        s = s * f - 1.6668057665e-1f;
+        s = s * f + 2.0000714765e-1f;
+        s = s * f - 2.4999993993e-1f;
+        s = s * f + 3.3333331174e-1f;
+        const float w = -(f + f * f * (s * f - 0.5f) + (float)exponent * 0.693147180559945f);
+        const float c = w - 2.5f;
+        float p = 2.81022636e-08f;
+        p = p * c + 3.43273939e-07f;
+        p = p * c - 3.5233877e-06f;
+        p = p * c - 4.39150654e-06f;
+        p = p * c + 2.1858087e-04f;
+        p = p * c - 1.25372503e-03f;
+        p = p * c - 4.17768164e-03f;
+        p = p * c + 2.46640727e-01f;
+        p = p * c + 1.50140941f;
+        const float d = sqrtf(w < 5.0f ? 5.0f : w) - 3.0f;
+        float q = -2.00214257e-04f;
+        q = q * d + 1.00950558e-04f;
+        q = q * d + 1.34934322e-03f;
+        q = q * d - 3.67342844e-03f;
+        q = q * d + 5.73950773e-03f;
+        q = q * d - 7.6224613e-03f;
+        q = q * d + 9.43887047e-03f;
+        q = q * d + 1.00167406f;
+        q = q * d + 2.83297682f;
+        return 1.41421356237f * x * (w < 5.0f ? p : q);
+    };
+"""
+"""C++ of all kernels that draw: `key_of` once per row, `bits_of` per number, `unit` or `normal` of these bits."""
+
+_UNIFORM, _NORMAL, _INTEGER = range(3)
 
 
 class RowKeys(NamedTuple):
@@ -61,15 +127,15 @@ def uniform(keys: RowKeys, n: int, low: float | Tensor = 0.0, high: float | Tens
         float32 [E, n].
     """
     if isinstance(low, Tensor) and isinstance(high, Tensor):
-        return torch.lerp(low, high, _draw(*keys, n, _UNIFORM, 0.0, 1.0))
+        return torch.lerp(low, high, _draw(keys, n, _UNIFORM))
     if isinstance(low, Tensor) or isinstance(high, Tensor):
-        return low + _draw(*keys, n, _UNIFORM, 0.0, 1.0) * (high - low)
-    return _draw(*keys, n, _UNIFORM, float(low), float(high))
+        return low + _draw(keys, n, _UNIFORM) * (high - low)
+    return _draw(keys, n, _UNIFORM, low=float(low), high=float(high))
 
 
 def normal(keys: RowKeys, n: int) -> Tensor:
-    """Draw from the standard normal distribution (Box and Muller, 1958), float32 [E, n]."""
-    return _draw(*keys, n, _NORMAL, 0.0, 1.0)
+    """Draw from the standard normal distribution, float32 [E, n]."""
+    return _draw(keys, n, _NORMAL)
 
 
 def integers(keys: RowKeys, n: int, low: int | Tensor, high: int | Tensor) -> Tensor:
@@ -82,106 +148,142 @@ def integers(keys: RowKeys, n: int, low: int | Tensor, high: int | Tensor) -> Te
     Returns:
         int64 [E, n].
     """
-    bits_EL = _draw_bits(*keys, n)
     # Scaling keeps the bias below span / 2^32, without the rejection loop that would need a host sync.
-    return low + ((bits_EL * (high - low + 1)) >> 32)
+    if isinstance(low, int) and isinstance(high, int):
+        return _draw(keys, n, _INTEGER, start=low, span=high - low + 1)
+    return low + ((_draw(keys, n, _INTEGER, span=1 << 32) * (high - low + 1)) >> 32)
 
 
-@wp.func
-def _mix(word: wp.uint32) -> wp.uint32:
-    x = word
-    x = (x ^ (x >> wp.uint32(16))) * _MUL_1
-    x = (x ^ (x >> wp.uint32(15))) * _MUL_2
-    return x ^ (x >> wp.uint32(15))
-
-
-@wp.func
-def _bits(
-    seed: wp.int64, stream: wp.uint32, counter: wp.int64, row: wp.uint32, index: wp.uint32
-) -> wp.uint32:
-    low = wp.uint32(counter & wp.int64(0xFFFFFFFF))
-    high = wp.uint32((counter >> wp.int64(32)) & wp.int64(0xFFFFFFFF))
-    base = _mix(wp.uint32((seed ^ (seed >> wp.int64(32))) & wp.int64(0xFFFFFFFF)) ^ stream)
-    first = _mix(base + low * _GOLDEN) ^ _mix(row + high + wp.uint32(1))
-    second = _mix(first + row * _GOLDEN + _GOLDEN) ^ _mix(low + stream)
-    return _mix(_mix(_mix(first) ^ ((index + wp.uint32(1)) * _GOLDEN)) ^ _mix(second))
-
-
-@wp.func
-def _unit(bits: wp.uint32) -> float:
-    return float(bits >> wp.uint32(8)) * 5.9604644775390625e-08  # 2^-24
-
-
-@wp.kernel(enable_backward=False)
-def _fill(
-    seed: wp.array[wp.int64],
-    stream: wp.uint32,
-    counter: wp.array[wp.int64],
-    counter_stride: int,
+# Addresses instead of arrays: see `QuickLaunch`. On the CPU one thread fills all rows, in loops of vector instructions.
+@wp.func_native(
+    DRAWS
+    + r"""
+    const long long seed = *(const long long*)seed_;
+    const long long* __restrict__ counter = (const long long*)counter_;
+    auto fill = [&](auto write) {
+        for (int row = begin_row; row < end_row; ++row) {
+            const RowKey key = key_of(seed, stream, counter[row * counter_stride], row);
+            for (int i = begin; i < end; ++i) write((long long)row * n + i, bits_of(key, (unsigned)i));
+        }
+    };
+    auto fill_one_each = [&](auto write) {
+        for (int row = begin_row; row < end_row; ++row)
+            write(row, bits_of(key_of(seed, stream, counter[row * counter_stride], row), 0u));
+    };
+    auto run = [&](auto write) { n == 1 ? fill_one_each(write) : fill(write); };
+    float* __restrict__ reals = (float*)out_;
+    long long* __restrict__ integers = (long long*)out_;
+    if (kind == 0) run([=](long long at, unsigned b) { reals[at] = low + unit(b) * (high - low); });
+    else if (kind == 1) run([=](long long at, unsigned b) { reals[at] = normal(b); });
+    else {
+        const unsigned long long size = (unsigned long long)span;
+        run([=](long long at, unsigned b) { integers[at] = start + (long long)((b * size) >> 32); });
+    }
+"""
+)
+def _fill_native(
+    begin_row: int,
+    end_row: int,
+    begin: int,
+    end: int,
+    n: int,
     kind: int,
     low: float,
     high: float,
-    out: wp.array2d[float],
-):
-    row, i = wp.tid()
-    count = counter[row * counter_stride]
-    if kind == 0:
-        out[row, i] = low + _unit(_bits(seed[0], stream, count, wp.uint32(row), wp.uint32(i))) * (high - low)
-    else:
-        u = _unit(_bits(seed[0], stream, count, wp.uint32(row), wp.uint32(2 * i)))
-        v = _unit(_bits(seed[0], stream, count, wp.uint32(row), wp.uint32(2 * i + 1)))
-        # 1 - u lies in (0, 1], so that the logarithm is finite.
-        out[row, i] = wp.sqrt(-2.0 * wp.log(1.0 - u)) * wp.cos(6.283185307179586 * v)
-
-
-@wp.kernel(enable_backward=False)
-def _fill_bits(
-    seed: wp.array[wp.int64],
+    start: wp.int64,
+    span: wp.int64,
     stream: wp.uint32,
-    counter: wp.array[wp.int64],
     counter_stride: int,
-    out: wp.array2d[wp.int64],
+    seed_: wp.uint64,
+    counter_: wp.uint64,
+    out_: wp.uint64,
+): ...
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def _fill(
+    rows: int,
+    columns: int,
+    n: int,
+    kind: int,
+    low: float,
+    high: float,
+    start: wp.int64,
+    span: wp.int64,
+    stream: wp.uint32,
+    counter_stride: int,
+    seed: wp.uint64,
+    counter: wp.uint64,
+    out: wp.uint64,
 ):
-    row, i = wp.tid()
-    count = counter[row * counter_stride]
-    out[row, i] = wp.int64(_bits(seed[0], stream, count, wp.uint32(row), wp.uint32(i)))
+    part, chunk = wp.tid()
+    row = part * rows
+    i = chunk * columns
+    _fill_native(
+        row,
+        row + rows,
+        i,
+        i + columns,
+        n,
+        kind,
+        low,
+        high,
+        start,
+        span,
+        stream,
+        counter_stride,
+        seed,
+        counter,
+        out,
+    )
 
 
-@torch.library.custom_op("ksim_rl::draw", mutates_args=())
+_launch = QuickLaunch(_fill)
+
+
 def _draw(
-    seed: Tensor, stream: int, counter: Tensor, num_rows: int, n: int, kind: int, low: float, high: float
+    keys: RowKeys,
+    n: int,
+    kind: int,
+    *,
+    low: float = 0.0,
+    high: float = 1.0,
+    start: int = 0,
+    span: int = 1,
 ) -> Tensor:
-    out_EL = torch.empty(num_rows, n, dtype=torch.float32, device=seed.device)
-    _launch(_fill, seed, stream, counter, [kind, low, high], out_EL)
+    # Eager code goes past torch's dispatcher, which takes longer than the launch.
+    run = _draw_operator if torch.compiler.is_compiling() else _draw_now
+    return run(*keys, n, kind, low, high, start, span)
+
+
+def _draw_now(
+    seed: Tensor,
+    stream: int,
+    counter: Tensor,
+    num_rows: int,
+    n: int,
+    kind: int,
+    low: float,
+    high: float,
+    start: int,
+    span: int,
+) -> Tensor:
+    dtype = torch.int64 if kind == _INTEGER else torch.float32
+    out_EL = torch.empty((num_rows, n), dtype=dtype, device=seed.device)
+    counter = counter.contiguous()
+    rows, columns = (num_rows, n) if seed.device.type == "cpu" else (1, 1)
+    dim = (num_rows // max(rows, 1), n // max(columns, 1))
+    addresses = seed.data_ptr(), counter.data_ptr(), out_EL.data_ptr()
+    layout = rows, columns, n, kind, low, high, start, span, stream, counter.ndim
+    _launch(seed.device, dim, (*layout, *addresses))
     return out_EL
 
 
-@torch.library.custom_op("ksim_rl::draw_bits", mutates_args=())
-def _draw_bits(seed: Tensor, stream: int, counter: Tensor, num_rows: int, n: int) -> Tensor:
-    out_EL = torch.empty(num_rows, n, dtype=torch.int64, device=seed.device)
-    _launch(_fill_bits, seed, stream, counter, [], out_EL)
-    return out_EL
+_draw_operator = torch.library.custom_op("ksim_rl::draw", _draw_now, mutates_args=())
 
 
-@_draw.register_fake
+@_draw_operator.register_fake
 def _(
-    seed: Tensor, stream: int, counter: Tensor, num_rows: int, n: int, kind: int, low: float, high: float
+    seed: Tensor, stream: int, counter: Tensor, num_rows: int, n: int, kind: int, *options: float
 ) -> Tensor:
-    return seed.new_empty((num_rows, n), dtype=torch.float32)
-
-
-@_draw_bits.register_fake
-def _(seed: Tensor, stream: int, counter: Tensor, num_rows: int, n: int) -> Tensor:
-    return seed.new_empty((num_rows, n), dtype=torch.int64)
-
-
-def _launch(
-    kernel: wp.Kernel, seed: Tensor, stream: int, counter: Tensor, options: list[int | float], out_EL: Tensor
-) -> None:
-    with warp_scope(out_EL.device):
-        stride = int(counter.ndim > 0)
-        seeds = wp.from_torch(seed.reshape(1), dtype=wp.int64, return_ctype=True)
-        counts = wp.from_torch(counter.reshape(-1), dtype=wp.int64, return_ctype=True)
-        out = wp.from_torch(out_EL, return_ctype=True)
-        inputs = [seeds, stream, counts, stride, *options]
-        wp.launch(kernel, dim=tuple(out_EL.shape), inputs=inputs, outputs=[out], device=str(out_EL.device))
+    return seed.new_empty((num_rows, n), dtype=torch.int64 if kind == _INTEGER else torch.float32)

@@ -4,6 +4,11 @@ from ksim_rl.data.dataset_buffer import DatasetBuffer
 from ksim_rl.data.dataset_cfg import DatasetCfg, rollout_length
 from ksim_rl.data.dataset_storage import MASK_KEY, DatasetStorage, DatasetWriter
 from ksim_rl.data.epoch_sampler import EpochSampler
+from ksim_rl.data.priority_sampler import PrioritySampler
+from ksim_rl.data.replay_cfg import ReplayCfg
+from ksim_rl.data.replay_ring import ReplayRing
+from ksim_rl.data.replay_sampler import ReplaySampler
+from ksim_rl.data.replay_storage import ReplayStorage, ReplayWriter
 
 __all__ = [
     "MASK_KEY",
@@ -12,5 +17,11 @@ __all__ = [
     "DatasetStorage",
     "DatasetWriter",
     "EpochSampler",
+    "PrioritySampler",
+    "ReplayCfg",
+    "ReplayRing",
+    "ReplaySampler",
+    "ReplayStorage",
+    "ReplayWriter",
     "rollout_length",
 ]

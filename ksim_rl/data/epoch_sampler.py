@@ -70,10 +70,17 @@ class EpochSampler(Sampler):
                 f"batch_size={batch_size} exceeds the {size} stored elements and drop_last=True: "
                 "nothing could be sampled; use a smaller batch_size or drop_last=False"
             )
+        index = self._next_part(size, batch_size, torch.device(getattr(storage, "device", None) or "cpu"))
+        if storage.ndim > 1:
+            index = torch.unravel_index(index, storage.shape)
+        return index, {}
+
+    def _next_part(self, size: int, batch_size: int, device: torch.device) -> Tensor:
+        """Return the next `batch_size` elements of the epoch's order of `range(size)`, on the device."""
         if size != self._size:
             self._size, self._position = size, 0
         if self._position == 0:
-            self._order_D = self._next_order(size, torch.device(getattr(storage, "device", None) or "cpu"))
+            self._order_D = self._next_order(size, device)
         assert self._order_D is not None
         index = self._order_D[self._position : self._position + batch_size]
         self._position += batch_size
@@ -82,9 +89,7 @@ class EpochSampler(Sampler):
         if self._ran_out:
             self._position = 0
         self._remaining_batches = left // batch_size if self.drop_last else -(-left // batch_size)
-        if storage.ndim > 1:
-            index = torch.unravel_index(index, storage.shape)
-        return index, {}
+        return index
 
     def _next_order(self, size: int, device: torch.device) -> Tensor:
         if not self.shuffle:
@@ -105,10 +110,7 @@ class EpochSampler(Sampler):
         self._ran_out = value
 
     def state_dict(self) -> dict[str, int]:
-        """Return the integers from which the orders continue exactly (reads the epoch counter on the host).
-
-        Eturn the integers from which the orders continue exactly (reads the epoch counter on the host).
-        """
+        """Return the integers from which the orders continue exactly (reads the epoch counter on the host)."""
         epoch = self._first_epoch if self._epoch is None else int(self._epoch)
         return {"seed": self.seed, "epoch": epoch, "size": self._size, "position": self._position}
 

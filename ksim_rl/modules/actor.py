@@ -1,81 +1,40 @@
-"""The stochastic policy: observation normalization, an MLP and a diagonal gaussian."""
-
-from dataclasses import dataclass
+"""The stochastic policy: observation normalization, an MLP and a distribution of the action."""
 
 import torch
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import TensorSpec
+from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor
 
-from ksim_rl.checks import check_choice, check_in_range
-from ksim_rl.modules.diagonal_gaussian import DiagonalGaussian
-from ksim_rl.modules.gaussian_head import GaussianHead
-from ksim_rl.modules.mlp import check_network, trunk
+from ksim_rl.modules.action_head import make_head
+from ksim_rl.modules.actor_cfg import ActorCfg
+from ksim_rl.modules.mixed_head import PARAMETERS, MixedHead
+from ksim_rl.modules.mlp import trunk
+from ksim_rl.modules.observation_keys import side_by_side
 from ksim_rl.modules.observation_normalizer import ObservationNormalizer
 
-STD_TYPES = ("scalar", "log")
 
-
-@dataclass(frozen=True, kw_only=True)
-class ActorCfg:
-    """The policy network.
-
-    Attributes:
-        hidden_dims: widths of the hidden layers.
-        activation: one of `ksim_rl.modules.ACTIVATIONS`.
-        obs_normalization: normalize observations by running statistics inside the network.
-        init_std: standard deviation of each action at the start, in units of the action.
-        std_type: "scalar" learns the standard deviation itself, "log" its logarithm.
-        state_dependent_std: predict the standard deviation from the state instead of learning one per action.
-        output_gain: scale of the last layer's weights. Small, so that the first policy acts around zero (the
-            default pose of a robot) in every state.
-    """
-
-    hidden_dims: tuple[int, ...] = (512, 256, 128)
-    activation: str = "elu"
-    obs_normalization: bool = True
-    init_std: float = 1.0
-    std_type: str = "scalar"
-    state_dependent_std: bool = False
-    output_gain: float = 0.01
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range, naming the field."""
-        object.__setattr__(self, "hidden_dims", tuple(self.hidden_dims))
-        check_network(self.hidden_dims, self.activation)
-        check_in_range("init_std", self.init_std, low=0.0, low_open=True)
-        check_choice("std_type", self.std_type, STD_TYPES)
-        check_in_range("output_gain", self.output_gain, low=0.0)
-
-
-class GaussianPolicy(nn.Module):
-    """Maps an observation [..., L] to `loc` and `scale` of the action, each [..., action_dim].
+class PolicyNetwork(nn.Module):
+    """Maps observations [..., L_i] to the parameters of the action's distribution.
 
     Attributes:
         normalizer: an `ObservationNormalizer`, or None.
+        head: the last layer, which also knows the distribution.
     """
 
     def __init__(
-        self, cfg: ActorCfg, *, obs_dim: int, action_dim: int, device: torch.device | str | None = None
+        self, cfg: ActorCfg, *, obs_dim: int, head: nn.Module, device: torch.device | str | None = None
     ) -> None:
         super().__init__()
         self.normalizer = ObservationNormalizer(obs_dim, device=device) if cfg.obs_normalization else None
         self.trunk = trunk(obs_dim, cfg.hidden_dims, activation=cfg.activation, device=device)
-        self.head = GaussianHead(
-            cfg.hidden_dims[-1] if cfg.hidden_dims else obs_dim,
-            action_dim,
-            init_std=cfg.init_std,
-            std_type=cfg.std_type,
-            state_dependent_std=cfg.state_dependent_std,
-            output_gain=cfg.output_gain,
-            device=device,
-        )
+        self.head = head
 
-    def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return `(loc, scale)` for `obs` [..., L]."""
+    def forward(self, *observations: Tensor) -> tuple[Tensor, ...]:
+        """Return the parameters, such as `(loc, scale)`, for observations that stand side by side."""
+        obs = side_by_side(observations)
         if self.normalizer is not None:
             obs = self.normalizer(obs)
         return self.head(self.trunk(obs))
@@ -85,29 +44,50 @@ def make_actor(
     cfg: ActorCfg,
     *,
     obs_dim: int,
-    action_dim: int,
-    in_key: NestedKey = "actor",
+    action_dim: int | None = None,
     action_spec: TensorSpec | None = None,
     device: torch.device | str | None = None,
 ) -> ProbabilisticActor:
     """Build the policy as TorchRL's `ProbabilisticActor`.
 
-    It reads `in_key` [..., obs_dim] and writes `loc`, `scale`, `action` [..., action_dim] and
-    `action_log_prob` [...]. It samples unless TorchRL's exploration type says otherwise;
-    `ExplorationType.DETERMINISTIC` gives the mean.
+    It reads `cfg.in_keys` and writes the parameters of the distribution (`loc` and `scale`, or `logits`), `action` and
+    `action_log_prob` [...]. Of several actions it writes each at its key, with `<key>_log_prob` beside it, and the
+    parameters under `("params", *key)`: the layout of `CompositeDistribution`. It samples unless TorchRL's exploration
+    type says otherwise; `ExplorationType.DETERMINISTIC` gives the mean, the median or the mode.
 
     Args:
-        action_spec: the env's action spec; kept for its shape and device, the policy does not clip to its
-            bounds.
+        obs_dim: size of the last dim of the observations side by side.
+        action_dim: where there is no spec: of one action without bounds.
+        action_spec: the env's `full_action_spec`, or the spec of its one action.
+
+    Raises:
+        ValueError: if `cfg.distribution` does not go with the spec.
     """
-    policy = GaussianPolicy(cfg, obs_dim=obs_dim, action_dim=action_dim, device=device)
+    if action_spec is None:
+        if action_dim is None:
+            raise ValueError("make_actor needs action_spec, or action_dim")
+        action_spec = Unbounded(action_dim)
+    feature_dim = cfg.hidden_dims[-1] if cfg.hidden_dims else obs_dim
+    # Drawn after the layers below it, so that one seed gives the same network whatever the head.
+    network = PolicyNetwork(cfg, obs_dim=obs_dim, head=nn.Identity(), device=device)
+    network.head, action_keys = make_head(cfg, action_spec, feature_dim, device=device)
+    return make_probabilistic(network, list(cfg.in_keys), action_keys, action_spec)
+
+
+def make_probabilistic(
+    network: nn.Module, in_keys: list[NestedKey], action_keys: list[NestedKey], action_spec: TensorSpec | None
+) -> ProbabilisticActor:
+    """Wrap a network with a `head` from `make_head` as TorchRL's `ProbabilisticActor`."""
+    head = network.head
+    mixed = isinstance(head, MixedHead)
+    parameter_keys = head.parameter_keys if mixed else list(head.parameter_names)  # type: ignore[union-attr,arg-type]
     return ProbabilisticActor(
-        TensorDictModule(policy, in_keys=[in_key], out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        out_keys=["action"],
+        TensorDictModule(network, in_keys=in_keys, out_keys=parameter_keys),
+        in_keys=[PARAMETERS] if mixed else parameter_keys,
+        out_keys=action_keys,
         spec=action_spec,
-        distribution_class=DiagonalGaussian,
+        # A method, so that the bounds are those of the head wherever it is moved or copied.
+        distribution_class=head.distribution,  # type: ignore[union-attr,arg-type]
         return_log_prob=True,
-        log_prob_key="action_log_prob",
         default_interaction_type=ExplorationType.RANDOM,
     )

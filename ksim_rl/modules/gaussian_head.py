@@ -4,8 +4,10 @@ import math
 
 import torch
 from torch import Tensor, nn
+from torch.distributions import Distribution
 from torch.nn import functional
 
+from ksim_rl.modules.diagonal_gaussian import DiagonalGaussian
 from ksim_rl.modules.mlp import linear
 
 MIN_STD = 1e-3
@@ -22,6 +24,8 @@ class GaussianHead(nn.Module):
             for every state; "scalar" then passes it through a softplus, so that it stays positive.
         output_gain: scale of the last layer's orthogonal weights.
     """
+
+    parameter_names = ("loc", "scale")
 
     def __init__(
         self,
@@ -61,3 +65,7 @@ class GaussianHead(nn.Module):
         # passes the bound (a plain clamp stops it), so that a std below it can come back.
         bounded = scale + (scale.clamp_min(MIN_STD) - scale).detach()
         return loc, bounded.expand_as(loc)
+
+    def distribution(self, loc: Tensor, scale: Tensor) -> Distribution:
+        """Return the distribution of the action."""
+        return DiagonalGaussian(loc, scale)

@@ -6,6 +6,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from ksim_rl.checks import check_in_range
+from ksim_rl.modules.observation_keys import side_by_side
 from ksim_rl.running_moments import RunningMoments
 
 
@@ -63,4 +64,13 @@ def update_normalizers(tensordict: TensorDictBase, *networks: nn.Module, valid: 
                 continue
             if id(normalizer) not in seen:
                 seen.add(id(normalizer))
-                normalizer.update(tensordict.get(module.in_keys[0]), valid)
+                normalizer.update(_observation(tensordict, module, normalizer.dim), valid)
+
+
+def _observation(tensordict: TensorDictBase, module: TensorDictModule, dim: int) -> Tensor:
+    """Return what a network normalizes: its first inputs, as many as make up `dim` numbers."""
+    observations: list[Tensor] = []
+    for key in module.in_keys:
+        if sum(obs.shape[-1] for obs in observations) < dim:
+            observations.append(tensordict.get(key))
+    return side_by_side(observations)

@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 from ksim_rl.checks import check_choice, check_in_range
 
+ADVANTAGES = ("gae", "td_lambda", "vtrace")
 SCHEDULES = ("adaptive", "fixed")
+SYMMETRIES = ("none", "augment", "loss")
 NORMALIZATIONS = ("dataset", "minibatch", "none")
 
 
@@ -14,7 +16,12 @@ class PPOCfg:
 
     Attributes:
         num_epochs: passes over each dataset.
+        advantage: "gae", "td_lambda" (lambda returns; the same numbers in the rollout of a collector), or "vtrace",
+            whose weights follow the policy from epoch to epoch.
         gamma, lmbda: discount per step, and weight of longer returns in the advantage.
+        rho_thresh, c_thresh: bounds of the probability ratios in V-trace; see `VTrace`.
+        estimate_each_epoch: estimate advantages and value targets anew before each epoch, with the present networks,
+            instead of once (Andrychowicz et al., arXiv 2006.05990, section 3.5). "vtrace" always does.
         clip_epsilon: the probability ratio is clipped to [1 - clip_epsilon, 1 + clip_epsilon].
         clip_value: radius of the value clipping; True takes `clip_epsilon`, False does not clip.
         entropy_coeff, critic_coeff: weights of the entropy bonus and of the value loss.
@@ -26,12 +33,19 @@ class PPOCfg:
         learning_rate_min, learning_rate_max: bounds of the adaptive schedule.
         max_grad_norm: bound on the norm of the gradient; None does not clip.
         betas, adam_eps, weight_decay: of Adam.
+        symmetry: "augment" adds the mirror image of each env state to its minibatch, "loss" adds the mirror loss, which
+            is zero for a policy that acts in the mirror as its mirror image; "none" does neither.
+        symmetry_coeff: weight of the mirror loss.
         max_skipped_steps: so many gradient steps in a row that are not finite end the run.
     """
 
     num_epochs: int = 5
+    advantage: str = "gae"
     gamma: float = 0.99
     lmbda: float = 0.95
+    rho_thresh: float = 1.0
+    c_thresh: float = 1.0
+    estimate_each_epoch: bool = False
     clip_epsilon: float = 0.2
     clip_value: bool | float = True
     entropy_coeff: float = 0.01
@@ -46,7 +60,14 @@ class PPOCfg:
     betas: tuple[float, float] = (0.9, 0.999)
     adam_eps: float = 1e-8
     weight_decay: float = 0.0
+    symmetry: str = "none"
+    symmetry_coeff: float = 1.0
     max_skipped_steps: int = 100
+
+    @property
+    def estimates_each_epoch(self) -> bool:
+        """Whether advantages are estimated anew before each epoch."""
+        return self.estimate_each_epoch or self.advantage == "vtrace"
 
     def __post_init__(self) -> None:
         """Refuse values out of range, naming the field."""
@@ -58,6 +79,8 @@ class PPOCfg:
         for field in ("gamma", "lmbda"):
             check_in_range(field, getattr(self, field), low=0.0, high=1.0)
         for field in (
+            "rho_thresh",
+            "c_thresh",
             "clip_epsilon",
             "desired_kl",
             "learning_rate",
@@ -67,7 +90,7 @@ class PPOCfg:
         ):
             check_in_range(field, getattr(self, field), low=0.0, low_open=True)
         check_in_range("clip_epsilon", self.clip_epsilon, high=1.0)
-        for field in ("entropy_coeff", "critic_coeff", "weight_decay"):
+        for field in ("entropy_coeff", "critic_coeff", "weight_decay", "symmetry_coeff"):
             check_in_range(field, getattr(self, field), low=0.0)
         if not isinstance(self.clip_value, bool):
             check_in_range("clip_value", self.clip_value, low=0.0)
@@ -77,6 +100,8 @@ class PPOCfg:
             check_in_range(f"betas[{index}]", beta, low=0.0, high=1.0)
         if len(self.betas) != 2 or max(self.betas) >= 1.0:
             raise ValueError(f"betas={self.betas!r}: expected two numbers in [0, 1)")
+        check_choice("advantage", self.advantage, ADVANTAGES)
+        check_choice("symmetry", self.symmetry, SYMMETRIES)
         check_choice("schedule", self.schedule, SCHEDULES)
         check_choice("normalize_advantage", self.normalize_advantage, NORMALIZATIONS)
         if self.learning_rate_min > self.learning_rate_max:

@@ -1,7 +1,7 @@
 """One gradient step of PPO, and the parts that it needs, built from one config."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Mapping
 from functools import reduce
 from operator import add
 from typing import Any
@@ -9,19 +9,34 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from ksim_rl.envs.transforms import MirrorMap
 from ksim_rl.objectives.adaptive_learning_rate import adapt_learning_rate_
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.gae import GAE
 from ksim_rl.objectives.ppo_cfg import PPOCfg
+from ksim_rl.objectives.rollout_estimator import RolloutEstimator
 from ksim_rl.objectives.step_guard import StepGuard, clip_and_guard
+from ksim_rl.objectives.symmetry import Loss, SymmetricAugmentation, with_augmentation, with_mirror_loss
+from ksim_rl.objectives.td_lambda import TDLambda
+from ksim_rl.objectives.vtrace import VTrace
 
 
-def make_gae(cfg: PPOCfg, critic: TensorDictModule) -> GAE:
-    """Build the advantage estimator of `cfg`."""
-    normalize = cfg.normalize_advantage == "dataset"
-    return GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, critic=critic, normalize_advantage=normalize)
+def make_advantage(
+    cfg: PPOCfg, actor: ProbabilisticTensorDictSequential, critic: TensorDictModule
+) -> RolloutEstimator:
+    """Build the advantage estimator of `cfg`. It uses the modules as they are."""
+    options: dict[str, Any] = {
+        "gamma": cfg.gamma,
+        "lmbda": cfg.lmbda,
+        "critic": critic,
+        "normalize_advantage": cfg.normalize_advantage == "dataset",
+    }
+    if cfg.advantage == "vtrace":
+        return VTrace(actor=actor, rho_thresh=cfg.rho_thresh, c_thresh=cfg.c_thresh, **options)
+    return {"gae": GAE, "td_lambda": TDLambda}[cfg.advantage](**options)
 
 
 def make_loss(cfg: PPOCfg, actor: ProbabilisticTensorDictSequential, critic: TensorDictModule) -> ClipPPOLoss:
@@ -38,6 +53,35 @@ def make_loss(cfg: PPOCfg, actor: ProbabilisticTensorDictSequential, critic: Ten
         functional=False,
         log_ratio_statistics=False,
     )
+
+
+def make_symmetric(
+    cfg: PPOCfg,
+    loss: ClipPPOLoss,
+    maps: Mapping[NestedKey, MirrorMap] | None,
+    *,
+    device: torch.device | str | None = None,
+) -> Loss:
+    """Return `loss` with the symmetry that `cfg` asks for; the loss itself if it asks for none.
+
+    Args:
+        maps: the mirror image of all that the networks of `loss` read, and of "action".
+
+    Raises:
+        ValueError: if a map is missing.
+    """
+    if cfg.symmetry == "none":
+        return loss
+    actor: Any = loss.actor_network
+    critic = loss.critic_network
+    read = dict.fromkeys([*actor.in_keys, *critic.in_keys, "action"])
+    missing = [key for key in read if key not in (maps or {})]
+    if missing:
+        raise ValueError(f"symmetry={cfg.symmetry!r} needs the mirror image of {missing}: add it to the maps")
+    mirror = SymmetricAugmentation(maps or {}, device=device)
+    if cfg.symmetry == "augment":
+        return with_augmentation(loss, mirror)
+    return with_mirror_loss(loss, actor, mirror, coeff=cfg.symmetry_coeff)
 
 
 def make_optimizer(cfg: PPOCfg, *modules: nn.Module) -> torch.optim.Adam:
@@ -70,7 +114,7 @@ def load_optimizer_state_(optimizer: torch.optim.Optimizer, state_dict: dict[str
 
 
 def ppo_step(
-    loss: Callable[[TensorDictBase], TensorDictBase],
+    loss: Loss,
     optimizer: torch.optim.Optimizer,
     minibatch_B: TensorDictBase,
     *,

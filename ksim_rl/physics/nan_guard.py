@@ -110,6 +110,10 @@ class NanGuard:
             torch.where(fails_E.view(-1, *[1] * (field.ndim - 1)), field, kept, out=kept)
         self._failed_E.masked_fill_(fails_E, _KEPT)
 
+    def count(self) -> Tensor:
+        """Return the number of worlds that failed since the last report, [] on the device."""
+        return (self._failed_E != _WATCHED).sum()
+
     def report(self) -> NanReport:
         """Write the worlds that failed since the last report, and watch them again; reads the device."""
         worlds = tuple(int(world) for world in (self._failed_E != _WATCHED).nonzero().flatten().cpu())

@@ -2,10 +2,12 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import mujoco_warp as mjw
 import torch
 import warp as wp
+from torch import Tensor
 
 from ksim_rl.physics import kernels
 
@@ -63,7 +65,7 @@ class OverflowReport:
 
 
 class OverflowRecord:
-    """Sticky overflow bits and running maxima on the device; `read` is the only transfer to the host."""
+    """Sticky overflow bits and running maxima on the device, which `counts` sums up there."""
 
     def __init__(self, warp_data_E: mjw.Data) -> None:
         self._warp_data_E = warp_data_E
@@ -91,11 +93,14 @@ class OverflowRecord:
         self.most_nefc_E.zero_()
         self.most_pool.zero_()
 
-    def read(self) -> OverflowReport:
-        """Copy one small tensor to the host, and say what it means."""
+    def counts(self) -> Tensor:
+        """Return the period in whole numbers on the device, [N]: worlds by bit, most rows, most contacts and pairs."""
         bits = torch.arange(len(BIT_NAMES), device=self.sticky_E.device, dtype=torch.int32)
-        counts = ((self.sticky_E[:, None] >> bits) & 1).sum(0)
-        numbers = torch.cat([counts, self.most_nefc_E.max().view(1), self.most_pool]).tolist()
+        worlds = ((self.sticky_E[:, None] >> bits) & 1).sum(0)
+        return torch.cat([worlds, self.most_nefc_E.max().view(1), self.most_pool])
+
+    def explain(self, numbers: Sequence[int]) -> OverflowReport:
+        """Say what `counts`, read on the host, mean."""
         d = self._warp_data_E
         worlds = dict(zip(BIT_NAMES, numbers, strict=False))
         nefc, ncon = numbers[len(BIT_NAMES)], max(numbers[len(BIT_NAMES) + 1 :])

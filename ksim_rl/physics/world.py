@@ -230,10 +230,24 @@ class World(views.DataViews):
 
     def overflow_report(self, *, clear: bool = True) -> OverflowReport:
         """Read what the physics needed since the last report; one transfer to the host. Call it once per rollout."""
-        report = self._overflow.read()
+        return self.explain_overflow(self.overflow_counts(clear=clear).tolist())
+
+    def overflow_counts(self, *, clear: bool = True) -> Tensor:
+        """Return what `explain_overflow` explains, whole numbers [N] on the device, without waiting for it."""
+        counts = self._overflow.counts()
         if clear:
             self._overflow.clear()
-        return report
+        return counts
+
+    def explain_overflow(self, numbers: Sequence[int]) -> OverflowReport:
+        """Make the report of `overflow_counts` that were read on the host."""
+        return self._overflow.explain(numbers)
+
+    def nan_count(self) -> Tensor:
+        """Return how many worlds became non-finite since the last `nan_report`, [] on the device; 0 without a guard."""
+        if self._nan_guard is None:
+            return torch.zeros((), dtype=torch.int64, device=self.device)
+        return self._nan_guard.count()
 
     def nan_report(self) -> NanReport:
         """Write the worlds that became non-finite since the last report to files; reads the device.

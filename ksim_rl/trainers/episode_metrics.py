@@ -1,4 +1,4 @@
-"""What the env says about episodes and physics, as metrics."""
+"""What the env says about episodes, as metrics."""
 
 from collections.abc import Mapping
 
@@ -52,20 +52,3 @@ def episode_means(sums: Mapping[str, float], *, max_episode_length_s: float) -> 
         elif room in ("termination", "metric"):
             metrics[f"{room}/{term}"] = total / episodes
     return metrics
-
-
-def overflow_report(env: EnvBase) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return the physics' own metrics and what it lost, one line each; reads the device once."""
-    world = getattr(innermost(env), "world", None)
-    if world is None or not hasattr(world, "overflow_report"):
-        return {}, ()
-    report = world.overflow_report()
-    return {f"physics/{name}": value for name, value in report.metrics.items()}, tuple(report.messages)
-
-
-def nan_messages(env: EnvBase) -> tuple[str, ...]:
-    """Return what the physics' NaN guard saved since the last call, one line each; reads the device if it is on."""
-    world = getattr(innermost(env), "world", None)
-    if world is None or not hasattr(world, "nan_report"):
-        return ()
-    return world.nan_report().messages

@@ -10,14 +10,17 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl.data import DatasetBuffer, DatasetCfg
+from ksim_rl.envs.mirror_maps import mirror_maps
+from ksim_rl.envs.transforms import MirrorMap
 from ksim_rl.modules import update_normalizers
 from ksim_rl.objectives import (
     PPOCfg,
     StepGuard,
     load_optimizer_state_,
-    make_gae,
+    make_advantage,
     make_loss,
     make_optimizer,
+    make_symmetric,
     ppo_step,
 )
 from ksim_rl.physics.capture import Captured
@@ -29,6 +32,7 @@ from ksim_rl.trainers.run_cfg import RunCfg
 LOGGED = {
     "loss_objective": "loss/policy",
     "loss_critic": "loss/value",
+    "loss_mirror": "loss/mirror",
     "entropy": "loss/entropy",
     "kl": "update/kl",
     "clip_fraction": "update/clip_fraction",
@@ -41,6 +45,7 @@ def make_ppo_update(cfg: RunCfg, env: EnvBase) -> "PPOUpdate":
     """Build the PPO update of a run."""
     assert isinstance(cfg.objective, PPOCfg)
     actor, critic = build_networks(cfg, env)
+    read = list(dict.fromkeys((*actor.in_keys, *critic.in_keys)))
     return PPOUpdate(
         cfg.objective,
         actor=actor,
@@ -48,6 +53,7 @@ def make_ppo_update(cfg: RunCfg, env: EnvBase) -> "PPOUpdate":
         data=cfg.data,
         seed=cfg.seed,
         device=cfg.resolved_device(),
+        mirror=mirror_maps(env, read) if cfg.objective.symmetry != "none" else None,
     )
 
 
@@ -70,6 +76,7 @@ class PPOUpdate:
         data: sizes of dataset and minibatch.
         seed: of the order of the env states in the minibatches.
         device: where all of it lives.
+        mirror: the mirror images of what the networks read and of the action, for `cfg.symmetry`.
     """
 
     def __init__(
@@ -81,11 +88,13 @@ class PPOUpdate:
         data: DatasetCfg,
         seed: int = 0,
         device: torch.device | str = "cpu",
+        mirror: Mapping[Any, MirrorMap] | None = None,
     ) -> None:
         self.cfg, self.actor, self.critic = cfg, actor, critic
         self.device = torch.device(device)
-        self.advantage = make_gae(cfg, critic)
+        self.advantage = make_advantage(cfg, actor, critic)
         self.loss = make_loss(cfg, actor, critic)
+        self._losses = make_symmetric(cfg, self.loss, mirror, device=self.device)
         self.optimizer = make_optimizer(cfg, actor, critic)
         self.dataset = DatasetBuffer(data, keys=self.loss.dataset_keys, seed=seed, device=self.device)
         self.guard = StepGuard(device=self.device)
@@ -145,13 +154,21 @@ class PPOUpdate:
         rollout_ET = self.advantage(self._rollout_ET)
         self._std.copy_(rollout_ET.get("scale").mean())
         self.dataset.extend(rollout_ET)
-        for _ in range(self.cfg.num_epochs):
+        for epoch in range(self.cfg.num_epochs):
+            if epoch > 0 and self.cfg.estimates_each_epoch:
+                self._estimate_anew(rollout_ET)
             for minibatch_B in self.dataset.epoch():
                 self._measure(
-                    ppo_step(self.loss, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard)
+                    ppo_step(self._losses, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard)
                 )
         # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
         update_normalizers(rollout_ET, self.actor, self.critic)
+
+    def _estimate_anew(self, rollout_ET: TensorDictBase) -> None:
+        # The rows that are not finite were counted with the first estimate.
+        count = self.dataset.non_finite_count.clone()
+        self.dataset.extend(self.advantage(rollout_ET))
+        self.dataset.non_finite_count.copy_(count)
 
     def _measure(self, step: Mapping[str, Tensor]) -> None:
         made = step["skipped"] == 0.0

@@ -7,7 +7,7 @@ import torch
 
 from ksim_rl.data import DatasetBuffer, DatasetCfg
 from ksim_rl.modules import update_normalizers
-from ksim_rl.objectives import PPOCfg, StepGuard, make_gae, make_loss, make_optimizer, ppo_step
+from ksim_rl.objectives import PPOCfg, StepGuard, make_advantage, make_loss, make_optimizer, ppo_step
 from ksim_rl.physics.capture import Captured
 from tests.gpu.no_syncs import no_syncs
 from tests.objectives.problems import networks, rollout
@@ -21,7 +21,7 @@ class _Update:
         self.actor, self.critic, self.data = copy.deepcopy(actor), copy.deepcopy(critic), data.clone()
         self.loss = make_loss(CFG, self.actor, self.critic)
         self.optimizer = make_optimizer(CFG, self.actor, self.critic)
-        self.gae = make_gae(CFG, self.critic)
+        self.gae = make_advantage(CFG, self.actor, self.critic)
         sizes = DatasetCfg(num_env_states_per_minibatch=128, num_minibatches=4)
         self.dataset = DatasetBuffer(sizes, keys=self.loss.dataset_keys)
         self.guard = StepGuard(device="cuda")

@@ -49,7 +49,7 @@ def test_samples_by_default_and_is_deterministic_on_request():
 
 def test_in_key_and_action_spec():
     spec = Bounded(low=-1.0, high=1.0, shape=(4, 2))
-    actor = make_actor(CFGS[0], obs_dim=5, action_dim=2, in_key=("obs", "policy"), action_spec=spec)
+    actor = make_actor(ActorCfg(in_keys=(("obs", "policy"),)), obs_dim=5, action_spec=spec)
     data = TensorDict({"obs": {"policy": torch.randn(4, 5)}}, [4])
     assert actor(data)["action"].shape == (4, 2)
     assert actor.in_keys == [("obs", "policy")]

@@ -20,7 +20,7 @@ def test_writes_state_value(shape, obs_normalization):
 
 
 def test_reads_the_key_it_is_given():
-    critic = make_critic(CriticCfg(hidden_dims=(8,)), obs_dim=5, in_key="privileged")
+    critic = make_critic(CriticCfg(hidden_dims=(8,), in_keys=("privileged",)), obs_dim=5)
     assert critic.in_keys == ["privileged"]
 
 

@@ -11,7 +11,7 @@ from ksim_rl.objectives import (
     PPOCfg,
     StepGuard,
     load_optimizer_state_,
-    make_gae,
+    make_advantage,
     make_loss,
     make_optimizer,
     ppo_step,
@@ -140,7 +140,7 @@ def test_a_whole_update_makes_no_host_sync(normalize_advantage):
     actor, critic, loss, optimizer = _parts(cfg)
     sizes = DatasetCfg(num_env_states_per_minibatch=12, num_minibatches=4)
     dataset = DatasetBuffer(sizes, keys=loss.dataset_keys)
-    parts = (actor, critic, loss, optimizer, make_gae(cfg, critic))
+    parts = (actor, critic, loss, optimizer, make_advantage(cfg, actor, critic))
     data, guard = rollout(actor), StepGuard()
     with count_syncs() as syncs:
         _update(cfg, parts, dataset, data.clone(), guard)
@@ -161,7 +161,7 @@ def test_learns_an_action_that_depends_on_the_state():
     dataset = DatasetBuffer(
         DatasetCfg(num_env_states_per_minibatch=256, num_minibatches=2), keys=loss.dataset_keys
     )
-    parts, guard = (actor, critic, loss, optimizer, make_gae(cfg, critic)), StepGuard()
+    parts, guard = (actor, critic, loss, optimizer, make_advantage(cfg, actor, critic)), StepGuard()
 
     def collect():
         obs = torch.randint(0, 2, (256, 2, 1)) * 2.0 - 1.0

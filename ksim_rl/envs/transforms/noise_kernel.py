@@ -1,8 +1,6 @@
 """Noise on all observations of a transform as one kernel, which is also a torch operator.
 
-Each column's draws are a hash of (seed, stream, counter, row, column), with the hash of `ksim_rl.random`. A normal is
-the inverse of the normal distribution's cumulative function at a uniform (Giles, "Approximating the erfinv function",
-2010): one hash per number and no branch, so that the CPU's compiler turns a row into vector instructions.
+Each column's draws are those of `ksim_rl.random` at (seed, stream, counter, row, column).
 """
 
 from typing import NamedTuple
@@ -11,7 +9,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ksim_rl.physics.streams import warp_scope
+from ksim_rl.physics.quick_launch import QuickLaunch, address
+from ksim_rl.random import DRAWS
 
 GAUSSIAN, MULTIPLY, BIAS_GAUSSIAN, BIAS_MULTIPLY, BY_LEVEL, HOLD = (1 << bit for bit in range(6))
 """What a column's flags say; the bits above them are the number of its observation."""
@@ -44,64 +43,8 @@ _COLUMNS = r"""
     const float levelled = enabled * *(const float*)level_;
     const bool resets = mode == 2;
 
-    const unsigned golden = 0x9E3779B9u;
-    auto mix = [](unsigned x) {
-        x = (x ^ (x >> 16)) * 0x21F0AAADu;
-        x = (x ^ (x >> 15)) * 0xD35A2D97u;
-        return x ^ (x >> 15);
-    };
-    const unsigned low = (unsigned)count, high = (unsigned)((unsigned long long)count >> 32);
-    const unsigned base = mix((unsigned)(seed ^ (seed >> 32)) ^ stream);
-    const unsigned first_key = mix(base + low * golden) ^ mix((unsigned)row + high + 1u);
-    const unsigned second_key = mix(first_key + (unsigned)row * golden + golden) ^ mix(low + stream);
-    const unsigned first = mix(first_key), second = mix(second_key);
-    auto bits = [=](unsigned index) { return mix(mix(first ^ ((index + 1u) * golden)) ^ second); };
-
-    auto unit = [](unsigned b) { return (float)(b >> 8) * 5.9604644775390625e-08f; };
-    auto normal = [](unsigned b) {
-        const float x = ((float)((int)(b >> 8) - 8388608) + 0.5f) * 1.1920928955078125e-07f;
-        const float t = (1.0f - x) * (1.0f + x);
-        unsigned word;
-        memcpy(&word, &t, 4);
-        int exponent = (int)(word >> 23) - 127;
-        word = (word & 0x7FFFFFu) | 0x3F800000u;
-        float mantissa;
-        memcpy(&mantissa, &word, 4);
-        const bool is_large = mantissa > 1.41421356f;
-        exponent += is_large;
-        const float f = (is_large ? 0.5f * mantissa : mantissa) - 1.0f;
-        float s = 7.0376836292e-2f;
-        s = s * f - 1.1514610310e-1f;
-        s = s * f + 1.1676998740e-1f;
-        s = s * f - 1.2420140846e-1f;
-        s = s * f + 1.4249322787e-1f;
-        s = s * f - 1.6668057665e-1f;
-        s = s * f + 2.0000714765e-1f;
-        s = s * f - 2.4999993993e-1f;
-        s = s * f + 3.3333331174e-1f;
-        const float w = -(f + f * f * (s * f - 0.5f) + (float)exponent * 0.693147180559945f);
-        const float c = w - 2.5f;
-        float p = 2.81022636e-08f;
-        p = p * c + 3.43273939e-07f;
-        p = p * c - 3.5233877e-06f;
-        p = p * c - 4.39150654e-06f;
-        p = p * c + 2.1858087e-04f;
-        p = p * c - 1.25372503e-03f;
-        p = p * c - 4.17768164e-03f;
-        p = p * c + 2.46640727e-01f;
-        p = p * c + 1.50140941f;
-        const float d = sqrtf(w < 5.0f ? 5.0f : w) - 3.0f;
-        float q = -2.00214257e-04f;
-        q = q * d + 1.00950558e-04f;
-        q = q * d + 1.34934322e-03f;
-        q = q * d - 3.67342844e-03f;
-        q = q * d + 5.73950773e-03f;
-        q = q * d - 7.6224613e-03f;
-        q = q * d + 9.43887047e-03f;
-        q = q * d + 1.00167406f;
-        q = q * d + 2.83297682f;
-        return 1.41421356237f * x * (w < 5.0f ? p : q);
-    };
+    const RowKey key = key_of(seed, stream, count, row);
+    auto bits = [=](unsigned index) { return bits_of(key, index); };
     auto sample = [&](int i, unsigned index, int parameter, bool is_normal, int features) {
         const unsigned b = bits(index);
         const float u = unit(b), z = features & 16 ? normal(b) : u;
@@ -153,8 +96,8 @@ _COLUMNS = r"""
 """
 
 
-# Addresses instead of arrays: wrapping ten tensors takes longer than the launch itself.
-@wp.func_native(_COLUMNS)
+# Addresses instead of arrays: see `QuickLaunch`.
+@wp.func_native(DRAWS + _COLUMNS)
 def _columns(
     row: int,
     begin: int,
@@ -179,7 +122,7 @@ def _columns(
 ): ...
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, grid_stride=False)
 def _apply_noise(
     width: int,
     n: int,
@@ -224,6 +167,9 @@ def _apply_noise(
         last,
         out,
     )
+
+
+_quick = QuickLaunch(_apply_noise)
 
 
 class NoiseState(NamedTuple):
@@ -318,9 +264,8 @@ def _launch(
         last_EL,
         out_EL,
     )
-    inputs = [width, num_columns, moment, features, stream, counter.ndim, *(_address(t) for t in tensors)]
-    with warp_scope(device):
-        wp.launch(_apply_noise, (num_rows, -(-num_columns // width)), inputs=inputs, device=str(device))
+    layout = width, num_columns, moment, features, stream, counter.ndim
+    _quick(device, (num_rows, -(-num_columns // width)), (*layout, *map(address, tensors)))
     return out_EL
 
 
@@ -330,7 +275,3 @@ _noise = torch.library.custom_op("ksim_rl::noise", _launch, mutates_args=("bias_
 @_noise.register_fake
 def _(clean_EL: Tensor, *others: object) -> Tensor:
     return clean_EL.new_empty(clean_EL.shape)
-
-
-def _address(tensor: Tensor | None) -> int:
-    return 0 if tensor is None else tensor.data_ptr()

@@ -9,12 +9,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ksim_rl.physics.streams import warp_scope
+from ksim_rl.physics.quick_launch import QuickLaunch, address
 
-# Rows of the ring are bytes, so that one kernel serves every dtype.
+# Rows of the ring are bytes, so that one kernel serves every dtype; a thread of the GPU copies one word of 16, 4 or 1.
 _COPY = r"""
-    const long long now = *(const long long*)clock_;
-    const int slot = (int)(now % num_slots);
+    struct alignas(16) Wide { unsigned word[4]; };
+    const unsigned long long now = *(const unsigned long long*)clock_;
+    // Whole numbers of 32 bits divide much faster.
+    const int slot = now >> 32 ? (int)(now % (unsigned)num_slots) : (int)((unsigned)now % (unsigned)num_slots);
     const bool resets = mask_ != 0;
     const bool begins = resets && ((const unsigned char*)mask_)[row];
     unsigned char* ring = (unsigned char*)ring_ + (long long)row * num_slots * num_bytes + part * width;
@@ -23,12 +25,13 @@ _COPY = r"""
     long long* start = (long long*)start_ + row;
 
     auto copy = [=](unsigned char* to, const unsigned char* from) {
-        if (width == 4) *(unsigned*)to = *(const unsigned*)from;
+        if (width == 16) *(Wide*)to = *(const Wide*)from;
+        else if (width == 4) *(unsigned*)to = *(const unsigned*)from;
         else memcpy(to, from, width);
     };
     if (first_frame == 0 && (begins || !resets)) copy(ring + slot * num_bytes, value);
-    if (begins && first_frame == 0 && part == 0) *start = now;
-    const long long age = resets ? 0 : now - *start;
+    if (begins && first_frame == 0 && part == 0) *start = (long long)now;
+    const long long age = resets ? 0 : (long long)now - *start;
     for (int frame = first_frame; frame < end_frame; ++frame) {
         long long lag = 0;
         if (!resets) {
@@ -65,7 +68,7 @@ def _copy(
 ): ...
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, grid_stride=False)
 def _push_and_read(
     frames_per_thread: int,
     width: int,
@@ -105,6 +108,9 @@ def _push_and_read(
         ring,
         out,
     )
+
+
+_quick = QuickLaunch(_push_and_read)
 
 
 def push_and_read(ring_EM: Tensor, start_E: Tensor, clock: Tensor, value_E: Tensor, lag_EN: Tensor) -> Tensor:
@@ -152,20 +158,17 @@ def _launch(
     out_EN = value_E.new_empty((value_E.shape[0], num_frames, *value_E.shape[1:]))
     num_bytes = value_E.shape[1:].numel() * value_E.element_size()
     value_stride = value_E.stride(0) * value_E.element_size()
-    # A thread copies one word on the GPU, and all of an env on the CPU.
+    # A thread copies one word of one frame on the GPU, and all of an env on the CPU.
+    addresses = [address(t) for t in (clock, start_E, lag_EN, mask_E, value_E, ring_EM, out_EN)]
     if device.type == "cpu":
         frames_per_thread, width = num_frames, num_bytes
     else:
-        is_aligned = num_bytes % 4 == 0 and value_stride % 4 == 0 and value_E.data_ptr() % 4 == 0
-        frames_per_thread, width = 1, 4 if is_aligned else 1
+        bits = num_bytes | value_stride | addresses[-3]
+        frames_per_thread, width = 1, 16 if bits % 16 == 0 else 4 if bits % 4 == 0 else 1
     row_stride, frame_stride = (0, 0) if lag_EN is None else lag_EN.stride()
-    tensors = (clock, start_E, lag_EN, mask_E, value_E, ring_EM, out_EN)
-    addresses = [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
-    layout = [frames_per_thread, width, num_bytes, value_stride]
-    inputs = [*layout, ring_EM.shape[1], num_frames, row_stride, frame_stride, *addresses]
-    with warp_scope(device):
-        dim = (value_E.shape[0], num_frames // frames_per_thread, num_bytes // max(width, 1))
-        wp.launch(_push_and_read, dim, inputs=inputs, device=str(device))
+    layout = frames_per_thread, width, num_bytes, value_stride, ring_EM.shape[1], num_frames
+    dim = (value_E.shape[0], num_frames // frames_per_thread, num_bytes // max(width, 1))
+    _quick(device, dim, (*layout, row_stride, frame_stride, *addresses))
     return out_EN
 
 

@@ -1,0 +1,121 @@
+"""Prioritized sampling on the device."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchrl.data.replay_buffers import Sampler
+from torchrl.data.replay_buffers.storages import Storage
+
+from ksim_rl.checks import check_in_range
+from ksim_rl.data.replay_storage import ReplayStorage
+
+
+class PrioritySampler(Sampler):
+    """Draws what is stored in proportion to (priority + eps)^alpha (Schaul et al., arXiv 1511.05952), with replacement.
+
+    A stand-in for TorchRL's `PrioritizedSampler` in any replay buffer, with the same probabilities, weights and default
+    priority, which is the highest so far. It has no tree: the cumulative sum over all priorities, in float64, and a
+    binary search per draw are a few kernels, make no host sync and can be captured in a CUDA graph. The draws are
+    stratified: one falls in each of B equal shares of the sum, as in the paper's appendix.
+
+    The info dict has `priority_weight` [B]: (P(i) / min_j P(j))^-beta, at most 1.
+
+    Args:
+        max_capacity: of the storage.
+        alpha: 0 is uniform.
+        beta: 1 undoes the priorities wholly.
+        eps: added to each priority, so that none is zero.
+        device: where the storage lives.
+    """
+
+    def __init__(
+        self,
+        max_capacity: int,
+        *,
+        alpha: float = 0.6,
+        beta: float = 0.4,
+        eps: float = 1e-8,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        check_in_range("alpha", alpha, low=0.0)
+        check_in_range("beta", beta, low=0.0)
+        check_in_range("eps", eps, low=0.0, low_open=True)
+        self.alpha, self.beta, self.eps = alpha, beta, eps
+        self._priority_N = torch.zeros(max_capacity, device=device)
+        self._highest = torch.zeros((), device=device)
+
+    @torch.no_grad()
+    def extend(self, index: Any, **_: Any) -> None:
+        """Give new entries the highest priority so far, 1 at the start."""
+        default = torch.where(self._highest > 0.0, self._highest, 1.0)
+        index_N = torch.as_tensor(index, device=self._priority_N.device).reshape(-1)
+        self._priority_N[index_N] = default.expand(index_N.shape[0])
+
+    add = extend
+
+    @torch.no_grad()
+    def update_priority(
+        self, index: Any, priority: float | Tensor, *, storage: Storage | None = None, **_: Any
+    ) -> None:
+        """Set priorities [B] or [] of entries [B]; of an index that occurs twice the highest counts.
+
+        One that is not finite is taken as the highest so far.
+        """
+        device = self._priority_N.device
+        index_B = torch.as_tensor(index, device=device).reshape(-1)
+        priority_B = torch.as_tensor(priority, dtype=torch.float32, device=device).reshape(-1)
+        priority_B = priority_B.expand(index_B.shape[0])
+        priority_B = torch.where(priority_B.isfinite(), priority_B, self._highest)
+        self._highest.copy_(torch.maximum(self._highest, priority_B.amax()))
+        self._priority_N.scatter_reduce_(0, index_B, priority_B, "amax", include_self=False)
+
+    mark_update = update_priority
+
+    @torch.no_grad()
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
+        """Return indices [B] and their weights."""
+        score_N = self._scores(storage)
+        upto_N = score_N.cumsum(0)
+        device = upto_N.device
+        share_B = torch.arange(batch_size, dtype=torch.float64, device=device)
+        share_B = (share_B + torch.rand(batch_size, dtype=torch.float64, device=device)) / batch_size
+        # Rounding could lead past the last entry that has a score.
+        last = (score_N > 0.0).to(torch.int64).mul_(torch.arange(score_N.shape[0], device=device)).amax()
+        index_B = torch.searchsorted(upto_N, share_B * upto_N[-1], right=True)
+        index_B = torch.minimum(index_B, last)
+        lowest = torch.where(score_N > 0.0, score_N, torch.inf).amin()
+        weight_B = (score_N[index_B] / lowest).pow(-self.beta).to(torch.float32)
+        return index_B, {"priority_weight": weight_B}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the priorities."""
+        return {"priority": self._priority_N, "highest": self._highest}
+
+    @torch.no_grad()
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue where `state_dict` was taken; tensors keep their addresses."""
+        self._priority_N.copy_(state_dict["priority"])
+        self._highest.copy_(state_dict["highest"])
+
+    def dumps(self, path: Any) -> None:
+        """Refuse: the priorities are saved by the `state_dict`."""
+        raise NotImplementedError("priorities are saved by their state_dict()")
+
+    def loads(self, path: Any) -> None:
+        """Refuse: the priorities are restored by `load_state_dict`."""
+        raise NotImplementedError("priorities are restored by load_state_dict()")
+
+    def _empty(self) -> None:
+        self._priority_N.zero_()
+        self._highest.zero_()
+
+    def _scores(self, storage: Storage) -> Tensor:
+        """Return (priority + eps)^alpha of what is stored and 0 elsewhere, float64 [N]."""
+        score_N = (self._priority_N.to(torch.float64) + self.eps).pow(self.alpha)
+        if isinstance(storage, ReplayStorage):
+            return torch.where(storage.available, score_N, 0.0)
+        length = len(storage)  # type: ignore[arg-type]
+        if length == 0:
+            raise RuntimeError("the replay buffer is empty: extend it before sampling")
+        return score_N[:length]

@@ -1,0 +1,62 @@
+"""The settings of a policy network."""
+
+from dataclasses import dataclass
+
+from ksim_rl.checks import check_choice, check_in_range, check_pair
+from ksim_rl.modules.mlp import check_network
+from ksim_rl.modules.observation_keys import ObservationKey, checked_keys
+
+STD_TYPES = ("scalar", "log")
+DISTRIBUTIONS = ("gaussian", "tanh_gaussian", "truncated_gaussian", "categorical")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActorCfg:
+    """The policy network.
+
+    Attributes:
+        in_keys: the observation groups that it reads, side by side; a list names a nested key.
+        hidden_dims: widths of the hidden layers.
+        activation: one of `ksim_rl.modules.ACTIVATIONS`.
+        obs_normalization: normalize observations by running statistics inside the network.
+        distribution: of continuous actions: "gaussian", or within bounds "tanh_gaussian" or "truncated_gaussian".
+            "categorical" where all actions are discrete; beside continuous ones, discrete ones always are.
+        action_range: (low, high) of the bounded distributions; None takes the finite bounds of the action spec.
+        init_std: standard deviation of each action at the start, in units of the action; of the bounded distributions
+            in units of half the range, before the tanh or the truncation.
+        std_type: "scalar" learns the standard deviation itself, "log" its logarithm.
+        state_dependent_std: predict the standard deviation from the state instead of learning one per action.
+        output_gain: scale of the last layer's weights. Small, so that the first policy acts around zero (the
+            default pose of a robot), or the center of the range, in every state.
+    """
+
+    in_keys: tuple[ObservationKey, ...] = ("actor",)
+    hidden_dims: tuple[int, ...] = (512, 256, 128)
+    activation: str = "elu"
+    obs_normalization: bool = True
+    distribution: str = "gaussian"
+    action_range: tuple[float, float] | None = None
+    init_std: float = 1.0
+    std_type: str = "scalar"
+    state_dependent_std: bool = False
+    output_gain: float = 0.01
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, naming the field."""
+        object.__setattr__(self, "in_keys", checked_keys(self.in_keys))
+        object.__setattr__(self, "hidden_dims", tuple(self.hidden_dims))
+        check_network(self.hidden_dims, self.activation)
+        check_choice("distribution", self.distribution, DISTRIBUTIONS)
+        if self.action_range is not None:
+            check_pair("action_range", self.action_range)
+            object.__setattr__(self, "action_range", tuple(self.action_range))
+            if self.action_range[0] == self.action_range[1]:
+                raise ValueError(f"action_range={self.action_range!r}: expected low < high")
+            if self.distribution not in ("tanh_gaussian", "truncated_gaussian"):
+                raise ValueError(
+                    f"action_range={self.action_range!r} does nothing with distribution={self.distribution!r}: "
+                    "use 'tanh_gaussian' or 'truncated_gaussian', or leave it out"
+                )
+        check_in_range("init_std", self.init_std, low=0.0, low_open=True)
+        check_choice("std_type", self.std_type, STD_TYPES)
+        check_in_range("output_gain", self.output_gain, low=0.0)

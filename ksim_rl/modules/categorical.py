@@ -1,0 +1,129 @@
+"""Discrete choices, one or several at once, free of host syncs."""
+
+from collections.abc import Iterable, Sequence
+from functools import reduce
+from operator import add
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, constraints, register_kl
+from torch.nn import functional
+
+
+class Categorical(Distribution):
+    """One choice among N, or several independent ones, as indices or one-hot.
+
+    It equals `torch.distributions.Categorical`, whose argument checks and sampling through `torch.multinomial` can
+    wait for the device. Samples are drawn by the largest of the logits plus Gumbel noise (Maddison et al.,
+    arXiv 1411.0030) from torch's default generator of the device.
+
+    Args:
+        logits: unnormalized log-probabilities [..., N]; those of several choices stand side by side.
+        sizes: number of options of each of K choices, which sum to N; None is one choice. Samples are [...] for None
+            and [..., K] otherwise.
+        one_hot: samples mark the options instead, [..., N].
+        dtype: of samples; None is int64, or bool where one-hot. What the action spec has.
+    """
+
+    arg_constraints = {"logits": constraints.real_vector}  # type: ignore[assignment]
+    has_rsample = False
+
+    def __init__(
+        self,
+        logits: Tensor,
+        sizes: Sequence[int] | None = None,
+        one_hot: bool = False,
+        dtype: torch.dtype | None = None,
+        validate_args: bool | None = None,
+    ) -> None:
+        if sizes is not None and sum(sizes) != logits.shape[-1]:
+            raise ValueError(f"sizes={tuple(sizes)}: they must sum to the {logits.shape[-1]} logits")
+        self.logits = logits
+        self.sizes = None if sizes is None else tuple(sizes)
+        self.one_hot = one_hot
+        self.dtype = dtype or (torch.bool if one_hot else torch.int64)
+        parts = logits.split(list(self.sizes or logits.shape[-1:]), -1)
+        smallest = torch.finfo(logits.dtype).min
+        # An option that a logit of minus infinity rules out has probability zero: a finite logarithm keeps it no NaN.
+        self._log_probs = [functional.log_softmax(part, -1).clamp_min(smallest) for part in parts]
+        event = logits.shape[-1:] if one_hot else torch.Size(() if self.sizes is None else (len(parts),))
+        # Argument checks compare all values and read the answer on the host.
+        super().__init__(logits.shape[:-1], event, validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint:  # type: ignore[override]
+        """Indices below the number of options, or marks of 0 and 1."""
+        if self.one_hot:
+            return constraints.independent(constraints.boolean, 1)
+        if self.sizes is None:
+            return constraints.integer_interval(0, self.logits.shape[-1] - 1)
+        return constraints.independent(constraints.integer_interval(0, max(self.sizes) - 1), 1)
+
+    @property
+    def probs(self) -> Tensor:
+        """The probabilities [..., N]; those of each choice sum to 1."""
+        return torch.cat([log_probs.exp() for log_probs in self._log_probs], -1)
+
+    @property
+    def mode(self) -> Tensor:
+        """The most likely option of each choice."""
+        return self._as_value([log_probs.argmax(-1) for log_probs in self._log_probs])
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """What TorchRL takes under `ExplorationType.DETERMINISTIC`: the mode."""
+        return self.mode
+
+    def expand(self, batch_shape: Any, _instance: Any = None) -> "Categorical":
+        """Return the distribution with a larger batch shape."""
+        logits = self.logits.expand(torch.Size(batch_shape) + self.logits.shape[-1:])
+        return Categorical(logits, self.sizes, self.one_hot, self.dtype)
+
+    def sample(self, sample_shape: Any = ()) -> Tensor:
+        """Draw the options, sample_shape + batch shape + event shape."""
+        chosen = []
+        with torch.no_grad():
+            for log_probs in self._log_probs:
+                shape = torch.Size(sample_shape) + log_probs.shape
+                waiting = torch.empty(shape, dtype=log_probs.dtype, device=log_probs.device).exponential_()
+                chosen.append((log_probs - waiting.log()).argmax(-1))
+        return self._as_value(chosen)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log probability of `value`, summed over the choices, shape [...]."""
+        return _sum(
+            log_probs.expand(*index.shape, -1).gather(-1, index.unsqueeze(-1)).squeeze(-1)
+            for log_probs, index in zip(self._log_probs, self._as_indices(value), strict=True)
+        )
+
+    def entropy(self) -> Tensor:
+        """Return the entropy in nats, summed over the choices, shape [...]."""
+        return _sum(-(log_probs.exp() * log_probs).sum(-1) for log_probs in self._log_probs)
+
+    def _as_value(self, indices: Sequence[Tensor]) -> Tensor:
+        if self.one_hot:
+            # torch's one_hot() asks the host whether all indices are in range.
+            marks = [
+                index.unsqueeze(-1) == torch.arange(log_probs.shape[-1], device=index.device)
+                for index, log_probs in zip(indices, self._log_probs, strict=True)
+            ]
+            return torch.cat(marks, -1).to(self.dtype)
+        value = indices[0] if self.sizes is None else torch.stack(tuple(indices), -1)
+        return value.to(self.dtype)
+
+    def _as_indices(self, value: Tensor) -> list[Tensor]:
+        if self.one_hot:
+            widths = [log_probs.shape[-1] for log_probs in self._log_probs]
+            return [marks.to(torch.uint8).argmax(-1) for marks in value.split(widths, -1)]
+        return [value.long()] if self.sizes is None else list(value.long().unbind(-1))
+
+
+@register_kl(Categorical, Categorical)
+def _kl(p: Categorical, q: Categorical) -> Tensor:
+    pairs = zip(p._log_probs, q._log_probs, strict=True)
+    return _sum((log_p.exp() * (log_p - log_q)).sum(-1) for log_p, log_q in pairs)
+
+
+def _sum(terms: Iterable[Tensor]) -> Tensor:
+    return reduce(add, terms)

@@ -1,0 +1,245 @@
+"""Memory for any network: a TensorDict module that turns observations into features of the episode so far."""
+
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torch.nn import functional
+from torchrl.data import Composite, Unbounded
+from torchrl.modules import recurrent_mode
+
+from ksim_rl.checks import check_choice
+from ksim_rl.modules.observation_normalizer import ObservationNormalizer
+from ksim_rl.modules.recurrent_cells import gru_layer, lstm_layer
+from ksim_rl.modules.recurrent_primer import RecurrentStatePrimer
+
+# What the state of each kind consists of, and how many gates it has.
+STATES = {"lstm": ("h", "c"), "gru": ("h",)}
+_NUM_GATES = {"lstm": 4, "gru": 3}
+STATE_KEY, FEATURE_KEY, RESET_KEY = "recurrent_state", "recurrent_features", "is_init"
+
+AnyModule = TypeVar("AnyModule", bound=TensorDictModuleBase)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecurrentCfg:
+    """The memory before a network.
+
+    Attributes:
+        kind: "lstm" or "gru".
+        hidden_dim: H, size of its state and of the features that the network reads.
+        num_layers: N, layers on top of each other.
+    """
+
+    kind: str = "lstm"
+    hidden_dim: int = 256
+    num_layers: int = 1
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, naming the field."""
+        check_choice("kind", self.kind, STATES)
+        for name in ("hidden_dim", "num_layers"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name}={value!r}: expected a whole number >= 1")
+
+
+class RecurrentNetwork(nn.Module):
+    """LSTM or GRU layers, time first; its parameters bear the names and shapes of `torch.nn.LSTM` and `torch.nn.GRU`.
+
+    Weights are orthogonal gate by gate, biases zero but for the LSTM's forget gate, whose bias is one (Jozefowicz et
+    al., "An empirical exploration of recurrent network architectures", 2015).
+
+    Attributes:
+        normalizer: an `ObservationNormalizer` before the first layer, or None.
+    """
+
+    def __init__(
+        self,
+        cfg: RecurrentCfg,
+        *,
+        obs_dim: int,
+        obs_normalization: bool = False,
+        device: torch.device | str | None = None,
+    ) -> None:
+        super().__init__()
+        self.cfg = cfg
+        self.normalizer = ObservationNormalizer(obs_dim, device=device) if obs_normalization else None
+        for layer in range(cfg.num_layers):
+            input_dim = cfg.hidden_dim if layer else obs_dim
+            for name, value in _layer_parameters(cfg, input_dim).items():
+                self.register_parameter(f"{name}_l{layer}", nn.Parameter(value.to(device)))
+
+    def forward(
+        self, obs_TB: Tensor, state_BN: tuple[Tensor, ...], reset_TB1: Tensor | None = None
+    ) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """Return the features [T, B, H], and the states after each step, each [T, B, N, H].
+
+        Args:
+            obs_TB: [T, B, L].
+            state_BN: before the first step: h (and c), each [B, N, H].
+            reset_TB1: bool [T, B, 1]: whether an episode begins at the step, from a state of zeros.
+        """
+        features_TB = obs_TB if self.normalizer is None else self.normalizer(obs_TB)
+        states_N: list[tuple[Tensor, ...]] = []
+        for layer in range(self.cfg.num_layers):
+            state_B = tuple(part_BN[:, layer] for part_BN in state_BN)
+            states_N.append(self._layer(layer, features_TB, state_B, reset_TB1))
+            features_TB = states_N[-1][0]
+        if len(states_N) == 1:
+            return features_TB, tuple(part_TB.unsqueeze(-2) for part_TB in states_N[0])
+        return features_TB, tuple(torch.stack(parts_N, -2) for parts_N in zip(*states_N, strict=True))
+
+    def _layer(
+        self, layer: int, features_TB: Tensor, state_B: tuple[Tensor, ...], reset_TB1: Tensor | None
+    ) -> tuple[Tensor, ...]:
+        weight_ih, weight_hh, bias_ih, bias_hh = (
+            self.get_parameter(f"{name}_l{layer}")
+            for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+        )
+        if self.cfg.kind == "lstm":
+            gates_TB = functional.linear(features_TB, weight_ih, bias_ih + bias_hh)
+            return lstm_layer(gates_TB, weight_hh, state_B, reset_TB1)
+        gates_TB = functional.linear(features_TB, weight_ih, bias_ih)
+        return gru_layer(gates_TB, weight_hh, bias_hh, state_B, reset_TB1)
+
+
+class RecurrentModule(TensorDictModule):
+    """A `RecurrentNetwork` on TensorDicts, by TorchRL's conventions; a drop-in for its `LSTMModule` and `GRUModule`.
+
+    Reads `in_key` [*batch, L], `is_init` and the state under ("recurrent_state", name, "h") and, for an LSTM, "c", each
+    [*batch, N, H]; writes the features [*batch, H] and, under "next", the state after the step.
+
+    By default every element of the batch is one step. Under TorchRL's `set_recurrent_mode(True)`, where its and our
+    losses run, the batch is [B, T]: sequences, of which only the first step's state is read. At each step whose
+    `is_init` is True the state is zero, whatever it was before.
+
+    An env carries the state from step to step, and begins each episode with zeros, if it has the transforms of
+    `recurrent_transforms`; or TorchRL's `InitTracker` and `make_tensordict_primer()`.
+
+    Args:
+        in_key: of the observation.
+        name: tells the states of several modules in one TensorDict apart.
+    """
+
+    module: RecurrentNetwork
+
+    def __init__(
+        self,
+        cfg: RecurrentCfg,
+        *,
+        obs_dim: int,
+        in_key: NestedKey,
+        name: str,
+        obs_normalization: bool = False,
+        device: torch.device | str | None = None,
+    ) -> None:
+        network = RecurrentNetwork(cfg, obs_dim=obs_dim, obs_normalization=obs_normalization, device=device)
+        self.state_keys = state_keys(cfg, name)
+        self.feature_key = (FEATURE_KEY, name)
+        super().__init__(
+            network,
+            in_keys=[in_key, RESET_KEY, *self.state_keys],
+            out_keys=[self.feature_key, *(("next", *key) for key in self.state_keys)],
+        )
+        self.cfg, self.name = cfg, name
+
+    def forward(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> TensorDictBase:
+        """Write features and next state into `tensordict`, and return it.
+
+        Raises:
+            ValueError: where sequences are expected and the batch is not [B, T], or has no `is_init`; where there is no
+                state.
+        """
+        obs, reset, *state = (tensordict.get(key, None) for key in self.in_keys)
+        if any(part is None for part in state):
+            raise ValueError(
+                f"the data has no {self.state_keys}: give the env `recurrent_transforms`, which begin episodes with a "
+                "state of zeros, before the first reset"
+            )
+        run = self._sequences if recurrent_mode() else self._steps
+        outputs = run(obs, reset, state, tensordict.batch_size)
+        for key, value in zip(self.out_keys, outputs, strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+    def _steps(
+        self, obs: Tensor, reset: Tensor | None, state: list[Tensor], batch_size: torch.Size
+    ) -> tuple[Tensor, ...]:
+        # One row per step: a sequence of length 1.
+        obs_1B = obs.reshape(1, -1, obs.shape[-1])
+        reset_1B1 = None if reset is None else reset.reshape(1, -1, 1)
+        features_1B, states_1B = self.module(
+            obs_1B, tuple(part.reshape(-1, *part.shape[-2:]) for part in state), reset_1B1
+        )
+        return tuple(part.reshape(*batch_size, *part.shape[2:]) for part in (features_1B, *states_1B))
+
+    def _sequences(
+        self, obs: Tensor, reset: Tensor | None, state: list[Tensor], batch_size: torch.Size
+    ) -> tuple[Tensor, ...]:
+        if len(batch_size) != 2 or reset is None:
+            raise ValueError(
+                f"the batch has the dims {tuple(batch_size)} and {'no ' if reset is None else ''}{RESET_KEY!r}: in "
+                f"recurrent mode {self.name!r} reads sequences [B, T] with {RESET_KEY!r}, which TorchRL's InitTracker "
+                "writes"
+            )
+        features_TB, states_TB = self.module(
+            obs.transpose(0, 1), tuple(part[:, 0] for part in state), reset.transpose(0, 1)
+        )
+        return tuple(part.transpose(0, 1) for part in (features_TB, *states_TB))
+
+    def make_tensordict_primer(self) -> RecurrentStatePrimer:
+        """Return the transform with which an env carries the state; TorchRL's `get_primers_from_module` asks for it."""
+        return RecurrentStatePrimer(state_spec(self.cfg, self.name))
+
+
+def with_memory(memory: RecurrentModule, network: AnyModule) -> AnyModule:
+    """Return an actor or a critic behind a memory, whose features it reads at `memory.feature_key`."""
+    if isinstance(network, ProbabilisticTensorDictSequential):
+        return ProbabilisticTensorDictSequential(memory, *network.module)  # type: ignore[return-value, arg-type]
+    return TensorDictSequential(memory, network)  # type: ignore[return-value]
+
+
+def memories(*networks: nn.Module) -> list[RecurrentModule]:
+    """Return the memories inside networks, each once."""
+    found = [m for network in networks for m in network.modules() if isinstance(m, RecurrentModule)]
+    return list(dict.fromkeys(found))
+
+
+def state_keys(cfg: RecurrentCfg, name: str) -> list[tuple[str, str, str]]:
+    """Return where the state lies in a TensorDict."""
+    return [(STATE_KEY, name, part) for part in STATES[cfg.kind]]
+
+
+def state_spec(cfg: RecurrentCfg, name: str) -> Composite:
+    """Return the spec of the state of one env."""
+    shape = (cfg.num_layers, cfg.hidden_dim)
+    parts = {part: Unbounded(shape) for part in STATES[cfg.kind]}
+    return Composite({STATE_KEY: Composite({name: Composite(parts)})})
+
+
+def _layer_parameters(cfg: RecurrentCfg, input_dim: int) -> dict[str, Tensor]:
+    """Draw the parameters of one layer, on the CPU, so that one seed gives the same network on every device."""
+    gates, hidden = _NUM_GATES[cfg.kind], cfg.hidden_dim
+    bias_hh = torch.zeros(gates, hidden)
+    if cfg.kind == "lstm":
+        bias_hh[1] = 1.0
+    return {
+        "weight_ih": torch.cat([_orthogonal(hidden, input_dim) for _ in range(gates)]),
+        "weight_hh": torch.cat([_orthogonal(hidden, hidden) for _ in range(gates)]),
+        "bias_ih": torch.zeros(gates * hidden),
+        "bias_hh": bias_hh.flatten(),
+    }
+
+
+def _orthogonal(rows: int, columns: int) -> Tensor:
+    return nn.init.orthogonal_(torch.empty(rows, columns))

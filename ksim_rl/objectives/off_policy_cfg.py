@@ -1,0 +1,120 @@
+"""The settings of off-policy learning: SAC, FastTD3 and FastSAC."""
+
+from dataclasses import dataclass
+
+from ksim_rl.checks import check_choice, check_in_range
+
+VALUE_REDUCTIONS = ("min", "mean")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffPolicyCfg:
+    """What all off-policy objectives share.
+
+    Attributes:
+        gamma: discount per step.
+        tau: share of the new weights in each update of the target networks.
+        value_reduction: "min" learns from, and climbs, the lowest of the predicted values (clipped double Q-learning,
+            Fujimoto et al., arXiv 1802.09477); "mean" lets each network learn from its own target and climbs the mean.
+        policy_delay: gradient steps of the critics for each of the actor.
+        critic_learning_rate, actor_learning_rate: of AdamW.
+        betas, adam_eps, weight_decay: of AdamW.
+        max_grad_norm: bound on the norm of the gradient; None does not clip.
+        autocast: run the networks in bfloat16, with float32 weights.
+        max_skipped_steps: so many gradient steps in a row that are not finite end the run.
+    """
+
+    gamma: float = 0.99
+    tau: float = 0.005
+    value_reduction: str = "min"
+    policy_delay: int = 1
+    critic_learning_rate: float = 3e-4
+    actor_learning_rate: float = 3e-4
+    betas: tuple[float, float] = (0.9, 0.999)
+    adam_eps: float = 1e-8
+    weight_decay: float = 0.0
+    max_grad_norm: float | None = None
+    autocast: bool = False
+    max_skipped_steps: int = 100
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, naming the field."""
+        object.__setattr__(self, "betas", tuple(self.betas))
+        for field in ("policy_delay", "max_skipped_steps"):
+            value = getattr(self, field)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{field}={value!r}: expected a whole number >= 1")
+        check_in_range("gamma", self.gamma, low=0.0, high=1.0)
+        check_in_range("tau", self.tau, low=0.0, high=1.0, low_open=True)
+        for field in ("critic_learning_rate", "actor_learning_rate", "adam_eps"):
+            check_in_range(field, getattr(self, field), low=0.0, low_open=True)
+        check_in_range("weight_decay", self.weight_decay, low=0.0)
+        if self.max_grad_norm is not None:
+            check_in_range("max_grad_norm", self.max_grad_norm, low=0.0, low_open=True)
+        if len(self.betas) != 2 or not all(0.0 <= beta < 1.0 for beta in self.betas):
+            raise ValueError(f"betas={self.betas!r}: expected two numbers in [0, 1)")
+        check_choice("value_reduction", self.value_reduction, VALUE_REDUCTIONS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACCfg(OffPolicyCfg):
+    """Soft actor-critic with a learned temperature (Haarnoja et al., arXiv 1801.01290 and 1812.05905).
+
+    Attributes:
+        alpha_init: temperature at the start, in units of the return per nat.
+        alpha_learning_rate: of the temperature's logarithm; 0 keeps `alpha_init`.
+        target_entropy_per_action: entropy that the temperature aims at, in nats per action, of actions scaled to [-1, 1].
+    """
+
+    alpha_init: float = 1.0
+    alpha_learning_rate: float = 3e-4
+    target_entropy_per_action: float = -1.0
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, naming the field."""
+        super().__post_init__()
+        check_in_range("alpha_init", self.alpha_init, low=0.0, low_open=True)
+        check_in_range("alpha_learning_rate", self.alpha_learning_rate, low=0.0)
+        check_in_range("target_entropy_per_action", self.target_entropy_per_action)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FastSACCfg(SACCfg):
+    """SAC with distributional critics, large minibatches and many envs (Seo et al., arXiv 2512.01996)."""
+
+    gamma: float = 0.97
+    tau: float = 0.125
+    value_reduction: str = "mean"
+    policy_delay: int = 4
+    betas: tuple[float, float] = (0.9, 0.95)
+    weight_decay: float = 1e-3
+    alpha_init: float = 1e-3
+    target_entropy_per_action: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FastTD3Cfg(OffPolicyCfg):
+    """TD3 with distributional critics, large minibatches and many envs (Seo et al., arXiv 2505.22642).
+
+    Attributes:
+        exploration_noise_min, exploration_noise_max: range of the standard deviation of the noise on the actions that are
+            taken, one per env, in units of half the range of an action.
+        target_noise, target_noise_clip: standard deviation and bound of the noise on the actions that targets are
+            computed for, in the same units.
+    """
+
+    gamma: float = 0.97
+    tau: float = 0.1
+    policy_delay: int = 2
+    weight_decay: float = 0.1
+    exploration_noise_min: float = 0.001
+    exploration_noise_max: float = 0.4
+    target_noise: float = 0.001
+    target_noise_clip: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, naming the field."""
+        super().__post_init__()
+        for field in ("exploration_noise_min", "target_noise", "target_noise_clip"):
+            check_in_range(field, getattr(self, field), low=0.0)
+        check_in_range("exploration_noise_max", self.exploration_noise_max, low=self.exploration_noise_min)

@@ -1,0 +1,204 @@
+"""What the estimators of advantages share: the state values of a rollout, and a recursion backwards in time."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, dispatch
+from torch import Tensor
+from torchrl.objectives.value import ValueEstimatorBase
+
+
+@dataclass(frozen=True, kw_only=True)
+class Signals:
+    """What an advantage is made of, all of one shape [*batch, 1]; flags are bool.
+
+    Attributes:
+        state_value, next_value: V before and after the step; the latter of the true next observation.
+        reward, done, terminated: of the step.
+        time_dim: the batch dim that is time, >= 0.
+    """
+
+    state_value: Tensor
+    next_value: Tensor
+    reward: Tensor
+    done: Tensor
+    terminated: Tensor
+    time_dim: int
+
+    def discounted(self, value: Tensor, gamma: Tensor) -> Tensor:
+        """Return gamma * value, and zero after a termination, whatever the value there."""
+        # A where instead of a product, because zero times NaN is NaN.
+        return torch.where(self.terminated, torch.zeros_like(value), gamma * value)
+
+
+class RolloutEstimator(ValueEstimatorBase):
+    """Base of `GAE`, `TDLambda` and `VTrace`, each beside TorchRL's estimator of that name: its keys and its results.
+
+    The forward reads no tensor value on the host: it can be captured in a CUDA graph and compiled. The value after a
+    step is V of the true next observation, which at a truncation is the last one of the episode, before the reset;
+    after a termination it is zero. Gradients are not tracked. `state_value` and `("next", "state_value")` are always
+    computed anew when there is a critic.
+
+    A step whose reward or values are not finite gets a NaN advantage, so that `DatasetBuffer` removes it, and the
+    recursion starts anew before it: the steps that led there keep finite advantages, which bootstrap from the value at
+    that step. A non-finite value after a termination does not matter.
+    """
+
+    flatten: bool
+    normalize_advantage: bool
+    time_dim: int | None
+
+    @abstractmethod
+    def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the advantages, the value targets, and which steps are finite: advantages elsewhere are ignored."""
+
+    @dispatch  # type: ignore[arg-type]
+    @torch.no_grad()
+    def forward(
+        self,
+        tensordict: TensorDictBase,
+        *,
+        params: TensorDictBase | None = None,
+        target_params: TensorDictBase | None = None,
+        time_dim: int | None = None,
+    ) -> TensorDictBase:
+        """Write `advantage`, `value_target` [..., 1] and the state values into `tensordict`, and return it.
+
+        Args:
+            tensordict: batch dims with time among them, e.g. `["E","T"]`; what the critic reads at the root
+                and under "next", and "reward", "done", "terminated" under "next". Its memory may be
+                time-major.
+            params, target_params: parameters of a functional critic, at the root and under "next".
+            time_dim: overrides that of the constructor.
+
+        Raises:
+            ValueError: if a value, the reward or a flag is missing, or their shapes differ.
+        """
+        signals = self._signals(tensordict, params, target_params, self._resolved(time_dim, tensordict))
+        advantage, value_target, finite = self._estimate(signals, tensordict)
+        if self.normalize_advantage:
+            advantage = _normalize(advantage, finite)
+        nan = torch.full_like(advantage, torch.nan)
+        tensordict.set(self.tensor_keys.advantage, torch.where(finite, advantage, nan))
+        tensordict.set(self.tensor_keys.value_target, value_target)
+        return tensordict
+
+    def _resolved(self, time_dim: int | None, tensordict: TensorDictBase) -> int:
+        if time_dim is None:
+            assert self.time_dim is not None
+            time_dim = self.time_dim
+        if not -tensordict.batch_dims <= time_dim < tensordict.batch_dims:
+            raise ValueError(
+                f"time_dim={time_dim}: the data has {tensordict.batch_dims} batch dims {tuple(tensordict.batch_size)}"
+            )
+        return time_dim % tensordict.batch_dims
+
+    def _signals(
+        self,
+        tensordict: TensorDictBase,
+        params: TensorDictBase | None,
+        target_params: TensorDictBase | None,
+        time_dim: int,
+    ) -> Signals:
+        keys = self.tensor_keys
+        following: TensorDictBase = tensordict.get("next")
+        if self.value_network is not None:
+            tensordict.set(keys.value, self._state_values(tensordict, params, time_dim))
+            next_params = params if target_params is None else target_params
+            following.set(keys.value, self._state_values(following, next_params, time_dim))
+        read: list[Any] = [tensordict.get(keys.value, None)]
+        read += [following.get(key, None) for key in (keys.value, keys.reward, keys.done)]
+        shapes = [None if signal is None else tuple(signal.shape) for signal in read]
+        if None in shapes or len(set(shapes)) != 1:
+            raise ValueError(
+                f"{type(self).__name__} needs these signals, all in one shape [*batch, 1]; got "
+                f"{keys.value!r} {shapes[0]}, ('next', {keys.value!r}) {shapes[1]}, "
+                f"('next', {keys.reward!r}) {shapes[2]}, ('next', {keys.done!r}) {shapes[3]}"
+            )
+        state_value, next_value, reward, done = read
+        return Signals(
+            state_value=state_value,
+            next_value=next_value,
+            reward=reward,
+            done=done,
+            terminated=following.get(keys.terminated, done),
+            time_dim=time_dim,
+        )
+
+    def _state_values(
+        self, tensordict: TensorDictBase, params: TensorDictBase | None, time_dim: int
+    ) -> Tensor:
+        critic = self.value_network
+        assert isinstance(critic, TensorDictModule)
+        with nullcontext() if params is None else params.to_module(critic):
+            return self._in_rows(
+                lambda rows: critic(rows).get(self.tensor_keys.value),
+                tensordict.select(*critic.in_keys),
+                time_dim,
+            )
+
+    def _in_rows(
+        self, network: Callable[[TensorDictBase], Tensor], inputs: TensorDictBase, time_dim: int
+    ) -> Tensor:
+        """Return what `network` gives for `inputs` in one batch dim, with the batch dims of `inputs` again."""
+        if not self.flatten or inputs.batch_dims < 2:
+            return network(inputs)
+        # Rows are taken in the order of the memory, which saves a copy of all observations.
+        leaf = next(iter(inputs.values(include_nested=True, leaves_only=True)))
+        first = time_dim if leaf.movedim(time_dim, 0).is_contiguous() else 0
+        last_dim = inputs.batch_dims - 1
+        rows = inputs.apply(
+            lambda leaf: leaf.movedim(first, 0).flatten(0, last_dim), batch_size=[inputs.numel()]
+        )
+        shape = list(inputs.batch_size)
+        shape.insert(0, shape.pop(first))
+        return network(rows).unflatten(0, shape).movedim(0, first)
+
+    def value_estimate(
+        self,
+        tensordict: TensorDictBase,
+        params: TensorDictBase | None = None,
+        target_params: TensorDictBase | None = None,
+        time_dim: int | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """Return the value target [..., 1] without writing into `tensordict`."""
+        copy = tensordict.copy()
+        self(copy, params=params, target_params=target_params, time_dim=time_dim)
+        return copy.get(self.tensor_keys.value_target)
+
+
+def device_of(critic: TensorDictModule | None, device: torch.device | str | None) -> torch.device | None:
+    """Return the device of an estimator's constants: `device`, or that of the critic."""
+    if device is None and critic is not None:
+        return next((parameter.device for parameter in critic.parameters()), None)
+    return None if device is None else torch.device(device)
+
+
+def discounted_sum(
+    term: Tensor, discount: Tensor, *, time_dim: int, following: Tensor | None = None
+) -> Tensor:
+    """Return x with x_t = term_t + discount_t x_{t+1}, all [..., T, ...]; x_T is `following`, or zero."""
+    terms, discounts = (leaf.movedim(time_dim, 0).unbind(0) for leaf in (term, discount))
+    total = torch.zeros_like(terms[0]) if following is None else following
+    totals = []
+    for term_t, discount_t in zip(reversed(terms), reversed(discounts), strict=True):
+        total = torch.addcmul(term_t, discount_t, total)
+        totals.append(total)
+    return torch.stack(totals[::-1]).movedim(0, time_dim)
+
+
+def _normalize(advantage: Tensor, finite: Tensor) -> Tensor:
+    """Shift and scale to mean 0 and standard deviation 1 over the elements that `finite` marks."""
+    count = finite.sum()
+    zero = torch.zeros_like(advantage)
+    mean = torch.where(finite, advantage, zero).sum() / count.clamp_min(1)
+    error = advantage - mean
+    variance = torch.where(finite, error, zero).square().sum() / (count - 1).clamp_min(1)
+    # The bound is TorchRL's: advantages that are all alike stay near zero.
+    return error / variance.sqrt().clamp_min(1e-4)

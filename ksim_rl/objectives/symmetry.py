@@ -1,0 +1,116 @@
+"""Policies of robots that are their own mirror image: mirrored samples, or a loss on what differs in the mirror."""
+
+from collections.abc import Callable, Mapping
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from ksim_rl import dims
+from ksim_rl.envs.transforms.mirror_map import MirrorMap, image
+from ksim_rl.objectives.gaussian_kl import gaussian_parameters
+
+Loss = Callable[[TensorDictBase], TensorDictBase]
+
+_MASK_KEY = ("collector", "mask")
+
+
+class SymmetricAugmentation:
+    """Adds to a minibatch what it looks like in the mirror (Mittal et al., arXiv 2403.04359, section III-B).
+
+    The image of an env state has the mirrored observations, action and distribution of the policy that collected it;
+    advantage, value target, state value and log-probability are those of the env state, as they are the same in the
+    mirror: there another policy collected, which is the image of the one that did. Makes no host sync.
+
+    Args:
+        maps: by key, of all observations that the networks read, and of "action".
+        device: of the minibatches.
+
+    Raises:
+        ValueError: if `maps` has no "action".
+    """
+
+    def __init__(
+        self, maps: Mapping[NestedKey, MirrorMap], *, device: torch.device | str | None = None
+    ) -> None:
+        if "action" not in maps:
+            raise ValueError(f"maps has the keys {list(maps)}: expected 'action' among them")
+        device = torch.device("cpu" if device is None else device)
+        self._images = {key: mirror.tensors(device) for key, mirror in maps.items()}
+        source_L, signs_L = self._images["action"]
+        self._images["loc"] = (source_L, signs_L)
+        self._images["scale"] = (source_L, torch.ones_like(signs_L))
+
+    def image_of(self, key: NestedKey, leaf_BL: Tensor) -> Tensor:
+        """Return the mirror image of vectors [B, L] of a kind that has a map."""
+        return image(leaf_BL, *self._images[key])
+
+    def image(self, minibatch_B: TensorDictBase) -> TensorDictBase:
+        """Return the mirror image of a minibatch; leaves without a map are the same tensors."""
+        reflected_B = minibatch_B.clone(recurse=False)
+        for key in self._images:
+            leaf_BL = minibatch_B.get(key, None)
+            if leaf_BL is not None:
+                reflected_B.set(key, self.image_of(key, leaf_BL))
+        return reflected_B
+
+    def __call__(self, minibatch_B: TensorDictBase) -> TensorDictBase:
+        """Return `minibatch_B` and its image, `["B"]` with twice the size; the first half is the minibatch."""
+        both_B: TensorDictBase = torch.cat((minibatch_B, self.image(minibatch_B)))  # type: ignore[call-overload]
+        return dims.name(both_B, dims.B)
+
+
+def mirror_loss(
+    actor: ProbabilisticTensorDictSequential, minibatch_B: TensorDictBase, mirror: SymmetricAugmentation
+) -> Tensor:
+    """Return the mean squared difference between pi(mirror(s)) and mirror(pi(s)) (Yu et al., arXiv 1801.08093).
+
+    The mean is over env states and actions, pi the mean of the policy's gaussian; the gradient flows through both.
+    (Yu et al. sum over actions.) Env states whose `("collector", "mask")` is False are left out.
+
+    Args:
+        actor: its distribution is a gaussian, or made of one.
+        minibatch_B: what the actor reads, [B, L] each.
+        mirror: for all that the actor reads, and the action.
+
+    Returns:
+        [], in squared units of the action.
+
+    Raises:
+        ValueError: if the distribution has no mean of that kind.
+    """
+    # One pass of the network for both.
+    dist = actor.get_dist(mirror(minibatch_B.select(*actor.in_keys)))
+    parameters = gaussian_parameters(dist)
+    if parameters is None:
+        raise ValueError(f"the mirror loss needs a gaussian policy, got {type(dist).__name__}")
+    loc_BL, loc_of_image_BL = parameters[0].chunk(2)
+    image_of_loc_BL = mirror.image_of("action", loc_BL)
+    error_B = (loc_of_image_BL - image_of_loc_BL).square().mean(-1)
+    mask = minibatch_B.get(_MASK_KEY, None)
+    if mask is None:
+        return error_B.mean()
+    mask_B = mask.reshape(error_B.shape)
+    return torch.where(mask_B, error_B, torch.zeros_like(error_B)).sum() / mask_B.sum().clamp_min(1)
+
+
+def with_mirror_loss(
+    loss: Loss, actor: ProbabilisticTensorDictSequential, mirror: SymmetricAugmentation, *, coeff: float
+) -> Loss:
+    """Return `loss` with `loss_mirror`, coeff * `mirror_loss`, beside its own results."""
+
+    def losses(minibatch_B: TensorDictBase) -> TensorDictBase:
+        return loss(minibatch_B).set("loss_mirror", coeff * mirror_loss(actor, minibatch_B, mirror))
+
+    return losses
+
+
+def with_augmentation(loss: Loss, mirror: SymmetricAugmentation) -> Loss:
+    """Return `loss` of each minibatch together with its mirror image."""
+
+    def losses(minibatch_B: TensorDictBase) -> TensorDictBase:
+        return loss(mirror(minibatch_B))
+
+    return losses
