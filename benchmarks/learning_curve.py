@@ -140,7 +140,7 @@ def _run_cfg(overrides: list[str], own: dict[str, str]) -> RunCfg:
     cfg = conf.compose([*overrides, *fixed])
     if "env_states" not in own:
         return cfg
-    per_iteration = cfg.data.num_env_states_per_minibatch * cfg.data.num_minibatches
+    per_iteration = cfg.num_envs * cfg.data.rollout_length(cfg.num_envs)
     iterations = -(-int(float(own["env_states"])) // per_iteration)
     return conf.compose([*overrides, *fixed, f"trainer.num_iterations={iterations}"])
 

@@ -4,9 +4,11 @@
 
 steps an env that does nothing but hand out 48 numbers, bare and with each transform, and prints one table:
 milliseconds of the env step, of the transform's own step and reset (4 of 4096 rows end), and, on CUDA, of its step as
-a graph. Where TorchRL has no such transform (noise, delays), the nearest one is what people build from its parts:
-`UnaryTransform` with a function that adds noise, and `CatFrames` of as many frames as the delay has to keep. The
-chain is noise -> delay -> history of 10 -> groups. Figures go to benchmarks/results/transforms.json.
+a graph. Ours and TorchRL's are timed in turn, and each ratio is the median over the rounds, so that whatever else the
+machine does weighs on both. Where TorchRL has no such transform (noise, delays, the time that is left), the nearest
+one is what people build from its parts: `UnaryTransform` with a function that adds noise or turns a count of steps into
+the time that is left, and `CatFrames` of as many frames as the delay has to keep. The chain is noise -> delay ->
+history of 10 -> groups. Figures go to benchmarks/results/transforms.json.
 
 `go1=true` (the default on CUDA) also times the captured control step of Unitree Go1, bare and with that chain on its
 observations: `chain_share_of_go1_step` is what the chain adds, relative to the bare step.
@@ -17,8 +19,8 @@ from __future__ import annotations
 import dataclasses
 import statistics
 import sys
+import time
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from rich.console import Console
@@ -55,7 +57,9 @@ NAMES = list(TERMS)
 HISTORY, MAX_LAG = 10, 3
 CALLS = 10
 """Calls per timing, so that one is long beside the clock's resolution."""
-ROUNDS = {"cuda": 20, "cpu": 15}
+MIN_ROUNDS, MAX_ROUNDS, SECONDS = 15, 400, 1.0
+"""Rounds of a comparison: as many as fit into these seconds, within these limits."""
+HORIZON = 1000
 GO1_STEPS = {"cuda": 200, "cpu": 2}
 
 Build = Callable[[], Transform]
@@ -74,6 +78,13 @@ def _noisy(draw: Callable[[Tensor], Tensor]) -> Callable[[], Transform]:
     return lambda: UnaryTransform(
         in_keys=["observation"], out_keys=["observation"], fn=lambda x: x + 0.1 * draw(x)
     )
+
+
+def _clock() -> Transform:
+    left = UnaryTransform(
+        in_keys=["step_count"], out_keys=["left"], fn=lambda n: ((HORIZON - n) / HORIZON).clamp_min(0.0)
+    )
+    return Compose(StepCounter(), left)
 
 
 def _frames(length: int) -> Transform:
@@ -161,9 +172,9 @@ PAIRS = {
         stock=lambda: RewardClipping(-1.0, 1.0),
     ),
     "TimeAwareObservation": Pair(
-        ours=lambda: ours.TimeAwareObservation(horizon=1000),
-        nearest="StepCounter",
-        stock=lambda: StepCounter(),
+        ours=lambda: ours.TimeAwareObservation(horizon=HORIZON),
+        nearest="StepCounter and UnaryTransform",
+        stock=_clock,
     ),
     "EpisodeTracker": Pair(
         ours=lambda: ours.EpisodeTracker(),
@@ -174,27 +185,27 @@ PAIRS = {
 }
 
 
-def measure(num_envs: int, device: torch.device) -> dict[str, dict[str, float | None]]:
-    """Time each transform and its nearest; return ms by row and column."""
-    rounds = ROUNDS[device.type]
+Row = dict[str, float | None]
+
+
+def measure(num_envs: int, device: torch.device) -> dict[str, Row]:
+    """Time each transform and its nearest; return ms and ratios by row and column."""
     bare = WideEnv(num_envs, device=device)
-    bare_ms = _least(lambda: _stepper(bare), rounds=rounds, device=device)
-    rows: dict[str, dict[str, float | None]] = {"bare env": {"env_ms": bare_ms}}
+    root = bare.rand_action(bare.reset())
+    found = [_time(lambda: bare.step(root.copy()), device) for _ in range(MIN_ROUNDS)]
+    rows: dict[str, Row] = {"bare env": {"env_ms": statistics.median(found)}}
     for name, pair in PAIRS.items():
         mine, theirs = (_Rig(build, num_envs, device) for build in (pair.ours, pair.stock))
-        row: dict[str, float | None] = {}
+        rows[name] = {}
         for what in ("env", "step", "reset"):
-            works = [getattr(rig, what) for rig in (mine, theirs)]
-            row[f"{what}_ms"], row[f"stock_{what}_ms"] = _alternately(works, rounds=rounds, device=device)
-        rows[name] = row
+            rows[name] |= _compare(what, getattr(mine, what), getattr(theirs, what), device)
     if device.type == "cuda":
+        graphs = {name: _Rig(pair.ours, num_envs, device).captured() for name, pair in PAIRS.items()}
         # Stock ones last: what cannot be captured leaves torch's generator in a bad state.
-        for prefix in ("", "stock_"):
-            for name, pair in PAIRS.items():
-                graph = _Rig(pair.stock if prefix else pair.ours, num_envs, device).captured()
-                rows[name][f"{prefix}captured_ms"] = (
-                    None if graph is None else milliseconds(graph, device=device, repeats=rounds) / CALLS
-                )
+        for name, pair in PAIRS.items():
+            mine, theirs = graphs[name], _Rig(pair.stock, num_envs, device).captured()
+            if mine is not None:
+                rows[name] |= _compare("captured", mine, theirs, device, calls=1, per=CALLS)
     return rows
 
 
@@ -254,27 +265,41 @@ def _renew_generator(device: torch.device) -> None:
     )
 
 
-def _stepper(env: Any) -> Callable[[], object]:
-    root = env.rand_action(env.reset())
-    return lambda: env.step(root.copy())
+def _time(work: Callable[[], object], device: torch.device, *, calls: int = CALLS, per: int = 1) -> float:
+    """Return the ms of one of `calls` calls, each of which does the thing `per` times."""
+
+    def repeatedly() -> None:
+        for _ in range(calls):
+            work()
+
+    return milliseconds(repeatedly, device=device, repeats=1) / (calls * per)
 
 
-def _least(build: Callable[[], Callable[[], object]], *, rounds: int, device: torch.device) -> float:
-    return _alternately([build()], rounds=rounds, device=device)[0]
-
-
-def _alternately(works: list[Callable[[], object]], *, rounds: int, device: torch.device) -> list[float]:
-    """Time works in turn and return the least times, ms per call: whatever else the machine does can only add."""
-    times: list[list[float]] = [[] for _ in works]
-    for _ in range(rounds):
-        for work, found in zip(works, times, strict=True):
-
-            def calls(work: Callable[[], object] = work) -> None:
-                for _ in range(CALLS):
-                    work()
-
-            found.append(milliseconds(calls, device=device, repeats=1) / CALLS)
-    return [min(found) for found in times]
+def _compare(
+    what: str,
+    mine: Callable[[], object],
+    theirs: Callable[[], object] | None,
+    device: torch.device,
+    **kwargs: int,
+) -> Row:
+    """Time the two in turn, each of them first in every other round; return the medians, and that of the ratios."""
+    for work in (mine, theirs):
+        if work is not None:
+            _time(work, device, **kwargs)
+    times: list[list[float]] = [[], []]
+    began = time.perf_counter()
+    while len(times[0]) < MIN_ROUNDS or (
+        len(times[0]) < MAX_ROUNDS and time.perf_counter() - began < SECONDS
+    ):
+        order = ((mine, 0), (theirs, 1)) if len(times[0]) % 2 else ((theirs, 1), (mine, 0))
+        for work, index in order:
+            if work is not None:
+                times[index].append(_time(work, device, **kwargs))
+    row: Row = {f"{what}_ms": statistics.median(times[0]), f"stock_{what}_ms": None, f"{what}_ratio": None}
+    if theirs is not None:
+        row[f"stock_{what}_ms"] = statistics.median(times[1])
+        row[f"{what}_ratio"] = statistics.median(a / b for a, b in zip(*times, strict=True))
+    return row
 
 
 def measure_go1(num_envs: int, device: torch.device) -> dict[str, float]:
@@ -316,26 +341,25 @@ def _captured_step(env: MaskedTransformedEnv, device: torch.device) -> Captured:
     return captured
 
 
-def _ratio(row: dict[str, float | None], column: str) -> float | None:
-    mine, theirs = row.get(column), row.get(f"stock_{column}")
-    return None if mine is None or theirs is None else mine / theirs
-
-
-def _table(rows: dict[str, dict[str, float | None]], num_envs: int, device: torch.device) -> Table:
-    table = Table(title=f"{num_envs} envs, {report.device_name(device)}; ms of ours / of the nearest")
-    columns = ["env_ms", "step_ms", "reset_ms", *(["captured_ms"] if device.type == "cuda" else [])]
+def _table(rows: dict[str, Row], num_envs: int, device: torch.device) -> Table:
+    table = Table(title=f"{num_envs} envs, {report.device_name(device)}; ms of ours / of the nearest: ratio")
+    columns = ["env", "step", "reset", *(["captured"] if device.type == "cuda" else [])]
     for heading in ("transform", "nearest", *columns):
         table.add_column(heading, justify="left" if heading in ("transform", "nearest") else "right")
     for name, row in rows.items():
-        cells = [
-            " / ".join(_number(row[c]) for c in (column, f"stock_{column}") if c in row) for column in columns
-        ]
-        table.add_row(name, PAIRS[name].nearest if name in PAIRS else "", *cells)
+        nearest = PAIRS[name].nearest if name in PAIRS else ""
+        table.add_row(name, nearest, *(_cell(row, column) for column in columns))
     return table
 
 
-def _number(value: float | None) -> str:
-    return "none" if value is None else f"{value:.3f}"
+def _cell(row: Row, column: str) -> str:
+    if f"{column}_ms" not in row:
+        return ""
+    mine, theirs, ratio = (
+        "none" if value is None else f"{value:.3f}"
+        for value in (row[f"{column}_ms"], row.get(f"stock_{column}_ms"), row.get(f"{column}_ratio"))
+    )
+    return f"{mine} / {theirs}: {ratio}" if f"{column}_ratio" in row else mine
 
 
 def main() -> None:
@@ -351,11 +375,11 @@ def main() -> None:
     prefix = f"{report.device_label(device)}/{num_envs}"
     figures: dict[str, float] = {}
     for name, row in rows.items():
-        figures |= {f"{prefix}/{name}/{column}": round(ms, 6) for column, ms in row.items() if ms is not None}
-    for column in ("step_ms", "env_ms", "captured_ms"):
-        found = [r for r in (_ratio(row, column) for row in rows.values()) if r is not None]
+        figures |= {f"{prefix}/{name}/{column}": round(v, 6) for column, v in row.items() if v is not None}
+    for column in ("step_ratio", "env_ratio", "captured_ratio"):
+        found = [ratio for row in rows.values() if (ratio := row.get(column)) is not None]
         if found:
-            figures[f"{prefix}/largest_{column.removesuffix('_ms')}_ratio"] = round(max(found), 4)
+            figures[f"{prefix}/largest_{column}"] = round(max(found), 4)
     if given.get("go1", str(device.type == "cuda")).lower() == "true":
         go1 = measure_go1(num_envs, device)
         print({name: round(value, 5) for name, value in go1.items()})

@@ -154,91 +154,63 @@ def integers(keys: RowKeys, n: int, low: int | Tensor, high: int | Tensor) -> Te
     return low + ((_draw(keys, n, _INTEGER, span=1 << 32) * (high - low + 1)) >> 32)
 
 
-# Addresses instead of arrays: see `QuickLaunch`. On the CPU one thread fills all rows, in loops of vector instructions.
+@wp.struct
+class _Fill:
+    rows: int
+    columns: int
+    n: int
+    kind: int
+    low: float
+    high: float
+    start: wp.int64
+    span: wp.int64
+    stream: wp.uint32
+    counter_stride: int
+    seed: wp.uint64
+    counter: wp.uint64
+    out: wp.uint64
+
+
+# On the CPU one thread fills all rows, in loops of vector instructions.
 @wp.func_native(
     DRAWS
     + r"""
-    const long long seed = *(const long long*)seed_;
-    const long long* __restrict__ counter = (const long long*)counter_;
+    const long long seed = *(const long long*)a.seed;
+    const long long* __restrict__ counter = (const long long*)a.counter;
+    const int begin_row = part * a.rows, begin = chunk * a.columns, n = a.n, stride = a.counter_stride;
+    const int end_row = begin_row + a.rows, end = begin + a.columns;
+    const unsigned stream = a.stream;
     auto fill = [&](auto write) {
         for (int row = begin_row; row < end_row; ++row) {
-            const RowKey key = key_of(seed, stream, counter[row * counter_stride], row);
+            const RowKey key = key_of(seed, stream, counter[row * stride], row);
             for (int i = begin; i < end; ++i) write((long long)row * n + i, bits_of(key, (unsigned)i));
         }
     };
     auto fill_one_each = [&](auto write) {
         for (int row = begin_row; row < end_row; ++row)
-            write(row, bits_of(key_of(seed, stream, counter[row * counter_stride], row), 0u));
+            write(row, bits_of(key_of(seed, stream, counter[row * stride], row), 0u));
     };
     auto run = [&](auto write) { n == 1 ? fill_one_each(write) : fill(write); };
-    float* __restrict__ reals = (float*)out_;
-    long long* __restrict__ integers = (long long*)out_;
-    if (kind == 0) run([=](long long at, unsigned b) { reals[at] = low + unit(b) * (high - low); });
-    else if (kind == 1) run([=](long long at, unsigned b) { reals[at] = normal(b); });
-    else {
-        const unsigned long long size = (unsigned long long)span;
-        run([=](long long at, unsigned b) { integers[at] = start + (long long)((b * size) >> 32); });
-    }
+    float* __restrict__ reals = (float*)a.out;
+    long long* __restrict__ integers = (long long*)a.out;
+    const float low = a.low, high = a.high;
+    const long long start = a.start;
+    const unsigned long long span = (unsigned long long)a.span;
+    if (a.kind == 0) run([=](long long at, unsigned b) { reals[at] = low + unit(b) * (high - low); });
+    else if (a.kind == 1) run([=](long long at, unsigned b) { reals[at] = normal(b); });
+    else run([=](long long at, unsigned b) { integers[at] = start + (long long)((b * span) >> 32); });
 """
 )
-def _fill_native(
-    begin_row: int,
-    end_row: int,
-    begin: int,
-    end: int,
-    n: int,
-    kind: int,
-    low: float,
-    high: float,
-    start: wp.int64,
-    span: wp.int64,
-    stream: wp.uint32,
-    counter_stride: int,
-    seed_: wp.uint64,
-    counter_: wp.uint64,
-    out_: wp.uint64,
-): ...
+def _fill_part(part: int, chunk: int, a: _Fill): ...
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)
-def _fill(
-    rows: int,
-    columns: int,
-    n: int,
-    kind: int,
-    low: float,
-    high: float,
-    start: wp.int64,
-    span: wp.int64,
-    stream: wp.uint32,
-    counter_stride: int,
-    seed: wp.uint64,
-    counter: wp.uint64,
-    out: wp.uint64,
-):
+def _fill(a: _Fill):
     part, chunk = wp.tid()
-    row = part * rows
-    i = chunk * columns
-    _fill_native(
-        row,
-        row + rows,
-        i,
-        i + columns,
-        n,
-        kind,
-        low,
-        high,
-        start,
-        span,
-        stream,
-        counter_stride,
-        seed,
-        counter,
-        out,
-    )
+    _fill_part(part, chunk, a)
 
 
-_launch = QuickLaunch(_fill)
+_launch = QuickLaunch(_fill, _Fill)
 
 
 def _draw(
@@ -275,7 +247,7 @@ def _draw_now(
     dim = (num_rows // max(rows, 1), n // max(columns, 1))
     addresses = seed.data_ptr(), counter.data_ptr(), out_EL.data_ptr()
     layout = rows, columns, n, kind, low, high, start, span, stream, counter.ndim
-    _launch(seed.device, dim, (*layout, *addresses))
+    _launch(seed.device, dim, *layout, *addresses)
     return out_EL
 
 

@@ -20,11 +20,12 @@ from ksim_rl.envs.overrides import check_key
 MAX_CHECKED_JOBS = 50
 
 
-def check_command_line(texts: Sequence[str], *, multirun: bool, values: bool) -> None:
+def check_command_line(texts: Sequence[str], *, name: str, multirun: bool, values: bool) -> None:
     """Refuse overrides that name an unknown group, choice or field, or (with `values`) give a field a bad value.
 
     Args:
         texts: Hydra overrides.
+        name: of the primary config.
         multirun: whether sweeps such as `seed=1,2` are allowed.
         values: also build the run's config, of each job of a sweep.
 
@@ -41,9 +42,9 @@ def check_command_line(texts: Sequence[str], *, multirun: bool, values: bool) ->
                 raise ValueError(
                     f"override {sweeps[0]!r} has several values: add --multirun to run one job for each"
                 )
-            _check_names(overrides, loader)
+            _check_names(overrides, loader, name)
             for job in itertools.islice(_jobs(overrides), MAX_CHECKED_JOBS if values else 0):
-                conf.compose_within(job)
+                conf.compose_within(job, name=name)
     except (HydraException, OmegaConfBaseException) as error:
         raise ValueError(f"the overrides do not compose: {' '.join(str(error).split())}") from error
 
@@ -58,11 +59,16 @@ def _parse(text: str, loader: ConfigLoader) -> Override:
         ) from error
 
 
-def _check_names(overrides: Sequence[Override], loader: ConfigLoader) -> None:
+def _check_names(overrides: Sequence[Override], loader: ConfigLoader, name: str) -> None:
     groups = _groups(loader)
     choices, fields = [], []
     for override in overrides:
         if override.key_or_group in groups:
+            if name == conf.RUN_AGAIN:
+                raise ValueError(
+                    f"override {override.input_line!r}: a run's config has no groups; override its fields, or compose "
+                    "a new config without --config-dir"
+                )
             options = loader.get_group_options(override.key_or_group)
             for choice in _values(override):
                 if choice not in options:
@@ -72,7 +78,7 @@ def _check_names(overrides: Sequence[Override], loader: ConfigLoader) -> None:
             choices.append(f"{added}{override.key_or_group}={_values(override)[0]}")
         elif not override.is_add() and not override.is_hydra_override():
             fields.append(override.key_or_group)
-    tree = OmegaConf.to_container(hydra.compose(conf.NAME, overrides=choices))
+    tree = OmegaConf.to_container(hydra.compose(name, overrides=choices))
     assert isinstance(tree, dict)
     for field in fields:
         known = tree if "." in field else {**tree, **dict.fromkeys(groups)}

@@ -15,7 +15,7 @@ def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None 
     )
     progress.note(
         f"{cfg.task_name}: {cfg.num_envs} envs x {cfg.data.rollout_length(cfg.num_envs)} steps = "
-        f"{cfg.data.num_env_states} env states per iteration, on {cfg.device}; run folder {shown(folder)}"
+        f"{cfg.num_envs * cfg.data.rollout_length(cfg.num_envs)} env states per iteration, on {cfg.device}; run folder {shown(folder)}"
     )
     with compile_notice(progress.status):
         outcome = run(cfg, folder, progress=progress, resume_from=resume_from)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -14,6 +15,7 @@ from ksim_rl.conf import search_path
 from ksim_rl.trainers import RunCfg
 
 MODULE, NAME = "ksim_rl.conf", "train"
+RUN_AGAIN, RUN_CONFIG = "run_again", "config.yaml"
 PPO = "ppo"
 
 
@@ -29,9 +31,9 @@ def compose(overrides: Sequence[str] = ()) -> RunCfg:
         return compose_within(overrides)
 
 
-def compose_within(overrides: Sequence[str]) -> RunCfg:
-    """Do the same where Hydra is initialized already."""
-    plain = OmegaConf.to_container(hydra.compose(NAME, overrides=list(overrides)), resolve=True)
+def compose_within(overrides: Sequence[str], *, name: str = NAME) -> RunCfg:
+    """Do the same where Hydra is initialized already; `name` is that of the primary config."""
+    plain = OmegaConf.to_container(hydra.compose(name, overrides=list(overrides)), resolve=True)
     assert isinstance(plain, dict)
     return RunCfg.from_tree({str(key): value for key, value in plain.items()})
 
@@ -50,6 +52,22 @@ def register() -> None:
         for objective in (PPO, *envs.task(name).training_by_objective):
             node = objective_defaults(name, objective)
             store(group="task/objective_training", name=f"{name}_{objective}", node=node, package="_global_")
+
+
+def register_run(folder: Path) -> bool:
+    """Store the config that a run left in its folder as the primary config `RUN_AGAIN`; False if there is none.
+
+    Its number of envs and its seed follow overrides, as they do in a config that is composed.
+    """
+    path = folder / RUN_CONFIG
+    tree = OmegaConf.to_container(OmegaConf.load(path)) if path.is_file() else None
+    if not isinstance(tree, dict) or not {"task_name", "task"} <= tree.keys():
+        return False
+    tree["task"]["scene"]["num_envs"] = "${num_envs}"
+    if tree["task"]["seed"] == tree["seed"]:
+        tree["task"]["seed"] = "${seed}"
+    ConfigStore.instance().store(name=RUN_AGAIN, node={"defaults": ["launch", "_self_"], **tree})
+    return True
 
 
 def training_defaults(name: str) -> dict[str, Any]:

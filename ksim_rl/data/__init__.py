@@ -9,8 +9,10 @@ from ksim_rl.data.replay_cfg import ReplayCfg
 from ksim_rl.data.replay_ring import ReplayRing
 from ksim_rl.data.replay_sampler import ReplaySampler
 from ksim_rl.data.replay_storage import ReplayStorage, ReplayWriter
+from ksim_rl.data.sequence_sampler import BURN_IN_KEY, SequenceSampler, sequence_length
 
 __all__ = [
+    "BURN_IN_KEY",
     "MASK_KEY",
     "DatasetBuffer",
     "DatasetCfg",
@@ -23,5 +25,7 @@ __all__ = [
     "ReplaySampler",
     "ReplayStorage",
     "ReplayWriter",
+    "SequenceSampler",
     "rollout_length",
+    "sequence_length",
 ]

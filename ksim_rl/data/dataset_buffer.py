@@ -15,8 +15,9 @@ from torchrl.data.replay_buffers import Sampler
 
 from ksim_rl import dims
 from ksim_rl.data.dataset_cfg import DatasetCfg
-from ksim_rl.data.dataset_storage import DatasetStorage, DatasetWriter
+from ksim_rl.data.dataset_storage import MASK_KEY, DatasetStorage, DatasetWriter
 from ksim_rl.data.epoch_sampler import EpochSampler
+from ksim_rl.data.sequence_sampler import BURN_IN_KEY, SequenceSampler
 
 
 class DatasetBuffer(ReplayBuffer):
@@ -83,23 +84,39 @@ class DatasetBuffer(ReplayBuffer):
                     f"the data lacks {missing}; it has {sorted(map(str, data.keys(True, True)))}"
                 )
             data = data.select(*self._keys, ("collector", "mask"), strict=False)
+        if isinstance(self._sampler, SequenceSampler):
+            self._sampler.begin(data.batch_size, batch_size=self.cfg.num_env_states_per_minibatch)
         return super().extend(data, update_priority=update_priority)
 
     def sample(self, batch_size: int | None = None, return_info: bool = False) -> Any:
-        """Return the next minibatch `["B"]` of the present epoch, with the info dict if `return_info`."""
-        result = super().sample(batch_size, return_info)
-        dims.name(result[0] if return_info else result, dims.B)
-        return result
+        """Return the next minibatch `["B"]` of the present epoch, with the info dict if `return_info`.
+
+        With a `SequenceSampler` it is `["B","T"]`: whole sequences, which begin with their burn-in if there is one.
+        """
+        data, info = super().sample(batch_size, return_info=True)
+        data = _labelled(data, info)
+        return (data, info) if return_info else data
 
     def epoch(self) -> Iterator[TensorDictBase]:
-        """Yield `num_minibatches` minibatches `["B"]` that cover the dataset exactly once, in a new order."""
+        """Yield `num_minibatches` minibatches `["B"]` that cover the dataset exactly once, in a new order.
+
+        With a `SequenceSampler` they are `["B","T"]`, as in `sample`.
+        """
         if isinstance(self._sampler, EpochSampler):
             self._sampler.restart()
         # One gather for all minibatches: a quarter of the kernels, and each minibatch is a contiguous slice.
-        data_D, _ = self._sample(self.cfg.num_env_states)
-        for minibatch_B in data_D.split(self.cfg.num_env_states_per_minibatch):
-            yield dims.name(minibatch_B, dims.B)
+        data, info = self._sample(self.cfg.num_env_states)
+        data = _labelled(data, info)
+        yield from data.split(data.batch_size[0] // self.cfg.num_minibatches)
 
     def all(self) -> TensorDictBase:
         """Return the dataset `["D"]`: views of the storage, which the next `extend` overwrites."""
         return dims.name(self._dataset.get(slice(None)), dims.D)
+
+
+def _labelled(data: TensorDictBase, info: dict[Any, Any]) -> TensorDictBase:
+    """Name the dims of a sample `["B"]` or `["B","T"]`, and write into it what a `SequenceSampler` says of its steps."""
+    if BURN_IN_KEY in info:
+        data.set(BURN_IN_KEY, info[BURN_IN_KEY])
+        data.set(MASK_KEY, data.get(MASK_KEY) & info[MASK_KEY])
+    return dims.name(data, *(dims.B, dims.T)[: data.batch_dims])

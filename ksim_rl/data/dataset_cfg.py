@@ -13,15 +13,24 @@ class DatasetCfg:
     Attributes:
         num_env_states_per_minibatch: B, env states in one gradient step.
         num_minibatches: gradient steps per epoch.
+        sequence_length: recurrent networks learn on so many successive steps of an env; None takes the whole rollout.
+        burn_in: so many steps before a sequence renew its first state, which is stored otherwise.
     """
 
     num_env_states_per_minibatch: int
     num_minibatches: int
+    sequence_length: int | None = None
+    burn_in: int = 0
 
     def __post_init__(self) -> None:
         """Refuse values that are no positive whole numbers, naming the field."""
         for field in ("num_env_states_per_minibatch", "num_minibatches"):
             _check_count(field, getattr(self, field))
+        if self.sequence_length is not None:
+            _check_count("sequence_length", self.sequence_length)
+        check_in_range("burn_in", self.burn_in, low=0)
+        if not isinstance(self.burn_in, int):
+            raise ValueError(f"burn_in={self.burn_in!r}: expected a whole number >= 0")
 
     @property
     def num_env_states(self) -> int:

@@ -15,7 +15,8 @@ class PrioritySampler(Sampler):
     """Draws what is stored in proportion to (priority + eps)^alpha (Schaul et al., arXiv 1511.05952), with replacement.
 
     A stand-in for TorchRL's `PrioritizedSampler` in any replay buffer, with the same probabilities, weights and default
-    priority, which is the highest so far. It has no tree: the cumulative sum over all priorities, in float64, and a
+    priority, which is the highest so far. (Give it priorities by the buffer's `update_priority(index, priority)`;
+    `update_tensordict_priority` of TorchRL's buffers does so for TorchRL's own sampler only.) It has no tree: the cumulative sum over all priorities, in float64, and a
     binary search per draw are a few kernels, make no host sync and can be captured in a CUDA graph. The draws are
     stratified: one falls in each of B equal shares of the sum, as in the paper's appendix.
 
@@ -52,7 +53,7 @@ class PrioritySampler(Sampler):
         index_N = torch.as_tensor(index, device=self._priority_N.device).reshape(-1)
         self._priority_N[index_N] = default.expand(index_N.shape[0])
 
-    add = extend
+    add = mark_update = extend
 
     @torch.no_grad()
     def update_priority(
@@ -69,8 +70,6 @@ class PrioritySampler(Sampler):
         priority_B = torch.where(priority_B.isfinite(), priority_B, self._highest)
         self._highest.copy_(torch.maximum(self._highest, priority_B.amax()))
         self._priority_N.scatter_reduce_(0, index_B, priority_B, "amax", include_self=False)
-
-    mark_update = update_priority
 
     @torch.no_grad()
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:

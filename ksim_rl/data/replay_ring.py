@@ -54,6 +54,7 @@ class ReplayRing(ReplayBuffer):
             storage=self._ring,
             sampler=priorities if cfg.prioritized else ReplaySampler(),
             writer=ReplayWriter(),
+            collate_fn=_as_it_is,
             batch_size=cfg.num_env_states_per_minibatch,
         )
         self.cfg = cfg
@@ -99,3 +100,7 @@ class ReplayRing(ReplayBuffer):
             return
         self._ring.load_state_dict(state_dict["ring"])
         self._sampler.load_state_dict(state_dict["sampler"])
+
+
+def _as_it_is(data: TensorDictBase) -> TensorDictBase:
+    return data

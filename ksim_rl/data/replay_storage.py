@@ -115,12 +115,14 @@ class ReplayStorage(Storage):
                 # brings it as its first.
                 finite_N &= self._put(leaf, following_N, rollout_ET.get(_next(key)))
             finite_N &= self._put(leaf, index_N, rollout_ET.get(key))
-        self.available[following_N] = False
-        self.available[index_N] = finite_N
+        self.available.index_fill_(0, following_N, False)
+        self.available.index_copy_(0, index_N, finite_N)
         self.non_finite_count.add_((~finite_N).sum())
         taken_E = places_ET.sum(1)
         self.head_E.add_(taken_E).remainder_(self.places)
         self.filled_E.add_(taken_E).clamp_max_(self.places - 1)
+        # After the end of an episode the newest observation's place still has what was there a round ago.
+        self.available.index_fill_(0, self._head_index(), False)
         return index_N
 
     @torch.no_grad()
@@ -221,20 +223,24 @@ class ReplayStorage(Storage):
             )
         self.content = TensorDict(ring, batch_size=[self.max_size], device=self.device)
 
+    def _head_index(self) -> Tensor:
+        """Return the index of the newest observation of each env, [E]."""
+        return self.head_E * self.num_envs + self._env_E
+
     def _cut_where_not_continued(self, rollout_ET: TensorDictBase) -> None:
         """Drop the newest env state of envs whose rollout does not begin at the newest observation.
 
         Such an env was reset in between, and what followed its last env state is about to be overwritten.
         """
         assert self.content is not None
-        head_E = self.index(self._env_E, torch.zeros_like(self._env_E))
+        head_E = self._head_index()
         newest_E = self.index(self._env_E, torch.ones_like(self._env_E))
         continued_E = self.available[newest_E]
         for key in self.observations:
             same = self.content.get(key)[head_E] == rollout_ET.get(key)[:, 0]
             continued_E = continued_E & same.reshape(self.num_envs, -1).all(1)
         # After the end of an episode the newest env state lies one place further back, with all that follows it.
-        self.available[newest_E] = continued_E
+        self.available.index_copy_(0, newest_E, continued_E)
 
     @staticmethod
     def _put(leaf: Tensor, index_N: Tensor, values_ET: Tensor) -> Tensor:

@@ -47,6 +47,19 @@ class SequenceSampler(EpochSampler):
         super().__init__(seed=seed, shuffle=shuffle)
         self.sequence_length, self.burn_in, self.rollout_length = sequence_length, burn_in, rollout_length
 
+    def begin(self, batch_size_ET: torch.Size, *, batch_size: int) -> None:
+        """Take T from a rollout that a storage of one dim takes in, and check the sizes before anything is sampled.
+
+        Raises:
+            ValueError: if the data is no rollout [E, T], or the sequences do not fit; the message has the numbers.
+        """
+        if len(batch_size_ET) != 2:
+            raise ValueError(f"sequences are cut from a rollout [E, T]; the data has the dims {tuple(batch_size_ET)}")
+        self.rollout_length = batch_size_ET[1]
+        sequence_length(
+            self.rollout_length, self.sequence_length, batch_size=batch_size, burn_in=self.burn_in
+        )
+
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
         """Return the indices [S, k + L] of the next minibatch, and the info dict, which is empty without burn-in.
 
@@ -56,9 +69,11 @@ class SequenceSampler(EpochSampler):
         size = len(storage)  # type: ignore[arg-type]
         if size == 0:
             raise RuntimeError("the replay buffer is empty: extend it before sampling")
-        steps = storage.shape[1] if storage.ndim > 1 else self.rollout_length or self.sequence_length
+        steps = storage.shape[1] if storage.ndim > 1 else self.rollout_length
         if steps is None:
             raise ValueError("the storage has one dim: pass rollout_length, the steps of each env in it")
+        if size % steps:
+            raise ValueError(f"the storage has {size} env states: no whole number of rollouts of {steps} steps")
         length = sequence_length(steps, self.sequence_length, batch_size=batch_size, burn_in=self.burn_in)
         device = torch.device(getattr(storage, "device", None) or "cpu")
         sequence_S = self._next_part(size // length, batch_size // length, device)

@@ -1,5 +1,6 @@
 """Which last layer a policy needs for an env's actions."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -9,6 +10,7 @@ from torch import Tensor, nn
 from torchrl import data as specs
 from torchrl.data import Composite, TensorSpec
 
+from ksim_rl.modules.action_range import action_range
 from ksim_rl.modules.actor_cfg import ActorCfg
 from ksim_rl.modules.bounded_gaussian_head import TanhGaussianHead, TruncatedGaussianHead
 from ksim_rl.modules.categorical_head import CategoricalHead
@@ -115,19 +117,13 @@ def _continuous(
 
 def _range(cfg: ActorCfg, key: NestedKey, leaf: TensorSpec) -> tuple[Tensor, Tensor]:
     """Return the bounds of an action [L]."""
-    if cfg.action_range is not None:
-        low, high = (torch.full(leaf.shape[-1:], end, dtype=leaf.dtype) for end in cfg.action_range)
-        return low, high
-    space: Any = leaf.space
-    if not isinstance(leaf, specs.Bounded) or not bool((space.low.isfinite() & space.high.isfinite()).all()):
+    low, high = action_range(leaf, math.inf if cfg.action_bound is None else cfg.action_bound)
+    if not bool((low.isfinite() & high.isfinite()).all()):
         raise ValueError(
             f"distribution={cfg.distribution!r} needs bounds, but the action {key!r} has no finite ones in the env's "
-            "spec: set action_range, e.g. [-1, 1], or take 'gaussian'"
+            "spec: set action_bound, e.g. 1.0, or take 'gaussian'"
         )
-    rows = [end.expand(leaf.shape).reshape(-1, leaf.shape[-1]) for end in (space.low, space.high)]
-    if any(bool((row != row[:1]).any()) for row in rows):
-        raise ValueError(f"the bounds of the action {key!r} differ from env to env: set action_range")
-    return rows[0][0].clone(), rows[1][0].clone()
+    return low, high
 
 
 def _describe(leaves: dict[NestedKey, Any]) -> str:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ksim_rl.checks import check_choice, check_in_range, check_pair
+from ksim_rl.checks import check_choice, check_in_range
 from ksim_rl.modules.mlp import check_network
 from ksim_rl.modules.observation_keys import ObservationKey, checked_keys
 
@@ -21,7 +21,8 @@ class ActorCfg:
         obs_normalization: normalize observations by running statistics inside the network.
         distribution: of continuous actions: "gaussian", or within bounds "tanh_gaussian" or "truncated_gaussian".
             "categorical" where all actions are discrete; beside continuous ones, discrete ones always are.
-        action_range: (low, high) of the bounded distributions; None takes the finite bounds of the action spec.
+        action_bound: the bounded distributions lie in [-action_bound, action_bound] where the env's action spec has no
+            bounds; None refuses such a spec.
         init_std: standard deviation of each action at the start, in units of the action; of the bounded distributions
             in units of half the range, before the tanh or the truncation.
         std_type: "scalar" learns the standard deviation itself, "log" its logarithm.
@@ -35,7 +36,7 @@ class ActorCfg:
     activation: str = "elu"
     obs_normalization: bool = True
     distribution: str = "gaussian"
-    action_range: tuple[float, float] | None = None
+    action_bound: float | None = None
     init_std: float = 1.0
     std_type: str = "scalar"
     state_dependent_std: bool = False
@@ -47,14 +48,11 @@ class ActorCfg:
         object.__setattr__(self, "hidden_dims", tuple(self.hidden_dims))
         check_network(self.hidden_dims, self.activation)
         check_choice("distribution", self.distribution, DISTRIBUTIONS)
-        if self.action_range is not None:
-            check_pair("action_range", self.action_range)
-            object.__setattr__(self, "action_range", tuple(self.action_range))
-            if self.action_range[0] == self.action_range[1]:
-                raise ValueError(f"action_range={self.action_range!r}: expected low < high")
+        if self.action_bound is not None:
+            check_in_range("action_bound", self.action_bound, low=0.0, low_open=True)
             if self.distribution not in ("tanh_gaussian", "truncated_gaussian"):
                 raise ValueError(
-                    f"action_range={self.action_range!r} does nothing with distribution={self.distribution!r}: "
+                    f"action_bound={self.action_bound!r} does nothing with distribution={self.distribution!r}: "
                     "use 'tanh_gaussian' or 'truncated_gaussian', or leave it out"
                 )
         check_in_range("init_std", self.init_std, low=0.0, low_open=True)

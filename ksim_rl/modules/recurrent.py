@@ -1,6 +1,7 @@
 """Memory for any network: a TensorDict module that turns observations into features of the episode so far."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import torch
@@ -11,13 +12,16 @@ from tensordict.nn import (
     TensorDictModuleBase,
     TensorDictSequential,
 )
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn import functional
 from torchrl.data import Composite, Unbounded
 from torchrl.modules import recurrent_mode
 
 from ksim_rl.checks import check_choice
+from ksim_rl.modules.actor import make_actor
+from ksim_rl.modules.actor_cfg import ActorCfg
+from ksim_rl.modules.critic import CriticCfg, make_critic
+from ksim_rl.modules.observation_keys import ObservationKey, side_by_side
 from ksim_rl.modules.observation_normalizer import ObservationNormalizer
 from ksim_rl.modules.recurrent_cells import gru_layer, lstm_layer
 from ksim_rl.modules.recurrent_primer import RecurrentStatePrimer
@@ -28,6 +32,7 @@ _NUM_GATES = {"lstm": 4, "gru": 3}
 STATE_KEY, FEATURE_KEY, RESET_KEY = "recurrent_state", "recurrent_features", "is_init"
 
 AnyModule = TypeVar("AnyModule", bound=TensorDictModuleBase)
+AnyCfg = TypeVar("AnyCfg", ActorCfg, CriticCfg)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +121,7 @@ class RecurrentNetwork(nn.Module):
 class RecurrentModule(TensorDictModule):
     """A `RecurrentNetwork` on TensorDicts, by TorchRL's conventions; a drop-in for its `LSTMModule` and `GRUModule`.
 
-    Reads `in_key` [*batch, L], `is_init` and the state under ("recurrent_state", name, "h") and, for an LSTM, "c", each
+    Reads observations side by side [*batch, L], `is_init` and the state under ("recurrent_state", name, "h") and, for an LSTM, "c", each
     [*batch, N, H]; writes the features [*batch, H] and, under "next", the state after the step.
 
     By default every element of the batch is one step. Under TorchRL's `set_recurrent_mode(True)`, where its and our
@@ -127,7 +132,8 @@ class RecurrentModule(TensorDictModule):
     `recurrent_transforms`; or TorchRL's `InitTracker` and `make_tensordict_primer()`.
 
     Args:
-        in_key: of the observation.
+        obs_dim: L.
+        in_keys: of the observations.
         name: tells the states of several modules in one TensorDict apart.
     """
 
@@ -138,17 +144,17 @@ class RecurrentModule(TensorDictModule):
         cfg: RecurrentCfg,
         *,
         obs_dim: int,
-        in_key: NestedKey,
+        in_keys: Sequence[ObservationKey],
         name: str,
         obs_normalization: bool = False,
         device: torch.device | str | None = None,
     ) -> None:
         network = RecurrentNetwork(cfg, obs_dim=obs_dim, obs_normalization=obs_normalization, device=device)
-        self.state_keys = state_keys(cfg, name)
+        self.obs_keys, self.state_keys = list(in_keys), state_keys(cfg, name)
         self.feature_key = (FEATURE_KEY, name)
         super().__init__(
             network,
-            in_keys=[in_key, RESET_KEY, *self.state_keys],
+            in_keys=[*self.obs_keys, RESET_KEY, *self.state_keys],
             out_keys=[self.feature_key, *(("next", *key) for key in self.state_keys)],
         )
         self.cfg, self.name = cfg, name
@@ -160,7 +166,9 @@ class RecurrentModule(TensorDictModule):
             ValueError: where sequences are expected and the batch is not [B, T], or has no `is_init`; where there is no
                 state.
         """
-        obs, reset, *state = (tensordict.get(key, None) for key in self.in_keys)
+        obs = side_by_side([tensordict.get(key) for key in self.obs_keys])
+        reset = tensordict.get(RESET_KEY, None)
+        state = [tensordict.get(key, None) for key in self.state_keys]
         if any(part is None for part in state):
             raise ValueError(
                 f"the data has no {self.state_keys}: give the env `recurrent_transforms`, which begin episodes with a "
@@ -202,6 +210,30 @@ class RecurrentModule(TensorDictModule):
         return RecurrentStatePrimer(state_spec(self.cfg, self.name))
 
 
+def make_recurrent_actor(
+    cfg: RecurrentCfg, actor: ActorCfg, *, obs_dim: int, name: str = "actor", **options: Any
+) -> ProbabilisticTensorDictSequential:
+    """Build a policy behind a memory, which reads and normalizes what the policy would.
+
+    Args:
+        cfg: of the memory.
+        actor: of the policy.
+        obs_dim: size of the observations side by side.
+        name: of the memory's state; see `RecurrentModule`.
+        **options: of `make_actor`.
+    """
+    memory, actor = _memory_before(actor, cfg, obs_dim=obs_dim, name=name, device=options.get("device"))
+    return with_memory(memory, make_actor(actor, obs_dim=cfg.hidden_dim, **options))
+
+
+def make_recurrent_critic(
+    cfg: RecurrentCfg, critic: CriticCfg, *, obs_dim: int, name: str = "critic", **options: Any
+) -> TensorDictModule:
+    """Build a critic behind a memory of its own; as `make_recurrent_actor`."""
+    memory, critic = _memory_before(critic, cfg, obs_dim=obs_dim, name=name, device=options.get("device"))
+    return with_memory(memory, make_critic(critic, obs_dim=cfg.hidden_dim, **options))
+
+
 def with_memory(memory: RecurrentModule, network: AnyModule) -> AnyModule:
     """Return an actor or a critic behind a memory, whose features it reads at `memory.feature_key`."""
     if isinstance(network, ProbabilisticTensorDictSequential):
@@ -225,6 +257,21 @@ def state_spec(cfg: RecurrentCfg, name: str) -> Composite:
     shape = (cfg.num_layers, cfg.hidden_dim)
     parts = {part: Unbounded(shape) for part in STATES[cfg.kind]}
     return Composite({STATE_KEY: Composite({name: Composite(parts)})})
+
+
+def _memory_before(
+    network: AnyCfg, cfg: RecurrentCfg, *, obs_dim: int, name: str, device: torch.device | str | None
+) -> tuple[RecurrentModule, AnyCfg]:
+    """Return a memory, and the settings of a network that reads its features instead of the observations."""
+    memory = RecurrentModule(
+        cfg,
+        obs_dim=obs_dim,
+        in_keys=network.in_keys,
+        name=name,
+        obs_normalization=network.obs_normalization,
+        device=device,
+    )
+    return memory, replace(network, in_keys=(memory.feature_key,), obs_normalization=False)
 
 
 def _layer_parameters(cfg: RecurrentCfg, input_dim: int) -> dict[str, Tensor]:

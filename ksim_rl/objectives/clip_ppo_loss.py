@@ -1,6 +1,5 @@
 """The clipped surrogate loss of PPO, free of host syncs."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,9 +14,15 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Distribution
 from torchrl import objectives
-from torchrl.modules.distributions.utils import has_analytic_entropy
+from torchrl.modules.distributions.utils import has_analytic_entropy, sample_and_log_prob
 
-from ksim_rl.objectives.gaussian_kl import gaussian_parameters, kl_divergence
+from ksim_rl.objectives.policy_kl import (
+    distribution_keys,
+    estimated_kl,
+    observation_keys,
+    policy_kl,
+    stored_distribution,
+)
 
 
 class ClipPPOLoss(objectives.ClipPPOLoss):
@@ -25,8 +30,9 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
     gradients.
 
     The stock loss reads tensor values on the host 1 to 3 times per call and breaks `fullgraph` compilation
-    with `clip_value`; this one never does. It also writes `kl`, the exact divergence from the policy that
-    collected the data to the present one, when the data has its `loc` and `scale`.
+    with `clip_value`; this one never does. It also writes `kl`, the divergence from the policy that collected the
+    data to the present one: exact where there is a closed form and the data has the parameters of the old distribution
+    (`loc` and `scale`, say), else an estimate from the actions.
 
     Losses are means over the env states, without a factor 0.5:
     `loss_objective` = -mean(min(r A, clip(r, 1 - clip_epsilon, 1 + clip_epsilon) A)), r the probability
@@ -43,16 +49,6 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         log_ratio_statistics: also write TorchRL's `ESS`, `max_ratio` and `mean_ratio`.
         **kwargs: all other options of TorchRL's `ClipPPOLoss`.
     """
-
-    @dataclass
-    class _AcceptedKeys(objectives.ClipPPOLoss._AcceptedKeys):
-        """Adds the keys of the collecting policy's distribution to those of TorchRL."""
-
-        loc: NestedKey = "loc"
-        scale: NestedKey = "scale"
-
-    default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys  # type: ignore[assignment]
 
     def __init__(
         self,
@@ -78,18 +74,17 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
     @property
     def dataset_keys(self) -> list[NestedKey]:
         """The leaves that a dataset needs for this loss, advantages already estimated."""
-        keys = self.tensor_keys
+        keys, actor = self.tensor_keys, self.actor_network
         critic_keys = (
             []
             if self.critic_network is None
             else [*self.critic_network.in_keys, keys.value, keys.value_target]
         )
         wanted = [
-            *self.actor_network.in_keys,
-            keys.action,
-            keys.sample_log_prob,
-            keys.loc,
-            keys.scale,
+            *observation_keys(actor),
+            *_as_list(keys.action),
+            *_as_list(keys.sample_log_prob),
+            *distribution_keys(actor),
             keys.advantage,
         ]
         return list(dict.fromkeys([*wanted, *critic_keys]))
@@ -99,8 +94,8 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         """Return the losses and what is logged beside them, all detached but those named `loss_*`.
 
         Args:
-            tensordict: a minibatch `["B"]` with the `dataset_keys`. Without an advantage it must be a
-                rollout, from which the value estimator computes one.
+            tensordict: a minibatch `["B"]`, or `["B","T"]` for recurrent networks, with the `dataset_keys`.
+                Without an advantage it must be a rollout, from which the value estimator computes one.
 
         Returns:
             TensorDict without batch dims: `loss_objective`, `loss_critic`, `loss_entropy`, `entropy`, `kl`,
@@ -108,8 +103,7 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         """
         tensordict = tensordict.clone(False)
         # Read before the actor runs, which writes its own distribution under the same keys.
-        loc_old = tensordict.get(self.tensor_keys.loc, None)
-        scale_old = tensordict.get(self.tensor_keys.scale, None)
+        dist_old = stored_distribution(self.actor_network, tensordict)
         advantage = self._advantage(tensordict)
         log_weight, dist, kl_approx, log_is_weight = self._log_weight(
             tensordict, adv_shape=advantage.shape[:-1]
@@ -130,8 +124,7 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
 
         losses = {"loss_objective": -gain}
         logged = {"clip_fraction": clipped.to(gain.dtype), "kl_approx": kl_approx}
-        if loc_old is not None and scale_old is not None:
-            logged.update(_kl(loc_old, scale_old, dist))
+        logged["kl"] = _kl(dist_old, dist, log_behavior_weight)
         out = TensorDict({})
         if self.entropy_bonus:
             entropy = self._get_entropy(dist, adv_shape=advantage.shape[:-1])
@@ -141,7 +134,8 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
                 entropy = entropy.sum(dim="feature", reduce=True)  # type: ignore[call-overload]
             logged["entropy"] = entropy
         if self._has_critic:
-            losses["loss_critic"], value_clip_fraction, explained_variance = self.loss_critic(tensordict)
+            loss_critic, value_clip_fraction, explained_variance = self.loss_critic(tensordict)
+            losses["loss_critic"] = loss_critic.view_as(advantage)
             if value_clip_fraction is not None:
                 out.set("value_clip_fraction", value_clip_fraction)
             if explained_variance is not None:
@@ -163,6 +157,10 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
             "target_critic_network_params",
         )
         return out
+
+    def _critic_loss_inputs(self, *values: Tensor | None) -> tuple[Tensor | None, ...]:
+        # TorchRL's explained variance is over the first dim: rows of sequences [B, T] come one below the other.
+        return super()._critic_loss_inputs(*(v if v is None else v.flatten(0, -2) for v in values))
 
     def _advantage(self, tensordict: TensorDictBase) -> Tensor:
         advantage = tensordict.get(self.tensor_keys.advantage, None)
@@ -206,18 +204,33 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         return error / variance.sqrt().clamp_min(torch.finfo(torch.float32).resolution)
 
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor | TensorDictBase:
-        if isinstance(dist, CompositeDistribution) or not has_analytic_entropy(dist):
-            return super()._get_entropy(dist, adv_shape)
         # TorchRL falls back on samples where the entropy is not finite, and asks the host for it.
-        return dist.entropy().unsqueeze(-1)
+        if isinstance(dist, CompositeDistribution):
+            entropies = {_entropy_key(key): self._entropy(part) for key, part in dist.dists.items()}
+            return TensorDict(entropies, batch_size=adv_shape).unsqueeze(-1)
+        return self._entropy(dist).unsqueeze(-1)
+
+    def _entropy(self, dist: Distribution) -> Tensor:
+        if has_analytic_entropy(dist):
+            return dist.entropy()
+        _, log_prob = sample_and_log_prob(
+            dist, (self.samples_mc_entropy,), reparameterize=bool(dist.has_rsample)
+        )
+        return -log_prob.mean(0)
 
 
-def _kl(loc_old: Tensor, scale_old: Tensor, dist: Distribution) -> dict[str, Tensor]:
-    parameters = gaussian_parameters(dist)
-    if parameters is None:
-        return {}
+def _kl(old: Distribution | None, new: Distribution, log_ratio: Tensor) -> Tensor:
     with torch.no_grad():
-        return {"kl": kl_divergence(loc_old, scale_old, *parameters).unsqueeze(-1)}
+        exact = None if old is None else policy_kl(old, new)
+        return estimated_kl(log_ratio) if exact is None else exact.unsqueeze(-1)
+
+
+def _entropy_key(key: NestedKey) -> NestedKey:
+    return f"{key}_entropy" if isinstance(key, str) else (*key[:-1], f"{key[-1]}_entropy")
+
+
+def _as_list(keys: NestedKey | list[NestedKey]) -> list[NestedKey]:
+    return list(keys) if isinstance(keys, list) else [keys]
 
 
 def _ratio_statistics(log_weight: Tensor) -> dict[str, Tensor]:

@@ -8,8 +8,7 @@ def project_distribution(probs: Tensor, reward: Tensor, discount: Tensor, suppor
     """Return the distribution of `reward + discount * z` on the atoms, for `z` distributed as `probs`.
 
     The mass of each moved atom goes to the two atoms that it falls between, in proportion to how near they are; beyond
-    the ends it goes to the last atom (algorithm 1 of the paper). Each target atom collects what is within one spacing of
-    it, so a triangular kernel replaces the paper's scatter, whose sums of atomics differ from run to run.
+    the ends it goes to the last atom (algorithm 1 of the paper).
 
     Args:
         probs: [..., A], probabilities of the atoms.
@@ -22,7 +21,7 @@ def project_distribution(probs: Tensor, reward: Tensor, discount: Tensor, suppor
     low, high, count = support[0], support[-1], support.shape[0]
     spacing = (high - low) / (count - 1)
     position = ((reward + discount * support).clamp(low, high) - low) / spacing
-    # One target atom at a time would be A kernels; all at once A^2 numbers per env state. The scatter below is neither.
+    # The last atom itself counts as the upper neighbour of the one before, so that no index runs over the end.
     lower = position.floor().clamp(0, count - 2)
     upper_share = position - lower
     lower_index = lower.to(torch.int64).expand_as(probs)

@@ -1,4 +1,4 @@
-"""The settings of off-policy learning: SAC, FastTD3 and FastSAC."""
+"""The settings of off-policy learning: SAC and TD3, and their recipes for many envs, FastSAC and FastTD3."""
 
 from dataclasses import dataclass
 
@@ -60,6 +60,8 @@ class OffPolicyCfg:
 class SACCfg(OffPolicyCfg):
     """Soft actor-critic with a learned temperature (Haarnoja et al., arXiv 1801.01290 and 1812.05905).
 
+    With critics of many atoms, large minibatches and many envs it is FastSAC (Seo et al., arXiv 2512.01996).
+
     Attributes:
         alpha_init: temperature at the start, in units of the return per nat.
         alpha_learning_rate: of the temperature's logarithm; 0 keeps `alpha_init`.
@@ -79,22 +81,10 @@ class SACCfg(OffPolicyCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FastSACCfg(SACCfg):
-    """SAC with distributional critics, large minibatches and many envs (Seo et al., arXiv 2512.01996)."""
+class TD3Cfg(OffPolicyCfg):
+    """Twin delayed deterministic policy gradients (Fujimoto et al., arXiv 1802.09477).
 
-    gamma: float = 0.97
-    tau: float = 0.125
-    value_reduction: str = "mean"
-    policy_delay: int = 4
-    betas: tuple[float, float] = (0.9, 0.95)
-    weight_decay: float = 1e-3
-    alpha_init: float = 1e-3
-    target_entropy_per_action: float = 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class FastTD3Cfg(OffPolicyCfg):
-    """TD3 with distributional critics, large minibatches and many envs (Seo et al., arXiv 2505.22642).
+    Targets take the present policy, not a slow copy of it, as FastTD3 does (Seo et al., arXiv 2505.22642).
 
     Attributes:
         exploration_noise_min, exploration_noise_max: range of the standard deviation of the noise on the actions that are
@@ -103,13 +93,10 @@ class FastTD3Cfg(OffPolicyCfg):
             computed for, in the same units.
     """
 
-    gamma: float = 0.97
-    tau: float = 0.1
     policy_delay: int = 2
-    weight_decay: float = 0.1
-    exploration_noise_min: float = 0.001
-    exploration_noise_max: float = 0.4
-    target_noise: float = 0.001
+    exploration_noise_min: float = 0.1
+    exploration_noise_max: float = 0.1
+    target_noise: float = 0.2
     target_noise_clip: float = 0.5
 
     def __post_init__(self) -> None:

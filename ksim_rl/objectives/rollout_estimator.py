@@ -2,14 +2,15 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, dispatch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives.value import ValueEstimatorBase
 
 
@@ -47,6 +48,9 @@ class RolloutEstimator(ValueEstimatorBase):
     A step whose reward or values are not finite gets a NaN advantage, so that `DatasetBuffer` removes it, and the
     recursion starts anew before it: the steps that led there keep finite advantages, which bootstrap from the value at
     that step. A non-finite value after a termination does not matter.
+
+    A recurrent critic needs batch dims [E, T]: it runs through the rollout from the state of the first step, and the
+    value after a step is that of the true next observation and the state after the step.
     """
 
     flatten: bool
@@ -82,7 +86,7 @@ class RolloutEstimator(ValueEstimatorBase):
         signals = self._signals(tensordict, params, target_params, self._resolved(time_dim, tensordict))
         advantage, value_target, finite = self._estimate(signals, tensordict)
         if self.normalize_advantage:
-            advantage = _normalize(advantage, finite)
+            advantage = standardized(advantage, finite)
         nan = torch.full_like(advantage, torch.nan)
         tensordict.set(self.tensor_keys.advantage, torch.where(finite, advantage, nan))
         tensordict.set(self.tensor_keys.value_target, value_target)
@@ -108,8 +112,11 @@ class RolloutEstimator(ValueEstimatorBase):
         keys = self.tensor_keys
         following: TensorDictBase = tensordict.get("next")
         if self.value_network is not None:
-            tensordict.set(keys.value, self._state_values(tensordict, params, time_dim))
             next_params = params if target_params is None else target_params
+            if carries_state(self.value_network):
+                tensordict.set(keys.value, self._unrolled_values(tensordict, params))
+            else:
+                tensordict.set(keys.value, self._state_values(tensordict, params, time_dim))
             following.set(keys.value, self._state_values(following, next_params, time_dim))
         read: list[Any] = [tensordict.get(keys.value, None)]
         read += [following.get(key, None) for key in (keys.value, keys.reward, keys.done)]
@@ -135,12 +142,22 @@ class RolloutEstimator(ValueEstimatorBase):
     ) -> Tensor:
         critic = self.value_network
         assert isinstance(critic, TensorDictModule)
-        with nullcontext() if params is None else params.to_module(critic):
+        # A recurrent critic, too, takes each element as one step here: it goes on from the state that lies beside it.
+        with nullcontext() if params is None else params.to_module(critic), steps_of(critic):
             return self._in_rows(
                 lambda rows: critic(rows).get(self.tensor_keys.value),
-                tensordict.select(*critic.in_keys),
+                tensordict.select(*critic.in_keys, strict=not carries_state(critic)),
                 time_dim,
             )
+
+    def _unrolled_values(self, tensordict: TensorDictBase, params: TensorDictBase | None) -> Tensor:
+        """Return the values of a recurrent critic from the first step's state on, and leave its states under "next"."""
+        critic = self.value_network
+        assert isinstance(critic, TensorDictModule)
+        with nullcontext() if params is None else params.to_module(critic), set_recurrent_mode(True):
+            unrolled = critic(tensordict.select(*critic.in_keys))
+        tensordict.get("next").update(unrolled.get("next"))
+        return unrolled.get(self.tensor_keys.value)
 
     def _in_rows(
         self, network: Callable[[TensorDictBase], Tensor], inputs: TensorDictBase, time_dim: int
@@ -173,6 +190,17 @@ class RolloutEstimator(ValueEstimatorBase):
         return copy.get(self.tensor_keys.value_target)
 
 
+def carries_state(network: TensorDictModuleBase) -> bool:
+    """Whether a network is recurrent: it writes under "next" what it reads at the root one step later."""
+    return any(isinstance(key, tuple) and key[0] == "next" for key in network.out_keys)
+
+
+def steps_of(network: TensorDictModuleBase) -> AbstractContextManager[Any]:
+    """Let a recurrent network take each element of a batch as one step, even inside a loss."""
+    # Not for others: the compiler cannot follow it.
+    return set_recurrent_mode(False) if carries_state(network) else nullcontext()
+
+
 def device_of(critic: TensorDictModule | None, device: torch.device | str | None) -> torch.device | None:
     """Return the device of an estimator's constants: `device`, or that of the critic."""
     if device is None and critic is not None:
@@ -193,7 +221,7 @@ def discounted_sum(
     return torch.stack(totals[::-1]).movedim(0, time_dim)
 
 
-def _normalize(advantage: Tensor, finite: Tensor) -> Tensor:
+def standardized(advantage: Tensor, finite: Tensor) -> Tensor:
     """Shift and scale to mean 0 and standard deviation 1 over the elements that `finite` marks."""
     count = finite.sum()
     zero = torch.zeros_like(advantage)

@@ -58,7 +58,13 @@ class SymmetricAugmentation:
 
     def __call__(self, minibatch_B: TensorDictBase) -> TensorDictBase:
         """Return `minibatch_B` and its image, `["B"]` with twice the size; the first half is the minibatch."""
-        both_B: TensorDictBase = torch.cat((minibatch_B, self.image(minibatch_B)))  # type: ignore[call-overload]
+        # Leaf by leaf: the compiler cannot follow torch.cat of TensorDicts.
+        both_B = minibatch_B.apply(
+            lambda *leaves: torch.cat(leaves),
+            self.image(minibatch_B),
+            batch_size=[2 * minibatch_B.batch_size[0]],
+        )
+        assert both_B is not None
         return dims.name(both_B, dims.B)
 
 

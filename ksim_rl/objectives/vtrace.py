@@ -12,7 +12,13 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import value
 
-from ksim_rl.objectives.rollout_estimator import RolloutEstimator, Signals, device_of, discounted_sum
+from ksim_rl.objectives.rollout_estimator import (
+    RolloutEstimator,
+    Signals,
+    device_of,
+    discounted_sum,
+    steps_of,
+)
 
 
 class VTrace(RolloutEstimator, value.VTrace):
@@ -111,7 +117,8 @@ class VTrace(RolloutEstimator, value.VTrace):
 
     def _ratio(self, tensordict: TensorDictBase, signals: Signals) -> Tensor:
         actor, keys = self.actor_network, [*self.actor_network.in_keys, *self.actor_network.dist_sample_keys]
-        log_prob = self._in_rows(self._log_prob, tensordict.select(*keys), signals.time_dim)
+        with steps_of(actor):
+            log_prob = self._in_rows(self._log_prob, tensordict.select(*keys), signals.time_dim)
         old_log_prob = tensordict.get(self.tensor_keys.sample_log_prob, None)
         if old_log_prob is None or old_log_prob.numel() != log_prob.numel():
             raise ValueError(

@@ -1,5 +1,8 @@
 """What the lanes of one warp do together: on CUDA 32 lanes share a world, on the CPU one lane has it all."""
 
+# Native functions have no body in Python; Warp gives each as many values as it is asked for.
+# pyright: reportReturnType=false
+
 import functools
 
 import warp as wp
@@ -29,9 +32,8 @@ def total(value: float) -> float:
 
 
 @functools.cache
-def scratch(size: int, worlds_per_block: int) -> wp.Function:
+def shared_floats(size: int, worlds_per_block: int) -> wp.Function:
     """Return a Warp function that gives the address of `size` floats that the lanes of a world share."""
-
     snippet = f"""
 #if defined(__CUDA_ARCH__)
 __shared__ float floats[{worlds_per_block * size}];

@@ -3,6 +3,8 @@
 from ksim_rl.trainers.build import build
 from ksim_rl.trainers.checkpoint import Checkpoint, CheckpointError
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
+from ksim_rl.trainers.hook import Hook
+from ksim_rl.trainers.off_policy_update import OffPolicyUpdate
 from ksim_rl.trainers.ppo_update import PPOUpdate
 from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg
@@ -15,7 +17,9 @@ __all__ = [
     "CheckpointError",
     "Evaluation",
     "Evaluator",
+    "Hook",
     "ModulesCfg",
+    "OffPolicyUpdate",
     "Outcome",
     "PPOUpdate",
     "Policy",

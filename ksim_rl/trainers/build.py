@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,11 @@ from ksim_rl import envs
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.envs.innermost import innermost
 from ksim_rl.trainers import state_tree
+from ksim_rl.trainers.checkpoint import Checkpoint
 from ksim_rl.trainers.evaluation import Evaluator
-from ksim_rl.trainers.loggers import make_loggers
+from ksim_rl.trainers.hook import Hook
+from ksim_rl.trainers.loggers import check_installed, make_loggers
+from ksim_rl.trainers.networks import with_recurrent_state
 from ksim_rl.trainers.run_cfg import RunCfg
 from ksim_rl.trainers.trainer import Trainer
 from ksim_rl.trainers.updates import make_update
@@ -26,7 +29,13 @@ EVALUATION_SEED_OFFSET = 1_000_003
 UNLIMITED_EPISODE_STEPS = 1000
 
 
-def build(cfg: RunCfg, *, run_folder: Path | None = None) -> Trainer:
+def build(
+    cfg: RunCfg,
+    *,
+    run_folder: Path | None = None,
+    hooks: Sequence[Hook] = (),
+    resume_from: Checkpoint | None = None,
+) -> Trainer:
     """Build everything that a run needs, with all its memory allocated.
 
     Torch's global seed, matmul precision and number of CPU threads are set from the config.
@@ -34,7 +43,13 @@ def build(cfg: RunCfg, *, run_folder: Path | None = None) -> Trainer:
     Args:
         cfg: of the run.
         run_folder: takes logs and checkpoints; None writes nothing.
+        hooks: what else to do between iterations.
+        resume_from: what the run continues from; None starts anew, with the weights of `cfg.checkpoint` if it has one.
+
+    Raises:
+        ValueError: if a logger's package is missing, or a checkpoint is of another network or env.
     """
+    check_installed(cfg.logger)
     torch.manual_seed(cfg.seed)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
     torch.set_num_threads(cfg.trainer.num_threads or max(1, (os.cpu_count() or 1) - 1))
@@ -48,23 +63,32 @@ def build(cfg: RunCfg, *, run_folder: Path | None = None) -> Trainer:
         keys=update.rollout_keys,
         cfg=cfg.collector,
     )
-    return Trainer(
+    trainer = Trainer(
         cfg.trainer,
         collector=collector,
         update=update,
         evaluator=build_evaluator(cfg, update.actor) if cfg.trainer.eval_episodes else None,
         solved_at=solved_at(cfg),
-        loggers=make_loggers(cfg.logger, run_folder) if run_folder else (),
+        hooks=hooks,
         folder=run_folder / "checkpoint" if run_folder else None,
         config=cfg.to_tree(),
     )
+    if resume_from is not None:
+        trainer.load_state_dict(resume_from.state)
+    elif cfg.checkpoint is not None:
+        trainer.load_weights(Path(cfg.checkpoint))
+    if run_folder is not None:
+        # Last, because a run that cannot be built must not show up anywhere.
+        trainer.loggers = make_loggers(cfg.logger, run_folder, config=trainer.config)
+    return trainer
 
 
 def build_env(cfg: RunCfg, *, num_envs: int, seed: int, render_mode: str | None = None) -> EnvBase:
     """Build the env of a run, with another number of envs and another seed."""
     scene = dataclasses.replace(cfg.task.scene, num_envs=num_envs)
     task = dataclasses.replace(cfg.task, scene=scene, seed=seed)
-    return envs.build(task, device=cfg.resolved_device(), render_mode=render_mode)
+    env = envs.build(task, device=cfg.resolved_device(), render_mode=render_mode)
+    return with_recurrent_state(env, cfg.modules)
 
 
 def load_actor(actor: TensorDictModuleBase, state: Mapping[str, Any]) -> None:

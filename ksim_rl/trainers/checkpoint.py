@@ -18,9 +18,8 @@ from typing import Any
 import safetensors.torch
 from safetensors import SafetensorError
 
-from ksim_rl.trainers import state_tree
+from ksim_rl.trainers import checkpoint_formats, state_tree
 
-FORMAT_VERSION = 1
 MANIFEST, TENSORS = "manifest.json", "tensors.safetensors"
 _TEMPORARY, _DISCARDED = ".writing-", ".discarded-"
 _MAX_MANIFEST_BYTES = 64 * 2**20
@@ -53,7 +52,7 @@ def save(
     tensor_bytes = safetensors.torch.save(tensors)
     manifest_bytes = _seal(
         {
-            "format_version": FORMAT_VERSION,
+            "format_version": checkpoint_formats.FORMAT_VERSION,
             "iteration": iteration,
             "files": {TENSORS: {"bytes": len(tensor_bytes), "sha256": _sha256(tensor_bytes)}},
             "values": values,
@@ -83,10 +82,10 @@ def save(
 
 
 def load(path: Path) -> Checkpoint:
-    """Read one checkpoint, verifying every byte before any of it is used.
+    """Read one checkpoint, verifying every byte before any of it is used, and bring an older format up to date.
 
     Raises:
-        CheckpointError: with the reason, when anything is absent, damaged, surplus or of another version.
+        CheckpointError: with the reason, when anything is absent, damaged, surplus or of a version that cannot be read.
     """
     manifest = _read_manifest(path)
     files = manifest["files"]
@@ -106,6 +105,7 @@ def load(path: Path) -> Checkpoint:
         state = state_tree.join(safetensors.torch.load(tensor_bytes), manifest["values"])
     except (SafetensorError, ValueError) as error:
         raise CheckpointError(f"{path / TENSORS}: not a valid tensor file: {error}") from error
+    state = checkpoint_formats.migrate(state, manifest["format_version"])
     return Checkpoint(path=path, iteration=manifest["iteration"], config=manifest["config"], state=state)
 
 
@@ -157,12 +157,9 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path / MANIFEST}: damaged: {type(error).__name__}: {error}") from error
     if not intact:
         raise CheckpointError(f"{path / MANIFEST}: damaged: its SHA-256 does not match its content")
-    if not isinstance(manifest, dict) or manifest.get("format_version") != FORMAT_VERSION:
-        version = manifest.get("format_version") if isinstance(manifest, dict) else None
-        raise CheckpointError(
-            f"{path}: checkpoint format {version!r}, this version reads {FORMAT_VERSION}: "
-            "load it with the version of ksim_rl that wrote it"
-        )
+    version = manifest.get("format_version") if isinstance(manifest, dict) else None
+    if reason := checkpoint_formats.refusal(version):
+        raise CheckpointError(f"{path}: {reason}")
     well_formed = (
         isinstance(manifest.get("iteration"), int)
         and isinstance(manifest.get("config"), dict)

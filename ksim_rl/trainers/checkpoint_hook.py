@@ -18,6 +18,8 @@ class CheckpointHook(Hook):
 
     def __call__(self, trainer: Trainer) -> None:
         """Save, or say why not."""
+        if trainer.folder is None:
+            return
         try:
             trainer.save()
         except OSError as error:
@@ -27,5 +29,5 @@ class CheckpointHook(Hook):
 
     def at_end(self, trainer: Trainer) -> None:
         """Save the end, which must not fail in silence."""
-        if trainer.saved_at != trainer.iteration:
+        if trainer.folder is not None and trainer.saved_at != trainer.iteration:
             trainer.save()

@@ -6,20 +6,23 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.data import DatasetBuffer, DatasetCfg
+from ksim_rl.data import DatasetBuffer, DatasetCfg, SequenceSampler
 from ksim_rl.envs.mirror_maps import mirror_maps
 from ksim_rl.envs.transforms import MirrorMap
-from ksim_rl.modules import update_normalizers
+from ksim_rl.modules import CarriedState, burnt_in, memories, update_normalizers
 from ksim_rl.objectives import (
     PPOCfg,
     StepGuard,
+    distribution_keys,
     load_optimizer_state_,
     make_advantage,
     make_loss,
     make_optimizer,
+    observation_keys,
     make_symmetric,
     ppo_step,
 )
@@ -44,8 +47,10 @@ LOGGED = {
 def make_ppo_update(cfg: RunCfg, env: EnvBase) -> "PPOUpdate":
     """Build the PPO update of a run."""
     assert isinstance(cfg.objective, PPOCfg)
+    if not isinstance(cfg.data, DatasetCfg):
+        raise ValueError(f"data is a {type(cfg.data).__name__}, and PPO needs a DatasetCfg: use data=on_policy")
     actor, critic = build_networks(cfg, env)
-    read = list(dict.fromkeys((*actor.in_keys, *critic.in_keys)))
+    read = list(dict.fromkeys((*observation_keys(actor), *critic.in_keys)))
     return PPOUpdate(
         cfg.objective,
         actor=actor,
@@ -71,7 +76,7 @@ class PPOUpdate:
 
     Args:
         cfg: of the objective.
-        actor: writes `action`, `action_log_prob`, `loc` and `scale`.
+        actor: any probabilistic module: writes actions, their log-probabilities and the parameters of their distribution.
         critic: writes `state_value`.
         data: sizes of dataset and minibatch.
         seed: of the order of the env states in the minibatches.
@@ -96,12 +101,23 @@ class PPOUpdate:
         self.loss = make_loss(cfg, actor, critic)
         self._losses = make_symmetric(cfg, self.loss, mirror, device=self.device)
         self.optimizer = make_optimizer(cfg, actor, critic)
-        self.dataset = DatasetBuffer(data, keys=self.loss.dataset_keys, seed=seed, device=self.device)
+        # Networks with a memory learn on sequences. The rollouts hold the actor's states, and not the critic's.
+        self._memories = memories(actor, critic)
+        self._carried = CarriedState(critic, acting=actor)
+        sampler = SequenceSampler(sequence_length=data.sequence_length, burn_in=data.burn_in, seed=seed)
+        self.dataset = DatasetBuffer(
+            data,
+            keys=self.loss.dataset_keys,
+            seed=seed,
+            sampler=sampler if self._memories else None,
+            device=self.device,
+        )
         self.guard = StepGuard(device=self.device)
         self._rollout_ET: TensorDictBase | None = None
         self._sums: dict[str, Tensor] = {}
         self._steps_made = torch.zeros((), device=self.device)
         self._std = torch.zeros((), device=self.device)
+        self._scale_keys = [key for key in distribution_keys(actor) if key == "scale" or key[-1] == "scale"]
         self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
         self._run = Captured(self._update, device=self.device)
 
@@ -118,10 +134,11 @@ class PPOUpdate:
     @property
     def rollout_keys(self) -> list[Any]:
         """The leaves of an env state that an update reads."""
-        observations = [*self.actor.in_keys, *self.critic.in_keys]
-        written = {"action", "action_log_prob", "loc", "scale"}
-        following = [("next", key) for key in (*self.critic.in_keys, "reward", "done", "terminated")]
-        return [*dict.fromkeys(observations), *sorted(written), *following]
+        actor = self.actor
+        written = [*actor.dist_sample_keys, *actor.log_prob_keys, *distribution_keys(actor)]
+        valued = [key for key in self.critic.in_keys if key not in self._carried.keys]
+        following = [unravel_key(("next", key)) for key in (*valued, "reward", "done", "terminated")]
+        return list(dict.fromkeys([*actor.in_keys, *valued, *written, *following]))
 
     def __call__(self, rollout_ET: TensorDictBase) -> None:
         """Update the networks with a rollout `["E","T"]` of the dataset's size."""
@@ -131,8 +148,8 @@ class PPOUpdate:
     def metrics(self) -> dict[str, Tensor]:
         """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
         means = {name: total / self._steps_made.clamp_min(1.0) for name, total in self._sums.items()}
-        return means | {
-            "policy/std": self._std,
+        std = {"policy/std": self._std} if self._scale_keys else {}
+        return means | std | {
             "update/learning_rate": self.optimizer.param_groups[0]["lr"],
             "update/skipped_steps": self.guard.skipped,
             "update/skipped_in_a_row": self._longest_skip,
@@ -151,13 +168,18 @@ class PPOUpdate:
     def _update(self) -> None:
         assert self._rollout_ET is not None
         self._clear_sums()
+        self._carried.begin_(self._rollout_ET)
         rollout_ET = self.advantage(self._rollout_ET)
-        self._std.copy_(rollout_ET.get("scale").mean())
+        self._carried.end_(rollout_ET)
+        if self._scale_keys:
+            self._std.copy_(sum(rollout_ET.get(key).mean() for key in self._scale_keys) / len(self._scale_keys))
         self.dataset.extend(rollout_ET)
         for epoch in range(self.cfg.num_epochs):
             if epoch > 0 and self.cfg.estimates_each_epoch:
                 self._estimate_anew(rollout_ET)
             for minibatch_B in self.dataset.epoch():
+                if self._memories:
+                    minibatch_B = burnt_in(minibatch_B, *self._memories, steps=self.dataset.cfg.burn_in)
                 self._measure(
                     ppo_step(self._losses, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard)
                 )
@@ -199,6 +221,7 @@ class PPOUpdate:
             "sampler": self.dataset.sampler.state_dict(),
             "guard": self.guard.state_dict(),
             "non_finite_env_states": self.dataset.non_finite_count,
+            "recurrent_state": self._carried.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -212,6 +235,7 @@ class PPOUpdate:
         self._load_optimizer(state["optimizer"])
         self.dataset.sampler.load_state_dict(state["sampler"])
         self.dataset.non_finite_count.copy_(state["non_finite_env_states"])
+        self._carried.load_state_dict(state["recurrent_state"], device=self.device)
 
     def load_weights(self, state: Mapping[str, Any]) -> None:
         """Take only the networks of a `state_dict`.

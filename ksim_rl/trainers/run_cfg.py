@@ -7,12 +7,23 @@ from typing import Any
 
 import torch
 
+from ksim_rl.checks import near
 from ksim_rl.collectors import CollectorCfg
-from ksim_rl.data import DatasetCfg
+from ksim_rl.data import DatasetCfg, ReplayCfg, sequence_length
 from ksim_rl.envs import ManagerBasedRlEnvCfg
 from ksim_rl.envs.config_tree import from_tree, to_tree
-from ksim_rl.modules import ActorCfg, CriticCfg
-from ksim_rl.objectives import PPOCfg
+from ksim_rl.modules import (
+    FEATURES,
+    ActorCfg,
+    CriticCfg,
+    DeterministicActorCfg,
+    ObservationKey,
+    QNetworkCfg,
+    RecurrentCfg,
+    SharedTrunkCfg,
+    SquashedActorCfg,
+)
+from ksim_rl.objectives import PPOCfg, SACCfg, TD3Cfg
 from ksim_rl.trainers.loggers import LoggerCfg
 from ksim_rl.trainers.trainer_cfg import TrainerCfg
 
@@ -22,12 +33,43 @@ class ModulesCfg:
     """The networks.
 
     Attributes:
-        actor: the policy; reads the observation group `actor`.
-        critic: the state value; reads the observation group `critic`.
+        actor: the policy.
+        critic: the state or action value.
+        trunk: layers that both share. Then both read its "features"; what they read beside them is theirs alone.
+        recurrent_actor, recurrent_critic: memories of actor and critic, each its own; None has none.
     """
 
-    actor: ActorCfg = field(default_factory=ActorCfg)
-    critic: CriticCfg = field(default_factory=CriticCfg)
+    actor: ActorCfg | DeterministicActorCfg | SquashedActorCfg = field(default_factory=ActorCfg)
+    critic: CriticCfg | QNetworkCfg = field(default_factory=CriticCfg)
+    trunk: SharedTrunkCfg | None = None
+    recurrent_actor: RecurrentCfg | None = None
+    recurrent_critic: RecurrentCfg | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a trunk that a network does not read, and features that nothing writes."""
+        for name, cfg in (("actor", self.actor), ("critic", self.critic)):
+            if (FEATURES in self._read_by(name)) != (self.trunk is not None):
+                raise ValueError(
+                    f"{name}.in_keys={self._read_by(name)!r}: {FEATURES!r} is what a trunk writes; name it with a trunk, which "
+                    "modules=shared_trunk has, and only with one"
+                )
+            if self.trunk is not None and cfg.obs_normalization:
+                raise ValueError(f"{name}.obs_normalization=True: with a trunk, the trunk normalizes observations")
+
+    @property
+    def recurrent(self) -> bool:
+        """Whether a network has a memory."""
+        return self.recurrent_actor is not None or self.recurrent_critic is not None
+
+    def observation_keys(self) -> list[ObservationKey]:
+        """Return what the networks read of an EnvState."""
+        shared = () if self.trunk is None else self.trunk.in_keys
+        keys = dict.fromkeys((*shared, *self._read_by("actor"), *self._read_by("critic")))
+        return [key for key in keys if key != FEATURES]
+
+    def _read_by(self, name: str) -> tuple[ObservationKey, ...]:
+        # The networks of off-policy methods read the group of their own name.
+        return getattr(getattr(self, name), "in_keys", (name,))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,17 +81,20 @@ class RunCfg:
         num_envs: E, parallel envs.
         device: "cpu", "cuda", "cuda:<index>", or "auto" for CUDA where there is a GPU.
         seed: of all draws.
+        checkpoint: a run folder or a checkpoint whose networks and normalizers this run starts from; None starts
+            anew.
         task: the env.
     """
 
     task_name: str
     num_envs: int
     task: ManagerBasedRlEnvCfg
-    data: DatasetCfg
+    data: DatasetCfg | ReplayCfg
     device: str = "auto"
     seed: int = 1
+    checkpoint: str | None = None
     collector: CollectorCfg = field(default_factory=CollectorCfg)
-    objective: PPOCfg = field(default_factory=PPOCfg)
+    objective: PPOCfg | SACCfg | TD3Cfg = field(default_factory=PPOCfg)
     modules: ModulesCfg = field(default_factory=ModulesCfg)
     trainer: TrainerCfg = field(default_factory=TrainerCfg)
     logger: LoggerCfg = field(default_factory=LoggerCfg)
@@ -69,12 +114,42 @@ class RunCfg:
                 f"task.scene.num_envs={self.task.scene.num_envs} differs from num_envs={self.num_envs}: "
                 "set num_envs, which sets both"
             )
-        missing = {"actor", "critic"} - set(self.task.observations)
+        groups = {key for key in self.modules.observation_keys() if isinstance(key, str)}
+        missing = sorted(groups - set(self.task.observations))
         if missing:
             raise ValueError(
-                f"task.observations has no group {sorted(missing)[0]!r}: networks read the groups 'actor' and 'critic'"
+                f"task.observations has no group {missing[0]!r}, which modules.*.in_keys name: "
+                f"{near(missing[0], self.task.observations)}"
             )
         self.data.rollout_length(self.num_envs)
+        self._check_sequences()
+
+    def _check_sequences(self) -> None:
+        """Refuse sequences where nothing remembers, memories where nothing gives them sequences, and sizes that do not fit."""
+        ppo = self.objective if isinstance(self.objective, PPOCfg) else None
+        if not self.modules.recurrent:
+            if isinstance(self.data, DatasetCfg) and (self.data.sequence_length or self.data.burn_in):
+                raise ValueError(
+                    f"data.sequence_length={self.data.sequence_length}, data.burn_in={self.data.burn_in}: only networks "
+                    "with a memory learn on sequences; use modules=lstm or modules=gru, or null and 0"
+                )
+            return
+        if ppo is None or not isinstance(self.data, DatasetCfg):
+            raise ValueError(
+                f"modules.recurrent_actor or recurrent_critic is set, and {type(self.objective).__name__} learns on "
+                "single env states: set both to null, or use objective=ppo"
+            )
+        if ppo.symmetry != "none":
+            raise ValueError(
+                f"objective.symmetry={ppo.symmetry!r}: the state of a memory has no known mirror image; use none, or "
+                "modules=mlp"
+            )
+        sequence_length(
+            self.data.rollout_length(self.num_envs),
+            self.data.sequence_length,
+            batch_size=self.data.num_env_states_per_minibatch,
+            burn_in=self.data.burn_in,
+        )
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> "RunCfg":

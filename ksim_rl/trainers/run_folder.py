@@ -2,7 +2,7 @@
 
 import json
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +14,7 @@ from ksim_rl.envs.innermost import innermost
 from ksim_rl.trainers import checkpoint, curves, video
 from ksim_rl.trainers.build import build, build_env, load_actor
 from ksim_rl.trainers.evaluation import Evaluation
+from ksim_rl.trainers.hook import Hook
 from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_cfg import RunCfg
 from ksim_rl.trainers.trainer import Outcome, Trainer
@@ -32,26 +33,29 @@ class Policy:
 
 
 def run(
-    cfg: RunCfg, run_folder: Path, *, progress: RunProgress, resume_from: checkpoint.Checkpoint | None = None
+    cfg: RunCfg,
+    run_folder: Path,
+    *,
+    progress: RunProgress,
+    hooks: Sequence[Hook] = (),
+    resume_from: checkpoint.Checkpoint | None = None,
 ) -> Outcome:
     """Train, and leave in `run_folder` the config, metrics, checkpoints, evaluation, learning curves and a video.
 
     What cannot be drawn (no OpenGL) is said in one line of `progress`.
 
     Raises:
-        ValueError: when the checkpoint to resume from belongs to another config.
+        ValueError: when the checkpoint to resume or start from belongs to another config.
     """
     run_folder.mkdir(parents=True, exist_ok=True)
     checkpoint.remove_leftovers(run_folder / "checkpoint")
     try:
-        trainer = build(cfg, run_folder=run_folder)
+        trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
     except Exception:
         with suppress(OSError):
             run_folder.rmdir()  # only where nothing is in it yet
         raise
     (run_folder / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
-    if resume_from is not None:
-        trainer.load_state_dict(resume_from.state)
     outcome = trainer.train(progress)
     if outcome.evaluation is not None:
         write_evaluation(

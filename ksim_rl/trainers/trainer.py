@@ -8,20 +8,21 @@ from typing import Any
 
 from tensordict import TensorDictBase
 
+from ksim_rl.checks import near
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.envs.innermost import innermost
 from ksim_rl.envs.transforms import observation_columns
 from ksim_rl.trainers import checkpoint
-from ksim_rl.trainers.episode_metrics import (
-    episode_means,
-    nan_messages,
-    overflow_report,
-    read_episode_sums,
-)
+from ksim_rl.trainers.checkpoint_hook import CheckpointHook
+from ksim_rl.trainers.columns import check_columns
+from ksim_rl.trainers.episode_metrics import episode_means, read_episode_sums
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
+from ksim_rl.trainers.evaluation_hook import EvaluationHook
+from ksim_rl.trainers.hook import Hook
 from ksim_rl.trainers.interrupt import InterruptRequest
 from ksim_rl.trainers.loggers import MetricLogger
-from ksim_rl.trainers.metrics import start_copy
+from ksim_rl.trainers.metrics import PendingMetrics, start_copy
+from ksim_rl.trainers.physics_metrics import explain_physics, read_physics, without_counts
 from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_clock import RunClock
 from ksim_rl.trainers.run_state import load_random_state, random_state
@@ -31,18 +32,25 @@ from ksim_rl.trainers.update import Update
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """How a run ended. `solved` is None where the task has no threshold or nothing was evaluated."""
+    """How a run ended.
+
+    `solved` is None where the task has no threshold or nothing was evaluated, `target_met` where no target was set.
+    """
 
     iteration: int
     env_states: int
     seconds: float
     evaluation: Evaluation | None
     solved: bool | None
+    target_met: bool | None
     interrupted_by: signal.Signals | None
 
 
 class Trainer:
     """Collects, learns, and beside that logs, evaluates and saves.
+
+    The metrics of an iteration come to the host in one copy. On CUDA they are read while the next iteration runs, so
+    that the device never waits for logs; before a hook is called the run is settled first.
 
     Args:
         cfg: how long, and how often what.
@@ -51,6 +59,7 @@ class Trainer:
         evaluator: judges the policy; None never evaluates.
         solved_at: the mean evaluation return that counts as solved.
         loggers: take the metrics.
+        hooks: what else to do between iterations; they run after an evaluation and before a checkpoint.
         folder: of checkpoints; None saves none.
         config: what a checkpoint says about how the run was configured (plain data).
     """
@@ -64,18 +73,25 @@ class Trainer:
         evaluator: Evaluator | None = None,
         solved_at: float | None = None,
         loggers: Sequence[MetricLogger] = (),
+        hooks: Sequence[Hook] = (),
         folder: Path | None = None,
         config: Mapping[str, Any] | None = None,
     ) -> None:
         self.cfg, self.collector, self.update = cfg, collector, update
         self.evaluator, self.solved_at = evaluator, solved_at
         self.loggers, self.folder, self.config = loggers, folder, dict(config or {})
-        self.iteration = 0
+        self.iteration, self.saved_at = 0, -1
+        self.metrics: dict[str, float] = {}
         self.evaluation: Evaluation | None = None
         self.interrupt = InterruptRequest()
         self.clock = RunClock()
         self.progress = RunProgress(cfg.num_iterations, enabled=False)
-        self._evaluated_at = self._saved_at = -1
+        self._own_hooks = tuple(hooks)
+        judge = [EvaluationHook(evaluator, interval=cfg.eval_interval)] if evaluator is not None else []
+        self._hooks = (*judge, *hooks, CheckpointHook(interval=cfg.checkpoint_interval))
+        self._overlaps = update.device.type == "cuda" if cfg.overlap is None else cfg.overlap
+        self._unread: list[tuple[int, PendingMetrics]] = []
+        self._target_met = False
         self._warned: set[str] = set()
 
     @property
@@ -91,7 +107,7 @@ class Trainer:
         return self.evaluation.return_mean >= self.solved_at
 
     def train(self, progress: RunProgress | None = None) -> Outcome:
-        """Run until all iterations are done, the task is solved, or a signal asks to stop.
+        """Run until all iterations are done, the task is solved, a target is met, or a signal asks to stop.
 
         The first SIGINT or SIGTERM ends the run after the current iteration, with everything saved.
 
@@ -103,60 +119,102 @@ class Trainer:
             try:
                 while not self._is_over():
                     self.iterate()
-                    self._evaluate_if_due()
-                    self._save_if_due()
-                self._finish()
+                    for hook in self._due_hooks():
+                        self.settle()
+                        hook(self)
+                self.settle()
+                for hook in self._hooks:
+                    hook.at_end(self)
             finally:
                 for logger in self.loggers:
                     logger.close()
         return self._outcome()
 
     def iterate(self) -> None:
-        """Run one iteration: collect a rollout, learn from it, and report what happened."""
+        """Run one iteration: collect a rollout, learn from it, and report what happened.
+
+        Where iterations overlap, what is reported is the iteration before.
+        """
         rollout_ET = self.collector.collect()
         self.update(rollout_ET)
-        self._report(rollout_ET)
+        self.iteration += 1
+        self._unread.append((self.iteration, self._start_reading(rollout_ET)))
+        self._report(all_but=1 if self._overlaps else 0)
+
+    def settle(self) -> None:
+        """Wait until the device has done all that it was asked for, and report it."""
+        self._report(all_but=0)
+
+    def log(self, figures: Mapping[str, float]) -> None:
+        """Add figures of the present iteration to its metrics, and write them to the loggers."""
+        self.metrics |= figures
+        self._write({"iteration": self.iteration, **figures}, self.iteration)
+        self._look_at_target()
 
     def _is_over(self) -> bool:
         stop = self.cfg.stop_when_solved and self.solved
-        return self.iteration >= self.cfg.num_iterations or bool(stop) or bool(self.interrupt)
+        return (
+            self.iteration >= self.cfg.num_iterations
+            or bool(stop)
+            or self._target_met
+            or bool(self.interrupt)
+        )
 
-    def _report(self, rollout_ET: TensorDictBase) -> None:
+    def _due_hooks(self) -> list[Hook]:
+        return [hook for hook in self._hooks if hook.interval and self.iteration % hook.interval == 0]
+
+    def _start_reading(self, rollout_ET: TensorDictBase) -> PendingMetrics:
         env = self.collector.env
-        pending = start_copy(
-            read_episode_sums(env, rollout_ET) | self.update.metrics(), device=self.update.device
-        )
-        physics, losses = overflow_report(env)
-        saved = nan_messages(env)
-        metrics = pending.read()
-        self.iteration += 1
-        seconds = self.clock.lap()
+        metrics = read_episode_sums(env, rollout_ET) | read_physics(env) | self.update.metrics()
+        return start_copy(metrics, device=self.update.device)
 
-        self._warn(losses, metrics)
-        for text in saved:
+    def _report(self, *, all_but: int) -> None:
+        while len(self._unread) > all_but:
+            iteration, pending = self._unread.pop(0)
+            self._report_iteration(iteration, pending.read())
+
+    def _report_iteration(self, iteration: int, read: dict[str, float]) -> None:
+        env, seconds = self.collector.env, self.clock.lap()
+        physics = explain_physics(env, read)
+        for text in physics.saved:
             self.progress.note(f"NaN guard: {text}")
-        self.update.check(metrics)
-        metrics = episode_means(
-            metrics, max_episode_length_s=getattr(innermost(env), "max_episode_length_s", 0.0)
+        self._warn(physics.lost, read, iteration)
+        self.update.check(read)
+        self.metrics = episode_means(
+            without_counts(read), max_episode_length_s=getattr(innermost(env), "max_episode_length_s", 0.0)
         )
-        metrics |= physics | {
-            "iteration": self.iteration,
+        self.metrics |= physics.metrics | {
+            "iteration": iteration,
             "seconds": self.clock.total,
             "throughput/env_states_per_s": self.update.num_env_states / seconds,
         }
-        if self.iteration % self.cfg.log_interval == 0 or self.iteration == self.cfg.num_iterations:
-            self._log(metrics)
+        if iteration % self.cfg.log_interval == 0 or iteration == self.cfg.num_iterations:
+            self._write(self.metrics, iteration)
+        self._look_at_target()
 
-    def _log(self, metrics: dict[str, float]) -> None:
+    def _write(self, metrics: dict[str, float], iteration: int) -> None:
+        env_states = iteration * self.update.num_env_states
         for logger in self.loggers:
-            logger.log_metrics(metrics, self.env_states)
+            logger.log_metrics(metrics, env_states)
         self.progress.update(
-            self.iteration,
-            {"env_states": self.env_states, **metrics},
-            seconds_left=self.clock.seconds_left(self.cfg.num_iterations - self.iteration),
+            iteration,
+            {"env_states": env_states, **metrics},
+            seconds_left=self.clock.seconds_left(self.cfg.num_iterations - iteration),
         )
 
-    def _warn(self, losses: Sequence[str], metrics: Mapping[str, float]) -> None:
+    def _look_at_target(self) -> None:
+        targets = self.cfg.stop_at
+        reached = [self.metrics.get(name, float("-inf")) >= value for name, value in targets.items()]
+        self._target_met |= bool(targets) and all(reached)
+        for name in targets:
+            known = name in self.metrics or name.startswith("evaluation/")
+            if not known and "episode/return" in self.metrics and name not in self._warned:
+                self._warned.add(name)
+                self.progress.note(
+                    f"warning: stop_at names {name!r}, which no metric is called: {near(name, self.metrics)}"
+                )
+
+    def _warn(self, losses: Sequence[str], metrics: Mapping[str, float], iteration: int) -> None:
         """Say what went wrong in this iteration, each kind once; the counts stay in the metrics."""
         texts = {
             text.split(":")[0].split(" needed")[0]: f"PHYSICS LOST CONTACTS OR CONSTRAINTS: {text}"
@@ -171,37 +229,7 @@ class Trainer:
         for kind, text in texts.items():
             if kind not in self._warned:
                 self._warned.add(kind)
-                self.progress.note(f"warning: {text} (iteration {self.iteration}; said once)")
-
-    def _evaluate_if_due(self) -> None:
-        interval = self.cfg.eval_interval
-        if self.evaluator is not None and interval and self.iteration % interval == 0:
-            self._evaluate(self.evaluator)
-
-    def _evaluate(self, evaluator: Evaluator) -> None:
-        with self.clock.paused():
-            evaluation = evaluator(stop=self.interrupt.__bool__)
-        if evaluation is None:
-            return
-        self.evaluation, self._evaluated_at = evaluation, self.iteration
-        figures = {f"evaluation/{name}": value for name, value in evaluation.as_dict().items()}
-        self._log({"iteration": self.iteration, **figures})
-
-    def _save_if_due(self) -> None:
-        interval = self.cfg.checkpoint_interval
-        if self.folder is not None and interval and self.iteration % interval == 0:
-            try:
-                self.save()
-            except OSError as error:
-                self.progress.note(
-                    f"warning: no checkpoint at iteration {self.iteration}: {error}; the run goes on"
-                )
-
-    def _finish(self) -> None:
-        if self.evaluator is not None and not self.interrupt and self._evaluated_at != self.iteration:
-            self._evaluate(self.evaluator)
-        if self.folder is not None and self._saved_at != self.iteration:
-            self.save()
+                self.progress.note(f"warning: {text} (iteration {iteration}; said once)")
 
     def _outcome(self) -> Outcome:
         return Outcome(
@@ -210,6 +238,7 @@ class Trainer:
             seconds=self.clock.total,
             evaluation=self.evaluation,
             solved=self.solved,
+            target_met=self._target_met if self.cfg.stop_at else None,
             interrupted_by=self.interrupt.signal,
         )
 
@@ -230,7 +259,7 @@ class Trainer:
                 config=self.config,
                 keep=self.cfg.keep_checkpoints,
             )
-        self._saved_at = self.iteration
+        self.saved_at = self.iteration
         return path
 
     def load(self, path: Path) -> None:
@@ -242,6 +271,20 @@ class Trainer:
         """
         self.load_state_dict(checkpoint.load(checkpoint.latest(path)).state)
 
+    def load_weights(self, path: Path) -> None:
+        """Start from the networks and normalizers of a checkpoint, whatever its task was; all else stays new.
+
+        Raises:
+            CheckpointError: when it is absent or damaged.
+            ValueError: when its networks or the observations that they read are others.
+        """
+        state = checkpoint.load(checkpoint.latest(path)).state
+        check_columns(state["observation_columns"], observation_columns(self.collector.env))
+        try:
+            self.update.load_weights(state["update"])
+        except KeyError as error:
+            raise ValueError(f"{path}: of another algorithm: it has no network {error}") from error
+
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next iteration depends on: tensors and plain data, nested."""
         return {
@@ -252,6 +295,7 @@ class Trainer:
             "env": dict(self.collector.env.state_dict()),
             "observation_columns": observation_columns(self.collector.env),
             "random": random_state(self.update.device),
+            "hooks": {str(index): hook.state_dict() for index, hook in enumerate(self._own_hooks)},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -260,17 +304,18 @@ class Trainer:
         Raises:
             ValueError: if it is of a run whose networks or observations are others.
         """
-        columns = observation_columns(self.collector.env)
-        if state["observation_columns"] != columns:
+        check_columns(state["observation_columns"], observation_columns(self.collector.env))
+        if len(state["hooks"]) != len(self._own_hooks):
             raise ValueError(
-                f"the checkpoint's observations have the columns {state['observation_columns']}, "
-                f"and this run's {columns}"
+                f"the checkpoint is of a run with {len(state['hooks'])} hooks, and this one has {len(self._own_hooks)}"
             )
         # A first reset allocates what the collector and the transforms keep, before the saved values go in.
         self.collector.reset()
         self.update.load_state_dict(state["update"])
         self.collector.env.load_state_dict(state["env"])
         self.collector.load_state_dict(state["collector"])
-        self.iteration = self._saved_at = state["iteration"]
+        for index, hook in enumerate(self._own_hooks):
+            hook.load_state_dict(state["hooks"][str(index)])
+        self.iteration = self.saved_at = state["iteration"]
         self.clock.total = state["seconds"]
         load_random_state(state["random"], self.update.device)

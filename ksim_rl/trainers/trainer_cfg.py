@@ -1,6 +1,7 @@
 """How long a run is, and what happens beside learning."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from ksim_rl.checks import check_choice, check_in_range
 
@@ -16,9 +17,14 @@ class TrainerCfg:
         eval_interval: between evaluations with deterministic actions in envs of their own.
         eval_episodes: episodes of an evaluation, one env each; 0 means no evaluation at all.
         stop_when_solved: end the run as soon as an evaluation reaches the task's threshold.
+        stop_at: end the run as soon as each of these metrics reaches its value in one and the same iteration, such as
+            `{"reward/track_linear": 1.39}`. Figures of evaluations count as well.
         checkpoint_interval: between checkpoints; the last iteration is always saved.
         keep_checkpoints: how many of the newest checkpoints stay.
         log_interval: between rows of the logs and lines of progress.
+        overlap: read the metrics of an iteration while the next one runs; None does so on CUDA. Where nothing else
+            asks for them earlier, `stop_at` and the guards then act one iteration later. What is learned, logged and
+            saved is the same.
         num_threads: torch's threads on the CPU; None leaves one core free. A thread that has to wait for a core that is
             busy elsewhere stalls all others: on two cores that made runs beside other work twenty times slower.
         matmul_precision: of float32 products on CUDA; "high" is TF32.
@@ -30,9 +36,11 @@ class TrainerCfg:
     eval_interval: int = 20
     eval_episodes: int = 100
     stop_when_solved: bool = True
+    stop_at: Mapping[str, float] = field(default_factory=dict)
     checkpoint_interval: int = 20
     keep_checkpoints: int = 3
     log_interval: int = 1
+    overlap: bool | None = None
     num_threads: int | None = None
     matmul_precision: str = "high"
     video: bool = True
@@ -51,6 +59,8 @@ class TrainerCfg:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < low:
                 raise ValueError(f"{name}={value!r}: expected a whole number >= {low}")
+        for name, value in self.stop_at.items():
+            check_in_range(f"stop_at.{name}", value)
         if self.num_threads is not None:
             check_in_range("num_threads", self.num_threads, low=1)
         check_choice("matmul_precision", self.matmul_precision, MATMUL_PRECISIONS)

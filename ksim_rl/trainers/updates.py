@@ -7,7 +7,13 @@ from typing import Any
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from ksim_rl.objectives import PPOCfg
+from ksim_rl.objectives import PPOCfg, SACCfg, TD3Cfg
+from ksim_rl.trainers.off_policy_algorithms import (
+    make_sac_policy,
+    make_sac_update,
+    make_td3_policy,
+    make_td3_update,
+)
 from ksim_rl.trainers.ppo_update import make_ppo_policy, make_ppo_update
 from ksim_rl.trainers.run_cfg import RunCfg
 from ksim_rl.trainers.update import Update
@@ -28,6 +34,8 @@ class Algorithm:
 
 ALGORITHMS: dict[type[Any], Algorithm] = {
     PPOCfg: Algorithm(update=make_ppo_update, policy=make_ppo_policy),
+    SACCfg: Algorithm(update=make_sac_update, policy=make_sac_policy),
+    TD3Cfg: Algorithm(update=make_td3_update, policy=make_td3_policy),
 }
 
 

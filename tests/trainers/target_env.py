@@ -121,6 +121,7 @@ def make_trainer(
     iterations=6,
     noise=0.05,
     loggers=(),
+    hooks=(),
     solved_at=None,
     env=None,
     ppo=None,
@@ -148,6 +149,7 @@ def make_trainer(
         evaluator=Evaluator(evaluation_env, actor, max_steps=LENGTH, seed=7),
         solved_at=solved_at,
         loggers=loggers,
+        hooks=hooks,
         folder=folder,
         config=config,
     )

@@ -13,7 +13,7 @@ import zipfile
 import pytest
 import torch
 
-from ksim_rl.trainers import checkpoint
+from ksim_rl.trainers import checkpoint, checkpoint_formats
 from ksim_rl.trainers.checkpoint import MANIFEST, TENSORS, CheckpointError
 
 STATE = {
@@ -165,10 +165,40 @@ def test_each_kind_of_damage_is_named(saved, damage, reason):
         checkpoint.load(saved)
 
 
-def test_another_format_version_is_refused_with_what_to_do(saved, monkeypatch):
-    monkeypatch.setattr(checkpoint, "FORMAT_VERSION", 2)
-    with pytest.raises(CheckpointError, match="format 1, this version reads 2: load it with the version"):
-        checkpoint.load(saved)
+def with_version(saved, version):
+    """Write the manifest as a program of another version would: its own number, and a seal that is right."""
+    manifest = json.loads((saved / MANIFEST).read_text())["manifest"] | {"format_version": version}
+    (saved / MANIFEST).write_bytes(checkpoint._seal(manifest))
+    return saved
+
+
+@pytest.mark.parametrize(
+    ("version", "reason"),
+    [
+        (checkpoint_formats.FORMAT_VERSION + 1, "load it with the newer ksim_rl that wrote it"),
+        (0, "expected a whole number from 1"),
+        (None, "expected a whole number from 1"),
+        ("2", "expected a whole number from 1"),
+        (True, "expected a whole number from 1"),
+    ],
+)
+def test_a_format_that_cannot_be_read_is_refused_with_what_to_do(saved, version, reason):
+    with pytest.raises(CheckpointError, match=reason):
+        checkpoint.load(with_version(saved, version))
+
+
+def test_an_older_format_without_a_way_up_is_refused(saved, monkeypatch):
+    monkeypatch.setattr(checkpoint_formats, "MIGRATIONS", {})
+    with pytest.raises(CheckpointError, match="format 1, and there is no way from 1 to 2: load it with the version"):
+        checkpoint.load(with_version(saved, 1))
+
+
+def test_a_checkpoint_of_version_1_is_migrated(saved):
+    """Version 1 is what ksim_rl wrote before hooks had a state."""
+    loaded = checkpoint.load(with_version(saved, 1))
+    assert loaded.state["hooks"] == {}
+    assert torch.equal(loaded.state["update"]["actor"]["weight"], STATE["update"]["actor"]["weight"])
+    assert loaded.state["sampler"] == STATE["sampler"]
 
 
 class Bomb:

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from ksim_rl.objectives import NonFiniteStepsError
-from ksim_rl.trainers import RunProgress, checkpoint
+from ksim_rl.testing import count_syncs
+from ksim_rl.trainers import Hook, RunProgress, checkpoint
 from tests.trainers.target_env import BEST_RETURN, MemoryLogger, make_env, make_trainer
 
 
@@ -117,16 +118,24 @@ def test_steps_that_stay_non_finite_end_the_run_with_a_named_error():
 
 
 class LossyWorld:
-    """A world that lost contacts."""
+    """A world that needs 30 rows of 20, in as many worlds as it counts on the device."""
 
-    def overflow_report(self):
+    def overflow_counts(self):
+        return torch.tensor([4, 30])
+
+    def explain_overflow(self, numbers):
+        worlds, rows = numbers
+
         class Report:
-            metrics = {"nefc_share": 1.5}
+            metrics = {"nefc_share": rows / 20}
             messages = (
-                "constraint rows needed 30 per world but has 20: set sim.njmax >= 30 (NEFC in 4 worlds)",
+                f"constraint rows needed {rows} per world but has 20: set sim.njmax >= {rows} (NEFC in {worlds} worlds)",
             )
 
         return Report()
+
+    def nan_count(self):
+        return torch.tensor(0)
 
 
 def test_lost_contacts_are_said_once_and_stay_in_the_metrics():
@@ -135,20 +144,24 @@ def test_lost_contacts_are_said_once_and_stay_in_the_metrics():
     make_trainer(iterations=3, env=env, loggers=[logger]).train(notes)
     said = [note for note in notes.notes if "njmax" in note]
     assert len(said) == 1
-    assert "needed 30" in said[0]
+    assert "needed 30" in said[0] and "4 worlds" in said[0]
     assert [row["physics/nefc_share"] for row in logger.rows if "physics/nefc_share" in row] == [1.5] * 3
 
 
 class GuardedWorld(LossyWorld):
-    """A world whose NaN guard saved something in the first rollout."""
+    """A world whose NaN guard has something to save after the first rollout."""
 
-    reports = 0
+    counts = reports = 0
+
+    def nan_count(self):
+        self.counts += 1
+        return torch.tensor(int(self.counts == 1))
 
     def nan_report(self):
         self.reports += 1
 
         class Report:
-            messages = ("world 3 became non-finite: see nan-0.safetensors",) if self.reports == 1 else ()
+            messages = ("world 3 became non-finite: see nan-0.safetensors",)
 
         return Report()
 
@@ -156,8 +169,8 @@ class GuardedWorld(LossyWorld):
 def test_what_the_nan_guard_saved_is_said_where_it_happened():
     env, notes = make_env(), Notes()
     env.base_env.__dict__["world"] = world = GuardedWorld()
-    make_trainer(iterations=2, env=env).train(notes)
-    assert world.reports == 2, "once per rollout"
+    make_trainer(iterations=3, env=env).train(notes)
+    assert (world.counts, world.reports) == (3, 1), "only what the count says is there is read"
     assert [note for note in notes.notes if "nan-0.safetensors" in note] == [
         "NaN guard: world 3 became non-finite: see nan-0.safetensors"
     ]
@@ -168,3 +181,102 @@ def test_envs_that_became_non_finite_are_reported():
     env.base_env.totals["termination/non_finite"].fill_(2.0)
     make_trainer(iterations=1, env=env).train(notes)
     assert any("2 envs ended with non-finite" in note for note in notes.notes)
+
+
+class Diary(Hook):
+    """Writes down when it was called, and what the trainer said then."""
+
+    def __init__(self, interval=1):
+        self.interval, self.calls, self.ended = interval, [], 0
+
+    def __call__(self, trainer):
+        self.calls.append((trainer.iteration, trainer.metrics["iteration"]))
+
+    def at_end(self, trainer):
+        self.ended += 1
+
+    def state_dict(self):
+        return {"calls": len(self.calls), "last": torch.tensor(self.calls[-1])}
+
+    def load_state_dict(self, state):
+        self.calls = [tuple(state["last"].tolist())] * state["calls"]
+
+
+@pytest.mark.parametrize("overlap", [False, True])
+def test_a_hook_sees_the_metrics_of_its_iteration(overlap):
+    hook = Diary(interval=2)
+    make_trainer(iterations=5, hooks=[hook], overlap=overlap).train()
+    assert hook.calls == [(2, 2), (4, 4)]
+    assert hook.ended == 1
+
+
+def test_a_hook_continues_from_a_checkpoint(tmp_path):
+    make_trainer(tmp_path, iterations=3, hooks=[Diary()]).train()
+    hook = Diary()
+    resumed = make_trainer(iterations=4, hooks=[hook])
+    resumed.load(tmp_path)
+    resumed.train()
+    assert hook.calls == [(3, 3)] * 3 + [(4, 4)]
+    with pytest.raises(ValueError, match="1 hooks, and this one has 0"):
+        make_trainer().load(tmp_path)
+
+
+def test_what_a_hook_changes_counts_in_the_next_iteration():
+    class Stop(Hook):
+        def __call__(self, trainer):
+            for group in trainer.update.optimizer.param_groups:
+                group["lr"].zero_()
+
+    trainer = make_trainer(iterations=1, hooks=[Stop()], ppo={"schedule": "fixed"})
+    trainer.train()
+    weights = {name: p.detach().clone() for name, p in trainer.update.actor.named_parameters()}
+    trainer.iterate()
+    assert all(torch.equal(weights[name], p) for name, p in trainer.update.actor.named_parameters())
+
+
+def rows_without_times(trainer_rows):
+    timed = ("seconds", "throughput/env_states_per_s")
+    return [{name: value for name, value in row.items() if name not in timed} for row in trainer_rows]
+
+
+def test_overlapping_iterations_log_the_same_rows():
+    one, other = MemoryLogger(), MemoryLogger()
+    make_trainer(iterations=5, eval_interval=2, loggers=[one], overlap=False).train()
+    make_trainer(iterations=5, eval_interval=2, loggers=[other], overlap=True).train()
+    assert len(one.rows) == 5 + 3
+    assert rows_without_times(one.rows) == rows_without_times(other.rows)
+
+
+def test_a_target_ends_the_run_one_iteration_later_where_iterations_overlap():
+    trainer = make_trainer(iterations=20, stop_at={"iteration": 4, "episode/length": 8})
+    outcome = trainer.train()
+    assert (outcome.iteration, outcome.target_met) == (4, True)
+    assert make_trainer(iterations=20, stop_at={"iteration": 4}, overlap=True).train().iteration == 5
+    # An evaluation settles its iteration, so nothing is late then.
+    assert (
+        make_trainer(iterations=20, stop_at={"iteration": 4}, overlap=True, eval_interval=4).train().iteration == 4
+    )
+
+
+def test_targets_count_only_together_and_evaluations_too():
+    figures = {"evaluation/return_mean": -1e9, "iteration": 3}
+    outcome = make_trainer(iterations=6, eval_interval=2, stop_at=figures).train()
+    assert outcome.iteration == 4
+    missed = make_trainer(iterations=2, stop_at={"iteration": 1, "episode/return": 1e9}).train()
+    assert (missed.iteration, missed.target_met) == (2, False)
+
+
+def test_a_target_that_no_metric_has_is_said():
+    notes = Notes()
+    make_trainer(iterations=2, stop_at={"episode/retrun": 1.0}).train(notes)
+    (text,) = [note for note in notes.notes if "stop_at" in note]
+    assert "did you mean 'episode/return'" in text
+
+
+def test_an_iteration_reads_the_device_once():
+    trainer = make_trainer()
+    trainer.iterate()
+    with count_syncs() as syncs:
+        trainer.iterate()
+    assert syncs.total == 1, syncs.report()
+    assert "metrics.py" in syncs.calls[0]

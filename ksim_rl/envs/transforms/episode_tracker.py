@@ -7,6 +7,7 @@ from torchrl.data import Composite, Unbounded
 
 from ksim_rl.envs.transforms.row_transform import Keys, RowTransform, as_keys
 from ksim_rl.envs.transforms.specs import Device, leaf_spec, set_leaf_spec
+from ksim_rl.envs.transforms.tally import tally
 
 
 class EpisodeTracker(RowTransform):
@@ -26,6 +27,7 @@ class EpisodeTracker(RowTransform):
     """
 
     step_E: Tensor
+    return_0: Tensor
 
     def __init__(
         self,
@@ -47,6 +49,7 @@ class EpisodeTracker(RowTransform):
         buffers = ["step_E", *(f"return_{index}" for index in range(len(in_keys)))]
         super().__init__(in_keys, returns + lengths, row_buffers=buffers)
         self.length_key = length_key
+        self._is_usual = False
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         """Add the returns, shaped as the rewards, and the lengths to the observations."""
@@ -72,31 +75,41 @@ class EpisodeTracker(RowTransform):
         for index, (shape, dtype) in enumerate(zip(shapes, dtypes, strict=True)):
             leaf = (self.num_rows, *shape[len(batch) :])
             self._size_buffer(f"return_{index}", leaf, dtype, device)
+        # One float32 reward per env is what nearly every env has: it is counted in one launch.
+        self._is_usual = dtypes == [torch.float32] and self.return_0.numel() == self.num_rows
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         if self._buffers["step_E"] is None or not self.num_rows:
             # The shapes of rewards are in the specs only.
             assert self.container is not None and self.container.output_spec is not None
         mask_E = self._reset_rows(tensordict, tensordict_reset)
+        if self._is_usual:
+            step_E, total_E = tally(self.step_E, self.return_0, None, mask_E)
+            return self._write(tensordict_reset, step_E, [total_E])
         self.step_E.masked_fill_(mask_E, 0)
-        for index in range(len(self.in_keys)):
-            return_E: Tensor = getattr(self, f"return_{index}")
-            return_E.masked_fill_(mask_E.reshape(-1, *[1] * (return_E.ndim - 1)), 0)
-        return self._write(tensordict_reset)
+        totals = self._totals()
+        for total_E in totals:
+            total_E.masked_fill_(mask_E.reshape(-1, *[1] * (total_E.ndim - 1)), 0)
+        return self._write(tensordict_reset, self.step_E.clone(), [total_E.clone() for total_E in totals])
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        rewards = [next_tensordict.get(key) for key in self.in_keys]
+        if self._is_usual:
+            step_E, total_E = tally(self.step_E, self.return_0, rewards[0], None)
+            return self._write(next_tensordict, step_E, [total_E])
         self.step_E.add_(1)
-        for index, key in enumerate(self.in_keys):
-            return_E: Tensor = getattr(self, f"return_{index}")
-            return_E.add_(next_tensordict.get(key).reshape(return_E.shape))
-        return self._write(next_tensordict)
+        totals = self._totals()
+        for total_E, reward in zip(totals, rewards, strict=True):
+            total_E.add_(reward.reshape(total_E.shape))
+        return self._write(next_tensordict, self.step_E.clone(), [total_E.clone() for total_E in totals])
 
-    def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Give out copies: the kept ones change in place."""
+    def _totals(self) -> list[Tensor]:
+        return [getattr(self, f"return_{index}") for index in range(len(self.in_keys))]
+
+    def _write(self, tensordict: TensorDictBase, step_E: Tensor, totals: list[Tensor]) -> TensorDictBase:
         batch = tensordict.batch_size
-        for index in range(len(self.in_keys)):
-            return_E: Tensor = getattr(self, f"return_{index}")
-            tensordict.set(self.out_keys[index], return_E.clone().reshape(*batch, *return_E.shape[1:]))
+        for key, total_E in zip(self.out_keys, totals, strict=False):
+            tensordict.set(key, total_E.reshape(*batch, *total_E.shape[1:]) if len(batch) != 1 else total_E)
         if self.length_key is not None:
-            tensordict.set(self.length_key, self.step_E.clone().reshape(*batch, 1))
+            tensordict.set(self.length_key, step_E.reshape(*batch, 1))
         return tensordict

@@ -1,7 +1,7 @@
 """Sensor noise."""
 
 from collections.abc import Mapping, Sequence
-from typing import Self
+from typing import Any, Self
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -21,8 +21,8 @@ from ksim_rl.envs.transforms.noise_kernel import (
     reset_noise,
     step_noise,
 )
-from ksim_rl.envs.transforms.row_transform import Keys, as_keys, checked_out_keys
-from ksim_rl.envs.transforms.specs import bounded, bounds, leaf_spec, set_leaf_spec
+from ksim_rl.envs.transforms.row_transform import Keys, RowTransform, as_keys, checked_out_keys
+from ksim_rl.envs.transforms.specs import Device, bounded, bounds, leaf_spec, set_leaf_spec
 
 
 class ObservationNoise(FollowsLevel, KeyedTransform):
@@ -48,6 +48,7 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
     purposes = ("step", "reset", "forward")
 
     enabled: Tensor
+    step_count_E: Tensor
     bias_EL: Tensor | None
     walk_EL: Tensor | None
     last_EL: Tensor | None
@@ -64,9 +65,8 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
     ) -> None:
         in_keys = as_keys(in_keys)
         out_keys = checked_out_keys(in_keys, out_keys)
-        super().__init__(
-            in_keys, out_keys, row_buffers=["bias_EL", "walk_EL", "last_EL"], seed=seed, stream=stream
-        )
+        names = ("step_count_E", "bias_EL", "walk_EL", "last_EL")
+        super().__init__(in_keys, out_keys, row_buffers=names, seed=seed, stream=stream)
         self.noise = _one_per_key(noise, self.in_keys)
         self._wanted = enabled
         self._layout: tuple[int, list[torch.Size]] | None = None
@@ -79,6 +79,12 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         self._wanted = enabled
         self.enabled.fill_(enabled)
         return self
+
+    def seed_(self, seed: int) -> Self:
+        """Set the seed and start the counters anew, in place."""
+        if self._buffers["step_count_E"] is not None:
+            self.step_count_E.zero_()
+        return super().seed_(seed)
 
     def train(self, mode: bool = True) -> Self:
         """Follow the mode of the env: noise is for training only."""
@@ -103,6 +109,10 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         self._size_rows(observation_spec.shape.numel(), observation_spec.device)
         self._size_columns([spec.shape[batch_dims:] for spec in specs])
         return observation_spec
+
+    def _size_rows(self, num_rows: int, device: Device) -> None:
+        super()._size_rows(num_rows, device)
+        self._size_buffer("step_count_E", (num_rows,), torch.int64, device)
 
     def _size_columns(self, shapes: list[torch.Size]) -> None:
         if self._layout == (self.num_rows, shapes):
@@ -129,44 +139,27 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         self._size_by(tensordict_reset)
-        mask_E = self._reset_rows(tensordict, tensordict_reset)
-        clean_EL = self._read(tensordict_reset, self.num_rows)
-        noisy_EL = reset_noise(
-            clean_EL,
-            self._state(),
-            self._columns.features,
-            mask_E,
-            seed=self.seed_value,
-            stream=self._stream_ids["reset"],
-            counter_E=self.reset_count_E,
-        )
+        # The kernel counts the resets, and below the steps.
+        mask_E = RowTransform._reset_rows(self, tensordict, tensordict_reset)
+        stream, counter_E = self._stream_ids["reset"], self.reset_count_E
+        clean_EL, state, features = self._read(tensordict_reset), self._state(), self._columns.features
+        noisy_EL = reset_noise(clean_EL, state, features, mask_E, stream=stream, counter_E=counter_E)
         return self._write(tensordict_reset, noisy_EL)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._size_by(next_tensordict)
-        self.step_count.add_(1)
-        noisy_EL = step_noise(
-            self._read(next_tensordict, self.num_rows),
-            self._state(),
-            self._columns.features,
-            seed=self.seed_value,
-            stream=self._stream_ids["step"],
-            counter=self.step_count,
-        )
+        stream, counter_E = self._stream_ids["step"], self.step_count_E
+        clean_EL, state, features = self._read(next_tensordict), self._state(), self._columns.features
+        noisy_EL = step_noise(clean_EL, state, features, stream=stream, counter_E=counter_E)
         return self._write(next_tensordict, noisy_EL)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add fresh noise to a batch of samples; they belong to no episode, so there is no bias, walk or dropout."""
         self._size_columns([tensordict.get(key).shape[tensordict.ndim :] for key in self.in_keys])
+        stream, counter = self._stream_ids["forward"], self.step_count
+        clean_EL, state, features = self._read(tensordict), self._state(), self._columns.features
+        noisy_EL = add_noise(clean_EL, state, features, stream=stream, counter=counter)
         self.step_count.add_(1)
-        noisy_EL = add_noise(
-            self._read(tensordict, tensordict.numel()),
-            self._state(),
-            self._columns.features,
-            seed=self.seed_value,
-            stream=self._stream_ids["forward"],
-            counter=self.step_count,
-        )
         return self._write(tensordict, noisy_EL)
 
     @property
@@ -175,29 +168,37 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         return self.noise_columns
 
     def _state(self) -> NoiseState:
-        buffers = self._buffers
+        buffers: dict[str, Any] = self._buffers
+        columns = self._columns
         return NoiseState(
-            self._columns.table_PL,
-            self._columns.flags_L,
-            self.enabled,
-            self.level,
+            columns.table_PL,
+            columns.flags_L,
+            buffers["enabled"],
+            buffers["level"],
+            buffers["seed_value"],
             buffers["bias_EL"],
             buffers["walk_EL"],
             buffers["last_EL"],
         )
 
-    def _read(self, tensordict: TensorDictBase, num_rows: int) -> Tensor:
-        """Return the clean readings side by side, float32 [E, L]."""
-        flat = [tensordict.get(key).reshape(num_rows, -1) for key in self.in_keys]
-        clean_EL = flat[0] if len(flat) == 1 else torch.cat(flat, dim=1)
+    def _read(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the clean readings, float32: those of one observation as they are, several side by side [E, L]."""
+        values = [tensordict.get(key) for key in self.in_keys]
+        if len(values) == 1:
+            return values[0] if values[0].dtype == torch.float32 else values[0].float()
+        clean_EL = torch.cat([value.reshape(tensordict.numel(), -1) for value in values], dim=1)
         return clean_EL if clean_EL.dtype == torch.float32 else clean_EL.float()
 
     def _write(self, tensordict: TensorDictBase, noisy_EL: Tensor) -> TensorDictBase:
+        if len(self.in_keys) == 1:
+            dtype = tensordict.get(self.in_keys[0]).dtype
+            noisy = noisy_EL if dtype == torch.float32 else noisy_EL.to(dtype)
+            return tensordict.set(self.out_keys[0], noisy)
         start = 0
         values = [tensordict.get(key) for key in self.in_keys]
         for out_key, value in zip(self.out_keys, values, strict=True):
             size = value.shape[tensordict.ndim :].numel()
-            noisy = noisy_EL if size == noisy_EL.shape[1] else noisy_EL[:, start : start + size]
+            noisy = noisy_EL[:, start : start + size]
             tensordict.set(out_key, noisy.reshape(value.shape).to(value.dtype))
             start += size
         return tensordict

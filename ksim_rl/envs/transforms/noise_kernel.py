@@ -25,25 +25,51 @@ NUM_PARAMETERS = 7
 
 _PLAIN, _STEP, _RESET = range(3)
 
+
+@wp.struct
+class _Noise:
+    n: int
+    mode: int
+    features: int
+    stream: wp.uint32
+    seed: wp.uint64
+    counter: wp.uint64
+    enabled: wp.uint64
+    level: wp.uint64
+    mask: wp.uint64
+    table: wp.uint64
+    flags: wp.uint64
+    clean: wp.uint64
+    bias: wp.uint64
+    walk: wp.uint64
+    last: wp.uint64
+    out: wp.uint64
+
+
 _COLUMNS = r"""
-    const float* clean = (const float*)clean_ + (long long)row * n;
-    float* out = (float*)out_ + (long long)row * n;
-    float* bias = (float*)bias_ + (long long)row * n;
-    float* walk = (float*)walk_ + (long long)row * n;
-    float* last = (float*)last_ + (long long)row * n;
-    const float* table = (const float*)table_;
-    const int* flags = (const int*)flags_;
-    if (mask_ && !((const unsigned char*)mask_)[row]) {
-        for (int i = begin; i < end; ++i) out[i] = clean[i];
+    const int n = a.n, features = a.features, mode = a.mode;
+    const float* clean = (const float*)a.clean + (long long)row * n;
+    float* out = (float*)a.out + (long long)row * n;
+    float* bias = (float*)a.bias + (long long)row * n;
+    float* walk = (float*)a.walk + (long long)row * n;
+    float* last = (float*)a.last + (long long)row * n;
+    const float* table = (const float*)a.table;
+    const int* flags = (const int*)a.flags;
+    if (a.mask && !((const unsigned char*)a.mask)[row]) {
+        for (int i = lane; i < n; i += LANES) out[i] = clean[i];
         return;
     }
-    const long long seed = *(const long long*)seed_;
-    const long long count = ((const long long*)counter_)[row * counter_stride];
-    const float enabled = *(const unsigned char*)enabled_ ? 1.0f : 0.0f;
-    const float levelled = enabled * *(const float*)level_;
+    const long long seed = *(const long long*)a.seed;
+    long long* counter = (long long*)a.counter + (mode == 0 ? 0 : row);
+    const long long count = *counter + 1;
+    // The lanes of a row are one warp, so that all have read the count before it goes on.
+    SYNC
+    if (lane == 0 && mode != 0) *counter = count;
+    const float enabled = *(const unsigned char*)a.enabled ? 1.0f : 0.0f;
+    const float levelled = enabled * *(const float*)a.level;
     const bool resets = mode == 2;
 
-    const RowKey key = key_of(seed, stream, count, row);
+    const RowKey key = key_of(seed, a.stream, count, row);
     auto bits = [=](unsigned index) { return bits_of(key, index); };
     auto sample = [&](int i, unsigned index, int parameter, bool is_normal, int features) {
         const unsigned b = bits(index);
@@ -82,94 +108,42 @@ _COLUMNS = r"""
     };
     switch (features) {
         case 0:
-            for (int i = begin; i < end; ++i) column(i, 0);
+            for (int i = lane; i < n; i += LANES) column(i, 0);
             break;
         case 16:
-            for (int i = begin; i < end; ++i) column(i, 16);
+            for (int i = lane; i < n; i += LANES) column(i, 16);
             break;
         case 17:
-            for (int i = begin; i < end; ++i) column(i, 17);
+            for (int i = lane; i < n; i += LANES) column(i, 17);
             break;
         default:
-            for (int i = begin; i < end; ++i) column(i, features);
+            for (int i = lane; i < n; i += LANES) column(i, features);
     }
+"""
+_LANES = 32
+"""Threads that share a row on the GPU; the CPU has one, which takes the columns in vector instructions."""
+_DEVICE = """
+    #if defined(__CUDA_ARCH__)
+        #define LANES 32
+        #define SYNC __syncwarp();
+    #else
+        #define LANES 1
+        #define SYNC
+    #endif
 """
 
 
-# Addresses instead of arrays: see `QuickLaunch`.
-@wp.func_native(DRAWS + _COLUMNS)
-def _columns(
-    row: int,
-    begin: int,
-    end: int,
-    n: int,
-    mode: int,
-    features: int,
-    stream: wp.uint32,
-    counter_stride: int,
-    seed_: wp.uint64,
-    counter_: wp.uint64,
-    enabled_: wp.uint64,
-    level_: wp.uint64,
-    mask_: wp.uint64,
-    table_: wp.uint64,
-    flags_: wp.uint64,
-    clean_: wp.uint64,
-    bias_: wp.uint64,
-    walk_: wp.uint64,
-    last_: wp.uint64,
-    out_: wp.uint64,
-): ...
+@wp.func_native(_DEVICE + DRAWS + _COLUMNS)
+def _columns(row: int, lane: int, a: _Noise): ...
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)
-def _apply_noise(
-    width: int,
-    n: int,
-    mode: int,
-    features: int,
-    stream: wp.uint32,
-    counter_stride: int,
-    seed: wp.uint64,
-    counter: wp.uint64,
-    enabled: wp.uint64,
-    level: wp.uint64,
-    mask: wp.uint64,
-    table: wp.uint64,
-    flags: wp.uint64,
-    clean: wp.uint64,
-    bias: wp.uint64,
-    walk: wp.uint64,
-    last: wp.uint64,
-    out: wp.uint64,
-):
-    row, part = wp.tid()
-    begin = part * width
-    _columns(
-        row,
-        begin,
-        wp.min(begin + width, n),
-        n,
-        mode,
-        features,
-        stream,
-        counter_stride,
-        seed,
-        counter,
-        enabled,
-        level,
-        mask,
-        table,
-        flags,
-        clean,
-        bias,
-        walk,
-        last,
-        out,
-    )
+def _apply_noise(a: _Noise):
+    row, lane = wp.tid()
+    _columns(row, lane, a)
 
 
-_quick = QuickLaunch(_apply_noise)
+_quick = QuickLaunch(_apply_noise, _Noise)
 
 
 class NoiseState(NamedTuple):
@@ -180,6 +154,7 @@ class NoiseState(NamedTuple):
         flags_L: what kind of noise a column has, int32.
         enabled: bool [].
         level: float32 []; the strength of the columns with `BY_LEVEL`.
+        seed: int64 [].
         bias_EL, walk_EL, last_EL: what lasts from step to step, float32; None where no column has it.
     """
 
@@ -187,39 +162,37 @@ class NoiseState(NamedTuple):
     flags_L: Tensor
     enabled: Tensor
     level: Tensor
+    seed: Tensor
     bias_EL: Tensor | None = None
     walk_EL: Tensor | None = None
     last_EL: Tensor | None = None
 
 
-def add_noise(
-    clean_EL: Tensor, state: NoiseState, features: int, *, seed: Tensor, stream: int, counter: Tensor
-) -> Tensor:
-    """Return the noisy readings of samples, which belong to no episode: no bias, drift or dropout, float32 [E, L]."""
-    return _run(
-        clean_EL, *state, features & (HAS_GAUSSIAN | HAS_RESOLUTION), _PLAIN, None, seed, stream, counter
-    )
+def add_noise(clean_EL: Tensor, state: NoiseState, features: int, *, stream: int, counter: Tensor) -> Tensor:
+    """Return the noisy readings of samples, which belong to no episode: no bias, drift or dropout."""
+    return _run(clean_EL, *state, features & (HAS_GAUSSIAN | HAS_RESOLUTION), _PLAIN, None, stream, counter)
 
 
 def step_noise(
-    clean_EL: Tensor, state: NoiseState, features: int, *, seed: Tensor, stream: int, counter: Tensor
+    clean_EL: Tensor, state: NoiseState, features: int, *, stream: int, counter_E: Tensor
 ) -> Tensor:
-    """Go on by one env step and return the noisy readings, float32 [E, L]."""
-    return _run(clean_EL, *state, features, _STEP, None, seed, stream, counter)
+    """Go on by one env step, which adds 1 to the counter of each row, and return the noisy readings.
+
+    Args:
+        clean_EL: E * L readings in any shape, float32; the result is like it.
+        state: see there; its `bias_EL`, `walk_EL` and `last_EL` change.
+        features: what any column has.
+        stream: the id of the stream of draws.
+        counter_E: int64; the draws are those of the count that it reaches.
+    """
+    return _run(clean_EL, *state, features, _STEP, None, stream, counter_E)
 
 
 def reset_noise(
-    clean_EL: Tensor,
-    state: NoiseState,
-    features: int,
-    mask_E: Tensor,
-    *,
-    seed: Tensor,
-    stream: int,
-    counter_E: Tensor,
+    clean_EL: Tensor, state: NoiseState, features: int, mask_E: Tensor, *, stream: int, counter_E: Tensor
 ) -> Tensor:
-    """Begin the episodes of the masked rows; return their noisy readings and the others' clean ones, float32 [E, L]."""
-    return _run(clean_EL, *state, features, _RESET, mask_E, seed, stream, counter_E)
+    """Begin the episodes of the masked rows, whose counters go on; return their noisy readings and the others' clean."""
+    return _run(clean_EL, *state, features, _RESET, mask_E, stream, counter_E)
 
 
 def _run(*arguments: object) -> Tensor:
@@ -235,21 +208,21 @@ def _launch(
     flags_L: Tensor,
     enabled: Tensor,
     level: Tensor,
+    seed: Tensor,
     bias_EL: Tensor | None,
     walk_EL: Tensor | None,
     last_EL: Tensor | None,
     features: int,
     moment: int,
     mask_E: Tensor | None,
-    seed: Tensor,
     stream: int,
     counter: Tensor,
 ) -> Tensor:
     clean_EL = clean_EL.contiguous()
-    num_rows, num_columns = clean_EL.shape
     out_EL = torch.empty_like(clean_EL)
+    num_columns = flags_L.numel()
+    num_rows = clean_EL.numel() // max(num_columns, 1)
     device = clean_EL.device
-    width = max(num_columns, 1) if device.type == "cpu" else 1
     tensors = (
         seed,
         counter,
@@ -264,12 +237,14 @@ def _launch(
         last_EL,
         out_EL,
     )
-    layout = width, num_columns, moment, features, stream, counter.ndim
-    _quick(device, (num_rows, -(-num_columns // width)), (*layout, *map(address, tensors)))
+    dim = (num_rows, 1 if device.type == "cpu" else _LANES)
+    _quick(device, dim, num_columns, moment, features, stream, *map(address, tensors))
     return out_EL
 
 
-_noise = torch.library.custom_op("ksim_rl::noise", _launch, mutates_args=("bias_EL", "walk_EL", "last_EL"))
+_noise = torch.library.custom_op(
+    "ksim_rl::noise", _launch, mutates_args=("bias_EL", "walk_EL", "last_EL", "counter")
+)
 
 
 @_noise.register_fake

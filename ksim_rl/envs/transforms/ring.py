@@ -11,106 +11,68 @@ from torch import Tensor
 
 from ksim_rl.physics.quick_launch import QuickLaunch, address
 
-# Rows of the ring are bytes, so that one kernel serves every dtype; a thread of the GPU copies one word of 16, 4 or 1.
-_COPY = r"""
+
+@wp.struct
+class _Ring:
+    width: int
+    num_bytes: int
+    value_stride: int
+    num_slots: int
+    num_frames: int
+    lag_row_stride: int
+    lag_frame_stride: int
+    clock: wp.uint64
+    start: wp.uint64
+    lag: wp.uint64
+    mask: wp.uint64
+    value: wp.uint64
+    ring: wp.uint64
+    out: wp.uint64
+
+
+# Rows of the ring are bytes, so that one kernel serves every dtype. A thread copies one word of 16, 4 or 1 in all frames:
+# the GPU hides the wait for one frame behind the next.
+@wp.func_native(r"""
     struct alignas(16) Wide { unsigned word[4]; };
-    const unsigned long long now = *(const unsigned long long*)clock_;
+    const int width = a.width, num_bytes = a.num_bytes, num_slots = a.num_slots;
+    const unsigned long long now = *(const unsigned long long*)a.clock;
     // Whole numbers of 32 bits divide much faster.
     const int slot = now >> 32 ? (int)(now % (unsigned)num_slots) : (int)((unsigned)now % (unsigned)num_slots);
-    const bool resets = mask_ != 0;
-    const bool begins = resets && ((const unsigned char*)mask_)[row];
-    unsigned char* ring = (unsigned char*)ring_ + (long long)row * num_slots * num_bytes + part * width;
-    const unsigned char* value = (const unsigned char*)value_ + (long long)row * value_stride + part * width;
-    unsigned char* out = (unsigned char*)out_ + (long long)row * num_frames * num_bytes + part * width;
-    long long* start = (long long*)start_ + row;
+    const bool resets = a.mask != 0;
+    const bool begins = resets && ((const unsigned char*)a.mask)[row];
+    unsigned char* ring = (unsigned char*)a.ring + (long long)row * num_slots * num_bytes + part * width;
+    const unsigned char* value = (const unsigned char*)a.value + (long long)row * a.value_stride + part * width;
+    unsigned char* out = (unsigned char*)a.out + (long long)row * a.num_frames * num_bytes + part * width;
+    long long* start = (long long*)a.start + row;
 
     auto copy = [=](unsigned char* to, const unsigned char* from) {
         if (width == 16) *(Wide*)to = *(const Wide*)from;
         else if (width == 4) *(unsigned*)to = *(const unsigned*)from;
         else memcpy(to, from, width);
     };
-    if (first_frame == 0 && (begins || !resets)) copy(ring + slot * num_bytes, value);
-    if (begins && first_frame == 0 && part == 0) *start = (long long)now;
+    if (begins || !resets) copy(ring + slot * num_bytes, value);
+    if (begins && part == 0) *start = (long long)now;
     const long long age = resets ? 0 : (long long)now - *start;
-    for (int frame = first_frame; frame < end_frame; ++frame) {
+    for (int frame = 0; frame < a.num_frames; ++frame) {
         long long lag = 0;
         if (!resets) {
-            lag = ((const long long*)lag_)[row * lag_row_stride + frame * lag_frame_stride];
+            lag = ((const long long*)a.lag)[row * a.lag_row_stride + frame * a.lag_frame_stride];
             lag = lag < age ? lag : age;
         }
         const int from = slot - (int)lag;
-        // The newest value is read from where it comes from: other threads may not have written it yet.
         copy(out + frame * num_bytes, lag == 0 ? value : ring + (from < 0 ? from + num_slots : from) * num_bytes);
     }
-"""
-
-
-@wp.func_native(_COPY)
-def _copy(
-    row: int,
-    first_frame: int,
-    end_frame: int,
-    part: int,
-    width: int,
-    num_bytes: int,
-    value_stride: int,
-    num_slots: int,
-    num_frames: int,
-    lag_row_stride: int,
-    lag_frame_stride: int,
-    clock_: wp.uint64,
-    start_: wp.uint64,
-    lag_: wp.uint64,
-    mask_: wp.uint64,
-    value_: wp.uint64,
-    ring_: wp.uint64,
-    out_: wp.uint64,
-): ...
+""")
+def _copy(row: int, part: int, a: _Ring): ...
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)
-def _push_and_read(
-    frames_per_thread: int,
-    width: int,
-    num_bytes: int,
-    value_stride: int,
-    num_slots: int,
-    num_frames: int,
-    lag_row_stride: int,
-    lag_frame_stride: int,
-    clock: wp.uint64,
-    start: wp.uint64,
-    lag: wp.uint64,
-    mask: wp.uint64,
-    value: wp.uint64,
-    ring: wp.uint64,
-    out: wp.uint64,
-):
-    row, chunk, part = wp.tid()
-    first_frame = chunk * frames_per_thread
-    _copy(
-        row,
-        first_frame,
-        wp.min(first_frame + frames_per_thread, num_frames),
-        part,
-        width,
-        num_bytes,
-        value_stride,
-        num_slots,
-        num_frames,
-        lag_row_stride,
-        lag_frame_stride,
-        clock,
-        start,
-        lag,
-        mask,
-        value,
-        ring,
-        out,
-    )
+def _push_and_read(a: _Ring):
+    row, part = wp.tid()
+    _copy(row, part, a)
 
 
-_quick = QuickLaunch(_push_and_read)
+_quick = QuickLaunch(_push_and_read, _Ring)
 
 
 def push_and_read(ring_EM: Tensor, start_E: Tensor, clock: Tensor, value_E: Tensor, lag_EN: Tensor) -> Tensor:
@@ -158,17 +120,17 @@ def _launch(
     out_EN = value_E.new_empty((value_E.shape[0], num_frames, *value_E.shape[1:]))
     num_bytes = value_E.shape[1:].numel() * value_E.element_size()
     value_stride = value_E.stride(0) * value_E.element_size()
-    # A thread copies one word of one frame on the GPU, and all of an env on the CPU.
+    # A thread copies a word of each frame on the GPU, and all of an env on the CPU.
     addresses = [address(t) for t in (clock, start_E, lag_EN, mask_E, value_E, ring_EM, out_EN)]
     if device.type == "cpu":
-        frames_per_thread, width = num_frames, num_bytes
+        width = num_bytes
     else:
-        bits = num_bytes | value_stride | addresses[-3]
-        frames_per_thread, width = 1, 16 if bits % 16 == 0 else 4 if bits % 4 == 0 else 1
+        bits = num_bytes | value_stride | value_E.data_ptr()
+        width = 16 if bits % 16 == 0 else 4 if bits % 4 == 0 else 1
     row_stride, frame_stride = (0, 0) if lag_EN is None else lag_EN.stride()
-    layout = frames_per_thread, width, num_bytes, value_stride, ring_EM.shape[1], num_frames
-    dim = (value_E.shape[0], num_frames // frames_per_thread, num_bytes // max(width, 1))
-    _quick(device, dim, (*layout, row_stride, frame_stride, *addresses))
+    layout = width, num_bytes, value_stride, ring_EM.shape[1], num_frames
+    dim = (value_E.shape[0], num_bytes // max(width, 1))
+    _quick(device, dim, *layout, row_stride, frame_stride, *addresses)
     return out_EN
 
 

@@ -100,7 +100,8 @@ class RowTransform(Transform):
 
 def _per_row(mask: Tensor, num_rows: int) -> Tensor:
     flat = mask.reshape(num_rows, -1)
-    return flat[:, 0] if flat.shape[1] == 1 else flat.any(-1)
+    # Kernels read it by address.
+    return flat[:, 0].contiguous() if flat.shape[1] == 1 else flat.any(-1)
 
 
 def as_keys(keys: Keys) -> list[NestedKey]:

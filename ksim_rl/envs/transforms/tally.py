@@ -1,4 +1,4 @@
-"""What trackers count per env, as kernels that are also torch operators: each one counts and copies in a single launch."""
+"""What trackers count per env, as kernels that are also torch operators: one launch counts and copies."""
 
 import torch
 import warp as wp
@@ -6,86 +6,78 @@ from torch import Tensor
 
 from ksim_rl.physics.quick_launch import QuickLaunch, address
 
-_COUNT_DOWN = r"""
-    const unsigned char* mask = (const unsigned char*)mask_;
-    float* __restrict__ left = (float*)left_;
-    float* __restrict__ out = (float*)out_;
-    for (int row = begin; row < end; ++row) {
+
+@wp.struct
+class _CountDown:
+    rows: int
+    horizon: float
+    divisor: float
+    mask: wp.uint64
+    left: wp.uint64
+    out: wp.uint64
+
+
+@wp.func_native(r"""
+    const unsigned char* mask = (const unsigned char*)a.mask;
+    float *left = (float*)a.left, *out = (float*)a.out;
+    for (int row = part * a.rows; row < (part + 1) * a.rows; ++row) {
         const float less = left[row] - 1.0f;
-        const float next = mask ? (mask[row] ? horizon : left[row]) : (less > 0.0f ? less : 0.0f);
+        const float next = mask ? (mask[row] ? a.horizon : left[row]) : (less > 0.0f ? less : 0.0f);
         left[row] = next;
-        out[row] = next / divisor;
+        out[row] = next / a.divisor;
     }
-"""
-
-_TALLY = r"""
-    const unsigned char* mask = (const unsigned char*)mask_;
-    const float* __restrict__ reward = (const float*)reward_;
-    float* __restrict__ total = (float*)total_;
-    float* __restrict__ total_out = (float*)total_out_;
-    long long* __restrict__ step = (long long*)step_;
-    long long* __restrict__ step_out = (long long*)step_out_;
-    for (int row = begin; row < end; ++row) {
-        const long long next = mask ? (mask[row] ? 0 : step[row]) : step[row] + 1;
-        step[row] = next;
-        step_out[row] = next;
-    }
-    for (int row = begin; row < end; ++row) {
-        const float next = mask ? (mask[row] ? 0.0f : total[row]) : total[row] + reward[row];
-        total[row] = next;
-        total_out[row] = next;
-    }
-"""
-
-
-@wp.func_native(_COUNT_DOWN)
-def _count_down_rows(
-    begin: int,
-    end: int,
-    horizon: float,
-    divisor: float,
-    mask_: wp.uint64,
-    left_: wp.uint64,
-    out_: wp.uint64,
-): ...
-
-
-@wp.func_native(_TALLY)
-def _tally_rows(
-    begin: int,
-    end: int,
-    mask_: wp.uint64,
-    reward_: wp.uint64,
-    total_: wp.uint64,
-    step_: wp.uint64,
-    total_out_: wp.uint64,
-    step_out_: wp.uint64,
-): ...
+""")
+def _count_down_part(part: int, a: _CountDown): ...
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)
-def _count_down_kernel(
-    rows: int, horizon: float, divisor: float, mask: wp.uint64, left: wp.uint64, out: wp.uint64
-):
-    begin = wp.tid() * rows
-    _count_down_rows(begin, begin + rows, horizon, divisor, mask, left, out)
+def _count_down_kernel(a: _CountDown):
+    _count_down_part(wp.tid(), a)
+
+
+@wp.struct
+class _Tally:
+    rows: int
+    mask: wp.uint64
+    reward: wp.uint64
+    total: wp.uint64
+    step: wp.uint64
+    total_out: wp.uint64
+    step_out: wp.uint64
+
+
+# Parameters are what the CPU's compiler believes not to overlap, so that loops become vector instructions.
+@wp.func_native(r"""
+    const int begin = part * a.rows, end = begin + a.rows;
+    auto begin_anew = [=](auto* __restrict__ kept, auto* __restrict__ out, const unsigned char* __restrict__ mask) {
+        for (int row = begin; row < end; ++row) out[row] = kept[row] = mask[row] ? 0 : kept[row];
+    };
+    auto add = [=](float* __restrict__ kept, float* __restrict__ out, const float* __restrict__ reward) {
+        for (int row = begin; row < end; ++row) out[row] = kept[row] = kept[row] + reward[row];
+    };
+    auto count = [=](long long* __restrict__ kept, long long* __restrict__ out) {
+        for (int row = begin; row < end; ++row) out[row] = kept[row] = kept[row] + 1;
+    };
+    float *total = (float*)a.total, *total_out = (float*)a.total_out;
+    long long *step = (long long*)a.step, *step_out = (long long*)a.step_out;
+    if (a.mask) {
+        begin_anew(total, total_out, (const unsigned char*)a.mask);
+        begin_anew(step, step_out, (const unsigned char*)a.mask);
+    } else {
+        add(total, total_out, (const float*)a.reward);
+        count(step, step_out);
+    }
+""")
+def _tally_part(part: int, a: _Tally): ...
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)
-def _tally_kernel(
-    rows: int,
-    mask: wp.uint64,
-    reward: wp.uint64,
-    total: wp.uint64,
-    step: wp.uint64,
-    total_out: wp.uint64,
-    step_out: wp.uint64,
-):
-    begin = wp.tid() * rows
-    _tally_rows(begin, begin + rows, mask, reward, total, step, total_out, step_out)
+def _tally_kernel(a: _Tally):
+    _tally_part(wp.tid(), a)
 
 
-_quick_count_down, _quick_tally = QuickLaunch(_count_down_kernel), QuickLaunch(_tally_kernel)
+_quick_count_down = QuickLaunch(_count_down_kernel, _CountDown)
+_quick_tally = QuickLaunch(_tally_kernel, _Tally)
 
 
 def count_down(left_E: Tensor, mask_E: Tensor | None, horizon: float, divisor: float) -> Tensor:
@@ -122,7 +114,7 @@ def _count_down_now(left_E: Tensor, mask_E: Tensor | None, horizon: float, divis
     out_E = torch.empty_like(left_E)
     dim, rows = _share(left_E)
     addresses = address(mask_E), left_E.data_ptr(), out_E.data_ptr()
-    _quick_count_down(left_E.device, dim, (rows, horizon, divisor, *addresses))
+    _quick_count_down(left_E.device, dim, rows, horizon, divisor, *addresses)
     return out_E
 
 
@@ -134,7 +126,7 @@ def _tally_now(
     outs = [torch.empty_like(step_E), torch.empty_like(total_E)]
     dim, rows = _share(step_E)
     tensors = mask_E, reward_E, total_E, step_E, outs[1], outs[0]
-    _quick_tally(step_E.device, dim, (rows, *map(address, tensors)))
+    _quick_tally(step_E.device, dim, rows, *map(address, tensors))
     return outs
 
 

@@ -8,6 +8,7 @@ from torchrl.data import Bounded, Composite
 from ksim_rl.envs.innermost import innermost
 from ksim_rl.envs.transforms.row_transform import RowTransform, as_keys
 from ksim_rl.envs.transforms.specs import set_leaf_spec
+from ksim_rl.envs.transforms.tally import count_down
 
 
 class TimeAwareObservation(RowTransform):
@@ -72,14 +73,12 @@ class TimeAwareObservation(RowTransform):
         if self._buffers["left_E"] is None or not self.num_rows:
             self._size_rows(tensordict_reset.numel(), tensordict_reset.device)
             self._size_buffer("left_E", (self.num_rows,), torch.float32, tensordict_reset.device)
-        self.left_E.masked_fill_(self._reset_rows(tensordict, tensordict_reset), self._horizon())
-        return self._write(tensordict_reset)
+        return self._count(tensordict_reset, self._reset_rows(tensordict, tensordict_reset))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self.left_E.sub_(1.0).clamp_min_(0.0)
-        return self._write(next_tensordict)
+        return self._count(next_tensordict, None)
 
-    def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Give out a copy: the kept one changes in place."""
-        left_E = self.left_E / self._horizon() if self.normalize else self.left_E.clone()
+    def _count(self, tensordict: TensorDictBase, mask_E: Tensor | None) -> TensorDictBase:
+        horizon = float(self._horizon())
+        left_E = count_down(self.left_E, mask_E, horizon, horizon if self.normalize else 1.0)
         return tensordict.set(self.out_keys[0], left_E.reshape(*tensordict.batch_size, 1))

@@ -1,32 +1,58 @@
 """Which loggers a run has."""
 
+import importlib.util
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from torchrl.record.loggers import TensorboardLogger
 
 from ksim_rl.trainers.loggers.csv_table import CsvTable
 from ksim_rl.trainers.loggers.metric_logger import MetricLogger
+from ksim_rl.trainers.loggers.mlflow_logger import MLflowCfg, open_mlflow
+from ksim_rl.trainers.loggers.wandb_logger import WandbCfg, open_wandb
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoggerCfg:
-    """Where metrics are written, inside the run folder.
+    """Where metrics are written; files lie in the run folder.
 
     Attributes:
         csv: one table, `metrics.csv`; the learning curves are drawn from it.
         tensorboard: event files in `tensorboard/`.
+        wandb: a run on Weights & Biases (needs `ksim_rl[wandb]`); None has none.
+        mlflow: a run in MLflow (needs `ksim_rl[mlflow]`); None has none.
     """
 
     csv: bool = True
     tensorboard: bool = True
+    wandb: WandbCfg | None = None
+    mlflow: MLflowCfg | None = None
 
 
-def make_loggers(cfg: LoggerCfg, run_folder: Path) -> list[MetricLogger]:
-    """Open the loggers of a run."""
+def check_installed(cfg: LoggerCfg) -> None:
+    """Refuse loggers whose packages are missing.
+
+    Raises:
+        ValueError: with the command that installs the package.
+    """
+    for name in ("wandb", "mlflow"):
+        if getattr(cfg, name) is not None and importlib.util.find_spec(name) is None:
+            raise ValueError(f"logger.{name}: the package {name} is missing: pip install 'ksim_rl[{name}]'")
+
+
+def make_loggers(
+    cfg: LoggerCfg, run_folder: Path, *, config: Mapping[str, Any] | None = None
+) -> list[MetricLogger]:
+    """Open the loggers of a run; those that show a run's config get `config`, plain data."""
     loggers: list[MetricLogger] = []
     if cfg.csv:
         loggers.append(CsvTable(run_folder / "metrics.csv"))
     if cfg.tensorboard:
         loggers.append(TensorboardLogger("tensorboard", log_dir=str(run_folder)))
+    if cfg.wandb is not None:
+        loggers.append(open_wandb(cfg.wandb, run_folder, config or {}))
+    if cfg.mlflow is not None:
+        loggers.append(open_mlflow(cfg.mlflow, run_folder, config or {}))
     return loggers

@@ -1,0 +1,118 @@
+"""The clipped losses of PPO and their gradients in closed form, as Triton functions.
+
+They are those of `ClipPPOLoss`, for a diagonal gaussian whose standard deviations do not depend on the state; the
+gradients are of the sum over the env states, not of the mean.
+
+What is known of an env state is one record: `O` columns each of the action, of the old mean and of the old standard
+deviation, then `LOG_PROB`, `ADVANTAGE`, `VALUE`, `TARGET` and `MASK`, counted from column 3 O.
+"""
+
+import triton
+import triton.language as tl
+
+LOG_PROB = tl.constexpr(0)
+ADVANTAGE = tl.constexpr(1)
+VALUE = tl.constexpr(2)
+TARGET = tl.constexpr(3)
+MASK = tl.constexpr(4)
+HALF_LOG_2_PI = tl.constexpr(0.9189385332046727)
+
+
+@triton.jit
+def policy_gradient(
+    loc,
+    raw_std,
+    record,
+    valid,
+    d_std_at,
+    statistics,
+    log_ratio_low,
+    log_ratio_high,
+    entropy_coeff,
+    A: tl.constexpr,
+    O: tl.constexpr,  # noqa: E741
+    LOG_STD: tl.constexpr,
+    MIN_STD: tl.constexpr,
+):
+    """Return the gradient of the policy loss and the entropy loss at `loc` [rows, O].
+
+    Writes that at the parameter of the std to `d_std_at` [O], and to `statistics` the sums of mask, policy loss,
+    divergence and clipped ratios.
+    """
+    o = tl.arange(0, O)[None, :]
+    action_dims = o < A
+    keep = valid[:, None]
+    action = tl.load(record[:, None] + o, mask=keep, other=0.0)
+    loc_old = tl.load(record[:, None] + (O + o), mask=keep, other=0.0)
+    scale_old = tl.load(record[:, None] + (2 * O + o), mask=keep, other=1.0)
+    log_prob_old = tl.load(record + (3 * O + LOG_PROB), mask=valid, other=0.0)
+    advantage = tl.load(record + (3 * O + ADVANTAGE), mask=valid, other=0.0)
+    mask = tl.load(record + (3 * O + MASK), mask=valid, other=0.0)
+
+    std = tl.exp(raw_std) if LOG_STD else raw_std
+    bounded = tl.maximum(std, MIN_STD)[None, :]
+    inverse = 1.0 / bounded
+    log_scale = tl.log(bounded)
+    error = (action - loc) * inverse
+    log_prob = tl.sum(tl.where(action_dims, -0.5 * error * error - log_scale - HALF_LOG_2_PI, 0.0), 1)
+    log_ratio = log_prob - log_prob_old
+    clipped = tl.minimum(tl.maximum(log_ratio, log_ratio_low), log_ratio_high)
+    gain = tl.exp(log_ratio) * advantage
+    clipped_gain = tl.exp(clipped) * advantage
+    inside = clipped == log_ratio
+    # Of the smaller of the two gains; the clipped one is constant where it is another.
+    slope = tl.where(inside | (gain < clipped_gain), -gain, 0.0) * mask
+
+    d_std = (slope[:, None] * (error * error - 1.0) - entropy_coeff * mask[:, None]) * inverse
+    if LOG_STD:
+        d_std = d_std * std[None, :]
+    tl.store(d_std_at + tl.arange(0, O), tl.sum(tl.where(action_dims, d_std, 0.0), 0))
+
+    log_std_ratio = tl.log(scale_old) - log_scale
+    drift = (loc_old - loc) * inverse
+    divergence = 0.5 * (tl.exp(2.0 * log_std_ratio) + drift * drift - 1.0) - log_std_ratio
+    tl.store(statistics, tl.sum(mask))
+    tl.store(statistics + 1, -tl.sum(tl.minimum(gain, clipped_gain) * mask))
+    tl.store(statistics + 2, tl.sum(tl.sum(tl.where(action_dims, divergence, 0.0), 1) * mask))
+    tl.store(statistics + 3, tl.sum(tl.where(inside, 0.0, mask)))
+    return tl.where(action_dims, slope[:, None] * error * inverse, 0.0)
+
+
+@triton.jit
+def value_gradient(
+    out,
+    record,
+    valid,
+    statistics,
+    clip_value,
+    critic_coeff,
+    O: tl.constexpr,  # noqa: E741
+    CLIP_VALUE: tl.constexpr,
+):
+    """Return the gradient of the value loss at `out` [rows, O], whose first column is the value.
+
+    Writes to `statistics` the sums of mask, value loss (without `critic_coeff`), target, its square, error, its square.
+    """
+    o = tl.arange(0, O)[None, :]
+    value = tl.sum(tl.where(o == 0, out, 0.0), 1)
+    target = tl.load(record + (3 * O + TARGET), mask=valid, other=0.0)
+    mask = tl.load(record + (3 * O + MASK), mask=valid, other=0.0)
+    error = value - target
+    loss = error * error
+    slope = 2.0 * error
+    if CLIP_VALUE:
+        value_old = tl.load(record + (3 * O + VALUE), mask=valid, other=0.0)
+        change = value - value_old
+        held = tl.minimum(tl.maximum(change, -clip_value), clip_value)
+        held_error = value_old + held - target
+        held_loss = held_error * held_error
+        slope = tl.where((held == change) | (loss > held_loss), slope, 0.0)
+        loss = tl.maximum(loss, held_loss)
+    slope = slope * mask * critic_coeff
+    tl.store(statistics, tl.sum(mask))
+    tl.store(statistics + 1, tl.sum(loss * mask))
+    tl.store(statistics + 2, tl.sum(target * mask))
+    tl.store(statistics + 3, tl.sum(target * target * mask))
+    tl.store(statistics + 4, tl.sum(error * mask))
+    tl.store(statistics + 5, tl.sum(error * error * mask))
+    return tl.where(o == 0, slope[:, None], 0.0)

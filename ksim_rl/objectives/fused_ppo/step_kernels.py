@@ -1,0 +1,231 @@
+"""Triton kernels between the gradients of a minibatch and the next one: sums, statistics, learning rate, Adam.
+
+What a gradient step measures is one row of `SUMMARY` columns.
+"""
+
+import triton
+import triton.language as tl
+
+from ksim_rl.objectives.fused_ppo.loss_kernels import HALF_LOG_2_PI
+
+SUMMARY = (
+    "loss_objective",
+    "loss_critic",
+    "entropy",
+    "kl",
+    "clip_fraction",
+    "explained_variance",
+    "loss",
+    "learning_rate",
+    "grad_norm",
+    "skipped",
+    "skipped_in_a_row",
+)
+LOSS = tl.constexpr(SUMMARY.index("loss"))
+LEARNING_RATE = tl.constexpr(SUMMARY.index("learning_rate"))
+GRAD_NORM = tl.constexpr(SUMMARY.index("grad_norm"))
+# As in TorchRL's explained variance: the resolution of float32.
+EPS = tl.constexpr(1.1920929e-07)
+
+
+@triton.jit
+def _sum_weights(program, partials, gradients, squares, count, network, first, SPLITS: tl.constexpr, NUM_WEIGHTS: tl.constexpr, NUM_PADDED: tl.constexpr, SIZE: tl.constexpr):
+    at = first + tl.arange(0, SIZE)
+    inside = at < NUM_WEIGHTS
+    total = tl.zeros((SIZE,), dtype=tl.float32)
+    for split in tl.static_range(SPLITS):
+        total += tl.load(partials + ((split * 2 + network) * NUM_WEIGHTS + at), mask=inside, other=0.0)
+    total = total / count
+    tl.store(gradients + (network * NUM_PADDED + at), total, mask=inside)
+    tl.store(squares + program, tl.sum(total * total))
+
+
+@triton.jit
+def _block_sums(partials, column, inside, WIDTH: tl.constexpr, BLOCKS: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    sums = tl.zeros((ROWS, COLUMNS), dtype=tl.float32)
+    for first in range(0, BLOCKS, ROWS):
+        block = (first + tl.arange(0, ROWS))[:, None]
+        keep = (block < BLOCKS) & inside[None, :]
+        sums += tl.load(partials + (block * 2 * WIDTH + column[None, :]), mask=keep, other=0.0)
+    return tl.sum(sums, 0)
+
+
+@triton.jit
+def _column(values, index: tl.constexpr, SIZE: tl.constexpr):
+    return tl.sum(tl.where(tl.arange(0, SIZE) == index, values, 0.0))
+
+
+@triton.jit
+def sum_gradients(
+    weight_partials,
+    block_partials,
+    gradients,
+    squares,
+    biases,
+    learning_rate,
+    summary,
+    entropy_coeff,
+    critic_coeff,
+    desired_kl,
+    learning_rate_min,
+    learning_rate_max,
+    SPLITS: tl.constexpr,
+    BLOCKS: tl.constexpr,
+    NUM_WEIGHTS: tl.constexpr,
+    NUM_BIASES: tl.constexpr,
+    NUM_STATISTICS: tl.constexpr,
+    A: tl.constexpr,
+    O: tl.constexpr,  # noqa: E741
+    LOG_STD: tl.constexpr,
+    MIN_STD: tl.constexpr,
+    ADAPTIVE: tl.constexpr,
+    SIZE: tl.constexpr,
+    COLUMNS: tl.constexpr,
+    ROWS: tl.constexpr,
+):
+    """Add up what splits and blocks left, divide by the number of env states, and adapt the learning rate.
+
+    The first programs take SIZE weights each, the next COLUMNS biases each, and leave mean gradients [2, NUM_WEIGHTS +
+    NUM_BIASES] and the sum of their squares; the last one takes the statistics of the loss.
+    """
+    WEIGHT_PROGRAMS: tl.constexpr = (NUM_WEIGHTS + SIZE - 1) // SIZE
+    BIAS_PROGRAMS: tl.constexpr = (NUM_BIASES + COLUMNS - 1) // COLUMNS
+    NUM_PADDED: tl.constexpr = NUM_WEIGHTS + NUM_BIASES
+    WIDTH: tl.constexpr = NUM_BIASES + NUM_STATISTICS
+    program = tl.program_id(0)
+    statistic = tl.arange(0, NUM_STATISTICS)
+    # The first statistic of both networks is the number of env states that take part. It may be none.
+    sums = _block_sums(
+        block_partials, NUM_BIASES + statistic, statistic < 4, WIDTH, BLOCKS, ROWS, NUM_STATISTICS
+    )
+    count = tl.maximum(_column(sums, 0, NUM_STATISTICS), 1.0)
+    if program < 2 * WEIGHT_PROGRAMS:
+        network = program // WEIGHT_PROGRAMS
+        _sum_weights(
+            program, weight_partials, gradients, squares, count, network, (program % WEIGHT_PROGRAMS) * SIZE,
+            SPLITS, NUM_WEIGHTS, NUM_PADDED, SIZE,
+        )  # fmt: skip
+    elif program < 2 * (WEIGHT_PROGRAMS + BIAS_PROGRAMS):
+        network = (program - 2 * WEIGHT_PROGRAMS) // BIAS_PROGRAMS
+        bias = ((program - 2 * WEIGHT_PROGRAMS) % BIAS_PROGRAMS) * COLUMNS + tl.arange(0, COLUMNS)
+        inside = bias < NUM_BIASES
+        total = _block_sums(block_partials + network * WIDTH, bias, inside, WIDTH, BLOCKS, ROWS, COLUMNS) / count
+        tl.store(gradients + (network * NUM_PADDED + NUM_WEIGHTS + bias), total, mask=inside)
+        tl.store(squares + program, tl.sum(total * total))
+    else:
+        policy = sums / count
+        value = (
+            _block_sums(
+                block_partials + WIDTH, NUM_BIASES + statistic, statistic < 6, WIDTH, BLOCKS, ROWS, NUM_STATISTICS
+            )
+            / count
+        )
+        objective = _column(policy, 1, NUM_STATISTICS)
+        kl = _column(policy, 2, NUM_STATISTICS)
+        critic = critic_coeff * _column(value, 1, NUM_STATISTICS)
+        target = _column(value, 2, NUM_STATISTICS)
+        target_variance = _column(value, 3, NUM_STATISTICS) - target * target
+        error = _column(value, 4, NUM_STATISTICS)
+        error_variance = _column(value, 5, NUM_STATISTICS) - error * error
+        o = tl.arange(0, O)
+        raw = tl.load(biases + (NUM_BIASES - O + o), mask=o < A, other=0.0 if LOG_STD else 1.0)
+        std = tl.maximum(tl.exp(raw) if LOG_STD else raw, MIN_STD)
+        entropy = tl.sum(tl.where(o < A, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0))
+        rate = tl.load(learning_rate)
+        if ADAPTIVE:
+            # As `adapt_learning_rate_`; comparisons with NaN are False.
+            slower = tl.maximum(rate / 1.5, learning_rate_min)
+            faster = tl.minimum(rate * 1.5, learning_rate_max)
+            too_near = (kl < 0.5 * desired_kl) & (kl > 0.0)
+            rate = tl.where(kl > 2.0 * desired_kl, slower, tl.where(too_near, faster, rate))
+            tl.store(learning_rate, rate)
+        tl.store(summary, objective)
+        tl.store(summary + 1, critic)
+        tl.store(summary + 2, entropy)
+        tl.store(summary + 3, kl)
+        tl.store(summary + 4, _column(policy, 3, NUM_STATISTICS))
+        tl.store(summary + 5, 1.0 - error_variance / (target_variance + EPS))
+        tl.store(summary + LOSS, objective + critic - entropy_coeff * entropy)
+        tl.store(summary + LEARNING_RATE, rate)
+
+
+@triton.jit
+def adam_step(
+    parameters,
+    means,
+    variances,
+    places,
+    gradients,
+    weights,
+    exact_weights,
+    squares,
+    summary,
+    steps,
+    skipped,
+    skipped_in_a_row,
+    beta1,
+    beta2,
+    log_beta1,
+    log_beta2,
+    eps,
+    weight_decay,
+    max_grad_norm,
+    SIZE: tl.constexpr,
+    NUM_SQUARES: tl.constexpr,
+    SQUARES: tl.constexpr,
+    CLIP: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Make one step of Adam (Kingma and Ba, arXiv 1412.6980), as torch's, on the clipped gradient.
+
+    If the norm of the gradient or the loss is not finite, nothing changes but the counters of skipped steps.
+
+    Args:
+        parameters, means, variances: flat form, [SIZE], changed in place.
+        places: of the flat form's elements in the padded one.
+        gradients: padded form.
+        weights, exact_weights: padded form, in the dtype of the products and in float32; both follow the parameters.
+        squares: sums of squares that together give the norm of the gradient, [NUM_SQUARES].
+        summary: the row of this step; the norm and whether it was skipped are added.
+        steps: number of steps made before this one; the number after it is written beside it.
+        skipped, skipped_in_a_row: int64 counters.
+    """
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = at < SIZE
+    q = tl.arange(0, SQUARES)
+    norm = tl.sqrt(tl.sum(tl.load(squares + q, mask=q < NUM_SQUARES, other=0.0)))
+    loss = tl.load(summary + LOSS)
+    rate = tl.load(summary + LEARNING_RATE)
+    step = tl.load(steps)
+    made = (norm < float("inf")) & (tl.abs(loss) < float("inf"))
+    # In float64: 1 - beta^t loses most digits of float32 in the first steps.
+    t = step.to(tl.float64) + 1.0
+    correction1 = (1.0 - tl.exp(t * log_beta1)).to(tl.float32)
+    correction2 = (1.0 - tl.exp(t * log_beta2)).to(tl.float32)
+
+    place = tl.load(places + at, mask=inside, other=0)
+    parameter = tl.load(parameters + at, mask=inside, other=0.0)
+    mean = tl.load(means + at, mask=inside, other=0.0)
+    variance = tl.load(variances + at, mask=inside, other=0.0)
+    gradient = tl.load(gradients + place, mask=inside, other=0.0)
+    if CLIP:
+        gradient = gradient * tl.minimum(max_grad_norm / (norm + 1e-6), 1.0)
+    gradient += weight_decay * parameter
+    new_mean = mean + (gradient - mean) * (1.0 - beta1)
+    new_variance = beta2 * variance + (1.0 - beta2) * gradient * gradient
+    change = (rate / correction1) * new_mean / (tl.sqrt(new_variance) / tl.sqrt(correction2) + eps)
+    parameter = tl.where(made, parameter - change, parameter)
+    tl.store(parameters + at, parameter, mask=inside)
+    tl.store(means + at, tl.where(made, new_mean, mean), mask=inside)
+    tl.store(variances + at, tl.where(made, new_variance, variance), mask=inside)
+    tl.store(weights + place, parameter.to(weights.dtype.element_ty), mask=inside)
+    tl.store(exact_weights + place, parameter, mask=inside)
+    if tl.program_id(0) == 0:
+        miss = tl.where(made, 0, 1).to(tl.int64)
+        in_a_row = (tl.load(skipped_in_a_row) + miss) * miss
+        tl.store(skipped, tl.load(skipped) + miss)
+        tl.store(skipped_in_a_row, in_a_row)
+        tl.store(steps + 1, tl.where(made, step + 1.0, step))
+        tl.store(summary + GRAD_NORM, norm)
+        tl.store(summary + GRAD_NORM + 1, miss.to(tl.float32))
+        tl.store(summary + GRAD_NORM + 2, in_a_row.to(tl.float32))

@@ -1,0 +1,48 @@
+"""Sizes of the kernels' blocks; they change the speed and the order of sums, nothing else."""
+
+from dataclasses import dataclass
+
+import torch
+
+from ksim_rl.objectives.fused_ppo.layout import FusedLayout
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tuning:
+    """How the work is cut. The defaults were the fastest on an H200 for layers of 512, 256 and 128.
+
+    Attributes:
+        block: rows of a minibatch that one program takes through a network.
+        chunk: columns of the widest layer that exist at a time.
+        stages: how far loads of weights run ahead.
+        warps: of such a program.
+        tile: rows and columns of the weights whose gradient one program computes.
+        depth: rows of a minibatch that it multiplies at a time.
+        tile_stages, tile_warps: as `stages` and `warps`.
+        splits: programs that share a tile, each with a part of the minibatch.
+        size: elements per program in sums and Adam.
+        columns, rows: of the blocks in which sums over programs are taken.
+        envs: per program, in the estimate of advantages.
+    """
+
+    block: int = 128
+    chunk: int = 64
+    stages: int = 2
+    warps: int = 8
+    tile: int = 128
+    depth: int = 64
+    tile_stages: int = 3
+    tile_warps: int = 8
+    splits: int = 8
+    size: int = 1024
+    columns: int = 32
+    rows: int = 64
+    envs: int = 32
+
+    @classmethod
+    def of(cls, layout: FusedLayout, dtype: torch.dtype) -> "Tuning":
+        """Return what suits networks of a layout."""
+        chunk = min(64, layout.hidden[0], layout.hidden[2])
+        if dtype == torch.float32:
+            return cls(block=64, chunk=min(chunk, 32), depth=32)
+        return cls(chunk=chunk)

@@ -1,0 +1,77 @@
+"""How far a policy moved, whatever its distribution: exact where there is a closed form."""
+
+from functools import reduce
+from operator import add
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import CompositeDistribution, ProbabilisticTensorDictSequential
+from tensordict.utils import NestedKey
+from torch import Tensor, distributions
+from torch.distributions import Distribution, TransformedDistribution
+from torchrl.modules.distributions.utils import has_analytic_kl
+
+from ksim_rl.objectives.gaussian_kl import gaussian_parameters, kl_divergence
+
+
+def distribution_keys(actor: ProbabilisticTensorDictSequential) -> list[NestedKey]:
+    """Return the leaves from which an actor builds its distribution, such as `loc` and `scale`."""
+    roots = {_path(key) for key in actor.dist_params_keys}
+    written = {_path(key): key for key in actor.out_keys}
+    parents = {path[:depth] for path in written for depth in range(1, len(path))}
+    return [
+        key
+        for path, key in written.items()
+        if path not in parents and any(path[: len(root)] == root for root in roots)
+    ]
+
+
+def observation_keys(actor: ProbabilisticTensorDictSequential) -> list[NestedKey]:
+    """Return what an actor reads of an EnvState.
+
+    The `in_keys` of one with a `CompositeDistribution` also name the TensorDict of parameters that it writes itself.
+    """
+    return [key for key in actor.in_keys if key not in actor.dist_params_keys]
+
+
+def stored_distribution(
+    actor: ProbabilisticTensorDictSequential, tensordict: TensorDictBase
+) -> Distribution | None:
+    """Return the distribution whose parameters the data has, or None where it lacks one."""
+    if any(tensordict.get(key, None) is None for key in distribution_keys(actor)):
+        return None
+    return actor.build_dist_from_params(tensordict)
+
+
+def policy_kl(old: Distribution, new: Distribution) -> Tensor | None:
+    """Return KL(old || new) in nats with the batch shape of the two, or None where no closed form is known.
+
+    The parts of a `CompositeDistribution` are independent: theirs add up.
+    """
+    if isinstance(old, CompositeDistribution) and isinstance(new, CompositeDistribution):
+        parts = [policy_kl(part, new.dists[key]) for key, part in old.dists.items()]
+        dims = len(old.batch_shape)
+        known = [part.flatten(dims).sum(-1) if part.ndim > dims else part for part in parts if part is not None]
+        return reduce(add, known) if len(known) == len(parts) else None
+    if isinstance(old, TransformedDistribution):
+        # torch compares the two maps on the host. They are those of one policy.
+        parameters = gaussian_parameters(old), gaussian_parameters(new)
+        if parameters[0] is None or parameters[1] is None:
+            return None
+        return kl_divergence(*parameters[0], *parameters[1])
+    return distributions.kl_divergence(old, new) if has_analytic_kl(old, new) else None
+
+
+def estimated_kl(log_ratio: Tensor) -> Tensor:
+    """Return an unbiased estimate of KL(old || new) that is never negative, from actions of the old policy.
+
+    It is r - 1 - log r with r = new / old (Schulman, "Approximating KL divergence", 2020).
+
+    Args:
+        log_ratio: log r of each action.
+    """
+    return torch.expm1(log_ratio) - log_ratio
+
+
+def _path(key: NestedKey) -> tuple[str, ...]:
+    return (key,) if isinstance(key, str) else tuple(key)

@@ -1,0 +1,91 @@
+"""The loss of soft actor-critic, free of host syncs."""
+
+import math
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from torch import Tensor, nn
+from torchrl.modules.distributions.utils import rsample_and_log_prob
+
+from ksim_rl.checks import check_in_range
+from ksim_rl.objectives.off_policy_loss import OffPolicyLoss
+from ksim_rl.objectives.target_network import frozen
+
+
+class SACLoss(OffPolicyLoss):
+    """Soft actor-critic with a learned temperature (Haarnoja et al., arXiv 1812.05905), and FastSAC with a `support`.
+
+    With values for critics and `value_reduction="min"` it has the losses and gradients of TorchRL's `SACLoss` with
+    `loss_function="l2"`. All critics are evaluated in one batched product instead of a `vmap`, and may predict
+    distributions.
+
+    `loss_qvalue` = sum over the critics of mean((Q - y)^2), or of the cross entropy to the projected target
+    distribution, y = r + gamma^n (1 - terminated) (Q'(s', a') - alpha log p(a'|s')); `loss_actor` = mean(alpha log p(a|s) -
+    Q(s, a)); `loss_alpha` = -log_alpha * mean(log p(a|s) + target_entropy).
+
+    Args:
+        actor_network: probabilistic.
+        critic_network, support, gamma, value_reduction: see `OffPolicyLoss`.
+        alpha_init: temperature at the start.
+        learn_alpha: whether the temperature learns.
+        target_entropy: that the temperature aims at, in nats.
+    """
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModule,
+        *,
+        target_entropy: float,
+        alpha_init: float = 1.0,
+        learn_alpha: bool = True,
+        support: Tensor | None = None,
+        gamma: float = 0.99,
+        value_reduction: str = "min",
+    ) -> None:
+        super().__init__(
+            actor_network, critic_network, support=support, gamma=gamma, value_reduction=value_reduction
+        )
+        check_in_range("alpha_init", alpha_init, low=0.0, low_open=True)
+        check_in_range("target_entropy", target_entropy)
+        self.target_entropy = target_entropy
+        device = next(critic_network.parameters()).device
+        log_alpha = torch.tensor(math.log(alpha_init), device=device)
+        self.log_alpha = nn.Parameter(log_alpha, requires_grad=learn_alpha)
+
+    @property
+    def alpha(self) -> Tensor:
+        """The temperature, [], without gradients."""
+        return self.log_alpha.detach().exp()
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return `loss_qvalue`, `loss_actor`, `loss_alpha`, and detached `alpha`, `entropy`, `value` and `td_error`.
+
+        Args:
+            tensordict: a minibatch `["B"]` with the `in_keys`. Gets the absolute error of each env state as "td_error".
+        """
+        loss_qvalue, logged = self.critic_loss(tensordict)
+        losses, more = self.actor_losses(tensordict)
+        return self._collect({"loss_qvalue": loss_qvalue, **losses}, logged | more)
+
+    def critic_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
+        with torch.no_grad():
+            following = tensordict.get("next").select(*self.actor_network.in_keys)
+            next_action, log_prob_B = rsample_and_log_prob(self.actor_network.get_dist(following))
+            bonus_B = -self.alpha * log_prob_B
+        return self._critic_loss(tensordict, next_action, bonus_B)
+
+    def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Return the losses of actor and temperature, each with gradients for it alone, and what is logged."""
+        observed = tensordict.select(*self.actor_network.in_keys)
+        action, log_prob_B = rsample_and_log_prob(self.actor_network.get_dist(observed))
+        with frozen(self.critic_network):
+            value_B = self._value(tensordict, action)
+        log_prob = self._mean(log_prob_B.detach(), tensordict)
+        losses = {
+            "loss_actor": self._mean(self.alpha * log_prob_B - value_B, tensordict),
+            "loss_alpha": -self.log_alpha * (log_prob + self.target_entropy),
+        }
+        return losses, {"alpha": self.alpha, "entropy": -log_prob}

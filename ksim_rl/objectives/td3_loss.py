@@ -1,0 +1,77 @@
+"""The loss of twin delayed deterministic policy gradients, free of host syncs."""
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor
+
+from ksim_rl.checks import check_in_range
+from ksim_rl.objectives.off_policy_loss import OffPolicyLoss
+from ksim_rl.objectives.target_network import frozen
+
+
+class TD3Loss(OffPolicyLoss):
+    """TD3 (Fujimoto et al., arXiv 1802.09477), and FastTD3 (Seo et al., arXiv 2505.22642) with a `support`.
+
+    `loss_qvalue` = sum over the critics of mean((Q - y)^2), or of the cross entropy to the projected target
+    distribution, y = r + gamma^n (1 - terminated) Q'(s', clip(a(s') + clip(noise))); `loss_actor` = -mean(Q(s, a(s))). As
+    in FastTD3, a(s') is the present policy, not a slow copy of it.
+
+    Args:
+        actor_network: deterministic.
+        critic_network, support, gamma, value_reduction: see `OffPolicyLoss`.
+        low, high: bounds of the actions, [action_dim].
+        target_noise, target_noise_clip: standard deviation and bound of the noise on a(s'), in units of half the range of
+            an action.
+    """
+
+    def __init__(
+        self,
+        actor_network: TensorDictModuleBase,
+        critic_network: TensorDictModule,
+        *,
+        low: Tensor,
+        high: Tensor,
+        target_noise: float = 0.2,
+        target_noise_clip: float = 0.5,
+        support: Tensor | None = None,
+        gamma: float = 0.99,
+        value_reduction: str = "min",
+    ) -> None:
+        super().__init__(
+            actor_network, critic_network, support=support, gamma=gamma, value_reduction=value_reduction
+        )
+        check_in_range("target_noise", target_noise, low=0.0)
+        check_in_range("target_noise_clip", target_noise_clip, low=0.0)
+        self.low, self.high = low, high
+        self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return `loss_qvalue` and `loss_actor`, and detached `value` and `td_error`.
+
+        Args:
+            tensordict: a minibatch `["B"]` with the `in_keys`. Gets the absolute error of each env state as "td_error".
+        """
+        loss_qvalue, logged = self.critic_loss(tensordict)
+        losses, more = self.actor_losses(tensordict)
+        return self._collect({"loss_qvalue": loss_qvalue, **losses}, logged | more)
+
+    def critic_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
+        with torch.no_grad():
+            following = tensordict.get("next").select(*self.actor_network.in_keys)
+            action = self.actor_network(following).get(self.tensor_keys.action)
+            noise = (torch.randn_like(action) * self.target_noise).clamp(
+                -self.target_noise_clip, self.target_noise_clip
+            )
+            action = action + noise * (self.high - self.low) / 2
+            next_action = torch.maximum(torch.minimum(action, self.high), self.low)
+        return self._critic_loss(tensordict, next_action)
+
+    def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Return the loss of the actor, which has gradients for it alone, and an empty dict."""
+        observed = tensordict.select(*self.actor_network.in_keys)
+        action = self.actor_network(observed).get(self.tensor_keys.action)
+        with frozen(self.critic_network):
+            value_B = self._value(tensordict, action)
+        return {"loss_actor": -self._mean(value_B, tensordict)}, {}

@@ -1,0 +1,37 @@
+"""The state of an optimizer with one group of parameters, as a checkpoint holds it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from ksim_rl.objectives import load_optimizer_state_
+from ksim_rl.trainers.state_tree import State
+
+
+def optimizer_state(optimizer: torch.optim.Optimizer) -> State:
+    """Return learning rate and moments."""
+    state = optimizer.state_dict()
+    return {"learning_rate": state["param_groups"][0]["lr"], "moments": state["state"]}
+
+
+def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, Any], *, what: str) -> None:
+    """Continue where `optimizer_state` was taken.
+
+    Raises:
+        ValueError: naming what does not fit this optimizer's parameters.
+    """
+    parameters = optimizer.param_groups[0]["params"]
+    moments = {int(index): entry for index, entry in state["moments"].items()}
+    if moments and set(moments) != set(range(len(parameters))):
+        raise ValueError(f"{what}: {len(moments)} parameters in the checkpoint, {len(parameters)} in this run")
+    for index, entry in moments.items():
+        for name in ("exp_avg", "exp_avg_sq"):
+            if entry[name].shape != parameters[index].shape:
+                raise ValueError(
+                    f"{what}: {name} of parameter {index} has shape {list(entry[name].shape)} in the checkpoint and "
+                    f"{list(parameters[index].shape)} in this run"
+                )
+    groups = optimizer.state_dict()["param_groups"]
+    groups[0] = groups[0] | {"lr": state["learning_rate"]}
+    load_optimizer_state_(optimizer, {"state": moments, "param_groups": groups})

@@ -1,0 +1,125 @@
+"""A run folder makes its run again, and starts others: `--config-dir RUN` and `checkpoint=RUN`."""
+
+import csv
+
+import pytest
+import torch
+
+from ksim_rl.cli import main
+from ksim_rl.trainers import checkpoint
+
+SMALL = (
+    "num_envs=16",
+    "data.num_env_states_per_minibatch=32",
+    "modules.actor.hidden_dims=[16]",
+    "modules.critic.hidden_dims=[16]",
+    "task.episode_length_s=0.3",
+    "trainer.eval_episodes=0",
+    "trainer.num_iterations=2",
+    "trainer.video=false",
+    "logger.tensorboard=false",
+)
+TIMES = ("seconds", "throughput/env_states_per_s")
+
+
+def run(*arguments):
+    with pytest.raises(SystemExit) as stopped:
+        main.main(["train", *arguments])
+    return stopped.value.code
+
+
+def rows(folder):
+    with open(folder / "metrics.csv", newline="") as file:
+        return [{name: row[name] for name in row if name not in TIMES} for row in csv.DictReader(file)]
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory):
+    """Train two iterations, and return the run folder."""
+    folder = tmp_path_factory.mktemp("work") / "run"
+    assert run(*SMALL, "seed=3", f"hydra.run.dir={folder}") == 0
+    return folder
+
+
+def test_a_run_folder_makes_the_same_run_again(first, tmp_path):
+    assert run("--config-dir", str(first), f"hydra.run.dir={tmp_path / 'again'}") == 0
+    assert rows(tmp_path / "again") == rows(first)
+    assert len(rows(first)) == 2
+    assert (tmp_path / "again" / "config.yaml").read_text() == (first / "config.yaml").read_text()
+
+
+def test_overrides_lie_over_a_run_that_is_made_again(first, tmp_path):
+    changes = ("seed=4", "num_envs=8", "objective.gamma=0.9")
+    assert run("--config-dir", str(first), *changes, f"hydra.run.dir={tmp_path}") == 0
+    config = checkpoint.load(checkpoint.latest(tmp_path)).config
+    assert (config["seed"], config["task"]["seed"]) == (4, 4)
+    assert (config["num_envs"], config["task"]["scene"]["num_envs"]) == (8, 8)
+    assert config["objective"]["gamma"] == 0.9
+    assert rows(tmp_path) != rows(first)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("objective.gama=0.9", "objective has no field 'gama': did you mean 'gamma'"),
+        ("objective.gamma=2.0", "objective.gamma=2.0: expected a finite number"),
+        ("task=cartpole_swingup", "a run's config has no groups"),
+    ],
+)
+def test_a_wrong_override_of_a_run_is_one_line(first, tmp_path, monkeypatch, capsys, override, message):
+    monkeypatch.chdir(tmp_path)
+    assert run("--config-dir", str(first), override) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_new_run_starts_from_the_weights_of_another(first, tmp_path):
+    frozen = ("objective.schedule=fixed", "objective.learning_rate=1e-30", "objective.learning_rate_min=1e-30")
+    code = run(
+        *SMALL, *frozen, f"checkpoint={first}", "task=cartpole_swingup", "seed=9", f"hydra.run.dir={tmp_path}"
+    )
+    assert code == 0
+    began, ended = (checkpoint.load(checkpoint.latest(folder)) for folder in (first, tmp_path))
+    assert ended.iteration == 2, "counted from its own start"
+    assert ended.config["checkpoint"] == str(first)
+    weights = {name for name, value in began.state["update"]["actor"].items() if value.dtype == torch.float32}
+    learned = {name for name in weights if "weight" in name or "bias" in name}
+    assert len(learned) >= 4
+    for name in learned:
+        assert torch.equal(began.state["update"]["actor"][name], ended.state["update"]["actor"][name]), name
+
+
+def test_weights_for_other_observations_are_refused_with_the_names(first, tmp_path, capsys):
+    code = run(*SMALL, f"checkpoint={first}", "task=pendulum_swingup", f"hydra.run.dir={tmp_path / 'run'}")
+    assert code == 2
+    error = capsys.readouterr().err
+    assert "the checkpoint is of other observations: group 'actor': " in error
+    assert error.count("\n") == 1, "Hydra adds no line of its own"
+    assert not (tmp_path / "run" / "metrics.csv").exists()
+
+
+def test_weights_that_are_not_there_are_one_line(tmp_path, capsys):
+    code = run(*SMALL, f"checkpoint={tmp_path / 'nowhere'}", f"hydra.run.dir={tmp_path / 'run'}")
+    assert code == 2
+    assert "no checkpoint here; expected a run folder" in capsys.readouterr().err
+
+
+def test_a_sweep_over_two_axes_of_a_run_made_again(first, tmp_path):
+    axes = ("seed=1,2", "objective.clip_epsilon=0.1,0.2", "trainer.num_iterations=1")
+    assert run("--multirun", "--config-dir", str(first), *axes, f"hydra.sweep.dir={tmp_path}") == 0
+    found = sorted(
+        (config["seed"], config["objective"]["clip_epsilon"])
+        for config in (checkpoint.load(checkpoint.latest(f)).config for f in tmp_path.iterdir() if f.is_dir())
+    )
+    assert found == [(1, 0.1), (1, 0.2), (2, 0.1), (2, 0.2)]
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seeds", ["1,2"])
+def test_a_sweep_runs_in_the_processes_of_another_launcher(tmp_path, seeds):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    launcher = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
+    assert run("--multirun", *launcher, *SMALL, f"seed={seeds}", f"hydra.sweep.dir={tmp_path}") == 0
+    saved = [checkpoint.load(checkpoint.latest(f)) for f in tmp_path.iterdir() if f.is_dir()]
+    assert sorted(entry.config["seed"] for entry in saved) == [1, 2]

@@ -1,0 +1,101 @@
+"""Off-policy learning of `TargetEnv`, whose best action values are known."""
+
+import torch
+
+from ksim_rl.collectors import RolloutCollector
+from ksim_rl.data import ReplayCfg
+from ksim_rl.modules import (
+    DeterministicActorCfg,
+    ExploringPolicy,
+    QNetworkCfg,
+    SquashedActorCfg,
+    make_deterministic_actor,
+    make_q_network,
+    make_squashed_actor,
+)
+from ksim_rl.objectives import SACCfg, SACLoss, TD3Cfg, TD3Loss
+from ksim_rl.trainers import Evaluator, OffPolicyUpdate, Trainer, TrainerCfg
+from tests.trainers.target_env import LENGTH, make_env
+
+GAMMA = 0.9
+SHARED = {"gamma": GAMMA, "critic_learning_rate": 3e-3, "actor_learning_rate": 3e-3, "tau": 0.1}
+OBJECTIVES = {
+    "sac": SACCfg(alpha_init=0.02, alpha_learning_rate=0.0, **SHARED),
+    "fast_sac": SACCfg(
+        alpha_init=0.02, alpha_learning_rate=0.0, value_reduction="mean", policy_delay=2, **SHARED
+    ),
+    "td3": TD3Cfg(exploration_noise_min=0.05, exploration_noise_max=0.3, target_noise=0.05, **SHARED),
+    "fast_td3": TD3Cfg(exploration_noise_min=0.05, exploration_noise_max=0.3, target_noise=0.05, **SHARED),
+}
+
+
+def make_update(name, env, *, device="cpu", objective=None, **data):
+    """Return the update of an algorithm for an env with observations and actions of one number."""
+    cfg = objective or OBJECTIVES[name]
+    fields = {
+        "num_env_states_per_minibatch": 128,
+        "num_minibatches": 8,
+        "num_steps": 4,
+        "capacity": 200,
+        "learning_starts": 8,
+    }
+    sizes = {"obs_dim": 1, "action_spec": env.action_spec[0], "device": device}
+    make, kind = (
+        (make_squashed_actor, SquashedActorCfg)
+        if isinstance(cfg, SACCfg)
+        else (make_deterministic_actor, DeterministicActorCfg)
+    )
+    actor = make(kind(hidden_dims=(32,), activation="silu", action_bound=2.0, layer_norm=True), **sizes)
+    # More than the highest value of any of the probes.
+    atoms = {"num_atoms": 41, "v_min": -15.0, "v_max": 15.0} if name.startswith("fast") else {}
+    critic = make_q_network(
+        QNetworkCfg(hidden_dims=(64, 64), activation="silu", **atoms), obs_dim=1, action_dim=1, device=device
+    )
+    low, high = torch.full((2, 1), 2.0, device=device) * torch.tensor([[-1.0], [1.0]], device=device)
+    shared = {
+        "support": critic.module.support,
+        "gamma": cfg.gamma,
+        "value_reduction": cfg.value_reduction,
+    }
+    noise = {}
+    if isinstance(cfg, SACCfg):
+        loss = SACLoss(
+            actor,
+            critic,
+            target_entropy=-1.0,
+            alpha_init=cfg.alpha_init,
+            learn_alpha=cfg.alpha_learning_rate > 0.0,
+            **shared,
+        )
+    else:
+        loss = TD3Loss(actor, critic, low=low, high=high, target_noise=cfg.target_noise, **shared)
+        noise = {"noise_min": cfg.exploration_noise_min, "noise_max": cfg.exploration_noise_max}
+    num_envs = env.batch_size[0]
+    behavior = ExploringPolicy(actor, low=low, high=high, num_envs=num_envs, **noise)
+    return OffPolicyUpdate(
+        cfg,
+        loss=loss,
+        behavior=behavior,
+        data=ReplayCfg(**(fields | data)),
+        num_envs=num_envs,
+        device=device,
+    )
+
+
+def make_trainer(name, folder=None, *, seed=0, iterations=6, env=None, objective=None, data=None, **cfg):
+    """Return a trainer for `TargetEnv`; `cfg` are fields of `TrainerCfg`, `data` fields of `ReplayCfg`."""
+    torch.manual_seed(seed)
+    env = make_env(32, seed=seed) if env is None else env
+    update = make_update(name, env, objective=objective, **(data or {}))
+    fields = {"num_iterations": iterations, "eval_interval": 0, "checkpoint_interval": 0, **cfg}
+    evaluation_env = make_env(10)
+    evaluation_env.eval()
+    return Trainer(
+        TrainerCfg(**fields),
+        collector=RolloutCollector(
+            env, update.behavior, rollout_length=update.data.num_steps, keys=update.rollout_keys
+        ),
+        update=update,
+        evaluator=Evaluator(evaluation_env, update.actor, max_steps=LENGTH, seed=7),
+        folder=folder,
+    )
