@@ -68,9 +68,9 @@ class RunningMoments(nn.Module):
         """Count every row of `values` once, as `update` does, and leave `mean` and `var` as they are."""
         if values.shape[-1] != self.dim:
             raise ValueError(f"obs has shape {tuple(values.shape)}: the last dim must be {self.dim}")
-        # A copy: it is changed below. In float64 no sum of finite float32 values overflows.
-        exact_NL = values.reshape(-1, self.dim).to(torch.float64, copy=True)
-        valid_N = torch.isfinite(exact_NL.sum(-1))
+        values_NL = values.reshape(-1, self.dim)
+        # 0 times what is not finite is NaN, and 0 times anything else is 0.
+        valid_N = (values_NL @ values_NL.new_zeros(self.dim)) == 0
         if valid is not None:
             if valid.numel() != valid_N.numel():
                 raise ValueError(
@@ -81,17 +81,20 @@ class RunningMoments(nn.Module):
         if self.until is not None:
             valid_N = valid_N & (self.count < self.until)
 
-        exact_NL.masked_fill_(~valid_N[:, None], 0.0)
-        weight_N, added = valid_N.to(torch.float64), valid_N.sum()
+        exact_NL = torch.where(valid_N[:, None], values_NL, 0.0).to(torch.float64)
+        weight_N = valid_N.to(torch.float64)
+        added = weight_N.sum()
         mean = weight_N @ exact_NL / added.clamp_min(1)
         sum_of_squares = weight_N @ exact_NL.sub_(mean).square_()
 
-        merged = _merge(
-            (self.count, self.exact_mean, self.exact_sum_of_squares), (added, mean, sum_of_squares)
-        )
-        self.count.copy_(merged[0])
-        self.exact_mean.copy_(merged[1])
-        self.exact_sum_of_squares.copy_(merged[2])
+        # What `_merge` does, in place.
+        before = self.count.to(torch.float64)
+        total = before + added
+        share = added / total.clamp_min(1)
+        delta = mean.sub_(self.exact_mean)
+        self.exact_mean.addcmul_(delta, share)
+        self.exact_sum_of_squares.add_(sum_of_squares.addcmul_(delta.square_(), share * before))
+        self.count.copy_(total)
 
     @torch.no_grad()
     def publish(self) -> None:

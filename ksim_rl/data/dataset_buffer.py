@@ -109,6 +109,16 @@ class DatasetBuffer(ReplayBuffer):
         data = _labelled(data, info)
         yield from data.split(data.batch_size[0] // self.cfg.num_minibatches)
 
+    def epoch_order(self) -> Tensor:
+        """Begin an epoch, and return its whole order instead of its minibatches: int64 [D], on the device.
+
+        Raises:
+            TypeError: with a sampler that is no `EpochSampler`.
+        """
+        if type(self._sampler) is not EpochSampler:
+            raise TypeError(f"a {type(self._sampler).__name__} has no order of single env states: use epoch()")
+        return self._sampler.epoch_order(self.cfg.num_env_states, device=self.non_finite_count.device)
+
     def all(self) -> TensorDictBase:
         """Return the dataset `["D"]`: views of the storage, which the next `extend` overwrites."""
         return dims.name(self._dataset.get(slice(None)), dims.D)

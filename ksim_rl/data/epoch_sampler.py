@@ -75,6 +75,11 @@ class EpochSampler(Sampler):
             index = torch.unravel_index(index, storage.shape)
         return index, {}
 
+    def epoch_order(self, size: int, *, device: torch.device) -> Tensor:
+        """Begin an epoch and return its order of `range(size)`, int64 [size], as `sample` would give it in parts."""
+        self.restart()
+        return self._next_part(size, size, device)
+
     def _next_part(self, size: int, batch_size: int, device: torch.device) -> Tensor:
         """Return the next `batch_size` elements of the epoch's order of `range(size)`, on the device."""
         if size != self._size:

@@ -16,7 +16,6 @@ from ksim_rl.modules.mlp import ACTIVATIONS, mlp
 from ksim_rl.modules.observation_keys import ObservationKey, observation_dim
 from ksim_rl.modules.observation_normalizer import ObservationNormalizer, update_normalizers
 from ksim_rl.modules.q_network import QNetwork, QNetworkCfg, make_q_network
-from ksim_rl.modules.shared_trunk import FEATURES, SharedTrunkCfg, make_shared_trunk
 from ksim_rl.modules.recurrent import (
     RecurrentCfg,
     RecurrentModule,
@@ -29,6 +28,7 @@ from ksim_rl.modules.recurrent import (
 )
 from ksim_rl.modules.recurrent_primer import RecurrentStatePrimer, recurrent_transforms
 from ksim_rl.modules.recurrent_state import CarriedState, burnt_in
+from ksim_rl.modules.shared_trunk import FEATURES, SharedTrunkCfg, make_shared_trunk
 from ksim_rl.modules.tanh_gaussian import TanhGaussian
 from ksim_rl.modules.truncated_gaussian import TruncatedGaussian
 

@@ -61,7 +61,12 @@ def _leaves(action_spec: TensorSpec) -> dict[NestedKey, tuple[TensorSpec, int]]:
 
 
 def _choosing(
-    cfg: ActorCfg, key: NestedKey, leaf: Any, batch_dims: int, feature_dim: int, device: torch.device | str | None
+    cfg: ActorCfg,
+    key: NestedKey,
+    leaf: Any,
+    batch_dims: int,
+    feature_dim: int,
+    device: torch.device | str | None,
 ) -> nn.Module:
     own_shape = leaf.shape[batch_dims:]
     one_hot = isinstance(leaf, specs.OneHot)

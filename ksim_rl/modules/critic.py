@@ -65,9 +65,7 @@ class ValueNetwork(nn.Module):
         return self.layers(obs)
 
 
-def make_critic(
-    cfg: CriticCfg, *, obs_dim: int, device: torch.device | str | None = None
-) -> ValueOperator:
+def make_critic(cfg: CriticCfg, *, obs_dim: int, device: torch.device | str | None = None) -> ValueOperator:
     """Build the critic as TorchRL's `ValueOperator`.
 
     Reads `cfg.in_keys`, `obs_dim` numbers side by side, and writes `state_value` [..., 1].

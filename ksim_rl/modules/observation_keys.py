@@ -21,7 +21,9 @@ def checked_keys(keys: Sequence[ObservationKey]) -> tuple[ObservationKey, ...]:
     for index, key in enumerate(keys):
         names = (key,) if isinstance(key, str) else tuple(key)
         if not names or not all(isinstance(name, str) and name for name in names):
-            raise ValueError(f"in_keys[{index}]={key!r}: expected a name, or a list of names for a nested key")
+            raise ValueError(
+                f"in_keys[{index}]={key!r}: expected a name, or a list of names for a nested key"
+            )
         checked.append(names[0] if len(names) == 1 else names)
     if len(set(checked)) < len(checked):
         raise ValueError(f"in_keys={tuple(checked)!r}: each key can be read once")

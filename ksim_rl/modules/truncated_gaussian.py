@@ -126,7 +126,9 @@ class TruncatedGaussian(Distribution):
 
     def _bound_densities(self) -> tuple[Tensor, Tensor]:
         """Return the density of the standardized variable at its two bounds."""
-        log_densities = (-0.5 * bound.square() - _HALF_LOG_2_PI - self._log_mass for bound in (self._a, self._b))
+        log_densities = (
+            -0.5 * bound.square() - _HALF_LOG_2_PI - self._log_mass for bound in (self._a, self._b)
+        )
         density_a, density_b = (log_density.exp() for log_density in log_densities)
         return density_a, density_b
 

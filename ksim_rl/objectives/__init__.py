@@ -18,6 +18,7 @@ from ksim_rl.objectives.ppo_step import (
     make_symmetric,
     ppo_step,
 )
+from ksim_rl.objectives.precision import in_precision
 from ksim_rl.objectives.rollout_estimator import RolloutEstimator
 from ksim_rl.objectives.sac_loss import SACLoss
 from ksim_rl.objectives.step_guard import NonFiniteStepsError, StepGuard, clip_and_guard
@@ -49,6 +50,7 @@ __all__ = [
     "descend",
     "follow_",
     "frozen",
+    "in_precision",
     "distribution_keys",
     "kl_divergence",
     "load_optimizer_state_",

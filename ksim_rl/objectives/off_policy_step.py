@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ksim_rl.objectives.off_policy_cfg import OffPolicyCfg
-from ksim_rl.objectives.step_guard import StepGuard, clip_and_guard
+from ksim_rl.objectives.step_guard import clip_and_guard
 
 
 def make_adamw(
@@ -30,7 +30,7 @@ def make_adamw(
 
 
 def descend(
-    loss: Tensor, optimizer: torch.optim.Optimizer, *, max_grad_norm: float | None, guard: StepGuard
+    loss: Tensor, optimizer: torch.optim.Optimizer, *, max_grad_norm: float | None
 ) -> tuple[Tensor, Tensor]:
     """Make one gradient step on the parameters of a fused optimizer, unless loss or gradient are not finite.
 
@@ -46,5 +46,4 @@ def descend(
     # Fused optimizers read these two, which torch's GradScaler sets as well, and skip the step on the device.
     optimizer.grad_scale, optimizer.found_inf = None, found_inf  # type: ignore[attr-defined]
     optimizer.step()
-    guard.count_(found_inf)
     return grad_norm, found_inf

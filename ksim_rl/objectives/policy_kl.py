@@ -51,7 +51,9 @@ def policy_kl(old: Distribution, new: Distribution) -> Tensor | None:
     if isinstance(old, CompositeDistribution) and isinstance(new, CompositeDistribution):
         parts = [policy_kl(part, new.dists[key]) for key, part in old.dists.items()]
         dims = len(old.batch_shape)
-        known = [part.flatten(dims).sum(-1) if part.ndim > dims else part for part in parts if part is not None]
+        known = [
+            part.flatten(dims).sum(-1) if part.ndim > dims else part for part in parts if part is not None
+        ]
         return reduce(add, known) if len(known) == len(parts) else None
     if isinstance(old, TransformedDistribution):
         # torch compares the two maps on the host. They are those of one policy.

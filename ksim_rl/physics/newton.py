@@ -1,4 +1,4 @@
-"""The constraint solver of the substeps: one kernel per substep where the model allows it, else MuJoCo Warp's own."""
+"""The constraint solver of the substeps, for the models that `suits` names: one kernel instead of some hundred."""
 
 import mujoco
 import mujoco_warp as mjw
@@ -11,34 +11,82 @@ from ksim_rl.physics.newton_lanes import CUDA_LANES
 SHARED_FLOATS = 48 * 1024 // 4
 WORLDS_PER_BLOCK = 4
 MOST_DOFS = 64
+INTEGRATORS = (
+    mujoco.mjtIntegrator.mjINT_EULER,
+    mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+)
 
 
-def is_one_kernel(warp_model: mjw.Model, warp_data_E: mjw.Data) -> bool:
-    """Whether the kernel solves this model: Newton from a warm start, with sparse rows, and small enough."""
-    m, d = warp_model, warp_data_E
-    elliptic = m.opt.cone == mjw.ConeType.ELLIPTIC
+def suits(mj_model: mujoco.MjModel, *, njmax: int) -> bool:
+    """Whether the kernel can solve this model: Newton from a warm start, few enough degrees of freedom and rows."""
+    opt = mj_model.opt
+    elliptic = opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     return (
-        m.opt.solver == mjw.SolverType.NEWTON
-        and m.is_sparse
-        and m.opt.integrator != mjw.IntegratorType.DISCRETE
-        and not m.opt.disableflags & mjw.DisableBit.WARMSTART
-        and not m.opt.enableflags & mjw.EnableBit.SLEEP
-        and m.opt.noslip_iterations == 0
-        and m.opt.iterations > 0
-        and d.njmax > 0
-        and 0 < m.nv <= MOST_DOFS
-        and floats_per_world(m.nv, d.njmax, elliptic=elliptic) <= SHARED_FLOATS
+        opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+        and opt.integrator in INTEGRATORS
+        and opt.jacobian != mujoco.mjtJacobian.mjJAC_DENSE
+        and opt.iterations > 0
+        and opt.noslip_iterations == 0
+        and not opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART
+        and not opt.enableflags & (mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY)
+        and mj_model.nflex == 0
+        and 0 < mj_model.nv <= MOST_DOFS
+        and njmax > 0
+        and floats_per_world(mj_model.nv, njmax, elliptic=bool(elliptic)) <= SHARED_FLOATS
     )
 
 
-def solve(warp_model: mjw.Model, warp_data_E: mjw.Data, *, worlds_per_block: int = WORLDS_PER_BLOCK, min_blocks: int = 0) -> None:
-    """Launch the solver: accelerations and constraint forces from the rows of `warp_data_E`."""
+def step(warp_model: mjw.Model, warp_data_E: mjw.Data, *, sensors: bool) -> None:
+    """Launch a physics step: that of MuJoCo Warp, with this solver.
+
+    Args:
+        warp_model: with `opt.run_qacc_smooth` off, since the solver does not need that acceleration.
+        warp_data_E: the worlds.
+        sensors: whether to compute them; they never change the state that is reached.
+    """
     m, d = warp_model, warp_data_E
+    mjw.fwd_position(m, d, factorize=False)
+    if sensors:
+        d.sensordata.zero_()
+        mjw.sensor_pos(m, d)
+    mjw.fwd_velocity(m, d)
+    if sensors:
+        mjw.sensor_vel(m, d)
+    mjw.fwd_actuation(m, d)
+    mjw.fwd_acceleration(m, d, factorize=True)
+    solve(m, d)
+    if sensors:
+        if m.sensor_rne_postconstraint:
+            mjw.rne_postconstraint(m, d)
+        mjw.sensor_acc(m, d, skip_rne_postconstraint=True)
+    if m.opt.integrator == mjw.IntegratorType.EULER:
+        mjw.euler(m, d)
+    else:
+        mjw.implicit(m, d)
+
+
+def solve(
+    warp_model: mjw.Model,
+    warp_data_E: mjw.Data,
+    *,
+    worlds_per_block: int = WORLDS_PER_BLOCK,
+    min_blocks: int = 0,
+) -> None:
+    """Launch the solver: accelerations and constraint forces from the rows of `warp_data_E`, which must be sparse.
+
+    Args:
+        warp_model: a model that `suits`.
+        warp_data_E: the worlds.
+        worlds_per_block: how many worlds share a block on CUDA; fewer where their memory does not fit.
+        min_blocks: how many blocks a multiprocessor is to hold at once, which bounds the registers; 0 does not.
+    """
+    m, d, efc = warp_model, warp_data_E, warp_data_E.efc
     elliptic = bool(m.opt.cone == mjw.ConeType.ELLIPTIC)
     on_cuda = d.qpos.device.is_cuda
     lanes = CUDA_LANES if on_cuda else 1
-    fits = SHARED_FLOATS // floats_per_world(m.nv, d.njmax, elliptic=elliptic)
-    worlds = min(worlds_per_block, fits) if on_cuda else 1
+    fitting = SHARED_FLOATS // floats_per_world(m.nv, d.njmax, elliptic=elliptic)
+    worlds = min(worlds_per_block, fitting) if on_cuda else 1
     kernel = newton_kernel(
         nv=m.nv,
         njmax=d.njmax,
@@ -48,7 +96,6 @@ def solve(warp_model: mjw.Model, warp_data_E: mjw.Data, *, worlds_per_block: int
         worlds_per_block=worlds,
         min_blocks=min_blocks if on_cuda else 0,
     )
-    efc = d.efc
     wp.launch(
         kernel,
         dim=(d.nworld, lanes),

@@ -86,7 +86,9 @@ def factorize(h: wp.array[float], inverse_diag: wp.array[float], nv: int, lane: 
             below = packed(row, 0)
             entry = h[below + col]
             for k in range(col):
-                entry -= h[below + k] * h[at + k]
+                # What overflows in one tree stays there: infinity times zero would be NaN.
+                if h[at + k] != 0.0:
+                    entry -= h[below + k] * h[at + k]
             h[below + col] = entry * inverse
         if lane == 0:
             inverse_diag[col] = inverse
@@ -104,7 +106,8 @@ def back_substitute(
         x = h[y + row] * inverse_diag[row]
         at = packed(row, 0)
         for k in range(lane, row, lanes):
-            h[y + k] = h[y + k] - h[at + k] * x
+            if h[at + k] != 0.0:
+                h[y + k] = h[y + k] - h[at + k] * x
         if lane == 0:
             search[row] = -x
         sync()
@@ -516,7 +519,10 @@ def newton_kernel(
                 alpha = float(0.0)
                 improvement = float(0.0)
                 searching = int(1)
-                if wp.abs(start[1]) < NOISE * gross:
+                if rows == 0:
+                    alpha = 1.0
+                    searching = 0
+                elif wp.abs(start[1]) < NOISE * gross:
                     searching = 0
                 low = wp.vec3(0.0, start[1], start[2])
                 high = wp.vec3(0.0, start[1], start[2])
@@ -633,7 +639,7 @@ def newton_kernel(
                     x[row] = x[row] + alpha * v[row]
                 sync()
                 iteration += 1
-                if alpha == 0.0 or (improvement > 0.0 and scale * improvement < tolerance):
+                if rows == 0 or alpha == 0.0 or (improvement > 0.0 and scale * improvement < tolerance):
                     solving = 2
 
         for i in range(lane, NV, LANES):

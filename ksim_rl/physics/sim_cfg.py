@@ -38,6 +38,9 @@ class SimCfg:
         deterministic: ask MuJoCo Warp for its reproducible contact order, constraint order and sums on a GPU, at a cost
             (large for scenes with many contacts). With MuJoCo Warp 4.0 it narrows the differences between runs and does
             not remove all of them (Go1 on an H200: 5e-7 in qpos after a step). On the CPU results are always the same.
+        one_kernel_solver: solve the constraints of a substep in one kernel instead of some hundred. It is MuJoCo Warp's
+            algorithm, so that results agree up to rounding. Models out of its range (solvers other than Newton,
+            more than 64 degrees of freedom, flexes, sleeping, noslip, RK4) and `deterministic` take MuJoCo Warp's own.
         require_graphs: refuse to run where graphs are unavailable, instead of a warning and a slow run.
         nan_guard: where to save what led to a non-finite state; `None` keeps nothing and costs nothing.
 
@@ -59,6 +62,7 @@ class SimCfg:
     njmax: int | None = None
     nconmax: int | None = None
     deterministic: bool = False
+    one_kernel_solver: bool = True
     require_graphs: bool = False
     nan_guard: NanGuardCfg | None = None
 
@@ -78,7 +82,7 @@ class SimCfg:
             if isinstance(value, bool) or not isinstance(value, int):
                 raise ValueError(f"{field}={value!r}: expected a whole number >= 1, or None")
             check_in_range(field, value, low=1)
-        for field in ("deterministic", "require_graphs"):
+        for field in ("deterministic", "one_kernel_solver", "require_graphs"):
             value = getattr(self, field)
             if not isinstance(value, bool):
                 raise ValueError(f"{field}={value!r}: expected True or False")

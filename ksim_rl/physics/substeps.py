@@ -7,7 +7,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from ksim_rl.physics import kernels
+from ksim_rl.physics import kernels, newton
 
 # These read the contacts of the last substep's collision pass, which a reset empties.
 COLLISION_SENSORS = (
@@ -23,15 +23,34 @@ class Substeps:
     """Shallow variants of one Warp model, so that a stage is left out without touching the model itself.
 
     The variants share all arrays with `warp_model`. Build them once its arrays are in their final place.
+
+    Args:
+        mj_model: the model.
+        warp_model: the same on the device.
+        warp_data_E: the worlds.
+        one_kernel_solver: solve with `newton`, which must suit the model, instead of MuJoCo Warp's own solver.
     """
 
-    def __init__(self, mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+    def __init__(
+        self,
+        mj_model: mujoco.MjModel,
+        warp_model: mjw.Model,
+        warp_data_E: mjw.Data,
+        *,
+        one_kernel_solver: bool = False,
+    ) -> None:
         self.warp_model = warp_model
         self.warp_data_E = warp_data_E
         sensor_type = mj_model.sensor_type
         has_history = np.any(mj_model.sensor_history > 0, axis=-1)
         # A delayed sensor samples at every substep.
-        self._silent_model = warp_model if has_history.any() else _without_sensors(warp_model)
+        self._always_senses = bool(has_history.any())
+        self._silent_model = warp_model if self._always_senses else _without_sensors(warp_model)
+        self._solver_model: mjw.Model | None = None
+        if one_kernel_solver:
+            # From the warm start even a world without constraints reaches qacc_smooth in one step.
+            opt = dataclasses.replace(warp_model.opt, run_qacc_smooth=False)
+            self._solver_model = dataclasses.replace(warp_model, opt=opt)
         self._refresh_model = _refreshable(
             warp_model, skip=has_history | np.isin(sensor_type, COLLISION_SENSORS), sensor_type=sensor_type
         )
@@ -41,7 +60,10 @@ class Substeps:
 
     def advance(self, *, sensors: bool) -> None:
         """Launch one physics step. Sensors never change the state that it reaches."""
-        mjw.step(self.warp_model if sensors else self._silent_model, self.warp_data_E)
+        if self._solver_model is not None:
+            newton.step(self._solver_model, self.warp_data_E, sensors=sensors or self._always_senses)
+        else:
+            mjw.step(self.warp_model if sensors else self._silent_model, self.warp_data_E)
 
     def refresh(self) -> None:
         """Launch what recomputes position- and velocity-stage quantities from the present qpos and qvel.

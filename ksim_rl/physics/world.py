@@ -11,7 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from ksim_rl.checks import check_choice, unknown_name
-from ksim_rl.physics import capacity, kernels, state, views
+from ksim_rl.physics import capacity, kernels, newton, state, views
 from ksim_rl.physics.fields import (
     FIXED,
     GRAVITY,
@@ -70,6 +70,14 @@ class World(views.DataViews):
         self.sim.apply_to(self.mj_model)
         expanded = fields_to_expand(per_world_fields)
         check_not_simple(self.mj_model, expanded)
+        self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
+        self.has_one_kernel_solver = (
+            self.sim.one_kernel_solver
+            and not self.sim.deterministic
+            and newton.suits(self.mj_model, njmax=self.njmax)
+        )
+        if self.has_one_kernel_solver:
+            self.mj_model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
         self._graphs = WarpGraphs(self.device, require_graphs=self.sim.require_graphs)
         with warp_scope(self.device):
             self.warp_model = warp_model_of(self.mj_model, dict.fromkeys(expanded, num_envs))
@@ -80,7 +88,6 @@ class World(views.DataViews):
                 self.warp_model.opt.tolerance.fill_(self.sim.tolerance)
             if self.device.type == "cuda" and not wp.is_conditional_graph_supported():
                 self.warp_model.opt.graph_conditional = False
-            self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
             self.warp_data_E = mjw.make_data(
                 self.mj_model, nworld=num_envs, nconmax=self.nconmax, njmax=self.njmax
             )
@@ -88,7 +95,12 @@ class World(views.DataViews):
             self._overflow = OverflowRecord(self.warp_data_E)
             self._reset_mask = wp.zeros(num_envs, dtype=bool)
             self._zeroed_at_reset = views.float_rows(self.warp_data_E, views.ACCELERATION_STAGE)
-            self._substeps = Substeps(self.mj_model, self.warp_model, self.warp_data_E)
+            self._substeps = Substeps(
+                self.mj_model,
+                self.warp_model,
+                self.warp_data_E,
+                one_kernel_solver=self.has_one_kernel_solver,
+            )
             self._masked_constants = self._prepare_constants(expanded)
         self._reset_mask_E = wp.to_torch(self._reset_mask)
         self._fields = {name: wp.to_torch(getattr(self.warp_model, name)) for name in expanded}

@@ -148,12 +148,15 @@ class OffPolicyUpdate:
         for tensor in (*self._sums.values(), *self._counts.values(), self._longest_skip):
             tensor.zero_()
         for step, minibatch_B in enumerate(self.replay.minibatches(self.data.num_minibatches), start=1):
-            self._improve_critic(minibatch_B)
+            skipped = self._improve_critic(minibatch_B)
             if step % self.cfg.policy_delay == 0:
-                self._improve_actor(minibatch_B)
+                skipped = torch.maximum(skipped, self._improve_actor(minibatch_B))
             self.loss.update_target_(self.cfg.tau)
+            self.guard.count_(skipped)
+            torch.maximum(self._longest_skip, self.guard.skipped_in_a_row, out=self._longest_skip)
 
-    def _improve_critic(self, minibatch_B: TensorDictBase) -> None:
+    def _improve_critic(self, minibatch_B: TensorDictBase) -> Tensor:
+        """Make one gradient step of the critics, and return 1 if it was skipped, else 0."""
         with self._precision():
             loss, logged = self.loss.critic_loss(minibatch_B)
         norm, skipped = self._descend(loss, "critic")
@@ -161,21 +164,21 @@ class OffPolicyUpdate:
             self.replay.update_priority(minibatch_B.get("index"), minibatch_B.get("td_error"))
         logged = logged | {"loss_qvalue": loss, "critic_grad_norm": norm}
         self._measure("critic", logged, OF_CRITIC_STEPS, skipped)
+        return skipped
 
-    def _improve_actor(self, minibatch_B: TensorDictBase) -> None:
+    def _improve_actor(self, minibatch_B: TensorDictBase) -> Tensor:
+        """Make one gradient step of the actor and the temperature, and return 1 if it was skipped, else 0."""
         with self._precision():
             losses, logged = self.loss.actor_losses(minibatch_B)
         norm, skipped = self._descend(losses["loss_actor"], "actor")
         if "alpha" in self.optimizers:
-            self._descend(losses["loss_alpha"], "alpha")
+            skipped = torch.maximum(skipped, self._descend(losses["loss_alpha"], "alpha")[1])
         logged = logged | {"loss_actor": losses["loss_actor"], "actor_grad_norm": norm}
         self._measure("actor", logged, OF_ACTOR_STEPS | OF_TEMPERATURE, skipped)
+        return skipped
 
     def _descend(self, loss: Tensor, which: str) -> tuple[Tensor, Tensor]:
-        optimizer = self.optimizers[which]
-        result = descend(loss, optimizer, max_grad_norm=self.cfg.max_grad_norm, guard=self.guard)
-        torch.maximum(self._longest_skip, self.guard.skipped_in_a_row, out=self._longest_skip)
-        return result
+        return descend(loss, self.optimizers[which], max_grad_norm=self.cfg.max_grad_norm)
 
     def _measure(
         self, which: str, measured: Mapping[str, Tensor], names: Mapping[str, str], skipped: Tensor

@@ -18,6 +18,7 @@ from ksim_rl.objectives import (
     PPOCfg,
     StepGuard,
     distribution_keys,
+    in_precision,
     load_optimizer_state_,
     make_advantage,
     make_loss,
@@ -28,6 +29,7 @@ from ksim_rl.objectives import (
 )
 from ksim_rl.physics.capture import Captured
 from ksim_rl.trainers import state_tree
+from ksim_rl.trainers.fused_ppo import make_fused_ppo
 from ksim_rl.trainers.networks import build_networks
 from ksim_rl.trainers.run_cfg import RunCfg
 
@@ -76,12 +78,15 @@ class PPOUpdate:
 
     Args:
         cfg: of the objective.
-        actor: any probabilistic module: writes actions, their log-probabilities and the parameters of their distribution.
+        actor: any probabilistic module; writes actions, their log-probabilities and parameters of the distribution.
         critic: writes `state_value`.
         data: sizes of dataset and minibatch.
         seed: of the order of the env states in the minibatches.
         device: where all of it lives.
         mirror: the mirror images of what the networks read and of the action, for `cfg.symmetry`.
+
+    Attributes:
+        fused: the kernels that make the gradient steps, or why torch makes them.
     """
 
     def __init__(
@@ -99,7 +104,8 @@ class PPOUpdate:
         self.device = torch.device(device)
         self.advantage = make_advantage(cfg, actor, critic)
         self.loss = make_loss(cfg, actor, critic)
-        self._losses = make_symmetric(cfg, self.loss, mirror, device=self.device)
+        losses = make_symmetric(cfg, self.loss, mirror, device=self.device)
+        self._losses = in_precision(losses, cfg.precision, device=self.device)
         self.optimizer = make_optimizer(cfg, actor, critic)
         # Networks with a memory learn on sequences. The rollouts hold the actor's states, and not the critic's.
         self._memories = memories(actor, critic)
@@ -113,6 +119,16 @@ class PPOUpdate:
             device=self.device,
         )
         self.guard = StepGuard(device=self.device)
+        self.fused = make_fused_ppo(
+            cfg,
+            actor=actor,
+            critic=critic,
+            optimizer=self.optimizer,
+            guard=self.guard,
+            dataset=self.dataset,
+            device=self.device,
+        )
+        self._is_fused = torch.tensor(float(not isinstance(self.fused, str)), device=self.device)
         self._rollout_ET: TensorDictBase | None = None
         self._sums: dict[str, Tensor] = {}
         self._steps_made = torch.zeros((), device=self.device)
@@ -138,7 +154,7 @@ class PPOUpdate:
         written = [*actor.dist_sample_keys, *actor.log_prob_keys, *distribution_keys(actor)]
         valued = [key for key in self.critic.in_keys if key not in self._carried.keys]
         following = [unravel_key(("next", key)) for key in (*valued, "reward", "done", "terminated")]
-        return list(dict.fromkeys([*actor.in_keys, *valued, *written, *following]))
+        return list(dict.fromkeys([*observation_keys(actor), *valued, *written, *following]))
 
     def __call__(self, rollout_ET: TensorDictBase) -> None:
         """Update the networks with a rollout `["E","T"]` of the dataset's size."""
@@ -151,6 +167,7 @@ class PPOUpdate:
         std = {"policy/std": self._std} if self._scale_keys else {}
         return means | std | {
             "update/learning_rate": self.optimizer.param_groups[0]["lr"],
+            "update/fused": self._is_fused,
             "update/skipped_steps": self.guard.skipped,
             "update/skipped_in_a_row": self._longest_skip,
             "update/non_finite_env_states": self.dataset.non_finite_count,
@@ -167,24 +184,35 @@ class PPOUpdate:
 
     def _update(self) -> None:
         assert self._rollout_ET is not None
-        self._clear_sums()
-        self._carried.begin_(self._rollout_ET)
-        rollout_ET = self.advantage(self._rollout_ET)
-        self._carried.end_(rollout_ET)
+        rollout_ET = self._rollout_ET
+        if isinstance(self.fused, str):
+            steps = self._torch_steps(rollout_ET)
+        else:
+            orders = [self.dataset.epoch_order() for _ in range(self.cfg.num_epochs)]
+            steps, left_out = self.fused(rollout_ET, orders)
+            self.dataset.non_finite_count.add_(left_out)
+        self._measure(steps)
         if self._scale_keys:
             self._std.copy_(sum(rollout_ET.get(key).mean() for key in self._scale_keys) / len(self._scale_keys))
+        # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
+        update_normalizers(rollout_ET, self.actor, self.critic)
+
+    def _torch_steps(self, rollout_ET: TensorDictBase) -> dict[str, Tensor]:
+        """Make all gradient steps with torch; return what each measured, [steps]."""
+        self._carried.begin_(rollout_ET)
+        rollout_ET = self.advantage(rollout_ET)
+        self._carried.end_(rollout_ET)
         self.dataset.extend(rollout_ET)
+        steps = []
         for epoch in range(self.cfg.num_epochs):
             if epoch > 0 and self.cfg.estimates_each_epoch:
                 self._estimate_anew(rollout_ET)
             for minibatch_B in self.dataset.epoch():
                 if self._memories:
                     minibatch_B = burnt_in(minibatch_B, *self._memories, steps=self.dataset.cfg.burn_in)
-                self._measure(
-                    ppo_step(self._losses, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard)
-                )
-        # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
-        update_normalizers(rollout_ET, self.actor, self.critic)
+                step = ppo_step(self._losses, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard)
+                steps.append(step | {"skipped_in_a_row": self.guard.skipped_in_a_row.clone()})
+        return {name: torch.stack([step[name] for step in steps]) for name in steps[0]}
 
     def _estimate_anew(self, rollout_ET: TensorDictBase) -> None:
         # The rows that are not finite were counted with the first estimate.
@@ -192,21 +220,15 @@ class PPOUpdate:
         self.dataset.extend(self.advantage(rollout_ET))
         self.dataset.non_finite_count.copy_(count)
 
-    def _measure(self, step: Mapping[str, Tensor]) -> None:
-        made = step["skipped"] == 0.0
-        self._steps_made.add_(made)
+    def _measure(self, steps: Mapping[str, Tensor]) -> None:
+        made = steps["skipped"] == 0.0
+        self._steps_made.copy_(made.sum())
         for name, logged in LOGGED.items():
-            if name in step:
+            if name in steps:
                 # A skipped step is counted; its numbers would spoil the means.
-                value = torch.where(made, step[name].detach(), 0.0)
-                self._sums.setdefault(logged, torch.zeros((), device=self.device)).add_(value)
-        torch.maximum(self._longest_skip, self.guard.skipped_in_a_row, out=self._longest_skip)
-
-    def _clear_sums(self) -> None:
-        self._longest_skip.zero_()
-        self._steps_made.zero_()
-        for total in self._sums.values():
-            total.zero_()
+                total = torch.where(made, steps[name], 0.0).sum()
+                self._sums.setdefault(logged, torch.zeros((), device=self.device)).copy_(total)
+        self._longest_skip.copy_(steps["skipped_in_a_row"].max())
 
     def state_dict(self) -> state_tree.State:
         """Return networks, optimizer, sampler and counters."""

@@ -203,7 +203,7 @@ class Trainer:
         )
 
     def _look_at_target(self) -> None:
-        targets = self.cfg.stop_at
+        targets = self.cfg.stop_at or {}
         reached = [self.metrics.get(name, float("-inf")) >= value for name, value in targets.items()]
         self._target_met |= bool(targets) and all(reached)
         for name in targets:

@@ -1,7 +1,7 @@
 """How long a run is, and what happens beside learning."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from ksim_rl.checks import check_choice, check_in_range
 
@@ -18,7 +18,7 @@ class TrainerCfg:
         eval_episodes: episodes of an evaluation, one env each; 0 means no evaluation at all.
         stop_when_solved: end the run as soon as an evaluation reaches the task's threshold.
         stop_at: end the run as soon as each of these metrics reaches its value in one and the same iteration, such as
-            `{"reward/track_linear": 1.39}`. Figures of evaluations count as well.
+            `{"reward/track_linear": 1.39}`; figures of evaluations count as well. None has no such targets.
         checkpoint_interval: between checkpoints; the last iteration is always saved.
         keep_checkpoints: how many of the newest checkpoints stay.
         log_interval: between rows of the logs and lines of progress.
@@ -36,7 +36,7 @@ class TrainerCfg:
     eval_interval: int = 20
     eval_episodes: int = 100
     stop_when_solved: bool = True
-    stop_at: Mapping[str, float] = field(default_factory=dict)
+    stop_at: Mapping[str, float] | None = None
     checkpoint_interval: int = 20
     keep_checkpoints: int = 3
     log_interval: int = 1
@@ -59,7 +59,7 @@ class TrainerCfg:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < low:
                 raise ValueError(f"{name}={value!r}: expected a whole number >= {low}")
-        for name, value in self.stop_at.items():
+        for name, value in (self.stop_at or {}).items():
             check_in_range(f"stop_at.{name}", value)
         if self.num_threads is not None:
             check_in_range("num_threads", self.num_threads, low=1)

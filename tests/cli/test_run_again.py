@@ -75,7 +75,11 @@ def test_a_wrong_override_of_a_run_is_one_line(first, tmp_path, monkeypatch, cap
 
 
 def test_a_new_run_starts_from_the_weights_of_another(first, tmp_path):
-    frozen = ("objective.schedule=fixed", "objective.learning_rate=1e-30", "objective.learning_rate_min=1e-30")
+    frozen = (
+        "objective.schedule=fixed",
+        "objective.learning_rate=1e-30",
+        "objective.learning_rate_min=1e-30",
+    )
     code = run(
         *SMALL, *frozen, f"checkpoint={first}", "task=cartpole_swingup", "seed=9", f"hydra.run.dir={tmp_path}"
     )

@@ -32,7 +32,7 @@ class RecallEnv(MaskedReset):
 
     All other rewards are zero. The best return of a policy that remembers is 1. One that sees only the present
     observation, which at the last step is the same whatever the cue was, has at best
-    max_a E[1 - (a - cue)^2] = max_a (1 - a^2 - 1) = 0, at a = 0: no better than its variance allows.
+    max_a E[1 - (a - cue)^2] = max_a (1 - a^2 - 1) = 0, at a = 0.
     """
 
     def __init__(self, num_envs):
@@ -83,12 +83,13 @@ class RecallEnv(MaskedReset):
         self.episode_E.zero_()
 
 
-def trained(kind, *, iterations, **sequences):
+def trained(kind, **sequences):
     """Return the mean return of the trained policy's mean action."""
     torch.manual_seed(0)
     env, evaluation_env = (MaskedTransformedEnv(RecallEnv(n)) for n in (NUM_ENVS, 256))
-    actor_cfg = ActorCfg(hidden_dims=(32,), init_std=0.5, obs_normalization=False)
-    critic_cfg = CriticCfg(hidden_dims=(32,), obs_normalization=False)
+    hidden_dims = (32,) if kind is None else ()
+    actor_cfg = ActorCfg(hidden_dims=hidden_dims, init_std=0.5, obs_normalization=False)
+    critic_cfg = CriticCfg(hidden_dims=hidden_dims, obs_normalization=False)
     if kind is None:
         actor, critic = make_actor(actor_cfg, obs_dim=2, action_dim=1), make_critic(critic_cfg, obs_dim=2)
     else:
@@ -99,12 +100,12 @@ def trained(kind, *, iterations, **sequences):
             for transform in recurrent_transforms(each, actor[0].make_tensordict_primer()):
                 each.append_transform(transform)
     env.set_seed(1)
-    # 16 steps per rollout: episodes of 5 steps begin and end anywhere in them, and states cross from one to the next.
-    data = DatasetCfg(num_env_states_per_minibatch=256, num_minibatches=4, **sequences)
-    ppo = PPOCfg(num_epochs=4, learning_rate=5e-3, schedule="fixed", entropy_coeff=0.0, gamma=0.99)
+    # 8 steps per rollout: episodes of 5 steps begin and end anywhere in them, and states cross from one to the next.
+    data = DatasetCfg(num_env_states_per_minibatch=256, num_minibatches=2, **sequences)
+    ppo = PPOCfg(num_epochs=4, learning_rate=2e-2, schedule="fixed", entropy_coeff=0.0)
     update = PPOUpdate(ppo, actor=actor, critic=critic, data=data)
-    collector = RolloutCollector(env, actor, rollout_length=16, keys=update.rollout_keys)
-    for _ in range(iterations):
+    collector = RolloutCollector(env, actor, rollout_length=8, keys=update.rollout_keys)
+    for _ in range(20):
         update(collector.collect())
     evaluation = Evaluator(evaluation_env, actor, max_steps=LENGTH, seed=7)()
     assert evaluation is not None and evaluation.unfinished == 0
@@ -117,13 +118,14 @@ def trained(kind, *, iterations, **sequences):
         ("lstm", {}),
         ("gru", {}),
         ("lstm", {"sequence_length": 4}),
-        ("gru", {"sequence_length": 8, "burn_in": 4}),
+        ("gru", {"sequence_length": 4, "burn_in": 2}),
     ],
 )
 def test_a_recurrent_policy_recalls_the_cue(kind, sequences):
-    assert trained(kind, iterations=40, **sequences) > 0.9
+    assert trained(kind, **sequences) > 0.8
 
 
 def test_a_policy_without_memory_cannot():
-    # Its best return is 0; the cues of 256 episodes leave that its standard error, which is below 0.07.
-    assert trained(None, iterations=40) < 0.1
+    # In 256 episodes a policy that always plays a gains -a^2 + 2 a * (mean cue), whose standard deviation is 1 / 16: at
+    # most the mean cue squared, 0.06 where that is four standard deviations off.
+    assert trained(None) < 0.06

@@ -41,7 +41,9 @@ SPECS = {
 
 def _actor(name, **options):
     distribution, spec = SPECS[name]
-    return make_actor(ActorCfg(hidden_dims=(16,), distribution=distribution, **options), obs_dim=5, action_spec=spec)
+    return make_actor(
+        ActorCfg(hidden_dims=(16,), distribution=distribution, **options), obs_dim=5, action_spec=spec
+    )
 
 
 def _data():
@@ -129,7 +131,11 @@ def test_compiles_without_a_break(name):
     [
         ("categorical", BOX, "'categorical' does not go with the action 'action', Bounded"),
         ("gaussian", SPECS["index"][1], "'gaussian', but the action 'action' is discrete: use 'categorical'"),
-        ("tanh_gaussian", Unbounded((4, 2)), "needs bounds, but the action 'action' has no finite ones.*action_bound"),
+        (
+            "tanh_gaussian",
+            Unbounded((4, 2)),
+            "needs bounds, but the action 'action' has no finite ones.*action_bound",
+        ),
         ("truncated_gaussian", Bounded(-1.0, torch.inf, (4, 2)), "has no finite ones"),
         ("categorical", MIXED, r"\('action', 'arm'\), BoundedContinuous of float32"),
         ("gaussian", Bounded(0, 5, (4, 2), dtype=torch.int64), "BoundedDiscrete of int64"),
@@ -160,7 +166,9 @@ def test_config_refusals_name_the_field(options, message):
 
 def test_several_groups_are_read_side_by_side_and_normalized_as_one():
     actor = make_actor(
-        ActorCfg(in_keys=("actor", ("obs", "height")), hidden_dims=(8,), output_gain=1.0), obs_dim=5, action_dim=2
+        ActorCfg(in_keys=("actor", ("obs", "height")), hidden_dims=(8,), output_gain=1.0),
+        obs_dim=5,
+        action_dim=2,
     )
     parts = torch.randn(40, 3) + 2.0, torch.randn(40, 2) * 3.0
     data = TensorDict({"actor": parts[0], "obs": {"height": parts[1]}}, [40])

@@ -50,7 +50,9 @@ def test_several_choices_are_independent_ones(one_hot):
         else MultiCategorical(SIZES, shape=(7, 3))
     )
     assert spec.is_in(sample)
-    index = torch.stack([part.long().argmax(-1) for part in sample.split(SIZES, -1)], -1) if one_hot else sample
+    index = (
+        torch.stack([part.long().argmax(-1) for part in sample.split(SIZES, -1)], -1) if one_hot else sample
+    )
     expected = sum(reference.log_prob(index[:, k]) for k, reference in enumerate(references))
     torch.testing.assert_close(ours.log_prob(sample), expected)
     torch.testing.assert_close(ours.entropy(), sum(reference.entropy() for reference in references))
@@ -68,7 +70,8 @@ def test_gradients_are_those_of_finite_differences():
     logits = torch.randn(4, sum(SIZES), dtype=torch.float64, requires_grad=True)
     value = Categorical(logits, SIZES).sample()
     assert torch.autograd.gradcheck(
-        lambda logits: (Categorical(logits, SIZES).log_prob(value), Categorical(logits, SIZES).entropy()), logits
+        lambda logits: (Categorical(logits, SIZES).log_prob(value), Categorical(logits, SIZES).entropy()),
+        logits,
     )
 
 

@@ -54,7 +54,11 @@ def _stock(operator):
             return loc, self.std.expand_as(loc)
 
     return ActorValueOperator(
-        TensorDictModule(nn.Sequential(trunk.module.normalizer, trunk.module.layers), in_keys=["actor"], out_keys=["features"]),
+        TensorDictModule(
+            nn.Sequential(trunk.module.normalizer, trunk.module.layers),
+            in_keys=["actor"],
+            out_keys=["features"],
+        ),
         ProbabilisticActor(
             TensorDictModule(Heads(), in_keys=["features"], out_keys=["loc", "scale"]),
             in_keys=["loc", "scale"],

@@ -18,7 +18,9 @@ def _parameters(*shape, dtype=torch.float32):
 
 def _grid(low=-1.0, high=1.0, count=400_001):
     """Return points dense near the bounds, where the density can peak, and the weight of each."""
-    edges = low + (high - low) * 0.5 * (1.0 - torch.cos(torch.linspace(0.0, math.pi, count, dtype=torch.float64)))
+    edges = low + (high - low) * 0.5 * (
+        1.0 - torch.cos(torch.linspace(0.0, math.pi, count, dtype=torch.float64))
+    )
     return 0.5 * (edges[1:] + edges[:-1]), edges.diff()
 
 

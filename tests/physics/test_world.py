@@ -14,7 +14,7 @@ OTHER_SENSORS = ("gyro", "velocity", "up", "momentum", "knee_pos", "servo_pos", 
 
 
 def test_step_is_bit_identical_to_mujoco_warp():
-    world = standing_quadrupeds()
+    world = standing_quadrupeds(sim=SimCfg(njmax=80, nconmax=40, one_kernel_solver=False))
     with wp.ScopedDevice("cpu"):
         m = mjw.put_model(world.mj_model)
         m.opt.warn_overflow = 0

@@ -189,7 +189,9 @@ def test_a_format_that_cannot_be_read_is_refused_with_what_to_do(saved, version,
 
 def test_an_older_format_without_a_way_up_is_refused(saved, monkeypatch):
     monkeypatch.setattr(checkpoint_formats, "MIGRATIONS", {})
-    with pytest.raises(CheckpointError, match="format 1, and there is no way from 1 to 2: load it with the version"):
+    with pytest.raises(
+        CheckpointError, match="format 1, and there is no way from 1 to 2: load it with the version"
+    ):
         checkpoint.load(with_version(saved, 1))
 
 

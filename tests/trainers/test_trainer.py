@@ -129,7 +129,8 @@ class LossyWorld:
         class Report:
             metrics = {"nefc_share": rows / 20}
             messages = (
-                f"constraint rows needed {rows} per world but has 20: set sim.njmax >= {rows} (NEFC in {worlds} worlds)",
+                f"constraint rows needed {rows} per world but has 20: set sim.njmax >= {rows} "
+                f"(NEFC in {worlds} worlds)",
             )
 
         return Report()
@@ -254,7 +255,8 @@ def test_a_target_ends_the_run_one_iteration_later_where_iterations_overlap():
     assert make_trainer(iterations=20, stop_at={"iteration": 4}, overlap=True).train().iteration == 5
     # An evaluation settles its iteration, so nothing is late then.
     assert (
-        make_trainer(iterations=20, stop_at={"iteration": 4}, overlap=True, eval_interval=4).train().iteration == 4
+        make_trainer(iterations=20, stop_at={"iteration": 4}, overlap=True, eval_interval=4).train().iteration
+        == 4
     )
 
 

@@ -1,5 +1,7 @@
 """Returns and lengths of episodes."""
 
+from typing import Any
+
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
@@ -84,8 +86,7 @@ class EpisodeTracker(RowTransform):
             assert self.container is not None and self.container.output_spec is not None
         mask_E = self._reset_rows(tensordict, tensordict_reset)
         if self._is_usual:
-            step_E, total_E = tally(self.step_E, self.return_0, None, mask_E)
-            return self._write(tensordict_reset, step_E, [total_E])
+            return self._tally(tensordict_reset, None, mask_E)
         self.step_E.masked_fill_(mask_E, 0)
         totals = self._totals()
         for total_E in totals:
@@ -93,23 +94,31 @@ class EpisodeTracker(RowTransform):
         return self._write(tensordict_reset, self.step_E.clone(), [total_E.clone() for total_E in totals])
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        rewards = [next_tensordict.get(key) for key in self.in_keys]
         if self._is_usual:
-            step_E, total_E = tally(self.step_E, self.return_0, rewards[0], None)
-            return self._write(next_tensordict, step_E, [total_E])
+            return self._tally(next_tensordict, next_tensordict.get(self.in_keys[0]), None)
         self.step_E.add_(1)
         totals = self._totals()
-        for total_E, reward in zip(totals, rewards, strict=True):
-            total_E.add_(reward.reshape(total_E.shape))
+        for key, total_E in zip(self.in_keys, totals, strict=True):
+            total_E.add_(next_tensordict.get(key).reshape(total_E.shape))
         return self._write(next_tensordict, self.step_E.clone(), [total_E.clone() for total_E in totals])
+
+    def _tally(
+        self, tensordict: TensorDictBase, reward: Tensor | None, mask_E: Tensor | None
+    ) -> TensorDictBase:
+        # The dict of buffers answers much faster than the module.
+        buffers: dict[str, Any] = self._buffers
+        step_E, total_E = tally(buffers["step_E"], buffers["return_0"], reward, mask_E)
+        return self._write(tensordict, step_E, [total_E])
 
     def _totals(self) -> list[Tensor]:
         return [getattr(self, f"return_{index}") for index in range(len(self.in_keys))]
 
     def _write(self, tensordict: TensorDictBase, step_E: Tensor, totals: list[Tensor]) -> TensorDictBase:
         batch = tensordict.batch_size
-        for key, total_E in zip(self.out_keys, totals, strict=False):
-            tensordict.set(key, total_E.reshape(*batch, *total_E.shape[1:]) if len(batch) != 1 else total_E)
+        for key, total_E in zip(self.out_keys, totals):  # noqa: B905 (the last key is that of the length)
+            tensordict.set(key, total_E if len(batch) == 1 else total_E.reshape(*batch, *total_E.shape[1:]))
         if self.length_key is not None:
-            tensordict.set(self.length_key, step_E.reshape(*batch, 1))
+            tensordict.set(
+                self.length_key, step_E.unsqueeze(1) if len(batch) == 1 else step_E.reshape(*batch, 1)
+            )
         return tensordict

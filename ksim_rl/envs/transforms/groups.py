@@ -100,18 +100,22 @@ class ObservationGroups(Transform):
         return bounded(low, high, dtype=dtype, device=device)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        get, ready = next_tensordict.get, self._concatenable
+        get = next_tensordict.get
         vectors = []
         for name, terms in self.groups.items():
             values = [get(term) for term in terms]
-            if name not in ready:
+            if name not in self._concatenable:
                 values = [value.reshape(*next_tensordict.batch_size, -1) for value in values]
             vectors.append(torch.cat(values, -1) if len(values) > 1 else values[0])
+        # Only now: a group may have the name of a term of another one.
         for name, vector in zip(self.groups, vectors):  # noqa: B905 (strict takes time in every step)
             next_tensordict.set(name, vector)
         for key in self.drop:
             _drop(next_tensordict, key)
         return next_tensordict
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self._call(next_tensordict)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Do the same to a batch of samples."""

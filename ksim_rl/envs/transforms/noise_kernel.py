@@ -120,11 +120,13 @@ _COLUMNS = r"""
             for (int i = lane; i < n; i += LANES) column(i, features);
     }
 """
+
 _LANES = 32
 """Threads that share a row on the GPU; the CPU has one, which takes the columns in vector instructions."""
-_DEVICE = """
+
+_DEVICE = f"""
     #if defined(__CUDA_ARCH__)
-        #define LANES 32
+        #define LANES {_LANES}
         #define SYNC __syncwarp();
     #else
         #define LANES 1
@@ -191,7 +193,7 @@ def step_noise(
 def reset_noise(
     clean_EL: Tensor, state: NoiseState, features: int, mask_E: Tensor, *, stream: int, counter_E: Tensor
 ) -> Tensor:
-    """Begin the episodes of the masked rows, whose counters go on; return their noisy readings and the others' clean."""
+    """Begin the episodes of the masked rows, and count them; return their noisy readings and the others' clean ones."""
     return _run(clean_EL, *state, features, _RESET, mask_E, stream, counter_E)
 
 

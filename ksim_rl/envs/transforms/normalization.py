@@ -133,7 +133,7 @@ class ObservationNormalization(RowTransform):
         for out_key, key, (values_EL, moments) in zip(
             self.out_keys, self.in_keys, self._flat(tensordict, num_rows), strict=True
         ):
-            normalized_EL = (values_EL - moments.mean) * torch.rsqrt(moments.var + self.eps)
+            normalized_EL = (values_EL - moments.mean).mul_(torch.rsqrt(moments.var + self.eps))
             value = tensordict.get(key)
             tensordict.set(out_key, normalized_EL.reshape(value.shape).to(value.dtype))
         return tensordict

@@ -30,8 +30,8 @@ class _Ring:
     out: wp.uint64
 
 
-# Rows of the ring are bytes, so that one kernel serves every dtype. A thread copies one word of 16, 4 or 1 in all frames:
-# the GPU hides the wait for one frame behind the next.
+# Rows of the ring are bytes, so that one kernel serves every dtype. A thread copies one word, of 16, 4 or 1, of all
+# frames: the GPU waits for many of them at once.
 @wp.func_native(r"""
     struct alignas(16) Wide { unsigned word[4]; };
     const int width = a.width, num_bytes = a.num_bytes, num_slots = a.num_slots;

@@ -112,9 +112,10 @@ def tally(step_E: Tensor, total_E: Tensor, reward_E: Tensor | None, mask_E: Tens
 
 def _count_down_now(left_E: Tensor, mask_E: Tensor | None, horizon: float, divisor: float) -> Tensor:
     out_E = torch.empty_like(left_E)
-    dim, rows = _share(left_E)
+    device, num_rows = left_E.device, left_E.numel()
+    dim, rows = _share(device, num_rows)
     addresses = address(mask_E), left_E.data_ptr(), out_E.data_ptr()
-    _quick_count_down(left_E.device, dim, rows, horizon, divisor, *addresses)
+    _quick_count_down(device, dim, rows, horizon, divisor, *addresses)
     return out_E
 
 
@@ -123,17 +124,26 @@ def _tally_now(
 ) -> list[Tensor]:
     if reward_E is not None:
         reward_E = reward_E.contiguous()
-    outs = [torch.empty_like(step_E), torch.empty_like(total_E)]
-    dim, rows = _share(step_E)
-    tensors = mask_E, reward_E, total_E, step_E, outs[1], outs[0]
-    _quick_tally(step_E.device, dim, rows, *map(address, tensors))
-    return outs
+    step_out_E, total_out_E = torch.empty_like(step_E), torch.empty_like(total_E)
+    device, num_rows = step_E.device, step_E.numel()
+    dim, rows = _share(device, num_rows)
+    _quick_tally(
+        device,
+        dim,
+        rows,
+        address(mask_E),
+        address(reward_E),
+        total_E.data_ptr(),
+        step_E.data_ptr(),
+        total_out_E.data_ptr(),
+        step_out_E.data_ptr(),
+    )
+    return [step_out_E, total_out_E]
 
 
-def _share(rows_E: Tensor) -> tuple[tuple[int], int]:
+def _share(device: torch.device, num_rows: int) -> tuple[tuple[int], int]:
     """Return the number of threads and of rows for each: one thread does all on the CPU, in vector instructions."""
-    num_rows = rows_E.numel()
-    return ((1,), num_rows) if rows_E.device.type == "cpu" else ((num_rows,), 1)
+    return ((1,), num_rows) if device.type == "cpu" else ((num_rows,), 1)
 
 
 _count_down_operator = torch.library.custom_op(

@@ -33,13 +33,11 @@ class FusedPPO:
     Args:
         cfg: of the objective; GAE, no symmetry, no new estimate in each epoch.
         networks: what learns.
-        normalize_actor, normalize_critic: from what actor and critic read in a TensorDict to the input of their first
-            layers, [..., L].
+        observe_actor, observe_critic: from a TensorDict to what the first layers of actor and critic take, [..., L].
         optimizer: Adam from `make_optimizer`; its moments, step counts and learning rate are used and kept.
         guard: counts skipped steps.
         num_env_states_per_minibatch, num_minibatches: B, and how many there are in an epoch.
-        dtype: of the products, float32 or bfloat16.
-        tuning: sizes of blocks.
+        tuning: sizes of blocks; None takes those that suit the networks.
     """
 
     def __init__(
@@ -47,20 +45,19 @@ class FusedPPO:
         cfg: PPOCfg,
         networks: FusedNetworks,
         *,
-        normalize_actor: Callable[[TensorDictBase], Tensor],
-        normalize_critic: Callable[[TensorDictBase], Tensor],
+        observe_actor: Callable[[TensorDictBase], Tensor],
+        observe_critic: Callable[[TensorDictBase], Tensor],
         optimizer: torch.optim.Adam,
         guard: StepGuard,
         num_env_states_per_minibatch: int,
         num_minibatches: int,
-        dtype: torch.dtype,
         tuning: Tuning | None = None,
     ) -> None:
         self.cfg, self.networks, self.optimizer, self.guard = cfg, networks, optimizer, guard
         self.layout = layout = FusedLayout(networks)
-        self.tuning = tuning = tuning or Tuning.of(layout, dtype)
-        self.dtype = dtype
-        self._observe = normalize_actor, normalize_critic
+        product_dtype: torch.dtype = getattr(torch, cfg.precision)
+        self.tuning = tuning = tuning or Tuning.of(layout, product_dtype)
+        self._observe = observe_actor, observe_critic
         self._parameters = networks.parameters
         self._device = device = self._parameters[0].device
         self.batch, self.num_minibatches = num_env_states_per_minibatch, num_minibatches
@@ -76,12 +73,12 @@ class FusedPPO:
         self._views = [layout.flat_views(flat, networks) for flat in self._flat]
         self._places = layout.padded_index(networks).to(device)
         self._exact = zeros(2, layout.num_padded)
-        self._weights = zeros(2, layout.num_padded, dtype=dtype)
+        self._weights = zeros(2, layout.num_padded, dtype=product_dtype)
         self._gradients = zeros(2, layout.num_padded)
         self._tiles = layout.weight_tiles(tuning.tile).to(device)
         # Tiles at the edge read past the last row.
-        self._inputs = zeros(2 * self.batch * layout.input_columns + tuning.tile, dtype=dtype)
-        self._slopes = zeros(2 * self.batch * layout.gradient_columns + tuning.tile, dtype=dtype)
+        self._inputs = zeros(2 * self.batch * layout.input_columns + tuning.tile, dtype=product_dtype)
+        self._slopes = zeros(2 * self.batch * layout.gradient_columns + tuning.tile, dtype=product_dtype)
         self._weight_partials = zeros(tuning.splits, 2, layout.num_weights)
         self._block_partials = zeros(self._blocks, 2, layout.num_biases + NUM_STATISTICS)
         weight_programs = -(-layout.num_weights // tuning.size)
@@ -89,8 +86,8 @@ class FusedPPO:
         self._squares = zeros(2 * (weight_programs + bias_programs))
         self._summary = zeros(num_steps, power_of_two(len(SUMMARY)))
         self._steps = zeros(num_steps + 1)
-        self._obs = zeros(2, self.size, layout.obs_width, dtype=dtype)
-        self._next_obs = zeros(self.size, layout.obs_width, dtype=dtype)
+        self._obs = zeros(2, self.size, layout.obs_width, dtype=product_dtype)
+        self._next_obs = zeros(self.size, layout.obs_width, dtype=product_dtype)
         self._values, self._next_values = zeros(self.size), zeros(self.size)
         self._advantages, self._targets = zeros(self.size), zeros(self.size)
         self._neutral = zeros(3 * layout.out_width + 16)

@@ -2,8 +2,9 @@
 
 import pytest
 import torch
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import GymEnv, TransformedEnv
-from torchrl.envs.transforms import RewardSum, StepCounter
+from torchrl.envs.transforms import Compose, RewardSum, StepCounter
 
 from ksim_rl.envs.transforms import EpisodeTracker, SuccessTracker, TimeAwareObservation
 from ksim_rl.testing import CounterEnv
@@ -29,6 +30,30 @@ def test_a_row_that_is_done_shows_its_whole_episode():
             expected = rollout_ET["next", "reward"][row, step + 1 - length : step + 1].double().sum()
             assert reached["episode_length"].item() == length
             assert reached["episode_return"].item() == pytest.approx(expected.item(), abs=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.int32])
+@pytest.mark.parametrize("size", [1, 2])
+def test_rewards_of_any_kind_equal_torchrls(dtype, size):
+    """One float32 reward per env has a kernel of its own, all others take torch's operators."""
+
+    class Paid(CounterEnv):
+        def __init__(self):
+            super().__init__(LENGTHS)
+            self.full_reward_spec = Composite(
+                reward=Unbounded(torch.Size([len(LENGTHS), size]), dtype=dtype), shape=(len(LENGTHS),)
+            )
+
+        def _step(self, tensordict):
+            reached = super()._step(tensordict)
+            reward = (reached["reward"] * 8).round().expand(-1, size) * torch.arange(1, size + 1)
+            return reached.set("reward", reward.to(dtype))
+
+    env = TransformedEnv(Paid(), Compose(EpisodeTracker(), RewardSum(), StepCounter()))
+    next_ET = fixed_rollout(env, 20)["next"]
+    assert next_ET["episode_return"].dtype == dtype
+    assert torch.equal(next_ET["episode_return"], next_ET["episode_reward"])
+    assert torch.equal(next_ET["episode_length"], next_ET["step_count"])
 
 
 def test_several_rewards_and_no_length():

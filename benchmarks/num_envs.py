@@ -1,0 +1,176 @@
+"""Does the number of envs matter to learning, where the dataset of an update stays as large?
+
+    python -m benchmarks.num_envs device=cpu
+
+trains a cartpole with 64, 256 and 1024 envs and D = 16384 env states per update (so T = 256, 64 and 16), five seeds
+each, and compares the curves of deterministic evaluations over env states. Other words are overrides of
+`ksim-rl train`. Figures go to benchmarks/results/num_envs.json, the picture beside it.
+
+A run's score is its mean evaluation return over all evaluations (the area under its curve). If num_envs did not
+matter, the three scores of one seed, which begin with the same networks, could change places. So the test counts in
+which share of all such exchanges the means of the settings lie at least as far apart as they do: its p-value.
+"""
+
+from __future__ import annotations
+
+import itertools
+import statistics
+import sys
+import tempfile
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks import report
+from ksim_rl import conf
+from ksim_rl.trainers import RunCfg, RunProgress, run
+from ksim_rl.trainers.loggers.csv_table import read_table
+
+NUM_ENVS, SEEDS = (64, 256, 1024), (1, 2, 3, 4, 5)
+SETTING = (
+    "task=cartpole_balance",
+    "data.num_env_states_per_minibatch=4096",
+    "data.num_minibatches=4",
+    # Short episodes, so that those of 1024 envs end within a few rollouts of 16 steps too.
+    "task.episode_length_s=3.0",
+    "trainer.num_iterations=24",
+    "trainer.eval_interval=3",
+    "trainer.eval_episodes=32",
+    "trainer.stop_when_solved=false",
+    "trainer.checkpoint_interval=0",
+    "trainer.video=false",
+    "trainer.num_threads=1",
+    "logger.tensorboard=false",
+)
+_COLORS = ("#3465a4", "#4e9a06", "#cc5500")
+
+Curve = list[tuple[float, float]]
+
+
+def main() -> None:
+    """Train all runs, print and write what they show."""
+    overrides = [*SETTING, *sys.argv[1:]]
+    cfg = conf.compose(overrides)
+    curves = {
+        num_envs: [learning_curve(conf.compose([*overrides, f"num_envs={num_envs}", f"seed={seed}"])) for seed in SEEDS]
+        for num_envs in NUM_ENVS
+    }  # fmt: skip
+    scores = {num_envs: [score(curve) for curve in found] for num_envs, found in curves.items()}
+    figures = compare(scores)
+    device = cfg.resolved_device()
+    label = f"{report.device_label(device)}/{cfg.task_name}"
+    Console(width=160).print(_table(label, scores, figures))
+    path = report.write(
+        "num_envs",
+        figures={f"{label}/{name}": value for name, value in figures.items()},
+        device=device,
+        module="benchmarks.num_envs",
+        scores={str(num_envs): [round(value, 3) for value in found] for num_envs, found in scores.items()},
+        curves={str(num_envs): found for num_envs, found in curves.items()},
+    )
+    draw(curves, path.with_suffix(".png"), title=_title(cfg, figures))
+    print(f"written to {path}")
+
+
+def learning_curve(cfg: RunCfg) -> Curve:
+    """Train, and return the evaluations: (env states, return)."""
+    with tempfile.TemporaryDirectory() as folder:
+        run(cfg, Path(folder), progress=RunProgress(cfg.trainer.num_iterations, enabled=False))
+        _, rows = read_table(Path(folder) / "metrics.csv")
+    name = "evaluation/return_mean"
+    curve = [(float(row["env_states"]), float(row[name])) for row in rows if row.get(name)]
+    print(f"{cfg.num_envs} envs, seed {cfg.seed}: {score(curve):.1f}", flush=True)
+    return curve
+
+
+def score(curve: Curve) -> float:
+    """Return the mean evaluation return of a run."""
+    return statistics.fmean(value for _, value in curve)
+
+
+def compare(scores: dict[int, list[float]]) -> dict[str, float]:
+    """Compare settings (num_envs -> a score for each seed) by exchanging scores within seeds, in all ways there are.
+
+    Returns:
+        The mean and the standard deviation over seeds of each setting; `largest_difference` of two means, also in
+        standard deviations of seeds (pooled over the settings); and the test's `p_value`.
+    """
+    by_seed = list(zip(*scores.values(), strict=True))
+    observed = _spread(by_seed)
+    exchanged = [
+        _spread(rows) for rows in itertools.product(*(itertools.permutations(row) for row in by_seed))
+    ]
+    as_far = sum(value >= observed * (1.0 - 1e-9) for value in exchanged)
+    means = [statistics.fmean(found) for found in scores.values()]
+    deviation = statistics.fmean(statistics.variance(found) for found in scores.values()) ** 0.5
+    difference = max(means) - min(means)
+    figures = {
+        "largest_difference": difference,
+        "seed_deviation": deviation,
+        "difference_in_deviations": difference / deviation if deviation else 0.0,
+        "p_value": as_far / len(exchanged),
+    }
+    for num_envs, found in scores.items():
+        figures |= {
+            f"{num_envs}_envs/mean": statistics.fmean(found),
+            f"{num_envs}_envs/std": statistics.stdev(found),
+        }
+    return {name: round(value, 4) for name, value in figures.items()}
+
+
+def _spread(rows) -> float:
+    """Return the variance of the settings' means; a row holds the scores of one seed."""
+    return statistics.pvariance([statistics.fmean(column) for column in zip(*rows, strict=True)])
+
+
+def draw(curves: dict[int, list[Curve]], picture: Path, *, title: str) -> None:
+    """Draw each setting's mean with the range of its seeds, over env states."""
+    figure = Figure(figsize=(7.2, 4.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for (num_envs, found), color in zip(curves.items(), _COLORS, strict=True):
+        steps = [step for step, _ in found[0]]
+        columns = list(zip(*([value for _, value in curve] for curve in found), strict=True))
+        low, high = [min(column) for column in columns], [max(column) for column in columns]
+        axes.fill_between(steps, low, high, color=color, alpha=0.12, linewidth=0)
+        means = [statistics.fmean(column) for column in columns]
+        axes.plot(steps, means, color=color, marker="o", markersize=4, label=f"{num_envs} envs")
+    axes.set_title(title, fontsize=10.5)
+    axes.set_xlabel("env states", fontsize=9)
+    axes.set_ylabel("evaluation return; line: mean, band: all seeds", fontsize=9)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.tick_params(labelsize=8)
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(fontsize=9, frameon=False, loc="lower right")
+    figure.savefig(picture, dpi=110)
+
+
+def _title(cfg: RunCfg, figures: dict[str, float]) -> str:
+    return (
+        f"{cfg.task_name}, {len(SEEDS)} seeds, {cfg.data.num_env_states} env states per update\n"
+        f"largest difference of two means: {figures['difference_in_deviations']:.2f} standard deviations of seeds, "
+        f"p = {figures['p_value']:.2f}"
+    )
+
+
+def _table(title: str, scores: dict[int, list[float]], figures: dict[str, float]) -> Table:
+    table = Table(title=f"{title}: mean evaluation return")
+    for column in ("num_envs", *(f"seed {seed}" for seed in SEEDS), "mean", "std"):
+        table.add_column(column, justify="right")
+    for num_envs, found in scores.items():
+        own = (figures[f"{num_envs}_envs/mean"], figures[f"{num_envs}_envs/std"])
+        table.add_row(str(num_envs), *(f"{value:.1f}" for value in (*found, *own)))
+    table.caption = (
+        f"largest difference {figures['largest_difference']:.1f} = {figures['difference_in_deviations']:.2f} "
+        f"standard deviations of seeds; p = {figures['p_value']:.3f}"
+    )
+    return table
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+"""Whether the gradient steps of a PPO run can be fused kernels, and these for it."""
+
+import importlib.util
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor, nn
+
+from ksim_rl.data import DatasetBuffer, EpochSampler
+from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, ValueNetwork
+from ksim_rl.modules.gaussian_head import MIN_STD, GaussianHead
+from ksim_rl.modules.observation_keys import side_by_side
+from ksim_rl.objectives import PPOCfg, StepGuard
+from ksim_rl.objectives.fused_ppo import FusedNetworks, why_not_fused
+from ksim_rl.running_moments import has_ranks
+
+if TYPE_CHECKING:
+    from ksim_rl.objectives.fused_ppo.fused_ppo import FusedPPO
+
+
+def make_fused_ppo(
+    cfg: PPOCfg,
+    *,
+    actor: ProbabilisticTensorDictSequential,
+    critic: TensorDictModuleBase,
+    optimizer: torch.optim.Adam,
+    guard: StepGuard,
+    dataset: DatasetBuffer,
+    device: torch.device,
+) -> "FusedPPO | str":
+    """Build the fused gradient steps of a run, or return why torch has to make them."""
+    if device.type != "cuda" or importlib.util.find_spec("triton") is None:
+        return "they need CUDA and Triton"
+    if has_ranks():
+        return "several ranks train together"
+    if type(dataset.sampler) is not EpochSampler:
+        return f"minibatches come from a {type(dataset.sampler).__name__}"
+    networks = fused_networks(actor, critic)
+    reason = networks if isinstance(networks, str) else why_not_fused(cfg, networks, data=dataset.cfg)
+    if reason is not None:
+        return reason
+    assert isinstance(networks, FusedNetworks)
+    # Triton is there only where CUDA is.
+    from ksim_rl.objectives.fused_ppo.fused_ppo import FusedPPO
+
+    return FusedPPO(
+        cfg,
+        networks,
+        observe_actor=observer(actor[0]),
+        observe_critic=observer(critic),
+        optimizer=optimizer,
+        guard=guard,
+        num_env_states_per_minibatch=dataset.cfg.num_env_states_per_minibatch,
+        num_minibatches=dataset.cfg.num_minibatches,
+    )
+
+
+def fused_networks(
+    actor: ProbabilisticTensorDictSequential, critic: TensorDictModuleBase
+) -> FusedNetworks | str:
+    """Return what the kernels need to know of `make_actor`'s and `make_critic`'s networks, or why they are others."""
+    policy, value = getattr(actor[0], "module", None), getattr(critic, "module", None)
+    if type(policy) is not PolicyNetwork or type(value) is not ValueNetwork:
+        return "the networks are not those of make_actor and make_critic"
+    head = policy.head
+    if type(head) is not GaussianHead or head.std is None:
+        return f"the policy is not a {DiagonalGaussian.__name__} whose std is the same in every state"
+    layers = [*_layers(policy.trunk), head.loc], _layers(value.layers)
+    activations = {type(part) for part in (*policy.trunk, *value.layers)} - {nn.Linear}
+    if activations != {nn.ELU}:
+        return f"the activations are {sorted(kind.__name__ for kind in activations)}, and not all ELU"
+    return FusedNetworks(
+        actor=layers[0], critic=layers[1], std=head.std, log_std=head.std_type == "log", min_std=MIN_STD
+    )
+
+
+def _layers(network: nn.Sequential) -> list[nn.Linear]:
+    return [layer for layer in network if isinstance(layer, nn.Linear)]
+
+
+def observer(module: TensorDictModuleBase) -> Callable[[TensorDictBase], Tensor]:
+    """Return what gives the input of a network's first layer."""
+    network = module.module
+    keys = list(module.in_keys)
+
+    def observe(env_states: TensorDictBase) -> Tensor:
+        obs = side_by_side([env_states.get(key) for key in keys])
+        return obs if network.normalizer is None else network.normalizer(obs)
+
+    return observe

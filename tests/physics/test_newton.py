@@ -1,0 +1,171 @@
+"""The one-kernel solver against MuJoCo's C engine and MuJoCo Warp's own solver, on rows of every kind."""
+
+import dataclasses
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from ksim_rl.physics import SimCfg, World, load_model, newton
+
+NUM_ENVS = 6
+ROWS_OF_ALL_KINDS = """
+<mujoco>
+  <option timestep="0.004" integrator="implicitfast" iterations="{iterations}" tolerance="1e-8" cone="{cone}"
+          impratio="3"/>
+  <worldbody>
+    <geom type="plane" size="5 5 1" friction="0.8 0.02 0.01"/>
+    <body name="pushed" pos="0 0 0.09">
+      <freejoint/>
+      <geom size="0.1" pos="0.2 0 0" condim="6" mass="0.4"/>
+      <geom size="0.1" pos="-0.2 0.1 0" condim="4" mass="0.3"/>
+      <geom size="0.1" pos="-0.2 -0.1 0" condim="3" mass="0.3"/>
+      <body pos="0 0 0.1">
+        <joint name="a" axis="0 1 0" range="-0.2 0.2" limited="true" damping="0.1"/>
+        <geom type="capsule" size="0.03 0.1" pos="0 0 0.15" mass="0.2" contype="0" conaffinity="0"/>
+        <body pos="0 0 0.3">
+          <joint name="b" axis="1 0 0" frictionloss="0.05" armature="0.01"/>
+          <geom size="0.05" mass="0.1" pos="0.1 0 0" contype="0" conaffinity="0"/>
+        </body>
+      </body>
+    </body>
+    <body name="smooth" pos="1 0 0.08">
+      <freejoint/>
+      <geom size="0.09" condim="1" mass="0.5"/>
+    </body>
+    <body name="arm" pos="1 0.5 0.5">
+      <joint name="c" axis="0 1 0"/>
+      <geom type="capsule" size="0.02 0.2" mass="0.3" contype="0" conaffinity="0"/>
+      <site name="tip" pos="0 0 0.2"/>
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="rope" limited="true" range="-0.1 0.1" frictionloss="0.02">
+      <joint joint="a" coef="1"/><joint joint="c" coef="-1"/>
+    </fixed>
+  </tendon>
+  <equality><joint joint1="c" joint2="b" polycoef="0.1 0.5 0 0 0"/></equality>
+</mujoco>
+"""
+CONES = ("pyramidal", "elliptic")
+
+
+def worlds(cone: str, *, iterations: int = 100, **sim) -> World:
+    model = load_model(ROWS_OF_ALL_KINDS.format(cone=cone, iterations=iterations))
+    world = World(model, num_envs=NUM_ENVS, sim=SimCfg(njmax=64, nconmax=16, tolerance=1e-8, **sim))
+    generator = torch.Generator().manual_seed(0)
+    world.qpos_EL[:, 2] -= 0.02 * torch.rand(NUM_ENVS, generator=generator)
+    world.qpos_EL[:, 7:9] += 0.4 * torch.randn(NUM_ENVS, 2, generator=generator)
+    world.qvel_EL.copy_(0.7 * torch.randn(world.qvel_EL.shape, generator=generator))
+    # The last world falls freely, with no row of a contact.
+    world.qpos_EL[-1, 2] = 1.0
+    return world
+
+
+def rows_of(world: World) -> None:
+    with wp.ScopedDevice("cpu"):
+        m, d = world.warp_model, world.warp_data_E
+        mjw.fwd_position(m, d, factorize=False)
+        mjw.fwd_velocity(m, d)
+        mjw.fwd_actuation(m, d)
+        mjw.fwd_acceleration(m, d, factorize=True)
+
+
+@pytest.mark.parametrize("cone", CONES)
+def test_accelerations_and_forces_are_those_of_the_c_engine(cone):
+    world = worlds(cone)
+    assert world.has_one_kernel_solver
+    rows_of(world)
+    with wp.ScopedDevice("cpu"):
+        newton.solve(world.warp_model, world.warp_data_E)
+    seen = set()
+    for row in range(NUM_ENVS):
+        mj_data = mujoco.MjData(world.mj_model)
+        mj_data.qpos[:], mj_data.qvel[:] = world.qpos_EL[row], world.qvel_EL[row]
+        mujoco.mj_forward(world.mj_model, mj_data)
+        assert mj_data.nefc == world.view("nefc")[row]
+        seen |= set(mj_data.efc_type.tolist())
+        scale = 1.0 + np.abs(mj_data.qacc).max()
+        np.testing.assert_allclose(world.qacc_EL[row] / scale, mj_data.qacc / scale, atol=2e-4)
+        forces = world.view("qfrc_constraint")[row].numpy()
+        scale = 1.0 + np.abs(mj_data.qfrc_constraint).max()
+        np.testing.assert_allclose(forces / scale, mj_data.qfrc_constraint / scale, atol=2e-4)
+    kinds = mujoco.mjtConstraint
+    contact = kinds.mjCNSTR_CONTACT_ELLIPTIC if cone == "elliptic" else kinds.mjCNSTR_CONTACT_PYRAMIDAL
+    expected = (
+        kinds.mjCNSTR_EQUALITY,
+        kinds.mjCNSTR_FRICTION_DOF,
+        kinds.mjCNSTR_FRICTION_TENDON,
+        kinds.mjCNSTR_LIMIT_JOINT,
+        kinds.mjCNSTR_LIMIT_TENDON,
+        kinds.mjCNSTR_CONTACT_FRICTIONLESS,
+        contact,
+    )
+    assert seen == {int(kind) for kind in expected}
+
+
+@pytest.mark.parametrize("cone", CONES)
+@pytest.mark.parametrize("iterations", [100, 2])
+def test_iterations_and_overflow_are_those_of_mujoco_warp(cone, iterations):
+    world = worlds(cone, iterations=iterations)
+    rows_of(world)
+    found = []
+    with wp.ScopedDevice("cpu"):
+        for solve in (mjw.solve, newton.solve):
+            world.view("overflow").zero_()
+            solve(world.warp_model, world.warp_data_E)
+            names = ("qacc", "qfrc_constraint", "efc.Ma", "efc.state", "solver_niter", "overflow")
+            found.append({name: world.view(name).clone() for name in names})
+    theirs, ours = found
+    # In its last steps an iteration is decided by rounding.
+    assert (theirs["solver_niter"] - ours["solver_niter"]).abs().max() <= (2 if iterations == 100 else 0)
+    for name in ("qacc", "qfrc_constraint", "efc.Ma"):
+        scale = 1.0 + theirs[name].abs().amax(-1, keepdim=True)
+        torch.testing.assert_close(ours[name] / scale, theirs[name] / scale, atol=2e-4, rtol=0, msg=name)
+    if iterations == 2:
+        assert torch.equal(ours["overflow"], theirs["overflow"]) and ours["overflow"].any()
+    for row, count in enumerate(world.view("nefc").tolist()):
+        assert torch.equal(ours["efc.state"][row, :count], theirs["efc.state"][row, :count])
+
+
+def test_steps_follow_those_of_mujoco_warp():
+    ours, theirs = worlds("elliptic"), worlds("elliptic", one_kernel_solver=False)
+    assert not theirs.has_one_kernel_solver
+    for world in (ours, theirs):
+        world.step(4)
+    torch.testing.assert_close(ours.qpos_EL, theirs.qpos_EL, atol=2e-5, rtol=0)
+    torch.testing.assert_close(ours.qvel_EL, theirs.qvel_EL, atol=2e-3, rtol=0)
+
+
+def test_what_overflows_in_one_tree_leaves_the_others_alone():
+    world = worlds("pyramidal")
+    model = load_model(
+        "<mujoco><worldbody><body><joint type='slide'/><geom size='0.1'/></body>"
+        "<body pos='1 0 0'><joint type='slide'/><geom size='0.1' mass='1e-6'/></body></worldbody></mujoco>"
+    )
+    world = World(model, num_envs=1, sim=SimCfg(njmax=8, nconmax=8))
+    world.view("qfrc_applied")[0, 1] = 1e35
+    world.step(1)
+    assert torch.isfinite(world.qvel_EL[0, 0]) and not torch.isfinite(world.qvel_EL[0, 1])
+
+
+def test_models_out_of_range_take_the_solver_of_mujoco_warp():
+    model = load_model(ROWS_OF_ALL_KINDS.format(cone="pyramidal", iterations=10))
+    assert newton.suits(model, njmax=64)
+    assert not newton.suits(model, njmax=100_000)
+    for field, value in (
+        ("solver", mujoco.mjtSolver.mjSOL_CG),
+        ("integrator", mujoco.mjtIntegrator.mjINT_RK4),
+        ("noslip_iterations", 2),
+        ("jacobian", mujoco.mjtJacobian.mjJAC_DENSE),
+    ):
+        kept = getattr(model.opt, field)
+        setattr(model.opt, field, value)
+        assert not newton.suits(model, njmax=64), field
+        setattr(model.opt, field, kept)
+    sim = SimCfg(njmax=64, nconmax=16)
+    assert World(model, num_envs=1, sim=sim).has_one_kernel_solver
+    assert not World(model, num_envs=1, sim=dataclasses.replace(sim, deterministic=True)).has_one_kernel_solver
