@@ -1,12 +1,18 @@
-"""The time that physics cannot do without: the substeps of an env step, from states and controls of a run."""
+"""The floor: what MuJoCo Warp itself takes for the substeps of an env step, from states and controls of a run.
+
+It is `mjw.step` on a model as `mjw.put_model` gives it, with its own choice of Jacobian and its own solver, and with
+the same fields per world; whatever this project changes about physics is not in it.
+"""
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import statistics
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import mujoco
 import mujoco_warp as mjw
 import torch
 import warp as wp
@@ -23,7 +29,7 @@ from ksim_rl.physics.streams import warp_scope
 RECORDED_STEPS = 16
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class RecordedStep:
     """One env step of a run: the physics state before it, and the controls that it applied."""
 
@@ -44,32 +50,60 @@ def record_steps(collector: RolloutCollector, count: int = RECORDED_STEPS) -> li
     return steps
 
 
+def stock_world(world: World) -> World:
+    """Return worlds of the same model and fields on which `mjw.step` is MuJoCo Warp's own from end to end."""
+    model = copy.copy(world.mj_model)
+    if world.has_one_kernel_solver:
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
+    return World(
+        model,
+        num_envs=world.num_envs,
+        device=world.device,
+        sim=dataclasses.replace(
+            world.sim, one_kernel_solver=False, nan_guard=None, njmax=world.njmax, nconmax=world.nconmax
+        ),
+        per_world_fields=tuple(world.per_world_fields()),
+    )
+
+
 def physics_ms(world: World, decimation: int, steps: Sequence[RecordedStep], *, repeats: int) -> float:
-    """Time the substeps of one env step alone, as one graph with all sensors in each, over the recorded steps."""
-    device, warp_device = world.device, wp.get_device(str(world.device))
+    """Time MuJoCo Warp's substeps of one env step, as one graph with all sensors in each, over the recorded steps."""
+    stock = stock_world(world)
+    device, warp_device = stock.device, wp.get_device(str(stock.device))
 
     def substeps() -> None:
         for _ in range(decimation):
-            mjw.step(world.warp_model, world.warp_data_E)
+            mjw.step(stock.warp_model, stock.warp_data_E)
 
     with warp_scope(device):
         substeps()
     _synchronize(device)
     with no_collection(), wp.ScopedDevice(warp_device), wp.ScopedCapture(device=warp_device) as capture:
         substeps()
+    found = _mean_ms(stock, lambda: _launch(capture.graph, device), steps, repeats=repeats)
+    stock.close()
+    return found
+
+
+def own_physics_ms(world: World, decimation: int, steps: Sequence[RecordedStep], *, repeats: int) -> float:
+    """Time this project's substeps of one env step, over the recorded steps."""
+    for _ in range(2):
+        world.step(decimation)
+    return _mean_ms(world, lambda: world.step(decimation), steps, repeats=repeats)
+
+
+def _mean_ms(
+    world: World, substeps: Callable[[], object], steps: Sequence[RecordedStep], *, repeats: int
+) -> float:
     times = []
     for step in steps:
 
         def restore(step: RecordedStep = step) -> None:
             world.load_state_dict(step.state)
             world.ctrl_EL.copy_(step.ctrl_EL)
-            _synchronize(device)
+            _synchronize(world.device)
 
-        times.append(
-            milliseconds(
-                lambda: _launch(capture.graph, device), device=device, repeats=repeats, before=restore
-            )
-        )
+        times.append(milliseconds(substeps, device=world.device, repeats=repeats, before=restore))
     return statistics.mean(times)
 
 

@@ -72,14 +72,24 @@ CASES = {
 NUM_ITERATIONS = 6
 # The first of these that a tensor's path begins with names its component; else it is the path's first word.
 COMPONENTS = {
-    "/update/actor": "policy and its normalizer",
-    "/update/critic": "critic and its normalizer",
-    "/update/target": "target networks",
-    "/update/optimizer": "optimizer",
+    "/update/actor": "policy and its normalizers",
+    "/update/critic": "critics and their normalizers",
+    "/update/recurrent": "hidden states",
+    "/update/optimizer": "optimizers",
     "/update/replay": "replay",
-    "/update": "other state of learning",
+    "/update": "learning: samplers, targets, guards",
     "/collector": "EnvState to start from",
-    "/env": "env: physics, clocks, commands, terms, transforms",
+    "/env/base_env.world.field": "randomized model",
+    "/env/base_env.world": "physics",
+    "/env/base_env.env.commands": "commands",
+    "/env/base_env.env.events": "events",
+    "/env/base_env.env.rewards~1": "rewards",
+    "/env/base_env.env.curriculum": "curricula",
+    "/env/base_env.env.reward_weights": "curricula",
+    "/env/base_env.env.shared": "curricula",
+    "/env/base_env.env": "env: clocks, actions, contacts, logs",
+    "/env/transform": "transforms: noise, delay, history",
+    "/env/last_root": "EnvState to start from",
     "/random": "random generators",
 }
 

@@ -3,9 +3,11 @@
     python -m benchmarks.throughput task=go1_velocity_flat num_envs=4096 device=cuda
 
 takes the overrides of `ksim-rl train`, trains some iterations, and prints one table: raw physics (the decimation's
-`mjw.step` calls as one graph, sensors in each, from states and controls recorded in this run), the env step, the
-rollout, the PPO update and the whole iteration, each in env states/s and relative to raw physics. Figures go to
-benchmarks/results/throughput.json.
+`mjw.step` calls of MuJoCo Warp as it is, as one graph, sensors in each, from states and controls recorded in this run),
+this project's own substeps from the same states, the env step, the rollout, the update and the whole iteration, each in
+env states/s and relative to raw physics. Below it: what the guards against overflow and non-finite states take of an
+iteration, and on CUDA the device memory per world and the waits and copies of the host in one iteration. Figures go to
+benchmarks/results/throughput.json. How long the first iteration takes: `benchmarks.first_iteration`.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import report
-from benchmarks.raw_physics import physics_ms, record_steps
+from benchmarks.host_traffic import host_traffic
+from benchmarks.raw_physics import own_physics_ms, physics_ms, record_steps
 from benchmarks.stopwatch import milliseconds
 from ksim_rl import conf
 from ksim_rl.physics import World
@@ -50,6 +53,9 @@ def measure(cfg: RunCfg) -> dict[str, float]:
     device = _world(trainer).device
     schedule = SCHEDULES[device.type]
     collector, update = trainer.collector, trainer.update
+    for _ in range(cfg.collector.warmup + 2):
+        collector.collect()
+    memory = _bytes_per_world(trainer)
     for _ in range(schedule.warmup_iterations):
         update(collector.collect())
 
@@ -59,18 +65,62 @@ def measure(cfg: RunCfg) -> dict[str, float]:
     update_ms = milliseconds(lambda: update(rollout_ET), device=device, repeats=schedule.repeats)
     steps = record_steps(collector)
     env_step_ms = _env_step_ms(trainer, device, schedule.repeats)
-    raw_ms = physics_ms(_world(trainer), cfg.task.decimation, steps, repeats=max(1, schedule.repeats // 3))
+    guards_ms = _guards_ms(trainer, cfg.task.decimation, device, schedule.repeats)
+    traffic = host_traffic(trainer.iterate) if device.type == "cuda" else {}
+    repeats = max(1, schedule.repeats // 3)
+    own_ms = own_physics_ms(_world(trainer), cfg.task.decimation, steps, repeats=repeats)
+    raw_ms = physics_ms(_world(trainer), cfg.task.decimation, steps, repeats=repeats)
 
     env_states_per_s = 1000.0 * cfg.data.num_env_states / iteration_ms
     return {
         "physics_ms": raw_ms,
+        "own_physics_ms": own_ms,
         "env_step_ms": env_step_ms,
         "rollout_ms": rollout_ms,
         "update_ms": update_ms,
         "iteration_ms": iteration_ms,
         "env_states_per_s": env_states_per_s,
         "iteration_over_physics": env_states_per_s / (1000.0 * cfg.num_envs / raw_ms),
+        "iteration_over_own_physics": env_states_per_s / (1000.0 * cfg.num_envs / own_ms),
+        "guards_share": guards_ms * cfg.data.rollout_length(cfg.num_envs) / iteration_ms,
+        **memory,
+        **traffic,
     }
+
+
+def _bytes_per_world(trainer: Trainer) -> dict[str, float]:
+    """Return the memory per world of MuJoCo Warp's arrays, and of all else that env and rollout hold.
+
+    The second is what torch has taken by now, policy and optimizer included; the update has not run.
+    """
+    world = _world(trainer)
+    figures = {"physics_bytes_per_world": float(world.bytes_per_world())}
+    if world.device.type == "cuda":
+        torch.cuda.synchronize(world.device)
+        torch.cuda.empty_cache()
+        figures["env_and_rollout_bytes_per_world"] = (
+            torch.cuda.memory_reserved(world.device) / world.num_envs
+        )
+    return figures
+
+
+@torch.no_grad()
+def _guards_ms(trainer: Trainer, decimation: int, device: torch.device, repeats: int) -> float:
+    """Time what an env step does against overflow and non-finite states, alone."""
+    world = _world(trainer)
+    action_EL = torch.zeros(world.num_envs, world.ctrl_EL.shape[1], device=device)
+
+    def guards() -> None:
+        for _ in range(decimation):
+            world.record_overflow()
+        finite_E = action_EL.sum(-1).abs() < torch.inf
+        finite_E = finite_E & ((world.qpos_EL.sum(-1) + world.qvel_EL.sum(-1)).abs() < torch.inf)
+        world.reset(~finite_E)
+
+    captured = Captured(guards, device=device, warmup=2)
+    for _ in range(4):
+        captured()
+    return milliseconds(captured, device=device, repeats=4 * repeats)
 
 
 def _iteration_ms(trainer: Trainer, device: torch.device, iterations: int) -> float:
@@ -115,10 +165,11 @@ def _table(cfg: RunCfg, figures: dict[str, float], device: torch.device) -> Tabl
     dataset = cfg.data.num_env_states
     physics_per_s = 1000.0 * cfg.num_envs / figures["physics_ms"]
     rows = (
-        ("raw physics", "physics_ms", cfg.num_envs),
+        ("raw physics (MuJoCo Warp)", "physics_ms", cfg.num_envs),
+        ("own substeps", "own_physics_ms", cfg.num_envs),
         ("env step", "env_step_ms", cfg.num_envs),
         ("rollout", "rollout_ms", dataset),
-        ("PPO update", "update_ms", dataset),
+        ("update", "update_ms", dataset),
         ("whole iteration", "iteration_ms", dataset),
     )
     for label, key, env_states in rows:
@@ -135,6 +186,8 @@ def main() -> None:
     device = cfg.resolved_device()
     figures = measure(cfg)
     Console().print(_table(cfg, figures, device))
+    for name in ("guards_share", *(name for name in figures if "per_world" in name or "host" in name)):
+        print(f"{name} {figures[name]:.4g}")
     prefix = f"{report.device_label(device)}/{cfg.task_name}/{cfg.num_envs}"
     path = report.write(
         "throughput",
@@ -144,8 +197,8 @@ def main() -> None:
         sizes={
             prefix: {
                 "rollout_length": cfg.data.rollout_length(cfg.num_envs),
-                "num_epochs": cfg.objective.num_epochs,
-                "num_minibatches": cfg.data.num_minibatches,
+                "num_epochs": getattr(cfg.objective, "num_epochs", None),
+                "num_minibatches": getattr(cfg.data, "num_minibatches", None),
             }
         },
     )

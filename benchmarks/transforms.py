@@ -4,11 +4,11 @@
 
 steps an env that does nothing but hand out 48 numbers, bare and with each transform, and prints one table:
 milliseconds of the env step, of the transform's own step and reset (4 of 4096 rows end), and, on CUDA, of its step as
-a graph. Ours and TorchRL's are timed in turn, and each ratio is the median over the rounds, so that whatever else the
-machine does weighs on both. Where TorchRL has no such transform (noise, delays, the time that is left), the nearest
-one is what people build from its parts: `UnaryTransform` with a function that adds noise or turns a count of steps into
-the time that is left, and `CatFrames` of as many frames as the delay has to keep. The chain is noise -> delay ->
-history of 10 -> groups. Figures go to benchmarks/results/transforms.json.
+a graph. Ours and TorchRL's are timed in turn, and each ratio is the median over the rounds; the CPU's times are those
+of the process on one thread: what else the machine does must not count. Where TorchRL has no such transform (noise,
+delays, the time that is left), the nearest one is what people build from its parts: `UnaryTransform` with a function
+that adds noise or turns a count of steps into the time that is left, and `CatFrames` of as many frames as the delay has
+to keep. The chain is noise -> delay -> history of 10 -> groups. Figures go to benchmarks/results/transforms.json.
 
 `go1=true` (the default on CUDA) also times the captured control step of Unitree Go1, bare and with that chain on its
 observations: `chain_share_of_go1_step` is what the chain adds, relative to the bare step.
@@ -272,7 +272,11 @@ def _time(work: Callable[[], object], device: torch.device, *, calls: int = CALL
         for _ in range(calls):
             work()
 
-    return milliseconds(repeatedly, device=device, repeats=1) / (calls * per)
+    if device.type == "cuda":
+        return milliseconds(repeatedly, device=device, repeats=1) / (calls * per)
+    began = time.process_time()
+    repeatedly()
+    return 1000.0 * (time.process_time() - began) / (calls * per)
 
 
 def _compare(
@@ -370,6 +374,8 @@ def main() -> None:
         raise SystemExit(f"unknown argument {sorted(unknown)[0]!r}: valid: device, num_envs, go1")
     device = torch.device(given.get("device", "cpu"))
     num_envs = int(given.get("num_envs", "4096"))
+    if device.type == "cpu":
+        torch.set_num_threads(1)
     rows = measure(num_envs, device)
     Console(width=140).print(_table(rows, num_envs, device))
     prefix = f"{report.device_label(device)}/{num_envs}"

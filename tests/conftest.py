@@ -19,6 +19,10 @@ import pytest
 import torch
 from jaxtyping import AbstractArray
 
+# Read when Triton is imported: without CUDA its kernels run in its interpreter.
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")
+
 # Robots that lie beside the checkout are used; tests that need one skip where there is none.
 _MENAGERIE = Path(__file__).parents[2] / "shared" / "menagerie"
 if _MENAGERIE.is_dir():

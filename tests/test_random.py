@@ -98,7 +98,7 @@ def test_normal_moments_and_tails():
     assert_mean(sample**2, 1.0, math.sqrt(2))
     assert_mean(sample**4, 3.0, math.sqrt(96))
     assert_mean((sample.abs() > 2).float(), math.erfc(math.sqrt(2)), 0.21)
-    # Box and Muller give two numbers from one pair: they must not be correlated.
+    # Numbers of one row come from neighbouring hashes: they must not be correlated.
     assert_mean(sample[:, :50] * sample[:, 51:], 0.0, 1.0)
 
 

@@ -164,6 +164,7 @@ def permutation(seed: int, epoch: Tensor, size: int) -> Tensor:
     """
     seed_tensor = torch.full((), seed, dtype=torch.int64, device=epoch.device)
     keys = random.row_keys(seed_tensor, _STREAM, epoch, size)
-    high_D, low_D = random.integers(keys, 2, 0, 2**31 - 1).unbind(1)
-    # 62 random bits: ties are rare, and the rank of equal keys is still a permutation.
-    return torch.argsort((high_D << 31) | low_D, stable=True)
+    keys_D = random.integers(keys, 1, 0, 2**31 - 1).squeeze(1).to(torch.int32)
+    # Of 100 000 keys of 31 bits about two pairs are equal. They keep their order, so it is still a permutation, and the
+    # sort takes half the passes that it takes for 64 bits.
+    return torch.argsort(keys_D, stable=True)

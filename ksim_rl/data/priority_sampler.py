@@ -14,11 +14,13 @@ from ksim_rl.data.replay_storage import ReplayStorage
 class PrioritySampler(Sampler):
     """Draws what is stored in proportion to (priority + eps)^alpha (Schaul et al., arXiv 1511.05952), with replacement.
 
-    A stand-in for TorchRL's `PrioritizedSampler` in any replay buffer, with the same probabilities, weights and default
-    priority, which is the highest so far. (Give it priorities by the buffer's `update_priority(index, priority)`;
-    `update_tensordict_priority` of TorchRL's buffers does so for TorchRL's own sampler only.) It has no tree: the cumulative sum over all priorities, in float64, and a
-    binary search per draw are a few kernels, make no host sync and can be captured in a CUDA graph. The draws are
-    stratified: one falls in each of B equal shares of the sum, as in the paper's appendix.
+    It stands in for TorchRL's `PrioritizedSampler` in any replay buffer, with the default priority of the paper: the
+    highest so far. Give it priorities by the buffer's `update_priority(index, priority)`; TorchRL's
+    `update_tensordict_priority` does so for TorchRL's own sampler only.
+
+    There is no tree: the cumulative sum over all priorities, in float64, and a binary search per draw are a few
+    kernels, make no host sync and can be captured in a CUDA graph. The draws are stratified: one falls in each of B
+    equal shares of the sum, as in the paper's appendix.
 
     The info dict has `priority_weight` [B]: (P(i) / min_j P(j))^-beta, at most 1.
 

@@ -21,7 +21,7 @@ class ReplayCfg:
         capacity: env states that are kept per env. An episode's end takes one more, for its terminal observation.
         n_step: rewards that a target sums before it bootstraps.
         learning_starts: steps of each env with random actions before the first gradient step.
-        prioritized: draw env states by their last temporal-difference error (Schaul et al., arXiv 1511.05952) instead of
+        prioritized: draw env states by their last temporal-difference error (Schaul et al., arXiv 1511.05952) and not
             uniformly.
         priority_alpha: how strongly the error counts; 0 is uniform.
         priority_beta: how far the weights of the losses undo that; 1 is wholly.

@@ -19,8 +19,8 @@ from ksim_rl.data.replay_storage import ReplayStorage, ReplayWriter
 class ReplayRing(ReplayBuffer):
     """Holds the last env states of each env and yields minibatches of B of them, with what follows n steps later.
 
-    Storage, sampler and writer are TorchRL parts: `ReplayStorage`, `ReplaySampler` or `PrioritySampler`, `ReplayWriter`.
-    `extend` takes rollouts `["E","T"]`. None of its methods makes a host sync, so all can be captured in a CUDA graph.
+    Its TorchRL parts are `ReplayStorage`, `ReplaySampler` or `PrioritySampler`, and `ReplayWriter`. `extend`
+    takes rollouts `["E","T"]`. None of its methods makes a host sync, so all can be captured in a CUDA graph.
 
     Args:
         cfg: sizes of the ring and its minibatches.

@@ -14,8 +14,8 @@ class ReplaySampler(Sampler):
 
     A place is drawn among all that may hold an env state. Those that do not (terminal observations, env states that are
     not finite) are drawn again, up to `tries` times; what is left then is masked. The first that holds one is taken, so
-    what is drawn is exactly uniform over the env states. Makes no host sync; numbers come from torch's default generator
-    of the device.
+    what is drawn is exactly uniform over the env states. Makes no host sync; numbers come from torch's default
+    generator of the device.
 
     Args:
         tries: with a share q of such places, a share q^tries of a minibatch is masked.

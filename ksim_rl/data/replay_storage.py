@@ -24,8 +24,8 @@ class ReplayStorage(Storage):
 
     Each env has a ring of places. An env state takes one: its observation, action, reward and flags. The observation
     that follows it lies in the next place, as that of the next env state; only where an episode ends is a place spent
-    on the terminal observation. So an env state costs its observation once, not twice: for Go1 (120 observed numbers, 12
-    actions) 535 bytes instead of 1015, 2.2 GB for 1000 env states of 4096 envs.
+    on the terminal observation. So an env state costs its observation once, not twice: for Go1 (120 observed numbers,
+    12 actions) 535 bytes instead of 1015, 2.2 GB for 1000 env states of 4096 envs.
 
     `write` and `get` make no host sync and can be captured in a CUDA graph: where the next env state goes is a tensor
     on the device.
@@ -218,9 +218,7 @@ class ReplayStorage(Storage):
         ring = {}
         for key in kept:
             leaf = rollout_ET.get(key)
-            ring[key] = torch.zeros(
-                self.max_size, *leaf.shape[2:], dtype=leaf.dtype, device=self.device
-            )
+            ring[key] = torch.zeros(self.max_size, *leaf.shape[2:], dtype=leaf.dtype, device=self.device)
         self.content = TensorDict(ring, batch_size=[self.max_size], device=self.device)
 
     def _head_index(self) -> Tensor:

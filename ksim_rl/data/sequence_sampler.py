@@ -25,8 +25,8 @@ class SequenceSampler(EpochSampler):
     The info has ("collector", "mask"), False where TorchRL's losses must look away, and "burn_in", True at the steps
     that renew the state, both [S, k + L, 1].
 
-    Storages have two dims, [E, T] (TorchRL's, with `ndim=2`), or one, in which the steps of each env follow each other
-    (`DatasetBuffer`). A `batch_size` counts env states without burn-in: S * L. Otherwise as `EpochSampler`.
+    Storages have two dims, [T, E], as TorchRL's with `ndim=2` keep rollouts [E, T]; or one, in which the steps of each
+    env follow each other (`DatasetBuffer`). A `batch_size` counts env states without burn-in: S * L.
 
     Args:
         sequence_length: L, a divisor of T; None is T.
@@ -54,7 +54,9 @@ class SequenceSampler(EpochSampler):
             ValueError: if the data is no rollout [E, T], or the sequences do not fit; the message has the numbers.
         """
         if len(batch_size_ET) != 2:
-            raise ValueError(f"sequences are cut from a rollout [E, T]; the data has the dims {tuple(batch_size_ET)}")
+            raise ValueError(
+                f"sequences are cut from a rollout [E, T]; the data has the dims {tuple(batch_size_ET)}"
+            )
         self.rollout_length = batch_size_ET[1]
         sequence_length(
             self.rollout_length, self.sequence_length, batch_size=batch_size, burn_in=self.burn_in
@@ -69,11 +71,13 @@ class SequenceSampler(EpochSampler):
         size = len(storage)  # type: ignore[arg-type]
         if size == 0:
             raise RuntimeError("the replay buffer is empty: extend it before sampling")
-        steps = storage.shape[1] if storage.ndim > 1 else self.rollout_length
+        steps = storage.shape[0] if storage.ndim > 1 else self.rollout_length
         if steps is None:
             raise ValueError("the storage has one dim: pass rollout_length, the steps of each env in it")
         if size % steps:
-            raise ValueError(f"the storage has {size} env states: no whole number of rollouts of {steps} steps")
+            raise ValueError(
+                f"the storage has {size} env states: no whole number of rollouts of {steps} steps"
+            )
         length = sequence_length(steps, self.sequence_length, batch_size=batch_size, burn_in=self.burn_in)
         device = torch.device(getattr(storage, "device", None) or "cpu")
         sequence_S = self._next_part(size // length, batch_size // length, device)
@@ -84,7 +88,7 @@ class SequenceSampler(EpochSampler):
         clamped_ST = step_ST.clamp_min(0)
         index: Any = rollout_S1 * steps + clamped_ST
         if storage.ndim > 1:
-            index = (rollout_S1.expand_as(clamped_ST), clamped_ST)
+            index = (clamped_ST, rollout_S1.expand_as(clamped_ST))
         return index, self._info(step_ST, offset_T)
 
     def _info(self, step_ST: Tensor, offset_T: Tensor) -> dict[Any, Tensor]:

@@ -40,9 +40,7 @@ class EnsembleLinear(nn.Module):
 class EnsembleLayerNorm(nn.Module):
     """N layer norms (Ba et al., arXiv 1607.06450) of the last dim, each with its own scale and offset."""
 
-    def __init__(
-        self, num_networks: int, dim: int, *, device: torch.device | str | None = None
-    ) -> None:
+    def __init__(self, num_networks: int, dim: int, *, device: torch.device | str | None = None) -> None:
         super().__init__()
         self.dim = dim
         self.weight = nn.Parameter(torch.ones(num_networks, 1, dim, device=device))

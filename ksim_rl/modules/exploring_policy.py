@@ -1,5 +1,7 @@
 """The policy that collects for off-policy learning."""
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -10,8 +12,8 @@ class ExploringPolicy(TensorDictModuleBase):
     """Lets a policy act with noise on its actions, and before learning starts with random actions instead.
 
     Each env has its own scale of noise, drawn uniformly from a range and drawn anew at the end of an episode, so that
-    one batch of envs explores both timidly and boldly (Seo et al., "FastTD3", arXiv 2505.22642). Draws come from torch's
-    default generator; nothing here makes a host sync.
+    one batch of envs explores both timidly and boldly (Seo et al., "FastTD3", arXiv 2505.22642). Draws come from
+    torch's default generator; nothing here makes a host sync.
 
     Args:
         actor: reads observations and writes "action".
@@ -36,7 +38,8 @@ class ExploringPolicy(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.actor = actor
-        self.in_keys, self.out_keys = list(actor.in_keys), ["action"]
+        self.in_keys: Any = list(actor.in_keys)
+        self.out_keys: Any = ["action"]
         self.noise_min, self.noise_max = noise_min, noise_max
         self._low, self._high = low, high
         self.register_buffer("random", torch.ones((), dtype=torch.bool, device=low.device))

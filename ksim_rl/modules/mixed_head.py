@@ -45,5 +45,5 @@ class MixedHead(nn.Module):
         return CompositeDistribution.from_distributions(params, parts)
 
 
-def _path(key: NestedKey) -> tuple[str, ...]:
+def _path(key: NestedKey) -> tuple[Any, ...]:
     return (key,) if isinstance(key, str) else tuple(key)

@@ -24,8 +24,8 @@ class QNetworkCfg:
         obs_normalization: normalize observations by running statistics inside the network.
         output_gain: scale of the last layer's weights.
         num_networks: N, networks that differ in their first weights only; two for clipped double Q-learning.
-        num_atoms: A, probabilities on A values spread evenly over [v_min, v_max] (Bellemare et al., arXiv 1707.06887); 1
-            predicts the value itself.
+        num_atoms: A, probabilities on A values spread evenly over [v_min, v_max] (Bellemare et al., arXiv 1707.06887);
+            1 predicts the value itself.
         v_min, v_max: the values that returns can have; of no effect with `num_atoms=1`.
     """
 

@@ -121,8 +121,8 @@ class RecurrentNetwork(nn.Module):
 class RecurrentModule(TensorDictModule):
     """A `RecurrentNetwork` on TensorDicts, by TorchRL's conventions; a drop-in for its `LSTMModule` and `GRUModule`.
 
-    Reads observations side by side [*batch, L], `is_init` and the state under ("recurrent_state", name, "h") and, for an LSTM, "c", each
-    [*batch, N, H]; writes the features [*batch, H] and, under "next", the state after the step.
+    Reads observations side by side [*batch, L], `is_init`, and the state under ("recurrent_state", name, "h") and, for
+    an LSTM, "c", each [*batch, N, H]; writes the features [*batch, H] and, under "next", the state after the step.
 
     By default every element of the batch is one step. Under TorchRL's `set_recurrent_mode(True)`, where its and our
     losses run, the batch is [B, T]: sequences, of which only the first step's state is read. At each step whose
@@ -254,7 +254,7 @@ def state_keys(cfg: RecurrentCfg, name: str) -> list[tuple[str, str, str]]:
 
 def state_spec(cfg: RecurrentCfg, name: str) -> Composite:
     """Return the spec of the state of one env."""
-    shape = (cfg.num_layers, cfg.hidden_dim)
+    shape = torch.Size((cfg.num_layers, cfg.hidden_dim))
     parts = {part: Unbounded(shape) for part in STATES[cfg.kind]}
     return Composite({STATE_KEY: Composite({name: Composite(parts)})})
 

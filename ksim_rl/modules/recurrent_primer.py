@@ -20,14 +20,15 @@ class RecurrentStatePrimer(TensorDictPrimer):
 
     def __init__(self, primers: Composite) -> None:
         super().__init__(primers, expand_specs=True)
+        self.state_keys: list[Any] = list(primers.keys(True, True))
 
     def _reset_func(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> Any:
         mask = None if tensordict is None else tensordict.get(self.reset_key, None)
-        for key, spec in self.primers.items(True, True):
-            zero = spec.zero()
+        for key in self.state_keys:
+            zero = self.primers[key].zero()  # pyright: ignore[reportOptionalSubscript]
             before = None if tensordict is None else tensordict.get(key, None)
             if mask is not None and before is not None:
-                zero = torch.where(mask.reshape(*spec.shape[:-2], 1, 1), zero, before)
+                zero = torch.where(mask.reshape(*zero.shape[:-2], 1, 1), zero, before)
             tensordict_reset.set(key, zero)
         return tensordict_reset
 

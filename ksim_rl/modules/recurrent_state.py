@@ -97,7 +97,8 @@ def burnt_in(
     """
     if not steps:
         return sequences_BT
-    before_BT, rest_BT = sequences_BT[:, :steps], sequences_BT[:, steps:]
+    length = sequences_BT.batch_size[1] - steps
+    before_BT, rest_BT = sequences_BT.split([steps, length], 1)
     renewed_B1 = before_BT.get(key)[:, -1]
     for memory in memories(*networks):
         with set_recurrent_mode(True):

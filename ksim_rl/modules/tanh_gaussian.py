@@ -14,9 +14,9 @@ from ksim_rl.modules.diagonal_gaussian import DiagonalGaussian
 class TanhGaussian(Distribution):
     """`center + half_range * tanh(u)` with `u` from a `DiagonalGaussian`, component by component.
 
-    The density includes the change of variables, log|dy/du| = log(half_range) + 2 (log 2 - u - softplus(-2 u)), which is
-    exact for every `u` (Haarnoja et al., arXiv 1812.05905, appendix C, have it as log(1 - tanh(u)^2), which underflows).
-    Without it the entropy grows with `scale` for ever, while the true one has a maximum and falls to minus infinity.
+    The density includes the change of variables, log|dy/du| = log(half_range) + 2 (log 2 - u - softplus(-2 u)), exact
+    for every `u`; the usual log(1 - tanh(u)^2) underflows (Haarnoja et al., arXiv 1812.05905, appendix C). Without it
+    the entropy grows with `scale` for ever, while the true one has a maximum and falls to minus infinity.
 
     The entropy has no closed form, so there is no `entropy`: TorchRL's losses then take
     `-rsample_and_log_prob()[1]`, an unbiased estimate whose gradient is reparametrized.

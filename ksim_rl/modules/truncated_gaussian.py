@@ -18,8 +18,8 @@ class TruncatedGaussian(Distribution):
 
     Every quantity is computed for the mirror image whose interval lies left of `loc`, from logarithms of the
     distribution function, which neither underflow nor cancel where `loc` is far from the interval; in float32 the log
-    density is then good to 0.03 nats at 40 standard deviations. Entropy, moments and divergence are exact (Johnson, Kotz
-    and Balakrishnan, "Continuous univariate distributions", vol. 1, 1994, ch. 13.10.1).
+    density is then good to 0.03 nats at 40 standard deviations. Entropy, moments and divergence are exact (Johnson,
+    Kotz and Balakrishnan, "Continuous univariate distributions", vol. 1, 1994, ch. 13.10.1).
 
     Nothing reads tensor values on the host, so it can be captured in a CUDA graph and compiled. Samples come from
     torch's default generator of the device.

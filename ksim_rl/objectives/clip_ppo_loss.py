@@ -158,9 +158,15 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         )
         return out
 
-    def _critic_loss_inputs(self, *values: Tensor | None) -> tuple[Tensor | None, ...]:
+    def _critic_loss_inputs(
+        self, target_return: Tensor, state_value: Tensor, old_state_value: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
         # TorchRL's explained variance is over the first dim: rows of sequences [B, T] come one below the other.
-        return super()._critic_loss_inputs(*(v if v is None else v.flatten(0, -2) for v in values))
+        return super()._critic_loss_inputs(
+            target_return.flatten(0, -2),
+            state_value.flatten(0, -2),
+            None if old_state_value is None else old_state_value.flatten(0, -2),
+        )
 
     def _advantage(self, tensordict: TensorDictBase) -> Tensor:
         advantage = tensordict.get(self.tensor_keys.advantage, None)
@@ -229,7 +235,8 @@ def _entropy_key(key: NestedKey) -> NestedKey:
     return f"{key}_entropy" if isinstance(key, str) else (*key[:-1], f"{key[-1]}_entropy")
 
 
-def _as_list(keys: NestedKey | list[NestedKey]) -> list[NestedKey]:
+def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:
+    assert keys is not None
     return list(keys) if isinstance(keys, list) else [keys]
 
 

@@ -65,7 +65,8 @@ class SACCfg(OffPolicyCfg):
     Attributes:
         alpha_init: temperature at the start, in units of the return per nat.
         alpha_learning_rate: of the temperature's logarithm; 0 keeps `alpha_init`.
-        target_entropy_per_action: entropy that the temperature aims at, in nats per action, of actions scaled to [-1, 1].
+        target_entropy_per_action: entropy that the temperature aims at, in nats per action, of actions scaled to
+            [-1, 1].
     """
 
     alpha_init: float = 1.0
@@ -87,8 +88,8 @@ class TD3Cfg(OffPolicyCfg):
     Targets take the present policy, not a slow copy of it, as FastTD3 does (Seo et al., arXiv 2505.22642).
 
     Attributes:
-        exploration_noise_min, exploration_noise_max: range of the standard deviation of the noise on the actions that are
-            taken, one per env, in units of half the range of an action.
+        exploration_noise_min, exploration_noise_max: range of the standard deviation of the noise on the actions that
+            are taken, one per env, in units of half the range of an action.
         target_noise, target_noise_clip: standard deviation and bound of the noise on the actions that targets are
             computed for, in the same units.
     """

@@ -1,6 +1,7 @@
 """What the losses of off-policy learning share: critics, their targets, and means over a minibatch."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -47,6 +48,8 @@ class OffPolicyLoss(LossModule):
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys  # type: ignore[assignment]
+    actor_network: Any
+    critic_network: Any
 
     def __init__(
         self,
@@ -84,6 +87,25 @@ class OffPolicyLoss(LossModule):
         observed = list(dict.fromkeys([*self.actor_network.in_keys, *observed]))
         following = [*observed, keys.reward, keys.terminated]
         return [*observed, keys.action, *(_next(key) for key in following)]
+
+    def critic_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
+        raise NotImplementedError
+
+    def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Return the losses of all else, each with gradients for its own network alone, and what is logged."""
+        raise NotImplementedError
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return all losses, `loss_*`, and what is logged beside them, which is detached.
+
+        Args:
+            tensordict: a minibatch `["B"]` with the `in_keys`. Gets the absolute error of each env state as "td_error".
+        """
+        loss_qvalue, logged = self.critic_loss(tensordict)
+        losses, more = self.actor_losses(tensordict)
+        detached = {name: value.detach() for name, value in (logged | more).items()}
+        return TensorDict({"loss_qvalue": loss_qvalue, **losses, **detached})
 
     def update_target_(self, tau: float) -> None:
         """Move the target critics by a share `tau` towards the critics."""
@@ -157,9 +179,6 @@ class OffPolicyLoss(LossModule):
         # A where instead of a product: what is left out may be anything, and zero times infinity is NaN.
         column_B = torch.where(weight_B > 0.0, column_B * weight_B, 0.0)
         return column_B.sum() / weight_B.sum().clamp_min(torch.finfo(torch.float32).tiny)
-
-    def _collect(self, losses: dict[str, Tensor], logged: dict[str, Tensor]) -> TensorDict:
-        return TensorDict(losses | {name: value.detach() for name, value in logged.items()})
 
 
 def _next(key: NestedKey) -> tuple[str, ...]:

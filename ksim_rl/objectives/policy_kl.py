@@ -2,10 +2,11 @@
 
 from functools import reduce
 from operator import add
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import CompositeDistribution, ProbabilisticTensorDictSequential
+from tensordict.nn import CompositeDistribution
 from tensordict.utils import NestedKey
 from torch import Tensor, distributions
 from torch.distributions import Distribution, TransformedDistribution
@@ -14,8 +15,8 @@ from torchrl.modules.distributions.utils import has_analytic_kl
 from ksim_rl.objectives.gaussian_kl import gaussian_parameters, kl_divergence
 
 
-def distribution_keys(actor: ProbabilisticTensorDictSequential) -> list[NestedKey]:
-    """Return the leaves from which an actor builds its distribution, such as `loc` and `scale`."""
+def distribution_keys(actor: Any) -> list[NestedKey]:
+    """Return the leaves from which a `ProbabilisticTensorDictSequential` builds its distribution, e.g. `loc`."""
     roots = {_path(key) for key in actor.dist_params_keys}
     written = {_path(key): key for key in actor.out_keys}
     parents = {path[:depth] for path in written for depth in range(1, len(path))}
@@ -26,7 +27,7 @@ def distribution_keys(actor: ProbabilisticTensorDictSequential) -> list[NestedKe
     ]
 
 
-def observation_keys(actor: ProbabilisticTensorDictSequential) -> list[NestedKey]:
+def observation_keys(actor: Any) -> list[NestedKey]:
     """Return what an actor reads of an EnvState.
 
     The `in_keys` of one with a `CompositeDistribution` also name the TensorDict of parameters that it writes itself.
@@ -34,9 +35,7 @@ def observation_keys(actor: ProbabilisticTensorDictSequential) -> list[NestedKey
     return [key for key in actor.in_keys if key not in actor.dist_params_keys]
 
 
-def stored_distribution(
-    actor: ProbabilisticTensorDictSequential, tensordict: TensorDictBase
-) -> Distribution | None:
+def stored_distribution(actor: Any, tensordict: TensorDictBase) -> Distribution | None:
     """Return the distribution whose parameters the data has, or None where it lacks one."""
     if any(tensordict.get(key, None) is None for key in distribution_keys(actor)):
         return None
@@ -75,5 +74,5 @@ def estimated_kl(log_ratio: Tensor) -> Tensor:
     return torch.expm1(log_ratio) - log_ratio
 
 
-def _path(key: NestedKey) -> tuple[str, ...]:
+def _path(key: NestedKey) -> tuple[Any, ...]:
     return (key,) if isinstance(key, str) else tuple(key)

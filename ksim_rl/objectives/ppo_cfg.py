@@ -39,10 +39,11 @@ class PPOCfg:
             is zero for a policy that acts in the mirror as its mirror image; "none" does neither.
         symmetry_coeff: weight of the mirror loss.
         max_skipped_steps: so many gradient steps in a row that are not finite end the run.
-        precision: of what layers multiply in the gradient steps: "float32", or "bfloat16", which has 8 significant bits
-            and changes each gradient by about half a percent; parameters, sums and Adam are float32 either way.
-        kernels: "auto" makes the gradient steps with a few fused kernels where these fit device and networks, "torch"
-            always with torch's; the figure `update/fused` says which. They differ by the order of sums.
+        precision: of what layers multiply in the gradient steps: "float32" (on CUDA as `trainer.matmul_precision`
+            says), or "bfloat16", which has 8 significant bits and moves the gradient by about half a percent of its
+            norm. Parameters, sums, losses and Adam are float32 either way.
+        kernels: of a bfloat16 update: "auto" takes a few fused kernels where they fit device and networks, "torch" never
+            does. They differ by the order of sums. The metric `update/fused` says which it is.
     """
 
     num_epochs: int = 5

@@ -111,9 +111,10 @@ class RolloutEstimator(ValueEstimatorBase):
     ) -> Signals:
         keys = self.tensor_keys
         following: TensorDictBase = tensordict.get("next")
-        if self.value_network is not None:
+        critic: Any = self.value_network
+        if critic is not None:
             next_params = params if target_params is None else target_params
-            if carries_state(self.value_network):
+            if carries_state(critic):
                 tensordict.set(keys.value, self._unrolled_values(tensordict, params))
             else:
                 tensordict.set(keys.value, self._state_values(tensordict, params, time_dim))

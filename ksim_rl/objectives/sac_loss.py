@@ -21,8 +21,8 @@ class SACLoss(OffPolicyLoss):
     distributions.
 
     `loss_qvalue` = sum over the critics of mean((Q - y)^2), or of the cross entropy to the projected target
-    distribution, y = r + gamma^n (1 - terminated) (Q'(s', a') - alpha log p(a'|s')); `loss_actor` = mean(alpha log p(a|s) -
-    Q(s, a)); `loss_alpha` = -log_alpha * mean(log p(a|s) + target_entropy).
+    distribution, y = r + gamma^n (1 - terminated) (Q'(s', a') - alpha log p(a'|s')); `loss_actor` = mean(alpha log
+    p(a|s) - Q(s, a)); `loss_alpha` = -log_alpha * mean(log p(a|s) + target_entropy).
 
     Args:
         actor_network: probabilistic.
@@ -58,16 +58,6 @@ class SACLoss(OffPolicyLoss):
     def alpha(self) -> Tensor:
         """The temperature, [], without gradients."""
         return self.log_alpha.detach().exp()
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return `loss_qvalue`, `loss_actor`, `loss_alpha`, and detached `alpha`, `entropy`, `value` and `td_error`.
-
-        Args:
-            tensordict: a minibatch `["B"]` with the `in_keys`. Gets the absolute error of each env state as "td_error".
-        """
-        loss_qvalue, logged = self.critic_loss(tensordict)
-        losses, more = self.actor_losses(tensordict)
-        return self._collect({"loss_qvalue": loss_qvalue, **losses}, logged | more)
 
     def critic_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""

@@ -14,15 +14,15 @@ class TD3Loss(OffPolicyLoss):
     """TD3 (Fujimoto et al., arXiv 1802.09477), and FastTD3 (Seo et al., arXiv 2505.22642) with a `support`.
 
     `loss_qvalue` = sum over the critics of mean((Q - y)^2), or of the cross entropy to the projected target
-    distribution, y = r + gamma^n (1 - terminated) Q'(s', clip(a(s') + clip(noise))); `loss_actor` = -mean(Q(s, a(s))). As
-    in FastTD3, a(s') is the present policy, not a slow copy of it.
+    distribution, y = r + gamma^n (1 - terminated) Q'(s', clip(a(s') + clip(noise))); `loss_actor` = -mean(Q(s, a(s))).
+    As in FastTD3, a(s') is the present policy, not a slow copy of it.
 
     Args:
         actor_network: deterministic.
         critic_network, support, gamma, value_reduction: see `OffPolicyLoss`.
         low, high: bounds of the actions, [action_dim].
-        target_noise, target_noise_clip: standard deviation and bound of the noise on a(s'), in units of half the range of
-            an action.
+        target_noise, target_noise_clip: standard deviation and bound of the noise on a(s'), in units of half the range
+            of an action.
     """
 
     def __init__(
@@ -45,16 +45,6 @@ class TD3Loss(OffPolicyLoss):
         check_in_range("target_noise_clip", target_noise_clip, low=0.0)
         self.low, self.high = low, high
         self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return `loss_qvalue` and `loss_actor`, and detached `value` and `td_error`.
-
-        Args:
-            tensordict: a minibatch `["B"]` with the `in_keys`. Gets the absolute error of each env state as "td_error".
-        """
-        loss_qvalue, logged = self.critic_loss(tensordict)
-        losses, more = self.actor_losses(tensordict)
-        return self._collect({"loss_qvalue": loss_qvalue, **losses}, logged | more)
 
     def critic_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""

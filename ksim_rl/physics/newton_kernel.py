@@ -9,10 +9,11 @@ Source of the algorithm: https://mujoco.readthedocs.io/en/stable/computation/ind
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false, reportInvalidTypeForm=false
+# Warp: a variable that changes in a loop is float(0.0), and what is static is decided by an `if` of its own.
+# ruff: noqa: UP018, SIM102
 
 import functools
-from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -127,7 +128,14 @@ def total3(value: wp.vec3) -> wp.vec3:
 
 @functools.cache
 def newton_kernel(
-    *, nv: int, njmax: int, elliptic: bool, ls_iterations: int, lanes: int, worlds_per_block: int, min_blocks: int = 0
+    *,
+    nv: int,
+    njmax: int,
+    elliptic: bool,
+    ls_iterations: int,
+    lanes: int,
+    worlds_per_block: int,
+    min_blocks: int = 0,
 ) -> wp.Kernel:
     """Return the kernel for models of `nv` degrees of freedom; launch it over (worlds, lanes)."""
     NV, NJ, LANES, LS = nv, njmax, lanes, ls_iterations
@@ -143,7 +151,13 @@ def newton_kernel(
 
     @wp.func
     def row_start(
-        kind: int, row: int, x: wp.array[float], v: wp.array[float], d: wp.array[float], limit: wp.array[float], cones: wp.array[float]
+        kind: int,
+        row: int,
+        x: wp.array[float],
+        v: wp.array[float],
+        d: wp.array[float],
+        limit: wp.array[float],
+        cones: wp.array[float],
     ) -> wp.vec3:
         if kind == ONE_SIDED:
             return rows_.one_sided_start(x[row], v[row], d[row])
@@ -174,7 +188,13 @@ def newton_kernel(
                 return rows_.cone_point(cones, FLOATS_PER_ROW * row, alpha)
         return wp.vec3(0.0)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"block_dim": block, "fast_math": True}, **bounds)
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        module_options={"block_dim": block, "fast_math": True},
+        **bounds,
+    )
     def kernel(
         # Model.
         iterations: int,
@@ -448,7 +468,9 @@ def newton_kernel(
                                     value += v[head + mate] * J_w[row_at + a] * J_w[row_at + b]
                             dof_a = J_col[at + a]
                             dof_b = J_col[at + b]
-                            h[packed(wp.max(dof_a, dof_b), wp.min(dof_a, dof_b))] = h[packed(wp.max(dof_a, dof_b), wp.min(dof_a, dof_b))] + value
+                            h[packed(wp.max(dof_a, dof_b), wp.min(dof_a, dof_b))] = (
+                                h[packed(wp.max(dof_a, dof_b), wp.min(dof_a, dof_b))] + value
+                            )
                         sync()
                 factorize(h, inverse_diag, NV, lane, LANES)
                 decrement = float(0.0)

@@ -8,7 +8,9 @@ themselves agree in most of their digits. Formulas: https://mujoco.readthedocs.i
 
 # Kernels are Python only in their spelling.
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false, reportInvalidTypeForm=false
+# Warp: a variable that changes in a loop is float(0.0).
+# ruff: noqa: UP018
 
 import mujoco
 import warp as wp

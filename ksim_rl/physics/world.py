@@ -240,6 +240,10 @@ class World(views.DataViews):
         """Return the views [E, ...] of the model fields that differ between worlds, by name."""
         return dict(self._fields)
 
+    def record_overflow(self) -> None:
+        """Keep the overflow bits and needs of the last substep for the next report, as each substep does by itself."""
+        self._graphs.run("record_overflow", self._overflow.record)
+
     def overflow_report(self, *, clear: bool = True) -> OverflowReport:
         """Read what the physics needed since the last report; one transfer to the host. Call it once per rollout."""
         return self.explain_overflow(self.overflow_counts(clear=clear).tolist())

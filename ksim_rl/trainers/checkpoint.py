@@ -105,8 +105,8 @@ def load(path: Path) -> Checkpoint:
         state = state_tree.join(safetensors.torch.load(tensor_bytes), manifest["values"])
     except (SafetensorError, ValueError) as error:
         raise CheckpointError(f"{path / TENSORS}: not a valid tensor file: {error}") from error
-    state = checkpoint_formats.migrate(state, manifest["format_version"])
-    return Checkpoint(path=path, iteration=manifest["iteration"], config=manifest["config"], state=state)
+    state, config = checkpoint_formats.migrate(state, manifest["config"], version=manifest["format_version"])
+    return Checkpoint(path=path, iteration=manifest["iteration"], config=config, state=state)
 
 
 def saved(folder: Path) -> list[Path]:
@@ -142,7 +142,8 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def _seal(manifest: dict[str, Any]) -> bytes:
-    body = json.dumps(manifest, sort_keys=True, allow_nan=False, separators=(",", ":"))
+    # In the order of the config: that of the observation terms, for one, is that of the networks' inputs.
+    body = json.dumps(manifest, allow_nan=False, separators=(",", ":"))
     return f'{{"manifest_sha256":"{_sha256(body.encode())}",\n"manifest":{body}}}\n'.encode()
 
 

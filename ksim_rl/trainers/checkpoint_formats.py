@@ -1,20 +1,40 @@
-"""Formats of checkpoints: what each version changed, and how an older state becomes a present one."""
+"""Formats of checkpoints: what each version changed, and how an older one becomes a present one."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ksim_rl.trainers.state_tree import State
 
 FORMAT_VERSION = 2
+Config = dict[str, Any]
 
 
-def _add_hooks(state: State) -> State:
-    """Version 2 keeps the state of a user's hooks, of which version 1 had none."""
-    return {**state, "hooks": {}}
+def _from_1(state: State, config: Config) -> tuple[State, Config]:
+    """Version 2 keeps the state of a user's hooks, and the config in its own order; version 1 sorted it by name.
+
+    The order of the observation terms is what networks read. It is that of the columns, which version 1 had.
+    """
+    state = {**state, "hooks": {}}
+    task = config.get("task", {})
+    observations = {
+        name: _in_order_of(group, state.get("observation_columns", {}).get(name, {}))
+        for name, group in task.get("observations", {}).items()
+    }
+    if observations:
+        config = {**config, "task": {**task, "observations": observations}}
+    return state, config
+
+
+def _in_order_of(group: Mapping[str, Any], columns: Mapping[str, Sequence[int]]) -> dict[str, Any]:
+    starts = {column.rpartition("/")[2]: start for column, (start, _) in columns.items()}
+    terms = group.get("terms", {})
+    if not terms.keys() <= starts.keys():
+        return dict(group)
+    return {**group, "terms": {name: terms[name] for name in sorted(terms, key=starts.__getitem__)}}
 
 
 # From each older version to the one after it; what has no entry is refused.
-MIGRATIONS: dict[int, Callable[[State], State]] = {1: _add_hooks}
+MIGRATIONS: dict[int, Callable[[State, Config], tuple[State, Config]]] = {1: _from_1}
 
 
 def refusal(version: Any) -> str | None:
@@ -35,8 +55,8 @@ def refusal(version: Any) -> str | None:
     return None
 
 
-def migrate(state: State, version: int) -> State:
-    """Bring a state from `version` to the present one, step by step."""
+def migrate(state: State, config: Config, *, version: int) -> tuple[State, Config]:
+    """Bring state and config from `version` to the present one, step by step."""
     for step in range(version, FORMAT_VERSION):
-        state = MIGRATIONS[step](state)
-    return state
+        state, config = MIGRATIONS[step](state, config)
+    return state, config

@@ -3,7 +3,7 @@
 from functools import partial
 from typing import Any
 
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.modules import ActorValueOperator
 
@@ -25,9 +25,7 @@ from ksim_rl.modules import (
 from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg
 
 
-def build_networks(
-    cfg: RunCfg, env: EnvBase
-) -> tuple[ProbabilisticTensorDictSequential, TensorDictModuleBase]:
+def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
     """Build actor and critic for the observation groups and actions of an env.
 
     Raises:

@@ -81,9 +81,7 @@ class OffPolicyUpdate:
         }
         if isinstance(cfg, SACCfg) and isinstance(loss, SACLoss) and loss.log_alpha.requires_grad:
             rate = cfg.alpha_learning_rate
-            self.optimizers["alpha"] = make_adamw(
-                cfg, [loss.log_alpha], learning_rate=rate, weight_decay=0.0
-            )
+            self.optimizers["alpha"] = make_adamw(cfg, [loss.log_alpha], learning_rate=rate, weight_decay=0.0)
         self.guard = StepGuard(device=self.device)
         self.steps_made = 0
         self._rollout_ET: TensorDictBase | None = None

@@ -24,7 +24,9 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, A
     parameters = optimizer.param_groups[0]["params"]
     moments = {int(index): entry for index, entry in state["moments"].items()}
     if moments and set(moments) != set(range(len(parameters))):
-        raise ValueError(f"{what}: {len(moments)} parameters in the checkpoint, {len(parameters)} in this run")
+        raise ValueError(
+            f"{what}: {len(moments)} parameters in the checkpoint, {len(parameters)} in this run"
+        )
     for index, entry in moments.items():
         for name in ("exp_avg", "exp_avg_sq"):
             if entry[name].shape != parameters[index].shape:

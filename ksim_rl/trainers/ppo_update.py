@@ -23,8 +23,8 @@ from ksim_rl.objectives import (
     make_advantage,
     make_loss,
     make_optimizer,
-    observation_keys,
     make_symmetric,
+    observation_keys,
     ppo_step,
 )
 from ksim_rl.physics.capture import Captured
@@ -193,7 +193,7 @@ class PPOUpdate:
             self.dataset.non_finite_count.add_(left_out)
         self._measure(steps)
         if self._scale_keys:
-            self._std.copy_(sum(rollout_ET.get(key).mean() for key in self._scale_keys) / len(self._scale_keys))
+            self._std.copy_(torch.stack([rollout_ET.get(key).mean() for key in self._scale_keys]).mean())
         # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
         update_normalizers(rollout_ET, self.actor, self.critic)
 

@@ -50,11 +50,13 @@ class ModulesCfg:
         for name, cfg in (("actor", self.actor), ("critic", self.critic)):
             if (FEATURES in self._read_by(name)) != (self.trunk is not None):
                 raise ValueError(
-                    f"{name}.in_keys={self._read_by(name)!r}: {FEATURES!r} is what a trunk writes; name it with a trunk, which "
-                    "modules=shared_trunk has, and only with one"
+                    f"{name}.in_keys={self._read_by(name)!r}: {FEATURES!r} is what a trunk writes; name it with a "
+                    "trunk, which modules=shared_trunk has, and only with one"
                 )
             if self.trunk is not None and cfg.obs_normalization:
-                raise ValueError(f"{name}.obs_normalization=True: with a trunk, the trunk normalizes observations")
+                raise ValueError(
+                    f"{name}.obs_normalization=True: with a trunk, the trunk normalizes observations"
+                )
 
     @property
     def recurrent(self) -> bool:
@@ -125,13 +127,13 @@ class RunCfg:
         self._check_sequences()
 
     def _check_sequences(self) -> None:
-        """Refuse sequences where nothing remembers, memories where nothing gives them sequences, and sizes that do not fit."""
+        """Refuse sequences where nothing remembers, memories without sequences, and sizes that do not fit."""
         ppo = self.objective if isinstance(self.objective, PPOCfg) else None
         if not self.modules.recurrent:
             if isinstance(self.data, DatasetCfg) and (self.data.sequence_length or self.data.burn_in):
                 raise ValueError(
-                    f"data.sequence_length={self.data.sequence_length}, data.burn_in={self.data.burn_in}: only networks "
-                    "with a memory learn on sequences; use modules=lstm or modules=gru, or null and 0"
+                    f"data.sequence_length={self.data.sequence_length}, data.burn_in={self.data.burn_in}: only "
+                    "networks with a memory learn on sequences; use modules=lstm or modules=gru, or null and 0"
                 )
             return
         if ppo is None or not isinstance(self.data, DatasetCfg):

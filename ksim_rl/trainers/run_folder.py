@@ -11,8 +11,10 @@ from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
 from ksim_rl.envs.innermost import innermost
+from ksim_rl.envs.transforms import observation_columns
 from ksim_rl.trainers import checkpoint, curves, video
 from ksim_rl.trainers.build import build, build_env, load_actor
+from ksim_rl.trainers.columns import check_columns
 from ksim_rl.trainers.evaluation import Evaluation
 from ksim_rl.trainers.hook import Hook
 from ksim_rl.trainers.progress import RunProgress
@@ -73,11 +75,12 @@ def load_policy(path: Path, *, device: str = "auto") -> Policy:
 
     Raises:
         CheckpointError: when there is none, or it is damaged.
-        ValueError: when its config does not fit this version.
+        ValueError: when its config does not fit this version, or makes other observations.
     """
     saved = checkpoint.load(checkpoint.latest(path))
     cfg = RunCfg.from_tree({**saved.config, "device": device})
     env = build_env(cfg, num_envs=1, seed=cfg.seed)
+    check_columns(saved.state["observation_columns"], observation_columns(env))
     actor = make_policy(cfg, env)
     env.close(raise_if_closed=False)
     load_actor(actor, saved.state)

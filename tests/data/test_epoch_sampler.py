@@ -79,7 +79,7 @@ def test_seed_fixes_the_orders():
 
 @pytest.mark.parametrize("distinct", [1, 2, 5])
 def test_equal_keys_still_give_a_permutation(monkeypatch, distinct):
-    keys = torch.randint(distinct, (50, 2))
+    keys = torch.randint(distinct, (50, 1))
     monkeypatch.setattr(random, "integers", lambda *_: keys)
     order = _epoch(_buffer(size=50, batch_size=10))
     assert torch.equal(order.sort().values, torch.arange(50))

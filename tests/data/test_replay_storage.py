@@ -172,7 +172,9 @@ def test_writes_keep_the_addresses_and_state_continues_exactly():
         first.write(history.rollout(4))
     second.write(history.rollout(1))
     own = {key: leaf.data_ptr() for key, leaf in second.content.items(True, True)}
-    second.load_state_dict({k: v.copy() if isinstance(v, dict) else v.clone() for k, v in first.state_dict().items()})
+    second.load_state_dict(
+        {k: v.copy() if isinstance(v, dict) else v.clone() for k, v in first.state_dict().items()}
+    )
     rollout = history.rollout(4)
     first.write(rollout), second.write(rollout)
     everything = torch.arange(len(first))

@@ -4,17 +4,21 @@ Two more have their tests where the part is: memory that leaks over a reset (rec
 deviation that grows through tanh (squashed gaussians).
 """
 
+import importlib
+
 import pytest
 import torch
 
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.data import EpochSampler
-from ksim_rl.objectives import ppo_step as ppo_step_module
+from ksim_rl.modules import ObservationNormalizer
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.rollout_estimator import RolloutEstimator, Signals
 from ksim_rl.trainers import ppo_update as ppo_update_module
 from tests.integration.probes import GAMMA, E, ProbeEnv, Run, T, one, sign_only, the_sign
 
+# The package has a function of the same name.
+ppo_step_module = importlib.import_module("ksim_rl.objectives.ppo_step")
 ESTIMATORS = ("gae", "td_lambda", "vtrace")
 
 
@@ -103,9 +107,8 @@ def test_returns_that_leak_over_the_end_of_an_episode(advantage, monkeypatch):
 
 
 def _normalizers(update):
-    return [
-        m.normalizer for m in (*update.actor.modules(), *update.critic.modules()) if hasattr(m, "normalizer")
-    ]
+    modules = (*update.actor.modules(), *update.critic.modules())
+    return [module for module in modules if isinstance(module, ObservationNormalizer)]
 
 
 def check_normalizers_count_once():
@@ -209,14 +212,11 @@ def test_epochs_that_reuse_an_order(bug, monkeypatch):
 
 def check_the_learning_rate_follows_the_divergence():
     """A policy that moves too far slows down, one that hardly moves speeds up."""
-    for desired_kl, faster in ((1e-5, False), (10.0, True)):
-        run = Run(ProbeEnv(sign_only, the_sign, length=1), schedule="adaptive", desired_kl=desired_kl)
-        before = float(run.update.optimizer.param_groups[0]["lr"])
-        run.iterate(1)
+    for desired_kl, faster in ((1e-6, False), (10.0, True)):
+        options = {"schedule": "adaptive", "desired_kl": desired_kl, "learning_rate": 1e-3}
+        run = Run(ProbeEnv(sign_only, the_sign, length=1), **options).iterate(1)
         rate = float(run.update.optimizer.param_groups[0]["lr"])
-        assert rate == (pytest.approx(1e-2) if faster else pytest.approx(1e-5, abs=before / 2))
-        if not faster:
-            assert rate < before / 2
+        assert rate > 2e-3 if faster else rate < 0.5e-3
 
 
 def test_an_adaptive_learning_rate_with_the_wrong_sign(monkeypatch):

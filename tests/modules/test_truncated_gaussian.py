@@ -10,7 +10,7 @@ from ksim_rl.modules import TruncatedGaussian
 from ksim_rl.testing import count_syncs
 
 LOW, HIGH = torch.tensor([-2.0, 0.5, -1.0]), torch.tensor([1.0, 0.7, 1.0])
-# (loc, scale) on [-1, 1]: inside, on a bound, wide, narrow, and further out on both sides than Phi can tell from 0 or 1.
+# (loc, scale) on [-1, 1]: inside, on a bound, wide, narrow, and further out than Phi can tell from 0 or 1.
 CASES = [(0.2, 0.5), (1.0, 0.3), (0.0, 50.0), (0.9, 1e-3), (3.0, 0.2), (-9.0, 0.2), (20.0, 0.5), (-41.0, 1.0)]
 
 

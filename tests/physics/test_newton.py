@@ -17,7 +17,7 @@ ROWS_OF_ALL_KINDS = """
   <option timestep="0.004" integrator="implicitfast" iterations="{iterations}" tolerance="1e-8" cone="{cone}"
           impratio="3"/>
   <worldbody>
-    <geom type="plane" size="5 5 1" friction="0.8 0.02 0.01"/>
+    <geom type="plane" size="5 5 1" condim="1" friction="0.8 0.02 0.01"/>
     <body name="pushed" pos="0 0 0.09">
       <freejoint/>
       <geom size="0.1" pos="0.2 0 0" condim="6" mass="0.4"/>
@@ -168,4 +168,6 @@ def test_models_out_of_range_take_the_solver_of_mujoco_warp():
         setattr(model.opt, field, kept)
     sim = SimCfg(njmax=64, nconmax=16)
     assert World(model, num_envs=1, sim=sim).has_one_kernel_solver
-    assert not World(model, num_envs=1, sim=dataclasses.replace(sim, deterministic=True)).has_one_kernel_solver
+    assert not World(
+        model, num_envs=1, sim=dataclasses.replace(sim, deterministic=True)
+    ).has_one_kernel_solver

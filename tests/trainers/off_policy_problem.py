@@ -29,8 +29,8 @@ OBJECTIVES = {
 }
 
 
-def make_update(name, env, *, device="cpu", objective=None, **data):
-    """Return the update of an algorithm for an env with observations and actions of one number."""
+def make_update(name, env, *, device="cpu", objective=None, obs_dim=1, support=(-15.0, 15.0), **data):
+    """Return the update of an algorithm for an env with actions of one number; `data` are fields of `ReplayCfg`."""
     cfg = objective or OBJECTIVES[name]
     fields = {
         "num_env_states_per_minibatch": 128,
@@ -39,17 +39,20 @@ def make_update(name, env, *, device="cpu", objective=None, **data):
         "capacity": 200,
         "learning_starts": 8,
     }
-    sizes = {"obs_dim": 1, "action_spec": env.action_spec[0], "device": device}
+    sizes = {"obs_dim": obs_dim, "action_spec": env.action_spec[0], "device": device}
     make, kind = (
         (make_squashed_actor, SquashedActorCfg)
         if isinstance(cfg, SACCfg)
         else (make_deterministic_actor, DeterministicActorCfg)
     )
     actor = make(kind(hidden_dims=(32,), activation="silu", action_bound=2.0, layer_norm=True), **sizes)
-    # More than the highest value of any of the probes.
-    atoms = {"num_atoms": 41, "v_min": -15.0, "v_max": 15.0} if name.startswith("fast") else {}
+    # The support reaches beyond the best value of each probe.
+    atoms = {"num_atoms": 41, "v_min": support[0], "v_max": support[1]} if name.startswith("fast") else {}
     critic = make_q_network(
-        QNetworkCfg(hidden_dims=(64, 64), activation="silu", **atoms), obs_dim=1, action_dim=1, device=device
+        QNetworkCfg(hidden_dims=(64, 64), activation="silu", **atoms),
+        obs_dim=obs_dim,
+        action_dim=1,
+        device=device,
     )
     low, high = torch.full((2, 1), 2.0, device=device) * torch.tensor([[-1.0], [1.0]], device=device)
     shared = {

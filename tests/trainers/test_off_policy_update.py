@@ -154,9 +154,7 @@ def test_without_a_saved_replay_a_resumed_run_warms_up_again(tmp_path):
     resumed = make_trainer("sac", **options)
     resumed.load(trainer.save())
     assert resumed.update.metrics()["replay/env_states"] == 0
-    assert torch.equal(
-        *(next(iter(one.update.actor.parameters())) for one in (trainer, resumed))
-    )
+    assert torch.equal(*(next(iter(one.update.actor.parameters())) for one in (trainer, resumed)))
     assert resumed.collector.collect()["action"].std() > 1.0
 
 

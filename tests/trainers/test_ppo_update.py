@@ -86,3 +86,31 @@ def test_an_optimizer_of_another_size_is_refused(trainer):
     state["optimizer"]["moments"].popitem()
     with pytest.raises(ValueError, match=r"optimizer: \d+ parameters in the checkpoint, \d+ in this run"):
         trainer.update.load_state_dict(state)
+
+
+@pytest.mark.parametrize(
+    ("ppo", "estimates"),
+    [({}, 1), ({"estimate_each_epoch": True}, 4), ({"advantage": "td_lambda"}, 1), ({"advantage": "vtrace"}, 4)],
+    ids=str,
+)
+def test_advantages_are_estimated_once_or_before_each_epoch(ppo, estimates, monkeypatch):
+    trainer = make_trainer(ppo=ppo)
+    rollout_ET = trainer.collector.collect()
+    rollout_ET["next", "reward"][0, 5] = float("nan")
+    targets = []
+    forward = type(trainer.update.advantage).forward
+
+    def watched(self, *args, **kwargs):
+        out = forward(self, *args, **kwargs)
+        targets.append(out["value_target"].clone())
+        return out
+
+    monkeypatch.setattr(type(trainer.update.advantage), "forward", watched)
+    trainer.update(rollout_ET)
+    assert len(targets) == estimates
+    # Each with the present networks; the env state that is not finite is counted once.
+    assert all(not torch.equal(one, other) for one, other in zip(targets, targets[1:], strict=False))
+    assert trainer.update.metrics()["update/non_finite_env_states"] == 1
+    with count_syncs() as syncs:
+        trainer.update(rollout_ET)
+    assert syncs.total == 0, syncs.report()

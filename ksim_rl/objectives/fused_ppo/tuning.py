@@ -1,8 +1,7 @@
 """Sizes of the kernels' blocks; they change the speed and the order of sums, nothing else."""
 
+import math
 from dataclasses import dataclass
-
-import torch
 
 from ksim_rl.objectives.fused_ppo.layout import FusedLayout
 
@@ -26,8 +25,8 @@ class Tuning:
     """
 
     block: int = 128
-    chunk: int = 64
-    stages: int = 2
+    chunk: int = 32
+    stages: int = 3
     warps: int = 8
     tile: int = 128
     depth: int = 64
@@ -40,9 +39,6 @@ class Tuning:
     envs: int = 32
 
     @classmethod
-    def of(cls, layout: FusedLayout, dtype: torch.dtype) -> "Tuning":
-        """Return what suits networks of a layout."""
-        chunk = min(64, layout.hidden[0], layout.hidden[2])
-        if dtype == torch.float32:
-            return cls(block=64, chunk=min(chunk, 32), depth=32)
-        return cls(chunk=chunk)
+    def of(cls, layout: FusedLayout) -> "Tuning":
+        """Return what suits networks of a layout: the first and the third width must be whole numbers of chunks."""
+        return cls(chunk=math.gcd(cls.chunk, layout.hidden[0], layout.hidden[2]))

@@ -1,0 +1,122 @@
+"""How fast the captured rollout is, beside TorchRL's own `Collector` on the same env.
+
+    python -m benchmarks.collector task=cartpole_balance num_envs=4096,64 device=cuda
+
+takes the overrides of `ksim-rl train`; `num_envs` may be a list. Both sides step the same kind of env with the same
+policy for `steps` (default 32) steps per rollout, in turn; each figure is the median over the rounds of the ratio of
+their times, so that whatever else the machine does weighs on both. The stock side steps its env with eager physics
+(`captured_over_stock`), and once more with each control step's physics as one graph
+(`captured_over_stock_with_graphs`). Figures go to benchmarks/results/collector.json as
+`<device>/cartpole/<num_envs>/...`.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.table import Table
+from torchrl.collectors import Collector
+
+from benchmarks import report
+from benchmarks.stopwatch import milliseconds
+from ksim_rl import conf
+from ksim_rl.collectors import RolloutCollector
+from ksim_rl.physics.capture import live_launches
+from ksim_rl.trainers import RunCfg
+from ksim_rl.trainers.build import build_env
+from ksim_rl.trainers.updates import make_update
+
+ROUNDS = 7
+WARMUP = 3
+STEPS = 32
+
+
+def measure(cfg: RunCfg, *, steps: int = STEPS, rounds: int = ROUNDS) -> dict[str, float]:
+    """Return env states/s of each side, medians over the rounds, and the ratios."""
+    device = cfg.resolved_device()
+    torch.manual_seed(cfg.seed)
+    envs = [build_env(cfg, num_envs=cfg.num_envs, seed=cfg.seed) for _ in range(2)]
+    actor = make_update(cfg, envs[0]).behavior
+    ours = RolloutCollector(envs[0], actor, rollout_length=steps)
+    stock = iter(
+        Collector(
+            envs[1],
+            actor,
+            frames_per_batch=steps * cfg.num_envs,
+            total_frames=-1,
+            device=device,
+            no_cuda_sync=True,
+            auto_register_policy_transforms=False,
+        )
+    )
+    sides: dict[str, Callable[[], object]] = {
+        "captured": ours.collect,
+        "stock": lambda: _next(stock, eager=True),
+        "stock_with_graphs": lambda: _next(stock, eager=False),
+    }
+    times: dict[str, list[float]] = {name: [] for name in sides}
+    for work in sides.values():
+        for _ in range(WARMUP):
+            work()
+    for _ in range(rounds):
+        for name, work in sides.items():
+            times[name].append(milliseconds(work, device=device, repeats=1))
+    env_states = 1000.0 * steps * cfg.num_envs
+    figures = {f"{name}_env_states_per_s": env_states / statistics.median(ms) for name, ms in times.items()}
+    for name in ("stock", "stock_with_graphs"):
+        ratios = [other / own for other, own in zip(times[name], times["captured"], strict=True)]
+        figures[f"captured_over_{name}"] = statistics.median(ratios)
+    for env in envs:
+        env.close(raise_if_closed=False)
+    return figures
+
+
+@torch.no_grad()
+def _next(rollouts: Iterator[Any], *, eager: bool) -> object:
+    """Collect one rollout; with `eager`, physics is issued launch by launch."""
+    with live_launches() if eager else nullcontext():
+        return next(rollouts)
+
+
+def main() -> None:
+    """Measure each number of envs, print the table and write the figures."""
+    own = {"num_envs": "4096", "steps": str(STEPS)}
+    words = []
+    for word in sys.argv[1:]:
+        key, _, value = word.partition("=")
+        if key in own:
+            own[key] = value
+        else:
+            words.append(word)
+    if not any(word.startswith("task=") for word in words):
+        words.append("task=cartpole_balance")
+    table = Table(title="captured rollout beside TorchRL's Collector")
+    for column in ("envs", "captured", "stock", "stock, graphs", "ratio", "ratio, graphs"):
+        table.add_column(column, justify="right")
+    figures: dict[str, float] = {}
+    device = torch.device("cpu")
+    for num_envs in own["num_envs"].split(","):
+        steps = int(own["steps"])
+        sizes = [f"num_envs={num_envs}", f"data.num_env_states_per_minibatch={steps * int(num_envs)}"]
+        cfg = conf.compose([*words, *sizes, "data.num_minibatches=1", "logger=none", "trainer.eval_episodes=0"])
+        device = cfg.resolved_device()
+        found = measure(cfg, steps=steps)
+        robot = cfg.task_name.split("_")[0]
+        prefix = f"{report.device_label(device)}/{robot}/{num_envs}"
+        figures |= {f"{prefix}/{name}": round(value, 3) for name, value in found.items()}
+        speeds = [f"{found[f'{side}_env_states_per_s']:,.0f}" for side in ("captured", "stock", "stock_with_graphs")]
+        ratios = [f"{found[f'captured_over_{side}']:.2f}" for side in ("stock", "stock_with_graphs")]
+        table.add_row(num_envs, *speeds, *ratios)
+    Console().print(table)
+    path = report.write("collector", figures=figures, device=device, module="benchmarks.collector")
+    print(f"written to {path}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""How long it takes from the start of Python to the end of the first iteration, without and with cached kernels.
+
+    python -m benchmarks.first_iteration task=go1_velocity_flat num_envs=4096 device=cuda
+
+takes the overrides of `ksim-rl train`. Two processes run one iteration each, one after the other, with a kernel cache
+of their own that is empty at first. Figures go to benchmarks/results/throughput.json: `first_iteration_cold_s` and
+`first_iteration_warm_s`.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+
+from benchmarks import report
+from ksim_rl import conf
+
+_CHILD = """
+import sys
+from ksim_rl import conf
+from ksim_rl.trainers import build
+trainer = build(conf.compose(sys.argv[1:]))
+trainer.iterate()
+"""
+
+
+def first_iteration_s(overrides: list[str], cache: str) -> float:
+    """Return the seconds that a new process takes for one iteration, with kernels cached in the folder `cache`."""
+    environment = os.environ | {"WARP_CACHE_PATH": cache, "TRITON_CACHE_DIR": f"{cache}/triton"}
+    environment["TORCHINDUCTOR_CACHE_DIR"] = f"{cache}/inductor"
+    began = time.perf_counter()
+    subprocess.run([sys.executable, "-c", _CHILD, *overrides], check=True, env=environment)
+    return time.perf_counter() - began
+
+
+def main() -> None:
+    """Measure both, print and write them."""
+    overrides = [*sys.argv[1:], "logger=none", "trainer.eval_episodes=0"]
+    cfg = conf.compose(overrides)
+    with tempfile.TemporaryDirectory() as cache:
+        figures = {
+            f"first_iteration_{state}_s": round(first_iteration_s(overrides, cache), 2)
+            for state in ("cold", "warm")
+        }
+    device = cfg.resolved_device()
+    prefix = f"{report.device_label(device)}/{cfg.task_name}/{cfg.num_envs}"
+    for name, seconds in figures.items():
+        print(f"{name} {seconds:.1f}")
+    path = report.write(
+        "throughput",
+        figures={f"{prefix}/{name}": value for name, value in figures.items()},
+        device=device,
+        module="benchmarks.first_iteration",
+    )
+    print(f"written to {path}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""How throughput grows with the number of envs: training, and the physics that it cannot do without.
+
+    python -m benchmarks.scaling task=go1_velocity_flat num_envs=1024,2048,4096,8192,16384,32768 device=cuda
+
+takes the overrides of `ksim-rl train`; each number of envs is a run of `benchmarks.throughput` in a process of its own,
+with rollouts of the same length and as many minibatches. Figures go to benchmarks/results/scaling.json:
+`<device>/<task>/<num_envs>/env_states_per_s` and `physics_env_states_per_s`, and `<device>/<task>/growth_4096_to_32768`.
+The chart beside it also shows the figure that the peer publishes for its own training of this task (`PUBLISHED`).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt  # noqa: E402
+
+from benchmarks import report
+from ksim_rl import conf
+
+NUM_ENVS = "1024,2048,4096,8192,16384,32768"
+SMALL, LARGE = 4096, 32768
+# mjlab 1.6.0 with rsl_rl 5.4.2 on one H200 (env states/s, training, 4096 envs).
+PUBLISHED = {"go1_velocity_flat": 0.160e6, "g1_velocity_flat": 0.153e6}
+OWN = ("env_states_per_s", "physics_env_states_per_s", "iteration_over_physics")
+
+
+def measure(words: list[str], num_envs: int) -> dict[str, float]:
+    """Run `benchmarks.throughput` with so many envs and return its figures."""
+    cfg = conf.compose([*words, "logger=none"])
+    length = cfg.data.rollout_length(cfg.num_envs)
+    per_minibatch = length * num_envs // cfg.data.num_minibatches
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "benchmarks.throughput", *words, f"num_envs={num_envs}"]
+        command.append(f"data.num_env_states_per_minibatch={per_minibatch}")
+        subprocess.run(command, check=True, env=os.environ | {"BENCHMARK_RESULTS": folder})
+        figures = json.loads((Path(folder) / "throughput.json").read_text())["figures"]
+    found = {name.rpartition("/")[2]: value for name, value in figures.items()}
+    found["physics_env_states_per_s"] = 1000.0 * num_envs / found["physics_ms"]
+    return {name: found[name] for name in OWN}
+
+
+def growth(figures: dict[int, dict[str, float]]) -> dict[str, float]:
+    """Return how much faster training is with the most envs than with 4096, under the name that says so."""
+    if SMALL not in figures or LARGE not in figures:
+        return {}
+    ratio = figures[LARGE]["env_states_per_s"] / figures[SMALL]["env_states_per_s"]
+    return {f"growth_{SMALL}_to_{LARGE}": ratio}
+
+
+def draw(figures: dict[int, dict[str, float]], path: Path, *, task_name: str, device: str) -> None:
+    """Draw training and raw physics over the number of envs, and the peer's published figure where there is one."""
+    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    sizes = sorted(figures)
+    lines = (
+        ("ksim_rl, training", "env_states_per_s", "o-", "#1f77b4"),
+        ("MuJoCo Warp, physics alone", "physics_env_states_per_s", "s--", "#7f7f7f"),
+    )
+    for label, name, style, color in lines:
+        values = [figures[size][name] / 1e6 for size in sizes]
+        axes.plot(sizes, values, style, color=color, label=label)
+    if task_name in PUBLISHED:
+        axes.plot(
+            [SMALL],
+            [PUBLISHED[task_name] / 1e6],
+            "D",
+            color="#d62728",
+            label="mjlab 1.6.0 + rsl_rl, training (on an H200, not measured in this run)",
+        )
+    axes.set(xscale="log", xlabel="envs", ylabel="million env states per second", title=f"{task_name} on {device}")
+    axes.set_xticks(sizes, [str(size) for size in sizes])
+    axes.minorticks_off()
+    axes.set_ylim(bottom=0.0)
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Measure all sizes, write the figures and draw the chart."""
+    sizes = [word.removeprefix("num_envs=") for word in sys.argv[1:] if word.startswith("num_envs=")]
+    words = [word for word in sys.argv[1:] if not word.startswith("num_envs=")]
+    cfg = conf.compose([*words, "logger=none"])
+    device = cfg.resolved_device()
+    figures = {int(size): measure(words, int(size)) for size in (sizes or [NUM_ENVS])[0].split(",")}
+    prefix = f"{report.device_label(device)}/{cfg.task_name}"
+    flat = {f"{prefix}/{size}/{name}": value for size, row in figures.items() for name, value in row.items()}
+    flat |= {f"{prefix}/{name}": value for name, value in growth(figures).items()}
+    path = report.write(
+        "scaling",
+        figures={name: round(value, 4) for name, value in flat.items()},
+        device=device,
+        module="benchmarks.scaling",
+    )
+    draw(
+        figures,
+        path.with_name(f"scaling_{cfg.task_name}.png"),
+        task_name=cfg.task_name,
+        device=report.device_name(device),
+    )
+    print(f"written to {path}")
+
+
+if __name__ == "__main__":
+    main()

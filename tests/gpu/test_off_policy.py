@@ -1,0 +1,114 @@
+"""Off-policy updates as CUDA graphs. Skipped where there is no GPU."""
+
+import dataclasses
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Unbounded
+
+from ksim_rl.objectives import SACCfg, TD3Cfg
+from tests.gpu.no_syncs import no_syncs
+from tests.trainers.off_policy_problem import make_update
+
+pytestmark = pytest.mark.gpu
+NUM_ENVS, LENGTH = 64, 4
+OBJECTIVES = {
+    "sac": SACCfg(alpha_init=0.1),
+    "fast_sac": SACCfg(value_reduction="mean", policy_delay=4, weight_decay=1e-3),
+    "fast_td3": TD3Cfg(weight_decay=0.1),
+}
+
+
+class _Env:
+    """What an update asks of an env."""
+
+    batch_size = torch.Size([NUM_ENVS])
+    action_spec = Unbounded((NUM_ENVS, 1))
+
+
+def _update(name, **options):
+    torch.manual_seed(0)
+    cfg = OBJECTIVES[name]
+    return make_update(name, _Env(), objective=cfg, device="cuda", learning_starts=1, **options)
+
+
+def _rollout():
+    shape = (NUM_ENVS, LENGTH)
+    obs = torch.randn(NUM_ENVS, LENGTH + 1, 1, device="cuda")
+    done = torch.rand(*shape, 1, device="cuda") < 0.2
+    leaves = {
+        "actor": obs[:, :-1],
+        "critic": obs[:, :-1],
+        "action": torch.rand(*shape, 1, device="cuda"),
+        ("next", "actor"): obs[:, 1:],
+        ("next", "critic"): obs[:, 1:],
+        ("next", "reward"): torch.randn(*shape, 1, device="cuda"),
+        ("next", "done"): done,
+        ("next", "terminated"): done & (torch.rand(*shape, 1, device="cuda") < 0.5),
+    }
+    return TensorDict(leaves, shape, device="cuda").clone()
+
+
+@pytest.mark.parametrize("name", list(OBJECTIVES))
+@pytest.mark.parametrize("options", [{}, {"prioritized": True, "n_step": 3}])
+def test_captured_without_syncs_and_learning_what_it_sees(name, options):
+    update, rollout = _update(name, **options), _rollout()
+    cut = 0
+    for iteration in range(6):
+        if iteration:
+            # Each of these rollouts begins elsewhere than the last one ended, which takes its last env state away.
+            cut += int((~rollout["next", "done"][:, -1]).sum())
+        # New numbers at the same addresses, as a rollout collector gives them; one is not finite.
+        rollout.copy_(_rollout())
+        rollout["next", "reward"][iteration, 2] = float("nan")
+        before = [parameter.clone() for parameter in update.loss.parameters()]
+        with no_syncs(on=iteration > 3):
+            update(rollout)
+        assert not all(torch.equal(a, b) for a, b in zip(before, update.loss.parameters(), strict=True))
+    assert update._store_and_learn.ready
+    metrics = update.metrics()
+    assert int(metrics["update/non_finite_env_states"]) == 6 and int(metrics["update/skipped_steps"]) == 0
+    # Each replay wrote to the ring where the last one ended.
+    assert int(metrics["replay/env_states"]) == 6 * (NUM_ENVS * LENGTH - 1) - cut
+    newest = update.replay.storage.index(
+        torch.arange(NUM_ENVS, device="cuda"), torch.zeros(NUM_ENVS, dtype=torch.int64, device="cuda")
+    )
+    going = ~rollout["next", "done"][:, -1, 0]
+    stored = update.replay.storage.content["actor"][newest]
+    assert torch.equal(stored[going], rollout["next", "actor"][going, -1])
+
+
+def test_captured_updates_equal_eager_ones():
+    captured, eager, rollout = _update("fast_td3"), _update("fast_td3"), _rollout()
+    for _ in range(5):
+        rollout.copy_(_rollout())
+        results = []
+        for update in (captured, eager):
+            # Both draw the same numbers; a graph reads the generator's state when it is replayed.
+            torch.cuda.manual_seed(7)
+            if update is captured:
+                update(rollout)
+            else:
+                update._rollout_ET = rollout
+                update._learn()
+            results.append(update.metrics())
+        torch.testing.assert_close(results[0]["loss/value"], results[1]["loss/value"], rtol=1e-3, atol=1e-4)
+    for one, other in zip(captured.loss.parameters(), eager.loss.parameters(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3)
+
+
+def test_bfloat16_learns_like_float32():
+    losses = {}
+    for autocast in (False, True):
+        torch.manual_seed(0)
+        cfg = dataclasses.replace(OBJECTIVES["fast_sac"], autocast=autocast)
+        update = make_update("fast_sac", _Env(), objective=cfg, device="cuda", learning_starts=1)
+        rollout = _rollout()
+        for _ in range(20):
+            update(rollout)
+        metrics = update.metrics()
+        assert int(metrics["update/skipped_steps"]) == 0
+        assert all(parameter.dtype == torch.float32 for parameter in update.loss.parameters())
+        losses[autocast] = metrics["loss/value"].item()
+    assert losses[True] == pytest.approx(losses[False], rel=0.1)
