@@ -3,7 +3,8 @@
     python -m benchmarks.learning_curve task=go1_velocity_flat seeds=1,2,3 env_states=30e6 num_envs=4096 device=cuda
 
 takes the overrides of `ksim-rl train`. Each seed is a process of its own; with several GPUs they run side by side.
-Figures go to benchmarks/results/learning_<task>.json: the medians over the seeds of the episode means (of rewards: per
+Figures go to benchmarks/results/learning_<task>.json, with another objective than PPO to
+learning_<task>_<objective>.json: the medians over the seeds of the episode means (of rewards: per
 second of the longest episode) over the last million env states. The picture is beside it.
 """
 
@@ -52,7 +53,8 @@ def main() -> None:
     figures = summary(list(curves.values()))
     label = f"{report.device_label(device)}/{cfg.task_name}/{cfg.num_envs}"
     Console(width=200).print(_table(label, curves))
-    name = f"learning_{cfg.task_name}"
+    objective = next((word.partition("=")[2] for word in overrides if word.startswith("objective=")), "ppo")
+    name = f"learning_{cfg.task_name}" + ("" if objective == "ppo" else f"_{objective}")
     path = report.write(
         name,
         figures={f"{label}/{figure}": value for figure, value in figures.items()} | _short_names(figures),

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -144,12 +145,26 @@ def main() -> None:
     sys.exit(any(comparison.tensors_that_differ for comparison in found.values()))
 
 
-def compare_runs(overrides: tuple[str, ...], folder: Path, *, num_iterations: int) -> Comparison:
-    """Train at a stretch and in two processes, and compare the final checkpoints."""
+def run_command(*words: str) -> None:
+    """Run `ksim-rl <words>` in a process of its own."""
+    command = [sys.executable, "-m", "ksim_rl.cli.main", *words]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    if done.returncode:
+        raise RuntimeError(f"ksim-rl {words[0]} ended with exit code {done.returncode}:\n{done.stdout}")
+
+
+def compare_runs(
+    overrides: tuple[str, ...],
+    folder: Path,
+    *,
+    num_iterations: int,
+    train: Callable[..., None] = run_command,
+) -> Comparison:
+    """Train at a stretch and in two processes, and compare the final checkpoints; `train` runs what is not resumed."""
     straight, halves = folder / "straight", folder / "halves"
-    _command("train", *overrides, f"trainer.num_iterations={num_iterations}", f"hydra.run.dir={straight}")
-    _command("train", *overrides, f"trainer.num_iterations={num_iterations // 2}", f"hydra.run.dir={halves}")
-    _command("resume", str(halves), "--num-iterations", str(num_iterations), "--device", "cpu")
+    train("train", *overrides, f"trainer.num_iterations={num_iterations}", f"hydra.run.dir={straight}")
+    train("train", *overrides, f"trainer.num_iterations={num_iterations // 2}", f"hydra.run.dir={halves}")
+    run_command("resume", str(halves), "--num-iterations", str(num_iterations), "--device", "cpu")
     one, other = (checkpoint.load(checkpoint.latest(run)) for run in (straight, halves))
     if one.iteration != num_iterations or other.iteration != num_iterations:
         raise RuntimeError(f"the runs ended after {one.iteration} and {other.iteration} iterations")
@@ -182,13 +197,6 @@ def _same(one: object, other: object) -> bool:
 
 def _bytes(tensor: Tensor) -> Tensor:
     return tensor.contiguous().reshape(-1).view(torch.uint8)
-
-
-def _command(*words: str) -> None:
-    command = [sys.executable, "-m", "ksim_rl.cli.main", *words]
-    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    if done.returncode:
-        raise RuntimeError(f"ksim-rl {words[0]} ended with exit code {done.returncode}:\n{done.stdout}")
 
 
 def _table(found: dict[str, Comparison]) -> Table:

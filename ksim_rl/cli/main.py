@@ -8,6 +8,8 @@ USAGE = """\
 usage: ksim-rl <command> [arguments]
 
   train    train a policy:          ksim-rl train task=cartpole_swingup num_envs=512
+           a run once more:         ksim-rl train --config-dir RUN
+           from its weights:        ksim-rl train checkpoint=RUN
   resume   continue a run:          ksim-rl resume RUN
   eval     evaluate a policy:       ksim-rl eval RUN --episodes 100
   play     record a video:          ksim-rl play RUN --seconds 10
@@ -16,7 +18,7 @@ usage: ksim-rl <command> [arguments]
 RUN is a run folder (its newest checkpoint) or one of its checkpoints.
 `ksim-rl <command> --help` tells more. KSIM_RL_TRACEBACK=1 shows the traceback of an error.
 
-exit codes: 0 done (and solved, where a task has a threshold), 1 not solved, 2 refused: the command or its
+exit codes: 0 done (and solved, or its target met, where there is one), 1 not solved, 2 refused: the command or its
 configuration is wrong, 3 the run failed, 130 / 143 interrupted and saved (SIGINT / SIGTERM)"""
 
 COMMANDS = ("train", "resume", "eval", "play", "envs")

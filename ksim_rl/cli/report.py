@@ -23,7 +23,8 @@ def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None 
         progress.note(line)
     if outcome.interrupted_by is not None:
         return 128 + int(outcome.interrupted_by)
-    return 1 if outcome.solved is False else 0
+    reached = outcome.solved if outcome.target_met is None else outcome.target_met
+    return 1 if reached is False else 0
 
 
 def verdict(evaluation: Evaluation, threshold: float | None) -> str:
@@ -52,6 +53,9 @@ def _summary(cfg: RunCfg, outcome: Outcome, folder: Path) -> list[str]:
         f"{outcome.iteration} iterations, {outcome.env_states:,} env states in {outcome.seconds:.0f} s "
         f"({speed:,.0f} per s, evaluations included)"
     ]
+    if outcome.target_met is not None:
+        targets = ", ".join(f"{name} >= {value:g}" for name, value in (cfg.trainer.stop_at or {}).items())
+        lines.append(f"stop_at {'MET' if outcome.target_met else 'NOT MET'}: {targets}")
     if outcome.interrupted_by is not None:
         name = outcome.interrupted_by.name
         lines.append(f"{name}: everything is saved; continue with: ksim-rl resume {shown(folder)}")

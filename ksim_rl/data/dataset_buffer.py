@@ -116,7 +116,9 @@ class DatasetBuffer(ReplayBuffer):
             TypeError: with a sampler that is no `EpochSampler`.
         """
         if type(self._sampler) is not EpochSampler:
-            raise TypeError(f"a {type(self._sampler).__name__} has no order of single env states: use epoch()")
+            raise TypeError(
+                f"a {type(self._sampler).__name__} has no order of single env states: use epoch()"
+            )
         return self._sampler.epoch_order(self.cfg.num_env_states, device=self.non_finite_count.device)
 
     def all(self) -> TensorDictBase:
@@ -125,7 +127,7 @@ class DatasetBuffer(ReplayBuffer):
 
 
 def _labelled(data: TensorDictBase, info: dict[Any, Any]) -> TensorDictBase:
-    """Name the dims of a sample `["B"]` or `["B","T"]`, and write into it what a `SequenceSampler` says of its steps."""
+    """Name the dims of a sample `["B"]` or `["B","T"]`, and write into it what its sampler says of burn-in."""
     if BURN_IN_KEY in info:
         data.set(BURN_IN_KEY, info[BURN_IN_KEY])
         data.set(MASK_KEY, data.get(MASK_KEY) & info[MASK_KEY])

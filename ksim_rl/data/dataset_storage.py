@@ -21,8 +21,8 @@ class DatasetStorage(TensorStorage):
     The first write allocates it; later ones copy into the same addresses, so that a captured update stays
     valid.
 
-    A row with a non-finite element in any leaf is removed without a host sync: its leaves become those of the
-    first row that is finite, `("collector", "mask")` reads False there, and `non_finite_count` grows by one.
+    A row with a non-finite element in any leaf is removed without a host sync: its numbers become those of the
+    first row that is finite (its flags stay), `("collector", "mask")` reads False there, and `non_finite_count` grows by one.
     All rows stay finite, so nothing non-finite reaches a loss or, through a zero times infinity, a gradient;
     and TorchRL's losses leave rows with a False mask out of their means. (Zeros instead of a finite row would
     not do: a standard deviation of zero has no logarithm.) If no row at all is finite, the leaves are zero
@@ -159,10 +159,13 @@ def _finite_rows(leaves_D: Iterable[Tensor]) -> Tensor:
 
 
 def _replace_rows(leaves_D: Iterable[Tensor], *, keep_D1: Tensor, donor_D1: Tensor) -> None:
-    """Overwrite rows where `keep_D1` is False, in place, by the first row that `donor_D1` marks."""
+    """Overwrite rows where `keep_D1` is False, in place, by the first row that `donor_D1` marks; flags stay."""
     # argmax gives the first of equal values. If none is marked it gives row 0, which nan_to_num makes finite.
     donor_1 = donor_D1.flatten().to(torch.uint8).argmax().unsqueeze(0)
     for leaf_D in leaves_D:
+        # That an episode begins at a row holds for the steps that follow it in a sequence.
+        if leaf_D.dtype == torch.bool:
+            continue
         row = leaf_D.index_select(0, donor_1)
         if leaf_D.is_floating_point():
             row = row.nan_to_num(0.0, 0.0, 0.0)

@@ -111,11 +111,14 @@ class RecurrentNetwork(nn.Module):
             self.get_parameter(f"{name}_l{layer}")
             for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
         )
-        if self.cfg.kind == "lstm":
-            gates_TB = functional.linear(features_TB, weight_ih, bias_ih + bias_hh)
-            return lstm_layer(gates_TB, weight_hh, state_B, reset_TB1)
-        gates_TB = functional.linear(features_TB, weight_ih, bias_ih)
-        return gru_layer(gates_TB, weight_hh, bias_hh, state_B, reset_TB1)
+        lstm = self.cfg.kind == "lstm"
+        gates_TB = functional.linear(features_TB, weight_ih, bias_ih + bias_hh if lstm else bias_ih)
+        # Under autocast only the projection is rounded: errors of a state add up over the steps.
+        with torch.autocast(gates_TB.device.type, enabled=False):
+            gates_TB = gates_TB.to(weight_hh.dtype)
+            if lstm:
+                return lstm_layer(gates_TB, weight_hh, state_B, reset_TB1)
+            return gru_layer(gates_TB, weight_hh, bias_hh, state_B, reset_TB1)
 
 
 class RecurrentModule(TensorDictModule):

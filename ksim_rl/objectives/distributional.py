@@ -33,7 +33,8 @@ def project_distribution(probs: Tensor, reward: Tensor, discount: Tensor, suppor
 
 def mean_of(probs: Tensor, support: Tensor) -> Tensor:
     """Return the means [...] of distributions [..., A]."""
-    return probs @ support
+    # No product of matrices: autocast would round it to bfloat16.
+    return (probs * support).sum(-1)
 
 
 def cross_entropy(logits: Tensor, probs: Tensor) -> Tensor:

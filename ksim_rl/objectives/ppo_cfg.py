@@ -42,8 +42,8 @@ class PPOCfg:
         precision: of what layers multiply in the gradient steps: "float32" (on CUDA as `trainer.matmul_precision`
             says), or "bfloat16", which has 8 significant bits and moves the gradient by about half a percent of its
             norm. Parameters, sums, losses and Adam are float32 either way.
-        kernels: of a bfloat16 update: "auto" takes a few fused kernels where they fit device and networks, "torch" never
-            does. They differ by the order of sums. The metric `update/fused` says which it is.
+        kernels: of a bfloat16 update: "auto" takes a few fused kernels where they fit device and networks, "torch"
+            never does. They differ by the order of sums. The metric `update/fused` says which it is.
     """
 
     num_epochs: int = 5

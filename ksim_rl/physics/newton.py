@@ -4,8 +4,7 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-from ksim_rl.physics.newton_kernel import floats_per_world, newton_kernel
-from ksim_rl.physics.newton_lanes import CUDA_LANES
+from ksim_rl.physics.newton_kernel import CUDA_LANES, floats_per_world, newton_kernel
 
 # The shared memory that a block has without asking for more, in floats, and how many worlds share it at best.
 SHARED_FLOATS = 48 * 1024 // 4

@@ -2,7 +2,7 @@
 
 import importlib.util
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -81,9 +81,9 @@ def _layers(network: nn.Sequential) -> list[nn.Linear]:
     return [layer for layer in network if isinstance(layer, nn.Linear)]
 
 
-def observer(module: TensorDictModuleBase) -> Callable[[TensorDictBase], Tensor]:
-    """Return what gives the input of a network's first layer."""
-    network = module.module
+def observer(module: Any) -> Callable[[TensorDictBase], Tensor]:
+    """Return what gives the input of the first layer of a network from `make_actor` or `make_critic`."""
+    network: PolicyNetwork | ValueNetwork = module.module
     keys = list(module.in_keys)
 
     def observe(env_states: TensorDictBase) -> Tensor:

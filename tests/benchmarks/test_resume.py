@@ -1,8 +1,10 @@
 """The resume table: it sees any difference, and the command itself leaves none."""
 
+import pytest
 import torch
 
 from benchmarks import resume
+from ksim_rl.cli import main
 
 STATE = {
     "seconds": 3.0,
@@ -43,6 +45,12 @@ def test_each_kind_of_difference_is_seen():
             assert differing == [path]
 
 
+def in_this_process(*words):
+    with pytest.raises(SystemExit) as stopped:
+        main.main(list(words))
+    assert stopped.value.code == 0
+
+
 def test_a_run_resumed_by_the_command_in_a_new_process_is_bit_identical(tmp_path):
     small = (
         "task=quadruped_velocity_flat",
@@ -51,7 +59,7 @@ def test_a_run_resumed_by_the_command_in_a_new_process_is_bit_identical(tmp_path
         "data.num_minibatches=2",
     )
     overrides = (*resume.TASK, *small, "task.episode_length_s=0.1")
-    comparison = resume.compare_runs(overrides, tmp_path, num_iterations=2)
+    comparison = resume.compare_runs(overrides, tmp_path, num_iterations=2, train=in_this_process)
     assert comparison.differing == {}
     assert {
         "physics",

@@ -11,7 +11,7 @@ from ksim_rl.data import DatasetCfg
 from ksim_rl.envs import to_tree
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.trainers import ModulesCfg, TrainerCfg
-from ksim_rl.trainers.loggers import LoggerCfg
+from ksim_rl.trainers.loggers import LoggerCfg, MLflowCfg, WandbCfg
 
 FOLDER = files("ksim_rl.conf")
 DATA = DatasetCfg(num_env_states_per_minibatch=4096, num_minibatches=4)
@@ -31,6 +31,8 @@ def read(name):
         ("trainer/on_policy.yaml", TrainerCfg()),
         ("logger/local.yaml", LoggerCfg()),
         ("logger/none.yaml", LoggerCfg(csv=False, tensorboard=False)),
+        ("logger/wandb.yaml", LoggerCfg(tensorboard=False, wandb=WandbCfg())),
+        ("logger/mlflow.yaml", LoggerCfg(tensorboard=False, mlflow=MLflowCfg())),
     ],
 )
 def test_a_yaml_file_lists_every_field(name, cfg):

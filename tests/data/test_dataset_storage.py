@@ -66,8 +66,9 @@ def test_rows_that_are_not_finite_are_replaced_masked_and_counted(bad):
     for key, leaf in clean.items(True, True):
         kept = leaf.flatten(0, 1)
         assert torch.equal(content[key][~removed.flatten()], kept[~removed.flatten()])
-        # Row 0 is removed, so row 1 is the first finite one.
-        assert torch.equal(content[key][removed.flatten()], kept[1:2].expand_as(content[key][:3]))
+        # Row 0 is removed, so row 1 is the first finite one. Flags stay.
+        replaced = kept[removed.flatten()] if leaf.dtype == torch.bool else kept[1:2].expand_as(kept[:3])
+        assert torch.equal(content[key][removed.flatten()], replaced)
     storage.write(clean)
     assert int(storage.non_finite_count) == 3
     assert _content(storage)[MASK_KEY].all()

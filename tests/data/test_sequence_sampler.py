@@ -93,6 +93,17 @@ def test_a_masked_env_state_stays_masked_beside_burn_in():
     assert masked == 1
 
 
+def test_where_episodes_begin_outlives_a_removed_env_state():
+    cfg = DatasetCfg(num_env_states_per_minibatch=24, num_minibatches=3)
+    dataset = DatasetBuffer(cfg, sampler=SequenceSampler(shuffle=False))
+    data = rollout()
+    data["is_init"] = data["step"] % 5 == 0
+    data["obs"][2, 5] = torch.nan
+    dataset.extend(data)
+    stored = torch.cat([minibatch_BT["is_init"] for minibatch_BT in dataset.epoch()])
+    assert torch.equal(stored, data["is_init"])
+
+
 def test_no_host_sync():
     epoch = ours(burn_in=2)
     epoch()

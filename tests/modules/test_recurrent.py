@@ -137,6 +137,23 @@ def test_gradients_are_those_of_finite_differences(kind):
 
 
 @kinds
+def test_autocast_rounds_the_inputs_only(kind):
+    ours, _, obs_TB, state_BN = pair(kind, 1)
+    ours, obs_TB, state_BN = (
+        ours.float(),
+        obs_TB.detach().float(),
+        tuple(p.detach().float() for p in state_BN),
+    )
+    expected_TB, _ = ours(obs_TB, state_BN)
+    with torch.autocast("cpu", torch.bfloat16):
+        features_TB, _ = ours(obs_TB, state_BN)
+    assert features_TB.dtype == torch.float32 and not torch.equal(features_TB, expected_TB)
+    torch.testing.assert_close(features_TB, expected_TB, atol=0.03, rtol=0.0)
+    features_TB.sum().backward()
+    assert all(parameter.grad is not None for parameter in ours.parameters())
+
+
+@kinds
 def test_a_state_that_is_not_finite_ends_with_its_episode(kind):
     ours, _, obs_TB, state_BN = pair(kind, 1)
     broken = tuple(part.detach().index_fill(0, torch.tensor([1]), torch.nan) for part in state_BN)

@@ -16,10 +16,12 @@ from ksim_rl.trainers.ppo_update import PPOUpdate
 ENVS, STEPS, ACTIONS, ACTOR_OBS, CRITIC_OBS = 8, 6, 3, 20, 24
 DATA = DatasetCfg(num_env_states_per_minibatch=24, num_minibatches=2)
 HIDDEN = (32, 32, 16)
-# Blocks that do not divide the 24 rows of a minibatch, the layers or the parameters; few, since the interpreter is slow.
+# Blocks that do not divide the 24 rows of a minibatch or the layers; few, since the interpreter is slow.
 TUNING = Tuning(block=16, chunk=16, stages=1, depth=16, tile=32, tile_stages=1, splits=2, size=1024)
 
-needs_interpreter = pytest.mark.skipif(torch.cuda.is_available(), reason="tests/gpu runs the kernels themselves")
+needs_interpreter = pytest.mark.skipif(
+    torch.cuda.is_available(), reason="tests/gpu runs the kernels themselves"
+)
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +94,11 @@ def assert_equal_states(one, other, *, atol=1e-4):
     assert one.keys() == other.keys()
     for name, value in one.items():
         torch.testing.assert_close(
-            value.float(), other[name].float(), atol=atol, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}"
+            value.float(),
+            other[name].float(),
+            atol=atol,
+            rtol=1e-4,
+            msg=lambda text, name=name: f"{name}: {text}",
         )
 
 
@@ -131,7 +137,11 @@ def test_updates_equal_those_of_torch(fused_ppo, options, actor_options):
     # Torch's has other numbers in the place of the env states that are left out, and takes their variance too.
     for name in theirs.keys() - {"update/explained_variance"}:
         torch.testing.assert_close(
-            ours[name].float(), theirs[name].float(), atol=1e-4, rtol=1e-3, msg=lambda text, name=name: f"{name}: {text}"
+            ours[name].float(),
+            theirs[name].float(),
+            atol=1e-4,
+            rtol=1e-3,
+            msg=lambda text, name=name: f"{name}: {text}",
         )
 
 
@@ -234,8 +244,6 @@ def test_bfloat16_products_change_a_gradient_step_a_little():
     for precision in ("float32", "bfloat16"):
         made = update(PPOCfg(precision=precision, **one), actor, critic, data=sizes)
         made(data.clone())
-        moved[precision] = torch.cat(
-            [entry["exp_avg"].flatten() for entry in made.optimizer.state.values()]
-        )
+        moved[precision] = torch.cat([entry["exp_avg"].flatten() for entry in made.optimizer.state.values()])
     error = (moved["bfloat16"] - moved["float32"]).norm() / moved["float32"].norm()
     assert 1e-5 < error < 0.03

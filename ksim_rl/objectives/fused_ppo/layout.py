@@ -98,9 +98,7 @@ class FusedLayout:
                     for column in range(0, fan_in, tile):
                         place = weight_at + row * fan_in + column
                         used = min(tile, fan_in - column), min(tile, fan_out - row)
-                        tiles.append(
-                            [network, input_at + column, gradient_at + row, place, fan_in, *used, 0]
-                        )
+                        tiles.append([network, input_at + column, gradient_at + row, place, fan_in, *used, 0])
                 input_at, gradient_at = input_at + fan_in, gradient_at + fan_out
                 weight_at += fan_in * fan_out
         return torch.tensor(tiles, dtype=torch.int32)

@@ -63,6 +63,9 @@ def _shape_reason(networks: FusedNetworks) -> str | None:
 
 def _size_reason(networks: FusedNetworks, data: MinibatchSizes) -> str | None:
     columns = sum(layer.out_features for layer in networks.actor) + MAX_OBS
-    if data.num_env_states_per_minibatch * columns >= MAX_PLACES or data.num_env_states * MAX_OBS >= MAX_PLACES:
+    if (
+        data.num_env_states_per_minibatch * columns >= MAX_PLACES
+        or data.num_env_states * MAX_OBS >= MAX_PLACES
+    ):
         return f"{data.num_env_states_per_minibatch} env states in a minibatch are too many"
     return None

@@ -42,7 +42,7 @@ def _outputs(
     STAGES: tl.constexpr,
     STORE: tl.constexpr,
 ):
-    """Return the outputs [BLOCK, O] for observations `x` [BLOCK, L]; STORE also writes the hidden layers to `inputs`."""
+    """Return the outputs [BLOCK, O] for observations `x` [BLOCK, L]; STORE also keeps the hidden layers in `inputs`."""
     W2: tl.constexpr = H1 * L
     W3: tl.constexpr = W2 + H2 * H1
     W4: tl.constexpr = W3 + H3 * H2
@@ -184,9 +184,7 @@ def minibatch_gradients(
             A, O, LOG_STD, MIN_STD,
         )  # fmt: skip
     else:
-        d_out = value_gradient(
-            out, record, valid, statistics, clip_value, critic_coeff, O, CLIP_VALUE
-        )
+        d_out = value_gradient(out, record, valid, statistics, clip_value, critic_coeff, O, CLIP_VALUE)
         tl.store(d_std_at + o, tl.zeros((O,), dtype=tl.float32))
 
     tl.store(partials + H1 + H2 + H3 + o, tl.sum(d_out, 0))

@@ -29,7 +29,19 @@ EPS = tl.constexpr(1.1920929e-07)
 
 
 @triton.jit
-def _sum_weights(program, partials, gradients, squares, count, network, first, SPLITS: tl.constexpr, NUM_WEIGHTS: tl.constexpr, NUM_PADDED: tl.constexpr, SIZE: tl.constexpr):
+def _sum_weights(
+    program,
+    partials,
+    gradients,
+    squares,
+    count,
+    network,
+    first,
+    SPLITS: tl.constexpr,
+    NUM_WEIGHTS: tl.constexpr,
+    NUM_PADDED: tl.constexpr,
+    SIZE: tl.constexpr,
+):
     at = first + tl.arange(0, SIZE)
     inside = at < NUM_WEIGHTS
     total = tl.zeros((SIZE,), dtype=tl.float32)
@@ -41,7 +53,15 @@ def _sum_weights(program, partials, gradients, squares, count, network, first, S
 
 
 @triton.jit
-def _block_sums(partials, column, inside, WIDTH: tl.constexpr, BLOCKS: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+def _block_sums(
+    partials,
+    column,
+    inside,
+    WIDTH: tl.constexpr,
+    BLOCKS: tl.constexpr,
+    ROWS: tl.constexpr,
+    COLUMNS: tl.constexpr,
+):
     sums = tl.zeros((ROWS, COLUMNS), dtype=tl.float32)
     for first in range(0, BLOCKS, ROWS):
         block = (first + tl.arange(0, ROWS))[:, None]
@@ -109,14 +129,22 @@ def sum_gradients(
         network = (program - 2 * WEIGHT_PROGRAMS) // BIAS_PROGRAMS
         bias = ((program - 2 * WEIGHT_PROGRAMS) % BIAS_PROGRAMS) * COLUMNS + tl.arange(0, COLUMNS)
         inside = bias < NUM_BIASES
-        total = _block_sums(block_partials + network * WIDTH, bias, inside, WIDTH, BLOCKS, ROWS, COLUMNS) / count
+        total = (
+            _block_sums(block_partials + network * WIDTH, bias, inside, WIDTH, BLOCKS, ROWS, COLUMNS) / count
+        )
         tl.store(gradients + (network * NUM_PADDED + NUM_WEIGHTS + bias), total, mask=inside)
         tl.store(squares + program, tl.sum(total * total))
     else:
         policy = sums / count
         value = (
             _block_sums(
-                block_partials + WIDTH, NUM_BIASES + statistic, statistic < 6, WIDTH, BLOCKS, ROWS, NUM_STATISTICS
+                block_partials + WIDTH,
+                NUM_BIASES + statistic,
+                statistic < 6,
+                WIDTH,
+                BLOCKS,
+                ROWS,
+                NUM_STATISTICS,
             )
             / count
         )

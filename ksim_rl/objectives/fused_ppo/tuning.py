@@ -21,7 +21,6 @@ class Tuning:
         splits: programs that share a tile, each with a part of the minibatch.
         size: elements per program in sums and Adam.
         columns, rows: of the blocks in which sums over programs are taken.
-        envs: per program, in the estimate of advantages.
     """
 
     block: int = 128
@@ -36,7 +35,6 @@ class Tuning:
     size: int = 1024
     columns: int = 32
     rows: int = 64
-    envs: int = 32
 
     @classmethod
     def of(cls, layout: FusedLayout) -> "Tuning":

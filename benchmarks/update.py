@@ -1,0 +1,234 @@
+"""What one PPO update costs, beside the same update made of TorchRL's own parts.
+
+    python -m benchmarks.update device=cuda num_envs=4096,16384
+
+Networks of 512, 256 and 128, rollouts of 24 steps of random env states of Go1's sizes (48 observations, 12 actions), 5
+epochs of 4 minibatches. Ours is timed eager and captured in float32 (TF32 on CUDA), and captured with
+`precision=bfloat16`, which takes the fused kernels where they fit: `update_ms`. The stock side is TorchRL's `GAE`,
+`ClipPPOLoss`, `ReplayBuffer` and torch's Adam on the same data and networks, in the same order of env states (our
+sampler in its buffer). The same capture is tried on it, and what stops it is written down. `parameter_difference` is
+that between ours and the stock side after one update in full float32, relative to the way that the parameters went.
+
+Figures go to benchmarks/results/update.json, as `<device>/<env states>/<figure>`.
+"""
+
+from __future__ import annotations
+
+import copy
+import sys
+from collections.abc import Callable
+
+import torch
+from rich.console import Console
+from rich.table import Table
+from tensordict import TensorDict
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from benchmarks import report
+from benchmarks.stopwatch import milliseconds
+from ksim_rl.data import DatasetCfg, EpochSampler
+from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
+from ksim_rl.objectives import PPOCfg
+from ksim_rl.physics.capture import Captured
+from ksim_rl.trainers.ppo_update import PPOUpdate
+
+STEPS, OBS, ACTIONS, MINIBATCHES = 24, 48, 12, 4
+# The stock side has no schedule that follows the divergence without a host sync at each step.
+CFG = PPOCfg(schedule="fixed")
+WARMUP, REPEATS = 2, 10
+CPU_REPEATS = 3
+
+Networks = tuple[ProbabilisticTensorDictSequential, TensorDictModule]
+
+
+def main() -> None:
+    """Time all sides for each number of envs, print the figures, and write them."""
+    options = dict(word.split("=", 1) for word in sys.argv[1:])
+    device = torch.device(options.pop("device", "cuda" if torch.cuda.is_available() else "cpu"))
+    sizes = options.pop("num_envs", "4096,16384" if device.type == "cuda" else "64")
+    if options:
+        raise SystemExit(f"unknown options {sorted(options)}: there are device and num_envs")
+    figures, notes = {}, {}
+    for num_envs in map(int, sizes.split(",")):
+        label = f"{report.device_label(device)}/{num_envs * STEPS}"
+        found, note = compare(num_envs, device=device)
+        figures |= {f"{label}/{name}": value for name, value in found.items()}
+        notes |= {f"{label}/{name}": text for name, text in note.items()}
+    table = Table("figure", "value")
+    for name, value in [*figures.items(), *notes.items()]:
+        table.add_row(name, value if isinstance(value, str) else f"{value:.4g}")
+    Console(width=160).print(table)
+    path = report.write("update", figures=figures, device=device, module="benchmarks.update", notes=notes)
+    print(f"written to {path}")
+
+
+def compare(num_envs: int, *, device: torch.device) -> tuple[dict[str, float], dict[str, str]]:
+    """Return the figures of one dataset's size, and why some are missing."""
+    networks = make_networks(device)
+    rollout_ET = make_rollout(networks[0], num_envs=num_envs, device=device)
+    figures = {"parameter_difference": parameter_difference(networks, rollout_ET)}
+    notes = {}
+    torch.set_float32_matmul_precision("high")
+
+    def ours(**options: str) -> PPOUpdate:
+        update = _ours(networks, num_envs=num_envs, device=device, **options)
+        # As the first calls of a run: they compile and allocate.
+        for _ in range(WARMUP + 1 if device.type == "cuda" else 1):
+            update(rollout_ET)
+        return update
+
+    update = ours()
+    figures["ours_eager_ms"] = _time(update._update, device)
+    stock = StockUpdate(networks, num_envs=num_envs)
+    figures["stock_eager_ms"] = _time(lambda: stock(rollout_ET), device)
+    if device.type == "cuda":
+        figures["ours_captured_ms"] = _time(lambda: update(rollout_ET), device)
+        fast = ours(precision="bfloat16")
+        figures["update_ms"] = _time(lambda: fast(rollout_ET), device)
+        notes["update"] = fast.fused if isinstance(fast.fused, str) else "fused kernels"
+        # Last, because a capture that fails leaves its stream behind.
+        notes["stock_captured_ms"] = why_not_captured(stock, rollout_ET, device=device)
+    else:
+        figures["update_ms"] = figures["ours_eager_ms"]
+    figures["stock_eager_over_update"] = figures["stock_eager_ms"] / figures["update_ms"]
+    return figures, notes
+
+
+class StockUpdate:
+    """One PPO update out of TorchRL's parts, with the options of `CFG`.
+
+    Args:
+        networks: actor and critic, which are copied.
+        num_envs: E.
+    """
+
+    def __init__(self, networks: Networks, *, num_envs: int) -> None:
+        self.actor, self.critic = copy.deepcopy(networks)
+        self.advantage = GAE(
+            gamma=CFG.gamma, lmbda=CFG.lmbda, value_network=self.critic, average_gae=True, time_dim=1
+        )
+        self.loss = ClipPPOLoss(
+            self.actor,
+            self.critic,
+            clip_epsilon=CFG.clip_epsilon,
+            clip_value=CFG.clip_value,
+            entropy_coeff=CFG.entropy_coeff,
+            critic_coeff=CFG.critic_coeff,
+            loss_critic_type="l2",
+            normalize_advantage=False,
+        )
+        device = next(self.actor.parameters()).device
+        self.optimizer = torch.optim.Adam(
+            self.loss.parameters(), lr=CFG.learning_rate, capturable=device.type == "cuda"
+        )
+        size = num_envs * STEPS
+        self.dataset = ReplayBuffer(
+            storage=LazyTensorStorage(size, device=device),
+            sampler=EpochSampler(),
+            batch_size=size // MINIBATCHES,
+        )
+
+    def __call__(self, rollout_ET: TensorDict) -> None:
+        """Make all gradient steps."""
+        rollout_ET = rollout_ET.clone(False)
+        with torch.no_grad():
+            self.advantage(rollout_ET)
+        self.dataset.extend(rollout_ET.reshape(-1).exclude("next"))
+        for _ in range(CFG.num_epochs * MINIBATCHES):
+            losses = self.loss(self.dataset.sample())
+            total = losses["loss_objective"] + losses["loss_entropy"] + losses["loss_critic"]
+            self.optimizer.zero_grad()
+            total.backward()
+            nn.utils.clip_grad_norm_(self.loss.parameters(), CFG.max_grad_norm)
+            self.optimizer.step()
+
+
+def parameter_difference(networks: Networks, rollout_ET: TensorDict) -> float:
+    """Return how far one update of ours and one of the stock side end from each other.
+
+    Relative to the way that the stock side's parameters went, both in full float32.
+    """
+    torch.set_float32_matmul_precision("highest")
+    num_envs = rollout_ET.batch_size[0]
+    update = _ours(networks, num_envs=num_envs, device=next(networks[0].parameters()).device)
+    update(rollout_ET)
+    stock = StockUpdate(networks, num_envs=num_envs)
+    stock(rollout_ET)
+    before, ours, theirs = map(_flat, (networks, (update.actor, update.critic), (stock.actor, stock.critic)))
+    return float((ours - theirs).norm() / (theirs - before).norm())
+
+
+def why_not_captured(stock: StockUpdate, rollout_ET: TensorDict, *, device: torch.device) -> str:
+    """Try to capture the stock update in a graph; return its time, or what stopped it."""
+    graph = Captured(lambda: stock(rollout_ET), device=device, warmup=WARMUP)
+    try:
+        for _ in range(WARMUP + 1):
+            graph()
+        return f"{_time(graph, device):.2f}"
+    except Exception as error:
+        return f"not captured: {str(error).splitlines()[0]}"
+
+
+def make_networks(device: torch.device) -> Networks:
+    """Return actor and critic, the same for one seed."""
+    torch.manual_seed(0)
+    actor = make_actor(ActorCfg(), obs_dim=OBS, action_dim=ACTIONS, device=device)
+    return actor, make_critic(CriticCfg(), obs_dim=OBS, device=device)
+
+
+def make_rollout(
+    actor: ProbabilisticTensorDictSequential, *, num_envs: int, device: torch.device
+) -> TensorDict:
+    """Return random env states `["E","T"]` in time-major memory, 2 percent of which end an episode."""
+    generator = torch.Generator(device).manual_seed(0)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(STEPS, num_envs, *shape, device=device, generator=generator)
+
+    terminated, truncated = draw(1) > 2.33, draw(1) > 2.33
+    rollout_TE = TensorDict(
+        {
+            "actor": draw(OBS),
+            "critic": draw(OBS),
+            "next": {
+                "critic": draw(OBS),
+                "reward": draw(1),
+                "terminated": terminated,
+                "truncated": truncated & ~terminated,
+                "done": terminated | truncated,
+            },
+        },
+        [STEPS, num_envs],
+        device=device,
+    )
+    with torch.no_grad():
+        return actor(rollout_TE).transpose(0, 1)
+
+
+def _ours(
+    networks: Networks, *, num_envs: int, device: torch.device, precision: str = "float32"
+) -> PPOUpdate:
+    actor, critic = copy.deepcopy(networks)
+    cfg = PPOCfg(schedule="fixed", precision=precision)
+    minibatch = num_envs * STEPS // MINIBATCHES
+    data = DatasetCfg(num_env_states_per_minibatch=minibatch, num_minibatches=MINIBATCHES)
+    return PPOUpdate(cfg, actor=actor, critic=critic, data=data, device=device)
+
+
+def _time(work: Callable[[], object], device: torch.device) -> float:
+    repeats = REPEATS if device.type == "cuda" else CPU_REPEATS
+    return milliseconds(work, device=device, repeats=repeats)
+
+
+def _flat(networks: Networks) -> Tensor:
+    return torch.cat(
+        [parameter.detach().flatten() for network in networks for parameter in network.parameters()]
+    )
+
+
+if __name__ == "__main__":
+    main()

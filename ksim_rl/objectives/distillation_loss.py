@@ -1,0 +1,130 @@
+"""How far a student is from what its teacher does."""
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torch.distributions import Distribution
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import set_recurrent_mode
+
+from ksim_rl.checks import check_choice
+from ksim_rl.objectives.distillation_cfg import LOSSES
+from ksim_rl.objectives.policy_kl import (
+    distribution_keys,
+    observation_keys,
+    policy_kl,
+    stored_distribution,
+)
+
+TEACHER = "teacher"
+"""Under this key a dataset holds what the teacher would do: its action and, for "kl", its distribution."""
+_MASK: NestedKey = ("collector", "mask")
+
+
+class DistillationLoss(nn.Module):
+    """`loss_distillation` = mean over env states of |a - a*|^2 / A, or of KL(teacher || student) in nats.
+
+    a and a* are the actions that student and teacher take deterministically, A their number. Env states whose
+    `("collector", "mask")` is False are left out. No value is read on the host.
+
+    Args:
+        actor_network: the student; a memory in it learns on sequences `["B","T"]`.
+        teacher: frozen; reads its own observations, writes "action" and, for "kl", parameters of a distribution.
+        loss: "mse" or "kl".
+
+    Raises:
+        ValueError: with "kl" for a teacher without a distribution; with "mse" for actions that are choices.
+    """
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        teacher: TensorDictModuleBase,
+        *,
+        loss: str = "mse",
+    ) -> None:
+        super().__init__()
+        check_choice("loss", loss, LOSSES)
+        self.actor_network = actor_network
+        # Not a submodule: its parameters are not the student's.
+        self._teacher: Any = (teacher,)
+        self.loss = loss
+        self.label_keys: list[NestedKey] = ["action"]
+        if loss == "kl":
+            if not isinstance(teacher, ProbabilisticTensorDictSequential):
+                raise ValueError("loss='kl': the teacher's policy has no distribution; use loss='mse'")
+            self.label_keys += distribution_keys(teacher)
+        if loss == "mse" and "logits" in distribution_keys(actor_network):
+            raise ValueError("loss='mse': the actions are choices, which have no distance; use loss='kl'")
+
+    @property
+    def dataset_keys(self) -> list[NestedKey]:
+        """The leaves that a dataset needs for this loss, labels included."""
+        actor = self.actor_network
+        labels = [(TEACHER, *((key,) if isinstance(key, str) else key)) for key in self.label_keys]
+        return list(dict.fromkeys([*observation_keys(actor), *distribution_keys(actor), *labels]))
+
+    @torch.no_grad()
+    def label(self, rollout_ET: TensorDictBase) -> TensorDictBase:
+        """Return a rollout `["E","T"]` with what the teacher would do in each env state, under "teacher"."""
+        (teacher,) = self._teacher
+        seen_ET = rollout_ET.select(*observation_keys_of(teacher))
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            judged_ET = teacher(seen_ET)
+        return rollout_ET.copy().set(TEACHER, judged_ET.select(*self.label_keys))
+
+    @torch.no_grad()
+    def action_error(self, labelled: TensorDictBase) -> Tensor:
+        """Return the root mean square of a - a* by the policy that collected the data, [], in units of the action."""
+        behaved = stored_distribution(self.actor_network, labelled)
+        if behaved is None or not labelled.get((TEACHER, "action")).is_floating_point():
+            return torch.zeros((), device=labelled.device)
+        error = _action_of(behaved) - labelled.get((TEACHER, "action"))
+        return error.square().nanmean().sqrt()
+
+    def forward(self, minibatch_B: TensorDictBase) -> TensorDictBase:
+        """Return `loss_distillation`, and detached `kl`: how far the student moved since it collected, in nats.
+
+        Args:
+            minibatch_B: `["B"]` or `["B","T"]` with the `dataset_keys`.
+        """
+        minibatch_B = minibatch_B.clone(False)
+        before = stored_distribution(self.actor_network, minibatch_B)
+        with set_recurrent_mode(True):
+            student = self.actor_network.get_dist(minibatch_B)
+        labels_B = minibatch_B.get(TEACHER)
+        if self.loss == "mse":
+            loss_B = (_action_of(student) - labels_B.get("action")).square().mean(-1)
+        else:
+            (teacher,) = self._teacher
+            divergence = policy_kl(teacher.build_dist_from_params(labels_B), student)
+            if divergence is None:
+                raise ValueError("loss='kl': teacher and student have distributions of different kinds")
+            loss_B = divergence
+        with torch.no_grad():
+            moved = None if before is None else policy_kl(before, student)
+        mask_B1 = minibatch_B.get(_MASK, None)
+        mask_B = torch.ones_like(loss_B, dtype=torch.bool) if mask_B1 is None else mask_B1.squeeze(-1)
+        out = {"loss_distillation": _mean(loss_B, mask_B)}
+        out["kl"] = torch.zeros_like(out["loss_distillation"]) if moved is None else _mean(moved, mask_B)
+        return TensorDict({"loss_distillation": out["loss_distillation"], "kl": out["kl"].detach()})
+
+
+def observation_keys_of(policy: Any) -> list[NestedKey]:
+    """Return what any policy reads of an env state, one without a distribution included."""
+    if isinstance(policy, ProbabilisticTensorDictSequential):
+        return observation_keys(policy)
+    return list(policy.in_keys)
+
+
+def _action_of(dist: Distribution) -> Tensor:
+    """Return the action that a distribution stands for when nothing is explored."""
+    return dist.deterministic_sample if hasattr(dist, "deterministic_sample") else dist.mean  # type: ignore[attr-defined]
+
+
+def _mean(values: Tensor, mask: Tensor) -> Tensor:
+    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp_min(1)

@@ -1,0 +1,122 @@
+"""What the gradient steps of an update read of a rollout, laid out for the kernels."""
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from ksim_rl.objectives.fused_ppo.advantage_kernel import estimate_advantages
+from ksim_rl.objectives.fused_ppo.launch import launch, parts
+from ksim_rl.objectives.fused_ppo.layout import FusedLayout
+from ksim_rl.objectives.fused_ppo.loss_kernels import LOG_PROB, MASK
+from ksim_rl.objectives.ppo_cfg import PPOCfg
+from ksim_rl.objectives.rollout_estimator import standardized
+
+# Envs per program.
+ENVS = 32
+Observe = Callable[[TensorDictBase], Tensor]
+
+
+class FusedDataset:
+    """Normalized observations, and one record for each env state, in the order of a collector's memory: step by step.
+
+    Attributes:
+        obs: [2, D, L], for actor and critic, padded with zeros, in the dtype of the products.
+        records: [D, columns]; see `loss_kernels`.
+
+    Args:
+        cfg: of the objective.
+        layout: of the networks.
+        observe_actor, observe_critic: from a TensorDict to what the first layers of actor and critic take, [..., L].
+        size: D.
+        dtype: of the products.
+    """
+
+    def __init__(
+        self,
+        cfg: PPOCfg,
+        layout: FusedLayout,
+        *,
+        observe_actor: Observe,
+        observe_critic: Observe,
+        size: int,
+        dtype: torch.dtype,
+        device: torch.device,
+    ) -> None:
+        self.cfg, self.layout = cfg, layout
+        self._observe = observe_actor, observe_critic
+        self.obs = torch.zeros(2, size, layout.obs_width, dtype=dtype, device=device)
+        self._next_obs = torch.zeros(size, layout.obs_width, dtype=dtype, device=device)
+        width = layout.out_width
+        # A standard deviation must have a logarithm, also where there is no action and where nothing takes part.
+        self._neutral = torch.zeros(3 * width + 16, device=device)
+        self._neutral[2 * width : 3 * width] = 1.0
+        self.records = self._neutral.repeat(size, 1)
+        self._signals = torch.zeros(4, size, device=device)
+
+    @torch.no_grad()
+    def read(self, rollout_ET: TensorDictBase, *, evaluate: Callable[[Tensor, Tensor], None]) -> Tensor:
+        """Take over a rollout `["E","T"]`, whose advantages are estimated here.
+
+        An env state with an element that is not finite takes no part, as in `DatasetStorage`.
+
+        Args:
+            evaluate: writes the values of observations [D, L] of the critic into a tensor [D].
+
+        Returns:
+            How many env states take no part, int64 [].
+        """
+        following = rollout_ET.get("next")
+        for obs_DL, observe, dim in zip(self.obs, self._observe, self.layout.obs_dims, strict=True):
+            obs_DL[:, :dim] = _time_major(observe(rollout_ET))
+        self._next_obs[:, : self.layout.obs_dims[1]] = _time_major(self._observe[1](following))
+        values_D, next_values_D, advantages_D, targets_D = self._signals
+        evaluate(self.obs[1], values_D)
+        evaluate(self._next_obs, next_values_D)
+        num_envs, length = rollout_ET.batch_size
+        launch(
+            estimate_advantages,
+            (parts(num_envs, ENVS),),
+            values_D,
+            next_values_D,
+            *(_time_major(following.get(key)) for key in ("reward", "done", "terminated")),
+            advantages_D,
+            targets_D,
+            num_envs,
+            self.cfg.gamma,
+            self.cfg.gamma * self.cfg.lmbda,
+            STEPS=length,
+            BLOCK=ENVS,
+            num_warps=1,
+        )
+        if self.cfg.normalize_advantage == "dataset":
+            estimated_D = advantages_D.isfinite()
+            normal_D = standardized(advantages_D, estimated_D)
+            advantages_D = torch.where(estimated_D, normal_D, torch.nan)
+        return self._record(rollout_ET, torch.stack([advantages_D, values_D, targets_D], 1))
+
+    def _record(self, rollout_ET: TensorDictBase, estimates: Tensor) -> Tensor:
+        width, actions = self.layout.out_width, self.layout.action_dim
+        first, mask = 3 * width + LOG_PROB.value, 3 * width + MASK.value
+        for place, key in enumerate(("action", "loc", "scale")):
+            self.records[:, place * width : place * width + actions] = _time_major(rollout_ET.get(key))
+        self.records[:, first] = _time_major(rollout_ET.get("action_log_prob"))
+        self.records[:, first + 1 : mask] = estimates
+        self.records[:, mask] = 1.0
+        finite_D = _finite_rows(self.records) & _finite_rows(self.obs[0]) & _finite_rows(self.obs[1])
+        # A zero times NaN is NaN: what takes no part must be finite too. The mask of the neutral row is zero.
+        torch.where(finite_D[:, None], self.records, self._neutral, out=self.records)
+        self.obs.masked_fill_(~finite_D[None, :, None], 0.0)
+        return (~finite_D).sum()
+
+
+def _time_major(leaf_ET: Tensor) -> Tensor:
+    """Return `["E","T", ...]` as [T * E, ...]; a view where the memory is time-major."""
+    return leaf_ET.transpose(0, 1).flatten(0, 1)
+
+
+def _finite_rows(table_DL: Tensor) -> Tensor:
+    """Return whether all elements of a row are finite, bool [D]: a sum is not where one of them is not."""
+    # A product with ones reads the table at full speed, which a reduction of its short rows does not.
+    return (table_DL @ table_DL.new_ones(table_DL.shape[1])).isfinite()

@@ -1,0 +1,13 @@
+"""How a Triton kernel is started."""
+
+from typing import Any
+
+
+def launch(kernel: Any, grid: tuple[int, ...], *args: Any, **options: Any) -> None:
+    """Run `grid` programs of a Triton kernel, whose signature type checkers cannot read, on the current stream."""
+    kernel[grid](*args, **options)
+
+
+def parts(total: int, size: int) -> int:
+    """Return how many programs of `size` elements cover `total`."""
+    return -(-total // size)

@@ -1,0 +1,125 @@
+"""The fused gradient steps on a GPU, beside torch's. Skipped where there is no GPU."""
+
+import copy
+
+import pytest
+import torch
+
+from benchmarks.update import make_rollout
+from ksim_rl.data import DatasetCfg
+from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
+from ksim_rl.objectives import PPOCfg
+from ksim_rl.physics.capture import Captured
+from ksim_rl.trainers.ppo_update import PPOUpdate
+from tests.gpu.no_syncs import no_syncs
+
+pytestmark = pytest.mark.gpu
+ENVS, STEPS, OBS = 256, 24, 48
+DEVICE = torch.device("cuda")
+
+
+def networks(*, hidden_dims=(512, 256, 128), action_dim=12, **actor_options):
+    torch.manual_seed(2)
+    actor_cfg = ActorCfg(hidden_dims=hidden_dims, **actor_options)
+    actor = make_actor(actor_cfg, obs_dim=OBS, action_dim=action_dim, device=DEVICE)
+    return actor, make_critic(CriticCfg(hidden_dims=hidden_dims), obs_dim=OBS, device=DEVICE)
+
+
+def update(actor, critic, *, minibatches=4, **options):
+    data = DatasetCfg(num_env_states_per_minibatch=ENVS * STEPS // minibatches, num_minibatches=minibatches)
+    cfg = PPOCfg(**({"precision": "bfloat16"} | options))
+    return PPOUpdate(cfg, actor=copy.deepcopy(actor), critic=copy.deepcopy(critic), data=data, device=DEVICE)
+
+
+def moments(made):
+    parameters = (*made.actor.parameters(), *made.critic.parameters())
+    return [made.optimizer.state[parameter]["exp_avg"] for parameter in parameters]
+
+
+def parameters(made):
+    return [*made.actor.parameters(), *made.critic.parameters()]
+
+
+@pytest.mark.parametrize(
+    "network_options",
+    [
+        {},
+        {"hidden_dims": (256, 128, 64), "action_dim": 29, "std_type": "log"},
+        {"hidden_dims": (48, 32, 16), "action_dim": 1},
+    ],
+)
+def test_the_gradient_is_that_of_exact_products(network_options):
+    actor, critic = networks(**network_options)
+    rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE)
+    rollout_ET["next", "reward"][3, 4] = float("nan")
+    # One step, not clipped: the mean of Adam is then a tenth of the gradient.
+    one = {"minibatches": 1, "num_epochs": 1, "max_grad_norm": None}
+    fused = update(actor, critic, **one)
+    exact = update(actor, critic, precision="float32", **one)
+    assert fused.metrics()["update/fused"] == 1.0
+    assert exact.metrics()["update/fused"] == 0.0
+    fused(rollout_ET.clone())
+    exact(rollout_ET.clone())
+    for ours, theirs in zip(moments(fused), moments(exact), strict=True):
+        assert (ours - theirs).norm() < 0.02 * theirs.norm()
+    ours, theirs = fused.metrics(), exact.metrics()
+    assert ours["update/non_finite_env_states"] == theirs["update/non_finite_env_states"] == 1
+    for name in ("loss/policy", "loss/value", "loss/entropy", "policy/std"):
+        torch.testing.assert_close(ours[name], theirs[name], atol=1e-3, rtol=1e-2)
+
+
+def test_the_fused_kernels_equal_torch_in_bfloat16():
+    actor, critic = networks()
+    rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE)
+    fused = update(actor, critic, schedule="fixed")
+    plain = update(actor, critic, schedule="fixed", kernels="torch")
+    assert plain.metrics()["update/fused"] == 0.0
+    before = [parameter.clone() for parameter in parameters(fused)]
+    for made in (fused, plain):
+        made(rollout_ET.clone())
+    for start, ours, theirs in zip(before, parameters(fused), parameters(plain), strict=True):
+        # Adam turns each rounding of a small gradient into a whole step.
+        assert (ours - theirs).norm() < 0.2 * (theirs - start).norm()
+    for name in ("loss/value", "update/grad_norm", "update/clip_fraction"):
+        torch.testing.assert_close(fused.metrics()[name], plain.metrics()[name], atol=0.01, rtol=0.03)
+
+
+def test_captured_steps_are_the_eager_ones_bit_for_bit():
+    actor, critic = networks()
+    rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE)
+    eager, captured = update(actor, critic), update(actor, critic)
+    eager._rollout_ET = captured._rollout_ET = rollout_ET
+    graph = Captured(captured._update, device=DEVICE, require_graphs=True)
+    for _ in range(5):
+        eager._update()
+        graph()
+    assert graph.ready
+    assert all(
+        torch.equal(one, other) for one, other in zip(parameters(eager), parameters(captured), strict=True)
+    )
+    assert all(parameter.isfinite().all() for parameter in parameters(eager))
+    assert captured.metrics()["update/skipped_steps"] == 0
+
+
+def test_no_host_sync():
+    actor, critic = networks()
+    rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE)
+    made = update(actor, critic)
+    made._rollout_ET = rollout_ET
+    made._update()
+    with no_syncs():
+        made._update()
+        made.metrics()
+
+
+def test_steps_that_are_not_finite_are_skipped():
+    actor, critic = networks()
+    rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE)
+    made = update(actor, critic, num_epochs=1)
+    made(rollout_ET)
+    with torch.no_grad():
+        made.critic.module.layers[0].weight.fill_(1e30)
+    before = [parameter.clone() for parameter in made.actor.parameters()]
+    made(rollout_ET)
+    assert all(torch.equal(one, other) for one, other in zip(before, made.actor.parameters(), strict=True))
+    assert made.metrics()["update/skipped_steps"] == 4
