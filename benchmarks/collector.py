@@ -104,13 +104,17 @@ def main() -> None:
     for num_envs in own["num_envs"].split(","):
         steps = int(own["steps"])
         sizes = [f"num_envs={num_envs}", f"data.num_env_states_per_minibatch={steps * int(num_envs)}"]
-        cfg = conf.compose([*words, *sizes, "data.num_minibatches=1", "logger=none", "trainer.eval_episodes=0"])
+        cfg = conf.compose(
+            [*words, *sizes, "data.num_minibatches=1", "logger=none", "trainer.eval_episodes=0"]
+        )
         device = cfg.resolved_device()
         found = measure(cfg, steps=steps)
         robot = cfg.task_name.split("_")[0]
         prefix = f"{report.device_label(device)}/{robot}/{num_envs}"
         figures |= {f"{prefix}/{name}": round(value, 3) for name, value in found.items()}
-        speeds = [f"{found[f'{side}_env_states_per_s']:,.0f}" for side in ("captured", "stock", "stock_with_graphs")]
+        speeds = [
+            f"{found[f'{side}_env_states_per_s']:,.0f}" for side in ("captured", "stock", "stock_with_graphs")
+        ]
         ratios = [f"{found[f'captured_over_{side}']:.2f}" for side in ("stock", "stock_with_graphs")]
         table.add_row(num_envs, *speeds, *ratios)
     Console().print(table)

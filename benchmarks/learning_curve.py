@@ -44,12 +44,12 @@ def main() -> None:
     }
     overrides = [word for word in sys.argv[1:] if word.partition("=")[0] not in OWN_OPTIONS]
     if "points" in own:
-        Path(own["points"]).write_text(json.dumps(train_one(_run_cfg(overrides, own))))
+        Path(own["points"]).write_text(json.dumps(train_one(run_cfg(overrides, own))))
         return
     seeds = [int(seed) for seed in own.get("seeds", "1").split(",")]
-    cfg = _run_cfg(overrides, own)
+    cfg = run_cfg(overrides, own)
     device = cfg.resolved_device()
-    curves = dict(zip(seeds, _train_all(seeds), strict=True))
+    curves = dict(zip(seeds, train_all(seeds), strict=True))
     figures = summary(list(curves.values()))
     label = f"{report.device_label(device)}/{cfg.task_name}/{cfg.num_envs}"
     Console(width=200).print(_table(label, curves))
@@ -105,7 +105,7 @@ def _short_names(figures: dict[str, float]) -> dict[str, float]:
     }
 
 
-def _train_all(seeds: list[int]) -> list[list[Point]]:
+def train_all(seeds: list[int]) -> list[list[Point]]:
     """Train each seed in its own process, as many at a time as there are GPUs (one on the CPU)."""
     gpus = max(1, torch.cuda.device_count())
     words = [word for word in sys.argv[1:] if not word.startswith("seeds=")]
@@ -132,7 +132,7 @@ def _start(words: list[str], seed: int, points: Path, gpu: int) -> subprocess.Po
     return subprocess.Popen(command, env=os.environ | {"CUDA_VISIBLE_DEVICES": own})
 
 
-def _run_cfg(overrides: list[str], own: dict[str, str]) -> RunCfg:
+def run_cfg(overrides: list[str], own: dict[str, str]) -> RunCfg:
     fixed = [
         "logger=local",
         "trainer.checkpoint_interval=0",

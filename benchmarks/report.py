@@ -14,7 +14,8 @@ from typing import Any
 
 import torch
 
-RESULTS = Path(__file__).parent / "results"
+# The variable is for benchmarks that run others and take their figures.
+RESULTS = Path(os.environ.get("BENCHMARK_RESULTS") or Path(__file__).parent / "results")
 PACKAGES = ("ksim_rl", "torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
 
 

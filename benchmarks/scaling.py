@@ -2,8 +2,8 @@
 
     python -m benchmarks.scaling task=go1_velocity_flat num_envs=1024,2048,4096,8192,16384,32768 device=cuda
 
-takes the overrides of `ksim-rl train`; each number of envs is a run of `benchmarks.throughput` in a process of its own,
-with rollouts of the same length and as many minibatches. Figures go to benchmarks/results/scaling.json:
+takes the overrides of `ksim-rl train`; each number of envs is a run of `benchmarks.throughput` in a process of its
+own, with rollouts of the same length and as many minibatches. Figures go to benchmarks/results/scaling.json:
 `<device>/<task>/<num_envs>/env_states_per_s` and `physics_env_states_per_s`, and `<device>/<task>/growth_4096_to_32768`.
 The chart beside it also shows the figure that the peer publishes for its own training of this task (`PUBLISHED`).
 """
@@ -20,12 +20,13 @@ from pathlib import Path
 import matplotlib
 
 matplotlib.use("Agg")
-from matplotlib import pyplot as plt  # noqa: E402
+from matplotlib import pyplot as plt
 
 from benchmarks import report
 from ksim_rl import conf
 
 NUM_ENVS = "1024,2048,4096,8192,16384,32768"
+PER_MINIBATCH = "data.num_env_states_per_minibatch="
 SMALL, LARGE = 4096, 32768
 # mjlab 1.6.0 with rsl_rl 5.4.2 on one H200 (env states/s, training, 4096 envs).
 PUBLISHED = {"go1_velocity_flat": 0.160e6, "g1_velocity_flat": 0.153e6}
@@ -38,8 +39,9 @@ def measure(words: list[str], num_envs: int) -> dict[str, float]:
     length = cfg.data.rollout_length(cfg.num_envs)
     per_minibatch = length * num_envs // cfg.data.num_minibatches
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "benchmarks.throughput", *words, f"num_envs={num_envs}"]
-        command.append(f"data.num_env_states_per_minibatch={per_minibatch}")
+        kept = [word for word in words if not word.startswith(PER_MINIBATCH)]
+        sizes = [f"num_envs={num_envs}", f"{PER_MINIBATCH}{per_minibatch}"]
+        command = [sys.executable, "-m", "benchmarks.throughput", *kept, *sizes]
         subprocess.run(command, check=True, env=os.environ | {"BENCHMARK_RESULTS": folder})
         figures = json.loads((Path(folder) / "throughput.json").read_text())["figures"]
     found = {name.rpartition("/")[2]: value for name, value in figures.items()}
@@ -74,7 +76,9 @@ def draw(figures: dict[int, dict[str, float]], path: Path, *, task_name: str, de
             color="#d62728",
             label="mjlab 1.6.0 + rsl_rl, training (on an H200, not measured in this run)",
         )
-    axes.set(xscale="log", xlabel="envs", ylabel="million env states per second", title=f"{task_name} on {device}")
+    axes.set(
+        xscale="log", xlabel="envs", ylabel="million env states per second", title=f"{task_name} on {device}"
+    )
     axes.set_xticks(sizes, [str(size) for size in sizes])
     axes.minorticks_off()
     axes.set_ylim(bottom=0.0)

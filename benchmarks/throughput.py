@@ -98,9 +98,7 @@ def _bytes_per_world(trainer: Trainer) -> dict[str, float]:
     if world.device.type == "cuda":
         torch.cuda.synchronize(world.device)
         torch.cuda.empty_cache()
-        figures["env_and_rollout_bytes_per_world"] = (
-            torch.cuda.memory_reserved(world.device) / world.num_envs
-        )
+        figures["env_and_rollout_bytes_per_world"] = torch.cuda.memory_reserved(world.device) / world.num_envs
     return figures
 
 
@@ -121,6 +119,23 @@ def _guards_ms(trainer: Trainer, decimation: int, device: torch.device, repeats:
     for _ in range(4):
         captured()
     return milliseconds(captured, device=device, repeats=4 * repeats)
+
+
+def train_ms(cfg: RunCfg, *, iterations: int) -> float:
+    """Train so many iterations and return the median time of the second half of them, ms."""
+    trainer = build(cfg)
+    for _ in range(iterations - iterations // 2):
+        trainer.iterate()
+    return _iteration_ms(trainer, _world(trainer).device, iterations // 2)
+
+
+def iteration_ms(trainer: Trainer) -> float:
+    """Warm up and return the median time of an iteration, ms."""
+    device = _world(trainer).device
+    schedule = SCHEDULES[device.type]
+    for _ in range(schedule.warmup_iterations):
+        trainer.iterate()
+    return _iteration_ms(trainer, device, schedule.timed_iterations)
 
 
 def _iteration_ms(trainer: Trainer, device: torch.device, iterations: int) -> float:

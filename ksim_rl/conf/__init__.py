@@ -17,6 +17,12 @@ from ksim_rl.trainers import RunCfg
 MODULE, NAME = "ksim_rl.conf", "train"
 RUN_AGAIN, RUN_CONFIG = "run_again", "config.yaml"
 PPO = "ppo"
+# What objectives take of a task's settings for PPO, unless it has some for them.
+TAKEN_FROM_PPO = {
+    PPO: ("objective", "data", "modules"),
+    "amp": ("objective", "data", "modules"),
+    "distillation": ("data", "modules"),
+}
 
 
 def compose(overrides: Sequence[str] = ()) -> RunCfg:
@@ -49,7 +55,7 @@ def register() -> None:
     store = ConfigStore.instance().store
     for name in envs.names():
         store(group="task/training", name=name, node=training_defaults(name), package="_global_")
-        for objective in (PPO, *envs.task(name).training_by_objective):
+        for objective in (*TAKEN_FROM_PPO, *envs.task(name).training_by_objective):
             node = objective_defaults(name, objective)
             store(group="task/objective_training", name=f"{name}_{objective}", node=node, package="_global_")
 
@@ -79,7 +85,7 @@ def training_defaults(name: str) -> dict[str, Any]:
         "num_envs": task.cfg().scene.num_envs,
         "task": {"scene": {"num_envs": "${num_envs}"}, "seed": "${seed}"},
     }
-    return _with(tree, {key: value for key, value in task.training.items() if not _is_of_objective(key)})
+    return _with(tree, {key: value for key, value in task.training.items() if _group(key) not in TAKEN_FROM_PPO[PPO]})
 
 
 def objective_defaults(name: str, objective: str) -> dict[str, Any]:
@@ -87,11 +93,12 @@ def objective_defaults(name: str, objective: str) -> dict[str, Any]:
     task = envs.task(name)
     if objective in task.training_by_objective:
         return _with({}, task.training_by_objective[objective])
-    return _with({}, {key: value for key, value in task.training.items() if _is_of_objective(key)})
+    taken = TAKEN_FROM_PPO[objective]
+    return _with({}, {key: value for key, value in task.training.items() if _group(key) in taken})
 
 
-def _is_of_objective(key: str) -> bool:
-    return key.partition(".")[0] in ("objective", "data", "modules")
+def _group(key: str) -> str:
+    return key.partition(".")[0]
 
 
 def _with(tree: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,9 @@ from ksim_rl.modules.bounded_actors import (
 from ksim_rl.modules.categorical import Categorical
 from ksim_rl.modules.critic import CriticCfg, ValueNetwork, make_critic
 from ksim_rl.modules.diagonal_gaussian import DiagonalGaussian
+from ksim_rl.modules.discriminator import Discriminator
 from ksim_rl.modules.exploring_policy import ExploringPolicy
+from ksim_rl.modules.mixed_policy import MixedPolicy
 from ksim_rl.modules.mlp import ACTIVATIONS, mlp
 from ksim_rl.modules.observation_keys import ObservationKey, observation_dim
 from ksim_rl.modules.observation_normalizer import ObservationNormalizer, update_normalizers
@@ -41,7 +43,9 @@ __all__ = [
     "CriticCfg",
     "DeterministicActorCfg",
     "DiagonalGaussian",
+    "Discriminator",
     "ExploringPolicy",
+    "MixedPolicy",
     "ObservationKey",
     "ObservationNormalizer",
     "PolicyNetwork",

@@ -1,12 +1,13 @@
-"""The policy that collects while a teacher still helps its student."""
+"""The policy that collects while a student learns from a teacher."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 
 class MixedPolicy(TensorDictModuleBase):
@@ -17,17 +18,26 @@ class MixedPolicy(TensorDictModuleBase):
 
     Args:
         student: writes "action" and what training needs.
-        teacher: acts deterministically, on its own observations.
+        teacher: acts deterministically, on its own observations; None leaves all to the student.
+        teacher_keys: what the teacher reads.
         share: [], in [0, 1], on the device; it stays where it is and may change in place.
+        explores: whether the student samples its actions, where TorchRL's exploration type says so; False takes those
+            that it finds best.
     """
 
     share: Tensor
 
     def __init__(
-        self, student: TensorDictModuleBase, teacher: TensorDictModuleBase, *, teacher_keys: Any, share: Tensor
+        self,
+        student: TensorDictModuleBase,
+        teacher: TensorDictModuleBase | None = None,
+        *,
+        share: Tensor,
+        teacher_keys: Sequence[Any] = (),
+        explores: bool = True,
     ) -> None:
         super().__init__()
-        self.student, self.teacher = student, teacher
+        self.student, self.teacher, self.explores = student, teacher, explores
         self._teacher_keys = list(teacher_keys)
         self.in_keys: Any = list(dict.fromkeys((*student.in_keys, *self._teacher_keys)))
         self.out_keys: Any = list(student.out_keys)
@@ -35,9 +45,13 @@ class MixedPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write "action" [E, action_dim], and beside it what the student writes."""
+        seen = tensordict.select(*self._teacher_keys)
+        with set_exploration_type(exploration_type() if self.explores else ExplorationType.DETERMINISTIC):
+            acted = self.student(tensordict)
+        if self.teacher is None:
+            return acted
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            shown = self.teacher(tensordict.select(*self._teacher_keys)).get("action")
-        acted = self.student(tensordict)
+            shown = self.teacher(seen).get("action")
         action = acted.get("action")
         helped = torch.rand(acted.batch_size, device=action.device) < self.share
         helped = helped.reshape(*acted.batch_size, *[1] * (action.ndim - acted.batch_dims))

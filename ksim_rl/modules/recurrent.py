@@ -15,7 +15,7 @@ from tensordict.nn import (
 from torch import Tensor, nn
 from torch.nn import functional
 from torchrl.data import Composite, Unbounded
-from torchrl.modules import recurrent_mode
+from torchrl.modules import SafeProbabilisticTensorDictSequential, recurrent_mode
 
 from ksim_rl.checks import check_choice
 from ksim_rl.modules.actor import make_actor
@@ -240,7 +240,7 @@ def make_recurrent_critic(
 def with_memory(memory: RecurrentModule, network: AnyModule) -> AnyModule:
     """Return an actor or a critic behind a memory, whose features it reads at `memory.feature_key`."""
     if isinstance(network, ProbabilisticTensorDictSequential):
-        return ProbabilisticTensorDictSequential(memory, *network.module)  # type: ignore[return-value, arg-type]
+        return SafeProbabilisticTensorDictSequential(memory, *network.module)  # type: ignore[return-value, arg-type]
     return TensorDictSequential(memory, network)  # type: ignore[return-value]
 
 

@@ -1,7 +1,11 @@
 """Objectives: what is estimated from a rollout, and the losses and gradient steps that improve the policy."""
 
 from ksim_rl.objectives.adaptive_learning_rate import adapt_learning_rate_
+from ksim_rl.objectives.amp_cfg import AMPCfg
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
+from ksim_rl.objectives.discriminator_loss import discriminator_loss, style_reward
+from ksim_rl.objectives.distillation_cfg import DistillationCfg
+from ksim_rl.objectives.distillation_loss import DistillationLoss, observation_keys_of
 from ksim_rl.objectives.distributional import cross_entropy, mean_of, project_distribution
 from ksim_rl.objectives.gae import GAE
 from ksim_rl.objectives.gaussian_kl import kl_divergence
@@ -29,8 +33,11 @@ from ksim_rl.objectives.td_lambda import TDLambda
 from ksim_rl.objectives.vtrace import VTrace
 
 __all__ = [
+    "AMPCfg",
     "GAE",
     "ClipPPOLoss",
+    "DistillationCfg",
+    "DistillationLoss",
     "NonFiniteStepsError",
     "OffPolicyCfg",
     "OffPolicyLoss",
@@ -48,6 +55,7 @@ __all__ = [
     "clip_and_guard",
     "cross_entropy",
     "descend",
+    "discriminator_loss",
     "follow_",
     "frozen",
     "in_precision",
@@ -63,6 +71,8 @@ __all__ = [
     "make_symmetric",
     "mirror_loss",
     "observation_keys",
+    "observation_keys_of",
     "ppo_step",
     "project_distribution",
+    "style_reward",
 ]

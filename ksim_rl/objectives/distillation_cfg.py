@@ -17,8 +17,8 @@ class DistillationCfg:
 
     Attributes:
         teacher: a run folder or a checkpoint, whose policy is the teacher.
-        loss: "mse", of the actions that both take deterministically, or "kl", the divergence of the student's
-            distribution from the teacher's, which also learns its standard deviation.
+        loss: "mse", of the actions that both take deterministically, without noise while it collects; or "kl", the
+            divergence of the student's distribution from the teacher's, which also learns how actions scatter.
         num_epochs: passes over each rollout.
         teacher_share: the chance that the teacher acts instead of the student, in each env state of the first rollout.
         teacher_share_decay: factor of it from rollout to rollout.

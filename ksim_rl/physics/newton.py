@@ -32,7 +32,7 @@ def suits(mj_model: mujoco.MjModel, *, njmax: int) -> bool:
         and mj_model.nflex == 0
         and 0 < mj_model.nv <= MOST_DOFS
         and njmax > 0
-        and floats_per_world(mj_model.nv, njmax, elliptic=bool(elliptic)) <= SHARED_FLOATS
+        and floats_per_world(mj_model.nv, njmax, elliptic=bool(elliptic), rows_on_chip=njmax) <= SHARED_FLOATS
     )
 
 
@@ -71,6 +71,8 @@ def solve(
     *,
     worlds_per_block: int = WORLDS_PER_BLOCK,
     min_blocks: int = 0,
+    rows_on_chip: int | None = None,
+    scratch: wp.array2d[float] | None = None,
 ) -> None:
     """Launch the solver: accelerations and constraint forces from the rows of `warp_data_E`, which must be sparse.
 
@@ -80,11 +82,15 @@ def solve(
         worlds_per_block: how many worlds share a block on CUDA; fewer where their memory does not fit.
         min_blocks: how many blocks a multiprocessor is to hold at once, which bounds the registers; 0 does not.
     """
-    m, d, efc = warp_model, warp_data_E, warp_data_E.efc
+    m, d = warp_model, warp_data_E
     elliptic = bool(m.opt.cone == mjw.ConeType.ELLIPTIC)
     on_cuda = d.qpos.device.is_cuda
     lanes = CUDA_LANES if on_cuda else 1
-    fitting = SHARED_FLOATS // floats_per_world(m.nv, d.njmax, elliptic=elliptic)
+    if rows_on_chip is None:
+        rows_on_chip = d.njmax
+    if scratch is None:
+        scratch = wp.empty((1, 1), dtype=float, device=d.qpos.device)
+    fitting = SHARED_FLOATS // floats_per_world(m.nv, d.njmax, elliptic=elliptic, rows_on_chip=rows_on_chip)
     worlds = min(worlds_per_block, fitting) if on_cuda else 1
     kernel = newton_kernel(
         nv=m.nv,
@@ -93,44 +99,44 @@ def solve(
         ls_iterations=int(m.opt.ls_iterations),
         lanes=lanes,
         worlds_per_block=worlds,
+        rows_on_chip=rows_on_chip,
         min_blocks=min_blocks if on_cuda else 0,
     )
-    wp.launch(
-        kernel,
-        dim=(d.nworld, lanes),
-        inputs=[
-            int(m.opt.iterations),
-            m.opt.tolerance,
-            m.opt.ls_tolerance,
-            m.opt.impratio_invsqrt,
-            m.M_rownnz,
-            m.M_rowadr,
-            m.M_hinit_i,
-            m.M_colind,
-            m.M_mulm_rowadr,
-            m.M_mulm_col,
-            m.M_mulm_madr,
-            d.ne,
-            d.nf,
-            d.nefc,
-            d.M,
-            d.qacc_warmstart,
-            d.qfrc_smooth,
-            d.contact.friction,
-            efc.type,
-            efc.id,
-            efc.J_rownnz,
-            efc.J_rowadr,
-            efc.J_colind.reshape((d.nworld, -1)),
-            efc.J.reshape((d.nworld, -1)),
-            efc.D,
-            efc.aref,
-            efc.frictionloss,
-            d.dof_frictionadr,
-            efc.jtdaj_adr,
-            efc.jtdaj_nrow,
-            efc.jtdaj_nblock,
-        ],
-        outputs=[d.qacc, efc.Ma, efc.force, efc.state, d.qfrc_constraint, d.solver_niter, d.overflow],
-        block_dim=worlds * lanes,
-    )
+    wp.launch(kernel, dim=(d.nworld, lanes), inputs=arguments(m, d, scratch), block_dim=worlds * lanes)
+
+
+def arguments(m: mjw.Model, d: mjw.Data, scratch: wp.array2d[float]) -> list[object]:
+    """Return what the kernel reads, then what it writes."""
+    efc = d.efc
+    return [
+        int(m.opt.iterations),
+        m.opt.tolerance,
+        m.opt.ls_tolerance,
+        m.opt.impratio_invsqrt,
+        m.M_hinit_i,
+        m.M_colind,
+        d.ne,
+        d.nf,
+        d.nefc,
+        d.M,
+        d.qacc_warmstart,
+        d.qfrc_smooth,
+        d.contact.friction,
+        efc.type,
+        efc.id,
+        efc.J_rownnz,
+        efc.J_rowadr,
+        efc.J_colind.reshape((d.nworld, -1)),
+        efc.J.reshape((d.nworld, -1)),
+        efc.D,
+        efc.aref,
+        efc.frictionloss,
+        scratch,
+        d.qacc,
+        efc.Ma,
+        efc.force,
+        efc.state,
+        d.qfrc_constraint,
+        d.solver_niter,
+        d.overflow,
+    ]

@@ -22,10 +22,47 @@ vec5 = wp.types.vector(length=5, dtype=float)
 _SOURCE = files("ksim_rl.physics").joinpath("newton_solver.cpp").read_text()
 
 
-def floats_per_world(nv: int, njmax: int, *, elliptic: bool) -> int:
+def row_stride(nv: int) -> int:
+    """Return the floats from a row of J or M to the next: whole groups of four, and as many as meet no bank twice."""
+    return 4 * (-(-nv // 4) | 1)
+
+
+def floats_per_world(nv: int, njmax: int, *, elliptic: bool, rows_on_chip: int) -> int:
     """Return how many floats the lanes of a world share."""
-    cones = 4 * (njmax + 3) if elliptic else 0
-    return (nv + 1) * (nv + 2) // 2 + 6 * nv + 5 * njmax + cones
+    stride, rows = row_stride(nv), _whole(njmax)
+    cones = 4 * (rows + 4) if elliptic else 0
+    return (nv + rows_on_chip) * stride + 2 * (stride + 4) + stride + 7 * rows + cones
+
+
+def _whole(njmax: int) -> int:
+    return 4 * -(-njmax // 4)
+
+
+def constants(
+    *,
+    nv: int,
+    njmax: int,
+    elliptic: bool,
+    ls_iterations: int,
+    lanes: int,
+    worlds_per_block: int,
+    rows_on_chip: int,
+) -> dict[str, int]:
+    """Return the constants that the C++ source reads."""
+    return {
+        "NV": nv,
+        "NJ": njmax,
+        "MANY": _whole(njmax),
+        "STRIDE": row_stride(nv),
+        "ROWS_ON_CHIP": rows_on_chip,
+        "LANES": lanes,
+        "WORLDS_PER_BLOCK": worlds_per_block,
+        "MOST_TRIALS": ls_iterations,
+        "ELLIPTIC": int(elliptic),
+        "FLOATS": floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=rows_on_chip),
+        "OUT_OF_ITERATIONS": int(mjw.OverflowType.ITERATIONS),
+        "OUT_OF_LS_ITERATIONS": int(mjw.OverflowType.LS_ITERATIONS),
+    }
 
 
 @functools.cache
@@ -37,21 +74,20 @@ def newton_kernel(
     ls_iterations: int,
     lanes: int,
     worlds_per_block: int,
+    rows_on_chip: int,
     min_blocks: int = 0,
 ) -> wp.Kernel:
     """Return the kernel for models of `nv` degrees of freedom; launch it over (worlds, lanes)."""
-    constants = {
-        "NV": nv,
-        "NJ": njmax,
-        "LANES": lanes,
-        "WORLDS_PER_BLOCK": worlds_per_block,
-        "MOST_TRIALS": ls_iterations,
-        "ELLIPTIC": int(elliptic),
-        "FLOATS": floats_per_world(nv, njmax, elliptic=elliptic),
-        "OUT_OF_ITERATIONS": int(mjw.OverflowType.ITERATIONS),
-        "OUT_OF_LS_ITERATIONS": int(mjw.OverflowType.LS_ITERATIONS),
-    }
-    snippet = "".join(f"constexpr int {name} = {value};\n" for name, value in constants.items()) + _SOURCE
+    values = constants(
+        nv=nv,
+        njmax=njmax,
+        elliptic=elliptic,
+        ls_iterations=ls_iterations,
+        lanes=lanes,
+        worlds_per_block=worlds_per_block,
+        rows_on_chip=rows_on_chip,
+    )
+    snippet = "".join(f"constexpr int {name} = {value};\n" for name, value in values.items()) + _SOURCE
 
     @wp.func_native(snippet)
     def solve_world(
@@ -61,13 +97,8 @@ def newton_kernel(
         tolerances: wp.array[float],
         ls_tolerances: wp.array[float],
         impratio_invsqrt: wp.array[float],
-        M_rownnz: wp.array[int],
-        M_rowadr: wp.array[int],
         M_row: wp.array[int],
         M_col: wp.array[int],
-        mulm_rowadr: wp.array[int],
-        mulm_col: wp.array[int],
-        mulm_adr: wp.array[int],
         ne: wp.array[int],
         nf: wp.array[int],
         nefc: wp.array[int],
@@ -84,10 +115,7 @@ def newton_kernel(
         efc_D: wp.array2d[float],
         efc_aref: wp.array2d[float],
         efc_limit: wp.array2d[float],
-        dof_friction_row: wp.array2d[int],
-        group_head: wp.array2d[int],
-        group_size: wp.array2d[int],
-        num_groups: wp.array[int],
+        scratch: wp.array2d[float],
         qacc: wp.array2d[float],
         efc_Ma: wp.array2d[float],
         efc_force: wp.array2d[float],
@@ -113,13 +141,8 @@ def newton_kernel(
         tolerances: wp.array[float],
         ls_tolerances: wp.array[float],
         impratio_invsqrt: wp.array[float],
-        M_rownnz: wp.array[int],
-        M_rowadr: wp.array[int],
         M_row: wp.array[int],
         M_col: wp.array[int],
-        mulm_rowadr: wp.array[int],
-        mulm_col: wp.array[int],
-        mulm_adr: wp.array[int],
         # Data.
         ne: wp.array[int],
         nf: wp.array[int],
@@ -137,10 +160,7 @@ def newton_kernel(
         efc_D: wp.array2d[float],
         efc_aref: wp.array2d[float],
         efc_limit: wp.array2d[float],
-        dof_friction_row: wp.array2d[int],
-        group_head: wp.array2d[int],
-        group_size: wp.array2d[int],
-        num_groups: wp.array[int],
+        scratch: wp.array2d[float],
         # Results.
         qacc: wp.array2d[float],
         efc_Ma: wp.array2d[float],
@@ -158,13 +178,8 @@ def newton_kernel(
             tolerances,
             ls_tolerances,
             impratio_invsqrt,
-            M_rownnz,
-            M_rowadr,
             M_row,
             M_col,
-            mulm_rowadr,
-            mulm_col,
-            mulm_adr,
             ne,
             nf,
             nefc,
@@ -181,10 +196,7 @@ def newton_kernel(
             efc_D,
             efc_aref,
             efc_limit,
-            dof_friction_row,
-            group_head,
-            group_size,
-            num_groups,
+            scratch,
             qacc,
             efc_Ma,
             efc_force,

@@ -1,56 +1,54 @@
 // The body of the function that solves one world; newton_kernel.py gives its arguments and the constants
-// NV, NJ, LANES, WORLDS_PER_BLOCK, MOST_TRIALS, ELLIPTIC, and says what it is about.
+// NV, NJ, LANES, WORLDS_PER_BLOCK, STRIDE, ROWS_ON_CHIP, FLOATS, MOST_TRIALS, ELLIPTIC, and says what it is about.
 //
-// x is the residual J qacc - aref of a row, v its rate J search, d its stiffness. Loops are not unrolled unless that hides
-// the latency of loads: the lanes of many worlds are in different places of this code at once, and it has to stay in the
-// instruction cache.
+// The lanes of a world share out its degrees of freedom: lane l has l, l + LANES, ..., of which each is a `block` with
+// its row of H from the block's first column on, so that on CUDA the rows of H lie in registers, symmetric within a
+// block, and with one lane (the CPU) they are the upper triangle. J and M lie on the chip as whole rows, zeros included:
+// then the sums over them have no index to look up, and all lanes read the same address or adjacent ones.
+//
+// x is the residual J qacc - aref of a row, v its rate J search, d its stiffness.
+
+#if defined(__CUDA_ARCH__)
+#define UNROLL _Pragma("unroll")
+#else
+#define UNROLL
+#endif
 
 constexpr int EQUALITY = 0, FRICTION = 1, ONE_SIDED = 2, CONE_HEAD = 3, CONE_TANGENT = 4;
 constexpr int SATISFIED = 0, QUADRATIC = 1, LINEAR_NEGATIVE = 2, LINEAR_POSITIVE = 3, CURVED = 4;
 constexpr int ELLIPTIC_CONTACT = 7;
 constexpr float TINY = 1e-15f;
 constexpr float NOISE = 8.0f * 1.1920929e-07f;  // rounding of a sum of some float32 terms
-constexpr float IS_CURVED = -1.0f;              // in the place of a stiffness
-constexpr int SIZE = FLOATS;
+constexpr int BLOCKS = (NV + LANES - 1) / LANES;
+constexpr int COLUMN = STRIDE + 4;
+constexpr int SIZE = FLOATS, STEP = STRIDE, CHIP = ROWS_ON_CHIP;
 
 #if defined(__CUDA_ARCH__)
-__shared__ float floats[WORLDS_PER_BLOCK * SIZE];
+__shared__ __align__(16) float floats[WORLDS_PER_BLOCK * SIZE];
 float* const memory = floats + (threadIdx.x / LANES) * SIZE;
 #else
 static float memory[SIZE];
 #endif
-float* const h = memory;  // the lower triangle of H, and below it b, which becomes the y of L y = b
-float* const acc = h + (NV + 1) * (NV + 2) / 2;
-float* const ma = acc + NV;
-float* const search = ma + NV;
-float* const mv = search + NV;
-float* const qfrc = mv + NV;
-float* const inverse_diag = qfrc + NV;
-float* const x = inverse_diag + NV;
-float* const v = x + NJ;  // between two line searches: the stiffness of the row, 0 where it is slack
-float* const force = v + NJ;
-float* const d = force + NJ;
-int* const kinds = (int*)(d + NJ);
-float* const cones = (float*)(kinds + NJ);
+float* const mass = memory;
+float* const chip = mass + NV * STEP;
+float* const columns = chip + CHIP * STEP;  // two
+float* const shared = columns + 2 * COLUMN;  // a vector of the degrees of freedom, for all lanes to read
+float* const x = shared + STEP;
+float* const v = x + MANY;  // between two line searches: the stiffness of the row, 0 where it is slack
+float* const force = v + MANY;
+float* const d = force + MANY;
+float* const bound = d + MANY;  // the most force of dry friction, the mu of a cone's head, the friction of its tangents
+int* const kinds = (int*)(bound + MANY);
+int* const units = kinds + MANY;  // the rows whose cost is evaluated: all but equalities and tangents
+float* const cones = (float*)(units + MANY);
 
-const float* const J = J_values.data + (size_t)world * J_values.shape[1];
-const int* const J_col = J_colind.data + (size_t)world * J_colind.shape[1];
-const int* const J_adr = J_rowadr.data + (size_t)world * J_rowadr.shape[1];
-const int* const J_nnz = J_rownnz.data + (size_t)world * J_rownnz.shape[1];
-const float* const mass = M.data + (size_t)world * M.shape[1];
-const float* const smooth = qfrc_smooth.data + (size_t)world * qfrc_smooth.shape[1];
-const float* const limit = efc_limit.data + (size_t)world * efc_limit.shape[1];
-const int* const ids = efc_id.data + (size_t)world * efc_id.shape[1];
-const int* const heads = group_head.data + (size_t)world * group_head.shape[1];
-const int* const sizes = group_size.data + (size_t)world * group_size.shape[1];
-const int* const friction_row = dof_friction_row.data + (size_t)world * dof_friction_row.shape[1];
-int* const states = efc_state.data + (size_t)world * efc_state.shape[1];
-
-const int equalities = ne.data[world], frictions = nf.data[world];
-const int rows = wp::min(nefc.data[world], NJ), groups = num_groups.data[world];
+const int rows = wp::min(nefc.data[world], NJ), equalities = ne.data[world], frictions = nf.data[world];
 const float impratio = impratio_invsqrt.data[world % impratio_invsqrt.shape[0]];
 const float tolerance = tolerances.data[world % tolerances.shape[0]];
 const float ls_tolerance = ls_tolerances.data[world % ls_tolerances.shape[0]];
+int* const states = efc_state.data + (size_t)world * efc_state.shape[1];
+float* const far = scratch.data + (size_t)world * scratch.shape[1];
+float* const J = CHIP >= NJ ? chip : CHIP == 0 ? far : rows <= CHIP ? chip : far;
 
 auto sync = [] {
 #if defined(__CUDA_ARCH__)
@@ -59,14 +57,22 @@ auto sync = [] {
 };
 auto total = [](float value) {
 #if defined(__CUDA_ARCH__)
-#pragma unroll
+UNROLL
     for (int distance = LANES / 2; distance > 0; distance >>= 1)
         value += __shfl_xor_sync(0xffffffffu, value, distance);
 #endif
     return value;
 };
+auto of_lane = [](float value, int lane) {
+#if defined(__CUDA_ARCH__)
+    value = __shfl_sync(0xffffffffu, value, lane);
+#endif
+    return value;
+};
 auto ratio = [](float a, float b) { return a / (b == 0.0f ? TINY : b); };
-auto packed = [](int row, int col) { return row * (row + 1) / 2 + col; };
+// A lane beyond the last degree of freedom does what the lane of the last one does, and writes nothing.
+auto is_dof = [&](int block) { return block * LANES + lane < NV; };
+auto dof_of = [&](int block) { return wp::min(block * LANES + lane, NV - 1); };
 
 struct Point {
     float cost, slope, curvature, start;  // the cost is relative to that at the start of the direction
@@ -77,8 +83,6 @@ struct Cone {
 auto cone_zone = [](float normal, float tangent, float mu) {
     return normal >= mu * tangent ? SATISFIED : mu * normal + tangent <= 0.0f ? QUADRATIC : CURVED;
 };
-// The friction coefficients of the contact of a row, and how the first scales with impratio.
-auto friction_of = [&](int row) { return (const float*)(contact_friction.data + ids[row]); };
 
 auto one_sided = [](float x, float v, float d, float alpha) {
     const float slope = d * v * x, curvature = d * v * v, start = x < 0.0f ? 0.5f * d * x * x : 0.0f;
@@ -127,51 +131,27 @@ auto cone_point = [&](const Cone& c, float alpha) {
     }
     return Point {change, c.dm * gap * gap_rate, c.dm * (gap_rate * gap_rate - c.mu * gap * bend), start};
 };
-// What the rows cost at a point of the search direction, summed over the rows first, first + stride, ...
-auto measure = [&](float alpha, int first, int stride) {
-    Point sum {0.0f, 0.0f, 0.0f, 0.0f};
-#pragma unroll 1
-    for (int row = equalities + first; row < rows; row += stride) {
-        const int kind = kinds[row] & 255;
-        if (kind == CONE_TANGENT)
-            continue;
-        Point point;
-        if (ELLIPTIC && kind == CONE_HEAD)
-            point = cone_point(*(const Cone*)(cones + 4 * row), alpha);
-        else if (kind == FRICTION)
-            point = dry_friction(x[row], v[row], d[row], limit[row], alpha);
-        else
-            point = one_sided(x[row], v[row], d[row], alpha);
-        sum.cost += point.cost;
-        sum.slope += point.slope;
-        sum.curvature += point.curvature;
-        sum.start += point.start;
-    }
-    return sum;
-};
 auto prepare_cone = [&](int head, int size) {
-    const float* const friction = friction_of(head);
     Cone& c = *(Cone*)(cones + 4 * head);
-    c.mu = friction[0] * impratio;
+    c.mu = bound[head];
     c.dm = ratio(d[head], c.mu * c.mu * (1.0f + c.mu * c.mu));
-    c.cost = c.slope = c.half_curvature = 0.0f;
+    c.cost = 0.5f * d[head] * x[head] * x[head];
+    c.slope = d[head] * x[head] * v[head];
+    c.half_curvature = 0.5f * d[head] * v[head] * v[head];
     float uu = 0.0f, uv = 0.0f, vv = 0.0f, aside = 0.0f;
 #pragma unroll 1
-    for (int k = 0; k < size; ++k) {
-        const int row = head + k;
+    for (int row = head + 1; row < head + size; ++row) {
         c.cost += 0.5f * d[row] * x[row] * x[row];
         c.slope += d[row] * x[row] * v[row];
         c.half_curvature += 0.5f * d[row] * v[row] * v[row];
-        if (k == 0)
-            continue;
-        const float u_k = x[row] * friction[k - 1], v_k = v[row] * friction[k - 1];
+        const float u_k = x[row] * bound[row], v_k = v[row] * bound[row];
         uu += u_k * u_k;
         uv += u_k * v_k;
         vv += v_k * v_k;
         // |u|^2 |v|^2 - (u v)^2 as a sum of squares: nothing cancels.
 #pragma unroll 1
-        for (int j = 1; j < k; ++j) {
-            const float minor = (u_k * v[head + j] - x[head + j] * v_k) * friction[j - 1];
+        for (int other = head + 1; other < row; ++other) {
+            const float minor = (u_k * v[other] - x[other] * v_k) * bound[other];
             aside += minor * minor;
         }
     }
@@ -183,234 +163,287 @@ auto prepare_cone = [&](int head, int size) {
     c.tangent = sqrtf(c.along * c.along + c.aside2);
     c.zone = (float)cone_zone(c.u0, c.tangent, c.mu);
 };
+
+// The start. What the rows are is looked up once.
+#pragma unroll 1
+for (int i = lane; i < NV * STEP; i += LANES)
+    mass[i] = 0.0f;
+#pragma unroll 1
+for (int i = lane; i < rows * STEP; i += LANES)
+    J[i] = 0.0f;
+float acc[BLOCKS], ma[BLOCKS], mv[BLOCKS], smooth[BLOCKS], pull[BLOCKS], slopes[BLOCKS], inverse[BLOCKS];
+float h[BLOCKS][NV];
+UNROLL
+for (int b = 0; b < BLOCKS; ++b) {
+    acc[b] = warmstart.data[(size_t)world * warmstart.shape[1] + dof_of(b)];
+    smooth[b] = qfrc_smooth.data[(size_t)world * qfrc_smooth.shape[1] + dof_of(b)];
+    if (is_dof(b))
+        shared[dof_of(b)] = acc[b];
+}
+sync();
+#pragma unroll 4
+for (int k = lane; k < M_row.shape[0]; k += LANES) {
+    const int row = M_row.data[k], col = M_col.data[k];
+    mass[row * STEP + col] = mass[col * STEP + row] = M.data[(size_t)world * M.shape[1] + k];
+}
+#pragma unroll 1
+for (int row = lane; row < rows; row += LANES) {
+    const int at = J_rowadr.data[(size_t)world * J_rowadr.shape[1] + row];
+    const int end = at + J_rownnz.data[(size_t)world * J_rownnz.shape[1] + row];
+    const float* const values = J_values.data + (size_t)world * J_values.shape[1];
+    const int* const cols = J_colind.data + (size_t)world * J_colind.shape[1];
+    float product = 0.0f;
+#pragma unroll 4
+    for (int k = at; k < end; ++k) {
+        J[row * STEP + cols[k]] = values[k];
+        product += values[k] * shared[cols[k]];
+    }
+    x[row] = product - efc_aref.data[(size_t)world * efc_aref.shape[1] + row];
+    d[row] = efc_D.data[(size_t)world * efc_D.shape[1] + row];
+    kinds[row] = row < equalities ? EQUALITY : row < equalities + frictions ? FRICTION : ONE_SIDED;
+    bound[row] = efc_limit.data[(size_t)world * efc_limit.shape[1] + row];
+    if (ELLIPTIC) {
+        const int* const types = efc_type.data + (size_t)world * efc_type.shape[1];
+        const int* const ids = efc_id.data + (size_t)world * efc_id.shape[1];
+        auto is_of_cone = [&](int mate) {
+            return mate >= 0 && mate < rows && types[mate] == ELLIPTIC_CONTACT && ids[mate] == ids[row];
+        };
+        if (is_of_cone(row)) {
+            const float* const friction = (const float*)(contact_friction.data + ids[row]);
+            int before = 0, after = 1;
+            while (is_of_cone(row - before - 1))
+                ++before;
+            while (is_of_cone(row + after))
+                ++after;
+            kinds[row] = before > 0 ? CONE_TANGENT : CONE_HEAD + (after << 8);
+            bound[row] = before > 0 ? friction[before - 1] : friction[0] * impratio;
+        }
+    }
+}
+sync();
+int num_units = 0;
+#pragma unroll 1
+for (int first = 0; first < rows; first += LANES) {
+    const int row = first + lane;
+    const bool counts = row >= equalities && row < rows && (!ELLIPTIC || kinds[row] != CONE_TANGENT);
+#if defined(__CUDA_ARCH__)
+    const unsigned all = __ballot_sync(0xffffffffu, counts);
+    if (counts)
+        units[num_units + __popc(all & ((1u << lane) - 1u))] = row;
+    num_units += __popc(all);
+#else
+    if (counts)
+        units[num_units++] = row;
+#endif
+}
+sync();
+
+// M times the shared vector.
+auto times_mass = [&](float* result) {
+UNROLL
+    for (int b = 0; b < BLOCKS; ++b) {
+        float product = 0.0f;
+UNROLL
+        for (int j = 0; j < NV; ++j) {
+            // What overflows in one tree stays there: zero times infinity would be NaN.
+            const float entry = mass[j * STEP + dof_of(b)];
+            product += entry == 0.0f ? 0.0f : entry * shared[j];
+        }
+        result[b] = product;
+    }
+};
 // The force of a row, and its stiffness in the place of its rate.
 auto push = [&](int row) {
     const int kind = kinds[row] & 255;
     if (kind == CONE_TANGENT)
         return;
     int zone = QUADRATIC;
-    float pull = -d[row] * x[row];
+    float stiffness = d[row], push = -d[row] * x[row];
     if (kind == ONE_SIDED && x[row] >= 0.0f) {
         zone = SATISFIED;
-        pull = 0.0f;
+        push = 0.0f;
     } else if (kind == FRICTION) {
-        const float most = limit[row], reach = ratio(most, d[row]);
+        const float most = bound[row], reach = ratio(most, d[row]);
         zone = x[row] <= -reach ? LINEAR_NEGATIVE : x[row] >= reach ? LINEAR_POSITIVE : QUADRATIC;
-        pull = zone == LINEAR_NEGATIVE ? most : zone == LINEAR_POSITIVE ? -most : pull;
-    } else if (ELLIPTIC && kind == CONE_HEAD) {
-        const float* const friction = friction_of(row);
-        const int size = kinds[row] >> 8;
-        const float mu = friction[0] * impratio, normal = x[row] * mu;
+        push = zone == LINEAR_NEGATIVE ? most : zone == LINEAR_POSITIVE ? -most : push;
+    }
+    if (zone != QUADRATIC)
+        stiffness = 0.0f;
+    if (ELLIPTIC && kind == CONE_HEAD) {
+        const int end = row + (kinds[row] >> 8);
+        const float mu = bound[row], normal = x[row] * mu;
         float tangent2 = 0.0f;
 #pragma unroll 1
-        for (int k = 1; k < size; ++k)
-            tangent2 += x[row + k] * friction[k - 1] * x[row + k] * friction[k - 1];
+        for (int mate = row + 1; mate < end; ++mate)
+            tangent2 += x[mate] * bound[mate] * x[mate] * bound[mate];
         const float tangent = sqrtf(tangent2);
         zone = cone_zone(normal, tangent, mu);
-        if (zone != QUADRATIC)
-            pull = zone == SATISFIED ? 0.0f : -ratio(d[row], mu * mu * (1.0f + mu * mu)) * (normal - mu * tangent) * mu;
-        const float slide = zone == CURVED ? -ratio(pull, tangent) : 0.0f;
+        float spring = 0.0f;
+        if (zone == SATISFIED)
+            push = stiffness = 0.0f;
+        if (zone == CURVED) {
+            const float dm = ratio(d[row], mu * mu * (1.0f + mu * mu));
+            push = dm * (mu * tangent - normal) * mu;
+            spring = push / tangent;
+            stiffness = -dm;
+        }
+        cones[4 * row] = spring;
 #pragma unroll 1
-        for (int k = 1; k < size; ++k) {
-            const int mate = row + k;
-            force[mate] = zone == QUADRATIC ? -d[mate] * x[mate] : slide * x[mate] * friction[k - 1] * friction[k - 1];
-            v[mate] = zone == QUADRATIC ? d[mate] : 0.0f;
+        for (int mate = row + 1; mate < end; ++mate) {
+            const float each = zone == QUADRATIC ? d[mate] : spring * bound[mate] * bound[mate];
+            force[mate] = -each * x[mate];
+            v[mate] = each;
             states[mate] = zone;
         }
     }
-    force[row] = pull;
-    v[row] = zone == QUADRATIC ? d[row] : zone == CURVED ? IS_CURVED : 0.0f;
+    force[row] = push;
+    v[row] = stiffness;
     states[row] = zone;
 };
-auto times_mass = [&](float* result, const float* vector) {
-#pragma unroll 1
-    for (int i = lane; i < NV; i += LANES) {
-        float product = 0.0f;
-#pragma unroll 4
-        for (int k = mulm_rowadr.data[i]; k < mulm_rowadr.data[i + 1]; ++k)
-            product += mass[mulm_adr.data[k]] * vector[mulm_col.data[k]];
-        result[i] = product;
-    }
-};
-auto times_row = [&](int row, const float* vector) {
-    const int at = J_adr[row], end = at + J_nnz[row];
-    float product = 0.0f;
-#pragma unroll 4
-    for (int k = at; k < end; ++k)
-        product += J[k] * vector[J_col[k]];
-    return product;
-};
-// J' force. The rows of a group share their columns, and no two groups are added at once.
+// J' force.
 auto pull_back = [&] {
-#pragma unroll 1
-    for (int i = lane; i < NV; i += LANES) {
-        const int row = frictions > 0 ? friction_row[i] : -1;
-        qfrc[i] = row >= 0 ? force[row] : 0.0f;
-    }
-    sync();
-#pragma unroll 1
-    for (int group = 0; group < groups; ++group) {
-        const int head = heads[group], size = sizes[group], at = J_adr[head], support = J_nnz[head];
-#pragma unroll 1
-        for (int k = lane; k < support; k += LANES) {
-            float pull = 0.0f;
-#pragma unroll 2
-            for (int mate = 0; mate < size; ++mate)
-                pull += force[head + mate] * J[at + mate * support + k];
-            qfrc[J_col[at + k]] += pull;
-        }
-        sync();
+UNROLL
+    for (int b = 0; b < BLOCKS; ++b) {
+        float sum = 0.0f;
+#pragma unroll 4
+        for (int row = 0; row < rows; ++row)
+            sum += J[row * STEP + dof_of(b)] * force[row];
+        pull[b] = sum;
     }
 };
-// H = M + J' D J, and the curvature of the cones that slide.
-auto build_h = [&] {
-#pragma unroll 1
-    for (int i = lane; i < NV * (NV + 1) / 2; i += LANES)
-        h[i] = 0.0f;
-    sync();
-#pragma unroll 2
-    for (int k = lane; k < M_row.shape[0]; k += LANES)
-        h[packed(M_row.data[k], M_col.data[k])] = mass[k];
-    sync();
-    if (frictions > 0) {
-#pragma unroll 1
-        for (int i = lane; i < NV; i += LANES)
-            if (friction_row[i] >= 0)
-                h[packed(i, i)] += v[friction_row[i]];
-        sync();
-    }
-#pragma unroll 1
-    for (int group = 0; group < groups; ++group) {
-        const int head = heads[group], size = sizes[group];
-        const bool curved = ELLIPTIC && v[head] == IS_CURVED;
-        bool active = curved;
-#pragma unroll 1
-        for (int mate = 0; mate < size; ++mate)
-            active = active || v[head + mate] != 0.0f;
-        if (!active)
+auto add_outer_product = [&](float scale, const float* vector) {
+UNROLL
+    for (int b = 0; b < BLOCKS; ++b) {
+        const float weight = scale * vector[dof_of(b)];
+        if (LANES == 1 && weight == 0.0f)
             continue;
-        const int at = J_adr[head], support = J_nnz[head];
-        const float* friction = 0;
-        float mu = 0.0f, dm = 0.0f, flat = 0.0f, stretch = 0.0f, per_tangent = 0.0f;
-        if (ELLIPTIC && curved) {
-            friction = friction_of(head);
-            mu = friction[0] * impratio;
-            dm = ratio(d[head], mu * mu * (1.0f + mu * mu));
-            float tangent2 = 0.0f;
+UNROLL
+        for (int j = b * LANES; j < NV; ++j)
+            h[b][j] += weight * vector[j];
+    }
+};
+// H = M + J' D J. A cone that slides adds, to the springs of its tangents, dm q q' - spring s s', where s is the
+// direction of its slip and q = mu (normal - s).
+auto build_h = [&] {
+UNROLL
+    for (int b = 0; b < BLOCKS; ++b)
+UNROLL
+        for (int j = b * LANES; j < NV; ++j)
+            h[b][j] = mass[j * STEP + dof_of(b)];
 #pragma unroll 1
-            for (int k = 1; k < size; ++k)
-                tangent2 += x[head + k] * friction[k - 1] * x[head + k] * friction[k - 1];
-            per_tangent = 1.0f / wp::max(sqrtf(tangent2), TINY);
-            stretch = mu * x[head] * mu * per_tangent;
-            flat = mu * mu - stretch;
-        }
+    for (int row = 0; row < rows; ++row)
+        if (v[row] > 0.0f)
+            add_outer_product(v[row], J + row * STEP);
+    if (!ELLIPTIC)
+        return;
+    float* const q = columns;
+    float* const s = columns + COLUMN;
 #pragma unroll 1
-        for (int entry = lane; entry < support * (support + 1) / 2; entry += LANES) {
-            const int b = (int)((sqrtf((float)(8 * entry + 1)) - 1.0f) * 0.5f), a = entry - b * (b + 1) / 2;
-            float value = 0.0f;
-            if (ELLIPTIC && curved) {
-                const float normal_a = mu * J[at + a], normal_b = mu * J[at + b];
-                float slide_a = 0.0f, slide_b = 0.0f, dot = 0.0f;
+    for (int unit = 0; unit < num_units; ++unit) {
+        const int head = units[unit];
+        const float dm = -v[head];
+        if (dm <= 0.0f)
+            continue;
+        const float mu = bound[head], by_push = -1.0f / force[head];
+UNROLL
+        for (int b = 0; b < BLOCKS; ++b) {
+            float slip = 0.0f;
 #pragma unroll 1
-                for (int k = 1; k < size; ++k) {
-                    const float z_a = friction[k - 1] * J[at + k * support + a];
-                    const float z_b = friction[k - 1] * J[at + k * support + b];
-                    const float u = x[head + k] * friction[k - 1] * per_tangent;
-                    slide_a += u * z_a;
-                    slide_b += u * z_b;
-                    dot += z_a * z_b;
-                }
-                value = dm * (normal_a * normal_b - mu * (normal_a * slide_b + normal_b * slide_a)
-                              + stretch * slide_a * slide_b + flat * dot);
-            } else {
-#pragma unroll 2
-                for (int mate = 0; mate < size; ++mate)
-                    value += v[head + mate] * J[at + mate * support + a] * J[at + mate * support + b];
+            for (int mate = head + 1; mate < head + (kinds[head] >> 8); ++mate)
+                slip += force[mate] * J[mate * STEP + dof_of(b)];
+            slip *= by_push;
+            if (is_dof(b)) {
+                s[dof_of(b)] = slip;
+                q[dof_of(b)] = mu * (J[head * STEP + dof_of(b)] - slip);
             }
-            const int dof_a = J_col[at + a], dof_b = J_col[at + b];
-            h[packed(wp::max(dof_a, dof_b), wp::min(dof_a, dof_b))] += value;
         }
+        sync();
+        add_outer_product(dm, q);
+        add_outer_product(-cones[4 * head], s);
         sync();
     }
 };
-// Cholesky. A lane owns a row at a time, and all lanes know the diagonal.
+// Cholesky (H = L D L') of the rows of H in place, and y of L y = slopes in the place of the slopes.
 auto factorize = [&] {
-#pragma unroll 1
-    for (int col = 0; col < NV; ++col) {
-        const float* const left = h + packed(col, 0);
-        float* below = h + packed(wp::min(col + 1 + lane, NV), 0);
-        float diag = left[col], entry = below[col];
-#pragma unroll 4
-        for (int k = 0; k < col; ++k) {
-            const float across = left[k];
-            diag -= across * across;
-            // What overflows in one tree stays there: infinity times zero would be NaN.
-            entry -= across == 0.0f ? 0.0f : below[k] * across;
+UNROLL
+    for (int c = 0; c < NV; ++c) {
+        const int own = c / LANES;
+        float* const column = columns + (c & 1) * COLUMN;
+        if (is_dof(own))
+            column[own * LANES + lane] = h[own][c];
+        if (lane == c % LANES) {
+            column[NV] = slopes[own];
+UNROLL
+            for (int j = (own + 1) * LANES; j < NV; ++j)
+                column[j] = h[own][j];
         }
-        const float inverse = 1.0f / sqrtf(wp::max(diag, TINY));
-        if (col + 1 + lane <= NV)
-            below[col] = entry * inverse;
-#pragma unroll 1
-        for (int row = col + 1 + lane + LANES; row <= NV; row += LANES) {
-            below = h + packed(row, 0);
-            entry = below[col];
-#pragma unroll 4
-            for (int k = 0; k < col; ++k)
-                entry -= left[k] == 0.0f ? 0.0f : below[k] * left[k];
-            below[col] = entry * inverse;
-        }
-        if (lane == 0)
-            inverse_diag[col] = inverse;
         sync();
+        const float by_pivot = 1.0f / wp::max(column[c], TINY);
+UNROLL
+        for (int b = own; b < BLOCKS; ++b) {
+            const int row = b * LANES + lane;
+            const float factor = row > c ? (b == own ? h[b][c] : column[dof_of(b)]) * by_pivot : 0.0f;
+            if (row == c)
+                inverse[b] = by_pivot;
+            if (factor != 0.0f)
+                slopes[b] -= factor * column[NV];
+            if (LANES == 1 && factor == 0.0f)
+                continue;
+UNROLL
+            for (int j = wp::max(c + 1, b * LANES); j < NV; ++j)
+                h[b][j] -= factor * column[j];
+        }
     }
 };
-// The negated x of L' x = y.
+// The search direction, the negated solution of D L' x = y, in the place of y and for all lanes to read.
 auto back_substitute = [&] {
-    float* const y = h + packed(NV, 0);
-#pragma unroll 1
-    for (int row = NV - 1; row >= 0; --row) {
-        const float found = y[row] * inverse_diag[row];
-        const float* const left = h + packed(row, 0);
-#pragma unroll 1
-        for (int k = lane; k < row; k += LANES)
-            if (left[k] != 0.0f)
-                y[k] -= left[k] * found;
-        if (lane == 0)
-            search[row] = -found;
-        sync();
+UNROLL
+    for (int c = NV - 1; c > 0; --c) {
+        const int own = c / LANES;
+        const float found = of_lane(slopes[own] * inverse[own], c % LANES);
+UNROLL
+        for (int b = 0; b <= own; ++b)
+            if (b * LANES + lane < c && h[b][c] != 0.0f)
+                slopes[b] -= h[b][c] * found;
     }
+UNROLL
+    for (int b = 0; b < BLOCKS; ++b) {
+        slopes[b] *= -inverse[b];
+        if (is_dof(b))
+            shared[dof_of(b)] = slopes[b];
+    }
+    sync();
+};
+// What the rows cost at a point of the search direction, summed over the units first, first + stride, ...
+auto measure = [&](float alpha, int first, int stride) {
+    Point sum {0.0f, 0.0f, 0.0f, 0.0f};
+#pragma unroll 1
+    for (int unit = first; unit < num_units; unit += stride) {
+        const int row = units[unit], kind = kinds[row] & 255;
+        Point point;
+        if (ELLIPTIC && kind == CONE_HEAD)
+            point = cone_point(*(const Cone*)(cones + 4 * row), alpha);
+        else if (kind == FRICTION)
+            point = dry_friction(x[row], v[row], d[row], bound[row], alpha);
+        else
+            point = one_sided(x[row], v[row], d[row], alpha);
+        sum.cost += point.cost;
+        sum.slope += point.slope;
+        sum.curvature += point.curvature;
+        sum.start += point.start;
+    }
+    return sum;
 };
 auto in_bracket = [](const Point& end, const Point& point) {
     return (end.slope < point.slope && point.slope < 0.0f) || (end.slope > point.slope && point.slope > 0.0f);
 };
 
-// The start: the last acceleration, what it needs, and how far it is from the reference.
+times_mass(ma);
 float trace = 0.0f;
-#pragma unroll 1
-for (int i = lane; i < NV; i += LANES) {
-    acc[i] = warmstart.data[(size_t)world * warmstart.shape[1] + i];
-    trace += mass[M_rowadr.data[i] + M_rownnz.data[i] - 1];
-}
-sync();
+UNROLL
+for (int b = 0; b < BLOCKS; ++b)
+    trace += is_dof(b) ? mass[dof_of(b) * (STEP + 1)] : 0.0f;
 const float scale = 1.0f / wp::max(TINY, total(trace));
-times_mass(ma, acc);
-#pragma unroll 1
-for (int row = lane; row < rows; row += LANES) {
-    x[row] = times_row(row, acc) - efc_aref.data[(size_t)world * efc_aref.shape[1] + row];
-    d[row] = efc_D.data[(size_t)world * efc_D.shape[1] + row];
-    int kind = row < equalities ? EQUALITY : row < equalities + frictions ? FRICTION : ONE_SIDED;
-    if (ELLIPTIC && efc_type.data[(size_t)world * efc_type.shape[1] + row] == ELLIPTIC_CONTACT)
-        kind = CONE_TANGENT;
-    kinds[row] = kind;
-}
-sync();
-if (ELLIPTIC) {
-#pragma unroll 1
-    for (int group = lane; group < groups; group += LANES)
-        if (kinds[heads[group]] == CONE_TANGENT)
-            kinds[heads[group]] = CONE_HEAD + (sizes[group] << 8);
-    sync();
-}
 
 int iteration = 0;
 bool last = false;
@@ -421,20 +454,19 @@ while (true) {
     sync();
     pull_back();
     float gradient2 = 0.0f;
-#pragma unroll 1
-    for (int i = lane; i < NV; i += LANES) {
-        const float slope = ma[i] - smooth[i] - qfrc[i];
-        h[packed(NV, i)] = slope;
-        gradient2 += slope * slope;
+UNROLL
+    for (int b = 0; b < BLOCKS; ++b) {
+        slopes[b] = ma[b] - smooth[b] - pull[b];
+        gradient2 += is_dof(b) ? slopes[b] * slopes[b] : 0.0f;
     }
     if (last || (iteration > 0 && scale * sqrtf(total(gradient2)) < tolerance))
         break;
     build_h();
     factorize();
     float decrement = 0.0f;
-#pragma unroll 1
-    for (int i = lane; i < NV; i += LANES)
-        decrement += h[packed(NV, i)] * h[packed(NV, i)];
+UNROLL
+    for (int b = 0; b < BLOCKS; ++b)
+        decrement += is_dof(b) ? slopes[b] * slopes[b] * inverse[b] : 0.0f;
     if (iteration > 0 && 0.5f * scale * total(decrement) < tolerance)
         break;
     if (iteration == iterations) {
@@ -442,19 +474,22 @@ while (true) {
             overflow.data[world] |= OUT_OF_ITERATIONS;
         break;
     }
-    sync();
     back_substitute();
-    times_mass(mv, search);
+    times_mass(mv);
     float search2 = 0.0f, slope = 0.0f, half_curvature = 0.0f;
-#pragma unroll 1
-    for (int i = lane; i < NV; i += LANES) {
-        search2 += search[i] * search[i];
-        slope += search[i] * (ma[i] - smooth[i]);
-        half_curvature += 0.5f * search[i] * mv[i];
-    }
+UNROLL
+    for (int b = 0; b < BLOCKS; ++b)
+        if (is_dof(b)) {
+            search2 += slopes[b] * slopes[b];
+            slope += slopes[b] * (ma[b] - smooth[b]);
+            half_curvature += 0.5f * slopes[b] * mv[b];
+        }
 #pragma unroll 1
     for (int row = lane; row < rows; row += LANES) {
-        const float rate = times_row(row, search);
+        float rate = 0.0f;
+UNROLL
+        for (int j = 0; j < NV; ++j)
+            rate += J[row * STEP + j] * shared[j];
         v[row] = rate;
         if (row < equalities) {
             slope += d[row] * rate * x[row];
@@ -467,9 +502,9 @@ while (true) {
     half_curvature = total(half_curvature);
     if (ELLIPTIC) {
 #pragma unroll 1
-        for (int row = lane; row < rows; row += LANES)
-            if ((kinds[row] & 255) == CONE_HEAD)
-                prepare_cone(row, kinds[row] >> 8);
+        for (int unit = lane; unit < num_units; unit += LANES)
+            if ((kinds[units[unit]] & 255) == CONE_HEAD)
+                prepare_cone(units[unit], kinds[units[unit]] >> 8);
         sync();
     }
 
@@ -580,11 +615,10 @@ while (true) {
         if (!moved || low_is_flat || high_is_flat)
             break;
     }
-
-#pragma unroll 1
-    for (int i = lane; i < NV; i += LANES) {
-        acc[i] += alpha * search[i];
-        ma[i] += alpha * mv[i];
+UNROLL
+    for (int b = 0; b < BLOCKS; ++b) {
+        acc[b] += alpha * slopes[b];
+        ma[b] += alpha * mv[b];
     }
 #pragma unroll 1
     for (int row = lane; row < rows; row += LANES)
@@ -594,14 +628,16 @@ while (true) {
     last = rows == 0 || alpha == 0.0f || (improvement > 0.0f && scale * improvement < tolerance);
 }
 
-#pragma unroll 1
-for (int i = lane; i < NV; i += LANES) {
-    qacc.data[(size_t)world * qacc.shape[1] + i] = acc[i];
-    efc_Ma.data[(size_t)world * efc_Ma.shape[1] + i] = ma[i];
-    qfrc_constraint.data[(size_t)world * qfrc_constraint.shape[1] + i] = qfrc[i];
-}
+UNROLL
+for (int b = 0; b < BLOCKS; ++b)
+    if (is_dof(b)) {
+        qacc.data[(size_t)world * qacc.shape[1] + dof_of(b)] = acc[b];
+        efc_Ma.data[(size_t)world * efc_Ma.shape[1] + dof_of(b)] = ma[b];
+        qfrc_constraint.data[(size_t)world * qfrc_constraint.shape[1] + dof_of(b)] = pull[b];
+    }
 #pragma unroll 1
 for (int row = lane; row < rows; row += LANES)
     efc_force.data[(size_t)world * efc_force.shape[1] + row] = force[row];
 if (lane == 0)
     solver_niter.data[world] = iteration;
+#undef UNROLL

@@ -22,6 +22,7 @@ from ksim_rl.physics.fields import (
 )
 from ksim_rl.physics.graphs import WarpGraphs
 from ksim_rl.physics.height_fields import take_over_height_fields
+from ksim_rl.physics.kernel_loading import loaded_together
 from ksim_rl.physics.masked_constants import MaskedConstants
 from ksim_rl.physics.model_checks import check_not_simple, warp_model_of
 from ksim_rl.physics.nan_guard import NanGuard, NanReport
@@ -111,6 +112,7 @@ class World(views.DataViews):
                 self._nan_guard = NanGuard(self.sim.nan_guard, self.mj_model, self.warp_data_E, self._fields)
         self.gravity_EL = gravity_EL
         super().__init__(self.warp_data_E)
+        self._load_kernels()
         self.refresh()
 
     @property
@@ -303,6 +305,14 @@ class World(views.DataViews):
             if hasattr(self, name):
                 delattr(self, name)
         self.drop_views()
+
+    def _load_kernels(self) -> None:
+        """Compile and load what steps, refreshes and resets launch, before any of them runs."""
+        with warp_scope(self.device), loaded_together(self.device):
+            for sensors in (False, True):
+                self._launch_substep(sensors=sensors)
+            self._substeps.refresh()
+            self._launch_reset()
 
     def _prepare_constants(self, expanded: Sequence[str]) -> MaskedConstants | None:
         groups = const_groups(expanded)

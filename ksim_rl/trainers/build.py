@@ -55,7 +55,7 @@ def build(
     torch.set_num_threads(cfg.trainer.num_threads or max(1, (os.cpu_count() or 1) - 1))
 
     env = build_env(cfg, num_envs=cfg.num_envs, seed=cfg.task.seed if cfg.task.seed is not None else cfg.seed)
-    update = make_update(cfg, env)
+    update = make_update(cfg, env, resumed=resume_from.state["update"] if resume_from else None)
     collector = RolloutCollector(
         env,
         update.behavior,

@@ -10,11 +10,12 @@ Config = dict[str, Any]
 
 
 def _from_1(state: State, config: Config) -> tuple[State, Config]:
-    """Version 2 keeps the state of a user's hooks, and the config in its own order; version 1 sorted it by name.
+    """Version 2 keeps the states of hooks and of recurrent networks, and the config in its own order.
 
-    The order of the observation terms is what networks read. It is that of the columns, which version 1 had.
+    Version 1 had neither and sorted the config by name. What networks read stands in the order of the observation
+    terms, and that is the order of the columns, which version 1 kept.
     """
-    state = {**state, "hooks": {}}
+    state = {**state, "hooks": {}, "update": {**state.get("update", {}), "recurrent_state": {}}}
     task = config.get("task", {})
     observations = {
         name: _in_order_of(group, state.get("observation_columns", {}).get(name, {}))

@@ -23,7 +23,7 @@ from ksim_rl.modules import (
     SharedTrunkCfg,
     SquashedActorCfg,
 )
-from ksim_rl.objectives import PPOCfg, SACCfg, TD3Cfg
+from ksim_rl.objectives import AMPCfg, DistillationCfg, PPOCfg, SACCfg, TD3Cfg
 from ksim_rl.trainers.loggers import LoggerCfg
 from ksim_rl.trainers.trainer_cfg import TrainerCfg
 
@@ -63,10 +63,11 @@ class ModulesCfg:
         """Whether a network has a memory."""
         return self.recurrent_actor is not None or self.recurrent_critic is not None
 
-    def observation_keys(self) -> list[ObservationKey]:
-        """Return what the networks read of an EnvState."""
+    def observation_keys(self, *names: str) -> list[ObservationKey]:
+        """Return what the networks read of an EnvState; given "actor" or "critic", what that one reads."""
         shared = () if self.trunk is None else self.trunk.in_keys
-        keys = dict.fromkeys((*shared, *self._read_by("actor"), *self._read_by("critic")))
+        own = [key for name in names or ("actor", "critic") for key in self._read_by(name)]
+        keys = dict.fromkeys((*shared, *own))
         return [key for key in keys if key != FEATURES]
 
     def _read_by(self, name: str) -> tuple[ObservationKey, ...]:
@@ -96,7 +97,7 @@ class RunCfg:
     seed: int = 1
     checkpoint: str | None = None
     collector: CollectorCfg = field(default_factory=CollectorCfg)
-    objective: PPOCfg | SACCfg | TD3Cfg = field(default_factory=PPOCfg)
+    objective: PPOCfg | AMPCfg | DistillationCfg | SACCfg | TD3Cfg = field(default_factory=PPOCfg)
     modules: ModulesCfg = field(default_factory=ModulesCfg)
     trainer: TrainerCfg = field(default_factory=TrainerCfg)
     logger: LoggerCfg = field(default_factory=LoggerCfg)
@@ -117,10 +118,11 @@ class RunCfg:
                 "set num_envs, which sets both"
             )
         groups = {key for key in self.modules.observation_keys() if isinstance(key, str)}
+        groups |= {self.objective.style_group} if isinstance(self.objective, AMPCfg) else set()
         missing = sorted(groups - set(self.task.observations))
         if missing:
             raise ValueError(
-                f"task.observations has no group {missing[0]!r}, which modules.*.in_keys name: "
+                f"task.observations has no group {missing[0]!r}, which modules.*.in_keys or objective.style_group name: "
                 f"{near(missing[0], self.task.observations)}"
             )
         self.data.rollout_length(self.num_envs)
@@ -128,7 +130,7 @@ class RunCfg:
 
     def _check_sequences(self) -> None:
         """Refuse sequences where nothing remembers, memories without sequences, and sizes that do not fit."""
-        ppo = self.objective if isinstance(self.objective, PPOCfg) else None
+        on_sequences = isinstance(self.objective, (PPOCfg, DistillationCfg))
         if not self.modules.recurrent:
             if isinstance(self.data, DatasetCfg) and (self.data.sequence_length or self.data.burn_in):
                 raise ValueError(
@@ -136,14 +138,15 @@ class RunCfg:
                     "networks with a memory learn on sequences; use modules=lstm or modules=gru, or null and 0"
                 )
             return
-        if ppo is None or not isinstance(self.data, DatasetCfg):
+        if not on_sequences or not isinstance(self.data, DatasetCfg):
             raise ValueError(
                 f"modules.recurrent_actor or recurrent_critic is set, and {type(self.objective).__name__} learns on "
-                "single env states: set both to null, or use objective=ppo"
+                "single env states: set both to null, or use objective=ppo, amp or distillation"
             )
-        if ppo.symmetry != "none":
+        symmetry = getattr(self.objective, "symmetry", "none")
+        if symmetry != "none":
             raise ValueError(
-                f"objective.symmetry={ppo.symmetry!r}: the state of a memory has no known mirror image; use none, or "
+                f"objective.symmetry={symmetry!r}: the state of a memory has no known mirror image; use none, or "
                 "modules=mlp"
             )
         sequence_length(

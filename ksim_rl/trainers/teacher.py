@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,26 +20,19 @@ MakePolicy = Callable[[RunCfg, EnvBase], TensorDictModuleBase]
 
 @dataclass(frozen=True, kw_only=True)
 class Teacher:
-    """A policy that does not change, with what a checkpoint says of it.
+    """A policy that does not change.
 
     Attributes:
         policy: the network, its normalizers included.
-        cfg: of its run.
-        columns: which columns of its groups belong to which term.
+        description: the config of its run and the columns of what it reads, as JSON: enough to build it once more.
     """
 
     policy: TensorDictModuleBase
-    cfg: RunCfg
-    columns: Mapping[str, Any]
+    description: Mapping[str, str] = field(default_factory=dict)
 
     def state_dict(self) -> state_tree.State:
-        """Return weights and config: `restored_teacher` builds the same one, without the folder of its run."""
-        return {
-            "actor": self.policy.state_dict(),
-            # As text, because lists of a config may hold more than plain data.
-            "config": json.dumps(self.cfg.to_tree()),
-            "columns": json.dumps(self.columns),
-        }
+        """Return weights and description: `restored_teacher` builds the same one, without the folder of its run."""
+        return {"actor": self.policy.state_dict(), **self.description}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Take the weights of a `state_dict`; tensors keep their addresses.
@@ -54,6 +47,8 @@ def load_teacher(path: Path, env: EnvBase, *, cfg: RunCfg, make_policy: MakePoli
     """Read the policy of a run folder or a checkpoint, for the env of a student.
 
     Args:
+        path: the folder, or one of its checkpoints.
+        env: that the student acts in, and that shows what the teacher reads.
         cfg: of the student's run, for the device.
         make_policy: builds the policy of a run.
 
@@ -76,29 +71,21 @@ def load_teacher(path: Path, env: EnvBase, *, cfg: RunCfg, make_policy: MakePoli
 def restored_teacher(
     state: Mapping[str, Any], env: EnvBase, *, cfg: RunCfg, make_policy: MakePolicy
 ) -> Teacher:
-    """Build the teacher of a `Teacher.state_dict`.
-
-    Raises:
-        ValueError: as `load_teacher`.
-    """
+    """Build the teacher of a `Teacher.state_dict`; see `load_teacher`."""
     teacher_cfg = RunCfg.from_tree({**json.loads(state["config"]), "device": str(cfg.resolved_device())})
-    columns = json.loads(state["columns"])
-    read = teacher_cfg.modules.actor_keys()
-    groups = [key for key in read if isinstance(key, str)]
-    own: Any = observation_columns(env)
+    read = teacher_cfg.modules.observation_keys("actor")
+    theirs, ours = json.loads(state["columns"]), observation_columns(env)
     shown: Any = env.observation_spec
-    missing = [key for key in read if key not in shown.keys(True)]
-    if missing:
-        raise ValueError(
-            f"the teacher reads {missing[0]!r}, and this env shows {', '.join(map(repr, own))}: add the group to "
-            "task.observations as the teacher's run has it"
-        )
-    check_columns(
-        {group: columns[group] for group in groups if group in columns},
-        {group: own[group] for group in groups if group in own},
-    )
+    for key in read:
+        if key not in shown.keys(True):
+            raise ValueError(
+                f"the teacher reads {key!r}, and this env shows {', '.join(map(repr, ours))}: add it to "
+                "task.observations as the teacher's run has it"
+            )
+    check_columns(*({key: columns[key] for key in read if key in columns} for columns in (theirs, ours)))
     policy = make_policy(teacher_cfg, env)
     if memories(policy):
-        raise ValueError("the teacher has a memory, and labels single env states: use a teacher without one")
+        raise ValueError("the teacher has a memory, and has to label single env states: take one without")
     state_tree.copy_into(policy.state_dict(), state["actor"], what="teacher")
-    return Teacher(policy=policy.requires_grad_(False).eval(), cfg=teacher_cfg, columns=columns)
+    description = {name: state[name] for name in ("config", "columns")}
+    return Teacher(policy=policy.requires_grad_(False).eval(), description=description)

@@ -312,7 +312,14 @@ class Trainer:
         # A first reset allocates what the collector and the transforms keep, before the saved values go in.
         self.collector.reset()
         self.update.load_state_dict(state["update"])
-        self.collector.env.load_state_dict(state["env"])
+        try:
+            self.collector.env.load_state_dict(state["env"])
+        except RuntimeError as error:  # what torch raises for names and shapes
+            reason = " ".join(str(error).split())
+            raise ValueError(
+                f"the checkpoint is of another env, or of one that an earlier ksim_rl built: {reason} Its networks may "
+                "still fit: ksim-rl train checkpoint=RUN"
+            ) from error
         self.collector.load_state_dict(state["collector"])
         for index, hook in enumerate(self._own_hooks):
             hook.load_state_dict(state["hooks"][str(index)])

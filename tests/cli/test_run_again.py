@@ -109,14 +109,14 @@ def test_weights_that_are_not_there_are_one_line(tmp_path, capsys):
     assert "no checkpoint here; expected a run folder" in capsys.readouterr().err
 
 
-def test_a_sweep_over_two_axes_of_a_run_made_again(first, tmp_path):
-    axes = ("seed=1,2", "objective.clip_epsilon=0.1,0.2", "trainer.num_iterations=1")
+def test_a_sweep_of_a_run_made_again(first, tmp_path):
+    axes = ("seed=1", "objective.clip_epsilon=0.1,0.2", "trainer.num_iterations=1")
     assert run("--multirun", "--config-dir", str(first), *axes, f"hydra.sweep.dir={tmp_path}") == 0
     found = sorted(
         (config["seed"], config["objective"]["clip_epsilon"])
         for config in (checkpoint.load(checkpoint.latest(f)).config for f in tmp_path.iterdir() if f.is_dir())
     )
-    assert found == [(1, 0.1), (1, 0.2), (2, 0.1), (2, 0.2)]
+    assert found == [(1, 0.1), (1, 0.2)]
 
 
 @pytest.mark.full

@@ -1,4 +1,4 @@
-"""Gymnasium's pendulum (`Pendulum-v1`) for many envs at once in pure torch, so that learning is tested without physics."""
+"""Gymnasium's pendulum (`Pendulum-v1`) for many envs in pure torch, so that learning is tested without physics."""
 
 import math
 

@@ -3,9 +3,10 @@
 import pytest
 import torch
 
+from ksim_rl import conf
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.objectives import SACCfg, TD3Cfg
-from ksim_rl.trainers import Evaluator
+from ksim_rl.trainers import Evaluator, build
 from tests.trainers.off_policy_problem import make_update
 from tests.trainers.pendulum_env import LENGTH, SOLVED_AT, PendulumEnv
 
@@ -46,3 +47,10 @@ def test_swings_a_pendulum_up(name):
             if best > SOLVED_AT:
                 break
     assert best > SOLVED_AT
+
+
+@pytest.mark.full
+def test_a_task_is_solved():
+    overrides = ["task=pendulum_swingup", "objective=fast_td3", "device=cpu", "logger=none"]
+    outcome = build(conf.compose([*overrides, "trainer.eval_episodes=20"])).train()
+    assert outcome.solved, outcome

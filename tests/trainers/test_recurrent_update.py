@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.modules import set_recurrent_mode
 
 from ksim_rl import conf
@@ -101,8 +102,6 @@ def test_values_are_those_of_a_critic_that_walks_along_with_the_env(trainer):
 
 
 def _nested(state_E):
-    from tensordict import TensorDict
-
     first = next(iter(state_E.values()))
     return TensorDict(dict(state_E.items()), batch_size=first.shape[:1])
 
@@ -140,6 +139,18 @@ def test_only_the_critic_may_remember():
     trainer = make("modules=lstm", "~modules.recurrent_actor.hidden_dim", "modules.recurrent_actor=null")
     trainer.train()
     assert memories(trainer.update.actor) == [] and len(memories(trainer.update.critic)) == 1
+
+
+def test_memories_above_a_shared_trunk_with_targets_that_follow_the_policy():
+    memory = "{kind: gru, hidden_dim: 6, num_layers: 1}"
+    overrides = ["modules=shared_trunk", f"modules.recurrent_actor={memory}"]
+    overrides += [f"modules.recurrent_critic={memory}", "objective.advantage=vtrace"]
+    cfg = conf.compose([*(o for o in SMALL if "hidden_dim=" not in o), *overrides])
+    trainer = build(cfg)
+    for _ in range(2):
+        trainer.iterate()
+    metrics = trainer.update.metrics()
+    assert metrics["update/skipped_steps"] == 0 and 0.0 < metrics["update/kl"] < 0.1
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """N iterations at a stretch equal N/2, a checkpoint, and N/2 in new objects: every tensor, bit for bit."""
 
+import json
 import subprocess
 import sys
 
@@ -69,6 +70,22 @@ def test_evaluating_does_not_change_the_run():
     assert_same(trained(iterations=3), trained(iterations=3, eval_interval=1))
 
 
+def test_a_checkpoint_of_version_1_resumes_bit_for_bit(tmp_path):
+    straight = trained(iterations=4)
+    trained(tmp_path, iterations=2)
+    manifest_path = checkpoint.latest(tmp_path) / checkpoint.MANIFEST
+    manifest = json.loads(manifest_path.read_text())["manifest"]
+    # What version 1 did not have; its config was sorted by name.
+    for path in ("/hooks", "/update/recurrent_state"):
+        del manifest["values"][path]
+    manifest |= {"format_version": 1}
+    manifest_path.write_bytes(checkpoint._seal(json.loads(json.dumps(manifest, sort_keys=True))))
+    resumed = make_trainer(iterations=4, seed=123)
+    resumed.load(tmp_path)
+    resumed.train()
+    assert_same(straight, resumed)
+
+
 def test_a_checkpoint_of_another_network_is_refused_with_both_shapes(tmp_path):
     make_trainer(tmp_path, iterations=1).train()
     saved = checkpoint.load(checkpoint.latest(tmp_path))
@@ -86,6 +103,21 @@ def test_a_checkpoint_of_other_observations_is_refused(tmp_path):
     saved.state["observation_columns"] = {"actor": {"obs/height": [0, 1]}}
     with pytest.raises(ValueError, match="other observations: .*only the checkpoint has obs/height"):
         make_trainer().load_state_dict(saved.state)
+
+
+def test_a_checkpoint_of_another_transform_is_refused_and_its_networks_still_fit(tmp_path):
+    trained(tmp_path, iterations=2)
+    saved = checkpoint.load(checkpoint.latest(tmp_path))
+    env = saved.state["env"]
+    name = next(name for name in env if name.startswith("transform."))
+    saved.state["env"] = {other: value for other, value in env.items() if other != name}
+    with pytest.raises(ValueError, match="another env.*ksim-rl train checkpoint=RUN"):
+        make_trainer().load_state_dict(saved.state)
+    fresh = make_trainer(seed=5)
+    fresh.load_weights(tmp_path)
+    assert fresh.iteration == 0
+    for key, value in fresh.update.actor.state_dict().items():
+        assert torch.equal(value, saved.state["update"]["actor"][key])
 
 
 def test_a_resumed_run_in_real_physics_is_bit_identical(tmp_path):

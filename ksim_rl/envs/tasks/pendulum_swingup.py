@@ -83,6 +83,32 @@ SWINGUP = Task(
         "trainer.num_iterations": 150,
         "trainer.eval_interval": 10,
     },
+    # Few envs, small networks and small minibatches, for a CPU.
+    training_by_objective={
+        "fast_td3": {
+            "num_envs": 16,
+            "data.num_env_states_per_minibatch": 256,
+            "data.num_minibatches": 32,
+            "data.num_steps": 8,
+            "data.capacity": 4000,
+            "data.learning_starts": 64,
+            "objective.gamma": 0.98,
+            "objective.tau": 0.02,
+            "objective.critic_learning_rate": 1e-3,
+            "objective.actor_learning_rate": 1e-3,
+            "objective.exploration_noise_min": 0.05,
+            "objective.exploration_noise_max": 0.5,
+            "objective.target_noise": 0.05,
+            "objective.weight_decay": 0.0,
+            "modules.actor.hidden_dims": [64, 64],
+            "modules.critic.hidden_dims": [128, 128],
+            # Rewards lie in [0, 1], returns in [0, 50].
+            "modules.critic.v_min": -5.0,
+            "modules.critic.v_max": 55.0,
+            "trainer.num_iterations": 400,
+            "trainer.eval_interval": 50,
+        },
+    },
     # Upright and at rest from 3 s on, on average over all starts (850 of 1000 steps), with nothing before that.
     solved_at=850.0,
 )
