@@ -13,6 +13,7 @@ usage: ksim-rl <command> [arguments]
   resume   continue a run:          ksim-rl resume RUN
   eval     evaluate a policy:       ksim-rl eval RUN --episodes 100
   play     record a video:          ksim-rl play RUN --seconds 10
+  warmup   compile ahead of time:   ksim-rl warmup task=go1_velocity_flat device=cuda
   envs     list the tasks, or print what one is made of: ksim-rl envs cartpole_swingup
 
 RUN is a run folder (its newest checkpoint) or one of its checkpoints.
@@ -21,7 +22,7 @@ RUN is a run folder (its newest checkpoint) or one of its checkpoints.
 exit codes: 0 done (and solved, or its target met, where there is one), 1 not solved, 2 refused: the command or its
 configuration is wrong, 3 the run failed, 130 / 143 interrupted and saved (SIGINT / SIGTERM)"""
 
-COMMANDS = ("train", "resume", "eval", "play", "envs")
+COMMANDS = ("train", "resume", "eval", "play", "warmup", "envs")
 REFUSED, FAILED = 2, 3
 
 
@@ -58,6 +59,10 @@ def _dispatch(arguments: list[str]) -> int:
         from ksim_rl.cli.train import train
 
         return train(rest)
+    if command == "warmup":
+        from ksim_rl.cli.warmup import warmup
+
+        return warmup(rest)
     if command in COMMANDS:
         from ksim_rl.cli import run_commands
 

@@ -85,7 +85,8 @@ def training_defaults(name: str) -> dict[str, Any]:
         "num_envs": task.cfg().scene.num_envs,
         "task": {"scene": {"num_envs": "${num_envs}"}, "seed": "${seed}"},
     }
-    return _with(tree, {key: value for key, value in task.training.items() if _group(key) not in TAKEN_FROM_PPO[PPO]})
+    of_all = {key: value for key, value in task.training.items() if _group(key) not in TAKEN_FROM_PPO[PPO]}
+    return _with(tree, of_all)
 
 
 def objective_defaults(name: str, objective: str) -> dict[str, Any]:

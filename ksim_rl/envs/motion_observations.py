@@ -53,7 +53,9 @@ def observe_motion(env: EnvBase, *, group: str, file: str) -> Tensor:
     # The least bit more, so that rounding does not cost the last frame.
     frames = 1 + int(duration_s / base.step_dt + 1e-6)
     if frames < 2:
-        raise ValueError(f"motion {file}: lasts {duration_s:g} s, less than an env step of {base.step_dt:g} s")
+        raise ValueError(
+            f"motion {file}: lasts {duration_s:g} s, less than an env step of {base.step_dt:g} s"
+        )
     ground = PlaneTerrain() if cfg.scene.terrain is not None else None
     played = dataclasses.replace(
         cfg,

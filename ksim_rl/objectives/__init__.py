@@ -22,7 +22,7 @@ from ksim_rl.objectives.ppo_step import (
     make_symmetric,
     ppo_step,
 )
-from ksim_rl.objectives.precision import in_precision
+from ksim_rl.objectives.precision import in_precision, with_precision_of
 from ksim_rl.objectives.rollout_estimator import RolloutEstimator
 from ksim_rl.objectives.sac_loss import SACLoss
 from ksim_rl.objectives.step_guard import NonFiniteStepsError, StepGuard, clip_and_guard
@@ -75,4 +75,5 @@ __all__ = [
     "ppo_step",
     "project_distribution",
     "style_reward",
+    "with_precision_of",
 ]

@@ -5,20 +5,21 @@ from dataclasses import dataclass
 from ksim_rl.checks import check_choice, check_in_range
 from ksim_rl.objectives.ppo_cfg import SCHEDULES
 
-LOSSES = ("mse", "kl")
+LOSSES = ("kl", "mse")
 
 
 @dataclass(frozen=True, kw_only=True)
 class DistillationCfg:
     """A student learns to act as a teacher does in the states that the student itself visits.
 
-    That is DAgger (Ross et al., arXiv 1011.0686), with the env states of the newest rollout alone: with thousands of envs
-    these are as many as the aggregate of the paper.
+    That is DAgger (Ross et al., arXiv 1011.0686) without its aggregate of all data: the newest rollout of thousands of
+    envs stands for it.
 
     Attributes:
         teacher: a run folder or a checkpoint, whose policy is the teacher.
-        loss: "mse", of the actions that both take deterministically, without noise while it collects; or "kl", the
-            divergence of the student's distribution from the teacher's, which also learns how actions scatter.
+        loss: "kl", the divergence of the student's distribution from the teacher's, which also learns how actions
+            scatter; or "mse", of the actions that both take deterministically, without noise while the student
+            collects, for teachers without a distribution or with another kind of it.
         num_epochs: passes over each rollout.
         teacher_share: the chance that the teacher acts instead of the student, in each env state of the first rollout.
         teacher_share_decay: factor of it from rollout to rollout.
@@ -33,7 +34,7 @@ class DistillationCfg:
     """
 
     teacher: str = ""
-    loss: str = "mse"
+    loss: str = "kl"
     num_epochs: int = 2
     teacher_share: float = 0.0
     teacher_share_decay: float = 0.95

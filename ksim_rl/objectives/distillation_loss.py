@@ -45,7 +45,7 @@ class DistillationLoss(nn.Module):
         actor_network: ProbabilisticTensorDictSequential,
         teacher: TensorDictModuleBase,
         *,
-        loss: str = "mse",
+        loss: str = "kl",
     ) -> None:
         super().__init__()
         check_choice("loss", loss, LOSSES)
@@ -103,7 +103,9 @@ class DistillationLoss(nn.Module):
             (teacher,) = self._teacher
             divergence = policy_kl(teacher.build_dist_from_params(labels_B), student)
             if divergence is None:
-                raise ValueError("loss='kl': teacher and student have distributions of different kinds")
+                raise ValueError(
+                    "loss='kl': teacher and student have distributions of different kinds; use loss='mse'"
+                )
             loss_B = divergence
         with torch.no_grad():
             moved = None if before is None else policy_kl(before, student)

@@ -1,9 +1,21 @@
-"""A loss whose matrix products take fewer bits."""
+"""In how many bits a loss multiplies matrices."""
+
+import dataclasses
 
 import torch
 from tensordict import TensorDictBase
 
+from ksim_rl.objectives.ppo_cfg import PPOCfg
 from ksim_rl.objectives.symmetry import Loss
+
+
+def with_precision_of(cfg: PPOCfg, device: torch.device | str) -> PPOCfg:
+    """Return `cfg` with the precision that "auto" stands for on a device: "bfloat16" on CUDA, else "float32"."""
+    if cfg.precision != "auto":
+        return cfg
+    return dataclasses.replace(
+        cfg, precision="bfloat16" if torch.device(device).type == "cuda" else "float32"
+    )
 
 
 def in_precision(loss: Loss, precision: str, *, device: torch.device | str) -> Loss:

@@ -32,7 +32,7 @@ def loaded_together(device: torch.device) -> Iterator[None]:
     def note(kernel: wp.Kernel, dim: Any, block_dim: int | None) -> None:
         size = dim if isinstance(dim, (tuple, list)) else (dim,)
         if all(size) and not kernel.is_generic:
-            modules[block_dim][kernel.module] = None
+            modules[None if device.type == "cpu" else block_dim][kernel.module] = None
 
     with _lock:
         launch, launch_tiled, capture_while = wp.launch, wp.launch_tiled, wp.capture_while
@@ -40,7 +40,7 @@ def loaded_together(device: torch.device) -> Iterator[None]:
         def noted(kernel: wp.Kernel, dim: Any, *args: Any, **kwargs: Any) -> Any:
             if threading.get_ident() != thread:
                 return launch(kernel, dim, *args, **kwargs)
-            return note(kernel, dim, kwargs.get("block_dim", 256))
+            return note(kernel, dim, kwargs.get("block_dim"))
 
         def noted_tiled(kernel: wp.Kernel, dim: Any, *args: Any, **kwargs: Any) -> Any:
             if threading.get_ident() != thread:

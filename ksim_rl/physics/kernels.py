@@ -8,11 +8,34 @@ import warp as wp
 
 
 @wp.kernel(enable_backward=False)
-def zero_rows(mask: wp.array[bool], rows: wp.array2d[float]):
-    """Zero the rows of the worlds that `mask` names."""
+def zero_rows(
+    mask: wp.array[bool],
+    rows_0: wp.array2d[float],
+    rows_1: wp.array2d[float],
+    rows_2: wp.array2d[float],
+    rows_3: wp.array2d[float],
+    rows_4: wp.array2d[float],
+    rows_5: wp.array2d[float],
+    rows_6: wp.array2d[float],
+):
+    """Zero the rows of the worlds that `mask` names in all arrays; the launch is as wide as the widest."""
     world, i = wp.tid()
-    if mask[world]:
-        rows[world, i] = 0.0
+    if not mask[world]:
+        return
+    if i < rows_0.shape[1]:
+        rows_0[world, i] = 0.0
+    if i < rows_1.shape[1]:
+        rows_1[world, i] = 0.0
+    if i < rows_2.shape[1]:
+        rows_2[world, i] = 0.0
+    if i < rows_3.shape[1]:
+        rows_3[world, i] = 0.0
+    if i < rows_4.shape[1]:
+        rows_4[world, i] = 0.0
+    if i < rows_5.shape[1]:
+        rows_5[world, i] = 0.0
+    if i < rows_6.shape[1]:
+        rows_6[world, i] = 0.0
 
 
 @wp.kernel(enable_backward=False)

@@ -44,12 +44,12 @@ ACCELERATION_STAGE = (
 
 
 def float_rows(warp_data_E: mjw.Data, names: tuple[str, ...]) -> list[wp.array]:
-    """Return the named arrays as rows of floats, one per world, on the same memory."""
+    """Return the named arrays as rows of floats, one per world, on the same memory; without elements, no columns."""
     rows = []
     for name in names:
         tensor = wp.to_torch(getattr(warp_data_E, name))
-        if tensor.numel():
-            rows.append(wp.from_torch(tensor.view(tensor.shape[0], -1), dtype=wp.float32))
+        width = tensor.numel() // warp_data_E.nworld
+        rows.append(wp.from_torch(tensor.reshape(warp_data_E.nworld, width), dtype=wp.float32))
     return rows
 
 

@@ -11,7 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from ksim_rl.checks import check_choice, unknown_name
-from ksim_rl.physics import capacity, kernels, newton, state, views
+from ksim_rl.physics import capacity, kernels, state, views
 from ksim_rl.physics.fields import (
     FIXED,
     GRAVITY,
@@ -28,6 +28,7 @@ from ksim_rl.physics.model_checks import check_not_simple, warp_model_of
 from ksim_rl.physics.nan_guard import NanGuard, NanReport
 from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
 from ksim_rl.physics.sim_cfg import SimCfg
+from ksim_rl.physics.solver_choice import takes_conditional_nodes, takes_one_kernel
 from ksim_rl.physics.streams import checked_device, warp_scope
 from ksim_rl.physics.substeps import Substeps
 
@@ -72,10 +73,8 @@ class World(views.DataViews):
         expanded = fields_to_expand(per_world_fields)
         check_not_simple(self.mj_model, expanded)
         self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
-        self.has_one_kernel_solver = (
-            self.sim.one_kernel_solver
-            and not self.sim.deterministic
-            and newton.suits(self.mj_model, njmax=self.njmax)
+        self.has_one_kernel_solver = takes_one_kernel(
+            self.mj_model, self.sim, njmax=self.njmax, device=self.device
         )
         if self.has_one_kernel_solver:
             self.mj_model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
@@ -87,8 +86,10 @@ class World(views.DataViews):
             self.warp_model.opt.deterministic = self.sim.deterministic
             if self.sim.tolerance is not None:
                 self.warp_model.opt.tolerance.fill_(self.sim.tolerance)
-            if self.device.type == "cuda" and not wp.is_conditional_graph_supported():
-                self.warp_model.opt.graph_conditional = False
+            if self.device.type == "cuda":
+                self.warp_model.opt.graph_conditional = takes_conditional_nodes(
+                    self.warp_model, supported=wp.is_conditional_graph_supported()
+                )
             self.warp_data_E = mjw.make_data(
                 self.mj_model, nworld=num_envs, nconmax=self.nconmax, njmax=self.njmax
             )
@@ -112,7 +113,8 @@ class World(views.DataViews):
                 self._nan_guard = NanGuard(self.sim.nan_guard, self.mj_model, self.warp_data_E, self._fields)
         self.gravity_EL = gravity_EL
         super().__init__(self.warp_data_E)
-        self._load_kernels()
+        if self.device.type == "cuda":
+            self._load_kernels()
         self.refresh()
 
     @property
@@ -361,5 +363,10 @@ class World(views.DataViews):
 
     def _launch_reset(self) -> None:
         mjw.reset_data(self.warp_model, self.warp_data_E, reset=self._reset_mask)
-        for rows in self._zeroed_at_reset:
-            wp.launch(kernels.zero_rows, dim=rows.shape, inputs=[self._reset_mask], outputs=[rows])
+        widest = max(rows.shape[1] for rows in self._zeroed_at_reset)
+        wp.launch(
+            kernels.zero_rows,
+            dim=(self.num_envs, widest),
+            inputs=[self._reset_mask],
+            outputs=list(self._zeroed_at_reset),
+        )

@@ -58,9 +58,9 @@ def make_amp_update(cfg: RunCfg, env: EnvBase) -> "AMPUpdate":
 class AMPUpdate:
     """Rewards a rollout's transitions for looking like the reference motions, and improves the policy with that.
 
-    In turn: the discriminator scores the rollout, PPO learns from it with both rewards, and the discriminator learns from
-    the motions and the policy's last rollouts. Nothing makes a host sync. Each rollout must be the same memory, which is what
-    `RolloutCollector` gives.
+    In turn: the discriminator scores the rollout, PPO learns from it with both rewards, and the discriminator learns
+    from the motions and the policy's last rollouts. Nothing makes a host sync. Each rollout must be the same memory,
+    which is what `RolloutCollector` gives.
 
     Args:
         cfg: of the objective.
@@ -76,7 +76,9 @@ class AMPUpdate:
     def __init__(self, cfg: AMPCfg, *, ppo: PPOUpdate, reference_N2L: Tensor, num_envs: int) -> None:
         self.cfg, self.ppo, self.device = cfg, ppo, ppo.device
         if not bool(reference_N2L.isfinite().all()):
-            raise ValueError(f"motions={cfg.motions!r}: group {cfg.style_group!r} is not finite in their states")
+            raise ValueError(
+                f"motions={cfg.motions!r}: group {cfg.style_group!r} is not finite in their states"
+            )
         self.reference_N2L = reference_N2L.to(self.device)
         self.discriminator = Discriminator(
             reference_N2L.shape[-1],
@@ -231,9 +233,7 @@ class AMPUpdate:
             ValueError: naming the tensor that is missing, unknown or of another shape or type.
         """
         self.ppo.load_state_dict(state)
-        state_tree.copy_into(
-            self.discriminator.state_dict(), state["discriminator"], what="discriminator"
-        )
+        state_tree.copy_into(self.discriminator.state_dict(), state["discriminator"], what="discriminator")
         load_optimizer_state(
             self.optimizer, state["discriminator_optimizer"], what="optimizer of the discriminator"
         )

@@ -144,8 +144,8 @@ class DistillationUpdate:
     def metrics(self) -> dict[str, Tensor]:
         """Return what the last update measured, each a tensor [] on the device; means are over the steps made.
 
-        `update/action_error` is how far the student acted from the teacher in the rollout, before it learned from it: the
-        root mean square in units of the action.
+        `update/action_error` is how far the student was from the teacher in the rollout, before it learned from it: the
+        root mean square over actions, in their unit.
         """
         return self._means | {
             "update/action_error": self._action_error,

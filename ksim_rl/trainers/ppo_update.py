@@ -26,6 +26,7 @@ from ksim_rl.objectives import (
     make_symmetric,
     observation_keys,
     ppo_step,
+    with_precision_of,
 )
 from ksim_rl.physics.capture import Captured
 from ksim_rl.trainers import state_tree
@@ -100,7 +101,8 @@ class PPOUpdate:
         device: torch.device | str = "cpu",
         mirror: Mapping[Any, MirrorMap] | None = None,
     ) -> None:
-        self.cfg, self.actor, self.critic = cfg, actor, critic
+        self.cfg = cfg = with_precision_of(cfg, device)
+        self.actor, self.critic = actor, critic
         self.device = torch.device(device)
         self.advantage = make_advantage(cfg, actor, critic)
         self.loss = make_loss(cfg, actor, critic)

@@ -122,8 +122,8 @@ class RunCfg:
         missing = sorted(groups - set(self.task.observations))
         if missing:
             raise ValueError(
-                f"task.observations has no group {missing[0]!r}, which modules.*.in_keys or objective.style_group name: "
-                f"{near(missing[0], self.task.observations)}"
+                f"task.observations has no group {missing[0]!r}, which modules.*.in_keys or objective.style_group "
+                f"name: {near(missing[0], self.task.observations)}"
             )
         self.data.rollout_length(self.num_envs)
         self._check_sequences()

@@ -74,7 +74,8 @@ def restored_teacher(
     """Build the teacher of a `Teacher.state_dict`; see `load_teacher`."""
     teacher_cfg = RunCfg.from_tree({**json.loads(state["config"]), "device": str(cfg.resolved_device())})
     read = teacher_cfg.modules.observation_keys("actor")
-    theirs, ours = json.loads(state["columns"]), observation_columns(env)
+    theirs: Any = json.loads(state["columns"])
+    ours: Any = observation_columns(env)
     shown: Any = env.observation_spec
     for key in read:
         if key not in shown.keys(True):
@@ -82,7 +83,10 @@ def restored_teacher(
                 f"the teacher reads {key!r}, and this env shows {', '.join(map(repr, ours))}: add it to "
                 "task.observations as the teacher's run has it"
             )
-    check_columns(*({key: columns[key] for key in read if key in columns} for columns in (theirs, ours)))
+    groups = [key for key in read if isinstance(key, str)]
+    check_columns(
+        *({group: columns[group] for group in groups if group in columns} for columns in (theirs, ours))
+    )
     policy = make_policy(teacher_cfg, env)
     if memories(policy):
         raise ValueError("the teacher has a memory, and has to label single env states: take one without")

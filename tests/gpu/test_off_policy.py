@@ -62,7 +62,7 @@ def test_captured_without_syncs_and_learning_what_it_sees(name, options):
         # New numbers at the same addresses, as a rollout collector gives them; one is not finite.
         rollout.copy_(_rollout())
         rollout["next", "reward"][iteration, 2] = float("nan")
-        before = [parameter.clone() for parameter in update.loss.parameters()]
+        before = [parameter.detach().clone() for parameter in update.loss.parameters()]
         with no_syncs(on=iteration > 3):
             update(rollout)
         assert not all(torch.equal(a, b) for a, b in zip(before, update.loss.parameters(), strict=True))

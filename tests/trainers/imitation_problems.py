@@ -4,7 +4,6 @@ import math
 
 import torch
 from tensordict import TensorDict
-from torch import nn
 from torchrl.data import Binary, Composite, Unbounded
 
 from ksim_rl import random
@@ -20,6 +19,7 @@ from ksim_rl.trainers.teacher import Teacher
 
 GAIN, LIMIT = 1.3, 2.0
 BINS = torch.linspace(-LIMIT, LIMIT, 21)
+INDEX = torch.arange(21)
 TURN = 0.5
 
 
@@ -56,7 +56,9 @@ class StateEnv(MaskedReset):
             mask_E = tensordict["_reset"].reshape(-1)
         self.step_E.masked_fill_(mask_E, 0)
         self.episode_E += mask_E
-        unit_E1 = random.uniform(random.row_keys(self.seed_value, 1, self.episode_E, len(mask_E)), 1, 0.0, 1.0)
+        unit_E1 = random.uniform(
+            random.row_keys(self.seed_value, 1, self.episode_E, len(mask_E)), 1, 0.0, 1.0
+        )
         self.x_EL.copy_(torch.where(mask_E[:, None], self.start(unit_E1), self.x_EL))
         no_E1 = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
         return self._env_state(done=no_E1, terminated=no_E1.clone(), truncated=no_E1.clone())
@@ -94,9 +96,8 @@ class DriftEnv(StateEnv):
         return (GAIN * x_EL + action_EL).clamp(-LIMIT, LIMIT)
 
     def observe(self):
-        nearest_E = (self.x_EL - BINS).abs().argmin(-1)
-        one_hot = nn.functional.one_hot(nearest_E, len(BINS)).float()
-        return {"actor": one_hot, "privileged": self.x_EL.clone()}
+        nearest_E1 = (self.x_EL - BINS).abs().argmin(-1, keepdim=True)
+        return {"actor": (nearest_E1 == INDEX).float(), "privileged": self.x_EL.clone()}
 
 
 class PlaneEnv(StateEnv):
@@ -127,7 +128,9 @@ def circling(count=128):
 
 def linear_teacher(gain=-GAIN, *, key="privileged"):
     actor = make_actor(
-        ActorCfg(in_keys=(key,), hidden_dims=(), obs_normalization=False, init_std=0.3), obs_dim=1, action_dim=1
+        ActorCfg(in_keys=(key,), hidden_dims=(), obs_normalization=False, init_std=0.3),
+        obs_dim=1,
+        action_dim=1,
     )
     with torch.no_grad():
         actor[0].module.head.loc.weight.fill_(gain)
@@ -187,5 +190,3 @@ def _trainer(env, update, data, folder, iterations):
     collector = RolloutCollector(env, update.behavior, rollout_length=length, keys=update.rollout_keys)
     cfg = TrainerCfg(num_iterations=iterations, eval_interval=0, checkpoint_interval=0)
     return Trainer(cfg, collector=collector, update=update, folder=folder)
-
-

@@ -297,6 +297,7 @@ def training(*, num_iterations: int) -> dict[str, Any]:
         "objective.clip_value": True,
         "objective.normalize_advantage": "dataset",
         "objective.max_grad_norm": 1.0,
+        "objective.precision": "auto",
         "modules.actor.hidden_dims": [512, 256, 128],
         "modules.actor.activation": "elu",
         "modules.actor.obs_normalization": True,

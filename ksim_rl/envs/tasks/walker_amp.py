@@ -1,7 +1,7 @@
 """A planar biped walks at a given speed in the style of a recorded walk (Peng et al., "AMP", arXiv 2104.02180).
 
-The reward asks for the speed alone. How to walk is learned from the motion, for which `objective=amp` compares the group
-"style": the policy never sees the motion, nor where in it it should be, unlike in `walker_track`.
+The reward asks for the speed alone. How to walk is learned from the motion: `objective=amp` compares the group "style".
+Unlike in `walker_track`, the policy never sees the motion, nor where in it it should be.
 """
 
 from dataclasses import dataclass
@@ -97,7 +97,11 @@ AMP = Task(
     training=TRAINING,
     training_by_objective={
         "amp": {
-            **{key: value for key, value in TRAINING.items() if key.startswith(("data.", "modules.", "objective."))},
+            **{
+                key: value
+                for key, value in TRAINING.items()
+                if key.startswith(("data.", "modules.", "objective."))
+            },
             "objective.motions": [MOTION],
         }
     },

@@ -23,10 +23,10 @@ class Tuning:
         columns, rows: of the blocks in which sums over programs are taken.
     """
 
-    block: int = 128
+    block: int = 64
     chunk: int = 32
     stages: int = 3
-    warps: int = 8
+    warps: int = 4
     tile: int = 128
     depth: int = 64
     tile_stages: int = 3

@@ -1,0 +1,45 @@
+"""`ksim-rl warmup`: compiles what a run needs ahead of time, and says how long that took."""
+
+import dataclasses
+import time
+
+import warp as wp
+
+from ksim_rl import conf
+from ksim_rl.physics import compile_notice
+from ksim_rl.trainers import RunProgress, build
+
+USAGE = """usage: ksim-rl warmup [overrides of ksim-rl train]
+
+Compiles the kernels of a task's physics, terms and networks and keeps them in the caches of Warp, Triton and torch, so
+that the next run with the same task starts at once: one iteration runs, with nothing logged or saved."""
+
+
+def warmup(arguments: list[str]) -> int:
+    """Run one iteration of the config, say how long it took and where the kernels are, and return the exit code.
+
+    Raises:
+        ValueError: for an override that is wrong.
+    """
+    if arguments and arguments[0] in ("-h", "--help"):
+        print(USAGE)
+        return 0
+    cfg = conf.compose([*arguments, "logger=none", "trainer.eval_episodes=0"])
+    cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
+    compiled: list[str] = []
+    progress = RunProgress(1)
+
+    def notice(text: str) -> None:
+        compiled.append(text)
+        progress.status(text)
+
+    with compile_notice(notice):
+        began = time.perf_counter()
+        trainer = build(cfg)
+        trainer.iterate()
+        seconds = time.perf_counter() - began
+    print(
+        f"{cfg.task_name} on {cfg.device}: {seconds:.1f} s; {len(compiled)} kernel modules were compiled, the others "
+        f"were cached in {wp.config.kernel_cache_dir}"
+    )
+    return 0
