@@ -2,9 +2,9 @@
 
     python -m benchmarks.profile task=go1_velocity_flat num_envs=4096 device=cuda
 
-takes the overrides of `ksim-rl train`. On CUDA one iteration runs without graphs, so that each kernel of the device can be laid
-to the room in which the host launched it: physics, policy, terms, transforms, resets, the storage of the rollout, GAE
-and update. The times are those of the kernels alone, since the graphs have no pauses for launches; what the measured
+takes the overrides of `ksim-rl train`. On CUDA one iteration runs without graphs, so that each kernel can be laid to
+the room in which the host launched it: physics, policy, terms, transforms, resets, the storage of the rollout, GAE and
+update. The times are those of the kernels alone, since the graphs have no pauses for launches; what the measured
 iteration (with graphs) takes beyond their sum is the `gaps`. On the CPU the rooms are timed on the wall clock. Figures
 go to benchmarks/results/profile.json: `<room>_ms`, `<room>_share` and, on CUDA, `<room>_kernels`. `label=before` keeps
 them under another name beside the present ones.

@@ -2,10 +2,11 @@
 
     python -m benchmarks.scaling task=go1_velocity_flat num_envs=1024,2048,4096,8192,16384,32768 device=cuda
 
-takes the overrides of `ksim-rl train`; each number of envs is a run of `benchmarks.throughput` in a process of its
-own, with rollouts of the same length and as many minibatches. Figures go to benchmarks/results/scaling.json:
-`<device>/<task>/<num_envs>/env_states_per_s` and `physics_env_states_per_s`, and `<device>/<task>/growth_4096_to_32768`.
-The chart beside it also shows the figure that the peer publishes for its own training of this task (`PUBLISHED`).
+takes the overrides of `ksim-rl train`; each number of envs is a run of `benchmarks.throughput` in a process of its own,
+with rollouts of the same length and as many minibatches. Figures go to benchmarks/results/scaling.json:
+`<device>/<task>/<num_envs>/env_states_per_s` and `physics_env_states_per_s`, and
+`<device>/<task>/growth_4096_to_32768`. The chart beside it also shows the figure that the peer reached with its own
+training of this task (`PUBLISHED`).
 """
 
 from __future__ import annotations

@@ -38,7 +38,8 @@ from ksim_rl.checks import check_choice, unknown_name
 from ksim_rl.collectors import CollectorCfg, RolloutCollector
 from ksim_rl.envs.innermost import innermost
 from ksim_rl.testing import check_env, count_syncs
-from ksim_rl.trainers.build import build_env, build_networks
+from ksim_rl.trainers.build import build_env
+from ksim_rl.trainers.networks import build_networks
 
 NAME = "tasks"
 CHECKED_ENVS = 4

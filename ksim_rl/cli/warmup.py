@@ -6,6 +6,7 @@ import time
 import warp as wp
 
 from ksim_rl import conf
+from ksim_rl.cli.command_line import check_command_line
 from ksim_rl.physics import compile_notice
 from ksim_rl.trainers import RunProgress, build
 
@@ -24,6 +25,7 @@ def warmup(arguments: list[str]) -> int:
     if arguments and arguments[0] in ("-h", "--help"):
         print(USAGE)
         return 0
+    check_command_line(arguments, name=conf.NAME, multirun=False, values=True)
     cfg = conf.compose([*arguments, "logger=none", "trainer.eval_episodes=0"])
     cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
     compiled: list[str] = []

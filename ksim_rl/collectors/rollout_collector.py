@@ -63,7 +63,7 @@ class RolloutCollector:
         self._keys = None if keys is None else list(keys)
         self._root: TensorDict | None = None
         self._storage_TE: TensorDict | None = None
-        self._leaves: list[tuple[NestedKey, Tensor]] = []
+        self._leaves_by_dtype: list[list[tuple[NestedKey, Tensor]]] = []
         device = env.device or torch.device("cpu")
         self._run = Captured(
             self._rollout, device=device, warmup=cfg.warmup, require_graphs=cfg.require_graphs
@@ -141,8 +141,15 @@ class RolloutCollector:
     def _store(self, t: int, env_state_E: TensorDictBase) -> None:
         if self._storage_TE is None:
             self._allocate(env_state_E)
-        for key, leaf_TE in self._leaves:
-            leaf_TE[t].copy_(env_state_E.get(key))
+        for leaves in self._leaves_by_dtype:
+            pairs = [(leaf_TE[t], env_state_E.get(key)) for key, leaf_TE in leaves]
+            # One kernel for all that lie in one piece; a column of something wider needs its own.
+            whole = [pair for pair in pairs if pair[1].is_contiguous()]
+            if whole:
+                torch._foreach_copy_(*map(list, zip(*whole, strict=True)))
+            for kept, value in pairs:
+                if not value.is_contiguous():
+                    kept.copy_(value)
 
     def _allocate(self, env_state_E: TensorDictBase) -> None:
         produced = list(env_state_E.keys(True, True))
@@ -160,7 +167,10 @@ class RolloutCollector:
             batch_size=[self.rollout_length, *env_state_E.batch_size],
             device=env_state_E.device,
         )
-        self._leaves = list(self._storage_TE.items(True, True))
+        by_dtype: dict[torch.dtype, list[tuple[NestedKey, Tensor]]] = {}
+        for key, leaf_TE in self._storage_TE.items(True, True):
+            by_dtype.setdefault(leaf_TE.dtype, []).append((key, leaf_TE))
+        self._leaves_by_dtype = list(by_dtype.values())
 
 
 def _flat(key: NestedKey) -> str:

@@ -11,7 +11,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from ksim_rl import envs
-from ksim_rl.conf import search_path
+from ksim_rl.conf import search_path, stored_configs
 from ksim_rl.trainers import RunCfg
 
 MODULE, NAME = "ksim_rl.conf", "train"
@@ -58,6 +58,7 @@ def register() -> None:
         for objective in (*TAKEN_FROM_PPO, *envs.task(name).training_by_objective):
             node = objective_defaults(name, objective)
             store(group="task/objective_training", name=f"{name}_{objective}", node=node, package="_global_")
+    stored_configs.quicken()
 
 
 def register_run(folder: Path) -> bool:

@@ -182,14 +182,21 @@ class MaskedReset(EnvBase):
         """Write the rows of `fresh` that the mask names into `root`, leaf by leaf, and return `root`."""
         batch_size = root.batch_size
         masks: dict[int, Tensor] = {}
+        shared: dict[tuple[int, int], Tensor] = {}
         for key in fresh.keys(True, True):
             if key == _RESET:
                 continue
             new, old = fresh.get(key), root.get(key, None)
             if old is not None and isinstance(old, Tensor):
-                if old.ndim not in masks:
-                    masks[old.ndim] = mask_E1.view(*batch_size, *[1] * (old.ndim - len(batch_size)))
-                new = torch.where(masks[old.ndim], new, old)
+                pair = _shared_rows(new, old)
+                if pair is None:
+                    new = torch.where(_mask_like(old, mask_E1, batch_size, masks), new, old)
+                else:
+                    at = id(pair[0]), id(pair[1])
+                    if at not in shared:
+                        mask = _mask_like(pair[1], mask_E1, batch_size, masks)
+                        shared[at] = torch.where(mask, *pair)
+                    new = shared[at].as_strided(new.shape, new.stride(), new.storage_offset())
             root.set(key, new)
         return self._labelled(root)
 
@@ -267,3 +274,23 @@ def mask_from_env_ids(
     for row in ids:
         mask[row] = True
     return torch.tensor(mask, device=device)
+
+
+def _mask_like(leaf: Tensor, mask_E1: Tensor, batch_size: torch.Size, masks: dict[int, Tensor]) -> Tensor:
+    """Return the mask with as many dims as `leaf`; `masks` keeps them."""
+    if leaf.ndim not in masks:
+        masks[leaf.ndim] = mask_E1.view(*batch_size, *[1] * (leaf.ndim - len(batch_size)))
+    return masks[leaf.ndim]
+
+
+def _shared_rows(new: Tensor, old: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Return the tensors that two leaves are the same columns of, if there are such: one `where` serves all columns."""
+    if torch.compiler.is_compiling():
+        return None
+    new_base, old_base = new._base, old._base
+    if new_base is None or old_base is None or new_base.ndim != 2 or new_base.shape != old_base.shape:
+        return None
+    same_place = new.stride() == old.stride() and new.storage_offset() == old.storage_offset()
+    whole = all(base.is_contiguous() and base.storage_offset() == 0 for base in (new_base, old_base))
+    columns = new.ndim == 2 and new.shape == old.shape and new.shape[0] == new_base.shape[0]
+    return (new_base, old_base) if same_place and whole and columns and new.dtype == old.dtype else None

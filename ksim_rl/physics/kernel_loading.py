@@ -52,11 +52,13 @@ def loaded_together(device: torch.device) -> Iterator[None]:
                 return capture_while(condition, while_body, *args, **kwargs)
             return while_body(**kwargs)
 
-        wp.launch, wp.launch_tiled, wp.capture_while = noted, noted_tiled, once
+        instead = {"launch": noted, "launch_tiled": noted_tiled, "capture_while": once}
+        saved = {"launch": launch, "launch_tiled": launch_tiled, "capture_while": capture_while}
+        vars(wp).update(instead)
         try:
             yield
         finally:
-            wp.launch, wp.launch_tiled, wp.capture_while = launch, launch_tiled, capture_while
+            vars(wp).update(saved)
     workers = min(os.cpu_count() or 1, MOST_WORKERS)
     for block_dim, found in modules.items():
         wp.force_load(warp_dev, modules=list(found), block_dim=block_dim, max_workers=workers)

@@ -7,8 +7,8 @@ import torch
 from ksim_rl.physics import newton
 from ksim_rl.physics.sim_cfg import SimCfg
 
-# On an H200 with 4096 worlds the one-kernel solver pays for Go1 (18 degrees of freedom: 5.9 ms for four substeps instead
-# of 8.1) and not for G1 (35: 10.7 instead of 9.5); on the CPU it always does (Go1: 1.5 ms instead of 6.4, 4 worlds).
+# On an H200 with 4096 worlds the one-kernel solver pays for Go1 (18 degrees of freedom: 5.9 ms for four substeps, not
+# 7.7) and did not for G1 (35: 10.7 ms, not 9.3); on the CPU it always does (Go1: 1.5 ms, not 6.4, of 4 worlds).
 MOST_DOFS_ON_CUDA = 32
 # MuJoCo Warp's solver ends its loop by a conditional node, which costs more than the few iterations that it saves
 # (H200, 4096 worlds, at most 10 iterations: Go1 8.22 ms without and 8.46 with it, G1 9.88 and 10.17).

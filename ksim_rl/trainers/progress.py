@@ -16,6 +16,8 @@ SHOWN = (
     ("loss/policy", "policy loss", "{:.2g}"),
     ("loss/value", "value loss", "{:.2g}"),
     ("loss/entropy", "entropy", "{:.3g}"),
+    ("style/reward", "style", "{:.2f}"),
+    ("update/action_error", "action error", "{:.3g}"),
     ("update/learning_rate", "learning rate", "{:.1e}"),
     ("evaluation/return_mean", "evaluation", "{:.4g}"),
 )

@@ -174,7 +174,7 @@ def test_models_out_of_range_take_the_solver_of_mujoco_warp():
         assert takes_one_kernel(model, choice, njmax=64, device=cpu) is on_cpu
         assert takes_one_kernel(model, choice, njmax=64, device=gpu) is on_gpu
     with pytest.raises(ValueError, match="one_kernel_solver='auto': expected True, False or None"):
-        SimCfg(one_kernel_solver="auto")
+        SimCfg(one_kernel_solver="auto")  # pyright: ignore[reportArgumentType]
     assert World(model, num_envs=1, sim=sim).has_one_kernel_solver
     assert not World(
         model, num_envs=1, sim=dataclasses.replace(sim, deterministic=True)

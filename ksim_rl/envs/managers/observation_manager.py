@@ -35,10 +35,19 @@ class ObservationManager:
     def read(self) -> dict[str, Tensor]:
         """Return the readings of the current state by term, none of them aliasing the state.
 
-        They are float32 [E, L], and images [E, H, W] or [E, H, W, C].
+        They are float32 [E, L], side by side in one tensor, and images [E, H, W] or [E, H, W, C].
         """
-        readings = {}
+        readings, vectors = {}, []
         for name, term in self.terms.items():
             with self._view.scope(f"observations/{name}"):
-                readings[name] = self._view.detached(term(self._view))
-        return readings
+                readings[name] = term(self._view)
+            if readings[name].ndim == 2 and readings[name].dtype == torch.float32:
+                vectors.append(name)
+            else:
+                readings[name] = self._view.detached(readings[name])
+        if len(vectors) < 2:
+            return {name: self._view.detached(value) for name, value in readings.items()}
+        # One copy for all of them, which also takes them off the state.
+        together_EL = torch.cat([readings[name] for name in vectors], dim=1)
+        widths = [readings[name].shape[1] for name in vectors]
+        return readings | dict(zip(vectors, together_EL.split(widths, dim=1), strict=True))

@@ -66,22 +66,20 @@ class ActionDelay(LaggedTransform):
         mask_E = self._reset_rows(tensordict, tensordict_reset)
         self._restart(mask_E)
         for index in range(len(self.in_keys_inv)):
-            self._begin(index, torch.full_like(self._ring(index)[:, 0], self.initial), mask_E)
+            ring_EM: torch.Tensor = getattr(self, f"ring_{index}")
+            self._through(index, torch.full_like(ring_EM[:, 0], self.initial), mask_E)
         return tensordict_reset
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if not self._sized:
             raise RuntimeError("ActionDelay has state per env: use it in an env, not on a batch of samples")
-        if not self._sized:
-            raise RuntimeError("ActionDelay has state per env: use it in an env, not on a batch of samples")
         actions = [self._checked(index, tensordict, key) for index, key in enumerate(self.out_keys_inv)]
         self._advance()
         for index, (key, action) in enumerate(zip(self.in_keys_inv, actions, strict=True)):
-            action_E = action.reshape(self.num_rows, *action.shape[tensordict.ndim :])
-            tensordict.set(key, self._push(index, action_E).reshape(action.shape))
+            tensordict.set(key, self._through(index, action, None))
         return tensordict
 
     def _checked(self, index: int, tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
         """Return the action, refused here since the env sees it only after the buffer."""
-        ring_KE: torch.Tensor = getattr(self, f"ring_{index}")
-        return checked_action(tensordict, key, ring_KE.shape[2:], ring_KE.dtype)
+        ring_EM: torch.Tensor = getattr(self, f"ring_{index}")
+        return checked_action(tensordict, key, ring_EM.shape[2:], ring_EM.dtype)

@@ -1,12 +1,11 @@
 """Sensor latency."""
 
-from collections.abc import Callable
-
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
+from ksim_rl.envs.transforms.columns import side_by_side, split
 from ksim_rl.envs.transforms.delay_cfg import DelayCfg
 from ksim_rl.envs.transforms.lagged_transform import LaggedTransform
 from ksim_rl.envs.transforms.row_transform import Keys, as_keys, checked_out_keys
@@ -42,7 +41,6 @@ class ObservationDelay(LaggedTransform):
         in_keys = as_keys(in_keys)
         out_keys = checked_out_keys(in_keys, out_keys)
         super().__init__(delay, len(in_keys), in_keys=in_keys, out_keys=out_keys, seed=seed, stream=stream)
-        self._sizes: list[int] = []
         self._is_joined = False
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -63,45 +61,41 @@ class ObservationDelay(LaggedTransform):
         self, num_rows: int, shapes: list[torch.Size], dtypes: list[torch.dtype], device: Device
     ) -> None:
         """Make one ring for all observations where they are of one dtype, and one for each otherwise."""
-        self._sizes = [shape.numel() for shape in shapes]
         self._is_joined = len(shapes) > 1 and len(set(dtypes)) == 1
         if self._is_joined:
-            shapes, dtypes = [torch.Size([sum(self._sizes)])], dtypes[:1]
+            shapes, dtypes = [torch.Size([sum(shape.numel() for shape in shapes)])], dtypes[:1]
         self._size_lags(num_rows, shapes, dtypes, device)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         values = self._read(tensordict_reset)
         mask_E = self._reset_rows(tensordict, tensordict_reset)
         self._restart(mask_E)
-        return self._pass(tensordict_reset, values, lambda index, value: self._begin(index, value, mask_E))
+        return self._pass(tensordict_reset, values, mask_E)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         values = self._read(next_tensordict)
         self._advance()
-        return self._pass(next_tensordict, values, self._push)
+        return self._pass(next_tensordict, values, None)
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         """Return the prompt observations, and make what the specs have not made yet."""
         values = [tensordict.get(key) for key in self.in_keys]
-        if not self._sizes:
+        if not self.num_rings:
             shapes = [value.shape[tensordict.ndim :] for value in values]
             dtypes = [value.dtype for value in values]
             self._size_signals(tensordict.numel(), shapes, dtypes, tensordict.device)
         return values
 
     def _pass(
-        self, tensordict: TensorDictBase, values: list[Tensor], through: Callable[[int, Tensor], Tensor]
+        self, tensordict: TensorDictBase, values: list[Tensor], mask_E: Tensor | None
     ) -> TensorDictBase:
-        """Send the values through the rings and write what comes out."""
-        batch_dims = tensordict.ndim
+        """Send the values through the rings, and write what comes out; a mask says which rows begin with them."""
+        found = values
         if self._is_joined:
-            joined_EL = torch.cat([value.reshape(self.num_rows, -1) for value in values], dim=1)
-            found = through(0, joined_EL).split(self._sizes, dim=1)
-        else:
-            found = [
-                through(index, value.reshape(self.num_rows, *value.shape[batch_dims:]))
-                for index, value in enumerate(values)
-            ]
-        for out_key, value, delayed in zip(self.out_keys, values, found, strict=True):
-            tensordict.set(out_key, delayed.reshape(value.shape))
+            found = [side_by_side(values, self.num_rows)]
+        found = [self._through(index, value, mask_E) for index, value in enumerate(found)]
+        if self._is_joined:
+            found = split(found[0], values)
+        for out_key, value in zip(self.out_keys, found):  # noqa: B905 (strict takes time in every step)
+            tensordict.set(out_key, value)
         return tensordict

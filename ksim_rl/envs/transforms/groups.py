@@ -10,6 +10,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 
 from ksim_rl import checks
+from ksim_rl.envs.transforms.columns import side_by_side
 from ksim_rl.envs.transforms.group_spec import GroupSpec, spell
 from ksim_rl.envs.transforms.row_transform import as_keys
 from ksim_rl.envs.transforms.specs import (
@@ -50,6 +51,13 @@ class ObservationGroups(Transform):
         self.group_specs: dict[NestedKey, GroupSpec] = {}
         # Groups whose terms are known to be vectors [E, L] already.
         self._concatenable: set[NestedKey] = set()
+        # Groups whose terms go nowhere else, so that their vector may lie where its terms do.
+        shared = [term for terms in self.groups.values() for term in terms]
+        self._owners = {
+            name
+            for name, terms in self.groups.items()
+            if all(term in self.drop and shared.count(term) == 1 for term in terms)
+        }
 
     def slice(self, group: NestedKey, term: NestedKey) -> slice:
         """Return the columns of a term in the vector of a group.
@@ -106,7 +114,10 @@ class ObservationGroups(Transform):
             values = [get(term) for term in terms]
             if name not in self._concatenable:
                 values = [value.reshape(*next_tensordict.batch_size, -1) for value in values]
-            vectors.append(torch.cat(values, -1) if len(values) > 1 else values[0])
+            if name in self._owners and len(next_tensordict.batch_size) == 1:
+                vectors.append(side_by_side(values, next_tensordict.batch_size[0]))
+            else:
+                vectors.append(torch.cat(values, -1) if len(values) > 1 else values[0])
         # Only now: a group may have the name of a term of another one.
         for name, vector in zip(self.groups, vectors):  # noqa: B905 (strict takes time in every step)
             next_tensordict.set(name, vector)

@@ -1,5 +1,7 @@
 """Lags and ring buffers, shared by observation and action delay."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -24,20 +26,20 @@ class LaggedTransform(FollowsLevel, KeyedTransform):
     purposes = ("step/lag", "step/hold", "reset/lag")
 
     lag_E: Tensor
-    start_E: Tensor
-    clock: Tensor
+    age_E: Tensor
     shared_count: Tensor
-    shared_start: Tensor
+    shared_age: Tensor
 
     def __init__(
         self, delay: DelayCfg, num_signals: int, *, seed: int = 0, stream: str | None = None, **keys: Keys
     ) -> None:
         rings = [f"ring_{index}" for index in range(num_signals)]
-        super().__init__(**keys, row_buffers=["lag_E", "start_E", *rings], seed=seed, stream=stream)
+        super().__init__(**keys, row_buffers=["lag_E", "age_E", *rings], seed=seed, stream=stream)
         self.delay = delay
         self.num_slots = delay.max_lag + 1
-        # The clock shows where the rings stand; unlike the count of steps that keys the draws, no seed turns it back.
-        for name in ("clock", "shared_count", "shared_start"):
+        self.num_rings = 0
+        # Unlike the count of steps that keys the draws, no seed turns the ages back: they show where the rings stand.
+        for name in ("shared_count", "shared_age"):
             self.register_buffer(name, torch.zeros((), dtype=torch.int64))
         self._register_level(is_used=delay.by_level)
 
@@ -52,9 +54,10 @@ class LaggedTransform(FollowsLevel, KeyedTransform):
         """Make one ring buffer [E, M, ...] per signal, M = max_lag + 1."""
         self._size_rows(num_rows, device)
         self._size_buffer("lag_E", (num_rows,), torch.int64, device)
-        self._size_buffer("start_E", (num_rows,), torch.int64, device)
+        self._size_buffer("age_E", (num_rows,), torch.int64, device)
         if self._is_fixed:
             self.lag_E.fill_(self.delay.min_lag)
+        self.num_rings = len(shapes)
         for index, (shape, dtype) in enumerate(zip(shapes, dtypes, strict=True)):
             self._size_buffer(f"ring_{index}", (num_rows, self.num_slots, *shape), dtype, device)
 
@@ -68,15 +71,14 @@ class LaggedTransform(FollowsLevel, KeyedTransform):
         return self.num_rows > 0
 
     def _advance(self) -> None:
-        """Go on by one env step, with new lags where they are due."""
+        """Draw new lags for the env step to come, where they are due."""
         delay = self.delay
-        self.clock.add_(1)
         if not delay.resample_every or self._is_fixed:
             return
         self.step_count.add_(1)
         # A shared lag is drawn once: a single row broadcasts over all.
-        num_rows, start = (self.num_rows, self.start_E) if delay.per_env else (1, self.shared_start)
-        due = (self.clock - start) % delay.resample_every == 0
+        num_rows, age = (self.num_rows, self.age_E + 1) if delay.per_env else (1, self.shared_age.add_(1))
+        due = age % delay.resample_every == 0
         if delay.hold_probability:
             chance = random.uniform(self._step_keys("step/hold", num_rows), 1)[:, 0]
             due = due & (chance >= delay.hold_probability)
@@ -92,7 +94,7 @@ class LaggedTransform(FollowsLevel, KeyedTransform):
             return
         together = mask_E.all()
         self.shared_count.add_(together)
-        self.shared_start.copy_(torch.where(together, self.clock, self.shared_start))
+        self.shared_age.mul_(~together)
         keys = random.row_keys(self.seed_value, self._stream_ids["reset/lag"], self.shared_count, 1)
         self.lag_E.copy_(torch.where(together, self._draw(keys), self.lag_E))
 
@@ -104,16 +106,14 @@ class LaggedTransform(FollowsLevel, KeyedTransform):
         reach = (self.level * (delay.max_lag - delay.min_lag)).round().long()
         return random.integers(keys, 1, delay.min_lag, delay.min_lag + reach)[:, 0]
 
-    def _push(self, index: int, value_E: Tensor) -> Tensor:
-        """Write this step's value [E, ...] and return the one that is due."""
-        lag_E1 = self.lag_E.unsqueeze(1)
-        return ring.push_and_read(self._ring(index), self.start_E, self.clock, value_E, lag_E1).squeeze(1)
-
-    def _begin(self, index: int, value_E: Tensor, mask_E: Tensor) -> Tensor:
-        """Let the masked rows begin with a value [E, ...], and return the value."""
-        return ring.begin(self._ring(index), self.start_E, self.clock, value_E, mask_E).squeeze(1)
-
-    def _ring(self, index: int) -> Tensor:
-        ring_EM = self._buffers[f"ring_{index}"]
-        assert ring_EM is not None, "an env sizes its transforms before it steps"
-        return ring_EM
+    def _through(self, index: int, value: Tensor, mask_E: Tensor | None) -> Tensor:
+        """Write this step's value [E, ...] and return the one that is due; masked rows begin with it."""
+        buffers: dict[str, Any] = self._buffers
+        ring_EM, age_E = buffers[f"ring_{index}"], buffers["age_E"]
+        value_E = value if value.ndim == ring_EM.ndim - 1 else value.reshape(-1, *ring_EM.shape[2:])
+        if mask_E is None:
+            counts = index == self.num_rings - 1
+            found_EL = ring.push(ring_EM, age_E, value_E, lag_E=buffers["lag_E"], counts=counts)
+        else:
+            found_EL = ring.begin(ring_EM, age_E, value_E, mask_E)
+        return found_EL if value.ndim == 2 else found_EL.view(value.shape)

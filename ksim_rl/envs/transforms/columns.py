@@ -1,0 +1,49 @@
+"""Observations side by side, as kernels that take all of them at once want them."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+
+def side_by_side(values: Sequence[Tensor], num_rows: int) -> Tensor:
+    """Return values [E, ...] as the columns of one tensor [E, L], without a copy where they are that already.
+
+    So what one transform has split, the next one need not join. The result may share memory with the values.
+    """
+    vectors = [value if value.ndim == 2 else value.reshape(num_rows, -1) for value in values]
+    if len(vectors) == 1:
+        return vectors[0]
+    # Memory is not there to be looked at while code is traced.
+    if not torch.compiler.is_compiling() and (whole := _whole(vectors)) is not None:
+        return whole
+    return torch.cat(vectors, dim=1)
+
+
+def _whole(vectors: list[Tensor]) -> Tensor | None:
+    """Return the tensor whose columns, all of them and in this order, the vectors are; None if there is none."""
+    owner = vectors[0]._base
+    if owner is None:
+        return None
+    width, offset = vectors[0].stride(0), 0
+    for vector in vectors:
+        placed = vector._base is owner and vector.storage_offset() == offset
+        if not placed or vector.dtype != owner.dtype or vector.stride() != (width, 1):
+            return None
+        offset += vector.shape[1]
+    if offset != width or owner.numel() != vectors[0].shape[0] * width or not owner.is_contiguous():
+        return None
+    return owner.view(-1, width)
+
+
+def split(joined_EL: Tensor, likes: Sequence[Tensor]) -> list[Tensor]:
+    """Return views of the columns in the shapes of these values, which `side_by_side` has joined."""
+    if len(likes) == 1:
+        return [joined_EL if joined_EL.shape == likes[0].shape else joined_EL.reshape(likes[0].shape)]
+    num_rows = joined_EL.shape[0]
+    sizes = [like.numel() // max(num_rows, 1) for like in likes]
+    parts = joined_EL.split(sizes, dim=1)
+    return [
+        part if part.shape == like.shape else part.reshape(like.shape)
+        for part, like in zip(parts, likes, strict=True)
+    ]

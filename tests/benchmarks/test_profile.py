@@ -1,0 +1,31 @@
+import time
+
+from benchmarks.profile import Clock, by_room
+
+
+def test_a_room_is_charged_without_the_rooms_inside_it():
+    clock = Clock()
+    clock.run("outer", lambda: clock.run("inner", lambda: time.sleep(0.05)))
+    assert clock.seconds["inner"] >= 0.05
+    assert clock.seconds["outer"] < clock.seconds["inner"]
+
+
+def test_kernels_go_to_the_innermost_room_that_launched_them():
+    def span(name, begin, end):
+        return {"name": f"room:{name}", "cat": "user_annotation", "ts": begin, "dur": end - begin}
+
+    def kernel(correlation, at, us, name="k"):
+        launch = {
+            "name": "cudaLaunchKernel",
+            "cat": "cuda_runtime",
+            "ts": at,
+            "args": {"correlation": correlation},
+        }
+        return [
+            launch,
+            {"name": name, "cat": "kernel", "ts": 900, "dur": us, "args": {"correlation": correlation}},
+        ]
+
+    events = [span("update", 0, 100), span("physics", 10, 20)]
+    events += kernel(1, 15, 3.0) + kernel(2, 50, 5.0) + kernel(3, 60, 7.0, "gae") + kernel(4, 200, 1.0)
+    assert by_room(events) == {"physics": (1, 3.0), "update": (1, 5.0), "gae": (1, 7.0), "other": (1, 1.0)}
