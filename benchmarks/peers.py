@@ -21,7 +21,7 @@ from pathlib import Path
 import torch
 
 from benchmarks import report
-from benchmarks.throughput import train_ms
+from benchmarks.throughput import num_env_states, train_ms
 from ksim_rl import conf
 
 ITERATIONS = 40
@@ -93,7 +93,7 @@ def main() -> None:
     if cfg.task_name not in TASKS:
         raise SystemExit(f"task={cfg.task_name}: the peer has {', '.join(TASKS)}")
     peer = peer_rate(options.python, cfg.task_name, num_envs=cfg.num_envs, iterations=options.iterations)
-    ours = 1000.0 * cfg.data.num_env_states / train_ms(cfg, iterations=options.iterations)
+    ours = 1000.0 * num_env_states(cfg) / train_ms(cfg, iterations=options.iterations)
     device = cfg.resolved_device()
     prefix = f"{report.device_label(device)}/{cfg.task_name}/{cfg.num_envs}"
     figures = {

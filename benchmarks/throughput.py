@@ -71,7 +71,7 @@ def measure(cfg: RunCfg) -> dict[str, float]:
     own_ms = own_physics_ms(_world(trainer), cfg.task.decimation, steps, repeats=repeats)
     raw_ms = physics_ms(_world(trainer), cfg.task.decimation, steps, repeats=repeats)
 
-    env_states_per_s = 1000.0 * cfg.data.num_env_states / iteration_ms
+    env_states_per_s = 1000.0 * num_env_states(cfg) / iteration_ms
     return {
         "physics_ms": raw_ms,
         "own_physics_ms": own_ms,
@@ -119,6 +119,11 @@ def _guards_ms(trainer: Trainer, decimation: int, device: torch.device, repeats:
     for _ in range(4):
         captured()
     return milliseconds(captured, device=device, repeats=4 * repeats)
+
+
+def num_env_states(cfg: RunCfg) -> int:
+    """Return the env states of one iteration."""
+    return cfg.num_envs * cfg.data.rollout_length(cfg.num_envs)
 
 
 def train_ms(cfg: RunCfg, *, iterations: int) -> float:
@@ -177,7 +182,7 @@ def _table(cfg: RunCfg, figures: dict[str, float], device: torch.device) -> Tabl
     table = Table(title=f"{cfg.task_name}, {cfg.num_envs} envs, {report.device_name(device)}")
     for column in ("", "ms", "env states", "env states/s", "relative to physics"):
         table.add_column(column, justify="left" if not column else "right")
-    dataset = cfg.data.num_env_states
+    dataset = num_env_states(cfg)
     physics_per_s = 1000.0 * cfg.num_envs / figures["physics_ms"]
     rows = (
         ("raw physics (MuJoCo Warp)", "physics_ms", cfg.num_envs),

@@ -25,6 +25,7 @@ def warmup(arguments: list[str]) -> int:
     if arguments and arguments[0] in ("-h", "--help"):
         print(USAGE)
         return 0
+    conf.register()
     check_command_line(arguments, name=conf.NAME, multirun=False, values=True)
     cfg = conf.compose([*arguments, "logger=none", "trainer.eval_episodes=0"])
     cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))

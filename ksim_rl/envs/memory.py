@@ -5,8 +5,35 @@ import math
 import torch
 from torch import Tensor
 
-# Columns that arenas are allocated in; a wider buffer has one of its own.
-ARENA_COLUMNS = 128
+# Numbers per env that an arena has room for; a wider buffer has one of its own.
+ARENA_WIDTH = 128
+
+
+class Arena:
+    """One tensor that holds many buffers of one dtype, one after the other, so that one mask clears all of them."""
+
+    def __init__(self, num_envs: int, width: int, dtype: torch.dtype, device: torch.device) -> None:
+        self.values = torch.zeros(num_envs * width, dtype=dtype, device=device)
+        self._num_envs = num_envs
+        self._row_N = torch.zeros(0, dtype=torch.int32, device=device)
+        self._used = 0
+
+    def has_room(self, width: int, dtype: torch.dtype) -> bool:
+        """Whether a buffer of this width and dtype fits."""
+        return dtype == self.values.dtype and self._used + self._num_envs * width <= self.values.numel()
+
+    def take(self, shape: tuple[int, ...]) -> Tensor:
+        """Return a buffer [E, *shape], contiguous, that nobody else has."""
+        width = math.prod(shape)
+        start, self._used = self._used, self._used + self._num_envs * width
+        rows = torch.arange(self._num_envs, dtype=torch.int32, device=self.values.device)
+        # Which env each number belongs to.
+        self._row_N = torch.cat((self._row_N, rows.repeat_interleave(width)))
+        return self.values[start : self._used].view(self._num_envs, *shape)
+
+    def clear(self, mask_E: Tensor) -> None:
+        """Zero the rows of `mask_E`, bool [E], in all buffers."""
+        self.values[: self._used].masked_fill_(mask_E.index_select(0, self._row_N), 0)
 
 
 class Memory:
@@ -15,8 +42,7 @@ class Memory:
     Buffers come into being while the env is constructed (each term runs once then). Afterwards the set is frozen:
     an allocation inside a captured step would give another tensor to each replay.
 
-    Buffers that start at zero are columns of few large tensors, one set per dtype, so that a reset clears all of them
-    at once. So a buffer need not be contiguous.
+    Buffers that start at zero lie in few large tensors, so that a reset clears all of them at once.
     """
 
     def __init__(self, num_envs: int, device: torch.device) -> None:
@@ -25,8 +51,7 @@ class Memory:
         self._buffers: dict[str, Tensor] = {}
         self._initial: dict[str, Tensor] = {}
         self._kept: set[str] = set()
-        self._arenas: list[Tensor] = []
-        self._used: list[int] = []
+        self._arenas: list[Arena] = []
         self._frozen = False
 
     def get(
@@ -59,7 +84,7 @@ class Memory:
             if keep or initial is not None:
                 buffer = torch.zeros(self._num_envs, *shape, dtype=dtype, device=self._device)
             else:
-                buffer = self._columns(shape, dtype)
+                buffer = self._arena(math.prod(shape), dtype).take(shape)
             self._buffers[name] = buffer
             if keep:
                 self._kept.add(name)
@@ -87,8 +112,8 @@ class Memory:
 
     def clear(self, mask_E: Tensor) -> None:
         """Let the rows of `mask_E`, bool [E], start anew in each buffer that is not kept."""
-        for arena, used in zip(self._arenas, self._used, strict=True):
-            arena[:, :used].masked_fill_(mask_E[:, None], 0)
+        for arena in self._arenas:
+            arena.clear(mask_E)
         for name, initial in self._initial.items():
             if name not in self._kept:
                 buffer = self._buffers[name]
@@ -99,19 +124,11 @@ class Memory:
         """Return the buffers by name."""
         return dict(self._buffers)
 
-    def _columns(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        """Return a view [E, *shape] of columns that nobody else has."""
-        width = math.prod(shape)
-        for index, arena in enumerate(self._arenas):
-            if arena.dtype == dtype and self._used[index] + width <= arena.shape[1]:
-                break
-        else:
-            index = len(self._arenas)
-            columns = max(width, ARENA_COLUMNS)
-            arena = torch.zeros(self._num_envs, columns, dtype=dtype, device=self._device)
-            self._arenas.append(arena)
-            self._used.append(0)
-        start = self._used[index]
-        self._used[index] += width
-        found = arena[:, start : start + width]
-        return found.unflatten(1, shape) if shape else found[:, 0]
+    def _arena(self, width: int, dtype: torch.dtype) -> Arena:
+        """Return an arena with room for so many numbers per env."""
+        for arena in self._arenas:
+            if arena.has_room(width, dtype):
+                return arena
+        made = Arena(self._num_envs, max(width, ARENA_WIDTH), dtype, self._device)
+        self._arenas.append(made)
+        return made

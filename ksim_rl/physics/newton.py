@@ -1,14 +1,16 @@
 """The constraint solver of the substeps, for the models that `suits` names: one kernel instead of some hundred."""
 
+import dataclasses
+from collections.abc import Callable
+
 import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-from ksim_rl.physics.newton_kernel import CUDA_LANES, floats_per_world, newton_kernel
+from ksim_rl.physics.newton_kernel import CUDA_LANES, Problem, floats_per_world, newton_kernel, row_stride
 
-# The shared memory that a block has without asking for more, in floats, and how many worlds share it at best.
+# The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
-WORLDS_PER_BLOCK = 4
 MOST_DOFS = 64
 INTEGRATORS = (
     mujoco.mjtIntegrator.mjINT_EULER,
@@ -17,10 +19,25 @@ INTEGRATORS = (
 )
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Placement:
+    """How the worlds lie on a CUDA device.
+
+    Args:
+        rows_on_chip: rows that the shared memory of a world holds; a world with more has all of them in device memory.
+        worlds_per_block: worlds that share a block.
+        min_blocks: blocks that a multiprocessor is to hold at once, which bounds the registers; 0 does not.
+    """
+
+    rows_on_chip: int
+    worlds_per_block: int = 1
+    min_blocks: int = 0
+
+
 def suits(mj_model: mujoco.MjModel, *, njmax: int) -> bool:
     """Whether the kernel can solve this model: Newton from a warm start, few enough degrees of freedom and rows."""
     opt = mj_model.opt
-    elliptic = opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    elliptic = bool(opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC)
     return (
         opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
         and opt.integrator in INTEGRATORS
@@ -32,16 +49,88 @@ def suits(mj_model: mujoco.MjModel, *, njmax: int) -> bool:
         and mj_model.nflex == 0
         and 0 < mj_model.nv <= MOST_DOFS
         and njmax > 0
-        and floats_per_world(mj_model.nv, njmax, elliptic=bool(elliptic), rows_on_chip=njmax) <= SHARED_FLOATS
+        and floats_per_world(mj_model.nv, njmax, elliptic=elliptic, rows_on_chip=0) <= SHARED_FLOATS
     )
 
 
-def step(warp_model: mjw.Model, warp_data_E: mjw.Data, *, sensors: bool) -> None:
+def placement(*, nv: int, njmax: int, elliptic: bool) -> Placement:
+    """Return the placement that was measured to be best."""
+    room = SHARED_FLOATS - floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=0)
+    return Placement(rows_on_chip=max(0, min(njmax, room // row_stride(nv))))
+
+
+def solver(
+    warp_model: mjw.Model, warp_data_E: mjw.Data, *, place: Placement | None = None
+) -> Callable[[], None]:
+    """Return what launches the solver: accelerations and forces from the constraint rows, which must be sparse.
+
+    Args:
+        warp_model: a model that `suits`.
+        warp_data_E: the worlds, with their arrays in their final place.
+        place: how they lie on a CUDA device; None is what was measured to be best.
+    """
+    m, d, efc = warp_model, warp_data_E, warp_data_E.efc
+    elliptic = bool(m.opt.cone == mjw.ConeType.ELLIPTIC)
+    lanes = CUDA_LANES if d.qpos.device.is_cuda else 1
+    if lanes == 1:
+        place = Placement(rows_on_chip=d.njmax)
+    elif place is None:
+        place = placement(nv=m.nv, njmax=d.njmax, elliptic=elliptic)
+    kernel = newton_kernel(
+        nv=m.nv,
+        njmax=d.njmax,
+        elliptic=elliptic,
+        ls_iterations=int(m.opt.ls_iterations),
+        lanes=lanes,
+        **dataclasses.asdict(place),
+    )
+    far_floats = 0 if place.rows_on_chip == d.njmax else d.njmax * row_stride(m.nv)
+    problem = Problem()
+    problem.iterations = int(m.opt.iterations)
+    problem.tolerance = m.opt.tolerance
+    problem.ls_tolerance = m.opt.ls_tolerance
+    problem.impratio_invsqrt = m.opt.impratio_invsqrt
+    problem.M_row = m.M_hinit_i
+    problem.M_col = m.M_colind
+    problem.ne = d.ne
+    problem.nf = d.nf
+    problem.nefc = d.nefc
+    problem.M = d.M
+    problem.warmstart = d.qacc_warmstart
+    problem.qfrc_smooth = d.qfrc_smooth
+    problem.contact_friction = d.contact.friction
+    problem.efc_type = efc.type
+    problem.efc_id = efc.id
+    problem.J_rownnz = efc.J_rownnz
+    problem.J_rowadr = efc.J_rowadr
+    problem.J_colind = efc.J_colind.reshape((d.nworld, -1))
+    problem.J_values = efc.J.reshape((d.nworld, -1))
+    problem.efc_D = efc.D
+    problem.efc_aref = efc.aref
+    problem.efc_limit = efc.frictionloss
+    problem.scratch = wp.empty((d.nworld, far_floats), dtype=float, device=d.qpos.device)
+    problem.qacc = d.qacc
+    problem.efc_Ma = efc.Ma
+    problem.efc_force = efc.force
+    problem.efc_state = efc.state
+    problem.qfrc_constraint = d.qfrc_constraint
+    problem.solver_niter = d.solver_niter
+    problem.overflow = d.overflow
+    dim, block_dim = (d.nworld, lanes), place.worlds_per_block * lanes
+
+    def launch() -> None:
+        wp.launch(kernel, dim=dim, inputs=[problem], block_dim=block_dim)
+
+    return launch
+
+
+def step(warp_model: mjw.Model, warp_data_E: mjw.Data, solve: Callable[[], None], *, sensors: bool) -> None:
     """Launch a physics step: that of MuJoCo Warp, with this solver.
 
     Args:
         warp_model: with `opt.run_qacc_smooth` off, since the solver does not need that acceleration.
         warp_data_E: the worlds.
+        solve: their `solver`.
         sensors: whether to compute them; they never change the state that is reached.
     """
     m, d = warp_model, warp_data_E
@@ -54,7 +143,7 @@ def step(warp_model: mjw.Model, warp_data_E: mjw.Data, *, sensors: bool) -> None
         mjw.sensor_vel(m, d)
     mjw.fwd_actuation(m, d)
     mjw.fwd_acceleration(m, d, factorize=True)
-    solve(m, d)
+    solve()
     if sensors:
         if m.sensor_rne_postconstraint:
             mjw.rne_postconstraint(m, d)
@@ -63,80 +152,3 @@ def step(warp_model: mjw.Model, warp_data_E: mjw.Data, *, sensors: bool) -> None
         mjw.euler(m, d)
     else:
         mjw.implicit(m, d)
-
-
-def solve(
-    warp_model: mjw.Model,
-    warp_data_E: mjw.Data,
-    *,
-    worlds_per_block: int = WORLDS_PER_BLOCK,
-    min_blocks: int = 0,
-    rows_on_chip: int | None = None,
-    scratch: wp.array2d[float] | None = None,
-) -> None:
-    """Launch the solver: accelerations and constraint forces from the rows of `warp_data_E`, which must be sparse.
-
-    Args:
-        warp_model: a model that `suits`.
-        warp_data_E: the worlds.
-        worlds_per_block: how many worlds share a block on CUDA; fewer where their memory does not fit.
-        min_blocks: how many blocks a multiprocessor is to hold at once, which bounds the registers; 0 does not.
-    """
-    m, d = warp_model, warp_data_E
-    elliptic = bool(m.opt.cone == mjw.ConeType.ELLIPTIC)
-    on_cuda = d.qpos.device.is_cuda
-    lanes = CUDA_LANES if on_cuda else 1
-    if rows_on_chip is None:
-        rows_on_chip = d.njmax
-    if scratch is None:
-        scratch = wp.empty((1, 1), dtype=float, device=d.qpos.device)
-    fitting = SHARED_FLOATS // floats_per_world(m.nv, d.njmax, elliptic=elliptic, rows_on_chip=rows_on_chip)
-    worlds = min(worlds_per_block, fitting) if on_cuda else 1
-    kernel = newton_kernel(
-        nv=m.nv,
-        njmax=d.njmax,
-        elliptic=elliptic,
-        ls_iterations=int(m.opt.ls_iterations),
-        lanes=lanes,
-        worlds_per_block=worlds,
-        rows_on_chip=rows_on_chip,
-        min_blocks=min_blocks if on_cuda else 0,
-    )
-    wp.launch(kernel, dim=(d.nworld, lanes), inputs=arguments(m, d, scratch), block_dim=worlds * lanes)
-
-
-def arguments(m: mjw.Model, d: mjw.Data, scratch: wp.array2d[float]) -> list[object]:
-    """Return what the kernel reads, then what it writes."""
-    efc = d.efc
-    return [
-        int(m.opt.iterations),
-        m.opt.tolerance,
-        m.opt.ls_tolerance,
-        m.opt.impratio_invsqrt,
-        m.M_hinit_i,
-        m.M_colind,
-        d.ne,
-        d.nf,
-        d.nefc,
-        d.M,
-        d.qacc_warmstart,
-        d.qfrc_smooth,
-        d.contact.friction,
-        efc.type,
-        efc.id,
-        efc.J_rownnz,
-        efc.J_rowadr,
-        efc.J_colind.reshape((efc.J_colind.shape[0], -1)),
-        efc.J.reshape((efc.J.shape[0], -1)),
-        efc.D,
-        efc.aref,
-        efc.frictionloss,
-        scratch,
-        d.qacc,
-        efc.Ma,
-        efc.force,
-        efc.state,
-        d.qfrc_constraint,
-        d.solver_niter,
-        d.overflow,
-    ]

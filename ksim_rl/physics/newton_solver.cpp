@@ -17,38 +17,39 @@
 constexpr int EQUALITY = 0, FRICTION = 1, ONE_SIDED = 2, CONE_HEAD = 3, CONE_TANGENT = 4;
 constexpr int SATISFIED = 0, QUADRATIC = 1, LINEAR_NEGATIVE = 2, LINEAR_POSITIVE = 3, CURVED = 4;
 constexpr int ELLIPTIC_CONTACT = 7;
-constexpr float TINY = 1e-15f;
+constexpr float TINY = 1e-15f, LARGEST = 3e38f;
 constexpr float NOISE = 8.0f * 1.1920929e-07f;  // rounding of a sum of some float32 terms
 constexpr int BLOCKS = (NV + LANES - 1) / LANES;
 constexpr int COLUMN = STRIDE + 4;
-constexpr int SIZE = FLOATS, STEP = STRIDE, CHIP = ROWS_ON_CHIP;
 
 #if defined(__CUDA_ARCH__)
-__shared__ __align__(16) float floats[WORLDS_PER_BLOCK * SIZE];
-float* const memory = floats + (threadIdx.x / LANES) * SIZE;
+__shared__ __align__(16) float floats[WORLDS_PER_BLOCK * FLOATS];
+float* const memory = floats + (threadIdx.x / LANES) * FLOATS;
 #else
-static float memory[SIZE];
+static float memory[FLOATS];
 #endif
 float* const mass = memory;
-float* const chip = mass + NV * STEP;
-float* const columns = chip + CHIP * STEP;  // two
+float* const chip = mass + NV * STRIDE;
+float* const columns = chip + ROWS_ON_CHIP * STRIDE;  // two
 float* const shared = columns + 2 * COLUMN;  // a vector of the degrees of freedom, for all lanes to read
-float* const x = shared + STEP;
-float* const v = x + MANY;  // between two line searches: the stiffness of the row, 0 where it is slack
-float* const force = v + MANY;
-float* const d = force + MANY;
-float* const bound = d + MANY;  // the most force of dry friction, the mu of a cone's head, the friction of its tangents
-int* const kinds = (int*)(bound + MANY);
-int* const units = kinds + MANY;  // the rows whose cost is evaluated: all but equalities and tangents
-float* const cones = (float*)(units + MANY);
+float* const x = shared + STRIDE;
+float* const v = x + PADDED_ROWS;  // between two line searches: the stiffness of the row, 0 where it is slack
+float* const force = v + PADDED_ROWS;
+float* const d = force + PADDED_ROWS;
+float* const bound = d + PADDED_ROWS;  // the most force of dry friction, the mu of a cone's head, the friction of its tangents
+int* const kinds = (int*)(bound + PADDED_ROWS);
+int* const units = kinds + PADDED_ROWS;  // the rows whose cost is evaluated: all but equalities and tangents
+float* const cones = (float*)(units + PADDED_ROWS);
 
-const int rows = wp::min(nefc.data[world], NJ), equalities = ne.data[world], frictions = nf.data[world];
-const float impratio = impratio_invsqrt.data[world % impratio_invsqrt.shape[0]];
-const float tolerance = tolerances.data[world % tolerances.shape[0]];
-const float ls_tolerance = ls_tolerances.data[world % ls_tolerances.shape[0]];
-int* const states = efc_state.data + (size_t)world * efc_state.shape[1];
-float* const far = scratch.data + (size_t)world * scratch.shape[1];
-float* const J = CHIP >= NJ ? chip : CHIP == 0 ? far : rows <= CHIP ? chip : far;
+auto row_of = [=](auto& array) { return array.data + (size_t)world * array.shape[1]; };
+auto of_world = [=](auto& array) { return array.data[world % array.shape[0]]; };
+const int rows = wp::min(problem.nefc.data[world], NJ), equalities = problem.ne.data[world], frictions = problem.nf.data[world];
+const float impratio = of_world(problem.impratio_invsqrt);
+const float tolerance = of_world(problem.tolerance);
+const float ls_tolerance = of_world(problem.ls_tolerance);
+int* const states = row_of(problem.efc_state);
+float* const far = row_of(problem.scratch);
+float* const J = ROWS_ON_CHIP == NJ ? chip : ROWS_ON_CHIP == 0 ? far : rows <= ROWS_ON_CHIP ? chip : far;
 
 auto sync = [] {
 #if defined(__CUDA_ARCH__)
@@ -69,6 +70,8 @@ auto of_lane = [](float value, int lane) {
 #endif
     return value;
 };
+// What overflows in one tree stays there: in the sums of another tree infinity times zero would be NaN.
+auto bounded = [](float value) { return wp::clamp(value, -LARGEST, LARGEST); };
 auto ratio = [](float a, float b) { return a / (b == 0.0f ? TINY : b); };
 // A lane beyond the last degree of freedom does what the lane of the last one does, and writes nothing.
 auto is_dof = [&](int block) { return block * LANES + lane < NV; };
@@ -132,84 +135,85 @@ auto cone_point = [&](const Cone& c, float alpha) {
     return Point {change, c.dm * gap * gap_rate, c.dm * (gap_rate * gap_rate - c.mu * gap * bend), start};
 };
 auto prepare_cone = [&](int head, int size) {
-    Cone& c = *(Cone*)(cones + 4 * head);
+    Cone c {};
     c.mu = bound[head];
+    c.u0 = x[head] * c.mu;
+    c.v0 = v[head] * c.mu;
     c.dm = ratio(d[head], c.mu * c.mu * (1.0f + c.mu * c.mu));
-    c.cost = 0.5f * d[head] * x[head] * x[head];
-    c.slope = d[head] * x[head] * v[head];
-    c.half_curvature = 0.5f * d[head] * v[head] * v[head];
-    float uu = 0.0f, uv = 0.0f, vv = 0.0f, aside = 0.0f;
+    float uu = 0.0f, uv = 0.0f, vv = 0.0f;
 #pragma unroll 1
-    for (int row = head + 1; row < head + size; ++row) {
-        c.cost += 0.5f * d[row] * x[row] * x[row];
-        c.slope += d[row] * x[row] * v[row];
+    for (int row = head; row < head + size; ++row) {
+        const float push = d[row] * x[row];
+        c.cost += 0.5f * push * x[row];
+        c.slope += push * v[row];
         c.half_curvature += 0.5f * d[row] * v[row] * v[row];
-        const float u_k = x[row] * bound[row], v_k = v[row] * bound[row];
-        uu += u_k * u_k;
-        uv += u_k * v_k;
-        vv += v_k * v_k;
-        // |u|^2 |v|^2 - (u v)^2 as a sum of squares: nothing cancels.
-#pragma unroll 1
-        for (int other = head + 1; other < row; ++other) {
-            const float minor = (u_k * v[other] - x[other] * v_k) * bound[other];
-            aside += minor * minor;
-        }
+        if (row == head)
+            continue;
+        const float u = x[row] * bound[row], rate = v[row] * bound[row];
+        uu += u * u;
+        uv += u * rate;
+        vv += rate * rate;
     }
     c.speed = sqrtf(vv);
     c.along = vv > 0.0f ? uv / c.speed : 0.0f;
-    c.aside2 = vv > 0.0f ? aside / vv : uu;
-    c.u0 = x[head] * c.mu;
-    c.v0 = v[head] * c.mu;
+    const float when = vv > 0.0f ? uv / vv : 0.0f;
+    // The part of the slip across its rate, term by term: as a difference of squares it would cancel.
+#pragma unroll 1
+    for (int row = head + 1; row < head + size; ++row) {
+        const float across = (x[row] - when * v[row]) * bound[row];
+        c.aside2 += across * across;
+    }
     c.tangent = sqrtf(c.along * c.along + c.aside2);
     c.zone = (float)cone_zone(c.u0, c.tangent, c.mu);
+    *(Cone*)(cones + 4 * head) = c;
 };
 
 // The start. What the rows are is looked up once.
 #pragma unroll 1
-for (int i = lane; i < NV * STEP; i += LANES)
+for (int i = lane; i < NV * STRIDE; i += LANES)
     mass[i] = 0.0f;
 #pragma unroll 1
-for (int i = lane; i < rows * STEP; i += LANES)
+for (int i = lane; i < rows * STRIDE; i += LANES)
     J[i] = 0.0f;
 float acc[BLOCKS], ma[BLOCKS], mv[BLOCKS], smooth[BLOCKS], pull[BLOCKS], slopes[BLOCKS], inverse[BLOCKS];
 float h[BLOCKS][NV];
 UNROLL
 for (int b = 0; b < BLOCKS; ++b) {
-    acc[b] = warmstart.data[(size_t)world * warmstart.shape[1] + dof_of(b)];
-    smooth[b] = qfrc_smooth.data[(size_t)world * qfrc_smooth.shape[1] + dof_of(b)];
+    acc[b] = row_of(problem.warmstart)[dof_of(b)];
+    smooth[b] = row_of(problem.qfrc_smooth)[dof_of(b)];
     if (is_dof(b))
-        shared[dof_of(b)] = acc[b];
+        shared[dof_of(b)] = bounded(acc[b]);
 }
 sync();
 #pragma unroll 4
-for (int k = lane; k < M_row.shape[0]; k += LANES) {
-    const int row = M_row.data[k], col = M_col.data[k];
-    mass[row * STEP + col] = mass[col * STEP + row] = M.data[(size_t)world * M.shape[1] + k];
+for (int k = lane; k < problem.M_row.shape[0]; k += LANES) {
+    const int row = problem.M_row.data[k], col = problem.M_col.data[k];
+    mass[row * STRIDE + col] = mass[col * STRIDE + row] = row_of(problem.M)[k];
 }
 #pragma unroll 1
 for (int row = lane; row < rows; row += LANES) {
-    const int at = J_rowadr.data[(size_t)world * J_rowadr.shape[1] + row];
-    const int end = at + J_rownnz.data[(size_t)world * J_rownnz.shape[1] + row];
-    const float* const values = J_values.data + (size_t)world * J_values.shape[1];
-    const int* const cols = J_colind.data + (size_t)world * J_colind.shape[1];
+    const int at = row_of(problem.J_rowadr)[row];
+    const int end = at + row_of(problem.J_rownnz)[row];
+    const float* const values = row_of(problem.J_values);
+    const int* const cols = row_of(problem.J_colind);
     float product = 0.0f;
 #pragma unroll 4
     for (int k = at; k < end; ++k) {
-        J[row * STEP + cols[k]] = values[k];
+        J[row * STRIDE + cols[k]] = values[k];
         product += values[k] * shared[cols[k]];
     }
-    x[row] = product - efc_aref.data[(size_t)world * efc_aref.shape[1] + row];
-    d[row] = efc_D.data[(size_t)world * efc_D.shape[1] + row];
+    x[row] = product - row_of(problem.efc_aref)[row];
+    d[row] = row_of(problem.efc_D)[row];
     kinds[row] = row < equalities ? EQUALITY : row < equalities + frictions ? FRICTION : ONE_SIDED;
-    bound[row] = efc_limit.data[(size_t)world * efc_limit.shape[1] + row];
+    bound[row] = row_of(problem.efc_limit)[row];
     if (ELLIPTIC) {
-        const int* const types = efc_type.data + (size_t)world * efc_type.shape[1];
-        const int* const ids = efc_id.data + (size_t)world * efc_id.shape[1];
+        const int* const types = row_of(problem.efc_type);
+        const int* const ids = row_of(problem.efc_id);
         auto is_of_cone = [&](int mate) {
             return mate >= 0 && mate < rows && types[mate] == ELLIPTIC_CONTACT && ids[mate] == ids[row];
         };
         if (is_of_cone(row)) {
-            const float* const friction = (const float*)(contact_friction.data + ids[row]);
+            const float* const friction = (const float*)(problem.contact_friction.data + ids[row]);
             int before = 0, after = 1;
             while (is_of_cone(row - before - 1))
                 ++before;
@@ -238,18 +242,15 @@ for (int first = 0; first < rows; first += LANES) {
 }
 sync();
 
-// M times the shared vector.
-auto times_mass = [&](float* result) {
+// M times the vector that the lanes share, of which each has its own entries.
+auto times_mass = [&](float* result, const float* own) {
 UNROLL
     for (int b = 0; b < BLOCKS; ++b) {
         float product = 0.0f;
 UNROLL
-        for (int j = 0; j < NV; ++j) {
-            // What overflows in one tree stays there: zero times infinity would be NaN.
-            const float entry = mass[j * STEP + dof_of(b)];
-            product += entry == 0.0f ? 0.0f : entry * shared[j];
-        }
-        result[b] = product;
+        for (int j = 0; j < NV; ++j)
+            product += mass[j * STRIDE + dof_of(b)] * shared[j];
+        result[b] = fabsf(own[b]) <= LARGEST ? product : own[b];
     }
 };
 // The force of a row, and its stiffness in the place of its rate.
@@ -307,7 +308,7 @@ UNROLL
         float sum = 0.0f;
 #pragma unroll 4
         for (int row = 0; row < rows; ++row)
-            sum += J[row * STEP + dof_of(b)] * force[row];
+            sum += J[row * STRIDE + dof_of(b)] * force[row];
         pull[b] = sum;
     }
 };
@@ -329,11 +330,11 @@ UNROLL
     for (int b = 0; b < BLOCKS; ++b)
 UNROLL
         for (int j = b * LANES; j < NV; ++j)
-            h[b][j] = mass[j * STEP + dof_of(b)];
+            h[b][j] = mass[j * STRIDE + dof_of(b)];
 #pragma unroll 1
     for (int row = 0; row < rows; ++row)
         if (v[row] > 0.0f)
-            add_outer_product(v[row], J + row * STEP);
+            add_outer_product(v[row], J + row * STRIDE);
     if (!ELLIPTIC)
         return;
     float* const q = columns;
@@ -350,11 +351,11 @@ UNROLL
             float slip = 0.0f;
 #pragma unroll 1
             for (int mate = head + 1; mate < head + (kinds[head] >> 8); ++mate)
-                slip += force[mate] * J[mate * STEP + dof_of(b)];
+                slip += force[mate] * J[mate * STRIDE + dof_of(b)];
             slip *= by_push;
             if (is_dof(b)) {
                 s[dof_of(b)] = slip;
-                q[dof_of(b)] = mu * (J[head * STEP + dof_of(b)] - slip);
+                q[dof_of(b)] = mu * (J[head * STRIDE + dof_of(b)] - slip);
             }
         }
         sync();
@@ -372,7 +373,7 @@ UNROLL
         if (is_dof(own))
             column[own * LANES + lane] = h[own][c];
         if (lane == c % LANES) {
-            column[NV] = slopes[own];
+            column[NV] = bounded(slopes[own]);
 UNROLL
             for (int j = (own + 1) * LANES; j < NV; ++j)
                 column[j] = h[own][j];
@@ -385,8 +386,7 @@ UNROLL
             const float factor = row > c ? (b == own ? h[b][c] : column[dof_of(b)]) * by_pivot : 0.0f;
             if (row == c)
                 inverse[b] = by_pivot;
-            if (factor != 0.0f)
-                slopes[b] -= factor * column[NV];
+            slopes[b] -= factor * column[NV];
             if (LANES == 1 && factor == 0.0f)
                 continue;
 UNROLL
@@ -400,17 +400,17 @@ auto back_substitute = [&] {
 UNROLL
     for (int c = NV - 1; c > 0; --c) {
         const int own = c / LANES;
-        const float found = of_lane(slopes[own] * inverse[own], c % LANES);
+        const float found = of_lane(bounded(slopes[own] * inverse[own]), c % LANES);
 UNROLL
         for (int b = 0; b <= own; ++b)
-            if (b * LANES + lane < c && h[b][c] != 0.0f)
+            if (b * LANES + lane < c)
                 slopes[b] -= h[b][c] * found;
     }
 UNROLL
     for (int b = 0; b < BLOCKS; ++b) {
         slopes[b] *= -inverse[b];
         if (is_dof(b))
-            shared[dof_of(b)] = slopes[b];
+            shared[dof_of(b)] = bounded(slopes[b]);
     }
     sync();
 };
@@ -438,11 +438,11 @@ auto in_bracket = [](const Point& end, const Point& point) {
     return (end.slope < point.slope && point.slope < 0.0f) || (end.slope > point.slope && point.slope > 0.0f);
 };
 
-times_mass(ma);
+times_mass(ma, acc);
 float trace = 0.0f;
 UNROLL
 for (int b = 0; b < BLOCKS; ++b)
-    trace += is_dof(b) ? mass[dof_of(b) * (STEP + 1)] : 0.0f;
+    trace += is_dof(b) ? mass[dof_of(b) * (STRIDE + 1)] : 0.0f;
 const float scale = 1.0f / wp::max(TINY, total(trace));
 
 int iteration = 0;
@@ -469,13 +469,13 @@ UNROLL
         decrement += is_dof(b) ? slopes[b] * slopes[b] * inverse[b] : 0.0f;
     if (iteration > 0 && 0.5f * scale * total(decrement) < tolerance)
         break;
-    if (iteration == iterations) {
+    if (iteration == problem.iterations) {
         if (lane == 0)
-            overflow.data[world] |= OUT_OF_ITERATIONS;
+            problem.overflow.data[world] |= OUT_OF_ITERATIONS;
         break;
     }
     back_substitute();
-    times_mass(mv);
+    times_mass(mv, slopes);
     float search2 = 0.0f, slope = 0.0f, half_curvature = 0.0f;
 UNROLL
     for (int b = 0; b < BLOCKS; ++b)
@@ -489,7 +489,7 @@ UNROLL
         float rate = 0.0f;
 UNROLL
         for (int j = 0; j < NV; ++j)
-            rate += J[row * STEP + j] * shared[j];
+            rate += J[row * STRIDE + j] * shared[j];
         v[row] = rate;
         if (row < equalities) {
             slope += d[row] * rate * x[row];
@@ -518,7 +518,7 @@ UNROLL
     for (int trial = -2; rows > 0; ++trial) {
         if (trial == MOST_TRIALS) {
             if (lane == 0)
-                overflow.data[world] |= OUT_OF_LS_ITERATIONS;
+                problem.overflow.data[world] |= OUT_OF_LS_ITERATIONS;
             break;
         }
         if (trial >= 0) {
@@ -631,13 +631,13 @@ UNROLL
 UNROLL
 for (int b = 0; b < BLOCKS; ++b)
     if (is_dof(b)) {
-        qacc.data[(size_t)world * qacc.shape[1] + dof_of(b)] = acc[b];
-        efc_Ma.data[(size_t)world * efc_Ma.shape[1] + dof_of(b)] = ma[b];
-        qfrc_constraint.data[(size_t)world * qfrc_constraint.shape[1] + dof_of(b)] = pull[b];
+        row_of(problem.qacc)[dof_of(b)] = acc[b];
+        row_of(problem.efc_Ma)[dof_of(b)] = ma[b];
+        row_of(problem.qfrc_constraint)[dof_of(b)] = pull[b];
     }
 #pragma unroll 1
 for (int row = lane; row < rows; row += LANES)
-    efc_force.data[(size_t)world * efc_force.shape[1] + row] = force[row];
+    row_of(problem.efc_force)[row] = force[row];
 if (lane == 0)
-    solver_niter.data[world] = iteration;
+    problem.solver_niter.data[world] = iteration;
 #undef UNROLL

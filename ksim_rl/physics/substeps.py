@@ -51,6 +51,7 @@ class Substeps:
             # From the warm start even a world without constraints reaches qacc_smooth in one step.
             opt = dataclasses.replace(warp_model.opt, run_qacc_smooth=False)
             self._solver_model = dataclasses.replace(warp_model, opt=opt)
+            self._solve = newton.solver(self._solver_model, warp_data_E)
         self._refresh_model = _refreshable(
             warp_model, skip=has_history | np.isin(sensor_type, COLLISION_SENSORS), sensor_type=sensor_type
         )
@@ -61,7 +62,8 @@ class Substeps:
     def advance(self, *, sensors: bool) -> None:
         """Launch one physics step. Sensors never change the state that it reaches."""
         if self._solver_model is not None:
-            newton.step(self._solver_model, self.warp_data_E, sensors=sensors or self._always_senses)
+            sensors = sensors or self._always_senses
+            newton.step(self._solver_model, self.warp_data_E, self._solve, sensors=sensors)
         else:
             mjw.step(self.warp_model if sensors else self._silent_model, self.warp_data_E)
 

@@ -10,9 +10,11 @@ from ksim_rl.trainers.state_tree import State
 
 
 def optimizer_state(optimizer: torch.optim.Optimizer) -> State:
-    """Return learning rate and moments."""
+    """Return learning rate and moments; a parameter that no loss has reached has an empty entry."""
     state = optimizer.state_dict()
-    return {"learning_rate": state["param_groups"][0]["lr"], "moments": state["state"]}
+    group = state["param_groups"][0]
+    moments = {index: state["state"].get(index, {}) for index in range(len(group["params"]))}
+    return {"learning_rate": group["lr"], "moments": moments}
 
 
 def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, Any], *, what: str) -> None:
@@ -23,10 +25,11 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, A
     """
     parameters = optimizer.param_groups[0]["params"]
     moments = {int(index): entry for index, entry in state["moments"].items()}
-    if moments and set(moments) != set(range(len(parameters))):
+    if set(moments) != set(range(len(parameters))):
         raise ValueError(
             f"{what}: {len(moments)} parameters in the checkpoint, {len(parameters)} in this run"
         )
+    moments = {index: entry for index, entry in moments.items() if entry}
     for index, entry in moments.items():
         for name in ("exp_avg", "exp_avg_sq"):
             if entry[name].shape != parameters[index].shape:

@@ -19,7 +19,6 @@ from ksim_rl.objectives import (
     StepGuard,
     distribution_keys,
     in_precision,
-    load_optimizer_state_,
     make_advantage,
     make_loss,
     make_optimizer,
@@ -32,6 +31,7 @@ from ksim_rl.physics.capture import Captured
 from ksim_rl.trainers import state_tree
 from ksim_rl.trainers.fused_ppo import make_fused_ppo
 from ksim_rl.trainers.networks import build_networks
+from ksim_rl.trainers.optimizer_state import load_optimizer_state, optimizer_state
 from ksim_rl.trainers.run_cfg import RunCfg
 
 # Names of the logged means, by the names that `ppo_step` gives them.
@@ -51,7 +51,9 @@ def make_ppo_update(cfg: RunCfg, env: EnvBase) -> "PPOUpdate":
     """Build the PPO update of a run."""
     assert isinstance(cfg.objective, PPOCfg)
     if not isinstance(cfg.data, DatasetCfg):
-        raise ValueError(f"data is a {type(cfg.data).__name__}, and PPO needs a DatasetCfg: use data=on_policy")
+        raise ValueError(
+            f"data is a {type(cfg.data).__name__}, and PPO needs a DatasetCfg: use data=on_policy"
+        )
     actor, critic = build_networks(cfg, env)
     read = list(dict.fromkeys((*observation_keys(actor), *critic.in_keys)))
     return PPOUpdate(
@@ -167,13 +169,17 @@ class PPOUpdate:
         """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
         means = {name: total / self._steps_made.clamp_min(1.0) for name, total in self._sums.items()}
         std = {"policy/std": self._std} if self._scale_keys else {}
-        return means | std | {
-            "update/learning_rate": self.optimizer.param_groups[0]["lr"],
-            "update/fused": self._is_fused,
-            "update/skipped_steps": self.guard.skipped,
-            "update/skipped_in_a_row": self._longest_skip,
-            "update/non_finite_env_states": self.dataset.non_finite_count,
-        }
+        return (
+            means
+            | std
+            | {
+                "update/learning_rate": self.optimizer.param_groups[0]["lr"],
+                "update/fused": self._is_fused,
+                "update/skipped_steps": self.guard.skipped,
+                "update/skipped_in_a_row": self._longest_skip,
+                "update/non_finite_env_states": self.dataset.non_finite_count,
+            }
+        )
 
     def check(self, metrics: Mapping[str, float]) -> None:
         """Stop a run whose gradient steps are all skipped; `metrics` are those of `metrics()`, on the host.
@@ -234,14 +240,10 @@ class PPOUpdate:
 
     def state_dict(self) -> state_tree.State:
         """Return networks, optimizer, sampler and counters."""
-        optimizer = self.optimizer.state_dict()
         return {
             "actor": self.actor.state_dict(),
             "critic": self.critic.state_dict(),
-            "optimizer": {
-                "learning_rate": optimizer["param_groups"][0]["lr"],
-                "moments": optimizer["state"],
-            },
+            "optimizer": optimizer_state(self.optimizer),
             "sampler": self.dataset.sampler.state_dict(),
             "guard": self.guard.state_dict(),
             "non_finite_env_states": self.dataset.non_finite_count,
@@ -256,7 +258,7 @@ class PPOUpdate:
         """
         self.load_weights(state)
         state_tree.copy_into(self.guard.state_dict(), state["guard"], what="guard")
-        self._load_optimizer(state["optimizer"])
+        load_optimizer_state(self.optimizer, state["optimizer"], what="optimizer")
         self.dataset.sampler.load_state_dict(state["sampler"])
         self.dataset.non_finite_count.copy_(state["non_finite_env_states"])
         self._carried.load_state_dict(state["recurrent_state"], device=self.device)
@@ -269,21 +271,3 @@ class PPOUpdate:
         """
         state_tree.copy_into(self.actor.state_dict(), state["actor"], what="actor")
         state_tree.copy_into(self.critic.state_dict(), state["critic"], what="critic")
-
-    def _load_optimizer(self, state: Mapping[str, Any]) -> None:
-        parameters = self.optimizer.param_groups[0]["params"]
-        moments = {int(index): entry for index, entry in state["moments"].items()}
-        if moments and set(moments) != set(range(len(parameters))):
-            raise ValueError(
-                f"optimizer: {len(moments)} parameters in the checkpoint, {len(parameters)} in this run"
-            )
-        for index, entry in moments.items():
-            for name in ("exp_avg", "exp_avg_sq"):
-                if entry[name].shape != parameters[index].shape:
-                    raise ValueError(
-                        f"optimizer: {name} of parameter {index} has shape {list(entry[name].shape)} in the "
-                        f"checkpoint and {list(parameters[index].shape)} in this run"
-                    )
-        groups = self.optimizer.state_dict()["param_groups"]
-        groups[0] = groups[0] | {"lr": state["learning_rate"]}
-        load_optimizer_state_(self.optimizer, {"state": moments, "param_groups": groups})

@@ -1,6 +1,7 @@
 """The one-kernel solver against MuJoCo's C engine and MuJoCo Warp's own solver, on rows of every kind."""
 
 import dataclasses
+from functools import partial
 
 import mujoco
 import mujoco_warp as mjw
@@ -81,7 +82,7 @@ def test_accelerations_and_forces_are_those_of_the_c_engine(cone):
     assert world.has_one_kernel_solver
     rows_of(world)
     with wp.ScopedDevice("cpu"):
-        newton.solve(world.warp_model, world.warp_data_E)
+        newton.solver(world.warp_model, world.warp_data_E)()
     seen = set()
     for row in range(NUM_ENVS):
         mj_data = mujoco.MjData(world.mj_model)
@@ -115,9 +116,10 @@ def test_iterations_and_overflow_are_those_of_mujoco_warp(cone, iterations):
     rows_of(world)
     found = []
     with wp.ScopedDevice("cpu"):
-        for solve in (mjw.solve, newton.solve):
+        model, data = world.warp_model, world.warp_data_E
+        for solve in (partial(mjw.solve, model, data), newton.solver(model, data)):
             world.view("overflow").zero_()
-            solve(world.warp_model, world.warp_data_E)
+            solve()
             names = ("qacc", "qfrc_constraint", "efc.Ma", "efc.state", "solver_niter", "overflow")
             found.append({name: world.view(name).clone() for name in names})
     theirs, ours = found
@@ -174,7 +176,7 @@ def test_models_out_of_range_take_the_solver_of_mujoco_warp():
         assert takes_one_kernel(model, choice, njmax=64, device=cpu) is on_cpu
         assert takes_one_kernel(model, choice, njmax=64, device=gpu) is on_gpu
     with pytest.raises(ValueError, match="one_kernel_solver='auto': expected True, False or None"):
-        SimCfg(one_kernel_solver="auto")  # pyright: ignore[reportArgumentType]
+        SimCfg(one_kernel_solver="auto")
     assert World(model, num_envs=1, sim=sim).has_one_kernel_solver
     assert not World(
         model, num_envs=1, sim=dataclasses.replace(sim, deterministic=True)

@@ -63,8 +63,7 @@ class ActionDelay(LaggedTransform):
         if not self._sized:
             # The action's shape is in the specs only, and they size the buffers.
             assert self.container is not None and self.container.input_spec is not None
-        mask_E = self._reset_rows(tensordict, tensordict_reset)
-        self._restart(mask_E)
+        mask_E = self._rows_that_reset(tensordict, tensordict_reset)
         for index in range(len(self.in_keys_inv)):
             ring_EM: torch.Tensor = getattr(self, f"ring_{index}")
             self._through(index, torch.full_like(ring_EM[:, 0], self.initial), mask_E)

@@ -68,8 +68,7 @@ class ObservationDelay(LaggedTransform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         values = self._read(tensordict_reset)
-        mask_E = self._reset_rows(tensordict, tensordict_reset)
-        self._restart(mask_E)
+        mask_E = self._rows_that_reset(tensordict, tensordict_reset)
         return self._pass(tensordict_reset, values, mask_E)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

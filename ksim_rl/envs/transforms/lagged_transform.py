@@ -3,6 +3,7 @@
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from ksim_rl import random
@@ -10,7 +11,7 @@ from ksim_rl.envs.transforms import ring
 from ksim_rl.envs.transforms.delay_cfg import DelayCfg
 from ksim_rl.envs.transforms.keyed_transform import KeyedTransform
 from ksim_rl.envs.transforms.level import FollowsLevel
-from ksim_rl.envs.transforms.row_transform import Keys
+from ksim_rl.envs.transforms.row_transform import Keys, RowTransform
 from ksim_rl.envs.transforms.specs import Device
 
 
@@ -84,19 +85,28 @@ class LaggedTransform(FollowsLevel, KeyedTransform):
             due = due & (chance >= delay.hold_probability)
         self.lag_E.copy_(torch.where(due, self._draw(self._step_keys("step/lag", num_rows)), self.lag_E))
 
-    def _restart(self, mask_E: Tensor) -> None:
-        """Draw the lags of the masked rows' new episodes."""
+    def _rows_that_reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
+        """Return which rows reset, bool [E], with what the rings do not do as these rows begin."""
+        if self._draws_in_ring:
+            return RowTransform._reset_rows(self, tensordict, tensordict_reset)
+        mask_E = self._reset_rows(tensordict, tensordict_reset)
         if self._is_fixed:
-            return
+            return mask_E
         if self.delay.per_env:
             lag_E = self._draw(self._reset_keys("reset/lag"))
             self.lag_E.copy_(torch.where(mask_E, lag_E, self.lag_E))
-            return
+            return mask_E
         together = mask_E.all()
         self.shared_count.add_(together)
         self.shared_age.mul_(~together)
         keys = random.row_keys(self.seed_value, self._stream_ids["reset/lag"], self.shared_count, 1)
         self.lag_E.copy_(torch.where(together, self._draw(keys), self.lag_E))
+        return mask_E
+
+    @property
+    def _draws_in_ring(self) -> bool:
+        """Whether the launch that lets rows begin draws their lags too."""
+        return self.delay.per_env and not self.delay.by_level and not self._is_fixed
 
     def _draw(self, keys: random.RowKeys) -> Tensor:
         """Draw lags, int64 [E] or [1]."""
@@ -115,5 +125,12 @@ class LaggedTransform(FollowsLevel, KeyedTransform):
             counts = index == self.num_rings - 1
             found_EL = ring.push(ring_EM, age_E, value_E, lag_E=buffers["lag_E"], counts=counts)
         else:
-            found_EL = ring.begin(ring_EM, age_E, value_E, mask_E)
+            lags = self._lags() if index == 0 and self._draws_in_ring else None
+            found_EL = ring.begin(ring_EM, age_E, value_E, mask_E, lags=lags)
         return found_EL if value.ndim == 2 else found_EL.view(value.shape)
+
+    def _lags(self) -> ring.Lags:
+        buffers, delay = self._buffers, self.delay
+        stream = self._stream_ids["reset/lag"]
+        drawn = buffers["lag_E"], buffers["seed_value"], buffers["reset_count_E"]
+        return ring.Lags(*drawn, stream, delay.min_lag, delay.max_lag)

@@ -1,13 +1,14 @@
 """Sensor noise."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
+from ksim_rl.envs.transforms.columns import side_by_side, split
 from ksim_rl.envs.transforms.keyed_transform import KeyedTransform
 from ksim_rl.envs.transforms.level import FollowsLevel
 from ksim_rl.envs.transforms.noise_cfg import NoiseCfg
@@ -141,38 +142,41 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         self._size_by(tensordict_reset)
         # The kernel counts the resets, and below the steps.
         mask_E = RowTransform._reset_rows(self, tensordict, tensordict_reset)
+        values = [tensordict_reset.get(key) for key in self.in_keys]
+        state, features = self._state()
         stream, counter_E = self._stream_ids["reset"], self.reset_count_E
-        clean_EL, state, features = self._read(tensordict_reset), self._state(), self._columns.features
+        clean_EL = self._joined(values)
         noisy_EL = reset_noise(clean_EL, state, features, mask_E, stream=stream, counter_E=counter_E)
-        return self._write(tensordict_reset, noisy_EL)
+        return self._write(tensordict_reset, noisy_EL, values)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._size_by(next_tensordict)
-        stream, counter_E = self._stream_ids["step"], self.step_count_E
-        clean_EL, state, features = self._read(next_tensordict), self._state(), self._columns.features
-        noisy_EL = step_noise(clean_EL, state, features, stream=stream, counter_E=counter_E)
-        return self._write(next_tensordict, noisy_EL)
+        values = [next_tensordict.get(key) for key in self.in_keys]
+        state, features = self._state()
+        stream, counter_E = self._stream_ids["step"], cast(Tensor, self._buffers["step_count_E"])
+        noisy_EL = step_noise(self._joined(values), state, features, stream=stream, counter_E=counter_E)
+        return self._write(next_tensordict, noisy_EL, values)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add fresh noise to a batch of samples; they belong to no episode, so there is no bias, walk or dropout."""
-        self._size_columns([tensordict.get(key).shape[tensordict.ndim :] for key in self.in_keys])
+        values = [tensordict.get(key) for key in self.in_keys]
+        self._size_columns([value.shape[tensordict.ndim :] for value in values])
+        state, features = self._state()
         stream, counter = self._stream_ids["forward"], self.step_count
-        clean_EL, state, features = self._read(tensordict), self._state(), self._columns.features
+        clean_EL = self._joined(values, tensordict.numel())
         noisy_EL = add_noise(clean_EL, state, features, stream=stream, counter=counter)
         self.step_count.add_(1)
-        return self._write(tensordict, noisy_EL)
+        return self._write(tensordict, noisy_EL, values)
 
-    @property
-    def _columns(self) -> NoiseColumns:
-        assert self.noise_columns is not None, "an env sizes its transforms before it steps"
-        return self.noise_columns
-
-    def _state(self) -> NoiseState:
+    def _state(self) -> tuple[NoiseState, int]:
+        """Return what the kernel reads and changes, and what any column has."""
+        # Look-ups by attribute go through `nn.Module` and would take a fifth of the step.
         buffers: dict[str, Any] = self._buffers
-        columns = self._columns
-        return NoiseState(
-            columns.table_PL,
-            columns.flags_L,
+        columns: Any = self._modules["noise_columns"]
+        parameters: dict[str, Any] = columns._buffers
+        state = NoiseState(
+            parameters["table_PL"],
+            parameters["flags_L"],
             buffers["enabled"],
             buffers["level"],
             buffers["seed_value"],
@@ -180,27 +184,19 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
             buffers["walk_EL"],
             buffers["last_EL"],
         )
+        return state, columns.features
 
-    def _read(self, tensordict: TensorDictBase) -> Tensor:
+    def _joined(self, values: list[Tensor], num_rows: int | None = None) -> Tensor:
         """Return the clean readings, float32: those of one observation as they are, several side by side [E, L]."""
-        values = [tensordict.get(key) for key in self.in_keys]
-        if len(values) == 1:
-            return values[0] if values[0].dtype == torch.float32 else values[0].float()
-        clean_EL = torch.cat([value.reshape(tensordict.numel(), -1) for value in values], dim=1)
+        clean_EL = values[0]
+        if len(values) > 1:
+            clean_EL = side_by_side(values, self.num_rows if num_rows is None else num_rows)
         return clean_EL if clean_EL.dtype == torch.float32 else clean_EL.float()
 
-    def _write(self, tensordict: TensorDictBase, noisy_EL: Tensor) -> TensorDictBase:
-        if len(self.in_keys) == 1:
-            dtype = tensordict.get(self.in_keys[0]).dtype
-            noisy = noisy_EL if dtype == torch.float32 else noisy_EL.to(dtype)
-            return tensordict.set(self.out_keys[0], noisy)
-        start = 0
-        values = [tensordict.get(key) for key in self.in_keys]
-        for out_key, value in zip(self.out_keys, values, strict=True):
-            size = value.shape[tensordict.ndim :].numel()
-            noisy = noisy_EL[:, start : start + size]
-            tensordict.set(out_key, noisy.reshape(value.shape).to(value.dtype))
-            start += size
+    def _write(self, tensordict: TensorDictBase, noisy_EL: Tensor, values: list[Tensor]) -> TensorDictBase:
+        found = [noisy_EL] if len(values) == 1 else split(noisy_EL, values)
+        for out_key, noisy, value in zip(self.out_keys, found, values):  # noqa: B905 (takes time in every step)
+            tensordict.set(out_key, noisy if noisy.dtype == value.dtype else noisy.to(value.dtype))
         return tensordict
 
 

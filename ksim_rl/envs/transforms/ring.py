@@ -6,12 +6,14 @@ which the kernel counts on the device, so that a captured step goes on correctly
 """
 
 import math
+from typing import NamedTuple
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from ksim_rl.physics.quick_launch import QuickLaunch, address
+from ksim_rl.random import DRAWS
 
 
 @wp.struct
@@ -25,6 +27,11 @@ class _Ring:
     stride: int
     num_parts: int
     counts: int
+    stream: wp.uint32
+    lowest: int
+    span: int
+    seed: wp.uint64
+    draw_count: wp.uint64
     age: wp.uint64
     lag: wp.uint64
     mask: wp.uint64
@@ -36,7 +43,9 @@ class _Ring:
 
 # Rows of the ring are bytes, so that one kernel serves every dtype. The lanes of a row copy words of 16, 4 or 1 bytes,
 # a few at once, as the GPU waits for all of them together; on the CPU one lane copies whole parts.
-@wp.func_native(r"""
+@wp.func_native(
+    DRAWS
+    + r"""
     struct alignas(16) Wide { unsigned word[4]; };
     const int num_bytes = a.num_bytes, num_slots = a.num_slots, num_frames = a.num_frames, lanes = a.lanes;
     long long* age = (long long*)a.age + row;
@@ -49,6 +58,11 @@ class _Ring:
     const bool writes = !resets || ((const unsigned char*)a.mask)[row];
     const long long now = resets ? 0 : before + 1;
     if (lane == 0 && writes && a.counts) *age = now;
+    if (lane == 0 && resets && writes && a.draw_count) {
+        const long long count = ++((long long*)a.draw_count)[row];
+        const unsigned long long bits = bits_of(key_of(*(const long long*)a.seed, a.stream, count, row), 0u);
+        ((long long*)a.lag)[row] = a.lowest + (long long)((bits * (unsigned)a.span) >> 32);
+    }
     // Whole numbers of 32 bits divide much faster.
     const int slot = now >> 32 ? (int)(now % (unsigned)num_slots) : (int)((unsigned)now % (unsigned)num_slots);
     const long long newest = a.lag && !resets ? ((const long long*)a.lag)[row] : 0;
@@ -104,7 +118,8 @@ class _Ring:
             }
         }
     }
-""")
+"""
+)
 def _copy(row: int, lane: int, a: _Ring): ...
 
 
@@ -117,6 +132,28 @@ def _push_and_read(a: _Ring):
 _quick = QuickLaunch(_push_and_read, _Ring)
 _LANES, _MANY_LANES = 32, 256
 """Threads that share a row on the GPU: a warp, or a block for large rows."""
+
+
+class Lags(NamedTuple):
+    """Lags that rows draw as they begin: those of `ksim_rl.random.integers` at the counts that they reach.
+
+    Attributes:
+        lag_E: int64; changed in place.
+        seed: int64 [].
+        count_E: resets of each row, int64; changed in place.
+        stream: the id of the stream of draws.
+        lowest, highest: env steps, both included.
+    """
+
+    lag_E: Tensor | None
+    seed: Tensor | None
+    count_E: Tensor | None
+    stream: int
+    lowest: int
+    highest: int
+
+
+_NO_LAGS = Lags(None, None, None, 0, 0, 0)
 
 
 def push(
@@ -146,7 +183,7 @@ def push(
     Returns:
         [E, N * L] for L elements per env. A lag that reaches back beyond the reset gives the value of that.
     """
-    return _run(ring_EM, age_E, value_E, lag_E, None, num_frames, stride, parts, counts)
+    return _run(ring_EM, age_E, value_E, lag_E, None, num_frames, stride, parts, counts, *_NO_LAGS[1:])
 
 
 def begin(
@@ -157,9 +194,14 @@ def begin(
     *,
     num_frames: int = 1,
     parts: Tensor | None = None,
+    lags: Lags | None = None,
 ) -> Tensor:
-    """Let the masked rows begin with these values, and return each row's value `num_frames` times; see `push`."""
-    return _run(ring_EM, age_E, value_E, None, mask_E, num_frames, 0, parts, True)
+    """Let the masked rows begin with these values, and return each row's value `num_frames` times; see `push`.
+
+    With `lags`, these rows also draw new ones.
+    """
+    drawn = _NO_LAGS if lags is None else lags
+    return _run(ring_EM, age_E, value_E, drawn[0], mask_E, num_frames, 0, parts, True, *drawn[1:])
 
 
 def _run(*arguments: object) -> Tensor:
@@ -179,6 +221,11 @@ def _launch(
     stride: int,
     parts: Tensor | None,
     counts: bool,
+    seed: Tensor | None,
+    draw_count_E: Tensor | None,
+    stream: int,
+    lowest: int,
+    highest: int,
 ) -> Tensor:
     if not _has_whole_rows(value_E):
         value_E = value_E.contiguous()
@@ -194,26 +241,10 @@ def _launch(
         bits = num_bytes | value_stride | value if parts is None else item_size
         width = 16 if bits % 16 == 0 else 4 if bits % 4 == 0 else 1
         lanes = _LANES if num_frames * num_bytes <= 32 * _LANES * width * num_parts else _MANY_LANES
-    _quick(
-        device,
-        (num_rows if num_bytes else 0, lanes),
-        width,
-        lanes,
-        num_bytes,
-        value_stride,
-        num_slots,
-        num_frames,
-        stride,
-        num_parts,
-        counts,
-        age_E.data_ptr(),
-        address(lag_E),
-        address(mask_E),
-        address(parts),
-        value,
-        ring_EM.data_ptr(),
-        out_EL.data_ptr(),
-    )
+    layout = width, lanes, num_bytes, value_stride, num_slots, num_frames, stride, num_parts, counts
+    draws = stream, lowest, highest - lowest + 1, address(seed), address(draw_count_E)
+    tensors = age_E.data_ptr(), address(lag_E), address(mask_E), address(parts), value
+    _quick(device, (num_rows, lanes), *layout, *draws, *tensors, ring_EM.data_ptr(), out_EL.data_ptr())
     return out_EL
 
 
@@ -222,7 +253,9 @@ def _has_whole_rows(value_E: Tensor) -> bool:
     return value_E.ndim == 1 or value_E.ndim == 2 and value_E.stride(1) == 1 or value_E.is_contiguous()
 
 
-_ring = torch.library.custom_op("ksim_rl::ring", _launch, mutates_args=("ring_EM", "age_E"))
+_ring = torch.library.custom_op(
+    "ksim_rl::ring", _launch, mutates_args=("ring_EM", "age_E", "lag_E", "draw_count_E")
+)
 
 
 @_ring.register_fake
