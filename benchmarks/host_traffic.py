@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.profiler import ProfilerActivity, profile
+from torch.profiler import ProfilerActivity, profile, record_function
 
 # Calls that wait for all work of a stream or the device. An event is waited for only where a copy is read.
 SYNCS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cuStreamSynchronize", "cuCtxSynchronize")
 BLOCKING_COPIES = ("cudaMemcpy", "cuMemcpyDtoH_v2")
+
+WORK = "work"
 
 Event = dict[str, Any]
 
@@ -21,7 +23,7 @@ Event = dict[str, Any]
 def cuda_events(work: Callable[[], object]) -> list[Event]:
     """Run `work` under the profiler and return its events, as a Chrome trace has them."""
     torch.cuda.synchronize()
-    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as recorded:
+    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as recorded, record_function(WORK):
         work()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "trace.json"
@@ -32,8 +34,16 @@ def cuda_events(work: Callable[[], object]) -> list[Event]:
 def host_traffic(work: Callable[[], object]) -> dict[str, int]:
     """Return how often `work` waits for the device, and how many copies it takes to the host."""
     events = cuda_events(work)
-    calls = [event["name"] for event in events if event.get("cat") in ("cuda_runtime", "cuda_driver")]
-    # Leaving the profiler waits for the device once.
+    work_event = next(
+        event for event in events if event.get("name") == WORK and event.get("cat") == "user_annotation"
+    )
+    end = work_event["ts"] + work_event["dur"]
+    # Leaving the profiler waits for the device as well, after the end.
+    calls = [
+        event["name"]
+        for event in events
+        if event.get("cat") in ("cuda_runtime", "cuda_driver") and event["ts"] < end
+    ]
     waits = sum(name in SYNCS or name in BLOCKING_COPIES for name in calls)
     copies = sum(event.get("cat") == "gpu_memcpy" and "DtoH" in event["name"] for event in events)
     return {"host_syncs": waits, "host_copies": copies}

@@ -12,9 +12,9 @@ which share of all such exchanges the means of the settings lie at least as far 
 
 More envs mean fewer steps of each, and that does show at the start of a run: until the critic has seen about
 1 / (1 - gamma) steps of an env, its estimates where a rollout is cut are of a shorter future, and envs that all begin
-alike fill the first datasets with one phase of an episode. So this setting has a short horizon, spread starts, and steps
-that a divergence bounds. With gamma 0.99, starts near upright and a fixed learning rate (the task's own training), 1024
-envs lose the first 200,000 env states or so.
+alike fill the first datasets with one phase of an episode. So this setting has a short horizon, spread starts, and
+steps that a divergence bounds. With gamma 0.99, starts near upright and a fixed learning rate (the training defaults of
+the task), 1024 envs lose the first 200,000 env states or so.
 """
 
 from __future__ import annotations

@@ -12,9 +12,11 @@ benchmarks/results/throughput.json. How long the first iteration takes: `benchma
 
 from __future__ import annotations
 
+import gc
 import statistics
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +32,7 @@ from ksim_rl import conf
 from ksim_rl.physics import World
 from ksim_rl.physics.capture import Captured
 from ksim_rl.trainers import RunCfg, Trainer, build
+from ksim_rl.trainers.updates import make_update
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,9 +58,10 @@ def measure(cfg: RunCfg) -> dict[str, float]:
     collector, update = trainer.collector, trainer.update
     for _ in range(cfg.collector.warmup + 2):
         collector.collect()
-    memory = _bytes_per_world(trainer)
+    memory = _bytes_per_world(trainer, cfg)
     for _ in range(schedule.warmup_iterations):
         update(collector.collect())
+    memory |= _bytes_of_the_update(trainer, memory)
 
     iteration_ms = _iteration_ms(trainer, device, schedule.timed_iterations)
     rollout_ms = milliseconds(collector.collect, device=device, repeats=schedule.repeats)
@@ -88,18 +92,37 @@ def measure(cfg: RunCfg) -> dict[str, float]:
     }
 
 
-def _bytes_per_world(trainer: Trainer) -> dict[str, float]:
-    """Return the memory per world of MuJoCo Warp's arrays, and of all else that env and rollout hold.
+def _bytes_per_world(trainer: Trainer, cfg: RunCfg) -> dict[str, float]:
+    """Return the memory per world of MuJoCo Warp's arrays, and of what env and rollout hold beside them.
 
-    The second is what torch has taken by now, policy and optimizer included; the update has not run.
+    The second is what torch has taken before the first update, without what an update takes when it is built.
     """
     world = _world(trainer)
     figures = {"physics_bytes_per_world": float(world.bytes_per_world())}
     if world.device.type == "cuda":
-        torch.cuda.synchronize(world.device)
-        torch.cuda.empty_cache()
-        figures["env_and_rollout_bytes_per_world"] = torch.cuda.memory_reserved(world.device) / world.num_envs
+        before = torch.cuda.memory_allocated(world.device)
+        another = make_update(cfg, trainer.collector.env)
+        of_update = torch.cuda.memory_allocated(world.device) - before
+        del another
+        held = _reserved(world.device) - of_update
+        figures["env_and_rollout_bytes_per_world"] = held / world.num_envs
     return figures
+
+
+def _bytes_of_the_update(trainer: Trainer, memory: Mapping[str, float]) -> dict[str, float]:
+    """Return the memory per world of networks, optimizer, dataset and activations."""
+    world = _world(trainer)
+    if world.device.type != "cuda":
+        return {}
+    held = _reserved(world.device) / world.num_envs
+    return {"update_bytes_per_world": held - memory["env_and_rollout_bytes_per_world"]}
+
+
+def _reserved(device: torch.device) -> int:
+    gc.collect()
+    torch.cuda.synchronize(device)
+    torch.cuda.empty_cache()
+    return torch.cuda.memory_reserved(device)
 
 
 @torch.no_grad()

@@ -11,7 +11,8 @@ that adds noise or turns a count of steps into the time that is left, and `CatFr
 to keep. The chain is noise -> delay -> history of 10 -> groups. Figures go to benchmarks/results/transforms.json.
 
 `go1=true` (the default on CUDA) also times the captured control step of Unitree Go1, bare and with that chain on its
-observations: `chain_share_of_go1_step` is what the chain adds, relative to the bare step.
+observations: `chain_share_of_go1_step` is what the chain adds (`go1_chain_ms`), relative to the bare step. `only=go1`
+times nothing else.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from collections.abc import Callable
 import torch
 from rich.console import Console
 from rich.table import Table
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import (
@@ -48,6 +49,7 @@ from benchmarks import report
 from benchmarks.stopwatch import milliseconds
 from benchmarks.transforms_env import TERMS, WideEnv
 from ksim_rl import envs
+from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from ksim_rl.envs import transforms as ours
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
 from ksim_rl.envs.transforms import DelayCfg, GaussianNoise, UniformNoise, compile_groups
@@ -307,42 +309,62 @@ def _compare(
 
 
 def measure_go1(num_envs: int, device: torch.device) -> dict[str, float]:
-    """Time the control step of Go1, bare and with the chain on its observations, in turn."""
+    """Time the control step of Go1 that stands and stumbles, bare and with the chain on its observations, in turn.
+
+    The bare env hands out its readings as they are: without noise and without groups. Both envs have one seed and get
+    the same actions, so they step through the same states, and what the chain adds is the median of the differences.
+    """
     cfg = envs.make_cfg("go1_velocity_flat", [f"task.scene.num_envs={num_envs}", "task.seed=0"])
     groups = {
         name: dataclasses.replace(group, delay=DelayCfg(max_lag=MAX_LAG), history=HISTORY)
         for name, group in cfg.observations.items()
         if name == "actor"
     }
-    rigs = []
-    for transforms in ([], compile_groups(groups)):
-        env = MaskedTransformedEnv(envs.ManagerBasedRlEnv(cfg, device=device), transforms or Compose())
-        env.seed(0)
-        rigs.append(_captured_step(env, device))
-    times: list[list[float]] = [[], []]
-    for _ in range(GO1_STEPS[device.type]):
-        for rig, found in zip(rigs, times, strict=True):
-            found.append(milliseconds(rig, device=device, repeats=1))
-    bare_ms, chained_ms = (statistics.median(found) for found in times)
+    chain = compile_groups(groups)
+    bare, chained = (_Go1(cfg, transforms, device) for transforms in (Compose(), Compose(*chain)))
+    generator = torch.Generator(device).manual_seed(0)
+    times: tuple[list[float], list[float]] = ([], [])
+    settle = GO1_STEPS[device.type] // 2
+    for step in range(-settle, GO1_STEPS[device.type]):
+        action_EL = 0.3 * torch.randn(bare.action_EL.shape, generator=generator, device=device)
+        order = (bare, chained) if step % 2 else (chained, bare)
+        for rig in order:
+            rig.action_EL.copy_(action_EL)
+            found = milliseconds(rig.step, device=device, repeats=1)
+            if step >= 0:
+                times[rig is chained].append(found)
+    step_ms = statistics.median(times[0])
+    chain_ms = statistics.median(both - alone for alone, both in zip(*times, strict=True))
     return {
-        "go1_step_ms": bare_ms,
-        "go1_step_with_chain_ms": chained_ms,
-        "chain_share_of_go1_step": chained_ms / bare_ms - 1.0,
+        "go1_step_ms": step_ms,
+        "go1_step_with_chain_ms": statistics.median(times[1]),
+        "go1_chain_ms": chain_ms,
+        "go1_contacts_per_env": bare.contacts_per_env(),
+        "chain_share_of_go1_step": chain_ms / step_ms,
     }
 
 
-@torch.no_grad()
-def _captured_step(env: MaskedTransformedEnv, device: torch.device) -> Captured:
-    root_E: TensorDictBase = env.rand_action(env.reset())
-    action_EL = torch.zeros_like(root_E["action"])
+class _Go1:
+    """Go1 with transforms, whose step is one graph."""
 
-    def step() -> None:
-        env.step_and_maybe_reset(root_E.copy().set("action", action_EL))
+    def __init__(self, cfg: ManagerBasedRlEnvCfg, transforms: Compose, device: torch.device) -> None:
+        self.base = ManagerBasedRlEnv(cfg, device=device)
+        self.env = MaskedTransformedEnv(self.base, transforms)
+        self.env.seed(0)
+        with torch.no_grad():
+            self.root_E = self.env.rand_action(self.env.reset())
+        self.action_EL = torch.zeros_like(self.root_E["action"])
+        self.step = Captured(self._step, device=device, warmup=2)
+        for _ in range(4):
+            self.step()
 
-    captured = Captured(step, device=device, warmup=2)
-    for _ in range(4):
-        captured()
-    return captured
+    @torch.no_grad()
+    def _step(self) -> None:
+        self.env.step_and_maybe_reset(self.root_E.copy().set("action", self.action_EL))
+
+    def contacts_per_env(self) -> float:
+        """Return the mean number of contacts now."""
+        return float(self.base.world.view("nacon").item()) / self.base.num_envs
 
 
 def _table(rows: dict[str, Row], num_envs: int, device: torch.device) -> Table:
@@ -369,15 +391,19 @@ def _cell(row: Row, column: str) -> str:
 def main() -> None:
     """Measure, print the table, and write the figures."""
     given = dict(word.split("=", 1) for word in sys.argv[1:])
-    unknown = set(given) - {"device", "num_envs", "go1"}
+    unknown = set(given) - {"device", "num_envs", "go1", "only"}
     if unknown:
-        raise SystemExit(f"unknown argument {sorted(unknown)[0]!r}: valid: device, num_envs, go1")
+        raise SystemExit(f"unknown argument {sorted(unknown)[0]!r}: valid: device, num_envs, go1, only")
     device = torch.device(given.get("device", "cpu"))
     num_envs = int(given.get("num_envs", "4096"))
     if device.type == "cpu":
         torch.set_num_threads(1)
-    rows = measure(num_envs, device)
-    Console(width=140).print(_table(rows, num_envs, device))
+    only_go1 = given.get("only") == "go1"
+    if not only_go1 and "only" in given:
+        raise SystemExit(f"only={given['only']!r}: valid: go1")
+    rows = {} if only_go1 else measure(num_envs, device)
+    if rows:
+        Console(width=140).print(_table(rows, num_envs, device))
     prefix = f"{report.device_label(device)}/{num_envs}"
     figures: dict[str, float] = {}
     for name, row in rows.items():
@@ -386,11 +412,12 @@ def main() -> None:
         found = [ratio for row in rows.values() if (ratio := row.get(column)) is not None]
         if found:
             figures[f"{prefix}/largest_{column}"] = round(max(found), 4)
-    if given.get("go1", str(device.type == "cuda")).lower() == "true":
+    if only_go1 or given.get("go1", str(device.type == "cuda")).lower() == "true":
         go1 = measure_go1(num_envs, device)
         print({name: round(value, 5) for name, value in go1.items()})
         figures |= {f"{prefix}/{name}": round(value, 6) for name, value in go1.items()}
-        figures["chain_share_of_go1_step"] = round(go1["chain_share_of_go1_step"], 6)
+        if device.type == "cuda":
+            figures["chain_share_of_go1_step"] = round(go1["chain_share_of_go1_step"], 6)
     path = report.write(
         "transforms",
         figures=figures,

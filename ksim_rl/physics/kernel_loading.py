@@ -52,13 +52,14 @@ def loaded_together(device: torch.device) -> Iterator[None]:
                 return capture_while(condition, while_body, *args, **kwargs)
             return while_body(**kwargs)
 
+        namespace: Any = vars(wp)
         instead = {"launch": noted, "launch_tiled": noted_tiled, "capture_while": once}
         saved = {"launch": launch, "launch_tiled": launch_tiled, "capture_while": capture_while}
-        vars(wp).update(instead)
+        namespace.update(instead)
         try:
             yield
         finally:
-            vars(wp).update(saved)
+            namespace.update(saved)
     workers = min(os.cpu_count() or 1, MOST_WORKERS)
     for block_dim, found in modules.items():
         wp.force_load(warp_dev, modules=list(found), block_dim=block_dim, max_workers=workers)

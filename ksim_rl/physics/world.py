@@ -73,9 +73,7 @@ class World(views.DataViews):
         expanded = fields_to_expand(per_world_fields)
         check_not_simple(self.mj_model, expanded)
         self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
-        self.has_one_kernel_solver = takes_one_kernel(
-            self.mj_model, self.sim, njmax=self.njmax, device=self.device
-        )
+        self.has_one_kernel_solver = takes_one_kernel(self.mj_model, self.sim, njmax=self.njmax)
         if self.has_one_kernel_solver:
             self.mj_model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
         self._graphs = WarpGraphs(self.device, require_graphs=self.sim.require_graphs)

@@ -71,24 +71,68 @@ def test_rings_of_any_dtype_and_width_give_back_what_was_pushed(dtype, shape):
     rows, length = 37, 4
     pushed_TE = torch.randint(0, 2 if dtype == torch.bool else 100, (9, rows, *shape)).to(dtype).cuda()
     ring_EM = torch.zeros(rows, length, *shape, dtype=dtype, device="cuda")
-    start_E = torch.zeros(rows, dtype=torch.int64, device="cuda")
-    # Beyond 32 bits, as the clock of a long run.
-    clock = torch.tensor(2**33 + 3, device="cuda")
+    # Beyond 32 bits, as after a long run; the ring stands where it stood for an age of 0.
+    age_E = torch.zeros(rows, dtype=torch.int64, device="cuda")
     everyone_E, nobody_E = (torch.full((rows,), flag, device="cuda") for flag in (True, False))
-    begun_EN = ring.begin(ring_EM, start_E, clock, pushed_TE[0], everyone_E, length)
+    shaped = (rows, length, *shape)
+    begun_EN = ring.begin(ring_EM, age_E, pushed_TE[0], everyone_E, num_frames=length).view(shaped)
     assert all(torch.equal(begun_EN[:, frame], pushed_TE[0]) for frame in range(length))
-    lag_EN = torch.arange(length - 1, -1, -1, device="cuda").expand(rows, -1)
+    age_E.fill_(2**34)
+    ring_EM.copy_(pushed_TE[0].unsqueeze(1))
     for step in range(1, 9):
-        clock.add_(1)
-        found_EN = ring.push_and_read(ring_EM, start_E, clock, pushed_TE[step], lag_EN)
+        found_EN = ring.push(ring_EM, age_E, pushed_TE[step], num_frames=length, stride=1).view(shaped)
         for frame in range(length):
             assert torch.equal(found_EN[:, frame], pushed_TE[max(step - length + 1 + frame, 0)]), (
                 step,
                 frame,
             )
-    assert torch.equal(ring.begin(ring_EM, start_E, clock, pushed_TE[0], nobody_E)[:, 0], pushed_TE[0])
-    again_EN = ring.push_and_read(ring_EM, start_E, clock, pushed_TE[8], lag_EN)
-    assert torch.equal(again_EN[:, 0], pushed_TE[5]), "a reset of nobody changes no ring"
+    unmoved = ring.begin(ring_EM, age_E, pushed_TE[0], nobody_E).view(pushed_TE[0].shape)
+    assert torch.equal(unmoved, pushed_TE[0])
+    again_EN = ring.push(ring_EM, age_E, pushed_TE[8], num_frames=length, stride=1).view(shaped)
+    assert torch.equal(again_EN[:, 0], pushed_TE[6]), "a reset of nobody changes no ring"
+    assert bool((age_E == 2**34 + 9).all())
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("sizes", [[3, 3, 12, 1], [16, 4, 8], [300, 20]])
+def test_rings_of_several_parts_give_all_frames_of_one_part_after_another(sizes):
+    rows, length, stride = 37, 3, 2
+    pushed_TEL = torch.randn(12, rows, sum(sizes), device="cuda")
+    ring_EM = torch.zeros(rows, (length - 1) * stride + 1, sum(sizes), device="cuda")
+    age_E = torch.zeros(rows, dtype=torch.int64, device="cuda")
+    parts = torch.tensor([4 * size for size in sizes], dtype=torch.int32, device="cuda")
+    mask_E = torch.arange(rows, device="cuda") % 3 == 0
+    ring.begin(ring_EM, age_E, pushed_TEL[0], torch.ones_like(mask_E), num_frames=length, parts=parts)
+    first_E = torch.zeros_like(age_E)
+    for step in range(1, 12):
+        found_EL = ring.push(ring_EM, age_E, pushed_TEL[step], num_frames=length, stride=stride, parts=parts)
+        start = 0
+        for part_EL in pushed_TEL.split(sizes, dim=2):
+            for frame in range(length):
+                wanted_E = torch.maximum(
+                    first_E, step - (length - 1 - frame) * torch.full_like(first_E, stride)
+                )
+                expected_EL = part_EL[wanted_E, torch.arange(rows, device="cuda")]
+                stop = start + part_EL.shape[2]
+                assert torch.equal(found_EL[:, start:stop], expected_EL), (step, frame)
+                start = stop
+        if step == 6:
+            ring.begin(ring_EM, age_E, pushed_TEL[6], mask_E, num_frames=length, parts=parts)
+            first_E = torch.where(mask_E, 6, first_E)
+
+
+@pytest.mark.gpu
+def test_rows_that_begin_draw_their_lags():
+    rows = 37
+    ring_EM, age_E = torch.zeros(rows, 4, 3, device="cuda"), torch.zeros(rows, device="cuda").long()
+    lag_E, count_E = torch.full_like(age_E, 9), torch.arange(rows, device="cuda")
+    mask_E = torch.arange(rows, device="cuda") % 2 == 0
+    seed = torch.tensor(5, device="cuda")
+    lags = ring.Lags(lag_E, seed, count_E, 77, 1, 3)
+    ring.begin(ring_EM, age_E, torch.ones(rows, 3, device="cuda"), mask_E, lags=lags)
+    assert torch.equal(count_E, torch.arange(rows, device="cuda") + mask_E)
+    drawn_E = random.integers(random.row_keys(seed, 77, count_E, rows), 1, 1, 3)[:, 0]
+    assert torch.equal(lag_E, torch.where(mask_E, drawn_E, 9))
 
 
 @pytest.mark.gpu

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import struct
+import time
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -52,6 +53,7 @@ def log_two_sessions(cfg, folder):
             logger.log_metrics({"loss/policy": value, "iteration": step / 512}, step)
         logger.log_metrics({"evaluation/return_mean": 7.0}, rows[-1][0])
         logger.close()
+        time.sleep(1.1)  # wandb names a session after the second it began in
 
 
 def test_mlflow_has_figures_and_config_of_a_run_that_was_resumed(tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ksim_rl import random
 from ksim_rl.envs.transforms import DelayCfg, ObservationDelay
 from tests.envs.transforms.chains import VECTOR, counter, fixed_rollout
 
@@ -113,6 +114,19 @@ def test_lags_are_uniform_and_drawn_anew_at_each_reset():
     for lag in range(1, 5):
         assert_frequency(drawn == lag, 0.25)
     assert_frequency(drawn[:, 1:] == drawn[:, :-1], 0.25)
+
+
+def test_lags_of_a_reset_are_the_keyed_draws_of_the_rows_that_reset():
+    delay = ObservationDelay("count", "delayed", delay=DelayCfg(min_lag=2, max_lag=9), seed=11, stream="imu")
+    env = counter(delay, lengths=(50,) * 5)
+    env.reset()
+    before = delay.lag_E.clone()
+    env.reset(env_ids=[1, 3])
+    resets_E = torch.tensor([1, 2, 1, 2, 1])
+    assert torch.equal(delay.reset_count_E, resets_E)
+    keys = random.row_keys(torch.tensor(11), random.stream_id("imu/reset/lag"), resets_E, 5)
+    assert torch.equal(delay.lag_E, random.integers(keys, 1, 2, 9)[:, 0])
+    assert torch.equal(delay.lag_E[::2], before[::2])
 
 
 def test_hold_probability_is_the_share_of_draws_that_change_nothing():

@@ -85,6 +85,21 @@ def test_it_equals_catframes():
     assert torch.equal(rollout_ET["next", "ours"], rollout_ET["next", "theirs"])
 
 
+@pytest.mark.parametrize("flat", [True, False])
+def test_observations_of_one_dtype_share_a_ring(flat):
+    """The frames of each are those that a transform of its own gives."""
+    together = ObservationHistory([VECTOR, "drawn", "count"], ["a", "b", "c"], length=4, stride=2, flat=flat)
+    alone = [
+        ObservationHistory(key, f"{name}_alone", length=4, stride=2, flat=flat)
+        for name, key in {"a": VECTOR, "b": "drawn", "c": "count"}.items()
+    ]
+    rollout_ET = fixed_rollout(counter(together, *alone), 15)
+    assert sum(name.startswith("ring_") for name in together.state_dict()) == 1
+    for name in "abc":
+        assert torch.equal(rollout_ET["next", name], rollout_ET["next", f"{name}_alone"])
+        assert torch.equal(rollout_ET[name], rollout_ET[f"{name}_alone"])
+
+
 def test_what_it_gives_out_does_not_change_later():
     env = counter(ObservationHistory("count", "frames", length=3))
     root = env.reset()
