@@ -13,9 +13,10 @@ def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None 
     progress = RunProgress(
         cfg.trainer.num_iterations, done=0 if resume_from is None else resume_from.iteration
     )
+    length = cfg.data.rollout_length(cfg.num_envs)
     progress.note(
-        f"{cfg.task_name}: {cfg.num_envs} envs x {cfg.data.rollout_length(cfg.num_envs)} steps = "
-        f"{cfg.num_envs * cfg.data.rollout_length(cfg.num_envs)} env states per iteration, on {cfg.device}; run folder {shown(folder)}"
+        f"{cfg.task_name}: {cfg.num_envs} envs x {length} steps = {cfg.num_envs * length} env states per iteration, "
+        f"on {cfg.device}; run folder {shown(folder)}"
     )
     with compile_notice(progress.status):
         outcome = run(cfg, folder, progress=progress, resume_from=resume_from)

@@ -146,7 +146,7 @@ class RolloutCollector:
             # One kernel for all that lie in one piece; a column of something wider needs its own.
             whole = [pair for pair in pairs if pair[1].is_contiguous()]
             if whole:
-                torch._foreach_copy_(*map(list, zip(*whole, strict=True)))
+                torch._foreach_copy_([kept for kept, _ in whole], [value for _, value in whole])
             for kept, value in pairs:
                 if not value.is_contiguous():
                     kept.copy_(value)

@@ -41,8 +41,8 @@ class PPOCfg:
         max_skipped_steps: so many gradient steps in a row that are not finite end the run.
         precision: of what layers multiply in the gradient steps: "float32" (on CUDA as `trainer.matmul_precision`
             says), or "bfloat16", which has 8 significant bits and moves the gradient by about half a percent of its
-            norm; "auto" is "bfloat16" on CUDA and "float32" elsewhere. Parameters, sums, losses and Adam are float32 either
-            way.
+            norm; "auto" is "bfloat16" on CUDA and "float32" elsewhere. Parameters, sums, losses and Adam are
+            always float32.
         kernels: of a bfloat16 update: "auto" takes a few fused kernels where they fit device and networks, "torch"
             never does. They differ by the order of sums. The metric `update/fused` says which it is.
     """

@@ -7,10 +7,20 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-from ksim_rl.physics.newton_kernel import CUDA_LANES, Problem, floats_per_world, newton_kernel, row_stride
+from ksim_rl.physics.newton_kernel import (
+    CUDA_LANES,
+    ORDER_THREADS,
+    Problem,
+    floats_per_world,
+    longest_first,
+    newton_kernel,
+    row_stride,
+)
 
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
+# What lets 16 worlds live on a multiprocessor at once.
+FLOATS_PER_WORLD = 3500
 MOST_DOFS = 64
 INTEGRATORS = (
     mujoco.mjtIntegrator.mjINT_EULER,
@@ -24,7 +34,7 @@ class Placement:
     """How the worlds lie on a CUDA device.
 
     Args:
-        rows_on_chip: rows that the shared memory of a world holds; a world with more has all of them in device memory.
+        rows_on_chip: rows that the shared memory of a world holds; those beyond are in device memory.
         worlds_per_block: worlds that share a block.
         min_blocks: blocks that a multiprocessor is to hold at once, which bounds the registers; 0 does not.
     """
@@ -32,6 +42,7 @@ class Placement:
     rows_on_chip: int
     worlds_per_block: int = 1
     min_blocks: int = 0
+    longest_first: bool = True
 
 
 def suits(mj_model: mujoco.MjModel, *, njmax: int) -> bool:
@@ -45,17 +56,21 @@ def suits(mj_model: mujoco.MjModel, *, njmax: int) -> bool:
         and opt.iterations > 0
         and opt.noslip_iterations == 0
         and not opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART
-        and not opt.enableflags & (mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY)
+        and not opt.enableflags
+        & (mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY)
         and mj_model.nflex == 0
         and 0 < mj_model.nv <= MOST_DOFS
         and njmax > 0
-        and floats_per_world(mj_model.nv, njmax, elliptic=elliptic, rows_on_chip=0) <= SHARED_FLOATS
+        and floats_per_world(mj_model.nv, njmax, elliptic=elliptic, rows_on_chip=0)
+        <= SHARED_FLOATS
     )
 
 
 def placement(*, nv: int, njmax: int, elliptic: bool) -> Placement:
     """Return the placement that was measured to be best."""
-    room = SHARED_FLOATS - floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=0)
+    room = FLOATS_PER_WORLD - floats_per_world(
+        nv, njmax, elliptic=elliptic, rows_on_chip=0
+    )
     return Placement(rows_on_chip=max(0, min(njmax, room // row_stride(nv))))
 
 
@@ -82,9 +97,11 @@ def solver(
         elliptic=elliptic,
         ls_iterations=int(m.opt.ls_iterations),
         lanes=lanes,
-        **dataclasses.asdict(place),
+        rows_on_chip=place.rows_on_chip,
+        worlds_per_block=place.worlds_per_block,
+        min_blocks=place.min_blocks,
     )
-    far_floats = 0 if place.rows_on_chip == d.njmax else d.njmax * row_stride(m.nv)
+    far_floats = (d.njmax - place.rows_on_chip) * row_stride(m.nv)
     problem = Problem()
     problem.iterations = int(m.opt.iterations)
     problem.tolerance = m.opt.tolerance
@@ -108,7 +125,9 @@ def solver(
     problem.efc_D = efc.D
     problem.efc_aref = efc.aref
     problem.efc_limit = efc.frictionloss
-    problem.scratch = wp.empty((d.nworld, far_floats), dtype=float, device=d.qpos.device)
+    problem.scratch = wp.empty(
+        (d.nworld, far_floats), dtype=float, device=d.qpos.device
+    )
     problem.qacc = d.qacc
     problem.efc_Ma = efc.Ma
     problem.efc_force = efc.force
@@ -116,15 +135,29 @@ def solver(
     problem.qfrc_constraint = d.qfrc_constraint
     problem.solver_niter = d.solver_niter
     problem.overflow = d.overflow
+    problem.order = wp.array(list(range(d.nworld)), dtype=int, device=d.qpos.device)
     dim, block_dim = (d.nworld, lanes), place.worlds_per_block * lanes
 
     def launch() -> None:
+        if lanes > 1 and place.longest_first:
+            wp.launch(
+                longest_first,
+                dim=ORDER_THREADS,
+                inputs=[problem],
+                block_dim=ORDER_THREADS,
+            )
         wp.launch(kernel, dim=dim, inputs=[problem], block_dim=block_dim)
 
     return launch
 
 
-def step(warp_model: mjw.Model, warp_data_E: mjw.Data, solve: Callable[[], None], *, sensors: bool) -> None:
+def step(
+    warp_model: mjw.Model,
+    warp_data_E: mjw.Data,
+    solve: Callable[[], None],
+    *,
+    sensors: bool,
+) -> None:
     """Launch a physics step: that of MuJoCo Warp, with this solver.
 
     Args:

@@ -57,6 +57,7 @@ class Problem:
     qfrc_constraint: wp.array2d[float]
     solver_niter: wp.array[int]
     overflow: wp.array[int]
+    order: wp.array[int]
 
 
 def row_stride(nv: int) -> int:
@@ -72,7 +73,13 @@ def floats_per_world(nv: int, njmax: int, *, elliptic: bool, rows_on_chip: int) 
     """Return how many floats the lanes of a world share."""
     stride, padded_rows = row_stride(nv), _padded(njmax)
     cones = 4 * (padded_rows + 4) if elliptic else 0
-    return (nv + rows_on_chip) * stride + 2 * (stride + 4) + stride + 7 * padded_rows + cones
+    return (
+        (nv + rows_on_chip) * stride
+        + 2 * (stride + 4)
+        + stride
+        + 7 * padded_rows
+        + cones
+    )
 
 
 def _padded(njmax: int) -> int:
@@ -98,7 +105,9 @@ def constants(
         "ROWS_ON_CHIP": rows_on_chip,
         "LANES": lanes,
         "WORLDS_PER_BLOCK": worlds_per_block,
-        "FLOATS": floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=rows_on_chip),
+        "FLOATS": floats_per_world(
+            nv, njmax, elliptic=elliptic, rows_on_chip=rows_on_chip
+        ),
         "MOST_TRIALS": ls_iterations,
         "ELLIPTIC": int(elliptic),
         "OUT_OF_ITERATIONS": int(mjw.OverflowType.ITERATIONS),
@@ -126,7 +135,7 @@ def newton_kernel(
         elliptic: whether friction cones are elliptic.
         ls_iterations: most trials of a line search.
         lanes: 32 on CUDA, 1 on the CPU.
-        rows_on_chip: rows that the shared memory of a world holds; a world with more has all of them in the scratch.
+        rows_on_chip: rows that the shared memory of a world holds; those beyond are in the scratch.
         worlds_per_block: worlds that share a block.
         min_blocks: blocks that a multiprocessor is to hold at once, which bounds the registers; 0 does not.
     """
@@ -139,7 +148,10 @@ def newton_kernel(
         rows_on_chip=rows_on_chip,
         worlds_per_block=worlds_per_block,
     )
-    snippet = "".join(f"constexpr int {name} = {value};\n" for name, value in known.items()) + _SOURCE
+    snippet = (
+        "".join(f"constexpr int {name} = {value};\n" for name, value in known.items())
+        + _SOURCE
+    )
 
     @wp.func_native(snippet)
     def solve_world(world: int, lane: int, problem: Problem) -> None: ...
@@ -156,6 +168,50 @@ def newton_kernel(
     )
     def kernel(problem: Problem):
         world, lane = wp.tid()
-        solve_world(world, lane, problem)
+        solve_world(problem.order[world], lane, problem)
 
     return kernel
+
+
+ORDER_THREADS = 1024
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+constexpr int KEYS = 64;
+__shared__ int places[KEYS];
+const int thread = threadIdx.x, threads = blockDim.x, worlds = problem.order.shape[0];
+auto key_of = [&](int world) {
+    return KEYS - 1 - wp::clamp(problem.solver_niter.data[world] * 2 + problem.nefc.data[world] / 4, 0, KEYS - 1);
+};
+for (int key = thread; key < KEYS; key += threads)
+    places[key] = 0;
+__syncthreads();
+for (int world = thread; world < worlds; world += threads)
+    atomicAdd(places + key_of(world), 1);
+__syncthreads();
+if (thread == 0) {
+    int before = 0;
+    for (int key = 0; key < KEYS; ++key) {
+        const int count = places[key];
+        places[key] = before;
+        before += count;
+    }
+}
+__syncthreads();
+for (int world = thread; world < worlds; world += threads)
+    problem.order.data[atomicAdd(places + key_of(world), 1)] = world;
+#endif
+""")
+def order_worlds(problem: Problem) -> None: ...
+
+
+@wp.kernel(
+    module="unique",
+    enable_backward=False,
+    grid_stride=False,
+    module_options={"block_dim": ORDER_THREADS},
+)
+def longest_first(problem: Problem):
+    """Order the worlds by how long they will take, as their last solution and the number of their rows tell."""
+    order_worlds(problem)

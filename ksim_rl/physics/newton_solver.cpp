@@ -48,8 +48,8 @@ const float impratio = of_world(problem.impratio_invsqrt);
 const float tolerance = of_world(problem.tolerance);
 const float ls_tolerance = of_world(problem.ls_tolerance);
 int* const states = row_of(problem.efc_state);
-float* const far = row_of(problem.scratch);
-float* const J = ROWS_ON_CHIP == NJ ? chip : ROWS_ON_CHIP == 0 ? far : rows <= ROWS_ON_CHIP ? chip : far;
+const int near_rows = wp::min(rows, ROWS_ON_CHIP);
+float* const far = row_of(problem.scratch) - near_rows * STRIDE;
 
 auto sync = [] {
 #if defined(__CUDA_ARCH__)
@@ -72,6 +72,23 @@ auto of_lane = [](float value, int lane) {
 };
 // What overflows in one tree stays there: in the sums of another tree infinity times zero would be NaN.
 auto bounded = [](float value) { return wp::clamp(value, -LARGEST, LARGEST); };
+// Calls body(row, its J) for the rows first, first + stride, ...: on chip, and those that found no room there.
+struct Singly {
+    enum { AT_ONCE = 1 };
+};
+struct ByFours {
+    enum { AT_ONCE = 4 };
+};
+auto each_row = [&](int first, int stride, auto pace, auto body) {
+#pragma unroll decltype(pace)::AT_ONCE
+    for (int row = first; row < near_rows; row += stride)
+        body(row, chip + row * STRIDE);
+    if (ROWS_ON_CHIP < NJ)
+#pragma unroll 1
+        for (int row = near_rows + first; row < rows; row += stride)
+            body(row, far + row * STRIDE);
+};
+auto row_at = [&](int row) { return (row < near_rows ? chip : far) + row * STRIDE; };
 auto ratio = [](float a, float b) { return a / (b == 0.0f ? TINY : b); };
 // A lane beyond the last degree of freedom does what the lane of the last one does, and writes nothing.
 auto is_dof = [&](int block) { return block * LANES + lane < NV; };
@@ -172,9 +189,11 @@ auto prepare_cone = [&](int head, int size) {
 #pragma unroll 1
 for (int i = lane; i < NV * STRIDE; i += LANES)
     mass[i] = 0.0f;
+each_row(0, 1, Singly {}, [&](int row, float* J) {
 #pragma unroll 1
-for (int i = lane; i < rows * STRIDE; i += LANES)
-    J[i] = 0.0f;
+    for (int j = lane; j < STRIDE; j += LANES)
+        J[j] = 0.0f;
+});
 float acc[BLOCKS], ma[BLOCKS], mv[BLOCKS], smooth[BLOCKS], pull[BLOCKS], slopes[BLOCKS], inverse[BLOCKS];
 float h[BLOCKS][NV];
 UNROLL
@@ -190,8 +209,7 @@ for (int k = lane; k < problem.M_row.shape[0]; k += LANES) {
     const int row = problem.M_row.data[k], col = problem.M_col.data[k];
     mass[row * STRIDE + col] = mass[col * STRIDE + row] = row_of(problem.M)[k];
 }
-#pragma unroll 1
-for (int row = lane; row < rows; row += LANES) {
+each_row(lane, LANES, Singly {}, [&](int row, float* J) {
     const int at = row_of(problem.J_rowadr)[row];
     const int end = at + row_of(problem.J_rownnz)[row];
     const float* const values = row_of(problem.J_values);
@@ -199,7 +217,7 @@ for (int row = lane; row < rows; row += LANES) {
     float product = 0.0f;
 #pragma unroll 4
     for (int k = at; k < end; ++k) {
-        J[row * STRIDE + cols[k]] = values[k];
+        J[cols[k]] = values[k];
         product += values[k] * shared[cols[k]];
     }
     x[row] = product - row_of(problem.efc_aref)[row];
@@ -223,7 +241,7 @@ for (int row = lane; row < rows; row += LANES) {
             bound[row] = before > 0 ? friction[before - 1] : friction[0] * impratio;
         }
     }
-}
+});
 sync();
 int num_units = 0;
 #pragma unroll 1
@@ -305,11 +323,8 @@ auto push = [&](int row) {
 auto pull_back = [&] {
 UNROLL
     for (int b = 0; b < BLOCKS; ++b) {
-        float sum = 0.0f;
-#pragma unroll 4
-        for (int row = 0; row < rows; ++row)
-            sum += J[row * STRIDE + dof_of(b)] * force[row];
-        pull[b] = sum;
+        pull[b] = 0.0f;
+        each_row(0, 1, ByFours {}, [&](int row, const float* J) { pull[b] += J[dof_of(b)] * force[row]; });
     }
 };
 auto add_outer_product = [&](float scale, const float* vector) {
@@ -331,10 +346,10 @@ UNROLL
 UNROLL
         for (int j = b * LANES; j < NV; ++j)
             h[b][j] = mass[j * STRIDE + dof_of(b)];
-#pragma unroll 1
-    for (int row = 0; row < rows; ++row)
+    each_row(0, 1, Singly {}, [&](int row, const float* J) {
         if (v[row] > 0.0f)
-            add_outer_product(v[row], J + row * STRIDE);
+            add_outer_product(v[row], J);
+    });
     if (!ELLIPTIC)
         return;
     float* const q = columns;
@@ -351,11 +366,11 @@ UNROLL
             float slip = 0.0f;
 #pragma unroll 1
             for (int mate = head + 1; mate < head + (kinds[head] >> 8); ++mate)
-                slip += force[mate] * J[mate * STRIDE + dof_of(b)];
+                slip += force[mate] * row_at(mate)[dof_of(b)];
             slip *= by_push;
             if (is_dof(b)) {
                 s[dof_of(b)] = slip;
-                q[dof_of(b)] = mu * (J[head * STRIDE + dof_of(b)] - slip);
+                q[dof_of(b)] = mu * (row_at(head)[dof_of(b)] - slip);
             }
         }
         sync();
@@ -484,18 +499,17 @@ UNROLL
             slope += slopes[b] * (ma[b] - smooth[b]);
             half_curvature += 0.5f * slopes[b] * mv[b];
         }
-#pragma unroll 1
-    for (int row = lane; row < rows; row += LANES) {
+    each_row(lane, LANES, Singly {}, [&](int row, const float* J) {
         float rate = 0.0f;
 UNROLL
         for (int j = 0; j < NV; ++j)
-            rate += J[row * STRIDE + j] * shared[j];
+            rate += J[j] * shared[j];
         v[row] = rate;
         if (row < equalities) {
             slope += d[row] * rate * x[row];
             half_curvature += 0.5f * d[row] * rate * rate;
         }
-    }
+    });
     sync();
     search2 = total(search2);
     slope = total(slope);
@@ -509,13 +523,13 @@ UNROLL
     }
 
     // The line search keeps two points whose slopes it drives to zero, and takes the better one. Its trials measure three
-    // points each, on CUDA by eight lanes each; the first two trials are the start and the Newton step.
+    // points each, on CUDA by eight lanes each; the first trial is of the start and of the Newton step.
     const float enough = wp::max(tolerance * ls_tolerance * sqrtf(search2) / scale, 1e-6f);
     float alpha = rows == 0 ? 1.0f : 0.0f, improvement = 0.0f, accepted = enough;
-    float alphas[3] = {0.0f, 0.0f, 0.0f}, low_alpha = 0.0f, high_alpha = 0.0f;
+    float alphas[3] = {0.0f, 1.0f, 1.0f}, low_alpha = 0.0f, high_alpha = 0.0f;
     Point low {0.0f, 0.0f, 0.0f, 0.0f}, high = low;
 #pragma unroll 1
-    for (int trial = -2; rows > 0; ++trial) {
+    for (int trial = -1; rows > 0; ++trial) {
         if (trial == MOST_TRIALS) {
             if (lane == 0)
                 problem.overflow.data[world] |= OUT_OF_LS_ITERATIONS;
@@ -529,9 +543,8 @@ UNROLL
         Point points[3];
 #if defined(__CUDA_ARCH__)
         const int mine = lane >> 3;
-        const float alpha_of_mine = mine == 0 ? alphas[0] : mine == 1 ? alphas[1] : alphas[2];
-        Point sum = measure(alpha_of_mine, mine == 3 ? NJ : lane & 7, 8);
-#pragma unroll
+        Point sum = measure(mine == 0 ? alphas[0] : mine == 1 ? alphas[1] : alphas[2], mine == 3 ? NJ : lane & 7, 8);
+UNROLL
         for (int distance = 4; distance > 0; distance >>= 1) {
             sum.cost += __shfl_xor_sync(0xffffffffu, sum.cost, distance);
             sum.slope += __shfl_xor_sync(0xffffffffu, sum.slope, distance);
@@ -539,7 +552,7 @@ UNROLL
             sum.start += __shfl_xor_sync(0xffffffffu, sum.start, distance);
         }
 #endif
-#pragma unroll
+UNROLL
         for (int i = 0; i < 3; ++i) {
 #if defined(__CUDA_ARCH__)
             points[i].cost = __shfl_sync(0xffffffffu, sum.cost, 8 * i);
@@ -547,26 +560,27 @@ UNROLL
             points[i].curvature = __shfl_sync(0xffffffffu, sum.curvature, 8 * i);
             points[i].start = __shfl_sync(0xffffffffu, sum.start, 0);
 #else
-            points[i] = measure(alphas[i], 0, 1);
+            points[i] = i == 2 && trial < 0 ? points[1] : measure(alphas[i], 0, 1);
 #endif
+        }
+UNROLL
+        for (int i = 0; i < 3; ++i) {
             points[i].cost += alphas[i] * (alphas[i] * half_curvature + slope);
             points[i].slope += 2.0f * alphas[i] * half_curvature + slope;
             points[i].curvature += 2.0f * half_curvature;
         }
-        if (trial == -2) {
+        if (trial < 0) {
             low = high = points[0];
             const float gross = sqrtf(2.0f * wp::max(low.start, 0.0f) * wp::max(low.curvature - 2.0f * half_curvature, 0.0f))
                 + fabsf(slope);
             accepted = wp::max(enough, NOISE * gross);
             if (fabsf(low.slope) < NOISE * gross)
                 break;
-            alphas[0] = alphas[1] = alphas[2] = -ratio(low.slope, low.curvature);
-            continue;
         }
         int best = -1;
 #pragma unroll
         for (int i = 0; i < 3; ++i)
-            if (fabsf(points[i].slope) < accepted && points[i].cost < (best < 0 ? 0.0f : improvement)) {
+            if ((i > 0 || trial >= 0) && fabsf(points[i].slope) < accepted && points[i].cost < (best < 0 ? 0.0f : improvement)) {
                 best = i;
                 improvement = points[i].cost;
                 alpha = alphas[i];
@@ -575,13 +589,13 @@ UNROLL
             improvement = -improvement;
             break;
         }
-        if (trial == -1) {
-            if (points[0].slope < low.slope) {
-                low = points[0];
-                low_alpha = alphas[0];
+        if (trial < 0) {
+            if (points[1].slope < low.slope) {
+                low = points[1];
+                low_alpha = alphas[1];
             } else {
-                high = points[0];
-                high_alpha = alphas[0];
+                high = points[1];
+                high_alpha = alphas[1];
             }
             continue;
         }

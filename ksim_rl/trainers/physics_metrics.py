@@ -28,7 +28,7 @@ class PhysicsReport:
 
 
 def read_physics(env: EnvBase) -> dict[str, Tensor]:
-    """Return the counts of this rollout, each a tensor [] on the device, and start a new period; none without a world."""
+    """Return the counts of this rollout, each a tensor [] on the device, and start anew; none without a world."""
     world = _world(env)
     if world is None:
         return {}

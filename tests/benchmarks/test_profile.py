@@ -27,5 +27,10 @@ def test_kernels_go_to_the_innermost_room_that_launched_them():
         ]
 
     events = [span("update", 0, 100), span("physics", 10, 20)]
-    events += kernel(1, 15, 3.0) + kernel(2, 50, 5.0) + kernel(3, 60, 7.0, "gae") + kernel(4, 200, 1.0)
+    events += (
+        kernel(1, 15, 3.0)
+        + kernel(2, 50, 5.0)
+        + kernel(3, 60, 7.0, "estimate_advantages")
+        + kernel(4, 200, 1.0)
+    )
     assert by_room(events) == {"physics": (1, 3.0), "update": (1, 5.0), "gae": (1, 7.0), "other": (1, 1.0)}
