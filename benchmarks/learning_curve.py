@@ -3,9 +3,9 @@
     python -m benchmarks.learning_curve task=go1_velocity_flat seeds=1,2,3 env_states=30e6 num_envs=4096 device=cuda
 
 takes the overrides of `ksim-rl train`. Each seed is a process of its own; with several GPUs they run side by side.
-Figures go to benchmarks/results/learning_<task>.json, with another objective than PPO to
-learning_<task>_<objective>.json: the medians over the seeds of the episode means (of rewards: per
-second of the longest episode) over the last million env states. The picture is beside it.
+Figures go to benchmarks/results/learning_<task>.json, with another objective than PPO or other modules than MLPs to
+learning_<task>_<objective>_<modules>.json: the medians over the seeds of the episode means (of rewards: per second of
+the longest episode) over the last million env states. The picture is beside it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,15 @@ from ksim_rl.trainers import RunCfg, RunProgress, run
 from ksim_rl.trainers.loggers.csv_table import read_table
 
 KEPT_POINTS = 60
-KEPT = ("env_states", "seconds", "episode/return", "episode/length", "throughput/env_states_per_s")
+KEPT = (
+    "env_states",
+    "seconds",
+    "episode/return",
+    "episode/length",
+    "throughput/env_states_per_s",
+    "metric/pose_distance",
+    "update/action_error",
+)
 OWN_OPTIONS = ("seeds", "env_states", "points")
 AVERAGED_STATES = 1e6
 
@@ -53,8 +61,9 @@ def main() -> None:
     figures = summary(list(curves.values()))
     label = f"{report.device_label(device)}/{cfg.task_name}/{cfg.num_envs}"
     Console(width=200).print(_table(label, curves))
-    objective = next((word.partition("=")[2] for word in overrides if word.startswith("objective=")), "ppo")
-    name = f"learning_{cfg.task_name}" + ("" if objective == "ppo" else f"_{objective}")
+    chosen = dict(word.split("=", 1) for word in overrides if word.startswith(("objective=", "modules=")))
+    others = [choice for choice in chosen.values() if choice not in ("ppo", "mlp")]
+    name = "_".join(["learning", cfg.task_name, *others])
     path = report.write(
         name,
         figures={f"{label}/{figure}": value for figure, value in figures.items()} | _short_names(figures),

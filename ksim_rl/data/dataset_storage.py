@@ -23,8 +23,8 @@ class DatasetStorage(TensorStorage):
 
     A row with a non-finite element in any leaf is removed without a host sync: its numbers become those of the
     first row that is finite (its flags stay), `("collector", "mask")` reads False there, and `non_finite_count`
-    grows by one. All rows stay finite, so nothing non-finite reaches a loss or, through a zero times infinity, a gradient;
-    and TorchRL's losses leave rows with a False mask out of their means. (Zeros instead of a finite row would
+    grows by one. All rows stay finite, so nothing non-finite reaches a loss or, through a zero times infinity, a
+    gradient; and TorchRL's losses leave rows with a False mask out of their means. (Zeros instead of a finite row would
     not do: a standard deviation of zero has no logarithm.) If no row at all is finite, the leaves are zero
     where they were not, and every mask is False.
 

@@ -56,21 +56,17 @@ def suits(mj_model: mujoco.MjModel, *, njmax: int) -> bool:
         and opt.iterations > 0
         and opt.noslip_iterations == 0
         and not opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART
-        and not opt.enableflags
-        & (mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY)
+        and not opt.enableflags & (mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY)
         and mj_model.nflex == 0
         and 0 < mj_model.nv <= MOST_DOFS
         and njmax > 0
-        and floats_per_world(mj_model.nv, njmax, elliptic=elliptic, rows_on_chip=0)
-        <= SHARED_FLOATS
+        and floats_per_world(mj_model.nv, njmax, elliptic=elliptic, rows_on_chip=0) <= SHARED_FLOATS
     )
 
 
 def placement(*, nv: int, njmax: int, elliptic: bool) -> Placement:
     """Return the placement that was measured to be best."""
-    room = FLOATS_PER_WORLD - floats_per_world(
-        nv, njmax, elliptic=elliptic, rows_on_chip=0
-    )
+    room = FLOATS_PER_WORLD - floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=0)
     return Placement(rows_on_chip=max(0, min(njmax, room // row_stride(nv))))
 
 
@@ -125,9 +121,7 @@ def solver(
     problem.efc_D = efc.D
     problem.efc_aref = efc.aref
     problem.efc_limit = efc.frictionloss
-    problem.scratch = wp.empty(
-        (d.nworld, far_floats), dtype=float, device=d.qpos.device
-    )
+    problem.scratch = wp.empty((d.nworld, far_floats), dtype=float, device=d.qpos.device)
     problem.qacc = d.qacc
     problem.efc_Ma = efc.Ma
     problem.efc_force = efc.force

@@ -73,13 +73,7 @@ def floats_per_world(nv: int, njmax: int, *, elliptic: bool, rows_on_chip: int) 
     """Return how many floats the lanes of a world share."""
     stride, padded_rows = row_stride(nv), _padded(njmax)
     cones = 4 * (padded_rows + 4) if elliptic else 0
-    return (
-        (nv + rows_on_chip) * stride
-        + 2 * (stride + 4)
-        + stride
-        + 7 * padded_rows
-        + cones
-    )
+    return (nv + rows_on_chip) * stride + 2 * (stride + 4) + stride + 7 * padded_rows + cones
 
 
 def _padded(njmax: int) -> int:
@@ -105,9 +99,7 @@ def constants(
         "ROWS_ON_CHIP": rows_on_chip,
         "LANES": lanes,
         "WORLDS_PER_BLOCK": worlds_per_block,
-        "FLOATS": floats_per_world(
-            nv, njmax, elliptic=elliptic, rows_on_chip=rows_on_chip
-        ),
+        "FLOATS": floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=rows_on_chip),
         "MOST_TRIALS": ls_iterations,
         "ELLIPTIC": int(elliptic),
         "OUT_OF_ITERATIONS": int(mjw.OverflowType.ITERATIONS),
@@ -148,10 +140,7 @@ def newton_kernel(
         rows_on_chip=rows_on_chip,
         worlds_per_block=worlds_per_block,
     )
-    snippet = (
-        "".join(f"constexpr int {name} = {value};\n" for name, value in known.items())
-        + _SOURCE
-    )
+    snippet = "".join(f"constexpr int {name} = {value};\n" for name, value in known.items()) + _SOURCE
 
     @wp.func_native(snippet)
     def solve_world(world: int, lane: int, problem: Problem) -> None: ...

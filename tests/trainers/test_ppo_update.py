@@ -90,7 +90,12 @@ def test_an_optimizer_of_another_size_is_refused(trainer):
 
 @pytest.mark.parametrize(
     ("ppo", "estimates"),
-    [({}, 1), ({"estimate_each_epoch": True}, 4), ({"advantage": "td_lambda"}, 1), ({"advantage": "vtrace"}, 4)],
+    [
+        ({}, 1),
+        ({"estimate_each_epoch": True}, 4),
+        ({"advantage": "td_lambda"}, 1),
+        ({"advantage": "vtrace"}, 4),
+    ],
     ids=str,
 )
 def test_advantages_are_estimated_once_or_before_each_epoch(ppo, estimates, monkeypatch):
