@@ -13,6 +13,8 @@ PANELS = {
     "reward/track_linear_velocity": "Linear velocity tracking (of 2)",
     "reward/track_angular_velocity": "Angular velocity tracking (of 2)",
     "episode/length": "Episode length (env steps)",
+    "metric/pose_distance": "Distance from the reference pose (rad)",
+    "update/action_error": "Distance from the teacher's actions",
 }
 # mjlab 1.6.0 with rsl_rl 5.4.2, one H200, 4096 envs, 24-step rollouts: env states, seconds, and the means of panels.
 PEER = {
