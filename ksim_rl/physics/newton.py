@@ -9,13 +9,12 @@ import warp as wp
 
 from ksim_rl.physics.newton_kernel import (
     CUDA_LANES,
-    ORDER_THREADS,
     Problem,
     floats_per_world,
-    longest_first,
     newton_kernel,
     row_stride,
 )
+from ksim_rl.physics.newton_order import put_longest_first
 
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
@@ -31,12 +30,13 @@ INTEGRATORS = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Placement:
-    """How the worlds lie on a CUDA device.
+    """How the worlds lie on a CUDA device; the CPU, which has no chip to fill, heeds `rows_on_chip` alone.
 
     Args:
         rows_on_chip: rows that the shared memory of a world holds; those beyond are in device memory.
         worlds_per_block: worlds that share a block.
         min_blocks: blocks that a multiprocessor is to hold at once, which bounds the registers; 0 does not.
+        longest_first: whether the worlds that will take longest start first.
     """
 
     rows_on_chip: int
@@ -82,11 +82,14 @@ def solver(
     """
     m, d, efc = warp_model, warp_data_E, warp_data_E.efc
     elliptic = bool(m.opt.cone == mjw.ConeType.ELLIPTIC)
-    lanes = CUDA_LANES if d.qpos.device.is_cuda else 1
-    if lanes == 1:
-        place = Placement(rows_on_chip=d.njmax)
-    elif place is None:
-        place = placement(nv=m.nv, njmax=d.njmax, elliptic=elliptic)
+    on_cuda = d.qpos.device.is_cuda
+    lanes = CUDA_LANES if on_cuda else 1
+    if place is None:
+        place = (
+            placement(nv=m.nv, njmax=d.njmax, elliptic=elliptic)
+            if on_cuda
+            else Placement(rows_on_chip=d.njmax)
+        )
     kernel = newton_kernel(
         nv=m.nv,
         njmax=d.njmax,
@@ -133,13 +136,8 @@ def solver(
     dim, block_dim = (d.nworld, lanes), place.worlds_per_block * lanes
 
     def launch() -> None:
-        if lanes > 1 and place.longest_first:
-            wp.launch(
-                longest_first,
-                dim=ORDER_THREADS,
-                inputs=[problem],
-                block_dim=ORDER_THREADS,
-            )
+        if on_cuda and place.longest_first:
+            put_longest_first(problem)
         wp.launch(kernel, dim=dim, inputs=[problem], block_dim=block_dim)
 
     return launch

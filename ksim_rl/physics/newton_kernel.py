@@ -25,7 +25,9 @@ _SOURCE = files("ksim_rl.physics").joinpath("newton_solver.cpp").read_text()
 
 @wp.struct
 class Problem:
-    """What the kernel reads of a model and its worlds, what it writes, and room for the rows that find none on chip."""
+    """What the kernel reads of a model and its worlds, what it writes, room for the rows that find none on chip, and
+    the order in which the worlds are taken up.
+    """
 
     iterations: int
     tolerance: wp.array[float]
@@ -160,47 +162,3 @@ def newton_kernel(
         solve_world(problem.order[world], lane, problem)
 
     return kernel
-
-
-ORDER_THREADS = 1024
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-constexpr int KEYS = 64;
-__shared__ int places[KEYS];
-const int thread = threadIdx.x, threads = blockDim.x, worlds = problem.order.shape[0];
-auto key_of = [&](int world) {
-    return KEYS - 1 - wp::clamp(problem.solver_niter.data[world] * 2 + problem.nefc.data[world] / 4, 0, KEYS - 1);
-};
-for (int key = thread; key < KEYS; key += threads)
-    places[key] = 0;
-__syncthreads();
-for (int world = thread; world < worlds; world += threads)
-    atomicAdd(places + key_of(world), 1);
-__syncthreads();
-if (thread == 0) {
-    int before = 0;
-    for (int key = 0; key < KEYS; ++key) {
-        const int count = places[key];
-        places[key] = before;
-        before += count;
-    }
-}
-__syncthreads();
-for (int world = thread; world < worlds; world += threads)
-    problem.order.data[atomicAdd(places + key_of(world), 1)] = world;
-#endif
-""")
-def order_worlds(problem: Problem) -> None: ...
-
-
-@wp.kernel(
-    module="unique",
-    enable_backward=False,
-    grid_stride=False,
-    module_options={"block_dim": ORDER_THREADS},
-)
-def longest_first(problem: Problem):
-    """Order the worlds by how long they will take, as their last solution and the number of their rows tell."""
-    order_worlds(problem)

@@ -95,7 +95,7 @@ auto is_dof = [&](int block) { return block * LANES + lane < NV; };
 auto dof_of = [&](int block) { return wp::min(block * LANES + lane, NV - 1); };
 
 struct Point {
-    float cost, slope, curvature, start;  // the cost is relative to that at the start of the direction
+    float cost, slope, curvature;  // the cost is relative to that at the start of the direction
 };
 struct Cone {
     float mu, u0, v0, along, speed, aside2, dm, cost, slope, half_curvature, tangent, zone;
@@ -107,19 +107,19 @@ auto cone_zone = [](float normal, float tangent, float mu) {
 auto one_sided = [](float x, float v, float d, float alpha) {
     const float slope = d * v * x, curvature = d * v * v, start = x < 0.0f ? 0.5f * d * x * x : 0.0f;
     if (x + alpha * v >= 0.0f && !(alpha == 0.0f && x < 0.0f))
-        return Point {-start, 0.0f, 0.0f, start};
+        return Point {-start, 0.0f, 0.0f};
     const float change = alpha * (slope + 0.5f * alpha * curvature);
-    return Point {x < 0.0f ? change : change + 0.5f * d * x * x, slope + alpha * curvature, curvature, start};
+    return Point {x < 0.0f ? change : change + 0.5f * d * x * x, slope + alpha * curvature, curvature};
 };
 auto dry_friction = [&](float x, float v, float d, float most, float alpha) {
     const float reach = ratio(most, d);
     auto cost = [&](float at) {
         return at <= -reach ? most * (-0.5f * reach - at) : at >= reach ? most * (-0.5f * reach + at) : 0.5f * d * at * at;
     };
-    const float there = x + alpha * v, start = cost(x);
+    const float there = x + alpha * v;
     const bool linear = there <= -reach || there >= reach;
     const float slope = there <= -reach ? -most * v : there >= reach ? most * v : d * v * there;
-    return Point {cost(there) - start, slope, linear ? 0.0f : d * v * v, start};
+    return Point {cost(there) - cost(x), slope, linear ? 0.0f : d * v * v};
 };
 auto cone_point = [&](const Cone& c, float alpha) {
     const int zone0 = (int)c.zone;
@@ -129,14 +129,14 @@ auto cone_point = [&](const Cone& c, float alpha) {
     const float tangent2 = ahead * ahead + c.aside2, tangent = sqrtf(tangent2);
     const int zone = cone_zone(normal, tangent, c.mu);
     if (zone == SATISFIED)
-        return Point {-start, 0.0f, 0.0f, start};
+        return Point {-start, 0.0f, 0.0f};
     // The quadratic cost of all rows exceeds that of the cone at the same point by dm / 2 (mu N + T)^2.
     const float half = alpha * c.half_curvature, quadratic = alpha * (half + c.slope);
     if (zone == QUADRATIC) {
         const float excess = c.mu * c.u0 + c.tangent;
         const float change = zone0 == CURVED ? quadratic + 0.5f * c.dm * excess * excess
             : zone0 == SATISFIED ? 0.5f * c.dm * (1.0f + c.mu * c.mu) * (normal * normal + tangent2) : quadratic;
-        return Point {change, 2.0f * half + c.slope, 2.0f * c.half_curvature, start};
+        return Point {change, 2.0f * half + c.slope, 2.0f * c.half_curvature};
     }
     const float gap = normal - c.mu * tangent;
     const float gap_rate = c.v0 - c.mu * ahead * c.speed / tangent;
@@ -149,7 +149,7 @@ auto cone_point = [&](const Cone& c, float alpha) {
         const float excess = c.mu * normal + tangent;
         change = quadratic - 0.5f * c.dm * excess * excess;
     }
-    return Point {change, c.dm * gap * gap_rate, c.dm * (gap_rate * gap_rate - c.mu * gap * bend), start};
+    return Point {change, c.dm * gap * gap_rate, c.dm * (gap_rate * gap_rate - c.mu * gap * bend)};
 };
 auto prepare_cone = [&](int head, int size) {
     Cone c {};
@@ -431,7 +431,7 @@ UNROLL
 };
 // What the rows cost at a point of the search direction, summed over the units first, first + stride, ...
 auto measure = [&](float alpha, int first, int stride) {
-    Point sum {0.0f, 0.0f, 0.0f, 0.0f};
+    Point sum {0.0f, 0.0f, 0.0f};
 #pragma unroll 1
     for (int unit = first; unit < num_units; unit += stride) {
         const int row = units[unit], kind = kinds[row] & 255;
@@ -445,12 +445,11 @@ auto measure = [&](float alpha, int first, int stride) {
         sum.cost += point.cost;
         sum.slope += point.slope;
         sum.curvature += point.curvature;
-        sum.start += point.start;
     }
     return sum;
 };
 auto in_bracket = [](const Point& end, const Point& point) {
-    return (end.slope < point.slope && point.slope < 0.0f) || (end.slope > point.slope && point.slope > 0.0f);
+    return end.slope * point.slope > 0.0f && fabsf(point.slope) < fabsf(end.slope);
 };
 
 times_mass(ma, acc);
@@ -491,7 +490,7 @@ UNROLL
     }
     back_substitute();
     times_mass(mv, slopes);
-    float search2 = 0.0f, slope = 0.0f, half_curvature = 0.0f;
+    float search2 = 0.0f, slope = 0.0f, half_curvature = 0.0f, noise = 0.0f;
 UNROLL
     for (int b = 0; b < BLOCKS; ++b)
         if (is_dof(b)) {
@@ -505,6 +504,7 @@ UNROLL
         for (int j = 0; j < NV; ++j)
             rate += J[j] * shared[j];
         v[row] = rate;
+        noise += fabsf(force[row] * rate);
         if (row < equalities) {
             slope += d[row] * rate * x[row];
             half_curvature += 0.5f * d[row] * rate * rate;
@@ -514,6 +514,7 @@ UNROLL
     search2 = total(search2);
     slope = total(slope);
     half_curvature = total(half_curvature);
+    noise = NOISE * (total(noise) + fabsf(slope));
     if (ELLIPTIC) {
 #pragma unroll 1
         for (int unit = lane; unit < num_units; unit += LANES)
@@ -525,9 +526,9 @@ UNROLL
     // The line search keeps two points whose slopes it drives to zero, and takes the better one. Its trials measure three
     // points each, on CUDA by eight lanes each; the first trial is of the start and of the Newton step.
     const float enough = wp::max(tolerance * ls_tolerance * sqrtf(search2) / scale, 1e-6f);
-    float alpha = rows == 0 ? 1.0f : 0.0f, improvement = 0.0f, accepted = enough;
+    float alpha = rows == 0 ? 1.0f : 0.0f, improvement = 0.0f, accepted = wp::max(enough, noise);
     float alphas[3] = {0.0f, 1.0f, 1.0f}, low_alpha = 0.0f, high_alpha = 0.0f;
-    Point low {0.0f, 0.0f, 0.0f, 0.0f}, high = low;
+    Point low {0.0f, 0.0f, 0.0f}, high = low;
 #pragma unroll 1
     for (int trial = -1; rows > 0; ++trial) {
         if (trial == MOST_TRIALS) {
@@ -549,7 +550,6 @@ UNROLL
             sum.cost += __shfl_xor_sync(0xffffffffu, sum.cost, distance);
             sum.slope += __shfl_xor_sync(0xffffffffu, sum.slope, distance);
             sum.curvature += __shfl_xor_sync(0xffffffffu, sum.curvature, distance);
-            sum.start += __shfl_xor_sync(0xffffffffu, sum.start, distance);
         }
 #endif
 UNROLL
@@ -558,7 +558,6 @@ UNROLL
             points[i].cost = __shfl_sync(0xffffffffu, sum.cost, 8 * i);
             points[i].slope = __shfl_sync(0xffffffffu, sum.slope, 8 * i);
             points[i].curvature = __shfl_sync(0xffffffffu, sum.curvature, 8 * i);
-            points[i].start = __shfl_sync(0xffffffffu, sum.start, 0);
 #else
             points[i] = i == 2 && trial < 0 ? points[1] : measure(alphas[i], 0, 1);
 #endif
@@ -571,10 +570,7 @@ UNROLL
         }
         if (trial < 0) {
             low = high = points[0];
-            const float gross = sqrtf(2.0f * wp::max(low.start, 0.0f) * wp::max(low.curvature - 2.0f * half_curvature, 0.0f))
-                + fabsf(slope);
-            accepted = wp::max(enough, NOISE * gross);
-            if (fabsf(low.slope) < NOISE * gross)
+            if (fabsf(low.slope) < noise)
                 break;
         }
         int best = -1;

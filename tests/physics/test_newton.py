@@ -133,6 +133,22 @@ def test_iterations_and_overflow_are_those_of_mujoco_warp(cone, iterations):
         assert torch.equal(ours["efc.state"][row, :count], theirs["efc.state"][row, :count])
 
 
+@pytest.mark.parametrize("cone", CONES)
+def test_rows_that_find_no_room_on_chip_solve_alike(cone):
+    world = worlds(cone)
+    rows_of(world)
+    found = []
+    with wp.ScopedDevice("cpu"):
+        for rows_on_chip in (world.njmax, 10, 0):
+            world.qacc_EL.zero_()
+            place = newton.Placement(rows_on_chip=rows_on_chip)
+            newton.solver(world.warp_model, world.warp_data_E, place=place)()
+            found.append(world.qacc_EL.clone())
+    assert found[0].any()
+    for other in found[1:]:
+        torch.testing.assert_close(other, found[0], rtol=1e-5, atol=1e-5)
+
+
 def test_steps_follow_those_of_mujoco_warp():
     ours, theirs = worlds("elliptic"), worlds("elliptic", one_kernel_solver=False)
     assert not theirs.has_one_kernel_solver
