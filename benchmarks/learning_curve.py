@@ -56,26 +56,30 @@ def main() -> None:
         return
     seeds = [int(seed) for seed in own.get("seeds", "1").split(",")]
     cfg = run_cfg(overrides, own)
-    device = cfg.resolved_device()
     curves = dict(zip(seeds, train_all(seeds), strict=True))
+    print(f"written to {keep(curves, cfg=cfg, overrides=overrides, module='benchmarks.learning_curve')}")
+
+
+def keep(curves: dict[int, list[Point]], *, cfg: RunCfg, overrides: list[str], module: str) -> Path:
+    """Print the curves of the seeds, write and draw them, and return the file."""
+    device = cfg.resolved_device()
     figures = summary(list(curves.values()))
     label = f"{report.device_label(device)}/{cfg.task_name}/{cfg.num_envs}"
     Console(width=200).print(_table(label, curves))
     chosen = dict(word.split("=", 1) for word in overrides if word.startswith(("objective=", "modules=")))
     others = [choice for choice in chosen.values() if choice not in ("ppo", "mlp")]
-    name = "_".join(["learning", cfg.task_name, *others])
     path = report.write(
-        name,
+        "_".join(["learning", cfg.task_name, *others]),
         figures={f"{label}/{figure}": value for figure, value in figures.items()} | _short_names(figures),
         device=device,
-        module="benchmarks.learning_curve",
+        module=module,
         curves={
             f"{label}/seed_{seed}": points[:: max(1, len(points) // KEPT_POINTS)] + [points[-1]]
             for seed, points in curves.items()
         },
     )
     draw(curves, path.with_suffix(".png"), task_name=cfg.task_name, num_envs=cfg.num_envs)
-    print(f"written to {path}")
+    return path
 
 
 def train_one(cfg: RunCfg) -> list[Point]:

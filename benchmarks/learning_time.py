@@ -6,7 +6,8 @@ takes the overrides of `ksim-rl train`. Each seed is trained as in `benchmarks.l
 training (collecting, learning, logging) up to the first point of the curve from which on, for `HELD_STATES` env states,
 the mean of each of `LEVELS` is at least its level. Figures go to benchmarks/results/learning_time.json:
 `seconds_to_track`, the median over the seeds, and `env_states_to_track`. A seed that does not get there counts as
-infinite; with most seeds infinite there is no figure, and the command fails.
+infinite; with most seeds infinite there is no figure, and the command fails. The curves are kept as
+`benchmarks.learning_curve` keeps them.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import report
-from benchmarks.learning_curve import OWN_OPTIONS, Point, run_cfg, train_all
+from benchmarks.learning_curve import OWN_OPTIONS, Point, keep, run_cfg, train_all
 
 # What mjlab 1.6.0 with rsl_rl 5.4.2 reaches after 30 M env states, in 192 s on an H200.
 LEVELS = {"reward/track_linear_velocity": 1.39, "reward/track_angular_velocity": 1.20}
@@ -48,6 +49,7 @@ def main() -> None:
     cfg = run_cfg(overrides, own)
     device = cfg.resolved_device()
     curves = dict(zip(seeds, train_all(seeds), strict=True))
+    keep(curves, cfg=cfg, overrides=overrides, module="benchmarks.learning_time")
     ends = {seed: reached(points) for seed, points in curves.items()}
     table = Table(title=f"{cfg.task_name}: until {', '.join(f'{k} >= {v}' for k, v in LEVELS.items())}")
     for column in ("seed", "seconds", "env states"):

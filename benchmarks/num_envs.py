@@ -39,7 +39,7 @@ from ksim_rl.trainers.loggers.csv_table import read_table
 NUM_ENVS, SEEDS = (64, 256, 1024), (1, 2, 3, 4, 5)
 SETTING = (
     "task=cartpole_balance",
-    "data.num_env_states_per_minibatch=4096",
+    "data.num_env_states_per_minibatch=16384",
     "data.num_minibatches=4",
     # So that the datasets are alike from the start; see above.
     "objective.gamma=0.95",

@@ -3,7 +3,7 @@
 MuJoCo Warp launches about ten kernels per iteration, over all worlds, until the last of them has converged; here no
 world waits for another, and what an iteration computes stays on the chip. The algorithm is the same: exact line search
 by bracketed Newton steps, and the same tests of convergence, so that the results agree up to rounding. It is written in
-C++ (newton_solver.cpp), since its matrix lies in registers, which needs loops that are unrolled, shuffles and shared
+C++ (newton_*.cpp), since its matrix lies in registers, which needs loops that are unrolled, shuffles and shared
 memory; the CPU compiles the same source, for a warp of one lane.
 
 Source of the algorithm: https://mujoco.readthedocs.io/en/stable/computation/index.html
@@ -20,7 +20,8 @@ import warp as wp
 
 CUDA_LANES = 32
 vec5 = wp.types.vector(length=5, dtype=float)
-_SOURCE = files("ksim_rl.physics").joinpath("newton_solver.cpp").read_text()
+_PARTS = ("newton_memory.cpp", "newton_rows.cpp", "newton_hessian.cpp", "newton_solver.cpp")
+_SOURCE = "".join(files("ksim_rl.physics").joinpath(part).read_text() for part in _PARTS)
 
 
 @wp.struct
@@ -75,11 +76,16 @@ def floats_per_world(nv: int, njmax: int, *, elliptic: bool, rows_on_chip: int) 
     """Return how many floats the lanes of a world share."""
     stride, padded_rows = row_stride(nv), _padded(njmax)
     cones = 4 * (padded_rows + 4) if elliptic else 0
-    return (nv + rows_on_chip) * stride + 2 * (stride + 4) + stride + 7 * padded_rows + cones
+    return (nv + rows_on_chip) * stride + 2 * _column(nv) + stride + 7 * padded_rows + cones
 
 
 def _padded(njmax: int) -> int:
     return 4 * -(-njmax // 4)
+
+
+def _column(nv: int) -> int:
+    # A column of a whole block has the entries of the block twice; one more is that of the gradient.
+    return _padded(nv + 1 + (CUDA_LANES if nv >= CUDA_LANES else 0))
 
 
 def constants(
@@ -98,6 +104,7 @@ def constants(
         "NJ": njmax,
         "PADDED_ROWS": _padded(njmax),
         "STRIDE": row_stride(nv),
+        "COLUMN": _column(nv),
         "ROWS_ON_CHIP": rows_on_chip,
         "LANES": lanes,
         "WORLDS_PER_BLOCK": worlds_per_block,

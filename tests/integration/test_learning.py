@@ -32,8 +32,9 @@ def reward_after(task, iterations, *overrides):
 
 
 def test_a_pendulum_is_swung_up_and_held():
-    # Upright and at rest pays 1 per step. An untrained policy gets 0.23 at first, and 0.07 after some steps.
-    assert reward_after("pendulum_swingup", 80, *SMALL) > 0.6
+    # Upright and at rest pays 1 per step. An untrained policy gets 0.23 at first, and 0.07 after some steps; five seeds
+    # of this one got 0.74 to 0.94.
+    assert reward_after("pendulum_swingup", 120, *SMALL, "objective.lmbda=0.9") > 0.55
 
 
 def test_a_hanging_pole_begins_to_swing_up():

@@ -95,7 +95,7 @@ class ActionScale(Transform):
                 raise RuntimeError(
                     "ActionScale knows its numbers once an env holds it and has made its specs"
                 )
-            tensordict.set(key, tensordict.get(out_key) * scale + offset)
+            tensordict.set(key, torch.addcmul(offset, tensordict.get(out_key), scale))
         return tensordict
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
