@@ -78,7 +78,8 @@ def keep(curves: dict[int, list[Point]], *, cfg: RunCfg, overrides: list[str], m
             for seed, points in curves.items()
         },
     )
-    draw(curves, path.with_suffix(".png"), task_name=cfg.task_name, num_envs=cfg.num_envs)
+    learner = ", ".join(chosen.values()) or "ppo"
+    draw(curves, path.with_suffix(".png"), task_name=cfg.task_name, learner=learner, num_envs=cfg.num_envs)
     return path
 
 

@@ -29,14 +29,16 @@ _COLORS = ("#3465a4", "#4e9a06", "#75507b", "#c4a000")
 _PEER_COLOR = "#cc5500"
 
 
-def draw(curves: dict[int, list[dict[str, float]]], picture: Path, *, task_name: str, num_envs: int) -> None:
-    """Draw each panel over env states, and over seconds below it."""
+def draw(
+    curves: dict[int, list[dict[str, float]]], picture: Path, *, task_name: str, learner: str, num_envs: int
+) -> None:
+    """Draw each panel over env states, and over seconds below it; `learner` is for the title."""
     rows = next(iter(curves.values()))
     present = [name for name in PANELS if any(name in point for point in rows)]
     figure = Figure(figsize=(3.9 * len(present), 6.2), layout="constrained")
     FigureCanvasAgg(figure)
     seeds = "1 seed" if len(curves) == 1 else f"{len(curves)} seeds"
-    figure.suptitle(f"{task_name}: {num_envs} envs, {seeds}", fontsize=13)
+    figure.suptitle(f"{task_name}, {learner}: {num_envs} envs, {seeds}", fontsize=13)
     for line, (step, label) in enumerate((("env_states", "env states"), ("seconds", "seconds"))):
         for column, name in enumerate(present):
             axes = figure.add_subplot(2, len(present), line * len(present) + column + 1)

@@ -75,7 +75,7 @@ def draw(figures: dict[int, dict[str, float]], path: Path, *, task_name: str, de
             [PUBLISHED[task_name] / 1e6],
             "D",
             color="#d62728",
-            label="mjlab 1.6.0 + rsl_rl, training (on an H200, not measured in this run)",
+            label="mjlab 1.6.0 + rsl_rl, training (published)",
         )
     axes.set(
         xscale="log", xlabel="envs", ylabel="million env states per second", title=f"{task_name} on {device}"
@@ -84,7 +84,7 @@ def draw(figures: dict[int, dict[str, float]], path: Path, *, task_name: str, de
     axes.minorticks_off()
     axes.set_ylim(bottom=0.0)
     axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, fontsize=9, loc="upper left")
     figure.savefig(path, dpi=150)
     plt.close(figure)
 
