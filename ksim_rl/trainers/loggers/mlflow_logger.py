@@ -39,7 +39,7 @@ class _Run(MLFlowLogger):
     """TorchRL's logger, which leaves the run open when it is closed."""
 
     def close(self, timeout: float | None = None) -> None:
-        import mlflow
+        import mlflow  # pyright: ignore[reportMissingImports]
 
         mlflow.end_run()
         super().close(timeout)
@@ -47,7 +47,7 @@ class _Run(MLFlowLogger):
 
 def open_mlflow(cfg: MLflowCfg, run_folder: Path, config: Mapping[str, Any]) -> MetricLogger:
     """Begin the run with the config of a training run, or continue that of a resumed one."""
-    import mlflow
+    import mlflow  # pyright: ignore[reportMissingImports]
 
     folder = run_folder / "mlflow"
     folder.mkdir(parents=True, exist_ok=True)
