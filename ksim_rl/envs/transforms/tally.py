@@ -94,7 +94,9 @@ def count_down(left_E: Tensor, mask_E: Tensor | None, horizon: float, divisor: f
     return run(left_E, mask_E, horizon, divisor)
 
 
-def tally(step_E: Tensor, total_E: Tensor, reward_E: Tensor | None, mask_E: Tensor | None) -> list[Tensor]:
+def tally(
+    step_E: Tensor, total_E: Tensor, reward_E: Tensor | None, mask_E: Tensor | None
+) -> tuple[Tensor, Tensor]:
     """Count one env step and add its reward, or, given the rows that reset, let those begin at 0.
 
     Args:
@@ -121,7 +123,7 @@ def _count_down_now(left_E: Tensor, mask_E: Tensor | None, horizon: float, divis
 
 def _tally_now(
     step_E: Tensor, total_E: Tensor, reward_E: Tensor | None, mask_E: Tensor | None
-) -> list[Tensor]:
+) -> tuple[Tensor, Tensor]:
     if reward_E is not None:
         reward_E = reward_E.contiguous()
     step_out_E, total_out_E = torch.empty_like(step_E), torch.empty_like(total_E)
@@ -138,7 +140,7 @@ def _tally_now(
         total_out_E.data_ptr(),
         step_out_E.data_ptr(),
     )
-    return [step_out_E, total_out_E]
+    return step_out_E, total_out_E
 
 
 def _share(device: torch.device, num_rows: int) -> tuple[tuple[int], int]:
@@ -158,5 +160,7 @@ def _(left_E: Tensor, mask_E: Tensor | None, horizon: float, divisor: float) -> 
 
 
 @_tally_operator.register_fake
-def _(step_E: Tensor, total_E: Tensor, reward_E: Tensor | None, mask_E: Tensor | None) -> list[Tensor]:
-    return [torch.empty_like(step_E), torch.empty_like(total_E)]
+def _(
+    step_E: Tensor, total_E: Tensor, reward_E: Tensor | None, mask_E: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    return torch.empty_like(step_E), torch.empty_like(total_E)
