@@ -37,6 +37,8 @@ from ksim_rl.physics.capture import Captured
 from ksim_rl.trainers.ppo_update import PPOUpdate
 
 STEPS, OBS, ACTIONS, MINIBATCHES = 24, 48, 12, 4
+# Of the dataset whose `update_ms` on a GPU stands in the results by that name alone.
+TARGET_STATES = 98304
 # The stock side has no schedule that follows the divergence without a host sync at each step.
 CFG = PPOCfg(schedule="fixed")
 WARMUP, REPEATS = 2, 10
@@ -58,6 +60,9 @@ def main() -> None:
         found, note = compare(num_envs, device=device)
         figures |= {f"{label}/{name}": value for name, value in found.items()}
         notes |= {f"{label}/{name}": text for name, text in note.items()}
+    target = f"{report.device_label(device)}/{TARGET_STATES}/update_ms"
+    if device.type == "cuda" and target in figures:
+        figures["update_ms"] = figures[target]
     table = Table("figure", "value")
     for name, value in [*figures.items(), *notes.items()]:
         table.add_row(name, value if isinstance(value, str) else f"{value:.4g}")
