@@ -6,10 +6,10 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data.replay_buffers import Writer
 from torchrl.data.replay_buffers.storages import TensorStorage
 
 from ksim_rl import dims
+from ksim_rl.data.stateless_writer import StatelessWriter
 
 # Where TorchRL's losses look for rows to leave out (`LossModule.loss_mask_key`), stock ones included.
 MASK_KEY = ("collector", "mask")
@@ -111,7 +111,7 @@ class DatasetStorage(TensorStorage):
         return stored
 
 
-class DatasetWriter(Writer):
+class DatasetWriter(StatelessWriter):
     """Writes a whole dataset at once into a `DatasetStorage`."""
 
     _storage: DatasetStorage
@@ -128,22 +128,6 @@ class DatasetWriter(Writer):
             raise ValueError(f"extend() got {type(data).__name__}: expected a TensorDict, e.g. a rollout")
         self._storage.write(data)
         return torch.arange(self._storage.max_size, device=self._storage.device)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return nothing: the writer has no state."""
-        return {}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Read nothing."""
-
-    def dumps(self, path: Any) -> None:
-        """Write nothing."""
-
-    def loads(self, path: Any) -> None:
-        """Read nothing."""
-
-    def _empty(self, empty_write_count: bool = True) -> None:
-        """Forget nothing."""
 
 
 def _finite_rows(leaves_D: Iterable[Tensor]) -> Tensor:

@@ -6,11 +6,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data.replay_buffers import Writer
 from torchrl.data.replay_buffers.storages import Storage
 
 from ksim_rl import dims
 from ksim_rl.data.dataset_storage import MASK_KEY
+from ksim_rl.data.stateless_writer import StatelessWriter
 
 REWARD: NestedKey = ("next", "reward")
 DONE: NestedKey = ("next", "done")
@@ -269,7 +269,7 @@ class ReplayStorage(Storage):
         return reward_B, done_B, terminated_B, steps_B
 
 
-class ReplayWriter(Writer):
+class ReplayWriter(StatelessWriter):
     """Adds rollouts to a `ReplayStorage`."""
 
     _storage: ReplayStorage
@@ -283,22 +283,6 @@ class ReplayWriter(Writer):
         if not isinstance(data, TensorDictBase):
             raise ValueError(f"extend() got {type(data).__name__}: expected a rollout of batch_size [E, T]")
         return self._storage.write(data)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return nothing: where the next rollout goes is the storage's."""
-        return {}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Read nothing."""
-
-    def dumps(self, path: Any) -> None:
-        """Write nothing."""
-
-    def loads(self, path: Any) -> None:
-        """Read nothing."""
-
-    def _empty(self, empty_write_count: bool = True) -> None:
-        """Forget nothing."""
 
 
 def _next(key: NestedKey) -> tuple[str, ...]:

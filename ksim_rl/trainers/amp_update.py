@@ -24,6 +24,7 @@ from ksim_rl.objectives import (
 )
 from ksim_rl.physics.capture import Captured
 from ksim_rl.trainers import state_tree
+from ksim_rl.trainers.gradient_steps import StepMeans, check_skipped_steps, in_columns
 from ksim_rl.trainers.optimizer_state import load_optimizer_state, optimizer_state
 from ksim_rl.trainers.ppo_update import PPOUpdate, make_ppo_update
 from ksim_rl.trainers.run_cfg import RunCfg
@@ -107,7 +108,7 @@ class AMPUpdate:
         )
         self.guard = StepGuard(device=self.device)
         self._rollout_ET: TensorDictBase | None = None
-        self._means = {name: torch.zeros((), device=self.device) for name in LOGGED.values()}
+        self._means = StepMeans(LOGGED)
         self._style = torch.zeros((), device=self.device)
         self._run = Captured(self._update, device=self.device)
 
@@ -165,9 +166,7 @@ class AMPUpdate:
         Raises:
             NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped, of PPO or the discriminator.
         """
-        if metrics["update/skipped_in_a_row"] >= self.cfg.max_skipped_steps:
-            self.ppo.guard.check(self.cfg.max_skipped_steps)
-            self.guard.check(self.cfg.max_skipped_steps)
+        check_skipped_steps(metrics, self.cfg.max_skipped_steps, self.ppo.guard, self.guard)
 
     def _update(self) -> None:
         rollout_ET = self._rollout_ET
@@ -208,14 +207,7 @@ class AMPUpdate:
             shown += [reference_B2L, policy_B2L]
         # Only now, so that all steps see the statistics that the rollout was scored with.
         net.normalizer.update(torch.cat(shown))
-        self._measure({name: torch.stack([step[name] for step in steps]) for name in steps[0]})
-
-    def _measure(self, steps: Mapping[str, Tensor]) -> None:
-        made = steps["skipped"] == 0.0
-        for name, logged in LOGGED.items():
-            # A skipped step is counted; its numbers would spoil the means.
-            total = torch.where(made, steps[name], 0.0).sum()
-            self._means[logged].copy_(total / made.sum().clamp_min(1))
+        self._means.take_(in_columns(steps))
 
     def state_dict(self) -> state_tree.State:
         """Return PPO's state, and beside it the discriminator with its optimizer and its replay."""

@@ -10,8 +10,8 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.data import DatasetBuffer, DatasetCfg, SequenceSampler
-from ksim_rl.modules import MixedPolicy, burnt_in, memories, update_normalizers
+from ksim_rl.data import DatasetCfg
+from ksim_rl.modules import MixedPolicy, memories, update_normalizers
 from ksim_rl.objectives import (
     DistillationCfg,
     DistillationLoss,
@@ -20,10 +20,16 @@ from ksim_rl.objectives import (
     make_optimizer,
     observation_keys,
     observation_keys_of,
-    ppo_step,
 )
 from ksim_rl.physics.capture import Captured
 from ksim_rl.trainers import state_tree
+from ksim_rl.trainers.gradient_steps import (
+    StepMeans,
+    check_skipped_steps,
+    epoch_of_steps,
+    in_columns,
+    make_dataset,
+)
 from ksim_rl.trainers.optimizer_state import load_optimizer_state, optimizer_state
 from ksim_rl.trainers.ppo_update import make_ppo_policy
 from ksim_rl.trainers.run_cfg import RunCfg
@@ -93,13 +99,8 @@ class DistillationUpdate:
         self.loss = DistillationLoss(actor, teacher.policy, loss=cfg.loss)
         self.optimizer = make_optimizer(cfg, actor)
         self._memories = memories(actor)
-        sampler = SequenceSampler(sequence_length=data.sequence_length, burn_in=data.burn_in, seed=seed)
-        self.dataset = DatasetBuffer(
-            data,
-            keys=self.loss.dataset_keys,
-            seed=seed,
-            sampler=sampler if self._memories else None,
-            device=self.device,
+        self.dataset = make_dataset(
+            data, keys=self.loss.dataset_keys, memories=self._memories, seed=seed, device=self.device
         )
         self.guard = StepGuard(device=self.device)
         self.teacher_share = torch.tensor(cfg.teacher_share, device=self.device)
@@ -115,8 +116,8 @@ class DistillationUpdate:
                 explores=cfg.loss == "kl",
             )
         self._rollout_ET: TensorDictBase | None = None
-        self._means = {name: self._zero() for name in LOGGED.values()}
-        self._action_error = self._zero()
+        self._means = StepMeans(LOGGED)
+        self._action_error = torch.zeros((), device=self.device)
         self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
         self._run = Captured(self._update, device=self.device)
 
@@ -162,8 +163,7 @@ class DistillationUpdate:
         Raises:
             NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped.
         """
-        if metrics["update/skipped_in_a_row"] >= self.cfg.max_skipped_steps:
-            self.guard.check(self.cfg.max_skipped_steps)
+        check_skipped_steps(metrics, self.cfg.max_skipped_steps, self.guard)
 
     @property
     def _teacher_keys(self) -> list[Any]:
@@ -174,28 +174,22 @@ class DistillationUpdate:
         labelled_ET = self.loss.label(self._rollout_ET)
         self._action_error.copy_(self.loss.action_error(labelled_ET))
         self.dataset.extend(labelled_ET)
-        steps = []
+        made: list[dict[str, Tensor]] = []
         for _ in range(self.cfg.num_epochs):
-            for minibatch_B in self.dataset.epoch():
-                if self._memories:
-                    minibatch_B = burnt_in(minibatch_B, *self._memories, steps=self.dataset.cfg.burn_in)
-                step = ppo_step(self.loss, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard)
-                steps.append(step | {"skipped_in_a_row": self.guard.skipped_in_a_row.clone()})
-        self._measure({name: torch.stack([step[name] for step in steps]) for name in steps[0]})
+            made += epoch_of_steps(
+                self.dataset,
+                self.loss,
+                self.optimizer,
+                cfg=self.cfg,
+                guard=self.guard,
+                memories=self._memories,
+            )
+        steps = in_columns(made)
+        self._means.take_(steps)
+        self._longest_skip.copy_(steps["skipped_in_a_row"].max())
         self.teacher_share.mul_(self.cfg.teacher_share_decay)
         # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
         update_normalizers(self._rollout_ET, self.actor)
-
-    def _measure(self, steps: Mapping[str, Tensor]) -> None:
-        made = steps["skipped"] == 0.0
-        for name, logged in LOGGED.items():
-            # A skipped step is counted; its numbers would spoil the means.
-            total = torch.where(made, steps[name], 0.0).sum()
-            self._means[logged].copy_(total / made.sum().clamp_min(1))
-        self._longest_skip.copy_(steps["skipped_in_a_row"].max())
-
-    def _zero(self) -> Tensor:
-        return torch.zeros((), device=self.device)
 
     def state_dict(self) -> state_tree.State:
         """Return student, teacher, optimizer, sampler and counters."""

@@ -14,6 +14,7 @@ from ksim_rl.modules import ExploringPolicy, update_normalizers
 from ksim_rl.objectives import OffPolicyCfg, OffPolicyLoss, SACCfg, SACLoss, StepGuard, descend, make_adamw
 from ksim_rl.physics.capture import Captured
 from ksim_rl.trainers import state_tree
+from ksim_rl.trainers.gradient_steps import check_skipped_steps
 from ksim_rl.trainers.optimizer_state import load_optimizer_state, optimizer_state
 
 # Names of the logged means, by the names that the losses give them.
@@ -130,8 +131,7 @@ class OffPolicyUpdate:
         Raises:
             NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped.
         """
-        if metrics["update/skipped_in_a_row"] >= self.cfg.max_skipped_steps:
-            self.guard.check(self.cfg.max_skipped_steps)
+        check_skipped_steps(metrics, self.cfg.max_skipped_steps, self.guard)
 
     def _store(self) -> None:
         rollout_ET = self._rollout_ET

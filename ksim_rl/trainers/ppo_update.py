@@ -10,10 +10,10 @@ from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.data import DatasetBuffer, DatasetCfg, SequenceSampler
+from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.mirror_maps import mirror_maps
 from ksim_rl.envs.transforms import MirrorMap
-from ksim_rl.modules import CarriedState, burnt_in, memories, update_normalizers
+from ksim_rl.modules import CarriedState, memories, update_normalizers
 from ksim_rl.objectives import (
     PPOCfg,
     StepGuard,
@@ -24,12 +24,18 @@ from ksim_rl.objectives import (
     make_optimizer,
     make_symmetric,
     observation_keys,
-    ppo_step,
     with_precision_of,
 )
 from ksim_rl.physics.capture import Captured
 from ksim_rl.trainers import state_tree
 from ksim_rl.trainers.fused_ppo import make_fused_ppo
+from ksim_rl.trainers.gradient_steps import (
+    StepMeans,
+    check_skipped_steps,
+    epoch_of_steps,
+    in_columns,
+    make_dataset,
+)
 from ksim_rl.trainers.networks import build_networks
 from ksim_rl.trainers.optimizer_state import load_optimizer_state, optimizer_state
 from ksim_rl.trainers.run_cfg import RunCfg
@@ -111,16 +117,11 @@ class PPOUpdate:
         losses = make_symmetric(cfg, self.loss, mirror, device=self.device)
         self._losses = in_precision(losses, cfg.precision, device=self.device)
         self.optimizer = make_optimizer(cfg, actor, critic)
-        # Networks with a memory learn on sequences. The rollouts hold the actor's states, and not the critic's.
+        # The rollouts hold the states of the actor's memory, and not those of the critic's.
         self._memories = memories(actor, critic)
         self._carried = CarriedState(critic, acting=actor)
-        sampler = SequenceSampler(sequence_length=data.sequence_length, burn_in=data.burn_in, seed=seed)
-        self.dataset = DatasetBuffer(
-            data,
-            keys=self.loss.dataset_keys,
-            seed=seed,
-            sampler=sampler if self._memories else None,
-            device=self.device,
+        self.dataset = make_dataset(
+            data, keys=self.loss.dataset_keys, memories=self._memories, seed=seed, device=self.device
         )
         self.guard = StepGuard(device=self.device)
         self.fused = make_fused_ppo(
@@ -134,8 +135,7 @@ class PPOUpdate:
         )
         self._is_fused = torch.tensor(float(not isinstance(self.fused, str)), device=self.device)
         self._rollout_ET: TensorDictBase | None = None
-        self._sums: dict[str, Tensor] = {}
-        self._steps_made = torch.zeros((), device=self.device)
+        self._means = StepMeans(LOGGED)
         self._std = torch.zeros((), device=self.device)
         self._scale_keys = [key for key in distribution_keys(actor) if key == "scale" or key[-1] == "scale"]
         self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
@@ -167,10 +167,9 @@ class PPOUpdate:
 
     def metrics(self) -> dict[str, Tensor]:
         """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
-        means = {name: total / self._steps_made.clamp_min(1.0) for name, total in self._sums.items()}
         std = {"policy/std": self._std} if self._scale_keys else {}
         return (
-            means
+            self._means
             | std
             | {
                 "update/learning_rate": self.optimizer.param_groups[0]["lr"],
@@ -187,8 +186,7 @@ class PPOUpdate:
         Raises:
             NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped.
         """
-        if metrics["update/skipped_in_a_row"] >= self.cfg.max_skipped_steps:
-            self.guard.check(self.cfg.max_skipped_steps)
+        check_skipped_steps(metrics, self.cfg.max_skipped_steps, self.guard)
 
     def _update(self) -> None:
         assert self._rollout_ET is not None
@@ -199,7 +197,8 @@ class PPOUpdate:
             orders = [self.dataset.epoch_order() for _ in range(self.cfg.num_epochs)]
             steps, left_out = self.fused(rollout_ET, orders)
             self.dataset.non_finite_count.add_(left_out)
-        self._measure(steps)
+        self._means.take_(steps)
+        self._longest_skip.copy_(steps["skipped_in_a_row"].max())
         if self._scale_keys:
             self._std.copy_(torch.stack([rollout_ET.get(key).mean() for key in self._scale_keys]).mean())
         # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
@@ -211,32 +210,25 @@ class PPOUpdate:
         rollout_ET = self.advantage(rollout_ET)
         self._carried.end_(rollout_ET)
         self.dataset.extend(rollout_ET)
-        steps = []
+        steps: list[dict[str, Tensor]] = []
         for epoch in range(self.cfg.num_epochs):
             if epoch > 0 and self.cfg.estimates_each_epoch:
                 self._estimate_anew(rollout_ET)
-            for minibatch_B in self.dataset.epoch():
-                if self._memories:
-                    minibatch_B = burnt_in(minibatch_B, *self._memories, steps=self.dataset.cfg.burn_in)
-                step = ppo_step(self._losses, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard)
-                steps.append(step | {"skipped_in_a_row": self.guard.skipped_in_a_row.clone()})
-        return {name: torch.stack([step[name] for step in steps]) for name in steps[0]}
+            steps += epoch_of_steps(
+                self.dataset,
+                self._losses,
+                self.optimizer,
+                cfg=self.cfg,
+                guard=self.guard,
+                memories=self._memories,
+            )
+        return in_columns(steps)
 
     def _estimate_anew(self, rollout_ET: TensorDictBase) -> None:
         # The rows that are not finite were counted with the first estimate.
         count = self.dataset.non_finite_count.clone()
         self.dataset.extend(self.advantage(rollout_ET))
         self.dataset.non_finite_count.copy_(count)
-
-    def _measure(self, steps: Mapping[str, Tensor]) -> None:
-        made = steps["skipped"] == 0.0
-        self._steps_made.copy_(made.sum())
-        for name, logged in LOGGED.items():
-            if name in steps:
-                # A skipped step is counted; its numbers would spoil the means.
-                total = torch.where(made, steps[name], 0.0).sum()
-                self._sums.setdefault(logged, torch.zeros((), device=self.device)).copy_(total)
-        self._longest_skip.copy_(steps["skipped_in_a_row"].max())
 
     def state_dict(self) -> state_tree.State:
         """Return networks, optimizer, sampler and counters."""

@@ -14,6 +14,7 @@ from ksim_rl.data import EpochSampler
 from ksim_rl.modules import ObservationNormalizer
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.rollout_estimator import RolloutEstimator, Signals
+from ksim_rl.trainers import gradient_steps as gradient_steps_module
 from ksim_rl.trainers import ppo_update as ppo_update_module
 from tests.integration.probes import GAMMA, E, ProbeEnv, Run, T, one, sign_only, the_sign
 
@@ -145,7 +146,7 @@ def check_the_first_step_sees_the_policy_that_collected(monkeypatch):
     run = Run(ProbeEnv(sign_only, the_sign, length=3), normalized=True)
     run.iterate(1)
     divergences = []
-    step = ppo_update_module.ppo_step
+    step = gradient_steps_module.ppo_step
 
     def watched(*args, **kwargs):
         result = step(*args, **kwargs)
@@ -153,7 +154,7 @@ def check_the_first_step_sees_the_policy_that_collected(monkeypatch):
         return result
 
     with monkeypatch.context() as patch:
-        patch.setattr(ppo_update_module, "ppo_step", watched)
+        patch.setattr(gradient_steps_module, "ppo_step", watched)
         run.iterate(1)
     assert divergences[0] == (pytest.approx(0.0, abs=1e-6), 0.0)
     assert divergences[-1][0] > 1e-5

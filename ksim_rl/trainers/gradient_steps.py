@@ -1,0 +1,93 @@
+"""What the updates share: their dataset, its epochs of gradient steps, and what these measured."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from ksim_rl.data import DatasetBuffer, DatasetCfg, SequenceSampler
+from ksim_rl.modules import RecurrentModule, burnt_in
+from ksim_rl.objectives import StepGuard, ppo_step
+
+
+def make_dataset(
+    data: DatasetCfg,
+    *,
+    keys: Sequence[NestedKey],
+    memories: Sequence[RecurrentModule],
+    seed: int,
+    device: torch.device,
+) -> DatasetBuffer:
+    """Build the dataset of one rollout; networks with a memory learn on sequences.
+
+    Args:
+        data: sizes of dataset, minibatch and sequence.
+        keys: the leaves that are kept.
+        memories: of the networks that learn from it.
+        seed: of the order of the env states in the minibatches.
+        device: where it lives.
+    """
+    sampler = SequenceSampler(sequence_length=data.sequence_length, burn_in=data.burn_in, seed=seed)
+    return DatasetBuffer(data, keys=keys, seed=seed, sampler=sampler if memories else None, device=device)
+
+
+def epoch_of_steps(
+    dataset: DatasetBuffer,
+    loss: Any,
+    optimizer: torch.optim.Optimizer,
+    *,
+    cfg: Any,
+    guard: StepGuard,
+    memories: Sequence[RecurrentModule],
+) -> list[dict[str, Tensor]]:
+    """Make a gradient step on each minibatch of one epoch; return what each measured, as `ppo_step` names it.
+
+    Beside it stands `skipped_in_a_row`, the guard's count after the step.
+    """
+    steps = []
+    for minibatch_B in dataset.epoch():
+        if memories:
+            minibatch_B = burnt_in(minibatch_B, *memories, steps=dataset.cfg.burn_in)
+        step = ppo_step(loss, optimizer, minibatch_B, cfg=cfg, guard=guard)
+        steps.append(step | {"skipped_in_a_row": guard.skipped_in_a_row.clone()})
+    return steps
+
+
+def in_columns(steps: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+    """Return what steps measured, each quantity as a tensor [steps]."""
+    return {name: torch.stack([step[name] for step in steps]) for name in steps[0]}
+
+
+class StepMeans(dict[str, Tensor]):
+    """Means over the gradient steps of the last update, by their logged names, each a tensor [] that stays in place.
+
+    Args:
+        names: logged names by those of what a step measures; what no step measures is left out.
+    """
+
+    def __init__(self, names: Mapping[str, str]) -> None:
+        super().__init__()
+        self._names = names
+
+    def take_(self, steps: Mapping[str, Tensor]) -> None:
+        """Take the means of `steps`, each [steps], over those that were made."""
+        made = steps["skipped"] == 0.0
+        count = made.sum().clamp_min(1)
+        for name, logged in self._names.items():
+            if name in steps:
+                # A skipped step is counted; its numbers would spoil the means.
+                total = torch.where(made, steps[name], 0.0).sum()
+                self.setdefault(logged, torch.zeros_like(total)).copy_(total / count)
+
+
+def check_skipped_steps(metrics: Mapping[str, float], limit: int, *guards: StepGuard) -> None:
+    """Stop a run whose gradient steps are all skipped; `metrics` are those of an update, on the host.
+
+    Raises:
+        NonFiniteStepsError: if `limit` or more in a row were skipped.
+    """
+    if metrics["update/skipped_in_a_row"] >= limit:
+        for guard in guards:
+            guard.check(limit)
