@@ -66,8 +66,7 @@ def keep(curves: dict[int, list[Point]], *, cfg: RunCfg, overrides: list[str], m
     figures = summary(list(curves.values()))
     label = f"{report.device_label(device)}/{cfg.task_name}/{cfg.num_envs}"
     Console(width=200).print(_table(label, curves))
-    chosen = dict(word.split("=", 1) for word in overrides if word.startswith(("objective=", "modules=")))
-    others = [choice for choice in chosen.values() if choice not in ("ppo", "mlp")]
+    others = other_choices(overrides)
     path = report.write(
         "_".join(["learning", cfg.task_name, *others]),
         figures={f"{label}/{figure}": value for figure, value in figures.items()} | _short_names(figures),
@@ -78,9 +77,15 @@ def keep(curves: dict[int, list[Point]], *, cfg: RunCfg, overrides: list[str], m
             for seed, points in curves.items()
         },
     )
-    learner = ", ".join(chosen.values()) or "ppo"
+    learner = ", ".join(others) or "ppo"
     draw(curves, path.with_suffix(".png"), task_name=cfg.task_name, learner=learner, num_envs=cfg.num_envs)
     return path
+
+
+def other_choices(overrides: list[str]) -> list[str]:
+    """Return the objective and the modules that are chosen, without the usual ones, PPO and MLPs."""
+    chosen = dict(word.split("=", 1) for word in overrides if word.startswith(("objective=", "modules=")))
+    return [choice for choice in chosen.values() if choice not in ("ppo", "mlp")]
 
 
 def train_one(cfg: RunCfg) -> list[Point]:

@@ -5,9 +5,9 @@
 takes the overrides of `ksim-rl train`. Each seed is trained as in `benchmarks.learning_curve`; the seconds are those of
 training (collecting, learning, logging) up to the first point of the curve from which on, for `HELD_STATES` env states,
 the mean of each of `LEVELS` is at least its level. Figures go to benchmarks/results/learning_time.json:
-`seconds_to_track`, the median over the seeds, and `env_states_to_track`. A seed that does not get there counts as
-infinite; with most seeds infinite there is no figure, and the command fails. The curves are kept as
-`benchmarks.learning_curve` keeps them.
+`seconds_to_track`, the median over the seeds, and `env_states_to_track`; with another objective than PPO or other
+modules than MLPs under the names of those. A seed that does not get there counts as infinite; with most seeds infinite
+there is no figure, and the command fails. The curves are kept as `benchmarks.learning_curve` keeps them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import report
-from benchmarks.learning_curve import OWN_OPTIONS, Point, keep, run_cfg, train_all
+from benchmarks.learning_curve import OWN_OPTIONS, Point, keep, other_choices, run_cfg, train_all
 
 # What mjlab 1.6.0 with rsl_rl 5.4.2 reaches after 30 M env states, in 192 s on an H200.
 LEVELS = {"reward/track_linear_velocity": 1.39, "reward/track_angular_velocity": 1.20}
@@ -64,11 +64,12 @@ def main() -> None:
     }
     if math.isinf(figures["seconds_to_track"]):
         raise SystemExit("most seeds did not get there: raise env_states")
-    prefix = f"{report.device_label(device)}/{cfg.task_name}/{cfg.num_envs}"
+    others = other_choices(overrides)
+    prefix = "/".join([report.device_label(device), cfg.task_name, str(cfg.num_envs), *others])
+    rounded = {name: round(value, 2) for name, value in figures.items()}
     path = report.write(
         "learning_time",
-        figures={f"{prefix}/{name}": round(value, 2) for name, value in figures.items()}
-        | {name: round(value, 2) for name, value in figures.items()},
+        figures={f"{prefix}/{name}": value for name, value in rounded.items()} | ({} if others else rounded),
         device=device,
         module="benchmarks.learning_time",
         seconds_of_seeds={

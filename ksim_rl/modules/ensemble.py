@@ -48,7 +48,10 @@ class EnsembleLayerNorm(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Normalize [N, B, dim]."""
-        return torch.addcmul(self.bias, functional.layer_norm(features, (self.dim,)), self.weight)
+        # Autocast would go on in float32 up to the next product, which moves twice the memory.
+        with torch.autocast(features.device.type, enabled=False):
+            normalized = functional.layer_norm(features, (self.dim,))
+            return torch.addcmul(self.bias.to(features.dtype), normalized, self.weight.to(features.dtype))
 
 
 def ensemble_mlp(

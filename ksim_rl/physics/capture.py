@@ -19,6 +19,7 @@ class _Phase(threading.local):
     """What this thread is doing inside a `Captured`."""
 
     live = 0
+    warming_up = 0
     capturing = 0
 
 
@@ -28,6 +29,11 @@ _phase = _Phase()
 def is_capturing() -> bool:
     """Whether a `Captured` of this thread is recording its graph right now."""
     return _phase.capturing > 0
+
+
+def is_warming_up() -> bool:
+    """Whether a `Captured` of this thread runs its body eagerly right now, before it records its graph."""
+    return _phase.warming_up > 0
 
 
 def wants_live_launches(device: torch.device) -> bool:
@@ -68,7 +74,6 @@ def refuse_or_warn(device: torch.device, *, require_graphs: bool) -> bool:
 @contextmanager
 def no_collection() -> Iterator[None]:
     """Keep the garbage collector out of a capture: a free in the middle of it would invalidate the graph."""
-    gc.collect()
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -79,14 +84,16 @@ def no_collection() -> Iterator[None]:
 
 
 @contextmanager
-def live_launches(*, capturing: bool = False) -> Iterator[None]:
+def live_launches(*, warming_up: bool = False, capturing: bool = False) -> Iterator[None]:
     """Let worlds issue launch by launch in this block, as they do inside a capture, and record no graphs of theirs."""
     _phase.live += 1
+    _phase.warming_up += warming_up
     _phase.capturing += capturing
     try:
         yield
     finally:
         _phase.live -= 1
+        _phase.warming_up -= warming_up
         _phase.capturing -= capturing
 
 
@@ -157,7 +164,7 @@ class Captured:
         with (
             torch.cuda.stream(stream),
             wp.ScopedStream(warp_stream(stream), sync_enter=False, sync_exit=False),
-            live_launches(),
+            live_launches(warming_up=True),
         ):
             self.body()
         caller.wait_stream(stream)

@@ -5,7 +5,13 @@ from collections.abc import Callable, Hashable
 import torch
 import warp as wp
 
-from ksim_rl.physics.capture import is_capturing, no_collection, refuse_or_warn, wants_live_launches
+from ksim_rl.physics.capture import (
+    is_capturing,
+    is_warming_up,
+    no_collection,
+    refuse_or_warn,
+    wants_live_launches,
+)
 from ksim_rl.physics.streams import warp_device, warp_scope, warp_stream
 
 
@@ -14,6 +20,7 @@ class WarpGraphs:
 
     On CPU the first run records the graph and replays it. On CUDA the first run is eager, so that all kernels are
     loaded, and the second one records. Inside an outer capture nothing is recorded here: launches go into that graph.
+    The warm-up of an outer capture replays the graphs that exist, and records none: they would not be used again.
     """
 
     def __init__(self, device: torch.device, *, require_graphs: bool = False) -> None:
@@ -28,7 +35,8 @@ class WarpGraphs:
     def run(self, key: Hashable, launches: Callable[[], None]) -> None:
         """Run `launches`, in order with torch's current stream. `key` names what it does."""
         with warp_scope(self.device):
-            if not self._available or wants_live_launches(self.device):
+            replays = is_warming_up() and key in self._graphs
+            if not self._available or (wants_live_launches(self.device) and not replays):
                 self._launch_live(launches)
                 return
             if key not in self._graphs:

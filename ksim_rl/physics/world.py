@@ -113,6 +113,7 @@ class World(views.DataViews):
         super().__init__(self.warp_data_E)
         if self.device.type == "cuda":
             self._load_kernels()
+            self._record_resets()
         self.refresh()
 
     @property
@@ -313,6 +314,16 @@ class World(views.DataViews):
                 self._launch_substep(sensors=sensors)
             self._substeps.refresh()
             self._launch_reset()
+
+    def _record_resets(self) -> None:
+        """Record the graphs of `reset` and `refresh`, which warm-ups of outer captures run once per env step.
+
+        Launched one by one, resets take longer than the substeps: MuJoCo Warp makes their kernels anew each time.
+        """
+        nowhere_E = torch.zeros_like(self._reset_mask_E)
+        for _ in range(2):
+            self.reset(nowhere_E)
+            self.refresh()
 
     def _prepare_constants(self, expanded: Sequence[str]) -> MaskedConstants | None:
         groups = const_groups(expanded)

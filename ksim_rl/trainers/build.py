@@ -27,6 +27,8 @@ from ksim_rl.trainers.updates import make_update
 EVALUATION_SEED_OFFSET = 1_000_003
 # The step limit of an evaluation where episodes have none.
 UNLIMITED_EPISODE_STEPS = 1000
+# Sixty threads take longer than eight for the little that torch does on the CPU of a GPU machine.
+MOST_THREADS_BESIDE_CUDA = 8
 
 
 def build(
@@ -52,7 +54,7 @@ def build(
     check_installed(cfg.logger)
     torch.manual_seed(cfg.seed)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
-    torch.set_num_threads(cfg.trainer.num_threads or max(1, (os.cpu_count() or 1) - 1))
+    torch.set_num_threads(cfg.trainer.num_threads or _num_threads(cfg.resolved_device()))
 
     env = build_env(cfg, num_envs=cfg.num_envs, seed=cfg.task.seed if cfg.task.seed is not None else cfg.seed)
     update = make_update(cfg, env, resumed=resume_from.state["update"] if resume_from else None)
@@ -81,6 +83,11 @@ def build(
         # Last, because a run that cannot be built must not show up anywhere.
         trainer.loggers = make_loggers(cfg.logger, run_folder, config=trainer.config)
     return trainer
+
+
+def _num_threads(device: torch.device) -> int:
+    all_but_one = max(1, (os.cpu_count() or 1) - 1)
+    return min(all_but_one, MOST_THREADS_BESIDE_CUDA) if device.type == "cuda" else all_but_one
 
 
 def build_env(cfg: RunCfg, *, num_envs: int, seed: int, render_mode: str | None = None) -> EnvBase:

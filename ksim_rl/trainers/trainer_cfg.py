@@ -25,8 +25,9 @@ class TrainerCfg:
         overlap: read the metrics of an iteration while the next one runs; None does so on CUDA. Where nothing else
             asks for them earlier, `stop_at` and the guards then act one iteration later. What is learned, logged and
             saved is the same.
-        num_threads: torch's threads on the CPU; None leaves one core free. A thread that has to wait for a core that is
-            busy elsewhere stalls all others: on two cores that made runs beside other work twenty times slower.
+        num_threads: torch's threads on the CPU; None leaves one core free, and takes eight at most for a run on CUDA. A
+            thread that has to wait for a core that is busy elsewhere stalls all others: on two cores that made runs
+            beside other work twenty times slower.
         matmul_precision: of float32 products on CUDA; "high" is TF32.
         video: record the final policy.
         video_s: seconds of it.
