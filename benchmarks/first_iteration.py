@@ -1,10 +1,10 @@
-"""How long it takes from the start of Python to the end of the first iteration, without and with cached kernels.
+"""How long it takes from the start of Python to the end of the first iteration, without and with caches.
 
     python -m benchmarks.first_iteration task=go1_velocity_flat num_envs=4096 device=cuda
 
-takes the overrides of `ksim-rl train`. Two processes run one iteration each, one after the other, with a kernel cache
-of their own that is empty at first. Figures go to benchmarks/results/throughput.json: `first_iteration_cold_s` and
-`first_iteration_warm_s`.
+takes the overrides of `ksim-rl train`. Two processes import what that imports, as it does, and run one iteration each,
+one after the other, with caches of kernels and of Python's bytecode of their own that are empty at first. Figures go to
+benchmarks/results/throughput.json: `first_iteration_cold_s` and `first_iteration_warm_s`.
 """
 
 from __future__ import annotations
@@ -20,17 +20,20 @@ from ksim_rl import conf
 
 _CHILD = """
 import sys
-from ksim_rl import conf
-from ksim_rl.trainers import build
+from ksim_rl.cli.main import collector_off
+with collector_off():
+    from ksim_rl import conf
+    from ksim_rl.trainers import build
 trainer = build(conf.compose(sys.argv[1:]))
 trainer.iterate()
 """
 
 
 def first_iteration_s(overrides: list[str], cache: str) -> float:
-    """Return the seconds that a new process takes for one iteration, with kernels cached in the folder `cache`."""
+    """Return the seconds that a new process takes for one iteration, with its caches in the folder `cache`."""
     environment = os.environ | {"WARP_CACHE_PATH": cache, "TRITON_CACHE_DIR": f"{cache}/triton"}
     environment["TORCHINDUCTOR_CACHE_DIR"] = f"{cache}/inductor"
+    environment |= {"PYTHONPYCACHEPREFIX": f"{cache}/bytecode", "PYTHONDONTWRITEBYTECODE": ""}
     began = time.perf_counter()
     subprocess.run([sys.executable, "-c", _CHILD, *overrides], check=True, env=environment)
     return time.perf_counter() - began

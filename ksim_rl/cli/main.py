@@ -1,8 +1,10 @@
 """`ksim-rl <command>`: finds the command, and turns errors of users into one line."""
 
+import gc
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 USAGE = """\
 usage: ksim-rl <command> [arguments]
@@ -54,22 +56,35 @@ def _dispatch(arguments: list[str]) -> int:
 
         print(f"ksim-rl {__version__}")
         return 0
-    # Imported here, so that usage and mistyped commands answer at once.
-    if command == "train":
-        from ksim_rl.cli.train import train
+    if command not in COMMANDS:
+        from ksim_rl.checks import unknown_name
 
-        return train(rest)
-    if command == "warmup":
+        raise unknown_name("command", command, COMMANDS)
+    # Imported here, so that usage and mistyped commands answer at once.
+    with collector_off():
+        from ksim_rl.cli import run_commands
+        from ksim_rl.cli.train import train
         from ksim_rl.cli.warmup import warmup
 
+    if command == "train":
+        return train(rest)
+    if command == "warmup":
         return warmup(rest)
-    if command in COMMANDS:
-        from ksim_rl.cli import run_commands
+    return run_commands.run_command(command, rest)
 
-        return run_commands.run_command(command, rest)
-    from ksim_rl.checks import unknown_name
 
-    raise unknown_name("command", command, COMMANDS)
+@contextmanager
+def collector_off() -> Iterator[None]:
+    """Import without the garbage collector, which would look through all modules again and again, and at exit too."""
+    if "torch" in sys.modules:  # called by a program whose objects are not ours to freeze
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def _code_for(error: Exception) -> int | None:

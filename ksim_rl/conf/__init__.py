@@ -1,7 +1,7 @@
 """The Hydra configs of `ksim-rl train` as YAML, one folder per group, and their composition in Python."""
 
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,8 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from ksim_rl import envs
-from ksim_rl.conf import search_path, stored_configs
+from ksim_rl.conf import search_path
+from ksim_rl.envs import stored_configs
 from ksim_rl.trainers import RunCfg
 
 MODULE, NAME = "ksim_rl.conf", "train"
@@ -52,12 +53,12 @@ def register() -> None:
     """
     search_path.register()
     envs.register_configs()
-    store = ConfigStore.instance().store
+    store = partial(stored_configs.store, package="_global_")
     for name in envs.names():
-        store(group="task/training", name=name, node=training_defaults(name), package="_global_")
+        store("task/training", name, partial(training_defaults, name))
         for objective in (*TAKEN_FROM_PPO, *envs.task(name).training_by_objective):
-            node = objective_defaults(name, objective)
-            store(group="task/objective_training", name=f"{name}_{objective}", node=node, package="_global_")
+            make = partial(objective_defaults, name, objective)
+            store("task/objective_training", f"{name}_{objective}", make)
     stored_configs.quicken()
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from collections.abc import Iterator, Sequence
-from functools import cache
+from functools import cache, partial
 from types import ModuleType
+from typing import Any
 
 import torch
 from hydra import compose, initialize
@@ -15,7 +16,7 @@ from omegaconf import OmegaConf
 
 import ksim_rl.envs.tasks
 from ksim_rl.checks import unknown_name
-from ksim_rl.envs import plugins
+from ksim_rl.envs import plugins, stored_configs
 from ksim_rl.envs.config_tree import from_tree, to_tree
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
@@ -68,10 +69,13 @@ def task(name: str) -> Task:
 @cache
 def register_configs() -> None:
     """Store each task's config tree in Hydra's config group `task`."""
-    store = ConfigStore.instance()
     for name in names():
-        store.store(group="task", name=name, node=to_tree(task(name).cfg(), ManagerBasedRlEnvCfg))
-    store.store(name=_CONFIG, node={"defaults": [{"task": "???"}, "_self_"]})
+        stored_configs.store("task", name, partial(_tree, name))
+    ConfigStore.instance().store(name=_CONFIG, node={"defaults": [{"task": "???"}, "_self_"]})
+
+
+def _tree(name: str) -> dict[str, Any]:
+    return to_tree(task(name).cfg(), ManagerBasedRlEnvCfg)
 
 
 def make_cfg(name: str, overrides: Sequence[str] = ()) -> ManagerBasedRlEnvCfg:
@@ -81,8 +85,7 @@ def make_cfg(name: str, overrides: Sequence[str] = ()) -> ManagerBasedRlEnvCfg:
         ValueError: naming the task or field that does not exist, or the value that is not valid, before any model is
             compiled.
     """
-    tree = to_tree(task(name).cfg(), ManagerBasedRlEnvCfg)
-    check_overrides({"task": tree}, overrides)
+    check_overrides({"task": _tree(name)}, overrides)
     register_configs()
     with initialize(version_base="1.3", config_path=None):
         composed = compose(config_name=_CONFIG, overrides=[f"task={name}", *overrides])

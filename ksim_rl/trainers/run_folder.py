@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from ksim_rl.envs.innermost import innermost
 from ksim_rl.envs.transforms import observation_columns
-from ksim_rl.trainers import checkpoint, curves, video
+from ksim_rl.trainers import checkpoint, video
 from ksim_rl.trainers.build import build, build_env, load_actor
 from ksim_rl.trainers.columns import check_columns
 from ksim_rl.trainers.evaluation import Evaluation
@@ -140,6 +140,8 @@ def _draw_curves(
     if not table.exists():
         note("no learning curves: they are drawn from metrics.csv, which needs logger.csv=true")
         return
+    from ksim_rl.trainers import curves  # Matplotlib takes half a second to import
+
     title = f"{cfg.task_name}: {cfg.num_envs} envs on {cfg.device}, seed {cfg.seed}"
     try:
         curves.draw(table, run_folder / CURVES, title=title, solved_at=solved_at)

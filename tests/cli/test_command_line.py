@@ -1,5 +1,9 @@
 """A mistake on the command line ends with one line that names the near names, and exit code 2."""
 
+import gc
+import subprocess
+import sys
+
 import pytest
 
 from ksim_rl.cli import main
@@ -108,3 +112,27 @@ def test_a_run_that_is_not_there_is_one_line(capsys, tmp_path, command):
     assert code == 2
     assert "no checkpoint here; expected a run folder" in output.err
     assert output.err.count("\n") == 1
+
+
+# Runs in a process of its own, as the command does.
+START = """
+import gc, sys
+from ksim_rl.cli import main
+try:
+    main.main(["train", "--cfg", "job"])
+finally:
+    assert gc.isenabled() and gc.get_freeze_count() > 100_000, gc.get_freeze_count()
+    slow = {"matplotlib", "tensorboard", "wandb", "mlflow"} & set(sys.modules)
+    assert not slow, slow
+"""
+
+
+def test_the_command_starts_without_what_only_later_parts_need(tmp_path):
+    done = subprocess.run([sys.executable, "-c", START], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_objects_of_a_program_that_calls_the_command_are_left_alone(capsys):
+    frozen = gc.get_freeze_count()
+    assert run(capsys, "envs")[0] == 0
+    assert gc.isenabled() and gc.get_freeze_count() == frozen

@@ -346,8 +346,6 @@ def off_policy_training() -> dict[str, dict[str, Any]]:
         "data.num_env_states_per_minibatch": 32768,
         "data.num_minibatches": 16,
         "objective.gamma": 0.97,
-        "objective.exploration_noise_min": 0.2,
-        "objective.exploration_noise_max": 0.8,
-        "objective.target_noise": 0.2,
+        "objective.target_noise": 0.1,
     }
     return {"fast_sac": shared | fast_sac, "fast_td3": shared | fast_td3}

@@ -1,0 +1,62 @@
+"""Configs in Hydra's store that cost nothing until Hydra loads them.
+
+`ConfigStore.store` makes OmegaConf nodes of whatever it is given, which takes most of a second for all of our tasks.
+And Hydra copies all that it holds whenever it lists a group, which `ksim-rl train --help` does a hundred times; what it
+loads it copies once more, so the first copy protects nothing.
+"""
+
+from collections.abc import Callable
+from functools import cache, cached_property
+from typing import Any
+
+from hydra.core.config_store import ConfigNode, ConfigStore
+from omegaconf import DictConfig, OmegaConf
+
+
+class _Kept(ConfigNode):
+    """A stored config that stays the same object in a copy of the store."""
+
+    def __deepcopy__(self, _memo: dict[int, Any]) -> "_Kept":
+        return self
+
+
+class _Made(_Kept):
+    """A stored config that is made when it is loaded first."""
+
+    def __init__(
+        self, make: Callable[[], dict[str, Any]], *, name: str, group: str, package: str | None
+    ) -> None:
+        self.make = make
+        self.name, self.group, self.package, self.provider = name, group, package, None
+
+    @cached_property
+    def node(self) -> DictConfig:
+        return _made(self.make)
+
+
+@cache
+def _made(make: Callable[[], dict[str, Any]]) -> DictConfig:
+    # Not kept in `_Made`: Hydra reads the node of a copy.
+    return OmegaConf.create(make())
+
+
+def store(group: str, name: str, make: Callable[[], dict[str, Any]], *, package: str | None = None) -> None:
+    """Store a config in a group; `make` is called for its tree when Hydra first loads it."""
+    folder = ConfigStore.instance().repo
+    for part in group.split("/"):
+        folder = folder.setdefault(part, {})
+    file = f"{name}.yaml"
+    folder[file] = _Made(make, name=file, group=group, package=package)
+
+
+def quicken() -> None:
+    """Let what others stored so far be listed without copies of it."""
+    _visit(ConfigStore.instance().repo)
+
+
+def _visit(folder: dict[str, Any]) -> None:
+    for name, entry in folder.items():
+        if isinstance(entry, dict):
+            _visit(entry)
+        elif type(entry) is ConfigNode:
+            folder[name] = _Kept(**vars(entry))
