@@ -9,7 +9,7 @@ ARGS ?=
 # Whole files go to one worker, since their tests share envs and compiled kernels.
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: setup train check lint types imports wheel test test-full clean
+.PHONY: setup train check lint types imports test test-full clean
 
 setup: $(STAMP)
 

@@ -15,18 +15,18 @@ MENAGERIE_ROOT is set.
 import argparse
 import dataclasses
 import os
-import sys
 from collections.abc import Callable
 
 import mujoco
 import numpy as np
 import torch
 
-from benchmarks import report
+from benchmarks import command_line, report
 from benchmarks.agreement_errors import COMPARED, CONTACT_LIMIT, Errors, compare
 from benchmarks.agreement_models import CARTPOLE, DOUBLE_PENDULUM, QUADRUPED, SPINNING_BODY
 from benchmarks.agreement_states import States, anywhere, in_contact
 from ksim_rl.physics import SimCfg, World, load_model, load_spec
+from ksim_rl.physics.streams import checked_device
 
 SMOOTH_LIMIT = 1e-4
 CONTACT_SHARE, MEDIAN_LIMIT = 0.95, 1e-5
@@ -164,9 +164,18 @@ def agrees(case: Case, found: Errors) -> bool:
 
 
 def chosen_cases(names: list[str] | None) -> list[Case]:
-    """Return the cases to run; menagerie robots only where MENAGERIE_ROOT names their folder."""
+    """Return the cases to run; menagerie robots only where MENAGERIE_ROOT names their folder.
+
+    Raises:
+        ValueError: if one of them is named and there is no such folder.
+    """
     offline = "MENAGERIE_ROOT" not in os.environ
     cases = [case for case in CASES if not (offline and case.name.startswith("unitree"))]
+    left_out = set(names or ()) - {case.name for case in cases}
+    if left_out:
+        raise ValueError(
+            f"--models {' '.join(sorted(left_out))}: set MENAGERIE_ROOT to the folder of these robots"
+        )
     return [case for case in cases if names is None or case.name in names]
 
 
@@ -179,7 +188,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--worlds", type=int, default=64)
     parser.add_argument("--models", nargs="+", choices=[case.name for case in CASES])
     options = parser.parse_args(arguments)
-    device = torch.device(options.device)
+    device = checked_device(options.device)
+    cases = chosen_cases(options.models)
     label = report.device_label(device)
     figures, all_agree = {}, True
     header = (
@@ -187,7 +197,7 @@ def main(arguments: list[str] | None = None) -> int:
         f"{'median at 1e-6':>16s}"
     )
     print(header, "-" * len(header), sep="\n")
-    for case in chosen_cases(options.models):
+    for case in cases:
         found = measure(case, num_worlds=options.worlds, device=device)
         for quantity, values in found.errors.items():
             as_trained = found.errors_as_trained[quantity]
@@ -219,4 +229,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command_line.run(main)

@@ -23,9 +23,8 @@ from rich.console import Console
 from rich.table import Table
 from torchrl.collectors import Collector
 
-from benchmarks import report
+from benchmarks import command_line, report
 from benchmarks.stopwatch import milliseconds
-from ksim_rl import conf
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.physics.capture import live_launches
 from ksim_rl.trainers import RunCfg
@@ -86,14 +85,8 @@ def _next(rollouts: Iterator[Any], *, eager: bool) -> object:
 
 def main() -> None:
     """Measure each number of envs, print the table and write the figures."""
-    own = {"num_envs": "4096", "steps": str(STEPS)}
-    words = []
-    for word in sys.argv[1:]:
-        key, _, value = word.partition("=")
-        if key in own:
-            own[key] = value
-        else:
-            words.append(word)
+    own, words = command_line.split(sys.argv[1:], {"num_envs": "4096", "steps": str(STEPS)})
+    steps = command_line.whole_number("steps", own["steps"])
     if not any(word.startswith("task=") for word in words):
         words.append("task=cartpole_balance")
     table = Table(title="captured rollout beside TorchRL's Collector")
@@ -101,10 +94,9 @@ def main() -> None:
         table.add_column(column, justify="right")
     figures: dict[str, float] = {}
     device = torch.device("cpu")
-    for num_envs in own["num_envs"].split(","):
-        steps = int(own["steps"])
-        sizes = [f"num_envs={num_envs}", f"data.num_env_states_per_minibatch={steps * int(num_envs)}"]
-        cfg = conf.compose(
+    for num_envs in command_line.whole_numbers("num_envs", own["num_envs"]):
+        sizes = [f"num_envs={num_envs}", f"data.num_env_states_per_minibatch={steps * num_envs}"]
+        cfg = command_line.compose(
             [*words, *sizes, "data.num_minibatches=1", "logger=none", "trainer.eval_episodes=0"]
         )
         device = cfg.resolved_device()
@@ -116,11 +108,11 @@ def main() -> None:
             f"{found[f'{side}_env_states_per_s']:,.0f}" for side in ("captured", "stock", "stock_with_graphs")
         ]
         ratios = [f"{found[f'captured_over_{side}']:.2f}" for side in ("stock", "stock_with_graphs")]
-        table.add_row(num_envs, *speeds, *ratios)
+        table.add_row(str(num_envs), *speeds, *ratios)
     Console().print(table)
     path = report.write("collector", figures=figures, device=device, module="benchmarks.collector")
     print(f"written to {path}")
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

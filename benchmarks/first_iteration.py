@@ -15,8 +15,7 @@ import sys
 import tempfile
 import time
 
-from benchmarks import report
-from ksim_rl import conf
+from benchmarks import command_line, report
 
 _CHILD = """
 import sys
@@ -26,13 +25,14 @@ with collector_off():
     from ksim_rl.trainers import build
 trainer = build(conf.compose(sys.argv[1:]))
 trainer.iterate()
+trainer.settle()
 """
 
 
 def first_iteration_s(overrides: list[str], cache: str) -> float:
     """Return the seconds that a new process takes for one iteration, with its caches in the folder `cache`."""
     environment = os.environ | {"WARP_CACHE_PATH": cache, "TRITON_CACHE_DIR": f"{cache}/triton"}
-    environment["TORCHINDUCTOR_CACHE_DIR"] = f"{cache}/inductor"
+    environment |= {"TORCHINDUCTOR_CACHE_DIR": f"{cache}/inductor", "CUDA_CACHE_PATH": f"{cache}/driver"}
     environment |= {"PYTHONPYCACHEPREFIX": f"{cache}/bytecode", "PYTHONDONTWRITEBYTECODE": ""}
     began = time.perf_counter()
     subprocess.run([sys.executable, "-c", _CHILD, *overrides], check=True, env=environment)
@@ -42,7 +42,7 @@ def first_iteration_s(overrides: list[str], cache: str) -> float:
 def main() -> None:
     """Measure both, print and write them."""
     overrides = [*sys.argv[1:], "logger=none", "trainer.eval_episodes=0"]
-    cfg = conf.compose(overrides)
+    cfg = command_line.compose(overrides)
     with tempfile.TemporaryDirectory() as cache:
         figures = {
             f"first_iteration_{state}_s": round(first_iteration_s(overrides, cache), 2)
@@ -62,4 +62,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

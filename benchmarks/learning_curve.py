@@ -5,7 +5,8 @@
 takes the overrides of `ksim-rl train`. Each seed is a process of its own; with several GPUs they run side by side.
 Figures go to benchmarks/results/learning_<task>.json, with another objective than PPO or other modules than MLPs to
 learning_<task>_<objective>_<modules>.json: the medians over the seeds of the episode means (of rewards: per second of
-the longest episode) over the last million env states. The picture is beside it.
+the longest episode) over the last million env states. The picture is beside it. The curve of a seed is kept there as
+soon as the seed is done; if one fails, the others go on, and there are no medians.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +25,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import report
+from benchmarks import command_line, report
 from benchmarks.learning_picture import draw
-from ksim_rl import conf
 from ksim_rl.trainers import RunCfg, RunProgress, run
 from ksim_rl.trainers.loggers.csv_table import read_table
 
@@ -39,7 +40,7 @@ KEPT = (
     "metric/pose_distance",
     "update/action_error",
 )
-OWN_OPTIONS = ("seeds", "env_states", "points")
+OWN_OPTIONS = {"seeds": "1", "env_states": "", "points": ""}
 AVERAGED_STATES = 1e6
 
 Point = dict[str, float]
@@ -47,39 +48,71 @@ Point = dict[str, float]
 
 def main() -> None:
     """Train all seeds, print their curves, and write them; or, as one of the seeds, train."""
-    own = {
-        key: value for key, _, value in (word.partition("=") for word in sys.argv[1:]) if key in OWN_OPTIONS
-    }
-    overrides = [word for word in sys.argv[1:] if word.partition("=")[0] not in OWN_OPTIONS]
-    if "points" in own:
-        Path(own["points"]).write_text(json.dumps(train_one(run_cfg(overrides, own))))
+    own, overrides = command_line.split(sys.argv[1:], OWN_OPTIONS)
+    cfg = run_cfg(overrides, own["env_states"])
+    if own["points"]:
+        Path(own["points"]).write_text(json.dumps(train_one(cfg)))
         return
-    seeds = [int(seed) for seed in own.get("seeds", "1").split(",")]
-    cfg = run_cfg(overrides, own)
-    curves = dict(zip(seeds, train_all(seeds), strict=True))
-    print(f"written to {keep(curves, cfg=cfg, overrides=overrides, module='benchmarks.learning_curve')}")
+    seeds = chosen_seeds(own, overrides)
+    curves = train_and_keep(seeds, cfg=cfg, overrides=overrides, module="benchmarks.learning_curve")
+    fail_without(seeds, curves)
 
 
-def keep(curves: dict[int, list[Point]], *, cfg: RunCfg, overrides: list[str], module: str) -> Path:
-    """Print the curves of the seeds, write and draw them, and return the file."""
+def chosen_seeds(own: dict[str, str], overrides: list[str]) -> list[int]:
+    """Return the seeds to train.
+
+    Raises:
+        ValueError: if they are no whole numbers, or given as an override, which would not be heeded.
+    """
+    for word in overrides:
+        if word.startswith("seed="):
+            raise ValueError(f"{word}: choose seeds with seeds={word.removeprefix('seed=')}")
+    return command_line.whole_numbers("seeds", own["seeds"], least=0)
+
+
+def train_and_keep(
+    seeds: list[int], *, cfg: RunCfg, overrides: list[str], module: str
+) -> dict[int, list[Point]]:
+    """Train all seeds, keep the curve of each when it is done, print, write and draw all; return the curves.
+
+    Without the seeds that failed, and without any medians if there are such.
+    """
     device = cfg.resolved_device()
-    figures = summary(list(curves.values()))
     label = f"{report.device_label(device)}/{cfg.task_name}/{cfg.num_envs}"
-    Console(width=200).print(_table(label, curves))
     others = other_choices(overrides)
-    path = report.write(
-        "_".join(["learning", cfg.task_name, *others]),
-        figures={f"{label}/{figure}": value for figure, value in figures.items()} | _short_names(figures),
-        device=device,
-        module=module,
-        curves={
-            f"{label}/seed_{seed}": points[:: max(1, len(points) // KEPT_POINTS)] + [points[-1]]
-            for seed, points in curves.items()
-        },
-    )
+    curves: dict[int, list[Point]] = {}
+
+    def write(figures: dict[str, float]) -> Path:
+        return report.write(
+            "_".join(["learning", cfg.task_name, *others]),
+            figures=figures,
+            device=device,
+            module=module,
+            curves={f"{label}/seed_{seed}": _some(points, KEPT_POINTS) for seed, points in curves.items()},
+        )
+
+    for seed, points in train_all(seeds):
+        curves[seed] = points
+        write({})
+    if not curves:
+        return curves
+    Console(width=200).print(_table(label, curves))
+    figures = summary(list(curves.values())) if len(curves) == len(seeds) else {}
+    short = _short_names(figures) if figures and device.type == "cuda" else {}
+    path = write({f"{label}/{figure}": value for figure, value in figures.items()} | short)
     learner = ", ".join(others) or "ppo"
     draw(curves, path.with_suffix(".png"), task_name=cfg.task_name, learner=learner, num_envs=cfg.num_envs)
-    return path
+    print(f"written to {path}")
+    return curves
+
+
+def fail_without(seeds: list[int], curves: dict[int, list[Point]]) -> None:
+    """End the command if a seed has no curve."""
+    failed = [str(seed) for seed in seeds if seed not in curves]
+    if failed:
+        raise SystemExit(
+            f"no medians, since the runs of seeds {','.join(failed)} failed; the others are kept"
+        )
 
 
 def other_choices(overrides: list[str]) -> list[str]:
@@ -93,12 +126,11 @@ def train_one(cfg: RunCfg) -> list[Point]:
     with tempfile.TemporaryDirectory() as folder:
         run(cfg, Path(folder), progress=RunProgress(cfg.trainer.num_iterations))
         _, rows = read_table(Path(folder) / "metrics.csv")
-    wanted = [name for name in rows[0] if name in KEPT or name.startswith("reward/")]
-    return [
-        {name: float(row[name]) for name in wanted if row.get(name)}
-        for row in rows
-        if row.get("episode/return")
-    ]
+    ended = [row for row in rows if row.get("episode/return")]
+    if not ended:
+        raise ValueError(f"no episode ended within {cfg.trainer.num_iterations} iterations: raise env_states")
+    wanted = [name for name in ended[0] if name in KEPT or name.startswith("reward/")]
+    return [{name: float(row[name]) for name in wanted if row.get(name)} for row in ended]
 
 
 def summary(curves: list[list[Point]]) -> dict[str, float]:
@@ -124,11 +156,13 @@ def _short_names(figures: dict[str, float]) -> dict[str, float]:
     }
 
 
-def train_all(seeds: list[int]) -> list[list[Point]]:
-    """Train each seed in its own process, as many at a time as there are GPUs (one on the CPU)."""
+def train_all(seeds: list[int]) -> Iterator[tuple[int, list[Point]]]:
+    """Train each seed in its own process, as many at a time as there are GPUs (one on the CPU); yield what they give.
+
+    A seed whose process fails is left out, and said.
+    """
     gpus = max(1, torch.cuda.device_count())
     words = [word for word in sys.argv[1:] if not word.startswith("seeds=")]
-    found: list[list[Point]] = []
     with tempfile.TemporaryDirectory() as folder:
         for first in range(0, len(seeds), gpus):
             running = [
@@ -137,11 +171,9 @@ def train_all(seeds: list[int]) -> list[list[Point]]:
             ]
             for process, seed in running:
                 if process.wait():
-                    for other, _ in running:
-                        other.terminate()
-                    raise RuntimeError(f"the run of seed {seed} ended with exit code {process.returncode}")
-                found.append(json.loads((Path(folder) / f"{seed}.json").read_text()))
-    return found
+                    print(f"the run of seed {seed} ended with exit code {process.returncode}", flush=True)
+                else:
+                    yield seed, json.loads((Path(folder) / f"{seed}.json").read_text())
 
 
 def _start(words: list[str], seed: int, points: Path, gpu: int) -> subprocess.Popen[bytes]:
@@ -151,19 +183,32 @@ def _start(words: list[str], seed: int, points: Path, gpu: int) -> subprocess.Po
     return subprocess.Popen(command, env=os.environ | {"CUDA_VISIBLE_DEVICES": own})
 
 
-def run_cfg(overrides: list[str], own: dict[str, str]) -> RunCfg:
+def run_cfg(overrides: list[str], env_states: str) -> RunCfg:
+    """Compose a seed's config: that of `ksim-rl train`, with what this benchmark needs, for so many env states.
+
+    Raises:
+        ValueError: naming the override that is wrong.
+    """
     fixed = [
         "logger=local",
         "trainer.checkpoint_interval=0",
         "trainer.video=false",
-        "trainer.eval_interval=0",
+        "trainer.eval_episodes=0",
     ]
-    cfg = conf.compose([*overrides, *fixed])
-    if "env_states" not in own:
+    cfg = command_line.compose([*overrides, *fixed])
+    if not env_states:
         return cfg
-    per_iteration = cfg.num_envs * cfg.data.rollout_length(cfg.num_envs)
-    iterations = -(-int(float(own["env_states"])) // per_iteration)
-    return conf.compose([*overrides, *fixed, f"trainer.num_iterations={iterations}"])
+    try:
+        wanted = int(float(env_states))
+    except ValueError as error:
+        raise ValueError(f"env_states={env_states}: expected a number, such as 30e6") from error
+    iterations = -(-wanted // (cfg.num_envs * cfg.data.rollout_length(cfg.num_envs)))
+    return command_line.compose([*overrides, *fixed, f"trainer.num_iterations={iterations}"])
+
+
+def _some(points: list[Point], count: int) -> list[Point]:
+    """Return about so many of the points, the last one among them."""
+    return [*points[: -1 : max(1, len(points) // count)], points[-1]]
 
 
 def _table(title: str, curves: dict[int, list[Point]]) -> Table:
@@ -172,10 +217,10 @@ def _table(title: str, curves: dict[int, list[Point]]) -> Table:
     for name in ("seed", *names):
         table.add_column(name.removeprefix("reward/"))
     for seed, points in curves.items():
-        for point in [*points[:: max(1, len(points) // 6)], points[-1]]:
+        for point in _some(points, 6):
             table.add_row(str(seed), *(f"{point.get(name, float('nan')):.4g}" for name in names))
     return table
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

@@ -49,7 +49,7 @@ def draw(
             if name in peer:
                 axes.plot(
                     peer[step], peer[name], color=_PEER_COLOR, marker="o", markersize=4, linestyle="--",
-                    label="mjlab 1.6.0 + rsl_rl",
+                    label="mjlab 1.6.0 + rsl_rl (H200)",
                 )  # fmt: skip
             axes.set_xlabel(label, fontsize=9)
             if step == "env_states":

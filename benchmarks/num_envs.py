@@ -3,8 +3,8 @@
     python -m benchmarks.num_envs device=cpu
 
 trains a cartpole with 64, 256 and 1024 envs and D = 65536 env states per update (so T = 1024, 256 and 64), five seeds
-each, and compares the curves of deterministic evaluations over env states. Other words are overrides of
-`ksim-rl train`. Figures go to benchmarks/results/num_envs.json, the picture beside it.
+each (`num_envs=64,256,1024 seeds=1,2,3,4,5`), and compares the curves of deterministic evaluations over env states.
+Other words are overrides of `ksim-rl train`. Figures go to benchmarks/results/num_envs.json, the picture beside it.
 
 A run's score is its mean evaluation return over all evaluations (the area under its curve). If num_envs did not
 matter, the three scores of one seed, which begin with the same networks, could change places. So the test counts in
@@ -31,12 +31,11 @@ from matplotlib.ticker import EngFormatter
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import report
-from ksim_rl import conf
+from benchmarks import command_line, report
 from ksim_rl.trainers import RunCfg, RunProgress, run
 from ksim_rl.trainers.loggers.csv_table import read_table
 
-NUM_ENVS, SEEDS = (64, 256, 1024), (1, 2, 3, 4, 5)
+OWN_OPTIONS = {"num_envs": "64,256,1024", "seeds": "1,2,3,4,5"}
 SETTING = (
     "task=cartpole_balance",
     "data.num_env_states_per_minibatch=16384",
@@ -63,17 +62,24 @@ Curve = list[tuple[float, float]]
 
 def main() -> None:
     """Train all runs, print and write what they show."""
-    overrides = [*SETTING, *sys.argv[1:]]
-    cfg = conf.compose(overrides)
-    curves = {
-        num_envs: [learning_curve(conf.compose([*overrides, f"num_envs={num_envs}", f"seed={seed}"])) for seed in SEEDS]
-        for num_envs in NUM_ENVS
-    }  # fmt: skip
+    own, words = command_line.split(sys.argv[1:], OWN_OPTIONS)
+    overrides = [*SETTING, *words]
+    seeds = command_line.whole_numbers("seeds", own["seeds"], least=0)
+    if len(seeds) < 2:
+        raise ValueError(f"seeds={own['seeds']}: expected two or more, for their deviation")
+    cfgs = {
+        num_envs: [
+            command_line.compose([*overrides, f"num_envs={num_envs}", f"seed={seed}"]) for seed in seeds
+        ]
+        for num_envs in command_line.whole_numbers("num_envs", own["num_envs"])
+    }
+    curves = {num_envs: [learning_curve(cfg) for cfg in found] for num_envs, found in cfgs.items()}
+    cfg = next(iter(cfgs.values()))[0]
     scores = {num_envs: [score(curve) for curve in found] for num_envs, found in curves.items()}
     figures = compare(scores)
     device = cfg.resolved_device()
     label = f"{report.device_label(device)}/{cfg.task_name}"
-    Console(width=160).print(_table(label, scores, figures))
+    Console(width=160).print(_table(label, seeds, scores, figures))
     path = report.write(
         "num_envs",
         figures={f"{label}/{name}": value for name, value in figures.items()},
@@ -82,7 +88,7 @@ def main() -> None:
         scores={str(num_envs): [round(value, 3) for value in found] for num_envs, found in scores.items()},
         curves={str(num_envs): found for num_envs, found in curves.items()},
     )
-    draw(curves, path.with_suffix(".png"), title=_title(cfg, figures))
+    draw(curves, path.with_suffix(".png"), title=_title(cfg, len(seeds), figures))
     print(f"written to {path}")
 
 
@@ -142,7 +148,7 @@ def draw(curves: dict[int, list[Curve]], picture: Path, *, title: str) -> None:
     figure = Figure(figsize=(7.2, 4.4), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    for (num_envs, found), color in zip(curves.items(), _COLORS, strict=True):
+    for (num_envs, found), color in zip(curves.items(), itertools.cycle(_COLORS), strict=False):
         steps = [step for step, _ in found[0]]
         columns = list(zip(*([value for _, value in curve] for curve in found), strict=True))
         low, high = [min(column) for column in columns], [max(column) for column in columns]
@@ -160,17 +166,17 @@ def draw(curves: dict[int, list[Curve]], picture: Path, *, title: str) -> None:
     figure.savefig(picture, dpi=110)
 
 
-def _title(cfg: RunCfg, figures: dict[str, float]) -> str:
+def _title(cfg: RunCfg, num_seeds: int, figures: dict[str, float]) -> str:
     return (
-        f"{cfg.task_name}, {len(SEEDS)} seeds, {cfg.data.num_env_states} env states per update\n"
+        f"{cfg.task_name}, {num_seeds} seeds, {cfg.data.num_env_states} env states per update\n"
         f"largest difference of two means: {figures['difference_in_deviations']:.2f} standard deviations of seeds, "
         f"p = {figures['p_value']:.2f}"
     )
 
 
-def _table(title: str, scores: dict[int, list[float]], figures: dict[str, float]) -> Table:
+def _table(title: str, seeds: list[int], scores: dict[int, list[float]], figures: dict[str, float]) -> Table:
     table = Table(title=f"{title}: mean evaluation return")
-    for column in ("num_envs", *(f"seed {seed}" for seed in SEEDS), "mean", "std"):
+    for column in ("num_envs", *(f"seed {seed}" for seed in seeds), "mean", "std"):
         table.add_column(column, justify="right")
     for num_envs, found in scores.items():
         own = (figures[f"{num_envs}_envs/mean"], figures[f"{num_envs}_envs/std"])
@@ -183,4 +189,4 @@ def _table(title: str, scores: dict[int, list[float]], figures: dict[str, float]
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

@@ -5,8 +5,8 @@
 takes the overrides of `ksim-rl train`. mjlab wants other versions of MuJoCo than this project, so it runs in an
 environment of its own, whose interpreter `--python` names; without one, or without mjlab in it, this says so in one
 line and ends well. First the peer trains `ITERATIONS` iterations of its task as its own command does, then we do; each
-is timed on the wall clock, from one iteration's log to the next, and the median of the second half counts. Figures go
-to benchmarks/results/peers.json.
+is timed on the wall clock, from one iteration's log to the next, and the median of the second half counts. Both write
+their logs for TensorBoard. Figures go to benchmarks/results/peers.json.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ import os
 import subprocess
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from benchmarks import report
+from benchmarks import command_line, report
 from benchmarks.throughput import num_env_states, train_ms
-from ksim_rl import conf
 
 ITERATIONS = 40
 TASKS = {
@@ -69,9 +69,13 @@ def has_mjlab(python: str) -> bool:
         return False
 
 
-def peer_rate(python: str, task_name: str, *, num_envs: int, iterations: int) -> dict:
-    """Train the peer's task in its own process and return env states/s and versions."""
-    gpu = os.environ.get("CUDA_VISIBLE_DEVICES", "0").split(",")[0] if torch.cuda.is_available() else ""
+def peer_rate(
+    python: str, task_name: str, *, num_envs: int, iterations: int, device: torch.device
+) -> dict[str, Any]:
+    """Train the peer's task in its own process, on the same device, and return env states/s and versions."""
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
+    index = device.index or 0
+    gpu = "" if device.type == "cpu" else visible[index] if visible != [""] else str(index)
     environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
     environment["CUDA_VISIBLE_DEVICES"] = gpu
     with tempfile.TemporaryDirectory() as folder:
@@ -85,16 +89,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Training beside mjlab's, each in its own environment.")
     parser.add_argument("--python", help="the interpreter of an environment with mjlab and rsl_rl")
     parser.add_argument("--iterations", type=int, default=ITERATIONS)
-    options, overrides = parser.parse_known_args()
+    parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as of `ksim-rl train`")
+    options = parser.parse_intermixed_args()
+    cfg = command_line.compose([*options.overrides, "logger=local", "trainer.eval_episodes=0"])
+    if options.iterations < 4:
+        raise ValueError(
+            f"--iterations {options.iterations}: expected at least 4, of which the last half counts"
+        )
     if options.python is None or not has_mjlab(options.python):
         print("no peer: give --python the interpreter of an environment with mjlab and rsl_rl")
         return
-    cfg = conf.compose([*overrides, "logger=none", "trainer.eval_episodes=0"])
     if cfg.task_name not in TASKS:
-        raise SystemExit(f"task={cfg.task_name}: the peer has {', '.join(TASKS)}")
-    peer = peer_rate(options.python, cfg.task_name, num_envs=cfg.num_envs, iterations=options.iterations)
-    ours = 1000.0 * num_env_states(cfg) / train_ms(cfg, iterations=options.iterations)
-    device = cfg.resolved_device()
+        raise ValueError(f"task={cfg.task_name}: the peer has {', '.join(TASKS)}")
+    device, iterations = cfg.resolved_device(), options.iterations
+    peer = peer_rate(
+        options.python, cfg.task_name, num_envs=cfg.num_envs, iterations=iterations, device=device
+    )
+    ours = 1000.0 * num_env_states(cfg) / train_ms(cfg, iterations=iterations)
     prefix = f"{report.device_label(device)}/{cfg.task_name}/{cfg.num_envs}"
     figures = {
         "env_states_per_s": ours,
@@ -114,4 +125,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

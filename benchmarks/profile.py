@@ -23,10 +23,9 @@ from rich.console import Console
 from rich.table import Table
 from torch.profiler import record_function
 
-from benchmarks import report
+from benchmarks import command_line, report
 from benchmarks.host_traffic import Event, cuda_events
 from benchmarks.throughput import iteration_ms
-from ksim_rl import conf
 from ksim_rl.envs.innermost import innermost
 from ksim_rl.physics.capture import live_launches
 from ksim_rl.trainers import RunCfg, Trainer, build
@@ -166,9 +165,9 @@ def by_room(events: list[Event]) -> dict[str, tuple[int, float]]:
 
 def main() -> None:
     """Measure, print the table and write the figures."""
-    labels = [word.removeprefix("label=") for word in sys.argv[1:] if word.startswith("label=")]
-    overrides = [word for word in sys.argv[1:] if not word.startswith("label=")]
-    cfg = conf.compose([*overrides, "logger=none", "trainer.eval_episodes=0"])
+    own, overrides = command_line.split(sys.argv[1:], {"label": ""})
+    labels = [own["label"]] if own["label"] else []
+    cfg = command_line.compose([*overrides, "logger=none", "trainer.eval_episodes=0"])
     device = cfg.resolved_device()
     figures = measure(cfg)
     table = Table(
@@ -197,4 +196,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

@@ -23,9 +23,9 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import report
+from benchmarks import command_line, report
 from benchmarks.stopwatch import milliseconds
-from ksim_rl import conf, envs
+from ksim_rl import envs
 from ksim_rl.envs import ManagerBasedRlEnvCfg, mdp
 from ksim_rl.envs.mdp.randomize import Mode, Randomize
 from ksim_rl.envs.scene import build_spec
@@ -35,8 +35,7 @@ from ksim_rl.physics.capture import Captured
 from ksim_rl.trainers import RunCfg
 
 VARIANTS = ("none", "startup", "reset")
-OWN_OPTION = "episode_steps="
-EPISODE_STEPS = 100
+EPISODE_STEPS = "100"
 FIELDS = ("body_mass", "body_inertia", "body_ipos")
 # Small random targets keep the robots moving.
 ACTION_SIZE = 0.3
@@ -198,10 +197,9 @@ def _table(cfg: RunCfg, figures: Mapping[str, float], episode_steps: int, device
 
 def main() -> None:
     """Measure, print the table, and write the figures."""
-    own = [word for word in sys.argv[1:] if word.startswith(OWN_OPTION)]
-    episode_steps = int(own[-1].removeprefix(OWN_OPTION)) if own else EPISODE_STEPS
-    overrides = [word for word in sys.argv[1:] if word not in own]
-    cfg = conf.compose([*overrides, "logger=none", "trainer.eval_episodes=0"])
+    own, overrides = command_line.split(sys.argv[1:], {"episode_steps": EPISODE_STEPS})
+    episode_steps = command_line.whole_number("episode_steps", own["episode_steps"])
+    cfg = command_line.compose([*overrides, "logger=none", "trainer.eval_episodes=0"])
     device = cfg.resolved_device()
     figures = measure(cfg, episode_steps)
     Console().print(_table(cfg, figures, episode_steps, device))
@@ -217,4 +215,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

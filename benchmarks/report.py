@@ -99,8 +99,11 @@ def write(
         "device": device_name(device),
         "versions": versions(),
     }
-    # The file's own entries are those of the last run; `runs` keeps which run each group of figures came from.
-    runs = {key.rpartition("/")[0]: run for key in figures}
+    # The file's own entries are those of the last run; `runs` keeps which run each group of figures came from, with
+    # the module at its end where that is not the file's own.
+    own = module.rpartition(".")[2]
+    ending = "" if own == name else f"/{own}"
+    runs = {key.rpartition("/")[0] + ending: run for key in figures}
     saved |= run | {
         "figures": {**saved.get("figures", {}), **figures},
         "runs": {**saved.get("runs", {}), **runs},

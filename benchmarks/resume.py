@@ -22,7 +22,8 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from benchmarks import report
+from benchmarks import command_line, report
+from ksim_rl.checks import check_choice
 from ksim_rl.trainers import checkpoint, state_tree
 
 TERM = "task.observations.actor.terms"
@@ -116,6 +117,8 @@ class Comparison:
 def main() -> None:
     """Run the cases that are named (or all), print the table and write it."""
     wanted = sys.argv[1:] or list(CASES)
+    for name in wanted:
+        check_choice("case", name, CASES)
     found = {}
     for name in wanted:
         with tempfile.TemporaryDirectory() as folder:
@@ -214,4 +217,4 @@ def _table(found: dict[str, Comparison]) -> Table:
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

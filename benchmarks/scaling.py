@@ -22,9 +22,10 @@ import matplotlib
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+from rich.console import Console
+from rich.table import Table
 
-from benchmarks import report
-from ksim_rl import conf
+from benchmarks import command_line, report
 
 NUM_ENVS = "1024,2048,4096,8192,16384,32768"
 PER_MINIBATCH = "data.num_env_states_per_minibatch="
@@ -36,14 +37,15 @@ OWN = ("env_states_per_s", "physics_env_states_per_s", "iteration_over_physics")
 
 def measure(words: list[str], num_envs: int) -> dict[str, float]:
     """Run `benchmarks.throughput` with so many envs and return its figures."""
-    cfg = conf.compose([*words, "logger=none"])
+    cfg = command_line.compose([*words, "logger=none"])
     length = cfg.data.rollout_length(cfg.num_envs)
     per_minibatch = length * num_envs // cfg.data.num_minibatches
     with tempfile.TemporaryDirectory() as folder:
         kept = [word for word in words if not word.startswith(PER_MINIBATCH)]
         sizes = [f"num_envs={num_envs}", f"{PER_MINIBATCH}{per_minibatch}"]
         command = [sys.executable, "-m", "benchmarks.throughput", *kept, *sizes]
-        subprocess.run(command, check=True, env=os.environ | {"BENCHMARK_RESULTS": folder})
+        environment = os.environ | {"BENCHMARK_RESULTS": folder}
+        subprocess.run(command, check=True, env=environment, stdout=subprocess.DEVNULL)
         figures = json.loads((Path(folder) / "throughput.json").read_text())["figures"]
     found = {name.rpartition("/")[2]: value for name, value in figures.items()}
     found["physics_env_states_per_s"] = 1000.0 * num_envs / found["physics_ms"]
@@ -75,7 +77,7 @@ def draw(figures: dict[int, dict[str, float]], path: Path, *, task_name: str, de
             [PUBLISHED[task_name] / 1e6],
             "D",
             color="#d62728",
-            label="mjlab 1.6.0 + rsl_rl, training (published)",
+            label="mjlab 1.6.0 + rsl_rl, training (published, H200)",
         )
     axes.set(
         xscale="log", xlabel="envs", ylabel="million env states per second", title=f"{task_name} on {device}"
@@ -90,29 +92,42 @@ def draw(figures: dict[int, dict[str, float]], path: Path, *, task_name: str, de
 
 
 def main() -> None:
-    """Measure all sizes, write the figures and draw the chart."""
-    sizes = [word.removeprefix("num_envs=") for word in sys.argv[1:] if word.startswith("num_envs=")]
-    words = [word for word in sys.argv[1:] if not word.startswith("num_envs=")]
-    cfg = conf.compose([*words, "logger=none"])
+    """Measure all sizes and print them, keep the figures of each as it is done, and draw the chart."""
+    own, words = command_line.split(sys.argv[1:], {"num_envs": NUM_ENVS})
+    sizes = command_line.whole_numbers("num_envs", own["num_envs"])
+    cfg = command_line.compose([*words, "logger=none"])
     device = cfg.resolved_device()
-    figures = {int(size): measure(words, int(size)) for size in (sizes or [NUM_ENVS])[0].split(",")}
-    prefix = f"{report.device_label(device)}/{cfg.task_name}"
-    flat = {f"{prefix}/{size}/{name}": value for size, row in figures.items() for name, value in row.items()}
-    flat |= {f"{prefix}/{name}": value for name, value in growth(figures).items()}
-    path = report.write(
-        "scaling",
-        figures={name: round(value, 4) for name, value in flat.items()},
-        device=device,
-        module="benchmarks.scaling",
+    prefix, figures = f"{report.device_label(device)}/{cfg.task_name}", {}
+    for size in sizes:
+        figures[size] = measure(words, size)
+        flat = {f"{size}/{name}": value for name, value in figures[size].items()} | growth(figures)
+        path = report.write(
+            "scaling",
+            figures={f"{prefix}/{name}": round(value, 4) for name, value in flat.items()},
+            device=device,
+            module="benchmarks.scaling",
+        )
+        print(
+            f"{size} envs: {figures[size]['env_states_per_s']:,.0f} env states/s, written to {path}",
+            flush=True,
+        )
+    Console().print(_table(figures, f"{cfg.task_name}, {report.device_name(device)}"))
+    chart = report.RESULTS / f"scaling_{cfg.task_name}.png"
+    draw(figures, chart, task_name=cfg.task_name, device=report.device_name(device))
+    print(f"drawn in {chart}")
+
+
+def _table(figures: dict[int, dict[str, float]], title: str) -> Table:
+    table = Table(
+        title=title, caption=" ".join(f"{name} {value:.2f}" for name, value in growth(figures).items())
     )
-    draw(
-        figures,
-        path.with_name(f"scaling_{cfg.task_name}.png"),
-        task_name=cfg.task_name,
-        device=report.device_name(device),
-    )
-    print(f"written to {path}")
+    for column in ("envs", "training, env states/s", "raw physics, env states/s", "relative to physics"):
+        table.add_column(column, justify="right")
+    for size, row in figures.items():
+        speeds = (f"{row[name]:,.0f}" for name in ("env_states_per_s", "physics_env_states_per_s"))
+        table.add_row(str(size), *speeds, f"{row['iteration_over_physics']:.3f}")
+    return table
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

@@ -30,13 +30,14 @@ from rich.console import Console
 from rich.table import Table
 from torchrl.envs import EnvBase
 
-from benchmarks import report
+from benchmarks import command_line, report
 from benchmarks.raw_physics import physics_ms, record_steps
 from benchmarks.stopwatch import milliseconds
 from ksim_rl import conf, envs
-from ksim_rl.checks import check_choice, unknown_name
+from ksim_rl.checks import check_choice
 from ksim_rl.collectors import CollectorCfg, RolloutCollector
 from ksim_rl.envs.innermost import innermost
+from ksim_rl.physics.streams import checked_device
 from ksim_rl.testing import check_env, count_syncs
 from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.networks import build_networks
@@ -123,25 +124,24 @@ def options(words: Sequence[str]) -> Options:
         "check_device": "",
         "results": str(report.RESULTS),
     }
-    for word in words:
-        name, _, value = word.partition("=")
-        if name not in given:
-            raise unknown_name("option", name, given)
-        given[name] = value
+    given = command_line.options(words, given)
     names = [envs.task(name).name for name in given["tasks"].split(",")]
     checked = given["check_device"] or given["device"]
     return Options(
         names=shard(names, given["shard"]),
-        num_envs=int(given["num_envs"]),
-        device=torch.device(given["device"]),
-        check_device=None if checked == "none" else torch.device(checked),
+        num_envs=command_line.whole_number("num_envs", given["num_envs"]),
+        device=checked_device(given["device"]),
+        check_device=None if checked == "none" else checked_device(checked),
         results=Path(given["results"]),
     )
 
 
 def shard(names: Sequence[str], which: str) -> tuple[str, ...]:
     """Return part "i/n" of the names: neighbours, since they mostly share a robot, and so the kernels to compile."""
-    index, count = (int(part) for part in which.split("/"))
+    numbers = which.split("/")
+    if len(numbers) != 2 or not all(number.isdecimal() for number in numbers):
+        raise ValueError(f"shard={which}: expected I/N, such as 0/4")
+    index, count = map(int, numbers)
     check_choice("shard", index, range(count))
     part = tuple(names[index * len(names) // count : (index + 1) * len(names) // count])
     if not part:
@@ -324,4 +324,4 @@ def _measure_all(options: Options) -> Path:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    command_line.run(lambda: main(sys.argv[1:]))

@@ -15,20 +15,21 @@ from __future__ import annotations
 import gc
 import statistics
 import sys
+import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import report
+from benchmarks import command_line, report
 from benchmarks.host_traffic import host_traffic
 from benchmarks.raw_physics import own_physics_ms, physics_ms, record_steps
 from benchmarks.stopwatch import milliseconds
-from ksim_rl import conf
 from ksim_rl.physics import World
 from ksim_rl.physics.capture import Captured
 from ksim_rl.trainers import RunCfg, Trainer, build
@@ -150,11 +151,15 @@ def num_env_states(cfg: RunCfg) -> int:
 
 
 def train_ms(cfg: RunCfg, *, iterations: int) -> float:
-    """Train so many iterations and return the median time of the second half of them, ms."""
-    trainer = build(cfg)
-    for _ in range(iterations - iterations // 2):
-        trainer.iterate()
-    return _iteration_ms(trainer, _world(trainer).device, iterations // 2)
+    """Train so many iterations with the logs of `cfg`; return the median time of the second half of them, ms."""
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = build(cfg, run_folder=Path(folder))
+        for _ in range(iterations - iterations // 2):
+            trainer.iterate()
+        median_ms = _iteration_ms(trainer, _world(trainer).device, iterations // 2)
+        for logger in trainer.loggers:
+            logger.close()
+    return median_ms
 
 
 def iteration_ms(trainer: Trainer) -> float:
@@ -167,7 +172,7 @@ def iteration_ms(trainer: Trainer) -> float:
 
 
 def _iteration_ms(trainer: Trainer, device: torch.device, iterations: int) -> float:
-    """Time whole iterations as `Trainer.train` runs them, logging included, on the wall clock."""
+    """Time whole iterations on the wall clock, with the copy of their metrics and the trainer's loggers, if any."""
     times = []
     for _ in range(iterations):
         if device.type == "cuda":
@@ -225,7 +230,7 @@ def _table(cfg: RunCfg, figures: dict[str, float], device: torch.device) -> Tabl
 
 def main() -> None:
     """Measure, print the table, and write the figures."""
-    cfg = conf.compose([*sys.argv[1:], "logger=none", "trainer.eval_episodes=0"])
+    cfg = command_line.compose([*sys.argv[1:], "logger=none", "trainer.eval_episodes=0"])
     device = cfg.resolved_device()
     figures = measure(cfg)
     Console().print(_table(cfg, figures, device))
@@ -249,4 +254,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

@@ -45,15 +45,17 @@ from torchrl.envs.transforms import (
     VecNormV2,
 )
 
-from benchmarks import report
+from benchmarks import command_line, report
 from benchmarks.stopwatch import milliseconds
 from benchmarks.transforms_env import TERMS, WideEnv
 from ksim_rl import envs
+from ksim_rl.checks import check_choice
 from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from ksim_rl.envs import transforms as ours
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
 from ksim_rl.envs.transforms import DelayCfg, GaussianNoise, UniformNoise, compile_groups
 from ksim_rl.physics.capture import Captured
+from ksim_rl.physics.streams import checked_device
 
 NAMES = list(TERMS)
 HISTORY, MAX_LAG = 10, 3
@@ -390,17 +392,20 @@ def _cell(row: Row, column: str) -> str:
 
 def main() -> None:
     """Measure, print the table, and write the figures."""
-    given = dict(word.split("=", 1) for word in sys.argv[1:])
-    unknown = set(given) - {"device", "num_envs", "go1", "only"}
-    if unknown:
-        raise SystemExit(f"unknown argument {sorted(unknown)[0]!r}: valid: device, num_envs, go1, only")
-    device = torch.device(given.get("device", "cpu"))
-    num_envs = int(given.get("num_envs", "4096"))
+    defaults = {
+        "device": "cuda" if torch.cuda.is_available() else "cpu",
+        "num_envs": "4096",
+        "go1": "auto",
+        "only": "all",
+    }
+    given = command_line.options(sys.argv[1:], defaults)
+    check_choice("go1", given["go1"], ("auto", "true", "false"))
+    check_choice("only", given["only"], ("all", "go1"))
+    device = checked_device(given["device"])
+    num_envs = command_line.whole_number("num_envs", given["num_envs"])
     if device.type == "cpu":
         torch.set_num_threads(1)
-    only_go1 = given.get("only") == "go1"
-    if not only_go1 and "only" in given:
-        raise SystemExit(f"only={given['only']!r}: valid: go1")
+    only_go1 = given["only"] == "go1"
     rows = {} if only_go1 else measure(num_envs, device)
     if rows:
         Console(width=140).print(_table(rows, num_envs, device))
@@ -412,7 +417,7 @@ def main() -> None:
         found = [ratio for row in rows.values() if (ratio := row.get(column)) is not None]
         if found:
             figures[f"{prefix}/largest_{column}"] = round(max(found), 4)
-    if only_go1 or given.get("go1", str(device.type == "cuda")).lower() == "true":
+    if only_go1 or given["go1"] == "true" or (given["go1"] == "auto" and device.type == "cuda"):
         go1 = measure_go1(num_envs, device)
         print({name: round(value, 5) for name, value in go1.items()})
         figures |= {f"{prefix}/{name}": round(value, 6) for name, value in go1.items()}
@@ -429,4 +434,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

@@ -8,6 +8,8 @@ epochs of 4 minibatches. Ours is timed eager and captured in float32 (TF32 on CU
 `ClipPPOLoss`, `ReplayBuffer` and torch's Adam on the same data and networks, in the same order of env states (our
 sampler in its buffer). The same capture is tried on it, and what stops it is written down. `parameter_difference` is
 that between ours and the stock side after one update in full float32, relative to the way that the parameters went.
+`stock_eager_over_update` is what all of ours saves together, bfloat16 included; on the CPU, where nothing is captured
+and all is float32, `update_ms` is `ours_eager_ms`.
 
 Figures go to benchmarks/results/update.json, as `<device>/<env states>/<figure>`.
 """
@@ -28,12 +30,13 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from benchmarks import report
+from benchmarks import command_line, report
 from benchmarks.stopwatch import milliseconds
 from ksim_rl.data import DatasetCfg, EpochSampler
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.physics.capture import Captured
+from ksim_rl.physics.streams import checked_device
 from ksim_rl.trainers.ppo_update import PPOUpdate
 
 STEPS, OBS, ACTIONS, MINIBATCHES = 24, 48, 12, 4
@@ -49,13 +52,12 @@ Networks = tuple[ProbabilisticTensorDictSequential, TensorDictModule]
 
 def main() -> None:
     """Time all sides for each number of envs, print the figures, and write them."""
-    options = dict(word.split("=", 1) for word in sys.argv[1:])
-    device = torch.device(options.pop("device", "cuda" if torch.cuda.is_available() else "cpu"))
-    sizes = options.pop("num_envs", "4096,16384" if device.type == "cuda" else "64")
-    if options:
-        raise SystemExit(f"unknown options {sorted(options)}: there are device and num_envs")
+    defaults = {"device": "cuda" if torch.cuda.is_available() else "cpu", "num_envs": ""}
+    given = command_line.options(sys.argv[1:], defaults)
+    device = checked_device(given["device"])
+    sizes = given["num_envs"] or ("4096,16384" if device.type == "cuda" else "64")
     figures, notes = {}, {}
-    for num_envs in map(int, sizes.split(",")):
+    for num_envs in command_line.whole_numbers("num_envs", sizes):
         label = f"{report.device_label(device)}/{num_envs * STEPS}"
         found, note = compare(num_envs, device=device)
         figures |= {f"{label}/{name}": value for name, value in found.items()}
@@ -81,14 +83,13 @@ def compare(num_envs: int, *, device: torch.device) -> tuple[dict[str, float], d
 
     def ours(**options: str) -> PPOUpdate:
         update = _ours(networks, num_envs=num_envs, device=device, **options)
-        # As the first calls of a run: they compile and allocate.
-        for _ in range(WARMUP + 1 if device.type == "cuda" else 1):
-            update(rollout_ET)
+        _warm_up(lambda: update(rollout_ET), device)
         return update
 
     update = ours()
     figures["ours_eager_ms"] = _time(update._update, device)
     stock = StockUpdate(networks, num_envs=num_envs)
+    _warm_up(lambda: stock(rollout_ET), device)
     figures["stock_eager_ms"] = _time(lambda: stock(rollout_ET), device)
     if device.type == "cuda":
         figures["ours_captured_ms"] = _time(lambda: update(rollout_ET), device)
@@ -224,6 +225,12 @@ def _ours(
     return PPOUpdate(cfg, actor=actor, critic=critic, data=data, device=device)
 
 
+def _warm_up(update: Callable[[], object], device: torch.device) -> None:
+    """Call it as a run does at first: these calls compile, allocate and, where it is captured, record the graph."""
+    for _ in range(WARMUP + 1 if device.type == "cuda" else 1):
+        update()
+
+
 def _time(work: Callable[[], object], device: torch.device) -> float:
     repeats = REPEATS if device.type == "cuda" else CPU_REPEATS
     return milliseconds(work, device=device, repeats=repeats)
@@ -236,4 +243,4 @@ def _flat(networks: Networks) -> Tensor:
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

@@ -147,9 +147,14 @@ def integers(keys: RowKeys, n: int, low: int | Tensor, high: int | Tensor) -> Te
 
     Returns:
         int64 [E, n].
+
+    Raises:
+        ValueError: if both are ints, and low exceeds high or is too far from it.
     """
     # Scaling keeps the bias below span / 2^32, without the rejection loop that would need a host sync.
     if isinstance(low, int) and isinstance(high, int):
+        if not 0 <= high - low < 1 << 31:
+            raise ValueError(f"low={low}, high={high}: expected low <= high < low + 2^31")
         return _draw(keys, n, _INTEGER, start=low, span=high - low + 1)
     return low + ((_draw(keys, n, _INTEGER, span=1 << 32) * (high - low + 1)) >> 32)
 
@@ -240,6 +245,11 @@ def _draw_now(
     start: int,
     span: int,
 ) -> Tensor:
+    if seed.dtype != torch.int64 or counter.dtype != torch.int64 or counter.shape not in ((), (num_rows,)):
+        raise ValueError(
+            f"seed is {seed.dtype}, counter is {counter.dtype} of shape {tuple(counter.shape)}: expected torch.int64, "
+            f"and a counter of shape () or ({num_rows},)"
+        )
     dtype = torch.int64 if kind == _INTEGER else torch.float32
     out_EL = torch.empty((num_rows, n), dtype=dtype, device=seed.device)
     counter = counter.contiguous()

@@ -36,7 +36,7 @@ def test_the_sdist_has_the_package_the_tests_and_what_builds_them(built):
     with tarfile.open(built[0]) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert sources("ksim_rl") <= names
-    assert sources("tests", (".py",)) <= names
+    assert sources("tests", (".py",)) | sources("docs", (".md", ".png")) <= names
     assert {"README.md", "LICENSE", "Makefile", "constraints.txt", "pyproject.toml"} <= names
     assert not [name for name in names if name.split("/")[0] in ("envs", "objectives", ".venv", "runs")]
 

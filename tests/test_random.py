@@ -147,3 +147,18 @@ def test_it_compiles_without_a_graph_break_to_the_same_numbers():
     compiled = torch.compile(draw, fullgraph=True, backend="eager")
     for eager, other in zip(draw(zero(4)), compiled(zero(4)), strict=True):
         assert torch.equal(eager, other)
+
+
+@pytest.mark.parametrize(
+    "counter_E",
+    [torch.zeros(3, dtype=torch.int64), torch.zeros(4, dtype=torch.int32), torch.zeros(1, 4).long()],
+)
+def test_counters_that_would_be_misread_are_refused(counter_E):
+    with pytest.raises(ValueError, match=r"expected torch.int64, and a counter of shape \(\) or \(4,\)"):
+        random.uniform(random.row_keys(SEED, 1, counter_E, 4), 2)
+
+
+@pytest.mark.parametrize(("low", "high"), [(5, 2), (0, 2**31)])
+def test_ranges_of_integers_are_checked(low, high):
+    with pytest.raises(ValueError, match=f"low={low}, high={high}"):
+        random.integers(keys(), 3, low, high)

@@ -74,7 +74,8 @@ class RslRlVecEnv(VecEnv):
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         """Step all envs; rows that ended come back with the first observation of their next episode."""
         step = self._stepper.step(actions)
-        extras: dict[str, Any] = {"time_outs": step.truncated_E}
+        # A row that also failed has no value to bootstrap.
+        extras: dict[str, Any] = {"time_outs": step.truncated_E & ~step.terminated_E}
         self._steps += 1
         if self._steps % self._log_interval == 0:
             extras["log"] = self._episode_means()

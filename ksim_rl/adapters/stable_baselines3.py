@@ -51,7 +51,8 @@ class StableBaselines3VecEnv(VecEnv):
         boxes = {name: box(env.full_observation_spec[key]) for name, key in self._stepper.keys.items()}
         self._single = next(iter(boxes)) if len(boxes) == 1 else None
         action = box(env.full_action_spec[env.action_key])
-        low, high = (np.clip(bound, -action_limit, action_limit) for bound in (action.low, action.high))
+        low = np.where(np.isfinite(action.low), action.low, -action_limit)
+        high = np.where(np.isfinite(action.high), action.high, action_limit)
         super().__init__(
             num_envs=env.batch_size[0],
             observation_space=spaces.Dict(dict(boxes)) if self._single is None else boxes[self._single],

@@ -63,6 +63,10 @@ def _check_names(overrides: Sequence[Override], loader: ConfigLoader, name: str)
     groups = _groups(loader)
     choices, fields = [], []
     for override in overrides:
+        if override.key_or_group == "task_name":
+            raise ValueError(
+                f"override {override.input_line!r}: the name comes with the task; choose that with task=name"
+            )
         if override.key_or_group in groups:
             if name == conf.RUN_AGAIN:
                 raise ValueError(
@@ -70,6 +74,11 @@ def _check_names(overrides: Sequence[Override], loader: ConfigLoader, name: str)
                     "a new config without --config-dir"
                 )
             options = loader.get_group_options(override.key_or_group)
+            if override.is_delete():
+                raise ValueError(
+                    f"override {override.input_line!r}: a run needs each group; choose another with "
+                    f"{override.key_or_group}=name: {', '.join(options)}"
+                )
             for choice in _values(override):
                 if choice not in options:
                     raise unknown_name(override.key_or_group, choice, options)

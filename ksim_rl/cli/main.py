@@ -1,10 +1,11 @@
 """`ksim-rl <command>`: finds the command, and turns errors of users into one line."""
 
 import gc
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+
+from ksim_rl.cli.errors import REFUSED, report, say
 
 USAGE = """\
 usage: ksim-rl <command> [arguments]
@@ -25,7 +26,6 @@ exit codes: 0 done (and solved, or its target met, where there is one), 1 not so
 configuration is wrong, 3 the run failed, 130 / 143 interrupted and saved (SIGINT / SIGTERM)"""
 
 COMMANDS = ("train", "resume", "eval", "play", "warmup", "envs")
-REFUSED, FAILED = 2, 3
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -34,15 +34,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         code = _dispatch(arguments)
     except KeyboardInterrupt:
-        _say("interrupted")
+        say("interrupted")
         code = 130
     except Exception as error:
-        if os.environ.get("KSIM_RL_TRACEBACK"):
-            raise
-        code = _code_for(error)
-        if code is None:
-            raise
-        _say(f"error: {' '.join(str(error).split())}")
+        code = report(error)
     sys.exit(code)
 
 
@@ -85,19 +80,6 @@ def collector_off() -> Iterator[None]:
     finally:
         gc.freeze()
         gc.enable()
-
-
-def _code_for(error: Exception) -> int | None:
-    """Return the exit code for an error that its message explains; None for one that needs its traceback."""
-    if isinstance(error, ValueError):
-        return REFUSED
-    if isinstance(error, (RuntimeError, OSError)) and not isinstance(error, NotImplementedError):
-        return FAILED
-    return None
-
-
-def _say(text: str) -> None:
-    print(f"ksim-rl: {text}", file=sys.stderr)
 
 
 if __name__ == "__main__":

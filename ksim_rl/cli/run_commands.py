@@ -9,11 +9,14 @@ from rich.console import Console
 from rich.table import Table
 
 from ksim_rl import envs
+from ksim_rl.checks import check_in_range
 from ksim_rl.cli.report import run_and_report, shown, verdict
 from ksim_rl.envs.innermost import innermost
 from ksim_rl.physics import compile_notice
 from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, load_policy, record_video
 from ksim_rl.trainers.build import build_evaluator, solved_at
+
+VIDEO_SUFFIXES = (".mp4", ".gif")
 
 
 def run_command(command: str, arguments: list[str]) -> int:
@@ -30,6 +33,10 @@ def _resume(arguments: list[str]) -> int:
     cfg = RunCfg.from_tree({**saved.config, "device": options.device})
     cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
     if options.num_iterations is not None:
+        if options.num_iterations < saved.iteration:
+            raise ValueError(
+                f"--num-iterations {options.num_iterations}: expected at least {saved.iteration}, those that are done"
+            )
         longer = dataclasses.replace(cfg.trainer, num_iterations=options.num_iterations)
         cfg = dataclasses.replace(cfg, trainer=longer)
     # A checkpoint lies in <run folder>/checkpoint/<iteration>.
@@ -64,8 +71,12 @@ def _play(arguments: list[str]) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the initial state")
     parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:<index> or auto")
     options = parser.parse_args(arguments)
-    if options.seconds is not None and not options.seconds > 0:
-        raise ValueError(f"--seconds {options.seconds}: expected more than 0")
+    if options.seconds is not None:
+        check_in_range("--seconds", options.seconds, low=0.0, low_open=True)
+    if options.output is not None and options.output.suffix not in VIDEO_SUFFIXES:
+        raise ValueError(
+            f"--output {options.output}: expected a file that ends in {' or '.join(VIDEO_SUFFIXES)}"
+        )
     progress = RunProgress(1)
     with compile_notice(progress.status):
         policy = load_policy(options.run, device=options.device)

@@ -10,16 +10,22 @@ from typing import Any
 import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from ksim_rl import conf
 from ksim_rl.cli.command_line import check_command_line
+from ksim_rl.cli.errors import report
 from ksim_rl.cli.report import run_and_report
+from ksim_rl.objectives import DistillationCfg
 from ksim_rl.trainers import RunCfg
 
 
 def train(arguments: list[str]) -> int:
-    """Run `ksim-rl train <arguments>` and return its exit code.
+    """Run `ksim-rl train <arguments>` and return its exit code, the highest of all jobs of a multirun.
+
+    A job that fails says why; the others still run.
 
     Raises:
         ValueError: for a group, name, field or value that is wrong; nothing was built or written then.
@@ -33,7 +39,6 @@ def train(arguments: list[str]) -> int:
         check_command_line(flags.overrides, name=name, multirun=multirun, values=builds)
 
     codes: list[int] = []
-    errors: list[Exception] = []
     process = os.getpid()
 
     @hydra.main(config_path=f"pkg://{conf.MODULE}", config_name=name, version_base="1.3")
@@ -43,35 +48,54 @@ def train(arguments: list[str]) -> int:
         except Exception as error:
             if os.getpid() != process:  # some launchers run jobs elsewhere; only Hydra can bring it here then
                 raise
-            # Kept from Hydra, which would print a line of its own about it.
-            errors.append(error)
-            return
+            # Kept from Hydra, which would print a line of its own about it and start no other job.
+            codes.append(report(error, about=_job_of_a_multirun()))
         if codes[-1] >= 128:  # interrupted: the other jobs of a multirun must not start
             sys.exit(codes[-1])
 
     # Hydra prints errors in its own way unless this is set; here they go to `ksim_rl.cli.main`.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     sys.argv = ["ksim-rl train", *arguments]
-    job()
-    if errors:
-        raise errors[0]
+    try:
+        job()
+    except HydraException as error:  # all that is left for Hydra to find, such as another --config-name
+        raise ValueError(str(error)) from error
     return max(codes, default=0)
 
 
 def _primary_config(flags: argparse.Namespace) -> tuple[str, bool]:
     """Return the name of the config to compose, and whether the user brings configs that only Hydra can check."""
-    if flags.config_dir and not flags.config_name and conf.register_run(Path(flags.config_dir)):
-        return conf.RUN_AGAIN, False
+    if flags.config_dir and not flags.config_name:
+        folder = Path(flags.config_dir)
+        if conf.register_run(folder):
+            return conf.RUN_AGAIN, False
+        if all(path.name == conf.RUN_CONFIG for path in folder.glob("*/**/*.yaml")):
+            # Nothing here is in a group, so Hydra would go on as if the folder had not been named.
+            raise ValueError(
+                f"--config-dir {folder}: expected a run folder, which has the {conf.RUN_CONFIG} of a run, or a folder "
+                "with config groups of yours"
+            )
     return conf.NAME, bool(flags.config_name or flags.config_dir or flags.config_path)
+
+
+def _job_of_a_multirun() -> str:
+    """Return which job this is, for a message; nothing for a run of its own."""
+    launched = HydraConfig.get()
+    if launched.mode != RunMode.MULTIRUN:
+        return ""
+    return f"job {launched.job.num} ({', '.join(launched.overrides.task)}): "
 
 
 def _train_one(config: DictConfig) -> int:
     plain: Any = OmegaConf.to_container(config, resolve=True)
     cfg = RunCfg.from_tree(plain)
     cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
+    # The run's own config must find what it names from anywhere.
     if cfg.checkpoint is not None:
-        # The run's own config must find it from anywhere.
         cfg = dataclasses.replace(cfg, checkpoint=str(Path(cfg.checkpoint).resolve()))
+    if isinstance(cfg.objective, DistillationCfg):
+        objective = dataclasses.replace(cfg.objective, teacher=str(Path(cfg.objective.teacher).resolve()))
+        cfg = dataclasses.replace(cfg, objective=objective)
     return run_and_report(cfg, _unused(Path(HydraConfig.get().runtime.output_dir)))
 
 

@@ -19,6 +19,10 @@ class CollectorCfg:
     warmup: int = 2
 
     def __post_init__(self) -> None:
-        """Refuse a warm-up that would capture cold kernels."""
+        """Refuse values of another kind, and a warm-up that would capture cold kernels."""
+        for field in ("require_graphs", "stagger_episodes"):
+            value = getattr(self, field)
+            if not isinstance(value, bool):
+                raise ValueError(f"{field}={value!r}: expected True or False")
         if isinstance(self.warmup, bool) or not isinstance(self.warmup, int) or self.warmup < 1:
             raise ValueError(f"warmup={self.warmup!r}: expected a whole number of at least 1")

@@ -124,6 +124,12 @@ class RolloutCollector:
                 f"unknown {sorted(state.keys() - own.keys())}"
             )
         for name, leaf in own.items():
+            if state[name].shape != leaf.shape or state[name].dtype != leaf.dtype:
+                raise ValueError(
+                    f"state of another collector: {name!r} is {state[name].dtype} of shape {tuple(state[name].shape)}, "
+                    f"but this env has {leaf.dtype} of shape {tuple(leaf.shape)}: build it with the same num_envs"
+                )
+        for name, leaf in own.items():
             leaf.copy_(state[name])
 
     def _rollout(self) -> None:

@@ -9,6 +9,8 @@ import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from ksim_rl import envs
 from ksim_rl.conf import search_path
@@ -66,14 +68,23 @@ def register_run(folder: Path) -> bool:
     """Store the config that a run left in its folder as the primary config `RUN_AGAIN`; False if there is none.
 
     Its number of envs and its seed follow overrides, as they do in a config that is composed.
+
+    Raises:
+        ValueError: if its file is not YAML.
     """
     path = folder / RUN_CONFIG
-    tree = OmegaConf.to_container(OmegaConf.load(path)) if path.is_file() else None
+    try:
+        tree = OmegaConf.to_container(OmegaConf.load(path)) if path.is_file() else None
+    except (YAMLError, OmegaConfBaseException) as error:
+        raise ValueError(f"{path}: cannot be read: {error}") from error
     if not isinstance(tree, dict) or not {"task_name", "task"} <= tree.keys():
         return False
-    tree["task"]["scene"]["num_envs"] = "${num_envs}"
-    if tree["task"]["seed"] == tree["seed"]:
-        tree["task"]["seed"] = "${seed}"
+    task = tree["task"]
+    if not isinstance(task, dict) or not isinstance(task.get("scene"), dict):
+        raise ValueError(f"{path}: task={task!r}: expected the config of an env, as a run writes it")
+    task["scene"]["num_envs"] = "${num_envs}"
+    if task.get("seed") == tree.get("seed"):
+        task["seed"] = "${seed}"
     ConfigStore.instance().store(name=RUN_AGAIN, node={"defaults": ["launch", "_self_"], **tree})
     return True
 

@@ -1,4 +1,4 @@
-"""Datasets and samplers: TorchRL replay buffers for the env states of one RL update."""
+"""Datasets, replays and samplers: TorchRL replay buffers for the env states that an RL update learns from."""
 
 from ksim_rl.data.dataset_buffer import DatasetBuffer
 from ksim_rl.data.dataset_cfg import DatasetCfg, rollout_length

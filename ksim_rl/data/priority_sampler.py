@@ -14,9 +14,9 @@ from ksim_rl.data.replay_storage import ReplayStorage
 class PrioritySampler(Sampler):
     """Draws what is stored in proportion to (priority + eps)^alpha (Schaul et al., arXiv 1511.05952), with replacement.
 
-    It stands in for TorchRL's `PrioritizedSampler` in any replay buffer, with the default priority of the paper: the
-    highest so far. Give it priorities by the buffer's `update_priority(index, priority)`; TorchRL's
-    `update_tensordict_priority` does so for TorchRL's own sampler only.
+    It stands in for TorchRL's `PrioritizedSampler` in any replay buffer whose storage has one dim, with the default
+    priority of the paper: the highest so far, 1 at the start. Give it priorities by the buffer's
+    `update_priority(index, priority)`; TorchRL's `update_tensordict_priority` does so for TorchRL's own sampler only.
 
     There is no tree: the cumulative sum over all priorities, in float64, and a binary search per draw are a few
     kernels, make no host sync and can be captured in a CUDA graph. The draws are stratified: one falls in each of B
@@ -50,8 +50,8 @@ class PrioritySampler(Sampler):
 
     @torch.no_grad()
     def extend(self, index: Any, **_: Any) -> None:
-        """Give new entries the highest priority so far, 1 at the start."""
-        default = torch.where(self._highest > 0.0, self._highest, 1.0)
+        """Give new entries the default priority."""
+        default = self._default()
         index_N = torch.as_tensor(index, device=self._priority_N.device).reshape(-1)
         self._priority_N[index_N] = default.expand(index_N.shape[0])
 
@@ -63,19 +63,29 @@ class PrioritySampler(Sampler):
     ) -> None:
         """Set priorities [B] or [] of entries [B]; of an index that occurs twice the highest counts.
 
-        One that is not finite is taken as the highest so far.
+        One that is negative or not finite is taken as the default priority.
         """
         device = self._priority_N.device
         index_B = torch.as_tensor(index, device=device).reshape(-1)
         priority_B = torch.as_tensor(priority, dtype=torch.float32, device=device).reshape(-1)
         priority_B = priority_B.expand(index_B.shape[0])
-        priority_B = torch.where(priority_B.isfinite(), priority_B, self._highest)
-        self._highest.copy_(torch.maximum(self._highest, priority_B.amax()))
+        valid_B = priority_B.isfinite() & (priority_B >= 0.0)
+        self._highest.copy_(torch.maximum(self._highest, torch.where(valid_B, priority_B, 0.0).amax()))
+        priority_B = torch.where(valid_B, priority_B, self._default())
         self._priority_N.scatter_reduce_(0, index_B, priority_B, "amax", include_self=False)
 
     @torch.no_grad()
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
-        """Return indices [B] and their weights."""
+        """Return indices [B] and their weights.
+
+        Raises:
+            ValueError: if the storage has more dims than one.
+        """
+        if getattr(storage, "ndim", 1) > 1:
+            raise ValueError(
+                f"the storage has ndim={storage.ndim}: PrioritySampler draws from storages of one dim; use ndim=1 and "
+                "extend by data with one batch dim"
+            )
         score_N = self._scores(storage)
         upto_N = score_N.cumsum(0)
         device = upto_N.device
@@ -86,7 +96,8 @@ class PrioritySampler(Sampler):
         index_B = torch.searchsorted(upto_N, share_B * upto_N[-1], right=True)
         index_B = torch.minimum(index_B, last)
         lowest = torch.where(score_N > 0.0, score_N, torch.inf).amin()
-        weight_B = (score_N[index_B] / lowest).pow(-self.beta).to(torch.float32)
+        # Where nothing has a score, what is drawn is masked: a finite weight keeps the losses' means finite.
+        weight_B = (score_N[index_B] / lowest).pow(-self.beta).clamp_max(1.0).to(torch.float32)
         return index_B, {"priority_weight": weight_B}
 
     def state_dict(self) -> dict[str, Any]:
@@ -110,6 +121,10 @@ class PrioritySampler(Sampler):
     def _empty(self) -> None:
         self._priority_N.zero_()
         self._highest.zero_()
+
+    def _default(self) -> Tensor:
+        """Return the highest priority so far, [], or 1 where there is none above zero."""
+        return torch.where(self._highest > 0.0, self._highest, 1.0)
 
     def _scores(self, storage: Storage) -> Tensor:
         """Return (priority + eps)^alpha of what is stored and 0 elsewhere, float64 [N]."""

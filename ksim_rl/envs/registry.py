@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from hydra import compose, initialize
 from hydra.core.config_store import ConfigStore
+from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
 import ksim_rl.envs.tasks
@@ -88,7 +89,10 @@ def make_cfg(name: str, overrides: Sequence[str] = ()) -> ManagerBasedRlEnvCfg:
     check_overrides({"task": _tree(name)}, overrides)
     register_configs()
     with initialize(version_base="1.3", config_path=None):
-        composed = compose(config_name=_CONFIG, overrides=[f"task={name}", *overrides])
+        try:
+            composed = compose(config_name=_CONFIG, overrides=[f"task={name}", *overrides])
+        except ConfigCompositionException as error:
+            raise ValueError(f"{error}: {error.__cause__}") from error
     return from_tree(ManagerBasedRlEnvCfg, OmegaConf.to_container(composed.task, resolve=True), "task")
 
 

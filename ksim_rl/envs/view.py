@@ -311,12 +311,18 @@ class EnvView(FirstRobot, BodiesAndSites):
 
         `counter` keys the draws (the step count unless given), and `draws` tells apart the moments of one term whose
         counters may coincide.
+
+        Raises:
+            ValueError: what the term raises, with its name before it.
         """
         self._scope, self._draw_scope, self._draws = name, f"{name}@{draws}", 0
         self._state.reader = name
         self._counter = self.step_count if counter is None else counter
         try:
             yield
+        except ValueError as error:
+            # A term does not know its own place in the config.
+            raise ValueError(f"{name.replace('/', '.')}: {error}") from error
         finally:
             self._scope = self._state.reader = ""
 

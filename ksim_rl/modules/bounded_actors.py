@@ -1,6 +1,5 @@
 """Policies whose actions lie in a box: the deterministic one of TD3 and the squashed gaussian of SAC."""
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +12,7 @@ from torchrl.modules import ProbabilisticActor
 
 from ksim_rl.checks import check_in_range
 from ksim_rl.modules.action_range import action_range
-from ksim_rl.modules.mlp import ACTIVATIONS, check_network, linear
+from ksim_rl.modules.mlp import check_network, mlp
 from ksim_rl.modules.observation_normalizer import ObservationNormalizer
 from ksim_rl.modules.tanh_gaussian import TanhGaussian
 
@@ -109,14 +108,15 @@ class BoundedActor(nn.Module):
         low, high = action_range(action_spec, cfg.action_bound, device=device)
         self.register_buffer("low", low)
         self.register_buffer("high", high)
-        self.layers, width = nn.Sequential(), obs_dim
-        for hidden_dim in cfg.hidden_dims:
-            self.layers.append(linear(width, hidden_dim, gain=math.sqrt(2.0), device=device))
-            if cfg.layer_norm:
-                self.layers.append(nn.LayerNorm(hidden_dim, device=device))
-            self.layers.append(ACTIVATIONS[cfg.activation]())
-            width = hidden_dim
-        self.layers.append(linear(width, output_dim, gain=cfg.output_gain, device=device))
+        self.layers = mlp(
+            obs_dim,
+            cfg.hidden_dims,
+            output_dim,
+            activation=cfg.activation,
+            layer_norm=cfg.layer_norm,
+            output_gain=cfg.output_gain,
+            device=device,
+        )
 
     def output(self, obs: Tensor) -> Tensor:
         """Return what the last layer says, float32 [..., output_dim]."""

@@ -38,29 +38,36 @@ def mlp(
     output_dim: int,
     *,
     activation: str = "elu",
+    layer_norm: bool = False,
     hidden_gain: float = math.sqrt(2.0),
     output_gain: float = 1.0,
     device: torch.device | str | None = None,
 ) -> nn.Sequential:
     """Build Linear layers with activations between them; the last one is linear.
 
-    Weights are orthogonal and biases zero: with such weights the scale of the signal does not depend on width
-        or
-    depth, and `output_gain` alone sets the scale of the first outputs (Andrychowicz et al., "What matters in
-    on-policy reinforcement learning?", 2021: the gain of the last policy layer matters most, and should be
-    small).
+    Weights are orthogonal and biases zero: with such weights the scale of the signal does not depend on width or depth,
+    and `output_gain` alone sets the scale of the first outputs (Andrychowicz et al., "What matters in on-policy
+    reinforcement learning?", 2021: the gain of the last policy layer matters most, and should be small).
 
     Args:
         input_dim, output_dim: sizes of the first and the last dim L.
         hidden_dims: widths of the layers between; `()` gives one linear layer.
         activation: one of `ACTIVATIONS`.
+        layer_norm: normalize before each activation.
         hidden_gain, output_gain: scales of the orthogonal weights.
 
     Returns:
         A module from [..., input_dim] to [..., output_dim].
     """
     check_in_range("output_gain", output_gain, low=0.0)
-    layers = trunk(input_dim, hidden_dims, activation=activation, hidden_gain=hidden_gain, device=device)
+    layers = trunk(
+        input_dim,
+        hidden_dims,
+        activation=activation,
+        layer_norm=layer_norm,
+        hidden_gain=hidden_gain,
+        device=device,
+    )
     width = hidden_dims[-1] if hidden_dims else input_dim
     return layers.append(linear(width, output_dim, gain=output_gain, device=device))
 
@@ -70,6 +77,7 @@ def trunk(
     hidden_dims: Sequence[int],
     *,
     activation: str = "elu",
+    layer_norm: bool = False,
     hidden_gain: float = math.sqrt(2.0),
     device: torch.device | str | None = None,
 ) -> nn.Sequential:
@@ -82,6 +90,8 @@ def trunk(
     width = input_dim
     for hidden_dim in hidden_dims:
         layers.append(linear(width, hidden_dim, gain=hidden_gain, device=device))
+        if layer_norm:
+            layers.append(nn.LayerNorm(hidden_dim, device=device))
         layers.append(ACTIVATIONS[activation]())
         width = hidden_dim
     return layers

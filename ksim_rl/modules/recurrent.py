@@ -12,6 +12,7 @@ from tensordict.nn import (
     TensorDictModuleBase,
     TensorDictSequential,
 )
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torch.nn import functional
 from torchrl.data import Composite, Unbounded
@@ -244,10 +245,27 @@ def with_memory(memory: RecurrentModule, network: AnyModule) -> AnyModule:
     return TensorDictSequential(memory, network)  # type: ignore[return-value]
 
 
-def memories(*networks: nn.Module) -> list[RecurrentModule]:
-    """Return the memories inside networks, each once."""
-    found = [m for network in networks for m in network.modules() if isinstance(m, RecurrentModule)]
-    return list(dict.fromkeys(found))
+def memories(*networks: nn.Module) -> list[Any]:
+    """Return the recurrent TensorDict modules inside networks, each once: ours, TorchRL's, or any other."""
+    found = [module for network in networks for module in network.modules() if carried_keys(module)]
+    # A sequence of modules carries the states of those that it holds.
+    holders = {
+        module for module in found if any(carried_keys(m) for m in module.modules() if m is not module)
+    }
+    return [module for module in dict.fromkeys(found) if module not in holders]
+
+
+def carried_keys(module: nn.Module) -> list[NestedKey]:
+    """Return the keys of a module's state: those that it reads, and under "next" writes for the step that follows."""
+    if not isinstance(module, TensorDictModuleBase):
+        return []
+    written = {unravel_key(key) for key in module.out_keys}
+    return [unravel_key(key) for key in module.in_keys if next_key(key) in written]
+
+
+def next_key(key: NestedKey) -> NestedKey:
+    """Return where the value of `key` after the step lies."""
+    return unravel_key(("next", key))
 
 
 def state_keys(cfg: RecurrentCfg, name: str) -> list[tuple[str, str, str]]:

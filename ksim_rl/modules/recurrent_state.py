@@ -8,7 +8,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
-from ksim_rl.modules.recurrent import RESET_KEY, memories
+from ksim_rl.modules.recurrent import RESET_KEY, RecurrentModule, carried_keys, memories, next_key
 
 
 class CarriedState:
@@ -20,22 +20,31 @@ class CarriedState:
     Args:
         network: whose states are carried.
         acting: networks whose states the rollouts hold already.
+
+    Raises:
+        ValueError: if a memory of `network` does not give the state after each step of a sequence.
     """
 
     def __init__(self, network: nn.Module, *, acting: nn.Module) -> None:
-        carried = [memory for memory in memories(network) if memory not in memories(acting)]
-        self._memories = {memory.name: memory for memory in carried}
+        for memory in memories(network):
+            if not isinstance(memory, RecurrentModule):
+                raise ValueError(
+                    f"critic={type(memory).__name__}: the values after each step need the state there, which TorchRL's "
+                    "modules give for the last step of a sequence only; use a RecurrentModule (make_recurrent_critic), "
+                    "or a critic without a memory"
+                )
+        self._memories = [memory for memory in memories(network) if memory not in memories(acting)]
         self._state_E: dict[Any, Tensor] = {}
 
     @property
     def keys(self) -> list[Any]:
         """Where the states lie in a rollout."""
-        return [key for memory in self._memories.values() for key in memory.state_keys]
+        return [key for memory in self._memories for key in memory.state_keys]
 
     def begin_(self, rollout_ET: TensorDictBase) -> None:
         """Write the carried states into a rollout `["E","T"]`, of whose steps only the first is meant."""
         num_envs, num_steps = rollout_ET.batch_size
-        for memory in self._memories.values():
+        for memory in self._memories:
             for key in memory.state_keys:
                 if key not in self._state_E:
                     shape = (num_envs, memory.cfg.num_layers, memory.cfg.hidden_dim)
@@ -103,8 +112,8 @@ def burnt_in(
     for memory in memories(*networks):
         with set_recurrent_mode(True):
             unrolled_BT = memory(before_BT.select(*memory.in_keys))
-        for state_key in memory.state_keys:
-            renewed_B = unrolled_BT.get(("next", *state_key))[:, -1]
+        for state_key in carried_keys(memory):
+            renewed_B = unrolled_BT.get(next_key(state_key))[:, -1]
             state_B = torch.where(renewed_B1.unsqueeze(-1), renewed_B, before_BT.get(state_key)[:, 0])
             rest_BT.set(state_key, state_B.unsqueeze(1).expand_as(rest_BT.get(state_key)))
     return rest_BT

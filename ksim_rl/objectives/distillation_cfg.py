@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from ksim_rl.checks import check_choice, check_in_range
-from ksim_rl.objectives.ppo_cfg import SCHEDULES
+from ksim_rl.objectives.ppo_cfg import check_schedule
 
 LOSSES = ("kl", "mse")
 
@@ -23,7 +23,7 @@ class DistillationCfg:
         num_epochs: passes over each rollout.
         teacher_share: the chance that the teacher acts instead of the student, in each env state of the first rollout.
         teacher_share_decay: factor of it from rollout to rollout.
-        learning_rate: of Adam, at the start.
+        learning_rate: of Adam, at the start; within its bounds if the schedule is adaptive.
         schedule: "fixed", or "adaptive", which changes it after each gradient step so that the divergence of the
             student from the one that collected the rollout stays near `desired_kl`.
         desired_kl: in nats.
@@ -55,7 +55,6 @@ class DistillationCfg:
         if not self.teacher:
             raise ValueError("teacher='': name a run folder or a checkpoint, objective.teacher=RUN")
         check_choice("loss", self.loss, LOSSES)
-        check_choice("schedule", self.schedule, SCHEDULES)
         for field in ("num_epochs", "max_skipped_steps"):
             value = getattr(self, field)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
@@ -69,7 +68,6 @@ class DistillationCfg:
             check_in_range("max_grad_norm", self.max_grad_norm, low=0.0, low_open=True)
         if len(self.betas) != 2 or not all(0.0 <= beta < 1.0 for beta in self.betas):
             raise ValueError(f"betas={self.betas!r}: expected two numbers in [0, 1)")
-        if self.learning_rate_min > self.learning_rate_max:
-            raise ValueError(
-                f"learning_rate_min={self.learning_rate_min!r} exceeds learning_rate_max={self.learning_rate_max!r}"
-            )
+        check_schedule(
+            self.schedule, self.learning_rate, low=self.learning_rate_min, high=self.learning_rate_max
+        )

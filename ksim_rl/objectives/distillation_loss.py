@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import CompositeDistribution, ProbabilisticTensorDictSequential, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Distribution
@@ -58,7 +58,8 @@ class DistillationLoss(nn.Module):
             if not isinstance(teacher, ProbabilisticTensorDictSequential):
                 raise ValueError("loss='kl': the teacher's policy has no distribution; use loss='mse'")
             self.label_keys += distribution_keys(teacher)
-        if loss == "mse" and "logits" in distribution_keys(actor_network):
+        self._has_choices = any(_is_logits(key) for key in distribution_keys(actor_network))
+        if loss == "mse" and self._has_choices:
             raise ValueError("loss='mse': the actions are choices, which have no distance; use loss='kl'")
 
     @property
@@ -81,10 +82,9 @@ class DistillationLoss(nn.Module):
     def action_error(self, labelled: TensorDictBase) -> Tensor:
         """Return the root mean square of a - a* by the policy that collected the data, [], in units of the action."""
         behaved = stored_distribution(self.actor_network, labelled)
-        if behaved is None or not labelled.get((TEACHER, "action")).is_floating_point():
+        if behaved is None or self._has_choices:
             return torch.zeros((), device=labelled.device)
-        error = _action_of(behaved) - labelled.get((TEACHER, "action"))
-        return error.square().nanmean().sqrt()
+        return _action_error(behaved, labelled.get(TEACHER)).square().nanmean().sqrt()
 
     def forward(self, minibatch_B: TensorDictBase) -> TensorDictBase:
         """Return `loss_distillation`, and detached `kl`: how far the student moved since it collected, in nats.
@@ -98,7 +98,7 @@ class DistillationLoss(nn.Module):
             student = self.actor_network.get_dist(minibatch_B)
         labels_B = minibatch_B.get(TEACHER)
         if self.loss == "mse":
-            loss_B = (_action_of(student) - labels_B.get("action")).square().mean(-1)
+            loss_B = _action_error(student, labels_B).square().mean(-1)
         else:
             (teacher,) = self._teacher
             divergence = policy_kl(teacher.build_dist_from_params(labels_B), student)
@@ -126,6 +126,17 @@ def observation_keys_of(policy: Any) -> list[NestedKey]:
 def _action_of(dist: Distribution) -> Tensor:
     """Return the action that a distribution stands for when nothing is explored."""
     return dist.deterministic_sample if hasattr(dist, "deterministic_sample") else dist.mean  # type: ignore[attr-defined]
+
+
+def _is_logits(key: NestedKey) -> bool:
+    return key == "logits" or key[-1] == "logits"
+
+
+def _action_error(dist: Distribution, labels: TensorDictBase) -> Tensor:
+    """Return a - a*, [*batch, A]; parts of an action lie side by side."""
+    if not isinstance(dist, CompositeDistribution):
+        return _action_of(dist) - labels.get("action")
+    return torch.cat([_action_of(part) - labels.get(key) for key, part in dist.dists.items()], -1)
 
 
 def _mean(values: Tensor, mask: Tensor) -> Tensor:

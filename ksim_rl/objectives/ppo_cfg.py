@@ -28,7 +28,7 @@ class PPOCfg:
         clip_value: radius of the value clipping; True takes `clip_epsilon`, False does not clip.
         entropy_coeff, critic_coeff: weights of the entropy bonus and of the value loss.
         normalize_advantage: over the whole "dataset", over each "minibatch", or "none".
-        learning_rate: of Adam, at the start.
+        learning_rate: of Adam, at the start; within its bounds if the schedule is adaptive.
         schedule: "adaptive" changes it after each gradient step so that the divergence of the policy from the
             one that collected the data stays near `desired_kl`; "fixed" keeps it.
         desired_kl: in nats.
@@ -112,11 +112,26 @@ class PPOCfg:
             raise ValueError(f"betas={self.betas!r}: expected two numbers in [0, 1)")
         check_choice("advantage", self.advantage, ADVANTAGES)
         check_choice("symmetry", self.symmetry, SYMMETRIES)
-        check_choice("schedule", self.schedule, SCHEDULES)
         check_choice("normalize_advantage", self.normalize_advantage, NORMALIZATIONS)
         check_choice("precision", self.precision, PRECISIONS)
         check_choice("kernels", self.kernels, KERNELS)
-        if self.learning_rate_min > self.learning_rate_max:
-            raise ValueError(
-                f"learning_rate_min={self.learning_rate_min!r} exceeds learning_rate_max={self.learning_rate_max!r}"
-            )
+        check_schedule(
+            self.schedule, self.learning_rate, low=self.learning_rate_min, high=self.learning_rate_max
+        )
+
+
+def check_schedule(schedule: str, learning_rate: float, *, low: float, high: float) -> None:
+    """Refuse a schedule of the learning rate that contradicts itself.
+
+    Raises:
+        ValueError: naming the field, its value and the bounds.
+    """
+    check_choice("schedule", schedule, SCHEDULES)
+    if low > high:
+        raise ValueError(f"learning_rate_min={low!r} exceeds learning_rate_max={high!r}")
+    if schedule == "adaptive" and not low <= learning_rate <= high:
+        # Its first change would be a jump to the bound, even upwards where it should become smaller.
+        raise ValueError(
+            f"learning_rate={learning_rate!r}: schedule=adaptive keeps it in [learning_rate_min, learning_rate_max] = "
+            f"[{low!r}, {high!r}]; start inside, move the bound, or use schedule=fixed"
+        )

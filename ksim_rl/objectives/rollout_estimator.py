@@ -121,20 +121,22 @@ class RolloutEstimator(ValueEstimatorBase):
             following.set(keys.value, self._state_values(following, next_params, time_dim))
         read: list[Any] = [tensordict.get(keys.value, None)]
         read += [following.get(key, None) for key in (keys.value, keys.reward, keys.done)]
+        read.append(following.get(keys.terminated, read[-1]))
         shapes = [None if signal is None else tuple(signal.shape) for signal in read]
         if None in shapes or len(set(shapes)) != 1:
             raise ValueError(
                 f"{type(self).__name__} needs these signals, all in one shape [*batch, 1]; got "
                 f"{keys.value!r} {shapes[0]}, ('next', {keys.value!r}) {shapes[1]}, "
-                f"('next', {keys.reward!r}) {shapes[2]}, ('next', {keys.done!r}) {shapes[3]}"
+                f"('next', {keys.reward!r}) {shapes[2]}, ('next', {keys.done!r}) {shapes[3]}, "
+                f"('next', {keys.terminated!r}) {shapes[4]}"
             )
-        state_value, next_value, reward, done = read
+        state_value, next_value, reward, done, terminated = read
         return Signals(
             state_value=state_value,
             next_value=next_value,
             reward=reward,
             done=done,
-            terminated=following.get(keys.terminated, done),
+            terminated=terminated,
             time_dim=time_dim,
         )
 

@@ -9,6 +9,15 @@ from torch import Tensor, nn
 class NonFiniteStepsError(RuntimeError):
     """Too many gradient steps in a row had a loss or a gradient that was not finite."""
 
+    @classmethod
+    def of(cls, in_a_row: int, *, limit: int, skipped: int) -> "NonFiniteStepsError":
+        """Build the error for so many skipped steps in a row, and since the start."""
+        return cls(
+            f"{in_a_row} gradient steps in a row had a loss or gradient that is not finite (limit {limit}, "
+            f"{skipped} since the start); the parameters are those of the last good step. "
+            "Lower the learning rate or max_grad_norm, or look for extreme rewards and observations"
+        )
+
 
 class StepGuard(nn.Module):
     """Counts skipped gradient steps on the device.
@@ -37,15 +46,11 @@ class StepGuard(nn.Module):
         """Read the counter on the host (once per iteration, not per step) and stop a run that cannot go on.
 
         Raises:
-            NonFiniteStepsError: if `limit` or more steps in a row were skipped.
+            NonFiniteStepsError: if the last `limit` steps or more were skipped.
         """
         in_a_row = int(self.skipped_in_a_row)
         if in_a_row >= limit:
-            raise NonFiniteStepsError(
-                f"{in_a_row} gradient steps in a row had a loss or gradient that is not finite (limit {limit}, "
-                f"{int(self.skipped)} since the start); the parameters are those of the last good step. "
-                "Lower the learning rate or max_grad_norm, or look for extreme rewards and observations"
-            )
+            raise NonFiniteStepsError.of(in_a_row, limit=limit, skipped=int(self.skipped))
 
 
 @torch.no_grad()

@@ -37,7 +37,7 @@ def is_warming_up() -> bool:
 
 
 def wants_live_launches(device: torch.device) -> bool:
-    """Whether Warp work must be issued launch by launch: an outer graph is recorded, or warms up to be."""
+    """Whether no graph may be recorded here: an outer one is recorded, or warms up to be."""
     if _phase.live > 0:
         return True
     return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
@@ -85,7 +85,10 @@ def no_collection() -> Iterator[None]:
 
 @contextmanager
 def live_launches(*, warming_up: bool = False, capturing: bool = False) -> Iterator[None]:
-    """Let worlds issue launch by launch in this block, as they do inside a capture, and record no graphs of theirs."""
+    """Let worlds issue launch by launch in this block, as they do inside a capture, and record no graphs of theirs.
+
+    With `warming_up` they replay the graphs that they have.
+    """
     _phase.live += 1
     _phase.warming_up += warming_up
     _phase.capturing += capturing

@@ -41,7 +41,7 @@ class NanReport:
     Args:
         worlds: their numbers.
         files: what was written, for `python -m ksim_rl.physics.replay FILE`.
-        messages: one line for each file, or for why there is none.
+        messages: one line for each file, and one where a file could not be written; none beyond `max_files`.
     """
 
     worlds: tuple[int, ...] = ()

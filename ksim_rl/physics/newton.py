@@ -1,4 +1,4 @@
-"""The constraint solver of the substeps, for the models that `suits` names: one kernel instead of some hundred."""
+"""The constraint solver of the substeps, unless `unsuited` says why not: one kernel instead of some hundred."""
 
 import dataclasses
 from collections.abc import Callable
@@ -46,23 +46,25 @@ class Placement:
     longest_first: bool = True
 
 
-def suits(mj_model: mujoco.MjModel, *, njmax: int) -> bool:
-    """Whether the kernel can solve this model: Newton from a warm start, few enough degrees of freedom and rows."""
-    opt = mj_model.opt
+def unsuited(mj_model: mujoco.MjModel, *, njmax: int) -> str | None:
+    """Return why the kernel cannot solve this model, or None where it can."""
+    opt, nv = mj_model.opt, mj_model.nv
     elliptic = bool(opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC)
-    return (
-        opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
-        and opt.integrator in INTEGRATORS
-        and opt.jacobian != mujoco.mjtJacobian.mjJAC_DENSE
-        and opt.iterations > 0
-        and opt.noslip_iterations == 0
-        and not opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART
-        and not opt.enableflags & (mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY)
-        and mj_model.nflex == 0
-        and 0 < mj_model.nv <= MOST_DOFS
-        and njmax > 0
-        and floats_per_world(mj_model.nv, njmax, elliptic=elliptic, rows_on_chip=0) <= SHARED_FLOATS
-    )
+    floats = floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=0)
+    reasons = {
+        "its solver is not Newton's": opt.solver != mujoco.mjtSolver.mjSOL_NEWTON,
+        f"its integrator is {mujoco.mjtIntegrator(opt.integrator).name}": opt.integrator not in INTEGRATORS,
+        "its Jacobian is dense": opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE,
+        "it allows no iterations": opt.iterations < 1,
+        "it has noslip iterations": opt.noslip_iterations > 0,
+        "its warm start is off": bool(opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART),
+        "it lets bodies sleep": bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP),
+        "it computes its energy": bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY),
+        "it has flexes": mj_model.nflex > 0,
+        f"it has {nv} degrees of freedom, outside of 1 to {MOST_DOFS}": not 0 < nv <= MOST_DOFS,
+        f"its {njmax} constraint rows (njmax) do not fit shared memory": floats > SHARED_FLOATS,
+    }
+    return next((reason for reason, holds in reasons.items() if holds), None)
 
 
 def placement(*, nv: int, njmax: int, elliptic: bool) -> Placement:
@@ -77,7 +79,7 @@ def solver(
     """Return what launches the solver: accelerations and forces from the constraint rows, which must be sparse.
 
     Args:
-        warp_model: a model that `suits`.
+        warp_model: a model that is not `unsuited`.
         warp_data_E: the worlds, with their arrays in their final place.
         place: how they lie on a CUDA device; None is what was measured to be best.
     """
@@ -167,6 +169,8 @@ def step(
     mjw.fwd_velocity(m, d)
     if sensors:
         mjw.sensor_vel(m, d)
+    if m.callback.control and not m.opt.disableflags & mjw.DisableBit.ACTUATION:
+        m.callback.control(m, d)
     mjw.fwd_actuation(m, d)
     mjw.fwd_acceleration(m, d, factorize=True)
     solve()

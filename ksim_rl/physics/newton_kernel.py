@@ -6,7 +6,8 @@ by bracketed Newton steps, and the same tests of convergence, so that the result
 C++ (newton_*.cpp), since its matrix lies in registers, which needs loops that are unrolled, shuffles and shared
 memory; the CPU compiles the same source, for a warp of one lane.
 
-Source of the algorithm: https://mujoco.readthedocs.io/en/stable/computation/index.html
+Source of the algorithm: https://mujoco.readthedocs.io/en/stable/computation/index.html; of its bounds, line
+search and tests of convergence: mujoco_warp/_src/solver.py.
 """
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.

@@ -40,8 +40,10 @@ class SimCfg:
             not remove all of them (Go1 on an H200: 5e-7 in qpos after a step). On the CPU results are always the same.
         one_kernel_solver: solve the constraints of a substep in one kernel instead of some hundred. It is MuJoCo Warp's
             algorithm, so that results agree up to rounding (four substeps of 4096 worlds on an H200: Go1 2.4 ms instead
-            of 8.2, G1 5.0 instead of 9.9). Models out of its range (solvers other than Newton, more than 64 degrees of
-            freedom, flexes, sleeping, noslip, RK4) and `deterministic` take MuJoCo Warp's own.
+            of 8.2, G1 5.0 instead of 9.9). Models out of its range (solvers other than Newton, integrators "rk4" and
+            "discrete", more than 64 degrees of freedom, more than 700 to 1700 constraint rows, flexes, sleeping,
+            energies, noslip, no warm start, a dense Jacobian) and `deterministic` take MuJoCo Warp's own;
+            `World.one_kernel_unavailable` says why.
         require_graphs: refuse to run where graphs are unavailable, instead of a warning and a slow run.
         nan_guard: where to save what led to a non-finite state; `None` keeps nothing and costs nothing.
 
@@ -87,6 +89,8 @@ class SimCfg:
             value = getattr(self, field)
             if not isinstance(value, bool):
                 raise ValueError(f"{field}={value!r}: expected True or False")
+        if self.nan_guard is not None and not isinstance(self.nan_guard, NanGuardCfg):
+            raise ValueError(f"nan_guard={self.nan_guard!r}: expected a NanGuardCfg(folder=...), or None")
 
     def apply_to(self, target: mujoco.MjSpec | mujoco.MjModel) -> None:
         """Write the settings that are not `None` into the options of a spec or a model, in place."""

@@ -11,9 +11,13 @@ from ksim_rl.physics.sim_cfg import SimCfg
 MOST_UNCONDITIONAL_ITERATIONS = 10
 
 
-def takes_one_kernel(mj_model: mujoco.MjModel, sim: SimCfg, *, njmax: int) -> bool:
-    """Whether the worlds of this model solve their constraints in one kernel."""
-    return sim.one_kernel_solver and not sim.deterministic and newton.suits(mj_model, njmax=njmax)
+def one_kernel_unavailable(mj_model: mujoco.MjModel, sim: SimCfg, *, njmax: int) -> str | None:
+    """Return why the worlds of this model take MuJoCo Warp's own solver, or None where one kernel solves them."""
+    if not sim.one_kernel_solver:
+        return "sim.one_kernel_solver is False"
+    if sim.deterministic:
+        return "sim.deterministic is True"
+    return newton.unsuited(mj_model, njmax=njmax)
 
 
 def takes_conditional_nodes(warp_model: mjw.Model, *, supported: bool) -> bool:

@@ -24,11 +24,12 @@ from ksim_rl.physics.graphs import WarpGraphs
 from ksim_rl.physics.height_fields import take_over_height_fields
 from ksim_rl.physics.kernel_loading import loaded_together
 from ksim_rl.physics.masked_constants import MaskedConstants
+from ksim_rl.physics.memory import memory_for
 from ksim_rl.physics.model_checks import check_not_simple, warp_model_of
 from ksim_rl.physics.nan_guard import NanGuard, NanReport
 from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
 from ksim_rl.physics.sim_cfg import SimCfg
-from ksim_rl.physics.solver_choice import takes_conditional_nodes, takes_one_kernel
+from ksim_rl.physics.solver_choice import one_kernel_unavailable, takes_conditional_nodes
 from ksim_rl.physics.streams import checked_device, warp_scope
 from ksim_rl.physics.substeps import Substeps
 
@@ -50,6 +51,12 @@ class World(views.DataViews):
         per_world_fields: model fields that may differ between worlds, by MuJoCo's names, and "gravity" (which always
             may). What MuJoCo derives from them at compile time differs as well; call `set_const` after writing.
 
+    Attributes:
+        mj_model: the copy, with the settings of `sim`.
+        njmax, nconmax: constraint rows and contacts that a world has room for.
+        one_kernel_unavailable: why MuJoCo Warp's own solver solves the constraints, several times slower on CUDA; None
+            where one kernel does (`SimCfg.one_kernel_solver`). That one computes no `qacc_smooth`, which stays zero.
+
     Raises:
         ValueError: naming the argument, its value and what is valid.
     """
@@ -65,6 +72,10 @@ class World(views.DataViews):
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise ValueError(f"num_envs={num_envs!r}: expected a whole number >= 1")
+        if not isinstance(mj_model, mujoco.MjModel):
+            raise ValueError(f"mj_model={mj_model!r}: expected a mujoco.MjModel, as load_model returns it")
+        if sim is not None and not isinstance(sim, SimCfg):
+            raise ValueError(f"sim={sim!r}: expected a SimCfg, or None")
         self.sim = SimCfg() if sim is None else sim
         self.device = checked_device(device)
         self.num_envs = num_envs
@@ -73,11 +84,11 @@ class World(views.DataViews):
         expanded = fields_to_expand(per_world_fields)
         check_not_simple(self.mj_model, expanded)
         self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
-        self.has_one_kernel_solver = takes_one_kernel(self.mj_model, self.sim, njmax=self.njmax)
+        self.one_kernel_unavailable = one_kernel_unavailable(self.mj_model, self.sim, njmax=self.njmax)
         if self.has_one_kernel_solver:
             self.mj_model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
         self._graphs = WarpGraphs(self.device, require_graphs=self.sim.require_graphs)
-        with warp_scope(self.device):
+        with memory_for(num_envs, self.device), warp_scope(self.device):
             self.warp_model = warp_model_of(self.mj_model, dict.fromkeys(expanded, num_envs))
             take_over_height_fields(self.warp_model)
             self.warp_model.opt.warn_overflow = 0
@@ -113,8 +124,12 @@ class World(views.DataViews):
         super().__init__(self.warp_data_E)
         if self.device.type == "cuda":
             self._load_kernels()
-            self._record_resets()
-        self.refresh()
+        self._record_resets()
+
+    @property
+    def has_one_kernel_solver(self) -> bool:
+        """Whether one kernel solves the constraints."""
+        return self.one_kernel_unavailable is None
 
     @property
     def timestep(self) -> float:
@@ -175,13 +190,14 @@ class World(views.DataViews):
         if not self._substeps.refreshes_subtree_velocities:
             self._substeps.refreshes_subtree_velocities = True
             self._graphs.clear()
-            self.refresh()
+            self._record_resets()
 
     def reset(self, mask_E: Tensor) -> None:
         """Put the worlds where `mask_E` (bool [E]) is true back to the model's `qpos0`, at rest, time 0.
 
         Their acceleration-stage quantities and sensors read zero until the next step; the other rows do not change.
-        Call `refresh` afterwards (and after writing another pose), before reading poses.
+        Call `refresh` afterwards (and after writing another pose), before reading poses or stepping on: the rows of
+        equality constraints are made from body velocities, which are those of the last substep until then.
         """
         self._take_mask(mask_E)
         self._graphs.run("reset", self._launch_reset)
@@ -210,7 +226,12 @@ class World(views.DataViews):
                 most robots this is much cheaper than all worlds. On models with tendons or flexes, with actuators on
                 anything but hinges and slides, or with moved frames of bodies that equality constraints tie, it costs
                 as much.
+
+        Raises:
+            ValueError: if a field is not expanded per world.
         """
+        for name in fields:
+            self.field(name)
         groups = const_groups(fields)
         if not groups:
             return
@@ -316,7 +337,7 @@ class World(views.DataViews):
             self._launch_reset()
 
     def _record_resets(self) -> None:
-        """Record the graphs of `reset` and `refresh`, which warm-ups of outer captures run once per env step.
+        """Refresh, and record the graphs of `reset` and `refresh`, which warm-ups of outer captures run per env step.
 
         Launched one by one, resets take longer than the substeps: MuJoCo Warp makes their kernels anew each time.
         """

@@ -92,6 +92,7 @@ class AMPUpdate:
         own = {
             "learning_rate": cfg.discriminator_learning_rate,
             "weight_decay": cfg.discriminator_weight_decay,
+            "schedule": "fixed",
         }
         self.optimizer = make_optimizer(dataclasses.replace(cfg, **own), self.discriminator)
         num_steps = ppo.num_env_states // num_envs
@@ -110,6 +111,7 @@ class AMPUpdate:
         self._rollout_ET: TensorDictBase | None = None
         self._means = StepMeans(LOGGED)
         self._style = torch.zeros((), device=self.device)
+        self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
         self._run = Captured(self._update, device=self.device)
 
     @property
@@ -149,7 +151,7 @@ class AMPUpdate:
         discriminator's steps.
         """
         metrics = self.ppo.metrics()
-        in_a_row = torch.maximum(metrics["update/skipped_in_a_row"], self.guard.skipped_in_a_row)
+        in_a_row = torch.maximum(metrics["update/skipped_in_a_row"], self._longest_skip)
         return (
             metrics
             | self._means
@@ -161,12 +163,12 @@ class AMPUpdate:
         )
 
     def check(self, metrics: Mapping[str, float]) -> None:
-        """Stop a run whose gradient steps are all skipped; `metrics` are those of `metrics()`, on the host.
+        """Stop a run that skips its gradient steps; `metrics` are those of `metrics()`, on the host.
 
         Raises:
             NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped, of PPO or the discriminator.
         """
-        check_skipped_steps(metrics, self.cfg.max_skipped_steps, self.ppo.guard, self.guard)
+        check_skipped_steps(metrics, self.cfg.max_skipped_steps)
 
     def _update(self) -> None:
         rollout_ET = self._rollout_ET
@@ -178,7 +180,7 @@ class AMPUpdate:
     def _rewarded(self, rollout_ET: TensorDictBase) -> TensorDictBase:
         """Return the rollout with the sum of both rewards, which leaves the env's own as it was."""
         style_ET = style_reward(self.discriminator(_transitions(rollout_ET, *self._features))).unsqueeze(-1)
-        self._style.copy_(style_ET.mean())
+        self._style.copy_(style_ET.nanmean())
         reward_ET = rollout_ET.get(("next", "reward"))
         rewarded_ET = rollout_ET.copy()
         total_ET = self.cfg.task_coeff * reward_ET + self.cfg.style_coeff * style_ET
@@ -186,7 +188,7 @@ class AMPUpdate:
 
     def _learn_style(self, rollout_ET: TensorDictBase) -> None:
         self.replay.extend(rollout_ET.select(*self._features, *_SIGNALS))
-        net, steps, shown = self.discriminator, [], []
+        net, made, shown = self.discriminator, [], []
         for minibatch_B in self.replay.minibatches(self.cfg.num_discriminator_steps):
             drawn_B = torch.randint(
                 len(self.reference_N2L), minibatch_B.batch_size, device=self.reference_N2L.device
@@ -203,11 +205,15 @@ class AMPUpdate:
             loss = loss + self.cfg.logit_decay * net.logit_weight.square().sum()
             _, skipped = descend(loss, self.optimizer, max_grad_norm=self.cfg.max_grad_norm)
             self.guard.count_(skipped)
-            steps.append(logged | {"skipped": skipped})
+            made.append(
+                logged | {"skipped": skipped, "skipped_in_a_row": self.guard.skipped_in_a_row.clone()}
+            )
             shown += [reference_B2L, policy_B2L]
         # Only now, so that all steps see the statistics that the rollout was scored with.
         net.normalizer.update(torch.cat(shown))
-        self._means.take_(in_columns(steps))
+        steps = in_columns(made)
+        self._means.take_(steps)
+        self._longest_skip.copy_(steps["skipped_in_a_row"].max())
 
     def state_dict(self) -> state_tree.State:
         """Return PPO's state, and beside it the discriminator with its optimizer and its replay."""

@@ -30,4 +30,10 @@ class CheckpointHook(Hook):
     def at_end(self, trainer: Trainer) -> None:
         """Save the end, which must not fail in silence."""
         if trainer.folder is not None and trainer.saved_at != trainer.iteration:
-            trainer.save()
+            try:
+                trainer.save()
+            except OSError as error:
+                raise OSError(
+                    f"{trainer.folder}: no checkpoint of the end, iteration {trainer.iteration}: {error}; make room or "
+                    "let it be written, and resume the run from the last one"
+                ) from error

@@ -158,12 +158,12 @@ class DistillationUpdate:
         }
 
     def check(self, metrics: Mapping[str, float]) -> None:
-        """Stop a run whose gradient steps are all skipped; `metrics` are those of `metrics()`, on the host.
+        """Stop a run that skips its gradient steps; `metrics` are those of `metrics()`, on the host.
 
         Raises:
             NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped.
         """
-        check_skipped_steps(metrics, self.cfg.max_skipped_steps, self.guard)
+        check_skipped_steps(metrics, self.cfg.max_skipped_steps)
 
     @property
     def _teacher_keys(self) -> list[Any]:

@@ -15,11 +15,6 @@ class InterruptRequest:
         self.signal: signal.Signals | None = None
         self._previous: dict[signal.Signals, object] = {}
 
-    @property
-    def exit_code(self) -> int:
-        """The shell's convention: 128 + the signal's number (130 for SIGINT, 143 for SIGTERM); 0 without one."""
-        return 0 if self.signal is None else 128 + int(self.signal)
-
     def __bool__(self) -> bool:
         return self.signal is not None
 

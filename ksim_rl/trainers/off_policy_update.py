@@ -126,12 +126,12 @@ class OffPolicyUpdate:
         }
 
     def check(self, metrics: Mapping[str, float]) -> None:
-        """Stop a run whose gradient steps are all skipped; `metrics` are those of `metrics()`, on the host.
+        """Stop a run that skips its gradient steps; `metrics` are those of `metrics()`, on the host.
 
         Raises:
             NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped.
         """
-        check_skipped_steps(metrics, self.cfg.max_skipped_steps, self.guard)
+        check_skipped_steps(metrics, self.cfg.max_skipped_steps)
 
     def _store(self) -> None:
         rollout_ET = self._rollout_ET

@@ -181,12 +181,12 @@ class PPOUpdate:
         )
 
     def check(self, metrics: Mapping[str, float]) -> None:
-        """Stop a run whose gradient steps are all skipped; `metrics` are those of `metrics()`, on the host.
+        """Stop a run that skips its gradient steps; `metrics` are those of `metrics()`, on the host.
 
         Raises:
             NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped.
         """
-        check_skipped_steps(metrics, self.cfg.max_skipped_steps, self.guard)
+        check_skipped_steps(metrics, self.cfg.max_skipped_steps)
 
     def _update(self) -> None:
         assert self._rollout_ET is not None
@@ -200,7 +200,7 @@ class PPOUpdate:
         self._means.take_(steps)
         self._longest_skip.copy_(steps["skipped_in_a_row"].max())
         if self._scale_keys:
-            self._std.copy_(torch.stack([rollout_ET.get(key).mean() for key in self._scale_keys]).mean())
+            self._std.copy_(torch.stack([rollout_ET.get(key).nanmean() for key in self._scale_keys]).mean())
         # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
         update_normalizers(rollout_ET, self.actor, self.critic)
 

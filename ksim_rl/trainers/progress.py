@@ -1,6 +1,8 @@
 """Progress of a run: one live panel on a terminal, plain lines in a pipe."""
 
+import sys
 from collections.abc import Mapping
+from contextlib import suppress
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -23,6 +25,17 @@ SHOWN = (
 )
 
 
+class _OwnConsole(Console):
+    """Goes on in silence where the pipe it writes to is closed; rich's own console would end the process."""
+
+    def on_broken_pipe(self) -> None:
+        try:
+            super().on_broken_pipe()
+        except SystemExit:
+            with suppress(OSError):  # stderr may be the same pipe
+                print("ksim-rl: nobody reads the output any more; the run goes on", file=sys.stderr)
+
+
 class RunProgress:
     """Shows iteration, speed, reward, episode length, losses and the time left.
 
@@ -40,7 +53,7 @@ class RunProgress:
         self, total: int, *, done: int = 0, console: Console | None = None, enabled: bool = True
     ) -> None:
         self.total, self.done = total, done
-        self.console = console or Console(highlight=False)
+        self.console = console or _OwnConsole(highlight=False)
         self._enabled = enabled
         self._status = ""
         self._metrics: dict[str, float] = {}

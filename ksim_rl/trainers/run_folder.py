@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from ksim_rl.envs.innermost import innermost
 from ksim_rl.envs.transforms import observation_columns
+from ksim_rl.physics.memory import memory_for
 from ksim_rl.trainers import checkpoint, video
 from ksim_rl.trainers.build import build, build_env, load_actor
 from ksim_rl.trainers.columns import check_columns
@@ -47,18 +48,21 @@ def run(
     What cannot be drawn (no OpenGL) is said in one line of `progress`.
 
     Raises:
-        ValueError: when the checkpoint to resume or start from belongs to another config.
+        ValueError: when the checkpoint to resume or start from belongs to another config, or memory does not suffice
+            for the number of envs.
     """
     run_folder.mkdir(parents=True, exist_ok=True)
     checkpoint.remove_leftovers(run_folder / "checkpoint")
-    try:
-        trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
-    except Exception:
-        with suppress(OSError):
-            run_folder.rmdir()  # only where nothing is in it yet
-        raise
-    (run_folder / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
-    outcome = trainer.train(progress)
+    # The graphs that the first iterations record take memory as well.
+    with memory_for(cfg.num_envs, cfg.resolved_device()):
+        try:
+            trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
+        except Exception:
+            with suppress(OSError):
+                run_folder.rmdir()  # only where nothing is in it yet
+            raise
+        (run_folder / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
+        outcome = trainer.train(progress)
     if outcome.evaluation is not None:
         write_evaluation(
             run_folder, outcome.evaluation, iteration=outcome.iteration, solved_at=trainer.solved_at
@@ -138,12 +142,13 @@ def _draw_curves(
 ) -> None:
     table = run_folder / "metrics.csv"
     if not table.exists():
-        note("no learning curves: they are drawn from metrics.csv, which needs logger.csv=true")
+        reason = "which has no rows yet" if cfg.logger.csv else "which needs logger.csv=true"
+        note(f"no learning curves: they are drawn from metrics.csv, {reason}")
         return
     from ksim_rl.trainers import curves  # Matplotlib takes half a second to import
 
     title = f"{cfg.task_name}: {cfg.num_envs} envs on {cfg.device}, seed {cfg.seed}"
     try:
         curves.draw(table, run_folder / CURVES, title=title, solved_at=solved_at)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         note(f"no learning curves: {error}")

@@ -68,10 +68,11 @@ def copy_into(live: Mapping[str, Tensor], saved: Mapping[str, Any], *, what: str
     for name in live:
         if name not in saved:
             raise ValueError(f"{what}: the checkpoint has no {name!r}")
-    for name, tensor in saved.items():
+    for name in saved:
         if name not in live:
             raise ValueError(f"{what}: the checkpoint's {name!r} is unknown to this run")
-        have, want = _describe(tensor), _describe(live[name])
+    for name, tensor in live.items():  # in the order of the layers, which a file does not keep
+        have, want = _describe(saved[name]), _describe(tensor)
         if have != want:
             raise ValueError(f"{what}: {name!r} is {have} in the checkpoint and {want} in this run")
     with torch.no_grad():

@@ -53,16 +53,16 @@ def load_teacher(path: Path, env: EnvBase, *, cfg: RunCfg, make_policy: MakePoli
         make_policy: builds the policy of a run.
 
     Raises:
-        CheckpointError: when there is none, or it is damaged.
-        ValueError: naming the observations or the tensor that this env does not have, or has otherwise.
+        ValueError: when there is none, or it is damaged; naming the observations or the tensor that this env does not
+            have, or has otherwise.
     """
-    saved = checkpoint.load(checkpoint.latest(path))
-    state = {
-        "actor": saved.state["update"]["actor"],
-        "config": json.dumps(saved.config),
-        "columns": json.dumps(saved.state["observation_columns"]),
-    }
     try:
+        saved = checkpoint.load(checkpoint.latest(path))
+        state = {
+            "actor": saved.state["update"]["actor"],
+            "config": json.dumps(saved.config),
+            "columns": json.dumps(saved.state["observation_columns"]),
+        }
         return restored_teacher(state, env, cfg=cfg, make_policy=make_policy)
     except ValueError as error:
         raise ValueError(f"objective.teacher={str(path)!r}: {error}") from error

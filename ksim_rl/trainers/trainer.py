@@ -1,7 +1,7 @@
 """The training loop."""
 
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -127,7 +127,7 @@ class Trainer:
                     hook.at_end(self)
             finally:
                 for logger in self.loggers:
-                    logger.close()
+                    self._ask(logger, logger.close)
         return self._outcome()
 
     def iterate(self) -> None:
@@ -195,12 +195,26 @@ class Trainer:
     def _write(self, metrics: dict[str, float], iteration: int) -> None:
         env_states = iteration * self.update.num_env_states
         for logger in self.loggers:
-            logger.log_metrics(metrics, env_states)
+            self._ask(logger, logger.log_metrics, metrics, env_states)
         self.progress.update(
             iteration,
             {"env_states": env_states, **metrics},
             seconds_left=self.clock.seconds_left(self.cfg.num_iterations - iteration),
         )
+
+    def _ask(self, logger: MetricLogger, call: Callable[..., Any], *arguments: Any) -> None:
+        """Call a logger; a full disk or a server that is gone costs what it would have written, not the run."""
+        try:
+            call(*arguments)
+        except Exception as error:
+            name = type(logger).__name__
+            if name not in self._warned:
+                self._warned.add(name)
+                reason = " ".join(f"{type(error).__name__}: {error}".split())
+                self.progress.note(
+                    f"warning: the logger {name} failed at iteration {self.iteration}: {reason}; the run goes on "
+                    "(said once)"
+                )
 
     def _look_at_target(self) -> None:
         targets = self.cfg.stop_at or {}
@@ -284,6 +298,11 @@ class Trainer:
             self.update.load_weights(state["update"])
         except KeyError as error:
             raise ValueError(f"{path}: of another algorithm: it has no network {error}") from error
+        except ValueError as error:
+            raise ValueError(
+                f"{path}: its networks are others: {error}; choose objective and modules as the "
+                "config.yaml of its run has them"
+            ) from error
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next iteration depends on: tensors and plain data, nested."""

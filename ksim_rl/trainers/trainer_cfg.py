@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from ksim_rl.checks import check_choice, check_in_range
 
 MATMUL_PRECISIONS = ("highest", "high", "medium")
+MOST_THREADS = 1024
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +64,7 @@ class TrainerCfg:
         for name, value in (self.stop_at or {}).items():
             check_in_range(f"stop_at.{name}", value)
         if self.num_threads is not None:
-            check_in_range("num_threads", self.num_threads, low=1)
+            # Where threads cannot be made, torch ends the process instead of raising.
+            check_in_range("num_threads", self.num_threads, low=1, high=MOST_THREADS)
         check_choice("matmul_precision", self.matmul_precision, MATMUL_PRECISIONS)
         check_in_range("video_s", self.video_s, low=0.0, low_open=True)

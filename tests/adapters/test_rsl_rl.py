@@ -80,6 +80,21 @@ def test_time_outs_and_the_log_of_episodes() -> None:
     vec_env.close()
 
 
+def test_a_failure_at_the_last_step_is_no_time_out() -> None:
+    # The pole hangs from the start, which is a fall.
+    overrides = [
+        "task.episode_length_s=0.01",
+        "task.events.reset.angle=3.1",
+        "task.events.reset.angle_range=3.0",
+    ]
+    vec_env = RslRlVecEnv(envs.make("cartpole_balance", num_envs=64, seed=0, overrides=overrides))
+    *_, done_E, extras = vec_env.step(torch.zeros(64, 1))
+    fallen_E = vec_env.unwrapped.view.terminated_E
+    assert done_E.all() and fallen_E.any() and not fallen_E.all()
+    assert torch.equal(extras["time_outs"], ~fallen_E)
+    vec_env.close()
+
+
 def test_rsl_rl_spreads_the_time_outs_through_the_clock() -> None:
     vec_env = RslRlVecEnv(envs.make("cartpole_balance", num_envs=2, seed=0))
     vec_env.get_observations()

@@ -5,6 +5,7 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecMonitor
+from torchrl.data import Bounded
 
 from ksim_rl import envs
 from ksim_rl.adapters.stable_baselines3 import StableBaselines3VecEnv
@@ -37,11 +38,15 @@ def test_one_observation_is_a_box_and_several_are_a_dict() -> None:
     assert StableBaselines3VecEnv(CounterEnv(LENGTHS), keys=["count"]).observation_space.shape == (1,)
 
 
-def test_unbounded_actions_get_the_limit() -> None:
+def test_unbounded_actions_get_the_limit_and_others_keep_theirs() -> None:
     env = StableBaselines3VecEnv(
         envs.make("cartpole_balance", num_envs=2, seed=0), keys=["actor"], action_limit=2.0
     )
     assert (env.action_space.low, env.action_space.high) == (-2.0, 2.0)
+    bounded = CounterEnv(LENGTHS)
+    bounded.action_spec = Bounded(-3.0, 5.0, bounded.action_spec.shape)
+    space = StableBaselines3VecEnv(bounded, keys=["count"]).action_space
+    assert space.low.tolist() == [-3.0, -3.0] and space.high.tolist() == [5.0, 5.0]
     with pytest.raises(ValueError, match="action_limit"):
         StableBaselines3VecEnv(CounterEnv(LENGTHS), action_limit=0.0)
     with pytest.raises(NotImplementedError, match="change its config"):

@@ -51,6 +51,18 @@ def test_a_report_says_what_ran_where_and_with_what(tmp_path: Path):
     assert "not installed" not in (saved["versions"]["mujoco"], saved["versions"]["warp-lang"])
 
 
+def test_figures_of_another_module_keep_their_own_run(tmp_path: Path):
+    write(tmp_path, {"cpu/a/ms": 2.0})
+    path = report.write(
+        "speed", figures={"cpu/a/cold_s": 9.0}, device=CPU, module="benchmarks.start", folder=tmp_path
+    )
+    runs = json.loads(path.read_text())["runs"]
+    assert {group: run["command"].split()[2] for group, run in runs.items()} == {
+        "cpu/a": "benchmarks.speed",
+        "cpu/a/start": "benchmarks.start",
+    }
+
+
 def test_labels_are_short(monkeypatch):
     assert report.device_label(CPU) == "cpu"
     for name, label in (("NVIDIA H200", "h200"), ("NVIDIA A100-SXM4-80GB", "a100"), ("Tesla T4", "t4")):

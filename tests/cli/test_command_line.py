@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from ksim_rl.cli import main
+from ksim_rl.cli import main, run_commands
 
 
 def run(capsys, *arguments):
@@ -33,6 +33,9 @@ def run(capsys, *arguments):
         ("seed=1,2", "add --multirun"),
         ("data.num_minibatches=[1", "does not parse"),
         ("just_a_word", "does not parse"),
+        ("task_name=cartpole_swingup", "the name comes with the task; choose that with task=name"),
+        ("~logger", "a run needs each group; choose another with logger=name: local, "),
+        ("trainer.num_threads=100000", "trainer.num_threads=100000: expected a finite number in [1, 1024]"),
     ],
 )
 def test_a_wrong_override_is_one_line_with_the_way_out(capsys, tmp_path, monkeypatch, override, message):
@@ -53,10 +56,38 @@ def test_every_job_of_a_sweep_is_checked_before_the_first_starts(capsys, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_traceback_is_shown_on_request(monkeypatch):
+def test_a_traceback_is_shown_on_request(capsys, monkeypatch):
     monkeypatch.setenv("KSIM_RL_TRACEBACK", "1")
-    with pytest.raises(ValueError, match="did you mean 'num_envs'"):
-        main.main(["train", "nun_envs=3"])
+    code, output = run(capsys, "train", "nun_envs=3")
+    assert code == 2 and "Traceback" in output.err and "did you mean 'num_envs'" in output.err
+
+
+def test_an_error_that_nobody_foresaw_shows_its_traceback_and_is_not_an_unsolved_run(capsys, monkeypatch):
+    def fault(_):
+        raise KeyError("weight")
+
+    monkeypatch.setattr(run_commands, "_envs", fault)
+    code, output = run(capsys, "envs")
+    assert code == 3
+    assert "in fault" in output.err and output.err.endswith("ksim-rl: error: KeyError: 'weight'\n")
+
+
+def test_a_config_that_hydra_cannot_find_is_one_line(capsys):
+    code, output = run(capsys, "train", "--config-name", "nowhere")
+    assert code == 2
+    assert "Cannot find primary config 'nowhere'" in output.err and output.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        (("--seconds", "inf"), "--seconds=inf: expected a finite number"),
+        (("--output", "clip.txt"), "--output clip.txt: expected a file that ends in .mp4 or .gif"),
+    ],
+)
+def test_a_video_that_cannot_be_is_refused_before_a_policy_is_read(capsys, option, message):
+    code, output = run(capsys, "play", "nowhere", *option)
+    assert code == 2 and message in output.err
 
 
 def test_cfg_job_prints_the_composed_config(capsys, tmp_path, monkeypatch):

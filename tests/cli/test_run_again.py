@@ -5,7 +5,7 @@ import csv
 import pytest
 import torch
 
-from ksim_rl.cli import main
+from ksim_rl.cli import main, train
 from ksim_rl.trainers import checkpoint
 
 SMALL = (
@@ -74,6 +74,31 @@ def test_a_wrong_override_of_a_run_is_one_line(first, tmp_path, monkeypatch, cap
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("elsewhere/config.yaml", "task_name: a\ntask: {}\n", "expected a run folder"),
+        ("config.yaml", "foo: 1", "expected a run folder"),
+        ("config.yaml", "a: [1", "config.yaml: cannot be read: "),
+        ("config.yaml", "task_name: a\ntask: null", "config.yaml: task=None: expected the config of an env"),
+    ],
+)
+def test_a_folder_without_a_run_is_refused_instead_of_ignored(tmp_path, capsys, name, text, message):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text(text)
+    assert run("--config-dir", str(tmp_path), f"hydra.run.dir={tmp_path / 'run'}") == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_config_groups_of_ones_own_lie_beside_ours(tmp_path, capsys):
+    (tmp_path / "logger").mkdir()
+    (tmp_path / "logger" / "quiet.yaml").write_text("csv: false\ntensorboard: false\n")
+    assert run("--config-dir", str(tmp_path), "logger=quiet", "--cfg", "job", "--package", "logger") == 0
+    assert "csv: false" in capsys.readouterr().out
+
+
 def test_a_new_run_starts_from_the_weights_of_another(first, tmp_path):
     frozen = (
         "objective.schedule=fixed",
@@ -103,6 +128,25 @@ def test_weights_for_other_observations_are_refused_with_the_names(first, tmp_pa
     assert not (tmp_path / "run" / "metrics.csv").exists()
 
 
+def test_weights_of_other_networks_are_refused_with_the_way_out(first, tmp_path, capsys):
+    other = "modules.actor.hidden_dims=[8]"
+    assert run(*SMALL, f"checkpoint={first}", other, f"hydra.run.dir={tmp_path}") == 2
+    error = capsys.readouterr().err
+    assert f"{first}: its networks are others: actor: " in error
+    assert (
+        "'module.0.module.trunk.0.weight' is float32[16, 5] in the checkpoint and float32[8, 5] in this run"
+        in error
+    )
+
+
+def test_a_run_names_its_teacher_so_that_it_is_found_from_anywhere(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(train, "run_and_report", lambda cfg, folder: seen.append(cfg) or 0)
+    monkeypatch.chdir(tmp_path)
+    assert run("objective=distillation", "objective.teacher=runs/expert") == 0
+    assert seen[0].objective.teacher == str(tmp_path / "runs" / "expert")
+
+
 def test_weights_that_are_not_there_are_one_line(tmp_path, capsys):
     code = run(*SMALL, f"checkpoint={tmp_path / 'nowhere'}", f"hydra.run.dir={tmp_path / 'run'}")
     assert code == 2
@@ -117,6 +161,18 @@ def test_a_sweep_of_a_run_made_again(first, tmp_path):
         for config in (checkpoint.load(checkpoint.latest(f)).config for f in tmp_path.iterdir() if f.is_dir())
     )
     assert found == [(1, 0.1), (1, 0.2)]
+
+
+def test_each_job_of_a_sweep_that_fails_says_so_and_the_others_run(first, tmp_path, capsys):
+    sources = f"checkpoint={tmp_path / 'none'},{first},{tmp_path / 'nowhere'}"
+    assert run("--multirun", *SMALL, sources, f"hydra.sweep.dir={tmp_path / 'sweep'}") == 2
+    errors = capsys.readouterr().err.splitlines()
+    assert [error.split(" (")[0] for error in errors] == [
+        "ksim-rl: error: job 0",
+        "ksim-rl: error: job 2",
+    ]
+    assert "none: no checkpoint here" in errors[0] and "nowhere: no checkpoint here" in errors[1]
+    assert checkpoint.load(checkpoint.latest(tmp_path / "sweep" / "1_cartpole_balance")).iteration == 2
 
 
 @pytest.mark.full

@@ -8,7 +8,7 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from ksim_rl import envs
-from ksim_rl.collectors import RolloutCollector
+from ksim_rl.collectors import CollectorCfg, RolloutCollector
 from ksim_rl.envs.mdp import JointPos, JointVel
 from ksim_rl.envs.transforms import UniformNoise
 from ksim_rl.testing import count_syncs
@@ -109,6 +109,14 @@ def test_a_rollout_needs_a_length():
         RolloutCollector(noisy_env(), RandomPolicy(), rollout_length=0)
 
 
+@pytest.mark.parametrize(
+    ("field", "value"), [("warmup", 0), ("warmup", True), ("require_graphs", "no"), ("stagger_episodes", 1)]
+)
+def test_options_of_another_kind_are_refused(field, value):
+    with pytest.raises(ValueError, match=f"{field}={value!r}: expected"):
+        CollectorCfg(**{field: value})
+
+
 def test_a_rollout_never_makes_the_host_wait():
     collector = RolloutCollector(noisy_env(), RandomPolicy(), rollout_length=STEPS)
     collector.collect()
@@ -130,3 +138,16 @@ def test_state_dict_continues_bit_exactly():
     torch.manual_seed(1)
     actual = twin.collect()
     assert all(torch.equal(actual[key], expected[key]) for key in expected.keys(True, True))
+
+
+def test_a_state_of_other_shapes_or_names_is_refused():
+    collector = RolloutCollector(noisy_env(), RandomPolicy(), rollout_length=2)
+    collector.reset()
+    state = collector.state_dict()
+    with pytest.raises(
+        ValueError, match=r"'actor' is torch.float32 of shape \(1, .*but this env has .*\(4, "
+    ):
+        collector.load_state_dict(state | {"actor": state["actor"][:1] + 1.0})
+    with pytest.raises(ValueError, match="unknown \\['other'\\]"):
+        collector.load_state_dict(state | {"other": state["actor"]})
+    assert torch.equal(collector.state_dict()["actor"], state["actor"])

@@ -58,8 +58,38 @@ def test_the_highest_priority_of_a_repeated_index_counts_and_bad_ones_do_not_spr
     sampler = PrioritySampler(4)
     sampler.extend(torch.arange(4))
     sampler.update_priority(torch.tensor([1, 1, 2]), torch.tensor([3.0, 1.0, float("nan")]))
-    torch.testing.assert_close(sampler.state_dict()["priority"], torch.tensor([1.0, 3.0, 0.0, 1.0]))
+    torch.testing.assert_close(sampler.state_dict()["priority"], torch.tensor([1.0, 3.0, 3.0, 1.0]))
     assert sampler.state_dict()["highest"] == 3.0
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -1.0])
+def test_a_bad_priority_is_the_default_one(bad):
+    sampler = PrioritySampler(3)
+    sampler.extend(torch.arange(3))
+    sampler.update_priority(torch.tensor([1]), bad)
+    assert sampler.state_dict()["priority"].tolist() == [1.0, 1.0, 1.0]
+    sampler.update_priority(torch.tensor([0, 1, 2]), torch.tensor([0.25, bad, 0.0]))
+    assert sampler.state_dict()["priority"].tolist() == [0.25, 0.25, 0.0]
+    assert sampler.state_dict()["highest"] == 0.25
+
+
+def test_priorities_of_zero_are_drawn_alike():
+    torch.manual_seed(0)
+    sampler = PrioritySampler(64)
+    buffer = _buffer(sampler)
+    buffer.update_priority(torch.arange(50), torch.zeros(50))
+    data, info = buffer.sample(return_info=True)
+    assert (torch.bincount(data["number"], minlength=50) - 400).abs().max() <= 2
+    torch.testing.assert_close(info["priority_weight"], torch.ones(20_000))
+
+
+def test_a_storage_of_two_dims_is_refused():
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(24, ndim=2), sampler=PrioritySampler(24), batch_size=8
+    )
+    buffer.extend(TensorDict({"number": torch.arange(24).view(4, 6)}, [4, 6]))
+    with pytest.raises(ValueError, match="ndim=2"):
+        buffer.sample()
 
 
 def test_in_a_ring_only_env_states_are_drawn_without_syncs():
@@ -85,6 +115,18 @@ def test_in_a_ring_only_env_states_are_drawn_without_syncs():
         torch.manual_seed(3)
         draws.append(next(one.minibatches(1)))
     assert (draws[0] == draws[1]).all()
+
+
+def test_a_ring_without_a_finite_env_state_gives_masked_rows_of_finite_weight():
+    sizes = ReplayCfg(
+        num_env_states_per_minibatch=8, num_minibatches=1, num_steps=2, capacity=20, prioritized=True
+    )
+    ring = ReplayRing(sizes, num_envs=NUM_ENVS, observations=["actor", "critic"])
+    rollout = _History().rollout(2)
+    rollout["next", "reward"].fill_(torch.nan)
+    ring.extend(rollout)
+    (minibatch,) = ring.minibatches(1)
+    assert not minibatch[MASK_KEY].any() and minibatch["priority_weight"].isfinite().all()
 
 
 @pytest.mark.parametrize("field", [{"alpha": -1.0}, {"beta": -1.0}, {"eps": 0.0}])

@@ -49,13 +49,14 @@ All tasks that come with the package: `ksim-rl train task=<task>`, or `envs.make
 * **episode**: its length in simulated time, if nothing ends it earlier.
 * **solved at**: the mean evaluation return at which training may stop, where the task has one.
 * **env states/s**: of captured rollouts of {NUM_ENVS} envs on one GPU, with the actor that training gives the task, its
-  first random actions, and resets. **of physics**: that, relative to the physics alone: the substeps of an env step as
-  one graph, from states of the same run.
+  first random actions, and resets. **of physics**: that, relative to MuJoCo Warp's physics alone: the substeps of an
+  env step as one graph, from states of the same run.
 * **syncs**: times that the host waits for the device in a step with its reset. **`check_env`**: the result of
   `ksim_rl.testing.check_env`.
 """
-TAIL = """The last four are measured: `python -m benchmarks.tasks device=cuda num_envs=4096`, on an H200. Physics alone is MuJoCo
-Warp's own. Rows below 1 of it are of a version before our solver, and were not measured again since."""
+TAIL = f"""The last four columns are measured on an H200: `python -m benchmarks.tasks device=cuda num_envs={NUM_ENVS}`.
+Rows whose ratio is below 1 were measured before this package had a constraint solver of its own: they are slower than
+what you will see."""
 
 
 def robots(scene: SceneCfg) -> str:

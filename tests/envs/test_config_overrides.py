@@ -107,3 +107,21 @@ def _grows(value):
 
 def test_every_field_of_the_config_is_a_key_of_the_tree():
     assert tree_of("cartpole_balance").keys() == set(ManagerBasedRlEnvCfg.__dataclass_fields__)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["task.rewards=[]"], r"override task\.rewards=\[\]"),
+        (["task.decimation=0"], r"task\.decimation=0: expected a whole number"),
+        (
+            ["task.actions.force.joints='slide_.*'"],
+            r"actions\.force: no joint matches 'slide_\.\*'.*'slider'",
+        ),
+        (["task.events.reset.mode=interval"], r"task\.events\.reset\.interval_range_s=None"),
+        (["task.viewer.body=nope"], r"viewer\.body='nope': valid: cart, pole"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_place(overrides, message):
+    with pytest.raises(ValueError, match=message):
+        envs.make("cartpole_balance", num_envs=2, overrides=overrides, render_mode="rgb_array")

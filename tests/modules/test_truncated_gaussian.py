@@ -40,6 +40,22 @@ def test_equals_torchrl():
     torch.testing.assert_close(ours.mode, stock.mode)
 
 
+def test_log_prob_and_its_gradients_equal_torchs_also_on_the_bounds():
+    low, high = LOW.double(), HIGH.double()
+    loc = (low + (high - low) * torch.rand(6, 3).double()).requires_grad_()
+    scale = (torch.rand(6, 3).double() + 0.1).requires_grad_()
+    gaussian = Normal(loc, scale)
+    for value in (low, 0.3 * low + 0.7 * high, high):
+        expected = gaussian.log_prob(value) - (gaussian.cdf(high) - gaussian.cdf(low)).log()
+        log_prob = TruncatedGaussian(loc, scale, low, high).log_prob(value)
+        torch.testing.assert_close(log_prob, expected.sum(-1), rtol=1e-9, atol=1e-9)
+        gradients = [
+            torch.autograd.grad(total.sum(), (loc, scale), retain_graph=True)
+            for total in (log_prob, expected)
+        ]
+        torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize(("loc", "scale"), CASES)
 def test_density_entropy_and_moments_equal_numerical_integrals(loc, scale):
     dist = _single(loc, scale)

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import distributions, nn
-from torchrl.data import Categorical
+from torchrl.data import Bounded, Categorical, Composite
 
 from ksim_rl.modules import ActorCfg, make_actor
 from ksim_rl.objectives import DistillationCfg, DistillationLoss
@@ -109,6 +109,37 @@ def test_choices_are_compared_by_their_divergence():
         DistillationLoss(actor, teacher, loss="mse")
 
 
+def test_parts_of_an_action_are_compared_side_by_side():
+    box = Bounded(-2.0, 1.0, (2,))
+    cfg = {"hidden_dims": (8,), "distribution": "tanh_gaussian", "output_gain": 1.0}
+
+    def both(**parts):
+        spec = Composite(action=Composite(parts))
+        return (
+            make_actor(ActorCfg(**cfg), obs_dim=3, action_spec=spec),
+            make_actor(ActorCfg(in_keys=("privileged",), **cfg), obs_dim=5, action_spec=spec),
+        )
+
+    actor, teacher = both(arm=box, leg=Bounded(-1.0, 3.0, (3,)))
+    data = rollout(actor)
+    with torch.no_grad():
+        errors = [
+            actor.get_dist(data.clone()).dists["action", part].median
+            - teacher.get_dist(data.clone()).dists["action", part].median
+            for part in ("arm", "leg")
+        ]
+    squares = torch.cat(errors, -1).square()
+    loss = DistillationLoss(actor, teacher, loss="mse")
+    labelled = loss.label(data)
+    out = loss(labelled.select(*loss.dataset_keys).reshape(-1))
+    torch.testing.assert_close(out["loss_distillation"].detach(), squares.mean())
+    torch.testing.assert_close(loss.action_error(labelled), squares.mean().sqrt())
+    mixed = both(arm=box, grip=Categorical(3))
+    with pytest.raises(ValueError, match="choices, which have no distance; use loss='kl'"):
+        DistillationLoss(*mixed, loss="mse")
+    assert DistillationLoss(*mixed).action_error(labelled) == 0.0
+
+
 def test_a_teacher_without_a_distribution_has_no_divergence():
     actor, _ = networks()
     teacher = TensorDictModule(nn.Linear(5, A), in_keys=["privileged"], out_keys=["action"])
@@ -151,6 +182,7 @@ def test_nothing_waits_for_the_device_and_the_teacher_does_not_learn():
         ({"max_grad_norm": 0.0}, "max_grad_norm"),
         ({"betas": (0.9, 1.0)}, "betas"),
         ({"learning_rate_min": 1.0}, "exceeds learning_rate_max"),
+        ({"learning_rate": 0.05, "schedule": "adaptive"}, "learning_rate=0.05"),
     ],
 )
 def test_values_out_of_range_are_refused(fields, message):

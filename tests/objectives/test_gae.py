@@ -210,5 +210,11 @@ def test_refusals_name_the_signal():
     with pytest.raises(ValueError, match=r"'reward'\) \(8, 6\)"):
         data = rollout(actor)
         gae(data.set(("next", "reward"), data["next", "reward"].squeeze(-1)))
+    # Flags of another shape would spread over values: [3, 3] with [3, 3, 1] gives [3, 3, 3].
+    for terminated in (torch.zeros(3, 3, dtype=torch.bool), torch.zeros(3, 3, 2, dtype=torch.bool)):
+        data = rollout(actor, num_envs=3, length=3)
+        shape = ", ".join(map(str, terminated.shape))
+        with pytest.raises(ValueError, match=rf"'terminated'\) \({shape}\)"):
+            gae(data.set(("next", "terminated"), terminated))
     with pytest.raises(ValueError, match="time_dim=2.*2 batch dims"):
         gae(rollout(actor), time_dim=2)

@@ -29,6 +29,8 @@ def test_defaults_are_valid_and_frozen():
         ("critic_coeff", float("nan")),
         ("normalize_advantage", "data_set"),
         ("learning_rate", 0.0),
+        ("learning_rate", 1e-6),
+        ("learning_rate", 0.02),
         ("schedule", "linear"),
         ("desired_kl", 0.0),
         ("max_grad_norm", 0.0),
@@ -44,3 +46,7 @@ def test_refusals_name_the_field_and_the_value(field, value):
         PPOCfg(**{field: value})
     shown = value[-1] if isinstance(value, tuple) and len(value) == 2 else value
     assert str(shown) in str(error.value)
+
+
+def test_a_fixed_learning_rate_has_no_bounds():
+    assert PPOCfg(learning_rate=0.5, schedule="fixed").learning_rate == 0.5

@@ -25,17 +25,43 @@ def _parts(cfg):
     return actor, critic, make_loss(cfg, actor, critic), make_optimizer(cfg, actor, critic)
 
 
-def test_equals_a_step_written_with_stock_parts():
-    cfg = PPOCfg(schedule="fixed", max_grad_norm=0.5, learning_rate=3e-3)
+OTHER_THAN_DEFAULT = {
+    "clip_epsilon": 0.1,
+    "clip_value": 0.3,
+    "entropy_coeff": 0.05,
+    "critic_coeff": 0.7,
+    "normalize_advantage": "minibatch",
+    "betas": (0.8, 0.95),
+    "adam_eps": 1e-5,
+    "weight_decay": 0.02,
+}
+
+
+@pytest.mark.parametrize("fields", [{}, OTHER_THAN_DEFAULT], ids=["defaults", "others"])
+def test_equals_a_step_written_with_stock_parts(fields):
+    cfg = PPOCfg(schedule="fixed", max_grad_norm=0.5, learning_rate=3e-3, **fields)
     torch.manual_seed(1)
     actor, critic, loss, optimizer = _parts(cfg)
     torch.manual_seed(1)
     stock_actor, stock_critic, *_ = _parts(cfg)
     data = [minibatch(actor, critic, drift=0.0) for _ in range(3)]
     stock_loss = objectives.ClipPPOLoss(
-        stock_actor, stock_critic, clip_value=0.2, entropy_coeff=0.01, loss_critic_type="l2"
+        stock_actor,
+        stock_critic,
+        clip_epsilon=fields.get("clip_epsilon", 0.2),
+        clip_value=fields.get("clip_value", 0.2),
+        entropy_coeff=fields.get("entropy_coeff", 0.01),
+        critic_coeff=fields.get("critic_coeff", 1.0),
+        normalize_advantage=bool(fields),
+        loss_critic_type="l2",
     )
-    stock_optimizer = torch.optim.Adam(stock_loss.parameters(), lr=3e-3)
+    stock_optimizer = torch.optim.Adam(
+        stock_loss.parameters(),
+        lr=3e-3,
+        betas=fields.get("betas", (0.9, 0.999)),
+        eps=fields.get("adam_eps", 1e-8),
+        weight_decay=fields.get("weight_decay", 0.0),
+    )
     for minibatch_B in data:
         metrics = ppo_step(loss, optimizer, minibatch_B.clone(), cfg=cfg)
         out = stock_loss(minibatch_B.clone())
@@ -61,6 +87,19 @@ def test_metrics_are_detached_scalars_with_the_documented_names():
     for value in metrics.values():
         assert value.shape == ()
         assert not value.requires_grad
+
+
+def test_bounds_and_thresholds_are_those_of_the_config():
+    bounds = {"learning_rate_min": 8e-4, "learning_rate_max": 1.2e-3, "desired_kl": 0.01}
+    for drift, expected in ((0.3, 8e-4), (1e-4, 1.2e-3)):
+        cfg = PPOCfg(**bounds)
+        actor, critic, loss, optimizer = _parts(cfg)
+        metrics = ppo_step(loss, optimizer, minibatch(actor, critic, drift=drift), cfg=cfg)
+        assert metrics["learning_rate"].item() == pytest.approx(expected, rel=1e-6)
+    cfg = PPOCfg(advantage="vtrace", gamma=0.8, lmbda=0.6, rho_thresh=2.0, c_thresh=0.5)
+    vtrace = make_advantage(cfg, actor, critic)
+    constants = [vtrace.gamma, vtrace.lmbda, vtrace.rho_thresh, vtrace.c_thresh]
+    torch.testing.assert_close(torch.stack(constants), torch.tensor([0.8, 0.6, 2.0, 0.5]))
 
 
 @pytest.mark.parametrize(("drift", "factor"), [(0.3, 1 / 1.5), (1e-4, 1.5)])
@@ -109,7 +148,7 @@ def test_optimizer_state_continues_exactly():
     actor, critic, loss, optimizer = _parts(cfg)
     first, second = minibatch(actor, critic), minibatch(actor, critic)
     ppo_step(loss, optimizer, first, cfg=cfg)
-    resumed = make_optimizer(dataclasses.replace(cfg, learning_rate=1.0), actor, critic)
+    resumed = make_optimizer(dataclasses.replace(cfg, learning_rate=9e-3), actor, critic)
     rate = resumed.param_groups[0]["lr"]
     load_optimizer_state_(resumed, optimizer.state_dict())
     assert resumed.param_groups[0]["lr"] is rate

@@ -61,14 +61,36 @@ def minibatch(**leaves):
     return TensorDict(data | leaves, [BATCH])
 
 
-def _both(actor, critic, *, gamma=0.95, alpha=0.3, fixed=False, low=-1.0):
-    ours = SACLoss(actor, critic, gamma=gamma, alpha_init=alpha, target_entropy=-2.5, learn_alpha=not fixed)
-    plain = [
+def for_torchrl(critic):
+    """Return the networks of an ensemble, one by one."""
+    return [
         TensorDictModule(
             _OneOfN(critic.module, which), in_keys=["critic", "action"], out_keys=["state_action_value"]
         )
         for which in range(critic.module.cfg.num_networks)
     ]
+
+
+def move_targets(ours, stock):
+    """Make the targets of both losses the same networks, other ones than the critics."""
+    torch.manual_seed(5)
+    for parameter in ours.target_critic_network.parameters():
+        parameter.data.add_(0.1 * torch.randn_like(parameter))
+    others = [dict(other.named_parameters()) for other in for_torchrl(ours.target_critic_network)]
+    for key, value in stock.target_qvalue_network_params.items(True, True):
+        value.data.copy_(torch.stack([other[".".join(key)] for other in others]))
+
+
+def assert_gradients_are_alike(critic, stock):
+    linear = [layer for layer in critic.module.layers if hasattr(layer, "weight")]
+    for number, layer in enumerate(linear):
+        weight = stock.qvalue_network_params.get(("module", "layers", str(2 * number), "weight"))
+        torch.testing.assert_close(layer.weight.grad, weight.grad.transpose(1, 2), rtol=1e-5, atol=1e-6)
+
+
+def _both(actor, critic, *, gamma=0.95, alpha=0.3, fixed=False, low=-1.0):
+    ours = SACLoss(actor, critic, gamma=gamma, alpha_init=alpha, target_entropy=-2.5, learn_alpha=not fixed)
+    plain = for_torchrl(critic)
     stock = objectives.SACLoss(
         actor_network=actor,
         qvalue_network=plain,
@@ -79,14 +101,7 @@ def _both(actor, critic, *, gamma=0.95, alpha=0.3, fixed=False, low=-1.0):
         target_entropy=-2.5,
     )
     stock.make_value_estimator(gamma=gamma)
-    # The targets are other networks than the critics.
-    torch.manual_seed(5)
-    for parameter in ours.target_critic_network.parameters():
-        parameter.data.add_(0.1 * torch.randn_like(parameter))
-    others = [_OneOfN(ours.target_critic_network.module, which) for which in range(len(plain))]
-    for key, value in stock.target_qvalue_network_params.items(True, True):
-        name = ".".join(key[1:])
-        value.data.copy_(torch.stack([dict(other.named_parameters())[name] for other in others]))
+    move_targets(ours, stock)
     return ours, stock
 
 
@@ -118,10 +133,7 @@ def test_losses_and_gradients_are_those_of_torchrl(low, num_networks, extra, fix
         torch.testing.assert_close(results[0][name], results[1][name], rtol=1e-5, atol=1e-6, msg=name)
     for one, other in zip(*gradients, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
-    linear = [layer for layer in critic.module.layers if hasattr(layer, "weight")]
-    for number, layer in enumerate(linear):
-        stock_weight = stock.qvalue_network_params.get(("module", "layers", str(2 * number), "weight"))
-        torch.testing.assert_close(layer.weight.grad, stock_weight.grad.transpose(1, 2), rtol=1e-5, atol=1e-6)
+    assert_gradients_are_alike(critic, stock)
     if not fixed:
         torch.testing.assert_close(ours.log_alpha.grad, stock.log_alpha.grad)
 

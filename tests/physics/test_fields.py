@@ -101,7 +101,7 @@ def test_changed_fields_change_the_motion_as_in_the_c_engine():
 
 
 def test_set_const_leaves_the_state_alone():
-    world = standing_quadrupeds(per_world_fields=("body_mass",))
+    world = standing_quadrupeds(per_world_fields=("body_mass", "geom_friction"))
     before = {name: world.view(name).clone() for name in ("qpos", "qvel", "sensordata", "xpos", "ctrl")}
     world.set_const(("body_mass", "geom_friction"))
     for name, tensor in before.items():
@@ -206,3 +206,14 @@ def test_room_for_dry_friction_that_the_model_does_not_have():
     rubbing.step(1)
     assert rubbing.njmax >= plain.njmax + 3
     assert not rubbing.overflow_report().messages
+
+
+def test_set_const_of_what_cannot_have_changed_is_refused():
+    world = World(quadruped(), num_envs=2, per_world_fields=("geom_friction",))
+    for mask_E in (None, torch.tensor([True, False])):
+        with pytest.raises(
+            ValueError, match="'body_mass' is shared by all worlds: add it to per_world_fields"
+        ):
+            world.set_const(("body_mass",), mask_E)
+        with pytest.raises(ValueError, match="unknown per-world model field 'body_mas'"):
+            world.set_const(("body_mas",), mask_E)

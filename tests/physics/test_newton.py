@@ -172,22 +172,47 @@ def test_what_overflows_in_one_tree_leaves_the_others_alone():
 
 def test_models_out_of_range_take_the_solver_of_mujoco_warp():
     model = load_model(ROWS_OF_ALL_KINDS.format(cone="pyramidal", iterations=10))
-    assert newton.suits(model, njmax=64)
-    assert not newton.suits(model, njmax=100_000)
-    for field, value in (
-        ("solver", mujoco.mjtSolver.mjSOL_CG),
-        ("integrator", mujoco.mjtIntegrator.mjINT_RK4),
-        ("noslip_iterations", 2),
-        ("jacobian", mujoco.mjtJacobian.mjJAC_DENSE),
+    assert newton.unsuited(model, njmax=64) is None
+    assert "100000 constraint rows" in str(newton.unsuited(model, njmax=100_000))
+    for field, value, reason in (
+        ("solver", mujoco.mjtSolver.mjSOL_CG, "not Newton's"),
+        ("integrator", mujoco.mjtIntegrator.mjINT_RK4, "mjINT_RK4"),
+        ("iterations", 0, "no iterations"),
+        ("noslip_iterations", 2, "noslip"),
+        ("jacobian", mujoco.mjtJacobian.mjJAC_DENSE, "dense"),
+        ("disableflags", mujoco.mjtDisableBit.mjDSBL_WARMSTART, "warm start"),
+        ("enableflags", mujoco.mjtEnableBit.mjENBL_SLEEP, "sleep"),
+        ("enableflags", mujoco.mjtEnableBit.mjENBL_ENERGY, "energy"),
     ):
         kept = getattr(model.opt, field)
-        setattr(model.opt, field, value)
-        assert not newton.suits(model, njmax=64), field
+        setattr(model.opt, field, int(value))
+        assert reason in str(newton.unsuited(model, njmax=64)), field
         setattr(model.opt, field, kept)
+    for count in (0, 65):
+        bodies = "<body><joint/><geom size='0.1'/></body>" * count
+        many = load_model(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+        assert f"{count} degrees of freedom" in str(newton.unsuited(many, njmax=8))
     sim = SimCfg(njmax=64, nconmax=16)
     with pytest.raises(ValueError, match="one_kernel_solver='auto': expected True or False"):
         SimCfg(one_kernel_solver="auto")  # pyright: ignore[reportArgumentType]
-    assert World(model, num_envs=1, sim=sim).has_one_kernel_solver
-    assert not World(
-        model, num_envs=1, sim=dataclasses.replace(sim, deterministic=True)
-    ).has_one_kernel_solver
+    world = World(model, num_envs=1, sim=sim)
+    assert world.has_one_kernel_solver and world.one_kernel_unavailable is None
+    for setting in ({"deterministic": True}, {"one_kernel_solver": False}, {"integrator": "rk4"}):
+        world = World(model, num_envs=1, sim=dataclasses.replace(sim, **setting))
+        reason = str(world.one_kernel_unavailable)
+        assert not world.has_one_kernel_solver and next(iter(setting)) in reason, reason
+
+
+def test_a_step_calls_the_control_callback_as_mujoco_warp_does():
+    reached = []
+    for one_kernel_solver in (True, False):
+        model = load_model(
+            "<mujoco><worldbody><body><joint name='j' type='slide'/><geom size='0.1' mass='1'/></body></worldbody>"
+            "<actuator><motor joint='j'/></actuator></mujoco>"
+        )
+        world = World(model, num_envs=1, sim=SimCfg(one_kernel_solver=one_kernel_solver))
+        world.gravity_EL.zero_()
+        world.warp_model.callback.control = lambda m, d: d.ctrl.fill_(2.0)
+        world.step(1)
+        reached.append(world.qvel_EL.item())
+    assert reached[0] == pytest.approx(2.0 * model.opt.timestep) and reached[0] == pytest.approx(reached[1])

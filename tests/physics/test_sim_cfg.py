@@ -42,6 +42,7 @@ def test_a_spec_takes_the_settings_too():
         ("njmax", True, "whole number"),
         ("nconmax", -3, "nconmax=-3"),
         ("deterministic", 1, "expected True or False"),
+        ("nan_guard", "folder", "expected a NanGuardCfg"),
     ],
 )
 def test_wrong_values_name_the_field_and_what_is_valid(field, value, hint):

@@ -6,7 +6,7 @@ import pytest
 import torch
 import warp as wp
 
-from ksim_rl.physics import SimCfg, World
+from ksim_rl.physics import SimCfg, World, load_model
 from tests.physics.models import NUM_ENVS, cartpole, forwarded, quadruped, sensor, standing_quadrupeds
 
 ACCELERATION_SENSORS = ("acceleration", "knee_force", "touch", "front_left_contact")
@@ -112,6 +112,23 @@ def test_non_finite_world_stays_alone_and_a_reset_heals_it():
     assert torch.isfinite(sick.sensordata_EL).all()
 
 
+def test_a_reset_and_a_refresh_heal_bodies_that_are_welded():
+    weld = "<weld body1='hand' body2='held'/>"
+    model = load_model(
+        "<mujoco><worldbody><body name='hand' mocap='true' pos='0 0 1'/><body name='held' pos='0 0 1'><freejoint/>"
+        f"<geom size='0.1'/></body></worldbody><equality>{weld}</equality></mujoco>"
+    )
+    world, fresh = (World(model, num_envs=2) for _ in range(2))
+    world.qvel_EL[1] = torch.nan
+    world.step(2)
+    assert torch.isfinite(world.qpos_EL).all(-1).tolist() == [True, False]
+    world.reset(torch.tensor([False, True]))
+    world.refresh()
+    world.step(1)
+    fresh.step(1)
+    assert torch.equal(world.qvel_EL[1], fresh.qvel_EL[1])
+
+
 def test_views_share_memory_with_warp_and_have_mujocos_shapes():
     world = standing_quadrupeds()
     nbody = world.mj_model.nbody
@@ -177,6 +194,10 @@ def test_num_envs_is_checked(num_envs):
 
 
 def test_arguments_are_checked():
+    with pytest.raises(ValueError, match="mj_model='robot.xml': expected a mujoco.MjModel"):
+        World("robot.xml", num_envs=2)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="sim={'njmax': 8}: expected a SimCfg"):
+        World(cartpole(), num_envs=2, sim={"njmax": 8})  # pyright: ignore[reportArgumentType]
     world = World(cartpole(), num_envs=2)
     with pytest.raises(ValueError, match="n=0"):
         world.step(0)

@@ -2,7 +2,9 @@ import pytest
 import torch
 from torchrl.envs import TransformedEnv
 
+from ksim_rl.envs import MaskedTransformedEnv
 from ksim_rl.envs.masked_reset import MaskedReset
+from ksim_rl.envs.transforms import ObservationScale
 from ksim_rl.testing import CounterEnv, check_env
 
 
@@ -151,3 +153,9 @@ def test_unknown_checks_are_refused():
 
 def test_the_refusal_of_actions_can_be_skipped():
     check_env(Accepting(), skip=["actions"])
+
+
+def test_the_sign_of_a_zero_is_kept():
+    # The counts are 0 after a reset, and times -1 they are negative zeros.
+    env = MaskedTransformedEnv(CounterEnv(), [ObservationScale(["count"], scale=-1.0)])
+    check_env(env, num_steps=5, skip=("memory",))

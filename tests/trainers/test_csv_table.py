@@ -56,3 +56,26 @@ def test_a_resumed_run_has_each_iteration_once(path):
 def test_only_the_table_is_left(path):
     CsvTable(path).log_metrics({"loss": 1.0}, 100)
     assert [entry.name for entry in path.parent.iterdir()] == ["metrics.csv"]
+
+
+def test_a_row_that_could_not_be_written_is_there_after_the_next_one(path, monkeypatch):
+    table = CsvTable(path)
+    table.log_metrics({"loss": 1.0}, 100)
+    with monkeypatch.context() as full:
+        full.setattr(table, "_writer", lambda file: file.write("20") and 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            table.log_metrics({"loss": 2.0}, 200)
+    table.log_metrics({"loss": 3.0}, 300)
+    assert [(row["env_states"], row["loss"]) for row in rows(path)] == [
+        ("100", "1"),
+        ("200", "2"),
+        ("300", "3"),
+    ]
+
+
+def test_a_row_that_a_crash_cut_off_is_left_out(path):
+    CsvTable(path).log_metrics({"loss": 1.0}, 100)
+    with open(path, "a") as file:
+        file.write("20")
+    CsvTable(path).log_metrics({"loss": 3.0}, 300)
+    assert [row["env_states"] for row in rows(path)] == ["100", "300"]

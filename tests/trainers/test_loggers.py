@@ -9,7 +9,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.record.loggers import CSVLogger
 
-from ksim_rl.trainers.loggers import LoggerCfg, MLflowCfg, WandbCfg, check_installed, make_loggers
+from ksim_rl.trainers.loggers import LoggerCfg, MLflowCfg, WandbCfg, check_installed, logger_cfg, make_loggers
 from tests.trainers.target_env import make_trainer
 
 CONFIG = {"task_name": "probe", "objective": {"gamma": 0.99, "betas": [0.9, 0.999]}}
@@ -117,3 +117,12 @@ def test_wandb_offline_has_figures_and_config_of_a_run_that_was_resumed(tmp_path
     configs += [record.config for record in records if record.WhichOneof("record_type") == "config"]
     updates = {update.key: update.value_json for config in configs for update in config.update}
     assert json.loads(updates["objective"]) == CONFIG["objective"]
+
+
+def test_a_service_that_is_not_there_is_named_with_the_way_out(monkeypatch, tmp_path):
+    def refuse(*_):
+        raise Exception("no such host")
+
+    monkeypatch.setattr(logger_cfg, "open_wandb", refuse)
+    with pytest.raises(RuntimeError, match=r"logger\.wandb .*logger\.wandb\.offline=true.*no such host"):
+        make_loggers(LoggerCfg(wandb=WandbCfg()), tmp_path)

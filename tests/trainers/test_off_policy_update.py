@@ -99,6 +99,17 @@ def test_rollouts_that_are_not_finite_reach_no_gradient():
     assert all(parameter.isfinite().all() for parameter in trainer.update.loss.parameters())
 
 
+def test_the_actor_makes_a_step_for_so_many_of_the_critics():
+    trainer = make_trainer("fast_sac")
+    for _ in range(2):
+        trainer.iterate()
+    update = trainer.update
+    steps = {
+        name: next(iter(optimizer.state.values()))["step"] for name, optimizer in update.optimizers.items()
+    }
+    assert update.cfg.policy_delay == 2 and steps["critic"] == 2 * steps["actor"] > 0
+
+
 def test_priorities_follow_the_errors():
     trainer = make_trainer("sac", data={"prioritized": True})
     for _ in range(4):

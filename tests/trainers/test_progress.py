@@ -1,6 +1,8 @@
 """Progress: plain lines in a pipe, one panel on a terminal."""
 
 import io
+import subprocess
+import sys
 
 import pytest
 from rich.console import Console
@@ -73,3 +75,21 @@ def test_without_progress_only_notes_are_shown():
 @pytest.mark.parametrize(("seconds", "text"), [(0, "0:00"), (59.6, "1:00"), (3725, "1:02:05")])
 def test_durations_are_readable(seconds, text):
     assert clock(seconds) == text
+
+
+# A pipe that nobody reads, as `ksim-rl train | head` leaves it.
+CLOSED = """
+import os
+reading, writing = os.pipe()
+os.dup2(writing, 1)
+os.close(reading)
+from ksim_rl.trainers.progress import RunProgress
+with RunProgress(10) as progress:
+    for iteration in range(10):
+        progress.update(iteration, {}, seconds_left=None)
+"""
+
+
+def test_a_pipe_that_nobody_reads_does_not_end_the_run():
+    done = subprocess.run([sys.executable, "-c", CLOSED], stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr.count("nobody reads the output any more")) == (0, 1)

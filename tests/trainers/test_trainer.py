@@ -103,6 +103,35 @@ def test_a_full_disk_costs_a_checkpoint_but_not_the_run(tmp_path, monkeypatch):
     assert not [entry for entry in tmp_path.iterdir() if entry.name.startswith(".")]
 
 
+def test_a_checkpoint_of_the_end_that_cannot_be_written_is_an_error_that_says_so(tmp_path, monkeypatch):
+    trainer = make_trainer(tmp_path, iterations=2, checkpoint_interval=1)
+
+    def fsync(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with pytest.raises(OSError, match="no checkpoint of the end, iteration 2: .*No space left on device"):
+        trainer.train(Notes())
+
+
+def test_a_logger_that_fails_costs_its_rows_but_not_the_run(tmp_path):
+    class Gone(MemoryLogger):
+        def log_metrics(self, metrics, step):
+            raise ConnectionError("no answer")
+
+        def close(self):
+            raise ConnectionError("no answer")
+
+    trainer, notes = make_trainer(tmp_path, iterations=3), Notes()
+    trainer.loggers = [Gone(), MemoryLogger()]
+    assert trainer.train(notes).iteration == 3
+    assert [row["iteration"] for row in trainer.loggers[1].rows] == [1, 2, 3, 3], (
+        "the last with its evaluation"
+    )
+    said = [note for note in notes.notes if "the logger Gone failed at iteration 1" in note]
+    assert len(said) == len(notes.notes) == 1 and "ConnectionError: no answer" in said[0]
+
+
 def test_steps_that_stay_non_finite_end_the_run_with_a_named_error():
     trainer = make_trainer(iterations=50, ppo={"max_skipped_steps": 40})
     weights = {name: value.clone() for name, value in trainer.update.actor.state_dict().items()}

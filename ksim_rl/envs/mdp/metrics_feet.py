@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from ksim_rl.envs.mdp.foot_contact import foot_contact
 from ksim_rl.envs.names import Patterns
 from ksim_rl.envs.term import MetricTerm
 from ksim_rl.envs.view import EnvView
@@ -29,7 +30,7 @@ class FootSlipSpeed(MetricTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the value of the current state, [E]."""
-        found_EF = view.contact(self.sensor).found_EN
+        found_EF = foot_contact(view, self.sensor, self.sites).found_EN
         speed_EF = torch.linalg.vector_norm(view.site_lin_vel_w(view.sites(self.sites))[..., :2], dim=-1)
         return (speed_EF * found_EF).sum(-1) / found_EF.sum(-1).clamp(min=1.0)
 

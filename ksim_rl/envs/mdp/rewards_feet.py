@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.mdp.command_speed import RewardWhileCommanded
+from ksim_rl.envs.mdp.foot_contact import foot_contact
 from ksim_rl.envs.names import Patterns
 from ksim_rl.envs.view import EnvView
 
@@ -57,7 +58,7 @@ class FootSwingHeight(RewardWhileCommanded):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        contact = view.contact(self.sensor)
+        contact = foot_contact(view, self.sensor, self.sites)
         height_EF = view.site_height(view.sites(self.sites))
         memory_EF = view.memory("peak_EF", height_EF.shape[-1])
         peak_EF = torch.where(contact.found_EN > 0, memory_EF, torch.maximum(memory_EF, height_EF))
@@ -80,7 +81,7 @@ class FootSlip(RewardWhileCommanded):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
         speed2_EF = view.site_lin_vel_w(view.sites(self.sites))[..., :2].square().sum(-1)
-        cost_E = (speed2_EF * view.contact(self.sensor).found_EN).sum(-1)
+        cost_E = (speed2_EF * foot_contact(view, self.sensor, self.sites).found_EN).sum(-1)
         return self.while_commanded(view, cost_E)
 
 

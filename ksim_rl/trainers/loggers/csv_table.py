@@ -25,7 +25,9 @@ class CsvTable:
         """Append one row, or complete the last one."""
         row = {STEP: str(step), **{name: f"{value:.9g}" for name, value in metrics.items()}}
         new_columns = [name for name in row if name not in self._columns]
-        if not self._started:
+        # False until the row is written, so that after a failure the next row writes the whole table again.
+        started, self._started = self._started, False
+        if not started:
             self._rows = [old for old in self._rows if int(old[STEP]) < step]
         same_row = bool(self._rows) and int(self._rows[-1][STEP]) == step
         if same_row:
@@ -33,7 +35,7 @@ class CsvTable:
         else:
             self._rows.append(row)
         self._columns += new_columns
-        if new_columns or same_row or not self._started:
+        if new_columns or same_row or not started:
             self._rewrite()
         else:
             with open(self.path, "a", newline="") as file:
@@ -57,8 +59,8 @@ class CsvTable:
 
 
 def read_table(path: Path) -> tuple[list[str], list[dict[str, str]]]:
-    """Read a table: its columns, and its rows as text by column."""
+    """Read a table: its columns, and its rows as text by column; a row that a crash cut off is left out."""
     with open(path, newline="") as file:
         reader = csv.DictReader(file)
-        rows = [row for row in reader if row.get(STEP)]
+        rows = [row for row in reader if row.get(STEP) and None not in row.values()]
         return list(reader.fieldnames or [STEP]), rows

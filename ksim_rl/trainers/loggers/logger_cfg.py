@@ -1,7 +1,8 @@
 """Which loggers a run has."""
 
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,14 +46,29 @@ def check_installed(cfg: LoggerCfg) -> None:
 def make_loggers(
     cfg: LoggerCfg, run_folder: Path, *, config: Mapping[str, Any] | None = None
 ) -> list[MetricLogger]:
-    """Open the loggers of a run; those that show a run's config get `config`, plain data."""
+    """Open the loggers of a run; those that show a run's config get `config`, plain data.
+
+    Raises:
+        RuntimeError: if a service is not there, or does not know the user.
+    """
     loggers: list[MetricLogger] = []
     if cfg.csv:
         loggers.append(CsvTable(run_folder / "metrics.csv"))
     if cfg.tensorboard:
         loggers.append(TensorboardLogger("tensorboard", log_dir=str(run_folder)))
     if cfg.wandb is not None:
-        loggers.append(open_wandb(cfg.wandb, run_folder, config or {}))
+        with _service("wandb", "log in, or set logger.wandb.offline=true"):
+            loggers.append(open_wandb(cfg.wandb, run_folder, config or {}))
     if cfg.mlflow is not None:
-        loggers.append(open_mlflow(cfg.mlflow, run_folder, config or {}))
+        with _service("mlflow", "see to the server, or set logger.mlflow.tracking_uri"):
+            loggers.append(open_mlflow(cfg.mlflow, run_folder, config or {}))
     return loggers
+
+
+@contextmanager
+def _service(name: str, fix: str) -> Iterator[None]:
+    """Turn what a service raises, which has types of its own, into an error that names the logger and the fix."""
+    try:
+        yield
+    except Exception as error:
+        raise RuntimeError(f"logger.{name} cannot begin a run ({fix}): {error}") from error

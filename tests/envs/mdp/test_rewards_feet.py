@@ -2,7 +2,8 @@ import pytest
 import torch
 
 from ksim_rl.envs import mdp
-from tests.envs.mdp.bench import Plateau
+from ksim_rl.envs.sensors import ContactSensor
+from tests.envs.mdp.bench import BOXES, Plateau
 
 MOVING, IDLE = [0.3, 0.0, 0.0], [0.0, 0.04, 0.0]
 GATE = {"command": "twist", "command_threshold": 0.05}
@@ -37,6 +38,24 @@ def test_slip_counts_feet_in_contact_only(boxes):
     boxes.command([MOVING, IDLE])
     value = boxes.read(mdp.FootSlip(sensor="touch", sites=("a", "b"), **GATE), "rewards/x")
     torch.testing.assert_close(value, torch.tensor([25.0, 0.0]), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "term",
+    [
+        mdp.FootSlip(sensor="any", sites=("a", "b"), **GATE),
+        mdp.FootSwingHeight(sensor="any", sites=("a", "b"), target_height=0.2, **GATE),
+        mdp.FootSlipSpeed(sensor="any", sites=("a", "b")),
+    ],
+    ids=lambda term: type(term).__name__,
+)
+def test_one_contact_does_not_stand_for_all_feet(make_bench, term):
+    bench = make_bench(BOXES, 2, {"any": ContactSensor(geoms=("a",))})
+    bench.command(MOVING)
+    with pytest.raises(
+        ValueError, match=r"rewards\.x: sensor='any' has 1 elements, and sites=\('a', 'b'\) are 2"
+    ):
+        bench.read(term, "rewards/x")
 
 
 def test_swing_height_is_paid_at_landing_and_starts_anew(boxes):

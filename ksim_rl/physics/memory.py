@@ -1,0 +1,56 @@
+"""Says how many envs fit where memory does not suffice for those that were asked for."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+# What Warp, torch on CUDA and torch on the CPU say when they get no memory.
+_REFUSALS = (
+    r"Failed to allocate (?P<size>\d+) bytes",
+    r"Tried to allocate (?P<size>[\d.]+) (?P<unit>[KMG]iB)",
+    r"can't allocate memory: you tried to allocate (?P<size>\d+) bytes",
+)
+_UNITS = {None: 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
+
+
+@contextmanager
+def memory_for(num_envs: int, device: torch.device) -> Iterator[None]:
+    """Explain an allocation that fails in this block, which makes what `num_envs` envs need.
+
+    Raises:
+        ValueError: with the memory that an env takes, as far as it is known by then, and the number of envs that fits.
+    """
+    free = _free_bytes(device)
+    try:
+        yield
+    except RuntimeError as error:
+        asked = refused_bytes(error)
+        if asked is None:
+            raise
+        left = _free_bytes(device)
+        taken = 0 if free is None or left is None else max(0, free - left)
+        per_env = max(1, (taken + asked) // num_envs)
+        fits = (
+            ""
+            if free is None
+            else f" of the {free / 1e9:.1f} GB that were free, enough for {free // per_env}"
+        )
+        raise ValueError(
+            f"num_envs={num_envs}: out of memory on {device}; one env takes at least {per_env:,} bytes{fits}. Lower "
+            "num_envs, or let other programs free what they hold"
+        ) from error
+
+
+def refused_bytes(error: RuntimeError) -> int | None:
+    """Return how many bytes an allocation asked for that failed, or None if `error` is no such failure."""
+    for refusal in _REFUSALS:
+        if found := re.search(refusal, str(error)):
+            parts = found.groupdict()
+            return int(float(parts["size"]) * _UNITS[parts.get("unit")])
+    return None
+
+
+def _free_bytes(device: torch.device) -> int | None:
+    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else None

@@ -1,0 +1,86 @@
+"""The figures in README and docs/speed.md are those of benchmarks/results."""
+
+import json
+from typing import Any
+
+import pytest
+
+from benchmarks import report
+from tests.docs.guide import DOCS, REPOSITORY
+
+README = (REPOSITORY / "README.md").read_text()
+PAGE = (DOCS / "speed.md").read_text()
+GO1, G1 = "h200/go1_velocity_flat/4096/", "h200/g1_velocity_flat/4096/"
+ENV_STATES = {"env_step_ms": 4096, "physics_ms": 4096, "own_physics_ms": 4096}
+ROWS = {
+    "raw physics": "physics_ms",
+    "own substeps": "own_physics_ms",
+    "env step": "env_step_ms",
+    "rollout with policy": "rollout_ms",
+    "PPO update": "update_ms",
+    "whole training iteration": "iteration_ms",
+}
+MEMORY = ("physics", "env_and_rollout", "update")
+ROOMS = ("physics", "terms", "update", "refresh", "resets", "policy")
+
+
+def results(name: str) -> Any:
+    return json.loads((report.RESULTS / f"{name}.json").read_text())["figures"]
+
+
+@pytest.mark.parametrize("label", ROWS)
+def test_the_table_of_an_iteration(label: str) -> None:
+    figures, name = results("throughput"), ROWS[label]
+    (row,) = (line for line in README.splitlines() if line.startswith(f"| {label}"))
+    ms, per_s, relative = (float(cell.replace(",", "")) for cell in row.strip("| ").split(" | ")[-3:])
+    assert ms == pytest.approx(figures[GO1 + name], rel=5e-3)
+    assert per_s == pytest.approx(1000 * ENV_STATES.get(name, 24 * 4096) / figures[GO1 + name], rel=1e-4)
+    assert relative == pytest.approx(per_s * figures[GO1 + "physics_ms"] / 4096 / 1000, rel=5e-3)
+
+
+def said() -> dict[str, tuple[str, str]]:
+    """By what is said: the page, and the words, with the figures that they have to hold."""
+    speed, peers = results("throughput"), results("peers")
+    learning, scaling = results("learning_time"), results("scaling")
+    collector, update = results("collector"), results("update")
+    profile, transforms = results("profile"), results("transforms")
+    memory = [round(speed[f"{GO1}{part}_bytes_per_world"] / 1000) for part in MEMORY]
+    return {
+        "first": (README, f"trains at {speed[GO1 + 'env_states_per_s'] / 1e6:.2f} million env states"),
+        "scaling": (
+            README,
+            f"{scaling['h200/go1_velocity_flat/32768/env_states_per_s'] / 1e6:.2f} million env states per second",
+        ),
+        "g1": (README, f"trains at {speed[G1 + 'env_states_per_s'] / 1000:.0f},000 with 4096"),
+        "g1 physics": (README, f"{speed[G1 + 'iteration_over_physics']:.2f} times its raw physics"),
+        "peers": (
+            README,
+            f"{peers[GO1 + 'over_peer']:.1f} times slower on Go1, {peers[G1 + 'over_peer']:.1f} times on G1",
+        ),
+        "learning": (README, f"**{learning['seconds_to_track']:.0f} s**"),
+        "first iteration": (
+            README,
+            f"takes {speed[GO1 + 'first_iteration_warm_s']:.1f} s, or {speed[GO1 + 'first_iteration_cold_s']:.0f} s",
+        ),
+        "memory": (PAGE, " kB, ".join(map(str, memory)) + " kB"),
+        "guards": (PAGE, f"{100 * speed[GO1 + 'guards_share']:.1f} % of an iteration"),
+        "chain": (PAGE, f"+ {100 * transforms['h200/4096/chain_share_of_go1_step']:.1f} % of a control step"),
+        "randomization": (
+            PAGE,
+            f"+ {100 * results('randomization')[GO1 + 'reset_share']:.1f} % of a control step",
+        ),
+        "terrain": (PAGE, f"x {results('terrain')['rough_over_flat']:.2f}"),
+        "profile": (
+            PAGE,
+            " | ".join(f"{100 * profile[f'{GO1}{room}_share']:.0f} %" for room in ROOMS),
+        ),
+        "collector": (PAGE, f"x {collector['h200/cartpole/4096/captured_over_stock']:.1f} |"),
+        "its graphs": (PAGE, f"x {collector['h200/cartpole/4096/captured_over_stock_with_graphs']:.1f} |"),
+        "update": (PAGE, f"x {update['h200/98304/stock_eager_over_update']:.1f} |"),
+    }
+
+
+@pytest.mark.parametrize("what", said())
+def test_a_figure_in_the_text(what: str) -> None:
+    page, words = said()[what]
+    assert words in page, f"{words!r} is not there: the results have changed, or the text"
