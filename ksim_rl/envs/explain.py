@@ -13,6 +13,7 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
+    from ksim_rl.physics import World
 
 WIDTH = 120
 
@@ -39,8 +40,15 @@ def _summary(env: ManagerBasedRlEnv) -> str:
     return (
         f"{env.num_envs} envs on {env.device}, "
         f"{env.step_dt:g} s per step = {env.cfg.decimation} x {env.physics_dt:g} s, "
-        f"episodes of {length if env.max_episode_length else 'any length'}"
+        f"episodes of {length if env.max_episode_length else 'any length'}\n"
+        f"constraints are solved by {_solver(env.world)}"
     )
+
+
+def _solver(world: World) -> str:
+    if world.one_kernel_unavailable is None:
+        return "one kernel"
+    return f"MuJoCo Warp's own solver, because {world.one_kernel_unavailable}"
 
 
 def _tables(env: ManagerBasedRlEnv) -> Iterable[Table]:

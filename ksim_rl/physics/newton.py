@@ -52,17 +52,18 @@ def unsuited(mj_model: mujoco.MjModel, *, njmax: int) -> str | None:
     elliptic = bool(opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC)
     floats = floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=0)
     reasons = {
-        "its solver is not Newton's": opt.solver != mujoco.mjtSolver.mjSOL_NEWTON,
-        f"its integrator is {mujoco.mjtIntegrator(opt.integrator).name}": opt.integrator not in INTEGRATORS,
-        "its Jacobian is dense": opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE,
-        "it allows no iterations": opt.iterations < 1,
-        "it has noslip iterations": opt.noslip_iterations > 0,
-        "its warm start is off": bool(opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART),
-        "it lets bodies sleep": bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP),
-        "it computes its energy": bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY),
-        "it has flexes": mj_model.nflex > 0,
-        f"it has {nv} degrees of freedom, outside of 1 to {MOST_DOFS}": not 0 < nv <= MOST_DOFS,
-        f"its {njmax} constraint rows (njmax) do not fit shared memory": floats > SHARED_FLOATS,
+        "the solver is not Newton's": opt.solver != mujoco.mjtSolver.mjSOL_NEWTON,
+        f"the integrator is {mujoco.mjtIntegrator(opt.integrator).name}": opt.integrator not in INTEGRATORS,
+        "the Jacobian is dense": opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE,
+        "no iterations are allowed": opt.iterations < 1,
+        "there are noslip iterations": opt.noslip_iterations > 0,
+        "warm starts are off": bool(opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART),
+        "bodies may sleep": bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP),
+        "energies are computed": bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY),
+        "there are flexes": mj_model.nflex > 0,
+        f"there are {nv} degrees of freedom, outside of 1 to {MOST_DOFS}": not 0 < nv <= MOST_DOFS,
+        "there are no constraint rows (njmax)": njmax < 1,
+        f"{njmax} constraint rows (njmax) do not fit shared memory": floats > SHARED_FLOATS,
     }
     return next((reason for reason, holds in reasons.items() if holds), None)
 

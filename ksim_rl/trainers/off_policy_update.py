@@ -233,8 +233,10 @@ class OffPolicyUpdate:
         """Take only the networks and the temperature of a `state_dict`.
 
         Raises:
-            ValueError: naming the tensor that is missing, unknown or of another shape or type.
+            ValueError: naming the tensor that is missing, unknown or of another shape or type, or the bound of actions
+                that is another.
         """
+        self._check_action_bounds(state["actor"])
         state_tree.copy_into(self.actor.state_dict(), state["actor"], what="actor")
         state_tree.copy_into(self.critic.state_dict(), state["critic"], what="critic")
         target = self.loss.target_critic_network.state_dict()
@@ -242,3 +244,13 @@ class OffPolicyUpdate:
         if isinstance(self.loss, SACLoss):
             with torch.no_grad():
                 self.loss.log_alpha.copy_(state["log_alpha"])
+
+    def _check_action_bounds(self, saved: Mapping[str, Any]) -> None:
+        """Refuse an actor that was trained for other actions: its bounds are not weights, and come from the config."""
+        for name, bound in self.actor.state_dict().items():
+            own = bound.cpu()
+            if name.endswith((".low", ".high")) and name in saved and not torch.equal(saved[name].cpu(), own):
+                raise ValueError(
+                    f"modules.actor.action_bound: {name!r} is {own.tolist()} in this run and {saved[name].tolist()} in "
+                    "the checkpoint; take that of the checkpoint's run"
+                )

@@ -19,7 +19,7 @@ class TrainerCfg:
         eval_episodes: episodes of an evaluation, one env each; 0 means no evaluation at all.
         stop_when_solved: end the run as soon as an evaluation reaches the task's threshold.
         stop_at: end the run as soon as each of these metrics reaches its value in one and the same iteration, such as
-            `{"reward/track_linear": 1.39}`; figures of evaluations count as well. None has no such targets.
+            `{"reward/track_linear_velocity": 1.39}`; figures of evaluations count as well. None has no such targets.
         checkpoint_interval: between checkpoints; the last iteration is always saved.
         keep_checkpoints: how many of the newest checkpoints stay.
         log_interval: between rows of the logs and lines of progress.

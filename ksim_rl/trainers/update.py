@@ -16,7 +16,7 @@ class Update(Protocol):
 
     Attributes:
         device: where all of it lives.
-        actor: the policy that is evaluated, recorded and exported.
+        actor: the policy that is evaluated, recorded and saved.
         behavior: the policy that collects; often the actor itself.
         num_env_states: how many env states a rollout has, E * T.
     """
@@ -25,7 +25,7 @@ class Update(Protocol):
 
     @property
     def actor(self) -> TensorDictModuleBase:
-        """The policy that is evaluated, recorded and exported."""
+        """The policy that is evaluated, recorded and saved."""
         ...
 
     @property

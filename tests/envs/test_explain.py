@@ -5,6 +5,7 @@ import math
 from ksim_rl.envs import ObservationGroupCfg, ObservationTermCfg, mdp
 from ksim_rl.envs.explain import explain
 from ksim_rl.envs.transforms.noise_cfg import UniformNoise
+from ksim_rl.physics import SimCfg
 from tests.envs.probe_env import DT, Kick, Launch, Position, Speed, Target, puck_env
 
 
@@ -31,7 +32,7 @@ def tables(text):
     """Return the tables by title, each a list of rows without its heads."""
     found: dict[str, list[str]] = {}
     title = ""
-    for line in text.splitlines()[1:]:
+    for line in text.splitlines()[2:]:
         if line and not line.startswith(" "):
             title = line
             found[title] = []
@@ -64,6 +65,14 @@ def test_the_first_line_says_how_many_and_how_long():
     line = explained().splitlines()[0]
     assert line == "3 envs on cpu, 0.02 s per step = 4 x 0.005 s, episodes of 0.1 s = 5 steps"
     assert puck_env(limit=None).explain().splitlines()[0].endswith("episodes of any length")
+
+
+def test_the_second_line_says_what_solves_the_constraints():
+    assert explained().splitlines()[1] == "constraints are solved by one kernel"
+    env = puck_env(limit=None, sim=SimCfg(solver="cg"))
+    assert env.explain().splitlines()[1] == (
+        "constraints are solved by MuJoCo Warp's own solver, because the solver is not Newton's"
+    )
 
 
 def test_an_empty_manager_says_none_and_lines_stay_within_the_width():

@@ -174,6 +174,7 @@ def test_models_out_of_range_take_the_solver_of_mujoco_warp():
     model = load_model(ROWS_OF_ALL_KINDS.format(cone="pyramidal", iterations=10))
     assert newton.unsuited(model, njmax=64) is None
     assert "100000 constraint rows" in str(newton.unsuited(model, njmax=100_000))
+    assert "no constraint rows" in str(newton.unsuited(model, njmax=0))
     for field, value, reason in (
         ("solver", mujoco.mjtSolver.mjSOL_CG, "not Newton's"),
         ("integrator", mujoco.mjtIntegrator.mjINT_RK4, "mjINT_RK4"),
@@ -182,7 +183,7 @@ def test_models_out_of_range_take_the_solver_of_mujoco_warp():
         ("jacobian", mujoco.mjtJacobian.mjJAC_DENSE, "dense"),
         ("disableflags", mujoco.mjtDisableBit.mjDSBL_WARMSTART, "warm start"),
         ("enableflags", mujoco.mjtEnableBit.mjENBL_SLEEP, "sleep"),
-        ("enableflags", mujoco.mjtEnableBit.mjENBL_ENERGY, "energy"),
+        ("enableflags", mujoco.mjtEnableBit.mjENBL_ENERGY, "energies"),
     ):
         kept = getattr(model.opt, field)
         setattr(model.opt, field, int(value))

@@ -50,6 +50,17 @@ def test_random_actions_until_learning_starts(name):
     assert update.metrics()["replay/env_states"] == 3 * 4 * 32
 
 
+def test_weights_for_actions_of_another_range_are_refused():
+    update = make_trainer("sac").update
+    state = update.state_dict()
+    high = next(name for name in state["actor"] if name.endswith(".high"))
+    state["actor"] = {**state["actor"], high: torch.tensor([3.0])}
+    with pytest.raises(
+        ValueError, match=r"modules\.actor\.action_bound: .* \[2\.0\] in this run and \[3\.0\]"
+    ):
+        update.load_weights(state)
+
+
 def test_noise_differs_by_env_and_changes_with_the_episode():
     trainer = make_trainer("fast_td3")
     scales = trainer.update.behavior.noise_scale_E1

@@ -24,7 +24,7 @@ class ObservationNormalization(RowTransform):
     each step (one collective per key, none while frozen), so they have to step alike; states of resets join in the next
     step's.
 
-    Prefer `obs_normalization` of actor and critic where they fit: those go into the exported policy by themselves.
+    Prefer `obs_normalization` of actor and critic where they fit: those go into the checkpoint by themselves.
 
     Args:
         in_keys: floating-point observations, of any shape; nested keys as tuples.
