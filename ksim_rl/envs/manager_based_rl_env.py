@@ -40,6 +40,7 @@ from ksim_rl.envs.scene import build_spec
 from ksim_rl.envs.view import EnvView
 from ksim_rl.envs.visualizer import DebugVisualizer
 from ksim_rl.physics import World, load_model, prepare_spec
+from ksim_rl.physics.streams import checked_device
 
 RENDER_MODES = (None, "rgb_array")
 
@@ -69,7 +70,7 @@ class ManagerBasedRlEnv(MaskedReset):
     ) -> None:
         if render_mode not in RENDER_MODES:
             raise ValueError(f"render_mode={render_mode!r}: expected one of {RENDER_MODES}")
-        super().__init__(device=torch.device(device), batch_size=torch.Size([cfg.scene.num_envs]))
+        super().__init__(device=checked_device(device), batch_size=torch.Size([cfg.scene.num_envs]))
         self.cfg = cfg
         self.render_mode = render_mode
         self.metadata = {

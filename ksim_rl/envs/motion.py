@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checks import near
-from ksim_rl.envs.motions import motion_path
+from ksim_rl.envs.motions import motion_names, motion_path
 from ksim_rl.envs.names import Index, Patterns, scalar_joint_ids
 
 if TYPE_CHECKING:
@@ -184,6 +184,10 @@ def motion_shift(view: EnvView) -> Tensor | None:
 
 
 def _read(path: Path) -> Mapping[str, np.ndarray]:
+    if not path.exists():
+        raise ValueError(
+            f"motion {path}: no such file, and none of that name comes with the package: {', '.join(motion_names())}"
+        )
     try:
         archive = np.load(path, allow_pickle=False)
         if not isinstance(archive, np.lib.npyio.NpzFile):

@@ -112,6 +112,8 @@ def test_reset_refuses_unknown_keywords():
 def test_the_constructor_refuses_unknown_keywords():
     with pytest.raises(TypeError, match="num_worlds"):
         ManagerBasedRlEnv(puck_cfg(), num_worlds=3)  # pyright: ignore[reportCallIssue]
+    with pytest.raises(ValueError, match="device='gpu': expected 'cpu', 'cuda' or 'cuda:<index>'"):
+        ManagerBasedRlEnv(puck_cfg(), device="gpu")
 
 
 @pytest.mark.parametrize(

@@ -11,3 +11,8 @@ def motion_path(file: str) -> Path:
     """Return where a motion of this name lies in the package or, if there is none of this name, `file` as a path."""
     shipped = Path(str(files(__name__).joinpath(f"{file}.npz")))
     return shipped if shipped.is_file() and shipped.parent == Path(__file__).parent else Path(file)
+
+
+def motion_names() -> list[str]:
+    """Return the names of the motions that come with the package."""
+    return sorted(path.stem for path in Path(__file__).parent.glob("*.npz"))
