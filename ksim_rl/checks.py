@@ -40,7 +40,8 @@ def check_in_range(
     bounds += f"{'inf' if high is None else high}{')' if high is None else ']'}"
     if isinstance(value, bool) or not isinstance(value, Real):
         raise ValueError(f"{field}={value!r}: expected a number in {bounds}")
-    number = float(value)
+    # Not as a float, which would take a large int for its neighbour.
+    number = value if isinstance(value, int) else float(value)
     below = low is not None and (number <= low if low_open else number < low)
     if number != number or abs(number) == float("inf") or below or (high is not None and number > high):
         raise ValueError(f"{field}={value!r}: expected a finite number in {bounds}")

@@ -27,6 +27,9 @@ from ksim_rl.objectives import AMPCfg, DistillationCfg, PPOCfg, SACCfg, TD3Cfg
 from ksim_rl.trainers.loggers import LoggerCfg
 from ksim_rl.trainers.trainer_cfg import TrainerCfg
 
+# Seeds of evaluations lie above a run's own, and must fit 64 bits as well.
+MOST_SEED = 2**62
+
 
 @dataclass(frozen=True, kw_only=True)
 class ModulesCfg:
@@ -108,6 +111,8 @@ class RunCfg:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < low:
                 raise ValueError(f"{name}={value!r}: expected a whole number >= {low}")
+        if self.seed > MOST_SEED:
+            raise ValueError(f"seed={self.seed}: expected at most {MOST_SEED}")
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):
             raise ValueError(f"device={self.device!r}: expected 'auto', 'cpu', 'cuda' or 'cuda:<index>'")
         if self.device.startswith("cuda") and not torch.cuda.is_available():

@@ -1,0 +1,23 @@
+"""Numbers are compared as they are."""
+
+import pytest
+
+from ksim_rl.checks import check_in_range
+
+
+def test_bounds_of_large_ints_are_exact():
+    check_in_range("seed", 2**63 - 1, low=0, high=2**63 - 1)
+    with pytest.raises(ValueError, match=r"seed=9223372036854775808: .* in \[0, 9223372036854775807\]"):
+        check_in_range("seed", 2**63, low=0, high=2**63 - 1)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), True, "1", None])
+def test_what_is_no_finite_number_is_refused(value):
+    with pytest.raises(ValueError, match="rate="):
+        check_in_range("rate", value)
+
+
+def test_an_open_bound_is_outside():
+    check_in_range("rate", 0.0, low=0.0)
+    with pytest.raises(ValueError, match=r"rate=0\.0: expected a finite number in \(0\.0, 1\.0\]"):
+        check_in_range("rate", 0.0, low=0.0, high=1.0, low_open=True)
