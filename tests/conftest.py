@@ -81,9 +81,10 @@ sys.meta_path.insert(0, _ShapeCheckingFinder())
 
 
 @pytest.fixture(autouse=True)
-def _seeded():
-    """Start each test from the same torch seed."""
+def _fresh_torch():
+    """Start each test from the same torch seed, with nothing compiled: tests share code, which compiles a few times."""
     torch.manual_seed(0)
+    torch.compiler.reset()
 
 
 def pytest_collection_modifyitems(items):

@@ -230,7 +230,6 @@ def test_a_state_dict_of_another_kind_is_refused():
 def test_it_compiles_without_a_graph_break():
     # The graph is what this is about: no code is generated, which would take minutes.
     eager, compiled = fresh(), fresh()
-    torch._dynamo.reset()
     compiled.compile(fullgraph=True, backend="eager")
     roots = [eager.reset(), compiled.reset()]
     for action in actions(8, eager):

@@ -114,7 +114,6 @@ def test_no_host_sync(name):
 
 @pytest.mark.parametrize("name", ["tanh_gaussian", "truncated_gaussian", "several one_hot", "mixed"])
 def test_compiles_without_a_break(name):
-    torch.compiler.reset()  # all actors share code, which is compiled for a few of them only
     actor, data = _actor(name), _data()
     compiled = torch.compile(actor, fullgraph=True, backend="aot_eager")
     with torch.no_grad():

@@ -81,7 +81,6 @@ def test_losses_equal_stock_torchrl(name, functional):
 
 @pytest.mark.parametrize("name", SPECS)
 def test_no_host_sync_and_compiles_without_a_break(name):
-    torch.compiler.reset()
     actor, critic, data, _ = _problem(name, size=16)
     loss = ClipPPOLoss(actor, critic, functional=False, log_ratio_statistics=False, loss_critic_type="l2")
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")(data.clone())
