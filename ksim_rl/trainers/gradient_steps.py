@@ -4,11 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
 from ksim_rl.data import DatasetBuffer, DatasetCfg, SequenceSampler
-from ksim_rl.modules import RecurrentModule, burnt_in
+from ksim_rl.modules import burnt_in
 from ksim_rl.objectives import NonFiniteStepsError, StepGuard, ppo_step
 
 
@@ -16,7 +17,7 @@ def make_dataset(
     data: DatasetCfg,
     *,
     keys: Sequence[NestedKey],
-    memories: Sequence[RecurrentModule],
+    memories: Sequence[TensorDictModuleBase],
     seed: int,
     device: torch.device,
 ) -> DatasetBuffer:
@@ -40,7 +41,7 @@ def epoch_of_steps(
     *,
     cfg: Any,
     guard: StepGuard,
-    memories: Sequence[RecurrentModule],
+    memories: Sequence[TensorDictModuleBase],
 ) -> list[dict[str, Tensor]]:
     """Make a gradient step on each minibatch of one epoch; return what each measured, as `ppo_step` names it.
 

@@ -45,7 +45,7 @@ def networks(num_atoms=1, low=-1.0, **fields):
     return actor, make_q_network(cfg, obs_dim=OBS, action_dim=ACTION)
 
 
-def minibatch(**leaves):
+def minibatch():
     torch.manual_seed(1)
     data = {
         "actor": torch.randn(BATCH, OBS),
@@ -58,7 +58,16 @@ def minibatch(**leaves):
         "steps_to_next_obs": torch.randint(1, 4, (BATCH, 1)),
     }
     data["next", "terminated"] = data["next", "done"] & (torch.rand(BATCH, 1) < 0.5)
-    return TensorDict(data | leaves, [BATCH])
+    return TensorDict(data, [BATCH])
+
+
+def with_extra(data, extra):
+    """Add what replays may give beside the env states: a mask, or weights; "" adds nothing."""
+    if extra == "mask":
+        data[MASK_KEY] = torch.rand(BATCH, 1) < 0.7
+    if extra == "weights":
+        data["priority_weight"] = torch.rand(BATCH)
+    return data
 
 
 def for_torchrl(critic):
@@ -113,11 +122,7 @@ def _both(actor, critic, *, gamma=0.95, alpha=0.3, fixed=False, low=-1.0):
 def test_losses_and_gradients_are_those_of_torchrl(low, num_networks, extra, fixed):
     actor, critic = networks(num_networks=num_networks, low=low)
     ours, stock = _both(actor, critic, fixed=fixed)
-    data = minibatch()
-    if extra == "mask":
-        data[MASK_KEY] = torch.rand(BATCH, 1) < 0.7
-    if extra == "weights":
-        data["priority_weight"] = torch.rand(BATCH)
+    data = with_extra(minibatch(), extra)
     results, gradients = [], []
     for loss in (ours, stock):
         torch.manual_seed(3)

@@ -6,17 +6,16 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl import objectives
 
-from ksim_rl.data import MASK_KEY
 from ksim_rl.objectives import TD3Loss
 from tests.objectives.test_sac_loss import (
     ACTION,
-    BATCH,
     OBS,
     assert_gradients_are_alike,
     for_torchrl,
     minibatch,
     move_targets,
     networks,
+    with_extra,
 )
 
 
@@ -44,11 +43,7 @@ def test_losses_and_gradients_are_those_of_torchrl(num_networks, extra):
     )
     stock.make_value_estimator(gamma=0.95)
     move_targets(ours, stock)
-    data = minibatch()
-    if extra == "mask":
-        data[MASK_KEY] = torch.rand(BATCH, 1) < 0.7
-    if extra == "weights":
-        data["priority_weight"] = torch.rand(BATCH)
+    data = with_extra(minibatch(), extra)
     results, gradients = [], []
     for loss in (ours, stock):
         torch.manual_seed(3)
