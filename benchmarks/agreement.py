@@ -25,8 +25,8 @@ from benchmarks import command_line, report
 from benchmarks.agreement_errors import COMPARED, CONTACT_LIMIT, Errors, compare
 from benchmarks.agreement_models import CARTPOLE, DOUBLE_PENDULUM, QUADRUPED, SPINNING_BODY
 from benchmarks.agreement_states import States, anywhere, in_contact
+from ksim_rl.device.streams import checked_device
 from ksim_rl.physics import SimCfg, World, load_model, load_spec
-from ksim_rl.physics.streams import checked_device
 
 SMOOTH_LIMIT = 1e-4
 CONTACT_SHARE, MEDIAN_LIMIT = 0.95, 1e-5

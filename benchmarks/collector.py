@@ -26,7 +26,7 @@ from torchrl.collectors import Collector
 from benchmarks import command_line, report
 from benchmarks.stopwatch import milliseconds
 from ksim_rl.collectors import RolloutCollector
-from ksim_rl.physics.capture import live_launches
+from ksim_rl.device.capture import live_launches
 from ksim_rl.trainers import RunCfg
 from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.updates import make_update

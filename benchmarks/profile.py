@@ -26,9 +26,9 @@ from torch.profiler import record_function
 from benchmarks import command_line, report
 from benchmarks.host_traffic import Event, cuda_events
 from benchmarks.throughput import iteration_ms
-from ksim_rl.envs.innermost import innermost
-from ksim_rl.physics.capture import live_launches
+from ksim_rl.device.capture import live_launches
 from ksim_rl.trainers import RunCfg, Trainer, build
+from ksim_rl.transforms.innermost import innermost
 
 ROOT = "iteration"
 PREFIX = "room:"

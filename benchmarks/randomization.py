@@ -25,13 +25,13 @@ from rich.table import Table
 
 from benchmarks import command_line, report
 from benchmarks.stopwatch import milliseconds
-from ksim_rl import envs
-from ksim_rl.envs import ManagerBasedRlEnvCfg, mdp
-from ksim_rl.envs.mdp.randomize import Mode, Randomize
-from ksim_rl.envs.scene import build_spec
+from ksim_rl import envs, mdp
+from ksim_rl.device.capture import Captured
+from ksim_rl.envs import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import EventTerm
+from ksim_rl.mdp.randomization.randomize import Mode, Randomize
 from ksim_rl.physics import load_model
-from ksim_rl.physics.capture import Captured
+from ksim_rl.scene.scene import build_spec
 from ksim_rl.trainers import RunCfg
 
 VARIANTS = ("none", "startup", "reset")

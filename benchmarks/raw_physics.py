@@ -23,10 +23,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from benchmarks.stopwatch import milliseconds
 from ksim_rl.collectors import RolloutCollector
-from ksim_rl.envs.innermost import innermost
+from ksim_rl.device.capture import no_collection
+from ksim_rl.device.streams import warp_scope
 from ksim_rl.physics import World
-from ksim_rl.physics.capture import no_collection
-from ksim_rl.physics.streams import warp_scope
+from ksim_rl.transforms.innermost import innermost
 
 RECORDED_STEPS = 16
 

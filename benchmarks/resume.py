@@ -24,7 +24,8 @@ from torch import Tensor
 
 from benchmarks import command_line, report
 from ksim_rl.checks import check_choice
-from ksim_rl.trainers import checkpoint, state_tree
+from ksim_rl.device import state_tree
+from ksim_rl.trainers import checkpoint
 
 TERM = "task.observations.actor.terms"
 # A robot of our own, with everything that has a state: noise with a bias and a walk, delays, histories, randomization
@@ -36,15 +37,15 @@ TASK = (
     "task.episode_length_s=0.5",
     "task.events.push_robot.interval_range_s=[0.1,0.3]",
     f"{TERM}.base_ang_vel.noise.walk_std=0.01",
-    f"{TERM}.base_lin_vel.noise.bias={{_target_: ksim_rl.envs.transforms.noise_cfg.GaussianNoise, std: 0.1}}",
+    f"{TERM}.base_lin_vel.noise.bias={{_target_: ksim_rl.transforms.noise.cfg.GaussianNoise, std: 0.1}}",
     f"{TERM}.base_ang_vel.delay={{min_lag: 0, max_lag: 3, resample_every: 5}}",
     f"{TERM}.projected_gravity.history=3",
-    "+task.events.mass={_target_: ksim_rl.envs.mdp.randomize_bodies.RandomizeBodyMass, mode: reset, bodies: [trunk], "
+    "+task.events.mass={_target_: ksim_rl.mdp.randomization.bodies.RandomizeBodyMass, mode: reset, bodies: [trunk], "
     "ranges: [0.8, 1.2], operation: scale}",
-    "+task.curriculum.level={_target_: ksim_rl.envs.mdp.curriculum_level.LinearLevel, end_step: 100}",
-    "+task.curriculum.weight={_target_: ksim_rl.envs.mdp.curriculum_scale.RewardWeightByLevel, "
+    "+task.curriculum.level={_target_: ksim_rl.mdp.curricula.level.LinearLevel, end_step: 100}",
+    "+task.curriculum.weight={_target_: ksim_rl.mdp.curricula.scale.RewardWeightByLevel, "
     "reward: track_linear_velocity, start: 1.0, end: 2.0}",
-    "+task.curriculum.speed={_target_: ksim_rl.envs.mdp.curriculum_scale.CommandRangesByLevel, command: twist, "
+    "+task.curriculum.speed={_target_: ksim_rl.mdp.curricula.scale.CommandRangesByLevel, command: twist, "
     "start: {lin_vel_x: [-0.5, 0.5]}, end: {lin_vel_x: [-1.0, 1.0]}}",
     "modules.actor.hidden_dims=[16]",
     "modules.critic.hidden_dims=[16]",

@@ -26,12 +26,17 @@ from benchmarks import command_line, report
 from benchmarks.stopwatch import milliseconds
 from ksim_rl import envs
 from ksim_rl.checks import unknown_name
+from ksim_rl.device.streams import checked_device
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
-from ksim_rl.envs.scene import build_spec
-from ksim_rl.envs.terrains import Ground, PlaneTerrain, Terrain, TerrainGrid
 from ksim_rl.envs.view import EnvView
 from ksim_rl.physics import World, load_model
-from ksim_rl.physics.streams import checked_device
+from ksim_rl.scene.scene import build_spec
+from ksim_rl.scene.terrains import (
+    Ground,
+    PlaneTerrain,
+    Terrain,
+    TerrainGrid,
+)
 
 TASK = "go1_velocity_rough"
 """Its `rough_over_flat` on a GPU stands in the results by that name alone."""

@@ -30,8 +30,8 @@ from benchmarks import command_line, report
 from benchmarks.host_traffic import host_traffic
 from benchmarks.raw_physics import own_physics_ms, physics_ms, record_steps
 from benchmarks.stopwatch import milliseconds
+from ksim_rl.device.capture import Captured
 from ksim_rl.physics import World
-from ksim_rl.physics.capture import Captured
 from ksim_rl.trainers import RunCfg, Trainer, build
 from ksim_rl.trainers.updates import make_update
 

@@ -49,13 +49,14 @@ from benchmarks import command_line, report
 from benchmarks.stopwatch import milliseconds
 from benchmarks.transforms_env import TERMS, WideEnv
 from ksim_rl import envs
+from ksim_rl import transforms as ours
 from ksim_rl.checks import check_choice
+from ksim_rl.device.capture import Captured
+from ksim_rl.device.streams import checked_device
 from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
-from ksim_rl.envs import transforms as ours
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
-from ksim_rl.envs.transforms import DelayCfg, GaussianNoise, UniformNoise, compile_groups
-from ksim_rl.physics.capture import Captured
-from ksim_rl.physics.streams import checked_device
+from ksim_rl.transforms import DelayCfg, GaussianNoise, UniformNoise
+from ksim_rl.transforms.groups import compile_groups
 
 NAMES = list(TERMS)
 HISTORY, MAX_LAG = 10, 3

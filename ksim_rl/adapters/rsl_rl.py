@@ -10,8 +10,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl.adapters.stepper import Stepper
-from ksim_rl.envs.innermost import innermost
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
+from ksim_rl.transforms.innermost import innermost
 
 try:
     from rsl_rl.env import VecEnv

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 
 from ksim_rl.adapters.stepper import Stepper
 from ksim_rl.checks import check_in_range
-from ksim_rl.envs.innermost import innermost
+from ksim_rl.transforms.innermost import innermost
 
 try:
     from gymnasium import spaces

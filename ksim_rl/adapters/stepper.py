@@ -11,8 +11,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl.checks import near
+from ksim_rl.device.capture import Captured
 from ksim_rl.envs.masked_reset import MaskedReset
-from ksim_rl.physics.capture import Captured
 
 
 @dataclass(frozen=True, kw_only=True)

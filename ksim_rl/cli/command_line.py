@@ -14,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ksim_rl import conf
 from ksim_rl.checks import unknown_name
-from ksim_rl.envs.overrides import check_key
+from ksim_rl.config.overrides import check_key
 
 # A sweep over more combinations than this is checked in part here; each job checks its own config again.
 MAX_CHECKED_JOBS = 50

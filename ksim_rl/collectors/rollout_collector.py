@@ -13,9 +13,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl import dims
 from ksim_rl.collectors.collector_cfg import CollectorCfg
-from ksim_rl.envs.innermost import innermost
+from ksim_rl.device.capture import Captured
 from ksim_rl.envs.masked_reset import MaskedReset
-from ksim_rl.physics.capture import Captured
+from ksim_rl.transforms.innermost import innermost
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 

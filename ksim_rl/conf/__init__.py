@@ -14,7 +14,7 @@ from yaml import YAMLError
 
 from ksim_rl import envs
 from ksim_rl.conf import search_path
-from ksim_rl.envs import stored_configs
+from ksim_rl.config import stored_configs
 from ksim_rl.trainers import RunCfg
 
 MODULE, NAME = "ksim_rl.conf", "train"

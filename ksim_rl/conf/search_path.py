@@ -1,10 +1,10 @@
-"""Lets Hydra find the YAML configs of other packages (see `ksim_rl.envs.plugins`)."""
+"""Lets Hydra find the YAML configs of other packages (see `ksim_rl.config.plugins`)."""
 
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 
-from ksim_rl.envs import plugins
+from ksim_rl.config import plugins
 
 
 class DeclaredConfigs(SearchPathPlugin):

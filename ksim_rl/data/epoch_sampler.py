@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
-from ksim_rl import random
+from ksim_rl.device import random
 
 _STREAM = random.stream_id("data.epoch_sampler")
 

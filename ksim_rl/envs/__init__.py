@@ -1,22 +1,10 @@
 """The env, its terms, its transforms and its tasks."""
 
-from ksim_rl.envs.config_tree import allow_package, from_tree, to_tree
-from ksim_rl.envs.entity import Entity
+from ksim_rl.config.config_tree import allow_package, from_tree, to_tree
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
-from ksim_rl.envs.placement import Placement
 from ksim_rl.envs.registry import build, make, make_cfg, names, register_configs, task
-from ksim_rl.envs.scene import MjcfRobot, Robot, SceneCfg
-from ksim_rl.envs.sensors import (
-    CameraSensor,
-    ContactSensor,
-    GridPattern,
-    ImuSensor,
-    PinholePattern,
-    RayCaster,
-    RingPattern,
-)
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import (
     ActionTerm,
@@ -28,10 +16,22 @@ from ksim_rl.envs.term import (
     RewardTerm,
     TerminationTerm,
 )
-from ksim_rl.envs.terrains import PlaneTerrain, TerrainGrid
-from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.envs.view import EnvView
-from ksim_rl.envs.viewer_cfg import ViewerCfg
+from ksim_rl.scene.placement import Placement
+from ksim_rl.scene.scene import MjcfRobot, Robot, SceneCfg
+from ksim_rl.scene.sensors import (
+    CameraSensor,
+    ContactSensor,
+    GridPattern,
+    ImuSensor,
+    PinholePattern,
+    RayCaster,
+    RingPattern,
+)
+from ksim_rl.scene.state.entity import Entity
+from ksim_rl.scene.terrains import PlaneTerrain, TerrainGrid
+from ksim_rl.scene.viewer_cfg import ViewerCfg
+from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 
 __all__ = [
     "ActionTerm",

@@ -6,13 +6,13 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
 
-from ksim_rl.envs.sensors import SensorTracker
 from ksim_rl.envs.term import CommandTerm, RewardTerm
+from ksim_rl.scene.sensors import SensorTracker
 
 if TYPE_CHECKING:
     from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
     from ksim_rl.envs.view import EnvView
-    from ksim_rl.envs.visualizer import DebugVisualizer
+    from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 
 
 class Drawing(Protocol):

@@ -17,8 +17,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ksim_rl import dims
+from ksim_rl.device.streams import checked_device
 from ksim_rl.envs import specs
-from ksim_rl.envs.actuators import JointDrives
 from ksim_rl.envs.drawing import Drawing, drawings
 from ksim_rl.envs.explain import explain
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
@@ -34,13 +34,13 @@ from ksim_rl.envs.managers import (
     TerminationManager,
 )
 from ksim_rl.envs.masked_reset import MaskedReset
-from ksim_rl.envs.rendering import OffscreenRenderer
 from ksim_rl.envs.reset_to_default import ResetToDefault
-from ksim_rl.envs.scene import build_spec
 from ksim_rl.envs.view import EnvView
-from ksim_rl.envs.visualizer import DebugVisualizer
 from ksim_rl.physics import World, load_model, prepare_spec
-from ksim_rl.physics.streams import checked_device
+from ksim_rl.scene.actuators import JointDrives
+from ksim_rl.scene.rendering.rendering import OffscreenRenderer
+from ksim_rl.scene.rendering.visualizer import DebugVisualizer
+from ksim_rl.scene.scene import build_spec
 
 RENDER_MODES = (None, "rgb_array")
 

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from ksim_rl.checks import check_in_range
-from ksim_rl.envs.scene import SceneCfg
 from ksim_rl.envs.term import (
     ActionTerm,
     CommandTerm,
@@ -16,9 +15,10 @@ from ksim_rl.envs.term import (
     RewardTerm,
     TerminationTerm,
 )
-from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg
-from ksim_rl.envs.viewer_cfg import ViewerCfg
 from ksim_rl.physics import SimCfg
+from ksim_rl.scene.scene import SceneCfg
+from ksim_rl.scene.viewer_cfg import ViewerCfg
+from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg
 
 
 @dataclass(frozen=True, kw_only=True)

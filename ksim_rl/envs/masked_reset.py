@@ -25,7 +25,7 @@ class MaskedReset(EnvBase):
     ignored, so it may return anything there. It gives:
 
     * `maybe_reset`: `_reset` runs at every step with `done` as its mask, so that nothing is read by the host.
-      Trajectories equal TorchRL's own if the draws in `_reset` are keyed per row (see `ksim_rl.random`).
+      Trajectories equal TorchRL's own if the draws in `_reset` are keyed per row (see `ksim_rl.device.random`).
     * `reset(tensordict, seed=, env_ids=, options=)`: untouched rows come back with their last root values.
     * `seed(seed=-1)`: returns the seed used. It ends in `_set_seed`, so that is where an env stores it.
     * `rollout` labelled ("E", "T"), and the label "E" on all that `step` and `reset` return.

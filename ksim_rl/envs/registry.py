@@ -15,18 +15,19 @@ from hydra.core.config_store import ConfigStore
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
-import ksim_rl.envs.tasks
 from ksim_rl.checks import unknown_name
-from ksim_rl.envs import plugins, stored_configs
-from ksim_rl.envs.config_tree import from_tree, to_tree
+from ksim_rl.config import plugins, stored_configs
+from ksim_rl.config.config_tree import from_tree, to_tree
+from ksim_rl.config.overrides import check_overrides
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
-from ksim_rl.envs.overrides import check_overrides
 from ksim_rl.envs.task import Task
-from ksim_rl.envs.transforms.compile_groups import compile_groups
+from ksim_rl.transforms.groups.compile_groups import compile_groups
 
 _CONFIG = "ksim_rl_env"
+# Imported by name when tasks are first asked for: they stand above this room and import it.
+OWN_TASKS = "ksim_rl.tasks"
 
 
 @cache
@@ -46,7 +47,8 @@ def _tasks() -> dict[str, Task]:
 
 
 def _own_modules() -> Iterator[tuple[str, ModuleType]]:
-    for module_info in pkgutil.iter_modules(ksim_rl.envs.tasks.__path__, "ksim_rl.envs.tasks."):
+    package = importlib.import_module(OWN_TASKS)
+    for module_info in pkgutil.iter_modules(package.__path__, f"{OWN_TASKS}."):
         yield module_info.name, importlib.import_module(module_info.name)
 
 

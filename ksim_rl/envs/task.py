@@ -13,7 +13,7 @@ from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 class Task:
     """An env config with what is known about training it.
 
-    A module in `ksim_rl/envs/tasks/` that holds one at its top level registers it.
+    A module in `ksim_rl/tasks/` that holds one at its top level registers it.
 
     Attributes:
         name: as in `task=<name>`.

@@ -19,7 +19,7 @@ from ksim_rl.checks import check_choice, check_in_range, check_pair
 
 if TYPE_CHECKING:
     from ksim_rl.envs.view import EnvView
-    from ksim_rl.envs.visualizer import DebugVisualizer
+    from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 
 EVENT_MODES = ("startup", "reset", "interval", "step")
 METRIC_REDUCTIONS = ("mean", "last", "max", "sum")

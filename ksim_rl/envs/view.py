@@ -10,18 +10,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ksim_rl import random
 from ksim_rl.checks import near
-from ksim_rl.envs.actuators import ActuatorParams, JointTargets
-from ksim_rl.envs.bodies_and_sites import BodiesAndSites
-from ksim_rl.envs.entity import Entity
-from ksim_rl.envs.first_robot import FirstRobot
-from ksim_rl.envs.guarded_state import GuardedState
-from ksim_rl.envs.memory import Memory
-from ksim_rl.envs.motion import ReferenceMotion, load_motion
-from ksim_rl.envs.names import Index, NameResolver, Patterns, as_index, scalar_joint_ids
-from ksim_rl.envs.quantity import quantity
-from ksim_rl.envs.sensors import (
+from ksim_rl.device import random
+from ksim_rl.physics import World
+from ksim_rl.scene.actuators import ActuatorParams, JointTargets
+from ksim_rl.scene.motions.motion import ReferenceMotion, load_motion
+from ksim_rl.scene.names import (
+    Index,
+    NameResolver,
+    Patterns,
+    as_index,
+    scalar_joint_ids,
+)
+from ksim_rl.scene.sensors import (
     CameraTracker,
     ContactState,
     ContactTracker,
@@ -29,9 +30,14 @@ from ksim_rl.envs.sensors import (
     RayTracker,
     SensorTracker,
 )
-from ksim_rl.envs.shared_values import SharedValues
-from ksim_rl.envs.terrains.ground import Ground
-from ksim_rl.physics import World
+from ksim_rl.scene.state.bodies_and_sites import BodiesAndSites
+from ksim_rl.scene.state.entity import Entity
+from ksim_rl.scene.state.first_robot import FirstRobot
+from ksim_rl.scene.state.guarded_state import GuardedState
+from ksim_rl.scene.state.memory import Memory
+from ksim_rl.scene.state.quantity import quantity
+from ksim_rl.scene.state.shared_values import SharedValues
+from ksim_rl.scene.terrains.ground import Ground
 
 Tracker = TypeVar("Tracker", bound=SensorTracker)
 

@@ -6,8 +6,8 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from ksim_rl.checks import check_in_range
+from ksim_rl.device.running_moments import RunningMoments
 from ksim_rl.modules.observation_keys import side_by_side
-from ksim_rl.running_moments import RunningMoments
 
 
 class ObservationNormalizer(RunningMoments):

@@ -12,7 +12,6 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from ksim_rl.envs.transforms import MirrorMap
 from ksim_rl.objectives.adaptive_learning_rate import adapt_learning_rate_
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.distillation_cfg import DistillationCfg
@@ -23,6 +22,7 @@ from ksim_rl.objectives.step_guard import StepGuard, clip_and_guard
 from ksim_rl.objectives.symmetry import Loss, SymmetricAugmentation, with_augmentation, with_mirror_loss
 from ksim_rl.objectives.td_lambda import TDLambda
 from ksim_rl.objectives.vtrace import VTrace
+from ksim_rl.transforms import MirrorMap
 
 
 def make_advantage(

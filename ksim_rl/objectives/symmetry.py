@@ -9,8 +9,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from ksim_rl import dims
-from ksim_rl.envs.transforms.mirror_map import MirrorMap, image
 from ksim_rl.objectives.gaussian_kl import gaussian_parameters
+from ksim_rl.transforms.mirror.mirror_map import MirrorMap, image
 
 Loss = Callable[[TensorDictBase], TensorDictBase]
 

@@ -8,7 +8,7 @@ from typing import TypeVar
 import torch
 from torch import nn
 
-from ksim_rl.running_moments import RunningMoments
+from ksim_rl.device.running_moments import RunningMoments
 
 Network = TypeVar("Network", bound=nn.Module)
 

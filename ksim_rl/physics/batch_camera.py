@@ -11,7 +11,7 @@ import warp as wp
 from mujoco_warp._src.bvh import build_hfield_bvh
 from torch import Tensor
 
-from ksim_rl.physics.streams import warp_scope
+from ksim_rl.device.streams import warp_scope
 from ksim_rl.physics.world import World
 
 

@@ -5,14 +5,14 @@ from collections.abc import Callable, Hashable
 import torch
 import warp as wp
 
-from ksim_rl.physics.capture import (
+from ksim_rl.device.capture import (
     is_capturing,
     is_warming_up,
     no_collection,
     refuse_or_warn,
     wants_live_launches,
 )
-from ksim_rl.physics.streams import warp_device, warp_scope, warp_stream
+from ksim_rl.device.streams import warp_device, warp_scope, warp_stream
 
 
 class WarpGraphs:

@@ -7,10 +7,10 @@ from pathlib import Path
 import mujoco
 import warp as wp
 
+from ksim_rl.device.warp_start import start_warp
 from ksim_rl.physics import menagerie
 from ksim_rl.physics.model_checks import check_finite, warp_model_of
 from ksim_rl.physics.mujoco_messages import caught_warnings
-from ksim_rl.physics.warp_start import start_warp
 
 SUFFIXES = (".xml", ".mjcf", ".urdf")
 Source = str | Path | mujoco.MjSpec

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ksim_rl.physics.streams import warp_scope
+from ksim_rl.device.streams import warp_scope
 
 SWEEPS = wp.constant(6)
 

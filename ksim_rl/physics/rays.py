@@ -9,7 +9,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from ksim_rl.physics.streams import warp_scope
+from ksim_rl.device.streams import warp_scope
 from ksim_rl.physics.world import World
 
 Groups = wp.types.vector(length=mujoco.mjNGROUP, dtype=wp.float32)

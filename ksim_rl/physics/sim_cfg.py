@@ -5,7 +5,7 @@ import dataclasses
 import mujoco
 
 from ksim_rl.checks import check_choice, check_in_range
-from ksim_rl.physics.nan_guard_cfg import NanGuardCfg
+from ksim_rl.physics.nan_guard.cfg import NanGuardCfg
 
 INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,

@@ -7,7 +7,8 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from ksim_rl.physics import kernels, newton
+from ksim_rl.physics import kernels
+from ksim_rl.physics.newton import solver as newton
 
 # These read the contacts of the last substep's collision pass, which a reset empties.
 COLLISION_SENSORS = (

@@ -11,6 +11,9 @@ import warp as wp
 from torch import Tensor
 
 from ksim_rl.checks import check_choice, unknown_name
+from ksim_rl.device.kernel_loading import loaded_together
+from ksim_rl.device.memory import memory_for
+from ksim_rl.device.streams import checked_device, warp_scope
 from ksim_rl.physics import capacity, kernels, state, views
 from ksim_rl.physics.fields import (
     FIXED,
@@ -21,16 +24,13 @@ from ksim_rl.physics.fields import (
     fields_to_expand,
 )
 from ksim_rl.physics.graphs import WarpGraphs
-from ksim_rl.physics.height_fields import take_over_height_fields
-from ksim_rl.physics.kernel_loading import loaded_together
+from ksim_rl.physics.height_field.contacts import take_over_height_fields
 from ksim_rl.physics.masked_constants import MaskedConstants
-from ksim_rl.physics.memory import memory_for
 from ksim_rl.physics.model_checks import check_not_simple, warp_model_of
-from ksim_rl.physics.nan_guard import NanGuard, NanReport
+from ksim_rl.physics.nan_guard.guard import NanGuard, NanReport
+from ksim_rl.physics.newton.choice import one_kernel_unavailable, takes_conditional_nodes
 from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
 from ksim_rl.physics.sim_cfg import SimCfg
-from ksim_rl.physics.solver_choice import one_kernel_unavailable, takes_conditional_nodes
-from ksim_rl.physics.streams import checked_device, warp_scope
 from ksim_rl.physics.substeps import Substeps
 
 

@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 from torchrl.envs import EnvBase
 
-from ksim_rl.envs.innermost import innermost
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.physics import World
 from ksim_rl.testing.replays import Replays
+from ksim_rl.transforms.innermost import innermost
 
 # Of the scale of a velocity, per substep: float32 and a solver that stops early stay far below; a field or an option
 # that one engine does not know of goes far beyond.

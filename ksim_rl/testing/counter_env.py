@@ -9,7 +9,8 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ksim_rl import dims, random
+from ksim_rl import dims
+from ksim_rl.device import random
 
 
 class CounterEnv(EnvBase):

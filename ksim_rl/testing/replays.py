@@ -10,8 +10,8 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.envs.innermost import innermost
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
+from ksim_rl.transforms.innermost import innermost
 
 SEED = 11
 

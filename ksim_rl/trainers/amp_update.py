@@ -12,7 +12,9 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl.data import ReplayCfg, ReplayRing
-from ksim_rl.envs.motion_observations import observe_motion
+from ksim_rl.device import state_tree
+from ksim_rl.device.capture import Captured
+from ksim_rl.mdp.motion_observations import observe_motion
 from ksim_rl.modules import Discriminator
 from ksim_rl.objectives import (
     AMPCfg,
@@ -22,8 +24,6 @@ from ksim_rl.objectives import (
     make_optimizer,
     style_reward,
 )
-from ksim_rl.physics.capture import Captured
-from ksim_rl.trainers import state_tree
 from ksim_rl.trainers.gradient_steps import StepMeans, check_skipped_steps, in_columns
 from ksim_rl.trainers.optimizer_state import load_optimizer_state, optimizer_state
 from ksim_rl.trainers.ppo_update import PPOUpdate, make_ppo_update

@@ -12,8 +12,7 @@ from torchrl.envs import EnvBase
 
 from ksim_rl import envs
 from ksim_rl.collectors import RolloutCollector
-from ksim_rl.envs.innermost import innermost
-from ksim_rl.trainers import state_tree
+from ksim_rl.device import state_tree
 from ksim_rl.trainers.checkpoint import Checkpoint
 from ksim_rl.trainers.evaluation import Evaluator
 from ksim_rl.trainers.hook import Hook
@@ -22,6 +21,7 @@ from ksim_rl.trainers.networks import with_recurrent_state
 from ksim_rl.trainers.run_cfg import RunCfg
 from ksim_rl.trainers.trainer import Trainer
 from ksim_rl.trainers.updates import make_update
+from ksim_rl.transforms.innermost import innermost
 
 # Evaluations see other initial states than training does.
 EVALUATION_SEED_OFFSET = 1_000_003

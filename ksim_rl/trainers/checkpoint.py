@@ -18,7 +18,8 @@ from typing import Any
 import safetensors.torch
 from safetensors import SafetensorError
 
-from ksim_rl.trainers import checkpoint_formats, state_tree
+from ksim_rl.device import state_tree
+from ksim_rl.trainers import checkpoint_formats
 
 MANIFEST, TENSORS = "manifest.json", "tensors.safetensors"
 _TEMPORARY, _DISCARDED = ".writing-", ".discarded-"

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from ksim_rl.trainers.state_tree import State
+from ksim_rl.device.state_tree import State
 
 FORMAT_VERSION = 2
 Config = dict[str, Any]

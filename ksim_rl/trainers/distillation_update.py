@@ -11,6 +11,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl.data import DatasetCfg
+from ksim_rl.device import state_tree
+from ksim_rl.device.capture import Captured
 from ksim_rl.modules import MixedPolicy, memories, update_normalizers
 from ksim_rl.objectives import (
     DistillationCfg,
@@ -21,8 +23,6 @@ from ksim_rl.objectives import (
     observation_keys,
     observation_keys_of,
 )
-from ksim_rl.physics.capture import Captured
-from ksim_rl.trainers import state_tree
 from ksim_rl.trainers.gradient_steps import (
     StepMeans,
     check_skipped_steps,

@@ -6,7 +6,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.envs.innermost import innermost
+from ksim_rl.transforms.innermost import innermost
 
 
 def read_episode_sums(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Tensor]:

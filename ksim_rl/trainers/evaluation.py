@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ksim_rl.physics.capture import Captured
+from ksim_rl.device.capture import Captured
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,12 +10,12 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torch import Tensor, nn
 
 from ksim_rl.data import DatasetBuffer, EpochSampler
+from ksim_rl.device.running_moments import has_ranks
 from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, ValueNetwork
 from ksim_rl.modules.gaussian_head import MIN_STD, GaussianHead
 from ksim_rl.modules.observation_keys import side_by_side
 from ksim_rl.objectives import PPOCfg, StepGuard
 from ksim_rl.objectives.fused_ppo import FusedNetworks, why_not_fused
-from ksim_rl.running_moments import has_ranks
 
 if TYPE_CHECKING:
     from ksim_rl.objectives.fused_ppo.fused_ppo import FusedPPO

@@ -10,10 +10,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from ksim_rl.data import ReplayCfg, ReplayRing
+from ksim_rl.device import state_tree
+from ksim_rl.device.capture import Captured
 from ksim_rl.modules import ExploringPolicy, update_normalizers
 from ksim_rl.objectives import OffPolicyCfg, OffPolicyLoss, SACCfg, SACLoss, StepGuard, descend, make_adamw
-from ksim_rl.physics.capture import Captured
-from ksim_rl.trainers import state_tree
 from ksim_rl.trainers.gradient_steps import check_skipped_steps
 from ksim_rl.trainers.optimizer_state import load_optimizer_state, optimizer_state
 

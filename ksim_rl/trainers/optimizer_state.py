@@ -5,8 +5,8 @@ from typing import Any
 
 import torch
 
+from ksim_rl.device.state_tree import State
 from ksim_rl.objectives import load_optimizer_state_
-from ksim_rl.trainers.state_tree import State
 
 
 def optimizer_state(optimizer: torch.optim.Optimizer) -> State:

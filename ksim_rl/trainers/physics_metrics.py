@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.envs.innermost import innermost
+from ksim_rl.transforms.innermost import innermost
 
 _OVERFLOW, _NAN = "overflow/", "nan/worlds"
 

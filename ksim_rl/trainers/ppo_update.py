@@ -11,8 +11,9 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl.data import DatasetCfg
-from ksim_rl.envs.mirror_maps import mirror_maps
-from ksim_rl.envs.transforms import MirrorMap
+from ksim_rl.device import state_tree
+from ksim_rl.device.capture import Captured
+from ksim_rl.mdp.mirror_maps import mirror_maps
 from ksim_rl.modules import CarriedState, memories, update_normalizers
 from ksim_rl.objectives import (
     PPOCfg,
@@ -26,8 +27,6 @@ from ksim_rl.objectives import (
     observation_keys,
     with_precision_of,
 )
-from ksim_rl.physics.capture import Captured
-from ksim_rl.trainers import state_tree
 from ksim_rl.trainers.fused_ppo import make_fused_ppo
 from ksim_rl.trainers.gradient_steps import (
     StepMeans,
@@ -39,6 +38,7 @@ from ksim_rl.trainers.gradient_steps import (
 from ksim_rl.trainers.networks import build_networks
 from ksim_rl.trainers.optimizer_state import load_optimizer_state, optimizer_state
 from ksim_rl.trainers.run_cfg import RunCfg
+from ksim_rl.transforms import MirrorMap
 
 # Names of the logged means, by the names that `ppo_step` gives them.
 LOGGED = {

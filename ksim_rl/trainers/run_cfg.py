@@ -9,9 +9,9 @@ import torch
 
 from ksim_rl.checks import near
 from ksim_rl.collectors import CollectorCfg
+from ksim_rl.config.config_tree import from_tree, to_tree
 from ksim_rl.data import DatasetCfg, ReplayCfg, sequence_length
 from ksim_rl.envs import ManagerBasedRlEnvCfg
-from ksim_rl.envs.config_tree import from_tree, to_tree
 from ksim_rl.modules import (
     FEATURES,
     ActorCfg,

@@ -10,9 +10,7 @@ from pathlib import Path
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
-from ksim_rl.envs.innermost import innermost
-from ksim_rl.envs.transforms import observation_columns
-from ksim_rl.physics.memory import memory_for
+from ksim_rl.device.memory import memory_for
 from ksim_rl.trainers import checkpoint, video
 from ksim_rl.trainers.build import build, build_env, load_actor
 from ksim_rl.trainers.columns import check_columns
@@ -22,6 +20,8 @@ from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_cfg import RunCfg
 from ksim_rl.trainers.trainer import Outcome, Trainer
 from ksim_rl.trainers.updates import make_policy
+from ksim_rl.transforms import observation_columns
+from ksim_rl.transforms.innermost import innermost
 
 CONFIG, EVALUATION, CURVES, VIDEO = "config.yaml", "evaluation.json", "curves.png", "video.mp4"
 

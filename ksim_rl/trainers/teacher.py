@@ -9,11 +9,12 @@ from typing import Any
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from ksim_rl.envs.transforms import observation_columns
+from ksim_rl.device import state_tree
 from ksim_rl.modules import memories
-from ksim_rl.trainers import checkpoint, state_tree
+from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.columns import check_columns
 from ksim_rl.trainers.run_cfg import RunCfg
+from ksim_rl.transforms import observation_columns
 
 MakePolicy = Callable[[RunCfg, EnvBase], TensorDictModuleBase]
 

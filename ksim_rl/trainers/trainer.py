@@ -10,8 +10,6 @@ from tensordict import TensorDictBase
 
 from ksim_rl.checks import near
 from ksim_rl.collectors import RolloutCollector
-from ksim_rl.envs.innermost import innermost
-from ksim_rl.envs.transforms import observation_columns
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.checkpoint_hook import CheckpointHook
 from ksim_rl.trainers.columns import check_columns
@@ -28,6 +26,8 @@ from ksim_rl.trainers.run_clock import RunClock
 from ksim_rl.trainers.run_state import load_random_state, random_state
 from ksim_rl.trainers.trainer_cfg import TrainerCfg
 from ksim_rl.trainers.update import Update
+from ksim_rl.transforms import observation_columns
+from ksim_rl.transforms.innermost import innermost
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from ksim_rl.trainers.state_tree import State
+from ksim_rl.device.state_tree import State
 
 
 class Update(Protocol):

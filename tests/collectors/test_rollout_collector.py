@@ -9,9 +9,9 @@ from torchrl.collectors import Collector
 
 from ksim_rl import envs
 from ksim_rl.collectors import CollectorCfg, RolloutCollector
-from ksim_rl.envs.mdp import JointPos, JointVel
-from ksim_rl.envs.transforms import UniformNoise
+from ksim_rl.mdp import JointPos, JointVel
 from ksim_rl.testing import count_syncs
+from ksim_rl.transforms import UniformNoise
 from tests.envs.probe_env import DT, RandomLaunch, Target, puck_cfg
 
 STEPS = 12

@@ -7,8 +7,8 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import SamplerWithoutReplacement
 
-from ksim_rl import random
 from ksim_rl.data import EpochSampler
+from ksim_rl.device import random
 from ksim_rl.testing import count_syncs
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from benchmarks import report, tasks
 from ksim_rl import envs
-from ksim_rl.envs.scene import SceneCfg
+from ksim_rl.scene.scene import SceneCfg
 
 PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
 RESULTS = report.RESULTS / "tasks.json"

@@ -19,8 +19,14 @@ from ksim_rl.envs import (
     ObservationTermCfg,
     SceneCfg,
 )
-from ksim_rl.envs.mdp import JointEffortAction, JointPos, JointVel, LastAction, TimeOut
 from ksim_rl.envs.term import CommandTerm, EventTerm, MetricTerm, RewardTerm, TerminationTerm
+from ksim_rl.mdp import (
+    JointEffortAction,
+    JointPos,
+    JointVel,
+    LastAction,
+    TimeOut,
+)
 
 SUBSTEP_S = 0.005
 DECIMATION = 4

@@ -13,7 +13,14 @@ import torch
 import warp
 from torchrl.envs import EnvBase
 
-from ksim_rl.envs import EnvView, ManagerBasedRlEnv, ObservationGroupCfg, ObservationTermCfg, mdp, registry
+from ksim_rl import mdp
+from ksim_rl.envs import (
+    EnvView,
+    ManagerBasedRlEnv,
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    registry,
+)
 from ksim_rl.envs.term import (
     ActionTerm,
     CommandTerm,
@@ -24,9 +31,9 @@ from ksim_rl.envs.term import (
     RewardTerm,
     TerminationTerm,
 )
-from ksim_rl.envs.transforms.noise_cfg import UniformNoise
-from tests.envs.mdp.recorder import Recorder
+from ksim_rl.transforms.noise.cfg import UniformNoise
 from tests.envs.probe_env import DT, Launch, RandomLaunch, puck_cfg, puck_env, push
+from tests.mdp.recorder import Recorder
 
 
 @pytest.fixture(scope="module")

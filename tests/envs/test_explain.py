@@ -2,10 +2,11 @@
 
 import math
 
-from ksim_rl.envs import ObservationGroupCfg, ObservationTermCfg, mdp
+from ksim_rl import mdp
+from ksim_rl.envs import ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.envs.explain import explain
-from ksim_rl.envs.transforms.noise_cfg import UniformNoise
 from ksim_rl.physics import SimCfg
+from ksim_rl.transforms.noise.cfg import UniformNoise
 from tests.envs.probe_env import DT, Kick, Launch, Position, Speed, Target, puck_env
 
 

@@ -8,9 +8,9 @@ from torchrl.envs.utils import check_env_specs
 
 from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv, keyed_transforms
-from ksim_rl.envs.transforms import GaussianNoise, ObservationNoise
 from ksim_rl.testing import CounterEnv, assert_dims, check_env, count_syncs
-from tests.envs.transforms.chains import (
+from ksim_rl.transforms import GaussianNoise, ObservationNoise
+from tests.transforms.chains import (
     actions,
     assert_same,
     copied,

@@ -3,7 +3,9 @@
 import numpy as np
 import torch
 
-from ksim_rl.physics import NanGuardCfg, SimCfg, nan_file, replay
+from ksim_rl.physics import NanGuardCfg, SimCfg
+from ksim_rl.physics.nan_guard import file as nan_file
+from ksim_rl.physics.nan_guard import replay
 from tests.envs.probe_env import DECIMATION, puck_env, push
 
 

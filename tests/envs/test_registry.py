@@ -30,7 +30,7 @@ def test_overrides_reach_every_level():
 
 
 def test_terms_can_be_added_and_removed():
-    added = "+task.rewards.extra={_target_: ksim_rl.envs.tasks.cartpole.CartpoleReward, weight: 2.0}"
+    added = "+task.rewards.extra={_target_: ksim_rl.tasks.cartpole.CartpoleReward, weight: 2.0}"
     cfg = envs.make_cfg("cartpole_balance", [added, "~task.rewards.balance"])
     assert list(cfg.rewards) == ["extra"] and cfg.rewards["extra"].weight == 2.0
 

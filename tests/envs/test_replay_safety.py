@@ -10,9 +10,9 @@ from torch import Tensor
 from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
-from tests.envs.mdp.busy_env import busy_env, write_clip
-from tests.envs.mdp.every_term_env import actions, every_term_env
 from tests.envs.probe_env import puck_cfg
+from tests.mdp.busy_env import busy_env, write_clip
+from tests.mdp.every_term_env import actions, every_term_env
 
 STEPS = 16
 

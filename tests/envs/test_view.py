@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from tests.envs.mdp.bench import FREE_BODY
 from tests.envs.random_states import FIXED_BASE, SITE, E, close, engine, random_bench, scalar_joints, velocity
+from tests.mdp.bench import FREE_BODY
 
 
 @pytest.fixture(scope="module")

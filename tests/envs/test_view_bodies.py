@@ -4,9 +4,9 @@ import mujoco
 import pytest
 import torch
 
-from ksim_rl.envs.quantity import indexed_quantity
-from tests.envs.mdp.bench import FREE_BODY, Plateau
+from ksim_rl.scene.state.quantity import indexed_quantity
 from tests.envs.random_states import FIXED_BASE, E, close, engine, random_bench, scalar_joints
+from tests.mdp.bench import FREE_BODY, Plateau
 
 
 @pytest.fixture(scope="module", params=[FREE_BODY, FIXED_BASE], ids=["free", "fixed"])

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from tests.envs.mdp.bench import FREE_BODY
 from tests.envs.random_states import FIXED_BASE, E, close, engine, random_bench, velocity
+from tests.mdp.bench import FREE_BODY
 
 
 def odd_rows():

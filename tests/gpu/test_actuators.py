@@ -6,10 +6,10 @@ import torch
 from tensordict import TensorDict
 
 from ksim_rl.physics import Captured
-from tests.envs.actuators.chain import one_of_each
-from tests.envs.actuators.test_joint_drives import FILTERED, E, actions, chain_env, run_by_hand
 from tests.gpu.no_syncs import no_syncs
 from tests.physics.models import standing_quadrupeds
+from tests.scene.actuators.chain import one_of_each
+from tests.scene.actuators.test_joint_drives import FILTERED, E, actions, chain_env, run_by_hand
 
 STEPS, RESET_AT, RESET_ROW = 10, 5, 2
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from ksim_rl.physics import Captured, SimCfg
-from tests.envs.mdp.busy_env import NUM_ENVS, busy_env, write_clip
 from tests.gpu.no_syncs import no_syncs
+from tests.mdp.busy_env import NUM_ENVS, busy_env, write_clip
 
 STEPS = 24
 

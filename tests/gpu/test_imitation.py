@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from ksim_rl import conf
-from ksim_rl.trainers import RunProgress, build, run, state_tree
+from ksim_rl.device import state_tree
+from ksim_rl.trainers import RunProgress, build, run
 from tests.gpu.no_syncs import no_syncs
 
 pytestmark = [

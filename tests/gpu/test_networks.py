@@ -7,9 +7,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, OneHot, Unbounded
 
+from ksim_rl.device.capture import Captured
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
 from ksim_rl.objectives import PPOCfg, make_loss, make_optimizer, ppo_step
-from ksim_rl.physics.capture import Captured
 from tests.gpu.no_syncs import no_syncs
 
 pytestmark = [

@@ -7,7 +7,8 @@ import pytest
 import torch
 import warp as wp
 
-from ksim_rl.physics import SimCfg, World, load_model, newton
+from ksim_rl.physics import SimCfg, World, load_model
+from ksim_rl.physics.newton import solver as newton
 from tests.physics.test_newton import CONES, ROWS_OF_ALL_KINDS
 
 NUM_ENVS = 300

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from ksim_rl.data import DatasetBuffer, DatasetCfg
+from ksim_rl.device.capture import Captured
 from ksim_rl.modules import update_normalizers
 from ksim_rl.objectives import PPOCfg, StepGuard, make_advantage, make_loss, make_optimizer, ppo_step
-from ksim_rl.physics.capture import Captured
 from tests.gpu.no_syncs import no_syncs
 from tests.objectives.problems import networks, rollout
 

@@ -5,9 +5,10 @@ import torch
 from torch import nn
 
 from ksim_rl import conf
+from ksim_rl.device import state_tree
 from ksim_rl.modules import RecurrentCfg, RecurrentNetwork
 from ksim_rl.modules.recurrent import STATES
-from ksim_rl.trainers import build, state_tree
+from ksim_rl.trainers import build
 from tests.gpu.no_syncs import no_syncs
 
 pytestmark = [

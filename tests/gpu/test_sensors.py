@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from ksim_rl.envs import CameraSensor, ContactSensor, ImuSensor
-from ksim_rl.physics import Captured, NanGuardCfg, SimCfg, nan_file
-from tests.envs.sensors.bench import SUBSTEPS, SensorBench
+from ksim_rl.physics import Captured, NanGuardCfg, SimCfg
+from ksim_rl.physics.nan_guard import file as nan_file
 from tests.gpu.no_syncs import no_syncs
 from tests.physics import test_nan_guard as sleds
+from tests.scene.sensors.bench import SUBSTEPS, SensorBench
 
 E, STEPS = 8, 12
 HEIGHTS = np.linspace(0.01, 0.2, E).tolist()

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from ksim_rl.physics import Captured
-from tests.envs.mdp.every_term_env import REWARDS, actions, every_term_env
 from tests.gpu.no_syncs import no_syncs
+from tests.mdp.every_term_env import REWARDS, actions, every_term_env
 
 STEPS = 20
 OF_THE_LAST_SUBSTEP = ("Acc", "Effort", "Force", "Contact", "Energy", "SensorReading", "SoftLanding")

@@ -4,14 +4,14 @@ import pytest
 import torch
 from torchrl.envs.transforms import Compose
 
-from ksim_rl import random
+from ksim_rl.device import random
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
-from ksim_rl.envs.transforms import ring
-from ksim_rl.envs.transforms.tally import count_down, tally
 from ksim_rl.testing import CounterEnv
-from tests.envs.transforms.chains import actions, full_chain
-from tests.envs.transforms.transform_checks import KINDS
-from tests.test_random import exact_uniform
+from ksim_rl.transforms import ring
+from ksim_rl.transforms.tally import count_down, tally
+from tests.device.test_random import exact_uniform
+from tests.transforms.chains import actions, full_chain
+from tests.transforms.transform_checks import KINDS
 
 
 def on_gpu(kind: str) -> MaskedTransformedEnv:

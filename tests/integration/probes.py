@@ -5,9 +5,9 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ksim_rl import random
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.data import DatasetCfg
+from ksim_rl.device import random
 from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
 from ksim_rl.objectives import PPOCfg

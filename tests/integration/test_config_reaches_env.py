@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from ksim_rl import envs
-from ksim_rl.envs import config_tree, rendering
+from ksim_rl.config import config_tree
 from ksim_rl.physics import SimCfg
 from ksim_rl.physics.sim_cfg import CONES, INTEGRATORS, SOLVERS
+from ksim_rl.scene.rendering import rendering
 
 DT = 0.01
 E = 2
@@ -55,13 +56,13 @@ def test_scene_num_envs():
 
 def test_scene_robots():
     with pytest.raises(ValueError, match="did you mean 'other/slider'"):  # several robots have prefixes
-        made("+task.scene.robots.other={_target_: ksim_rl.envs.robots.cartpole.Cartpole}")
+        made("+task.scene.robots.other={_target_: ksim_rl.scene.robots.cartpole.Cartpole}")
 
 
 def test_scene_terrain_and_sensors():
     env = made(
-        "task.scene.terrain={_target_: ksim_rl.envs.terrains.plane.PlaneTerrain, friction: [0.5, 0.1, 0.2]}",
-        "+task.scene.sensors.touch={_target_: ksim_rl.envs.sensors.contact.ContactSensor, geoms: [pole], "
+        "task.scene.terrain={_target_: ksim_rl.scene.terrains.plane.PlaneTerrain, friction: [0.5, 0.1, 0.2]}",
+        "+task.scene.sensors.touch={_target_: ksim_rl.scene.sensors.contact.ContactSensor, geoms: [pole], "
         "against: terrain}",
     ).base_env
     assert env.world.mj_model.geom("terrain").friction.tolist() == [0.5, 0.1, 0.2]
@@ -75,7 +76,7 @@ def test_scene_soft_joint_pos_limit_factor():
 
 def test_observations_of_one_group_leave_the_other_alone():
     velocity = "task.observations.actor.terms.velocity"
-    noise = "{_target_: ksim_rl.envs.transforms.noise_cfg.ConstantNoise, value: 0.25}"
+    noise = "{_target_: ksim_rl.transforms.noise.cfg.ConstantNoise, value: 0.25}"
     rollout_ET = rolled_out(made(f"{velocity}.scale=2.0", f"{velocity}.noise={noise}"), 3)
     actor, critic = rollout_ET["actor"], rollout_ET["critic"]
     torch.testing.assert_close(actor[..., 3:], 2.0 * (critic[..., 3:] + 0.25))
@@ -99,7 +100,7 @@ def test_observations_clip_delay_history_and_keep_terms():
 
 
 def test_observations_enable_noise():
-    noise = "{_target_: ksim_rl.envs.transforms.noise_cfg.ConstantNoise, value: 5.0}"
+    noise = "{_target_: ksim_rl.transforms.noise.cfg.ConstantNoise, value: 5.0}"
     given = f"task.observations.actor.terms.velocity.noise={noise}"
     silent = rolled_out(made(given, "task.observations.actor.enable_noise=false"))
     assert torch.equal(silent["actor"], silent["critic"])
@@ -270,7 +271,7 @@ def test_curriculum(own_terms):
 
 
 def test_metrics():
-    acceleration = "{_target_: ksim_rl.envs.mdp.ActionAcceleration, reduce: max}"
+    acceleration = "{_target_: ksim_rl.mdp.ActionAcceleration, reduce: max}"
     env = made(f"+task.metrics.jolt={acceleration}", f"task.episode_length_s={2 * DT}")
     rolled_out(env, 2, action=0.5)
     assert float(env.base_env.episode_log()["metric/jolt"]) == 0.5 * E

@@ -5,9 +5,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Binary, Composite, Unbounded
 
-from ksim_rl import random
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.data import DatasetCfg
+from ksim_rl.device import random
 from ksim_rl.envs import MaskedTransformedEnv
 from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.modules import (

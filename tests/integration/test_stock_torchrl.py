@@ -10,13 +10,13 @@ from torchrl.envs.utils import check_env_specs
 
 from ksim_rl import dims, envs
 from ksim_rl.collectors import RolloutCollector
-from ksim_rl.envs.scene import build_spec
 from ksim_rl.modules import ActorCfg, make_actor
+from ksim_rl.scene.scene import build_spec
 from ksim_rl.testing import check_env, count_syncs
 
 E, T = 4, 16
 EPISODE_STEPS = 6  # short, so that each rollout holds several resets
-# One of each kind; every registered task is checked in tests/envs/tasks.
+# One of each kind; every registered task is checked in tests/tasks.
 TASKS = ("cartpole_balance", "go1_velocity_flat", "go1_velocity_rough", "quadruped_velocity_flat", "arm_push")
 
 

@@ -8,11 +8,11 @@ from torch import nn
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from ksim_rl.data import DatasetCfg
-from ksim_rl.envs.transforms import MirrorMap
 from ksim_rl.modules import ActorCfg, CriticCfg, DiagonalGaussian, make_actor, make_critic
 from ksim_rl.objectives import ClipPPOLoss, PPOCfg, SymmetricAugmentation, make_symmetric, mirror_loss
 from ksim_rl.testing import count_syncs
 from ksim_rl.trainers import PPOUpdate
+from ksim_rl.transforms import MirrorMap
 from tests.objectives.problems import minibatch, networks
 
 # Of the networks in `problems`: five numbers for the actor, seven for the critic, two actions.

@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 import torch
 
-from ksim_rl.physics import NanGuardCfg, SimCfg, World, load_model, nan_file, replay
+from ksim_rl.physics import (
+    NanGuardCfg,
+    SimCfg,
+    World,
+    load_model,
+)
+from ksim_rl.physics.nan_guard import file as nan_file
+from ksim_rl.physics.nan_guard import replay
 
 HISTORY, SUBSTEPS = 5, 4
 SLEDS = """
@@ -48,7 +55,10 @@ def test_a_failed_world_is_saved_with_the_states_that_led_there(tmp_path):
     push(world, row=1, light=1e9)  # geared to 1e34 N, on a microgram: no float32 holds the acceleration
     report = world.nan_report()
     assert report.worlds == (1,) and len(report.files) == 1 and not report.ok
-    assert str(report.files[0]) in report.messages[0] and "ksim_rl.physics.replay" in report.messages[0]
+    assert (
+        str(report.files[0]) in report.messages[0]
+        and "ksim_rl.physics.nan_guard.replay" in report.messages[0]
+    )
 
     failure = nan_file.read(report.files[0])
     # It broke in the first substep of the third step; the ring holds the four before it as well.

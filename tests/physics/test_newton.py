@@ -10,7 +10,8 @@ import pytest
 import torch
 import warp as wp
 
-from ksim_rl.physics import SimCfg, World, load_model, newton
+from ksim_rl.physics import SimCfg, World, load_model
+from ksim_rl.physics.newton import solver as newton
 
 NUM_ENVS = 6
 ROWS_OF_ALL_KINDS = """

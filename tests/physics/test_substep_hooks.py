@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ksim_rl.physics.capture import live_launches
+from ksim_rl.device.capture import live_launches
 from ksim_rl.testing import count_syncs
 from tests.physics.models import sensor, standing_quadrupeds
 

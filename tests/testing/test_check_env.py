@@ -4,8 +4,8 @@ from torchrl.envs import TransformedEnv
 
 from ksim_rl.envs import MaskedTransformedEnv
 from ksim_rl.envs.masked_reset import MaskedReset
-from ksim_rl.envs.transforms import ObservationScale
 from ksim_rl.testing import CounterEnv, check_env
+from ksim_rl.transforms import ObservationScale
 
 
 class Masked(MaskedReset, CounterEnv):

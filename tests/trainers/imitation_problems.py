@@ -6,9 +6,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Binary, Composite, Unbounded
 
-from ksim_rl import random
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.data import DatasetCfg
+from ksim_rl.device import random
 from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
 from ksim_rl.objectives import AMPCfg, DistillationCfg

@@ -4,15 +4,15 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Binary, Composite, Unbounded
 
-from ksim_rl import random
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.data import DatasetCfg
+from ksim_rl.device import random
 from ksim_rl.envs import MaskedTransformedEnv
 from ksim_rl.envs.masked_reset import MaskedReset
-from ksim_rl.envs.transforms import GaussianNoise, ObservationNoise
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.trainers import Evaluator, PPOUpdate, Trainer, TrainerCfg
+from ksim_rl.transforms import GaussianNoise, ObservationNoise
 
 LENGTH = 8
 BEST_RETURN = float(LENGTH)

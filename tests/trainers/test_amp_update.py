@@ -7,9 +7,10 @@ import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl import conf
+from ksim_rl.device import state_tree
 from ksim_rl.objectives import AMPCfg
 from ksim_rl.testing import count_syncs
-from ksim_rl.trainers import build, state_tree
+from ksim_rl.trainers import build
 from tests.trainers.imitation_problems import TURN, PlaneEnv, make_amp
 
 

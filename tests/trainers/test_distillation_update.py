@@ -7,9 +7,17 @@ import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl import conf
+from ksim_rl.device import state_tree
 from ksim_rl.modules import ActorCfg, make_actor
 from ksim_rl.testing import count_syncs
-from ksim_rl.trainers import RunCfg, RunProgress, build, checkpoint, load_policy, run, state_tree
+from ksim_rl.trainers import (
+    RunCfg,
+    RunProgress,
+    build,
+    checkpoint,
+    load_policy,
+    run,
+)
 from ksim_rl.trainers.distillation_update import DistillationUpdate
 from tests.trainers.imitation_problems import (
     GAIN,

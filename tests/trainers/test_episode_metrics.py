@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ksim_rl.envs import mdp
+from ksim_rl import mdp
 from ksim_rl.trainers.episode_metrics import episode_means, read_episode_sums
 from ksim_rl.trainers.loggers.csv_table import CsvTable, read_table
 from ksim_rl.trainers.metrics import start_copy

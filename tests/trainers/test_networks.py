@@ -16,12 +16,12 @@ from torchrl.modules import (
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.data import DatasetCfg
 from ksim_rl.envs import MaskedTransformedEnv
-from ksim_rl.envs.transforms import GaussianNoise, ObservationNoise
 from ksim_rl.modules import ActorCfg, CriticCfg, SharedTrunkCfg, make_actor, make_critic, make_shared_trunk
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.testing import count_syncs
 from ksim_rl.trainers import Evaluator, PPOUpdate
 from ksim_rl.trainers.run_cfg import ModulesCfg
+from ksim_rl.transforms import GaussianNoise, ObservationNoise
 from tests.trainers.target_env import BEST_RETURN, LENGTH, TargetEnv, make_env
 
 DATA = DatasetCfg(num_env_states_per_minibatch=64, num_minibatches=4)

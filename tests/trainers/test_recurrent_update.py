@@ -6,9 +6,10 @@ from tensordict import TensorDict
 from torchrl.modules import set_recurrent_mode
 
 from ksim_rl import conf
+from ksim_rl.device import state_tree
 from ksim_rl.modules import memories
 from ksim_rl.testing import count_syncs
-from ksim_rl.trainers import build, load_policy, state_tree
+from ksim_rl.trainers import build, load_policy
 
 SMALL = [
     "task=cartpole_balance",

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from ksim_rl import conf
-from ksim_rl.trainers import build, checkpoint, state_tree
+from ksim_rl.device import state_tree
+from ksim_rl.trainers import build, checkpoint
 from tests.trainers.target_env import make_trainer
 
 

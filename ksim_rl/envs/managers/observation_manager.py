@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from ksim_rl.envs.transforms.group_cfg import ObservationGroupCfg
 from ksim_rl.envs.view import EnvView
+from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg
 
 IMAGE_DTYPES = (torch.float32, torch.int32, torch.uint8)
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from ksim_rl.envs import EnvView, MjcfRobot, SceneCfg
-from ksim_rl.envs.mdp import JointEffortAction
 from ksim_rl.envs.term import ActionTerm
+from ksim_rl.mdp import JointEffortAction
 from tests.envs.probe_env import PUCK_XML, puck_env
 
 TWO_PUCKS = SceneCfg(

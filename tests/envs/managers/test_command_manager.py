@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from ksim_rl.envs import EnvView, ObservationGroupCfg, ObservationTermCfg
-from ksim_rl.envs.mdp import Command
 from ksim_rl.envs.term import CommandTerm, RewardTerm
+from ksim_rl.mdp import Command
 from tests.envs.probe_env import DT, Target, puck_env, push
 
 

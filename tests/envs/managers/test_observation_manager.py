@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ksim_rl.envs import EnvView, ObservationGroupCfg, ObservationTermCfg
-from ksim_rl.envs.mdp import JointPos
 from ksim_rl.envs.term import ObservationTerm
+from ksim_rl.mdp import JointPos
 from tests.envs.probe_env import puck_cfg, puck_env, push
 
 

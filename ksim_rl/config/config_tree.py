@@ -1,0 +1,210 @@
+"""Dataclasses to plain trees and back: what YAML and Hydra see, checked field by field on the way in.
+
+A tree is made of dicts, lists and scalars. A dataclass becomes a dict of its fields; where the annotation does not say
+which class it is (any term, any robot), the key `_target_` does. Only classes of allowed packages are ever imported
+or built, so that a config file cannot run code.
+"""
+
+from __future__ import annotations
+
+import collections.abc
+import dataclasses
+import functools
+import importlib
+import operator
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, TypeVar, Union
+
+from ksim_rl.checks import near
+from ksim_rl.config import plugins
+
+TARGET = "_target_"
+_allowed_packages = {"ksim_rl"}
+
+Config = TypeVar("Config")
+
+
+def allow_package(name: str) -> None:
+    """Let configs build the dataclasses of another package (its top-level name)."""
+    _allowed_packages.add(name)
+
+
+def to_tree(value: Any, annotation: Any = None) -> Any:
+    """Return the plain tree of a dataclass, mapping, sequence or scalar."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        hints = typing.get_type_hints(type(value))
+        tree: dict[str, Any] = {}
+        if type(value) is not _default_class(annotation):
+            tree[TARGET] = f"{type(value).__module__}.{type(value).__qualname__}"
+        for field in dataclasses.fields(value):
+            tree[field.name] = to_tree(getattr(value, field.name), hints[field.name])
+        return tree
+    if isinstance(value, Mapping):
+        item = next(iter(typing.get_args(annotation)[1:]), None)
+        return {str(key): to_tree(entry, item) for key, entry in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [to_tree(entry) for entry in value]
+    return value
+
+
+def from_tree(annotation: type[Config], tree: Any, path: str = "") -> Config:
+    """Build the dataclass that a tree describes.
+
+    Args:
+        annotation: the dataclass that is expected.
+        tree: as `to_tree` returns it.
+        path: what stands before the fields' names in errors, such as "task".
+
+    Raises:
+        ValueError: with the full path of the field that is unknown, missing, of a wrong type or out of range, and what
+            would be valid.
+    """
+    return _build(annotation, tree, path)
+
+
+def _build(annotation: Any, value: Any, path: str) -> Any:
+    if annotation is Any:
+        return value
+    alternatives = _alternatives(annotation)
+    if value is None and type(None) in alternatives:
+        return None
+    alternatives = [option for option in alternatives if option is not type(None)]
+    classes = [option for option in alternatives if isinstance(option, type) and not _is_scalar(option)]
+    if isinstance(value, Mapping) and (TARGET in value or any(dataclasses.is_dataclass(c) for c in classes)):
+        return _build_dataclass(classes, value, path)
+    for option in alternatives:
+        built = _match(option, value, path)
+        if built is not _NO_MATCH:
+            return built
+    raise ValueError(f"{path}={value!r}: expected {_describe(annotation)}")
+
+
+_NO_MATCH = object()
+
+
+def _match(option: Any, value: Any, path: str) -> Any:
+    origin, arguments = typing.get_origin(option), typing.get_args(option)
+    if origin is Literal:
+        return value if value in arguments else _NO_MATCH
+    if origin is tuple:
+        if not isinstance(value, (list, tuple)):
+            return _NO_MATCH
+        if len(arguments) == 2 and arguments[1] is Ellipsis:
+            return tuple(_build(arguments[0], entry, f"{path}[{i}]") for i, entry in enumerate(value))
+        if len(arguments) != len(value):
+            return _NO_MATCH
+        return tuple(
+            _build(a, entry, f"{path}[{i}]")
+            for i, (a, entry) in enumerate(zip(arguments, value, strict=True))
+        )
+    if origin is collections.abc.Sequence:
+        if not isinstance(value, (list, tuple)):
+            return _NO_MATCH
+        return tuple(_build(arguments[0], entry, f"{path}[{i}]") for i, entry in enumerate(value))
+    if origin in (collections.abc.Mapping, dict):
+        if not isinstance(value, Mapping):
+            return _NO_MATCH
+        return {
+            _build_key(arguments[0], k, path): _build(arguments[1], entry, f"{path}.{k}" if path else str(k))
+            for k, entry in value.items()
+        }
+    if option is bool or option is str:
+        return value if isinstance(value, option) else _NO_MATCH
+    if option is int:
+        return value if isinstance(value, int) and not isinstance(value, bool) else _NO_MATCH
+    if option is float:
+        return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else _NO_MATCH
+    return _NO_MATCH
+
+
+def _build_key(annotation: Any, key: object, path: str) -> Any:
+    if annotation is not int:
+        return str(key)
+    try:
+        return int(str(key))
+    except ValueError:
+        raise ValueError(f"{path}: key {key!r}: expected a whole number") from None
+
+
+def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> Any:
+    cls: Any
+    if TARGET in tree:
+        cls = _resolve_target(tree[TARGET], path)
+        bases = [c for c in classes if not getattr(c, "_is_protocol", False)]
+        if bases and not issubclass(cls, tuple(bases)):
+            kinds = _describe(functools.reduce(operator.or_, bases))
+            raise ValueError(f"{path}.{TARGET}={tree[TARGET]!r}: expected a kind of {kinds}")
+    else:
+        cls = _default_class(functools.reduce(operator.or_, classes))
+        if getattr(cls, "__abstractmethods__", None):
+            raise ValueError(f"{path}: needs {TARGET}, the class of this {cls.__name__}")
+    hints = typing.get_type_hints(cls)
+    fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
+    given = {}
+    for key, entry in tree.items():
+        if key == TARGET:
+            continue
+        where = f"{path}.{key}" if path else str(key)
+        if key not in fields:
+            raise ValueError(f"unknown field {where!r} of {cls.__name__}: {near(str(key), fields)}")
+        given[key] = _build(hints[key], entry, where)
+    missing = [
+        name
+        for name, field in fields.items()
+        if name not in given
+        and field.default is dataclasses.MISSING
+        and field.default_factory is dataclasses.MISSING
+    ]
+    if missing:
+        raise ValueError(
+            f"{path}: {cls.__name__} needs the field {missing[0]!r}: {_describe(hints[missing[0]])}"
+        )
+    try:
+        return cls(**given)
+    except ValueError as error:
+        raise ValueError(f"{path}.{error}" if path else str(error)) from None
+
+
+def _resolve_target(target: object, path: str) -> type:
+    """Import the dataclass that a `_target_` names, if its package is allowed."""
+    module_name, _, class_name = str(target).rpartition(".")
+    allowed = _allowed_packages | plugins.packages()
+    if module_name.split(".")[0] not in allowed:
+        raise ValueError(
+            f"{path}.{TARGET}={target!r}: only classes of these packages are built: {', '.join(sorted(allowed))}. "
+            "`ksim_rl.envs.allow_package` or an entry point (see `ksim_rl.config.plugins`) adds one"
+        )
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError:
+        raise ValueError(f"{path}.{TARGET}={target!r}: no module {module_name!r}") from None
+    cls = getattr(module, class_name, None)
+    if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
+        names = [n for n, v in vars(module).items() if isinstance(v, type) and dataclasses.is_dataclass(v)]
+        raise ValueError(
+            f"{path}.{TARGET}={target!r}: no dataclass {class_name!r} there: {near(class_name, names)}"
+        )
+    return cls
+
+
+def _alternatives(annotation: Any) -> list[Any]:
+    if typing.get_origin(annotation) in (Union, types.UnionType):
+        return list(typing.get_args(annotation))
+    return [annotation]
+
+
+def _default_class(annotation: Any) -> Any:
+    """Return the dataclass that a tree without `_target_` means: the first that the annotation names."""
+    return next((option for option in _alternatives(annotation) if dataclasses.is_dataclass(option)), None)
+
+
+def _is_scalar(option: Any) -> bool:
+    return option in (bool, int, float, str)
+
+
+def _describe(annotation: Any) -> str:
+    if isinstance(annotation, type) and typing.get_origin(annotation) is None:
+        return annotation.__name__
+    return str(annotation).replace("typing.", "").replace("collections.abc.", "")

@@ -1,0 +1,86 @@
+"""Warp launches that cost little from Python.
+
+`wp.launch` packs every argument anew, which takes longer than most small kernels run. Warp can record a launch and
+issue it again; then only the bytes of its arguments are written, in one go.
+"""
+
+import ctypes
+import struct
+import threading
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ksim_rl.device.streams import CPU_LOCK, warp_scope, warp_stream
+
+MAX_RECORDED = 64
+"""Records that one kernel keeps, one per device and size; a batch size that never comes again must not pile up."""
+
+_CODES = {
+    ctypes.c_int32: "i",
+    ctypes.c_uint32: "I",
+    ctypes.c_int64: "q",
+    ctypes.c_uint64: "Q",
+    ctypes.c_float: "f",
+}
+
+
+_streams: dict[tuple[int, int], wp.Stream] = {}
+
+
+class QuickLaunch:
+    """One Warp kernel whose only argument is a struct of numbers and addresses, launched on torch's stream.
+
+    Args:
+        kernel: without gradients.
+        arguments: the struct; addresses are `wp.uint64`, as wrapping a tensor takes longer than the launch.
+    """
+
+    def __init__(self, kernel: wp.Kernel, arguments: type) -> None:
+        self._kernel, self._arguments = kernel, arguments
+        self._recorded: dict[tuple[torch.device, tuple[int, ...]], tuple[wp.Launch, ctypes.Structure]] = {}
+        self._packer = struct.Struct("")
+        # The bytes are shared by all launches until the driver, or the kernel on the CPU, has read them.
+        self._lock = threading.Lock()
+
+    def __call__(self, device: torch.device, dim: tuple[int, ...], *values: float) -> None:
+        """Launch with one value per field of the struct, in their order; do nothing for a dim of 0."""
+        if 0 in dim:
+            return
+        if device.type == "cpu":
+            lock, stream = CPU_LOCK, None
+        else:
+            lock, stream = self._lock, _current_stream(device)
+        with lock:
+            launch, packed = self._recorded.get((device, dim)) or self._record(device, dim)
+            self._packer.pack_into(packed, 0, *values)
+            launch.launch(stream)
+
+    def _record(self, device: torch.device, dim: tuple[int, ...]) -> tuple[wp.Launch, ctypes.Structure]:
+        if len(self._recorded) >= MAX_RECORDED:
+            self._recorded.clear()
+        with warp_scope(device):
+            launch = wp.launch(
+                self._kernel, dim, inputs=[self._arguments()], device=str(device), record_cmd=True
+            )
+        # The first parameter is the size of the launch.
+        packed = launch.params[1]
+        self._packer = struct.Struct("@" + "".join(_CODES[field[1]] for field in packed._fields_))
+        self._recorded[device, dim] = launch, packed
+        return launch, packed
+
+
+def _current_stream(device: torch.device) -> wp.Stream:
+    """Return Warp's wrapper of torch's current stream; the look-up by handle spares the making of a stream object."""
+    handle: int = torch._C._cuda_getCurrentRawStream(device.index)  # pyright: ignore[reportAttributeAccessIssue]
+    found = _streams.get((device.index, handle))
+    if found is None:
+        # The wrapper keeps the stream for ever, so no other one gets its handle.
+        found = _streams[device.index, handle] = warp_stream(torch.cuda.current_stream(device))
+    return found
+
+
+def address(tensor: Tensor | None) -> int:
+    """Return where a tensor lies; 0 for None."""
+    return 0 if tensor is None else tensor.data_ptr()

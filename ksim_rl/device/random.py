@@ -1,0 +1,271 @@
+"""Counter-based random numbers: a pure function of (seed, stream, env row, counter).
+
+A generator with hidden state gives other numbers as soon as one more reset happens somewhere. Here each draw is a
+hash of its coordinates, as in Salmon et al., "Parallel random numbers: as easy as 1, 2, 3" (SC 2011): one row's reset
+never changes another row's numbers, a masked reset at every step and TorchRL's reset-when-any-done agree exactly, and
+a resumed run needs only the integers. The mixing function is Wellons' two-round 32-bit hash (constants from his
+"hash-prospector" search), in wrapping 32-bit arithmetic, so that each device gives the same bits.
+
+Draws made at every step are keyed by a step counter; draws made at a reset by a per-env counter of resets. A draw is
+one Warp kernel, which is also a torch operator: it can be captured and compiled. A normal is the inverse of the normal
+distribution's cumulative function at a uniform (Giles, "Approximating the erfinv function", 2010): one hash per number
+and no branch, so that the CPU's compiler turns loops into vector instructions.
+"""
+
+import zlib
+from typing import NamedTuple
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ksim_rl.device.quick_launch import QuickLaunch
+
+DRAWS = r"""
+    const unsigned golden = 0x9E3779B9u;
+    auto mix = [](unsigned x) {
+        x = (x ^ (x >> 16)) * 0x21F0AAADu;
+        x = (x ^ (x >> 15)) * 0xD35A2D97u;
+        return x ^ (x >> 15);
+    };
+    struct RowKey { unsigned first, second; };
+    auto key_of = [=](long long seed, unsigned stream, long long count, int row) {
+        const unsigned low = (unsigned)count, high = (unsigned)((unsigned long long)count >> 32);
+        const unsigned base = mix((unsigned)(seed ^ (seed >> 32)) ^ stream);
+        const unsigned first = mix(base + low * golden) ^ mix((unsigned)row + high + 1u);
+        const unsigned second = mix(first + (unsigned)row * golden + golden) ^ mix(low + stream);
+        return RowKey{mix(first), mix(second)};
+    };
+    auto bits_of = [=](RowKey key, unsigned index) {
+        return mix(mix(key.first ^ ((index + 1u) * golden)) ^ key.second);
+    };
+    auto unit = [](unsigned b) { return (float)(b >> 8) * 5.9604644775390625e-08f; };
+    auto normal = [](unsigned b) {
+        const float x = ((float)((int)(b >> 8) - 8388608) + 0.5f) * 1.1920928955078125e-07f;
+        const float t = (1.0f - x) * (1.0f + x);
+        unsigned word;
+        memcpy(&word, &t, 4);
+        int exponent = (int)(word >> 23) - 127;
+        word = (word & 0x7FFFFFu) | 0x3F800000u;
+        float mantissa;
+        memcpy(&mantissa, &word, 4);
+        const bool is_large = mantissa > 1.41421356f;
+        exponent += is_large;
+        const float f = (is_large ? 0.5f * mantissa : mantissa) - 1.0f;
+        float s = 7.0376836292e-2f;
+        s = s * f - 1.1514610310e-1f;
+        s = s * f + 1.1676998740e-1f;
+        s = s * f - 1.2420140846e-1f;
+        s = s * f + 1.4249322787e-1f;
+        s = s * f - 1.6668057665e-1f;
+        s = s * f + 2.0000714765e-1f;
+        s = s * f - 2.4999993993e-1f;
+        s = s * f + 3.3333331174e-1f;
+        const float w = -(f + f * f * (s * f - 0.5f) + (float)exponent * 0.693147180559945f);
+        const float c = w - 2.5f;
+        float p = 2.81022636e-08f;
+        p = p * c + 3.43273939e-07f;
+        p = p * c - 3.5233877e-06f;
+        p = p * c - 4.39150654e-06f;
+        p = p * c + 2.1858087e-04f;
+        p = p * c - 1.25372503e-03f;
+        p = p * c - 4.17768164e-03f;
+        p = p * c + 2.46640727e-01f;
+        p = p * c + 1.50140941f;
+        const float d = sqrtf(w < 5.0f ? 5.0f : w) - 3.0f;
+        float q = -2.00214257e-04f;
+        q = q * d + 1.00950558e-04f;
+        q = q * d + 1.34934322e-03f;
+        q = q * d - 3.67342844e-03f;
+        q = q * d + 5.73950773e-03f;
+        q = q * d - 7.6224613e-03f;
+        q = q * d + 9.43887047e-03f;
+        q = q * d + 1.00167406f;
+        q = q * d + 2.83297682f;
+        return 1.41421356237f * x * (w < 5.0f ? p : q);
+    };
+"""
+"""C++ of all kernels that draw: `key_of` once per row, `bits_of` per number, `unit` or `normal` of these bits."""
+
+_UNIFORM, _NORMAL, _INTEGER = range(3)
+
+
+class RowKeys(NamedTuple):
+    """The coordinates of one draw, up to the number within the row."""
+
+    seed: Tensor
+    stream: int
+    counter: Tensor
+    num_rows: int
+
+
+def stream_id(name: str) -> int:
+    """Return a stable 31-bit id for a named stream of draws (the same in every process)."""
+    return zlib.crc32(name.encode()) & 0x7FFFFFFF
+
+
+def row_keys(seed: Tensor, stream: int, counter: Tensor, num_rows: int) -> RowKeys:
+    """Name the coordinates of one draw for each env row.
+
+    Args:
+        seed: int64, shape [].
+        stream: the id of what is drawn (see `stream_id`); two streams never share numbers.
+        counter: int64, shape [] (all rows at the same count) or [E].
+        num_rows: E.
+    """
+    return RowKeys(seed, stream, counter, num_rows)
+
+
+def uniform(keys: RowKeys, n: int, low: float | Tensor = 0.0, high: float | Tensor = 1.0) -> Tensor:
+    """Draw from the uniform distribution on [low, high).
+
+    Args:
+        n: numbers per env row.
+        low, high: floats, or float32 tensors that broadcast to [E, n].
+
+    Returns:
+        float32 [E, n].
+    """
+    if isinstance(low, Tensor) and isinstance(high, Tensor):
+        return torch.lerp(low, high, _draw(keys, n, _UNIFORM))
+    if isinstance(low, Tensor) or isinstance(high, Tensor):
+        return low + _draw(keys, n, _UNIFORM) * (high - low)
+    return _draw(keys, n, _UNIFORM, low=float(low), high=float(high))
+
+
+def normal(keys: RowKeys, n: int) -> Tensor:
+    """Draw from the standard normal distribution, float32 [E, n]."""
+    return _draw(keys, n, _NORMAL)
+
+
+def integers(keys: RowKeys, n: int, low: int | Tensor, high: int | Tensor) -> Tensor:
+    """Draw integers from {low, ..., high}, both included.
+
+    Args:
+        n: numbers per env row.
+        low, high: ints, or int64 tensors that broadcast to [E, n]. `high - low` must be below 2^31.
+
+    Returns:
+        int64 [E, n].
+
+    Raises:
+        ValueError: if both are ints, and low exceeds high or is too far from it.
+    """
+    # Scaling keeps the bias below span / 2^32, without the rejection loop that would need a host sync.
+    if isinstance(low, int) and isinstance(high, int):
+        if not 0 <= high - low < 1 << 31:
+            raise ValueError(f"low={low}, high={high}: expected low <= high < low + 2^31")
+        return _draw(keys, n, _INTEGER, start=low, span=high - low + 1)
+    return low + ((_draw(keys, n, _INTEGER, span=1 << 32) * (high - low + 1)) >> 32)
+
+
+@wp.struct
+class _Fill:
+    rows: int
+    columns: int
+    n: int
+    kind: int
+    low: float
+    high: float
+    start: wp.int64
+    span: wp.int64
+    stream: wp.uint32
+    counter_stride: int
+    seed: wp.uint64
+    counter: wp.uint64
+    out: wp.uint64
+
+
+# On the CPU one thread fills all rows, in loops of vector instructions.
+@wp.func_native(
+    DRAWS
+    + r"""
+    const long long seed = *(const long long*)a.seed;
+    const long long* __restrict__ counter = (const long long*)a.counter;
+    const int begin_row = part * a.rows, begin = chunk * a.columns, n = a.n, stride = a.counter_stride;
+    const int end_row = begin_row + a.rows, end = begin + a.columns;
+    const unsigned stream = a.stream;
+    auto fill = [&](auto write) {
+        for (int row = begin_row; row < end_row; ++row) {
+            const RowKey key = key_of(seed, stream, counter[row * stride], row);
+            for (int i = begin; i < end; ++i) write((long long)row * n + i, bits_of(key, (unsigned)i));
+        }
+    };
+    auto fill_one_each = [&](auto write) {
+        for (int row = begin_row; row < end_row; ++row)
+            write(row, bits_of(key_of(seed, stream, counter[row * stride], row), 0u));
+    };
+    auto run = [&](auto write) { n == 1 ? fill_one_each(write) : fill(write); };
+    float* __restrict__ reals = (float*)a.out;
+    long long* __restrict__ integers = (long long*)a.out;
+    const float low = a.low, high = a.high;
+    const long long start = a.start;
+    const unsigned long long span = (unsigned long long)a.span;
+    if (a.kind == 0) run([=](long long at, unsigned b) { reals[at] = low + unit(b) * (high - low); });
+    else if (a.kind == 1) run([=](long long at, unsigned b) { reals[at] = normal(b); });
+    else run([=](long long at, unsigned b) { integers[at] = start + (long long)((b * span) >> 32); });
+"""
+)
+def _fill_part(part: int, chunk: int, a: _Fill): ...
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def _fill(a: _Fill):
+    part, chunk = wp.tid()
+    _fill_part(part, chunk, a)
+
+
+_launch = QuickLaunch(_fill, _Fill)
+
+
+def _draw(
+    keys: RowKeys,
+    n: int,
+    kind: int,
+    *,
+    low: float = 0.0,
+    high: float = 1.0,
+    start: int = 0,
+    span: int = 1,
+) -> Tensor:
+    # Eager code goes past torch's dispatcher, which takes longer than the launch.
+    run = _draw_operator if torch.compiler.is_compiling() else _draw_now
+    return run(*keys, n, kind, low, high, start, span)
+
+
+def _draw_now(
+    seed: Tensor,
+    stream: int,
+    counter: Tensor,
+    num_rows: int,
+    n: int,
+    kind: int,
+    low: float,
+    high: float,
+    start: int,
+    span: int,
+) -> Tensor:
+    if seed.dtype != torch.int64 or counter.dtype != torch.int64 or counter.shape not in ((), (num_rows,)):
+        raise ValueError(
+            f"seed is {seed.dtype}, counter is {counter.dtype} of shape {tuple(counter.shape)}: expected torch.int64, "
+            f"and a counter of shape () or ({num_rows},)"
+        )
+    dtype = torch.int64 if kind == _INTEGER else torch.float32
+    out_EL = torch.empty((num_rows, n), dtype=dtype, device=seed.device)
+    counter = counter.contiguous()
+    rows, columns = (num_rows, n) if seed.device.type == "cpu" else (1, 1)
+    dim = (num_rows // max(rows, 1), n // max(columns, 1))
+    addresses = seed.data_ptr(), counter.data_ptr(), out_EL.data_ptr()
+    layout = rows, columns, n, kind, low, high, start, span, stream, counter.ndim
+    _launch(seed.device, dim, *layout, *addresses)
+    return out_EL
+
+
+_draw_operator = torch.library.custom_op("ksim_rl::draw", _draw_now, mutates_args=())
+
+
+@_draw_operator.register_fake
+def _(
+    seed: Tensor, stream: int, counter: Tensor, num_rows: int, n: int, kind: int, *options: float
+) -> Tensor:
+    return seed.new_empty((num_rows, n), dtype=torch.int64 if kind == _INTEGER else torch.float32)

@@ -1,0 +1,72 @@
+"""Where Warp work goes: the device, in order with torch's current stream.
+
+On CUDA, Warp launches on the very stream that torch uses, so neither waits for the other. The wrappers of streams are
+kept for ever: a temporary one that dies unregisters the CUDA stream ("unknown stream"). On CPU, two threads that
+launch Warp work at once abort the process, so one process-wide lock lets them in one at a time.
+"""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+import warp as wp
+
+from ksim_rl.device.warp_start import start_warp
+
+CPU_LOCK = threading.RLock()
+
+_warp_streams: dict[tuple[int, int], tuple[torch.cuda.Stream, wp.Stream]] = {}
+
+
+def checked_device(device: str | torch.device) -> torch.device:
+    """Return the torch device with its index, or say what is wrong with it.
+
+    Raises:
+        ValueError: if it is no device, is of a kind that Warp does not run on, or is not there.
+    """
+    start_warp()
+    try:
+        checked = torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(f"device={device!r}: expected 'cpu', 'cuda' or 'cuda:<index>'") from error
+    if checked.type == "cpu":
+        return torch.device("cpu")
+    if checked.type != "cuda":
+        raise ValueError(f"device={device!r}: expected 'cpu', 'cuda' or 'cuda:<index>'")
+    if not torch.cuda.is_available() or not wp.is_cuda_available():
+        raise ValueError(
+            f"device={device!r}: no CUDA device is available to torch and Warp; use device='cpu', or install an "
+            "NVIDIA driver and a CUDA build of torch"
+        )
+    index = torch.cuda.current_device() if checked.index is None else checked.index
+    if index >= torch.cuda.device_count():
+        raise ValueError(f"device={device!r}: this machine has {torch.cuda.device_count()} CUDA devices")
+    return torch.device("cuda", index)
+
+
+def warp_device(device: torch.device) -> wp.Device:
+    """Return Warp's device for a torch device."""
+    return wp.get_device(str(device))
+
+
+def warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
+    """Return the one Warp wrapper of a torch stream; both live for ever."""
+    key = (stream.device_index, stream.cuda_stream)
+    if key not in _warp_streams:
+        start_warp()  # without a world there was no need for Warp so far, and its stream look-up does not start it
+        _warp_streams[key] = (stream, wp.stream_from_torch(stream))
+    return _warp_streams[key][1]
+
+
+@contextmanager
+def warp_scope(device: torch.device) -> Iterator[None]:
+    """Send the Warp work of this block to `device`, ordered with torch's current stream there."""
+    if device.type == "cpu":
+        start_warp()
+        with CPU_LOCK, wp.ScopedDevice("cpu"):
+            yield
+    else:
+        stream = warp_stream(torch.cuda.current_stream(device))
+        with wp.ScopedStream(stream, sync_enter=False, sync_exit=False):
+            yield

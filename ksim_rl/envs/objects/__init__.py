@@ -1,5 +1,0 @@
-"""Passive things for `SceneCfg.objects`."""
-
-from ksim_rl.envs.objects.box import Box
-
-__all__ = ["Box"]

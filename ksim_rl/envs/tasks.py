@@ -1,0 +1,5 @@
+"""A door: the tasks are the room `ksim_rl.tasks`; here are the modules from which others of a kind are made."""
+
+from ksim_rl.tasks import get_up, planar, velocity, velocity_rough
+
+__all__ = ["get_up", "planar", "velocity", "velocity_rough"]

@@ -1,0 +1,89 @@
+"""What actions on joints have in common: the way from a raw action to a number per joint."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import check_in_range, check_pair
+from ksim_rl.envs.term import ActionTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.constants import constant, values_by_name
+from ksim_rl.scene.names import Patterns
+
+PerJoint = float | Mapping[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointAction(ActionTerm):
+    """An action with one column per joint, in the order of `joints`; the actuators may stand in any order.
+
+    A raw action is clipped, squashed, scaled, filtered and shifted, in this order; each is left out by default.
+
+    Attributes:
+        joints: names or patterns.
+        scale: units of the target per unit action, one for all or by joint (keys are regular expressions).
+        offset: added at the end, in the target's units, one for all or by joint.
+        clip: bounds of the raw action, or None.
+        tanh: squashes the action into (-1, 1).
+        cutoff_hz: corner frequency of a first-order low-pass filter, or None. At each env step it takes the part
+            `1 - exp(-2 pi cutoff_hz step_dt)` of the way to the new value, as the continuous filter does under a
+            constant input. After a reset it starts at 0, which is what no action at all asks for.
+    """
+
+    joints: Patterns
+    scale: PerJoint = 1.0
+    offset: PerJoint = 0.0
+    clip: tuple[float, float] | None = None
+    tanh: bool = False
+    cutoff_hz: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("scale", "offset"):
+            check_per_joint(name, getattr(self, name))
+        if self.clip is not None:
+            check_pair("clip", self.clip)
+        if self.cutoff_hz is not None:
+            check_in_range("cutoff_hz", self.cutoff_hz, low=0.0, low_open=True)
+
+    def size(self, view: EnvView) -> int:
+        """Return the number of joints."""
+        return len(view.joint_names(self.joints))
+
+    def shaped(self, view: EnvView, action_EK: Tensor) -> Tensor:
+        """Return the action after clip, tanh, scale, filter and offset, [E, K]."""
+        scaled_EK = self.scaled(view, action_EK, "scale", self.scale)
+        offset = per_joint(view, "offset", self.offset, self.joints)
+        return scaled_EK if isinstance(offset, float) and offset == 0.0 else scaled_EK + offset
+
+    def scaled(self, view: EnvView, action_EK: Tensor, field: str, scale: PerJoint) -> Tensor:
+        """Return the action after clip, tanh, a scale (the field of that name) and the filter, [E, K]."""
+        if self.clip is not None:
+            action_EK = action_EK.clamp(*self.clip)
+        if self.tanh:
+            action_EK = torch.tanh(action_EK)
+        action_EK = action_EK * per_joint(view, field, scale, self.joints)
+        if self.cutoff_hz is None:
+            return action_EK
+        filtered_EK = view.memory(f"filtered_{field}_EK", action_EK.shape[1])
+        return filtered_EK.lerp_(action_EK, 1.0 - math.exp(-2.0 * math.pi * self.cutoff_hz * view.step_dt))
+
+
+def check_per_joint(field: str, value: PerJoint) -> None:
+    """Refuse numbers that are not finite.
+
+    Raises:
+        ValueError: naming the field and the pattern.
+    """
+    table = value if isinstance(value, Mapping) else {None: value}
+    for pattern, number in table.items():
+        check_in_range(field if pattern is None else f"{field}[{pattern!r}]", number)
+
+
+def per_joint(view: EnvView, field: str, value: PerJoint, joints: Patterns) -> float | Tensor:
+    """Return the number for all joints, or those by joint as a tensor [K]."""
+    if not isinstance(value, Mapping):
+        return float(value)
+    return constant(values_by_name(field, value, view.joint_names(joints)), view.device)

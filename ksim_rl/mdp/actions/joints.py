@@ -1,0 +1,118 @@
+"""Maps from actions to what joints are asked for."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import check_in_range
+from ksim_rl.envs.term import ActionTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.actions.joint_action import JointAction, PerJoint, check_per_joint
+from ksim_rl.scene.names import Patterns
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointPositionAction(JointAction):
+    """Positions (rad or m): the shaped action, relative to the default pose unless `use_default_offset=False`."""
+
+    use_default_offset: bool = True
+
+    def __call__(self, view: EnvView, action_EK: Tensor) -> None:
+        """Write the position targets."""
+        target_EK = self.shaped(view, action_EK)
+        if self.use_default_offset:
+            target_EK = target_EK + view.default_joint_pos_EL[:, view.joints(self.joints)]
+        view.write_joint_pos_target(self.joints, target_EK)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RelativeJointPositionAction(JointAction):
+    """Positions (rad or m): the shaped action, relative to where the joints are when the env step begins."""
+
+    def __call__(self, view: EnvView, action_EK: Tensor) -> None:
+        """Write the position targets."""
+        now_EK = view.joint_pos_EL[:, view.joints(self.joints)]
+        view.write_joint_pos_target(self.joints, now_EK + self.shaped(view, action_EK))
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointVelocityAction(JointAction):
+    """Velocities (rad/s or m/s): the shaped action."""
+
+    def __call__(self, view: EnvView, action_EK: Tensor) -> None:
+        """Write the velocity targets."""
+        view.write_joint_vel_target(self.joints, self.shaped(view, action_EK))
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointEffortAction(JointAction):
+    """Efforts (N m or N): the shaped action, kept inside each motor's control range.
+
+    A motor of the MJCF takes it as its control, which its gear and gain multiply.
+    """
+
+    joints: Patterns = ".*"
+
+    def __call__(self, view: EnvView, action_EK: Tensor) -> None:
+        """Write the effort targets."""
+        view.write_joint_effort_target(self.joints, self.shaped(view, action_EK))
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointPositionVelocityAction(JointPositionAction):
+    """Positions and velocities: first one column per joint for the positions, then as many for the velocities.
+
+    Clip, tanh and filter hold for both; scale and offset are those of the positions.
+
+    Attributes:
+        velocity_scale: rad/s or m/s per unit action, one for all or by joint.
+    """
+
+    velocity_scale: PerJoint = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_per_joint("velocity_scale", self.velocity_scale)
+
+    def size(self, view: EnvView) -> int:
+        """Return twice the number of joints."""
+        return 2 * super().size(view)
+
+    def __call__(self, view: EnvView, action_EK: Tensor) -> None:
+        """Write both targets."""
+        pos_EK, vel_EK = action_EK.chunk(2, dim=1)
+        super().__call__(view, pos_EK)
+        view.write_joint_vel_target(
+            self.joints, self.scaled(view, vel_EK, "velocity_scale", self.velocity_scale)
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActuatorAction(ActionTerm):
+    """Controls of actuators as they are (tendons, muscles, grippers): the action, kept inside each control range.
+
+    One column per actuator, in the order of `actuators`.
+
+    Attributes:
+        actuators: names or patterns.
+        scale: control units per unit action.
+    """
+
+    actuators: Patterns
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_in_range("scale", self.scale)
+
+    def size(self, view: EnvView) -> int:
+        """Return the number of actuators."""
+        ids = view.resolver.ids("actuator", self.actuators)
+        view.targets.check_no_law(ids)
+        return len(ids)
+
+    def __call__(self, view: EnvView, action_EK: Tensor) -> None:
+        """Write the controls."""
+        index = view.actuators(self.actuators)
+        limits_K2 = view.ctrl_limits_L2[index]
+        view.write_ctrl(index, torch.clamp(action_EK * self.scale, limits_K2[:, 0], limits_K2[:, 1]))

@@ -1,0 +1,114 @@
+"""The command of a velocity task. Others: `commands_pose`, `commands_gait`, `commands_joystick`."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import check_in_range, check_pair
+from ksim_rl.envs.term import CommandTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.constants import constant
+from ksim_rl.scene import quaternion
+from ksim_rl.scene.rendering.visualizer import DebugVisualizer, Rgba
+
+Range = tuple[float, float]
+_COMMANDED: Rgba = (0.2, 0.6, 0.2, 0.8)
+_REACHED: Rgba = (0.2, 0.3, 0.8, 0.8)
+
+
+@dataclass(frozen=True, kw_only=True)
+class UniformVelocityCommand(CommandTerm):
+    """A planar velocity (vx, vy, wz) in the root's frame, m/s and rad/s, [E, 3], drawn uniformly.
+
+    Each resampling makes some envs special, independently of each other:
+
+    * forward: `vx = max(|vx|, forward_min_speed)`, `vy = wz = 0`;
+    * heading: wz steers to a drawn world heading, `clip(heading_stiffness * heading error, ang_vel_z)`, at every step,
+      also where the env is a forward one;
+    * standing: all zero, whatever else it is.
+
+    Attributes:
+        lin_vel_x, lin_vel_y: m/s.
+        ang_vel_z: rad/s; also the bounds of heading control.
+        heading: rad, the targets of heading control.
+        heading_stiffness: 1/s.
+        rel_standing_envs, rel_heading_envs, rel_forward_envs: probabilities.
+        forward_min_speed: m/s.
+        entity: the robot that it is for; "" is the first one.
+    """
+
+    lin_vel_x: Range
+    lin_vel_y: Range
+    ang_vel_z: Range
+    heading: Range = (-math.pi, math.pi)
+    heading_stiffness: float = 0.5
+    rel_standing_envs: float = 0.0
+    rel_heading_envs: float = 0.0
+    rel_forward_envs: float = 0.0
+    forward_min_speed: float = 0.3
+    entity: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for field in ("lin_vel_x", "lin_vel_y", "ang_vel_z", "heading"):
+            check_pair(field, getattr(self, field))
+        for field in ("rel_standing_envs", "rel_heading_envs", "rel_forward_envs"):
+            check_in_range(field, getattr(self, field), low=0.0, high=1.0)
+        check_in_range("heading_stiffness", self.heading_stiffness, low=0.0)
+        check_in_range("forward_min_speed", self.forward_min_speed, low=0.0)
+
+    @property
+    def ranges(self) -> Mapping[str, Range]:
+        """What a curriculum may change."""
+        return {name: getattr(self, name) for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z", "heading")}
+
+    def shared_ranges(self, view: EnvView) -> Tensor:
+        """Return the present ranges, and after them three of [0, 1) for the kinds, (low, high) [2, 7]."""
+        return view.shared("ranges_2N", tuple(zip(*self.ranges.values(), *[(0.0, 1.0)] * 3, strict=True)))
+
+    def resample(self, view: EnvView, mask_E: Tensor) -> None:
+        """Draw velocities, heading targets and kinds for the rows of `mask_E`."""
+        # One draw for all: targets in their ranges, then three numbers in [0, 1) that decide the kinds.
+        target_E4, kind_E3 = view.uniform(7, *self.shared_ranges(view).unbind(0)).split((4, 3), dim=-1)
+        shares_3 = (self.rel_standing_envs, self.rel_heading_envs, self.rel_forward_envs)
+        is_kind_E3 = kind_E3 < constant(shares_3, view.device)
+        speed_E1 = target_E4[:, :1].abs().clamp(min=self.forward_min_speed)
+        forward_E3 = speed_E1 * constant((1.0, 0.0, 0.0), view.device)
+        velocity_E3 = torch.where(is_kind_E3[:, 2:], forward_E3, target_E4[:, :3])
+
+        drawn_E4 = torch.cat((velocity_E3, target_E4[:, 3:]), dim=-1)
+        held_E4, held_E2 = self._target(view), self._kind(view)
+        held_E4.copy_(torch.where(mask_E[:, None], drawn_E4, held_E4))
+        held_E2.copy_(torch.where(mask_E[:, None], is_kind_E3[:, :2], held_E2))
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the command of the current heading and targets, float32 [E, 3]."""
+        target_E4, kind_E2 = self._target(view), self._kind(view)
+        error_E = quaternion.wrap_to_pi(target_E4[:, 3] - view.entity(self.entity).heading_E)
+        steer_E = (self.heading_stiffness * error_E).clamp(*self.shared_ranges(view)[:, 2].unbind())
+        wz_E = torch.where(kind_E2[:, 1], steer_E, target_E4[:, 2])
+        command_E3 = torch.cat((target_E4[:, :2], wz_E[:, None]), dim=-1)
+        return torch.where(kind_E2[:, :1], 0.0, command_E3)
+
+    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
+        """Draw the commanded (green) and the actual (blue) planar velocity above the root, 0.5 m per m/s."""
+        robot = view.entity(self.entity)
+        above = robot.root_pos_EL[env_index] + constant((0.0, 0.0, 0.3), view.device)
+        command_E3, actual_E3 = self(view), robot.root_lin_vel_b_EL
+        for velocity_E3, rgba in ((command_E3, _COMMANDED), (actual_E3, _REACHED)):
+            planar_E3 = torch.cat((velocity_E3[:, :2], torch.zeros_like(velocity_E3[:, :1])), dim=-1)
+            arrow_E3 = 0.5 * quaternion.rotate(robot.root_quat_EL, planar_E3)
+            start = above.cpu().numpy()
+            visualizer.arrow(start, start + np.asarray(arrow_E3[env_index].cpu()), rgba=rgba)
+
+    def _target(self, view: EnvView) -> Tensor:
+        """Drawn vx, vy, wz and heading, [E, 4]."""
+        return view.memory("target_E4", 4)
+
+    def _kind(self, view: EnvView) -> Tensor:
+        """Whether each env stands and whether it is heading-controlled, bool [E, 2]."""
+        return view.memory("kind_E2", 2, dtype=torch.bool)

@@ -1,0 +1,79 @@
+"""Events that disturb a robot: a force that lasts, and a jump. A kick by velocity: `PushByVelocity`."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import check_pair
+from ksim_rl.envs.term import EventTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp import se3_ranges
+from ksim_rl.mdp.events.resets import free_root_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushByForce(EventTerm):
+    """Press on a body for a while with a constant wrench at its centre of mass; both are drawn when the interval ends.
+
+    A push that is due while another lasts replaces it. Several of these events on one body add up.
+
+    Attributes:
+        body: its name.
+        wrench_range: by axis: x, y, z (N), roll, pitch, yaw (N m), world frame.
+        duration_s: range, s; taken as the nearest whole number of env steps, and at least one.
+    """
+
+    body: str
+    wrench_range: Mapping[str, tuple[float, float]]
+    duration_s: tuple[float, float]
+    mode: Literal["startup", "reset", "interval", "step"] = "interval"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        se3_ranges.check_ranges("wrench_range", self.wrench_range)
+        check_pair("duration_s", self.duration_s, low=0.0)
+        if self.mode != "interval":
+            raise ValueError(f"mode={self.mode!r}: expected 'interval', which also says when a push ends")
+
+    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+        """Begin a push in the rows of `mask_E`, and go on with or end those of the others; once per env step."""
+        held_E6, applied_E6 = view.memory("wrench_E6", 6), view.memory("applied_E6", 6)
+        left_E = view.memory("left_s_E")
+        drawn_E6 = se3_ranges.draw(view, self.wrench_range)
+        duration_E = view.uniform(1, *self.duration_s)[:, 0].clamp(min=view.step_dt)
+        left_E.copy_(torch.where(mask_E, duration_E, left_E - view.step_dt))
+        held_E6.copy_(torch.where(mask_E[:, None], drawn_E6, held_E6))
+        # The clock has run out at the env step that is nearest, whatever the subtractions round to.
+        wrench_E6 = torch.where((left_E > 0.5 * view.step_dt)[:, None], held_E6, 0.0)
+        view.world.xfrc_applied_EL[:, view.resolver.one("body", self.body)].add_(wrench_E6 - applied_E6)
+        applied_E6.copy_(wrench_E6)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Jump(EventTerm):
+    """Throw the free root body up: add the upward velocity sqrt(2 g h) that carries it a drawn height h further.
+
+    Attributes:
+        height_range: h, m, in free flight.
+        entity: the robot or object; "" is the first robot.
+    """
+
+    height_range: tuple[float, float]
+    mode: Literal["startup", "reset", "interval", "step"] = "interval"
+    entity: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_pair("height_range", self.height_range, low=0.0)
+
+    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+        """Write the rows of `mask_E`."""
+        body = free_root_of(view, self, self.entity)
+        height_E = view.uniform(1, *self.height_range)[:, 0]
+        up_E = torch.sqrt(2.0 * torch.linalg.vector_norm(view.world.gravity_EL, dim=-1) * height_E)
+        lin_vel_E3 = body.root_lin_vel_w_EL.clone()
+        lin_vel_E3[:, 2] += up_E
+        body.write_root_velocity(mask_E, lin_vel_E3, body.root_ang_vel_w_EL)

@@ -1,0 +1,69 @@
+"""How feet move, and what they press with.
+
+Poses and velocities are of the current state; contacts and forces belong to the last physics substep (acceleration
+stage).
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from ksim_rl.envs.term import MetricTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.foot_contact import foot_contact
+from ksim_rl.scene.names import Patterns
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootSlipSpeed(MetricTerm):
+    """Mean over the feet in contact of their horizontal speed, world frame, m/s, [E]; 0 while none touches.
+
+    Attributes:
+        sensor: contact sensor, one element per foot, in the order of `sites`.
+        sites: the feet.
+    """
+
+    sensor: str
+    sites: Patterns
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the value of the current state, [E]."""
+        found_EF = foot_contact(view, self.sensor, self.sites).found_EN
+        speed_EF = torch.linalg.vector_norm(view.site_lin_vel_w(view.sites(self.sites))[..., :2], dim=-1)
+        return (speed_EF * found_EF).sum(-1) / found_EF.sum(-1).clamp(min=1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeakFootHeight(MetricTerm):
+    """Height of the highest foot above the ground below it, m, [E]; by default its greatest value in the episode.
+
+    Attributes:
+        sites: the feet.
+    """
+
+    sites: Patterns
+    reduce: Literal["mean", "last", "max", "sum"] = "max"
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the value of the current state, [E]."""
+        return view.terrain.clearance(view.site_pos_w(view.sites(self.sites))).amax(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeakContactForce(MetricTerm):
+    """Magnitude of the greatest net contact force, N, [E]; by default its greatest value in the episode.
+
+    It is sampled once per env step, at its last physics substep: an impact may have been harder.
+
+    Attributes:
+        sensor: a contact sensor of `scene.sensors`.
+    """
+
+    sensor: str
+    reduce: Literal["mean", "last", "max", "sum"] = "max"
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the value of the last substep, [E]."""
+        return torch.linalg.vector_norm(view.contact(self.sensor).force_EN3, dim=-1).amax(-1)

@@ -1,0 +1,270 @@
+"""The left-right mirror image of what a policy reads and does, found from the env's own terms."""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from tensordict import NestedKey
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ksim_rl import mdp
+from ksim_rl.checks import near
+from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
+from ksim_rl.mdp.actions.joint_action import JointAction, per_joint
+from ksim_rl.scene.names import Patterns
+from ksim_rl.scene.sensors import ContactSensor
+from ksim_rl.scene.sensors.ray_patterns import grid_points
+from ksim_rl.transforms import (
+    AXIAL,
+    PLANAR_VELOCITY,
+    POLAR,
+    QUATERNION,
+    MirrorMap,
+    group_specs,
+    mirror_by_name,
+    mirror_group,
+    mirror_joints,
+)
+from ksim_rl.transforms.innermost import innermost
+from ksim_rl.transforms.mirror.mirror_map import concatenate, unchanged
+
+_SENSORS = {
+    **dict.fromkeys(("GYRO", "TORQUE", "FRAMEANGVEL", "FRAMEANGACC", "BALLANGVEL", "SUBTREEANGMOM"), AXIAL),
+    **dict.fromkeys(
+        ("VELOCIMETER", "ACCELEROMETER", "FORCE", "FRAMELINVEL", "FRAMELINACC", "FRAMEPOS"), POLAR
+    ),
+    **dict.fromkeys(("FRAMEXAXIS", "FRAMEZAXIS", "SUBTREECOM", "SUBTREELINVEL"), POLAR),
+    **dict.fromkeys(("FRAMEQUAT", "BALLQUAT"), QUATERNION),
+}
+_IMU = {"ang_vel": AXIAL, "lin_acc": POLAR, "quat": QUATERNION, "projected_gravity": POLAR}
+_TOLERANCE = 1e-4
+
+
+def mirror_maps(
+    env: EnvBase, groups: Sequence[NestedKey] = ("actor", "critic")
+) -> dict[NestedKey, MirrorMap]:
+    """Return the mirror image of observation groups and of the action, by key, in the plane y = 0 of the world.
+
+    For a robot that is its own mirror image, in a scene and with rewards that are too, the image of an episode is an
+    episode. A history repeats the map of its term.
+
+    Args:
+        env: a `ManagerBasedRlEnv`, transformed or not.
+        groups: those to map.
+
+    Raises:
+        ValueError: if the image of a term is not known (register it with `term_mirror.register`), or if joints, default
+            pose or action scale are not symmetric.
+    """
+    inner, specs = innermost(env), group_specs(env)
+    maps: dict[NestedKey, MirrorMap] = {}
+    for group in groups:
+        if group not in specs:
+            raise ValueError(f"no observation group {group!r}: {near(str(group), map(str, specs))}")
+        terms = inner.cfg.observations[group].terms
+        images = {
+            name: _named(f"observations.{group}.{name}", cfg.term, inner) for name, cfg in terms.items()
+        }
+        maps[group] = mirror_group(specs[group], images)
+    maps["action"] = _action(inner)
+    return maps
+
+
+def _named(where: str, term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
+    try:
+        return term_mirror(term, env)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+@functools.singledispatch
+def term_mirror(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
+    """Return the mirror image of what an observation term reads, a command gives, or an action term takes.
+
+    Example:
+        >>> @term_mirror.register
+        ... def _(term: WindDirection, env): return POLAR
+
+    Raises:
+        ValueError: if nothing is registered for the term, or the robot is not symmetric there.
+    """
+    raise ValueError(
+        f"the mirror image of {type(term).__name__} is not known: give it with "
+        "ksim_rl.mdp.mirror_maps.term_mirror.register"
+    )
+
+
+# -- root, sensors, time -----------------------------------------------------------------------------------------
+
+
+@term_mirror.register(mdp.RootPos)
+@term_mirror.register(mdp.RootLinVel)
+@term_mirror.register(mdp.ProjectedGravity)
+def _(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
+    return POLAR
+
+
+@term_mirror.register
+def _(term: mdp.RootAngVel, env: ManagerBasedRlEnv) -> MirrorMap:
+    return AXIAL
+
+
+@term_mirror.register
+def _(term: mdp.RootQuat, env: ManagerBasedRlEnv) -> MirrorMap:
+    return QUATERNION
+
+
+@term_mirror.register
+def _(term: mdp.SensorReading, env: ManagerBasedRlEnv) -> MirrorMap:
+    sensor = env.view.world.mj_model.sensor(term.sensor)
+    kind = mujoco.mjtSensor(int(sensor.type[0])).name.removeprefix("mjSENS_")
+    if kind not in _SENSORS:
+        raise ValueError(f"the mirror image of a sensor of type {kind} is not known")
+    return _SENSORS[kind]
+
+
+@term_mirror.register
+def _(term: mdp.ImuReading, env: ManagerBasedRlEnv) -> MirrorMap:
+    return _IMU[term.quantity]
+
+
+@term_mirror.register(mdp.EpisodeTime)
+@term_mirror.register(mdp.RemainingTime)
+def _(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
+    return unchanged(1)
+
+
+@term_mirror.register
+def _(term: mdp.HeightScan, env: ManagerBasedRlEnv) -> MirrorMap:
+    points_N3 = grid_points(term.size, term.resolution)
+    # Rows along x, one after the other along y.
+    rows = len(np.unique(points_N3[:, 1].round(6)))
+    columns = np.arange(len(points_N3)).reshape(rows, -1)[::-1].ravel()
+    return MirrorMap(source=tuple(map(int, columns)))
+
+
+# -- commands, joints, actions -----------------------------------------------------------------------------------
+
+
+@term_mirror.register
+def _(term: mdp.Command, env: ManagerBasedRlEnv) -> MirrorMap:
+    return term_mirror(env.cfg.commands[term.command], env)
+
+
+@term_mirror.register
+def _(term: mdp.UniformVelocityCommand, env: ManagerBasedRlEnv) -> MirrorMap:
+    return PLANAR_VELOCITY
+
+
+@term_mirror.register(mdp.JointVel)
+@term_mirror.register(mdp.JointAcc)
+@term_mirror.register(mdp.JointEffort)
+@term_mirror.register(mdp.JointPos)
+def _(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
+    return _joints(env, term.joints)
+
+
+@term_mirror.register
+def _(term: mdp.JointPosRel, env: ManagerBasedRlEnv) -> MirrorMap:
+    return _relative_joints(env, term.joints)
+
+
+@term_mirror.register
+def _(term: mdp.LastAction, env: ManagerBasedRlEnv) -> MirrorMap:
+    return _action(env)
+
+
+@term_mirror.register
+def _(term: JointAction, env: ManagerBasedRlEnv) -> MirrorMap:
+    relative = getattr(term, "use_default_offset", False)
+    mirror = _relative_joints(env, term.joints) if relative else _joints(env, term.joints)
+    view, (source, signs) = env.view, mirror.tensors(env.view.device)
+    scale = per_joint(view, "scale", term.scale, term.joints)
+    if isinstance(scale, Tensor) and source is not None:
+        _check_symmetric("scale", scale, scale[source])
+    offset = per_joint(view, "offset", term.offset, term.joints)
+    _check_symmetric("offset", signs * 0.0 + offset, mirror(signs * 0.0 + offset))
+    if term.clip is not None and term.clip[0] != -term.clip[1] and bool((signs < 0).any()):
+        raise ValueError(
+            f"clip={term.clip} is not symmetric, and some joints turn the other way in the mirror"
+        )
+    return mirror.repeat(term.size(view) // mirror.size)
+
+
+def _action(env: ManagerBasedRlEnv) -> MirrorMap:
+    return concatenate([_named(f"actions.{name}", term, env) for name, term in env.cfg.actions.items()])
+
+
+def _joints(env: ManagerBasedRlEnv, joints: Patterns) -> MirrorMap:
+    return mirror_joints(env.view.world.mj_model, env.view.joint_names(joints))
+
+
+def _relative_joints(env: ManagerBasedRlEnv, joints: Patterns) -> MirrorMap:
+    mirror = _joints(env, joints)
+    default_K = env.view.default_joint_pos_EL[0, env.view.joints(joints)]
+    _check_symmetric("the default pose", default_K, mirror(default_K))
+    return mirror
+
+
+def _check_symmetric(what: str, value_K: Tensor, image_K: Tensor) -> None:
+    if float((value_K - image_K).abs().max()) > _TOLERANCE:
+        raise ValueError(f"{what} {value_K.tolist()} is not its own mirror image {image_K.tolist()}")
+
+
+# -- bodies, feet and contacts: one number or vector for each name -----------------------------------------------
+
+
+@term_mirror.register(mdp.BodyPos)
+@term_mirror.register(mdp.BodyLinVel)
+@term_mirror.register(mdp.CenterOfMassPos)
+@term_mirror.register(mdp.CenterOfMassVel)
+def _(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
+    return mirror_by_name(_names(env, "body", term.bodies), POLAR)
+
+
+@term_mirror.register
+def _(term: mdp.BodyAngVel, env: ManagerBasedRlEnv) -> MirrorMap:
+    return mirror_by_name(_names(env, "body", term.bodies), AXIAL)
+
+
+@term_mirror.register
+def _(term: mdp.BodyQuat, env: ManagerBasedRlEnv) -> MirrorMap:
+    return mirror_by_name(_names(env, "body", term.bodies), QUATERNION)
+
+
+@term_mirror.register
+def _(term: mdp.FootPos, env: ManagerBasedRlEnv) -> MirrorMap:
+    return mirror_by_name(_names(env, "site", term.sites), POLAR)
+
+
+@term_mirror.register
+def _(term: mdp.FootHeight, env: ManagerBasedRlEnv) -> MirrorMap:
+    return mirror_by_name(_names(env, "site", term.sites))
+
+
+@term_mirror.register(mdp.Contact)
+@term_mirror.register(mdp.FootContact)
+@term_mirror.register(mdp.FootAirTime)
+def _(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
+    return mirror_by_name(_elements(env, term.sensor))
+
+
+@term_mirror.register(mdp.ContactForce)
+@term_mirror.register(mdp.FootContactForces)
+def _(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
+    return mirror_by_name(_elements(env, term.sensor), POLAR)
+
+
+def _names(env: ManagerBasedRlEnv, kind: str, patterns: Patterns) -> list[str]:
+    names = env.view.resolver.names(kind)
+    return [names[i] for i in env.view.resolver.ids(kind, patterns)]
+
+
+def _elements(env: ManagerBasedRlEnv, sensor: str) -> list[str]:
+    contact = env.cfg.scene.sensors[sensor]
+    assert isinstance(contact, ContactSensor)
+    kind = "geom" if contact.kind == "geom" else "body"
+    return contact.elements(env.view.resolver.names(kind))

@@ -1,0 +1,77 @@
+"""What an env would observe if a reference motion were played in it."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
+from ksim_rl.envs.registry import build
+from ksim_rl.envs.term import EventTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.scene.motions.motion import load_motion, motion_start_time
+from ksim_rl.scene.terrains import PlaneTerrain
+from ksim_rl.transforms.innermost import innermost
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlayMotion(EventTerm):
+    """Put env e into the state that a motion has after e env steps."""
+
+    file: str
+
+    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+        """Write the rows of `mask_E`."""
+        start_E = motion_start_time(view, self.file)
+        start_E.copy_(torch.arange(view.num_envs, device=view.device) * view.step_dt)
+        qpos_EL, qvel_EL = view.motion(self.file).sample(start_E)
+        view.write_qpos(mask_E, qpos_EL)
+        view.write_qvel(mask_E, qvel_EL)
+
+
+def observe_motion(env: EnvBase, *, group: str, file: str) -> Tensor:
+    """Return an observation group along a reference motion, one row per env step, float32 [F, L] on the env's device.
+
+    Envs of their own, on a plane, are put into the motion's states, and the group's terms and transforms compute what
+    they always do; noise is off. Terms that read more than positions and velocities (commands, actions, contacts,
+    forces) read what they have after a reset.
+
+    Args:
+        env: around a `ManagerBasedRlEnv`; it stays as it is.
+        group: one of its observation groups.
+        file: a reference motion, as `view.motion` reads it.
+
+    Raises:
+        ValueError: if the motion does not fit the model, or is shorter than an env step.
+    """
+    base: ManagerBasedRlEnv = innermost(env)
+    cfg, device = base.cfg, base.device
+    assert device is not None
+    duration_s = load_motion(file, base.world.mj_model, torch.device("cpu")).duration_s
+    # The least bit more, so that rounding does not cost the last frame.
+    frames = 1 + int(duration_s / base.step_dt + 1e-6)
+    if frames < 2:
+        raise ValueError(
+            f"motion {file}: lasts {duration_s:g} s, less than an env step of {base.step_dt:g} s"
+        )
+    ground = PlaneTerrain() if cfg.scene.terrain is not None else None
+    played = dataclasses.replace(
+        cfg,
+        scene=dataclasses.replace(cfg.scene, num_envs=frames, terrain=ground),
+        observations={group: cfg.observations[group]},
+        events={"play": PlayMotion(file=file)},
+        rewards={},
+        terminations={},
+        curriculum={},
+        metrics={},
+        episode_length_s=0.0,
+        viewer=dataclasses.replace(cfg.viewer, env_index=0),
+        seed=0,
+    )
+    player = build(played, device=device)
+    player.eval()
+    seen_FL = player.reset().get(group).clone()
+    player.close(raise_if_closed=False)
+    return seen_FL

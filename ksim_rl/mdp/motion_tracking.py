@@ -1,0 +1,181 @@
+"""Terms of following a reference motion, from where `ResetToMotion` began the episode.
+
+`file` is what `view.motion` reads. Kernels are those of Peng et al., "DeepMimic" (2018), with their scales k written as
+std = 1 / sqrt(k): joint positions 2, joint velocities 0.1, ends of limbs 40, root or centre of mass 10.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import check_in_range
+from ksim_rl.envs.term import ObservationTerm, TerminationTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.rewards.gaussian_reward import GaussianReward
+from ksim_rl.scene import quaternion
+from ksim_rl.scene.motions.motion import motion_bodies, motion_joints, motion_time
+from ksim_rl.scene.names import Patterns
+
+# -- observations ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionPhase(ObservationTerm):
+    """Sine and cosine of 2 pi t / cycle, `t` the present time in the motion, [E, 2].
+
+    Attributes:
+        cycle_s: s, after which a periodic motion repeats; None is the motion's duration.
+    """
+
+    file: str
+    cycle_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.cycle_s is not None:
+            check_in_range("cycle_s", self.cycle_s, low=0.0, low_open=True)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
+        cycle_s = self.cycle_s or view.motion(self.file).duration_s
+        angle_E = motion_time(view, self.file) * (2.0 * math.pi / cycle_s)
+        return torch.stack((torch.sin(angle_E), torch.cos(angle_E)), dim=-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionJoints(ObservationTerm):
+    """Positions (rad or m), then velocities (per s), that joints have in the motion, [E, 2L].
+
+    Attributes:
+        ahead_s: s, how far ahead of the present time.
+    """
+
+    file: str
+    joints: Patterns = ".*"
+    ahead_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_in_range("ahead_s", self.ahead_s)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
+        if self.ahead_s == 0.0:
+            return torch.cat(motion_joints(view, self.file, self.joints), dim=-1)
+        time_E = motion_time(view, self.file) + self.ahead_s
+        return torch.cat(view.motion(self.file).sample_joints(time_E, view.joints(self.joints)), dim=-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionBodyOffset(ObservationTerm):
+    """Where bodies are in the motion minus where they are, world frame, m, [E, 3N]; position stage."""
+
+    file: str
+    bodies: Patterns
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the reading."""
+        return _body_offset(view, self.file, self.bodies).flatten(start_dim=1)
+
+
+# -- rewards -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionReward(GaussianReward):
+    """exp(-error^2 / std^2), [E], of an error that is summed over joints or bodies.
+
+    Attributes:
+        file: the motion.
+    """
+
+    file: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackMotionJointPos(MotionReward):
+    """exp(-sum_j (q_j - qref_j)^2 / std^2), rad or m, [E]; position stage."""
+
+    joints: Patterns = ".*"
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        pos_EL, _ = motion_joints(view, self.file, self.joints)
+        own_EL = view.joint_pos_EL[:, view.joints(self.joints)]
+        return self.rate((own_EL - pos_EL).square().sum(-1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackMotionJointVel(MotionReward):
+    """exp(-sum_j (v_j - vref_j)^2 / std^2), rad/s or m/s, [E]; velocity stage."""
+
+    joints: Patterns = ".*"
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        _, vel_EL = motion_joints(view, self.file, self.joints)
+        own_EL = view.joint_vel_EL[:, view.joints(self.joints)]
+        return self.rate((own_EL - vel_EL).square().sum(-1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackMotionBodyPos(MotionReward):
+    """exp(-sum_b |p_b - pref_b|^2 / std^2), world frame, m, [E]; position stage."""
+
+    bodies: Patterns
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return self.rate(_body_offset(view, self.file, self.bodies).square().sum((-2, -1)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackMotionBodyQuat(MotionReward):
+    """exp(-sum_b a_b^2 / std^2), `a` the angle of a body from its orientation in the motion, rad, [E]."""
+
+    bodies: Patterns
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        _, quat_EN4 = motion_bodies(view, self.file, self.bodies)
+        own_EN4 = view.body_quat_w(view.bodies(self.bodies))
+        return self.rate(quaternion.angle_between(own_EN4, quat_EN4).square().sum(-1))
+
+
+# -- terminations ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class FarFromMotion(TerminationTerm):
+    """A body is further than `distance` (m) from where it is in the motion, world frame; position stage."""
+
+    file: str
+    bodies: Patterns
+    distance: float
+
+    def __post_init__(self) -> None:
+        check_in_range("distance", self.distance, low=0.0, low_open=True)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return which envs end, bool [E]."""
+        offset_EN3 = _body_offset(view, self.file, self.bodies)
+        return (torch.linalg.vector_norm(offset_EN3, dim=-1) > self.distance).any(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionFinished(TerminationTerm):
+    """The motion's last frame is reached: there is nothing more to follow."""
+
+    file: str
+    time_out: bool = True
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return which envs end, bool [E]."""
+        # Half a step early: sums of float32 steps may fall short of the end by some rounding.
+        return motion_time(view, self.file) > view.motion(self.file).duration_s - 0.5 * view.step_dt
+
+
+def _body_offset(view: EnvView, file: str, bodies: Patterns) -> Tensor:
+    """Return the motion's positions of bodies minus their own, world frame, m, [E, N, 3]."""
+    pos_EN3, _ = motion_bodies(view, file, bodies)
+    return pos_EN3 - view.body_pos_w(view.bodies(bodies))

@@ -1,0 +1,198 @@
+"""Events that make each world's model differ: domain randomization. What all of them share.
+
+Each draw starts from the model's own values, so that neither the order of resets nor their number matters.
+"""
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import check_choice, check_in_range, check_pair
+from ksim_rl.envs.term import EventTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.constants import constant, index_constant
+from ksim_rl.scene.names import Patterns
+
+Pair = tuple[float, float]
+Mode = Literal["startup", "reset", "interval", "step"]
+Operation = Literal["abs", "add", "scale"]
+Distribution = Literal["uniform", "log_uniform", "gaussian"]
+OPERATIONS = ("abs", "add", "scale")
+DISTRIBUTIONS = ("uniform", "log_uniform", "gaussian")
+# Where a gaussian draw is cut, in standard deviations, so that its reach can be checked.
+CUT = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Randomize(EventTerm):
+    """Draw values per world: once at startup, for the rows that reset, or at intervals.
+
+    Attributes:
+        operation: "abs" replaces the model's own value, "add" and "scale" start from it, not from the last draw.
+        distribution: "uniform" and "log_uniform" draw between the numbers (low, high) of a range; log_uniform needs
+            positive ones. "gaussian" takes the pair as (mean, standard deviation), and is cut at three of these.
+        shared: one draw for all elements of a world, instead of one for each.
+    """
+
+    operation: Operation = "abs"
+    distribution: Distribution = "uniform"
+    shared: bool = False
+    mode: Mode = "startup"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("operation", self.operation, OPERATIONS)
+        check_choice("distribution", self.distribution, DISTRIBUTIONS)
+
+    def check_range(self, name: str, pair: object) -> None:
+        """Refuse a range that the distribution cannot draw from.
+
+        Raises:
+            ValueError: naming the field, the value and what would be valid.
+        """
+        if self.distribution == "gaussian":
+            check_pair(name, (0.0, 0.0) if _is_pair(pair) else pair)
+            mean, deviation = pair  # pyright: ignore[reportGeneralTypeIssues]
+            check_in_range(f"{name}[0] (mean)", mean)
+            check_in_range(f"{name}[1] (standard deviation)", deviation, low=0.0)
+            return
+        check_pair(name, pair)
+        if self.distribution == "log_uniform":
+            check_in_range(f"{name}[0] (log_uniform)", pair[0], low=0.0, low_open=True)  # pyright: ignore
+
+    def draw(self, view: EnvView, count: int, pairs: Sequence[Pair]) -> Tensor:
+        """Draw float32 [E, count, C], one column per range; [E, 1, C] if shared."""
+        size = (1 if self.shared else count) * len(pairs)
+        first = [float(pair[0]) for pair in pairs]
+        second = [float(pair[1]) for pair in pairs]
+        if self.distribution == "gaussian":
+            mean_C, deviation_C = constant(first, view.device), constant(second, view.device)
+            drawn_ENC = view.normal(size).view(view.num_envs, -1, len(pairs)).clamp(-CUT, CUT)
+            return torch.addcmul(mean_C, drawn_ENC, deviation_C)
+        if self.distribution == "log_uniform":
+            first, second = [math.log(low) for low in first], [math.log(high) for high in second]
+        low_C = constant(first, view.device)
+        width_C = constant([high - low for low, high in zip(first, second, strict=True)], view.device)
+        drawn_ENC = view.uniform(size).view(view.num_envs, -1, len(pairs))
+        drawn_ENC = torch.addcmul(low_C, drawn_ENC, width_C)
+        return torch.exp(drawn_ENC) if self.distribution == "log_uniform" else drawn_ENC
+
+    def combine(self, nominal: Tensor, drawn: Tensor) -> Tensor:
+        """Return the values that the draws make of the model's own."""
+        if self.operation == "abs":
+            return drawn
+        return nominal + drawn if self.operation == "add" else nominal * drawn
+
+    def reach(self, nominal: np.ndarray, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lowest and the highest values that the draws can make of the model's own, shaped like these."""
+        low, high = pair
+        if self.distribution == "gaussian":
+            mean, deviation = pair
+            low, high = mean - CUT * deviation, mean + CUT * deviation
+        if self.operation == "add":
+            return nominal + low, nominal + high
+        if self.operation == "scale":
+            return np.minimum(nominal * low, nominal * high), np.maximum(nominal * low, nominal * high)
+        return np.full_like(nominal, low), np.full_like(nominal, high)
+
+    @abstractmethod
+    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+        """Draw for the rows of `mask_E`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeModelField(Randomize):
+    """Draw entries of a model field per world. Subclasses name the field; its rows are elements of one kind.
+
+    Attributes:
+        ranges: what to draw from, by column of the field; one pair is drawn from for every column.
+    """
+
+    ranges: Pair | Mapping[int, Pair]
+
+    field: ClassVar[str]
+    kind: ClassVar[str]
+    columns: ClassVar[int] = 1
+    lowest: ClassVar[float | None] = None
+    """What a value must exceed or equal to make sense, if anything."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.ranges, Mapping):
+            self.check_range("ranges", self.ranges)
+            return
+        for column, pair in self.ranges.items():
+            check_choice("ranges", column, range(self.columns))
+            self.check_range(f"ranges[{column}]", pair)
+
+    @property
+    @abstractmethod
+    def elements(self) -> Patterns:
+        """Names or patterns of what is randomized."""
+
+    @property
+    def per_world_fields(self) -> tuple[str, ...]:
+        """The one field that this event writes."""
+        return (self.field,)
+
+    def ids(self, view: EnvView) -> tuple[int, ...]:
+        """Return the rows of the field that are meant."""
+        return view.resolver.ids(self.kind, self.elements)
+
+    def nominal(self, view: EnvView) -> np.ndarray:
+        """Return the model's own values of the rows that are meant, [N, columns]."""
+        values = np.asarray(getattr(view.world.mj_model, self.field), dtype=np.float64)
+        return values.reshape(-1, self.columns)[list(self.ids(view))]
+
+    def pairs(self) -> dict[int, Pair]:
+        """Return the ranges by column, in the order of the columns."""
+        if isinstance(self.ranges, Mapping):
+            return dict(sorted(self.ranges.items()))
+        return dict.fromkeys(range(self.columns), self.ranges)
+
+    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+        """Draw for the rows of `mask_E`."""
+        ids, pairs, nominal = self.ids(view), self.pairs(), self.nominal(view)
+        if not pairs:
+            return
+        self._check_reach(view, nominal, pairs)
+        columns = tuple(pairs)
+        own_NC = constant(nominal[:, list(columns)].ravel().tolist(), view.device).view(len(ids), -1)
+        value_ENC = self.combine(own_NC, self.draw(view, len(ids), list(pairs.values())))
+        write_entries(view.field(self.field), ids, columns, mask_E, value_ENC)
+
+    def _check_reach(self, view: EnvView, nominal: np.ndarray, pairs: Mapping[int, Pair]) -> None:
+        if self.lowest is None:
+            return
+        for column, pair in pairs.items():
+            low, _ = self.reach(nominal[:, column], pair)
+            if np.any(low < self.lowest):
+                names = view.resolver.names(self.kind)
+                name = names[view.resolver.ids(self.kind, self.elements)[int(low.argmin())]]
+                raise ValueError(
+                    f"{type(self).__name__}.ranges={self.ranges!r}: {self.field} of {self.kind} {name!r} would reach "
+                    f"{low.min():g}; expected at least {self.lowest:g}"
+                )
+
+
+def write_entries(
+    field: Tensor, ids: Sequence[int], columns: Sequence[int], mask_E: Tensor, value_ENC: Tensor
+) -> None:
+    """Write entries of a per-world field [E, rows] or [E, rows, columns] in the worlds of `mask_E`, bool [E]."""
+    entries = field.unsqueeze(-1) if field.ndim == 2 else field
+    rows, across = index_constant(ids, field.device), index_constant(columns, field.device)
+    held_ENC = entries[:, rows][..., across]
+    new_ENC = torch.where(mask_E[:, None, None], value_ENC, held_ENC)
+    if isinstance(rows, Tensor) and isinstance(across, Tensor):
+        rows = rows[:, None]
+    entries[:, rows, across] = new_ENC
+
+
+def _is_pair(value: object) -> bool:
+    return isinstance(value, (tuple, list)) and len(value) == 2

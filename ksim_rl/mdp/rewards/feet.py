@@ -1,0 +1,148 @@
+"""Rewards for how feet move, 0 unless the commanded speed exceeds `command_threshold` (`active` below).
+
+Foot poses and velocities are of the current state (position and velocity stage); contacts and forces belong to the
+last physics substep (acceleration stage).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import check_in_range
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.commands.speed import RewardWhileCommanded
+from ksim_rl.mdp.foot_contact import foot_contact
+from ksim_rl.scene.names import Patterns
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootClearance(RewardWhileCommanded):
+    """active * sum_f |height_f - target_height| * |v_xy,f|, m^2/s, [E]: a foot that moves should be at that height.
+
+    Attributes:
+        sites: the feet; heights are above the ground right below them, velocities in the world frame.
+        target_height: m.
+    """
+
+    sites: Patterns
+    target_height: float
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        index = view.sites(self.sites)
+        miss_EF = (view.site_height(index) - self.target_height).abs()
+        speed_EF = torch.linalg.vector_norm(view.site_lin_vel_w(index)[..., :2], dim=-1)
+        return self.while_commanded(view, (miss_EF * speed_EF).sum(-1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootSwingHeight(RewardWhileCommanded):
+    """active * sum_f landed_f * (peak_f / target_height - 1)^2, [E]; `peak` is the swing's greatest height.
+
+    The peak starts at 0 after each landing and each reset.
+
+    Attributes:
+        sensor: contact sensor, one geom per foot, in the order of `sites`.
+        sites: the feet; heights are above the ground right below them.
+        target_height: m.
+    """
+
+    sensor: str
+    sites: Patterns
+    target_height: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_in_range("target_height", self.target_height, low=0.0, low_open=True)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        contact = foot_contact(view, self.sensor, self.sites)
+        height_EF = view.site_height(view.sites(self.sites))
+        memory_EF = view.memory("peak_EF", height_EF.shape[-1])
+        peak_EF = torch.where(contact.found_EN > 0, memory_EF, torch.maximum(memory_EF, height_EF))
+        memory_EF.copy_(torch.where(contact.first_contact_EN > 0, 0.0, peak_EF))
+        cost_E = ((peak_EF / self.target_height - 1.0).square() * contact.first_contact_EN).sum(-1)
+        return self.while_commanded(view, cost_E)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootSlip(RewardWhileCommanded):
+    """active * sum_f contact_f * |v_xy,f|^2, (m/s)^2, [E]; velocities of the sites in the world frame.
+
+    Attributes:
+        sensor: contact sensor, one geom per foot, in the order of `sites`.
+    """
+
+    sensor: str
+    sites: Patterns
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        speed2_EF = view.site_lin_vel_w(view.sites(self.sites))[..., :2].square().sum(-1)
+        cost_E = (speed2_EF * foot_contact(view, self.sensor, self.sites).found_EN).sum(-1)
+        return self.while_commanded(view, cost_E)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoftLanding(RewardWhileCommanded):
+    """active * sum_f landed_f * |force_f|, N, [E]; the net contact force at the end of the step of touch-down."""
+
+    sensor: str
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        contact = view.contact(self.sensor)
+        force_EF = torch.linalg.vector_norm(contact.force_EN3, dim=-1)
+        cost_E = (force_EF * contact.first_contact_EN).sum(-1)
+        return self.while_commanded(view, cost_E)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeetAirTime(RewardWhileCommanded):
+    """active * number of feet whose present flight has lasted between two thresholds (s), [E]."""
+
+    sensor: str
+    threshold_min: float
+    threshold_max: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_in_range("threshold_max", self.threshold_max, low=self.threshold_min)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        air_time_EF = view.contact(self.sensor).air_time_EN
+        inside_EF = (air_time_EF > self.threshold_min) & (air_time_EF < self.threshold_max)
+        count_E = inside_EF.to(torch.float32).sum(-1)
+        return self.while_commanded(view, count_E)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaitPhase(RewardWhileCommanded):
+    """Fraction of the feet that do what the rhythm asks for: swing where their sine is positive, else stand; [E].
+
+    Attributes:
+        gait: a `SinusoidalGaitCommand`, one offset per foot in the order of `sensor`.
+        sensor: contact sensor, one element per foot.
+    """
+
+    gait: str
+    sensor: str
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E].
+
+        Raises:
+            ValueError: if the gait has another number of feet than the sensor.
+        """
+        touches_EF, phase_EL = view.contact(self.sensor).found_EN > 0, view.command(self.gait)
+        feet = touches_EF.shape[-1]
+        if phase_EL.shape[-1] != 2 * feet:
+            raise ValueError(
+                f"gait={self.gait!r} has {phase_EL.shape[-1] // 2} feet, sensor={self.sensor!r} has {feet}: give each "
+                "foot one offset"
+            )
+        matches_EF = touches_EF != (phase_EL[:, :feet] > 0)
+        return self.while_commanded(view, matches_EF.to(torch.float32).mean(-1))

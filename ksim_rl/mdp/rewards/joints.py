@@ -1,0 +1,171 @@
+"""Rewards for what joints and actuators do, [E]; weights are usually negative.
+
+Positions and velocities are of the current state; accelerations, efforts and forces belong to the last physics substep
+(acceleration stage). `joints` and `actuators` take names or regular expressions; ".*" is all.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import check_in_range
+from ksim_rl.envs.term import RewardTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.constants import constant, values_by_name
+from ksim_rl.scene.names import Patterns
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointLimitReward(RewardTerm):
+    """Sum over joints of how far the size of something is above `soft_factor` of its limit, [E].
+
+    Attributes:
+        limits: by joint, in the unit of what is limited; keys are regular expressions that match each of `joints` once.
+        soft_factor: fraction of the limit that is free of penalty.
+    """
+
+    limits: Mapping[str, float]
+    joints: Patterns = ".*"
+    soft_factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for pattern, limit in self.limits.items():
+            check_in_range(f"limits[{pattern!r}]", limit, low=0.0, low_open=True)
+        check_in_range("soft_factor", self.soft_factor, low=0.0, high=1.0, low_open=True)
+
+    def overshoot(self, view: EnvView, value_EL: Tensor) -> Tensor:
+        """Return the sum for values of all joints, [E]."""
+        limit_L = values_by_name("limits", self.limits, view.joint_names(self.joints))
+        free_L = constant([self.soft_factor * limit for limit in limit_L], view.device)
+        return (value_EL[:, view.joints(self.joints)].abs() - free_L).clamp(min=0.0).sum(-1)
+
+
+# -- position ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointPosLimits(RewardTerm):
+    """Sum over joints of how far each is beyond its soft limits, rad or m, [E]; position stage.
+
+    Soft limits: `scene.soft_joint_pos_limit_factor` of the range, about its middle.
+    """
+
+    joints: Patterns = ".*"
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        index = view.joints(self.joints)
+        pos_EL, limits_L2 = view.joint_pos_EL[:, index], view.soft_joint_pos_limits_L2[index]
+        inside_EL = torch.clamp(pos_EL, limits_L2[:, 0], limits_L2[:, 1])
+        return (pos_EL - inside_EL).abs().sum(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointDeviationL1(RewardTerm):
+    """Sum of |q - q0| from the default pose, rad or m, [E]; position stage."""
+
+    joints: Patterns = ".*"
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return view.joint_pos_rel_EL[:, view.joints(self.joints)].abs().sum(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointDeviationL2(RewardTerm):
+    """Sum of (q - q0)^2 from the default pose, rad^2 or m^2, [E]; position stage."""
+
+    joints: Patterns = ".*"
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return view.joint_pos_rel_EL[:, view.joints(self.joints)].square().sum(-1)
+
+
+# -- velocity and acceleration -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointVelL2(RewardTerm):
+    """Sum of squared joint velocities, (rad/s)^2 or (m/s)^2, [E]; velocity stage."""
+
+    joints: Patterns = ".*"
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return view.joint_vel_EL[:, view.joints(self.joints)].square().sum(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointVelLimits(JointLimitReward):
+    """Sum over joints of how far each speed is above `soft_factor` of its limit, rad/s or m/s, [E]; velocity stage."""
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return self.overshoot(view, view.joint_vel_EL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointAccL2(RewardTerm):
+    """Sum of squared joint accelerations, (rad/s^2)^2 or (m/s^2)^2, [E]; acceleration stage."""
+
+    joints: Patterns = ".*"
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return view.joint_acc_EL[:, view.joints(self.joints)].square().sum(-1)
+
+
+# -- effort ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointEffortL2(RewardTerm):
+    """Sum of squared efforts (torques) of the actuators at joints, (N m)^2 or N^2, [E]; acceleration stage."""
+
+    joints: Patterns = ".*"
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return view.joint_effort_EL[:, view.joints(self.joints)].square().sum(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointEffortLimits(JointLimitReward):
+    """Sum over joints of how far each effort is above `soft_factor` of its limit, N m or N, [E]; acceleration stage.
+
+    Actuators that clamp at their limit never exceed it: there, choose a factor below 1.
+    """
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return self.overshoot(view, view.joint_effort_EL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActuatorForceL2(RewardTerm):
+    """Sum of squared actuator forces, before the gears, N^2 or (N m)^2, [E]; acceleration stage."""
+
+    actuators: Patterns = ".*"
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return view.world.actuator_force_EL[:, view.actuators(self.actuators)].square().sum(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Energy(RewardTerm):
+    """Sum over joints of |effort * velocity|, W, [E]: braking costs as much as driving.
+
+    Efforts belong to the last physics substep (acceleration stage), velocities to the state that it reached.
+    """
+
+    joints: Patterns = ".*"
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        index = view.joints(self.joints)
+        return (view.joint_effort_EL[:, index] * view.joint_vel_EL[:, index]).abs().sum(-1)

@@ -1,0 +1,105 @@
+"""Rewards for how bodies move, [E]; weights are usually negative. Velocities are of the current state."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import check_in_range
+from ksim_rl.envs.term import RewardTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.commands.speed import is_commanded
+from ksim_rl.scene.names import Patterns
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinVelZL2(RewardTerm):
+    """v_z^2, `v` the root's linear velocity in its own frame, (m/s)^2, [E]; velocity stage.
+
+    Attributes:
+        entity: the robot that is meant; "" is the first one.
+    """
+
+    entity: str = ""
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return view.entity(self.entity).root_lin_vel_b_EL[:, 2].square()
+
+
+@dataclass(frozen=True, kw_only=True)
+class AngVelXYL2(RewardTerm):
+    """|w_xy|^2, `w` the root's angular velocity in its own frame, (rad/s)^2, [E]; velocity stage.
+
+    Attributes:
+        entity: the robot that is meant; "" is the first one.
+    """
+
+    entity: str = ""
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return view.entity(self.entity).root_ang_vel_b_EL[:, :2].square().sum(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodyAngularVelocity(RewardTerm):
+    """|w_xy|^2, `w` a body's angular velocity in the world frame, (rad/s)^2, [E]; velocity stage. Yaw is free."""
+
+    body: str
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return view.body_ang_vel_w(view.bodies(self.body))[..., :2].square().sum((-2, -1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class AngularMomentum(RewardTerm):
+    """|L|^2 of a `subtreeangmom` sensor, about the subtree's centre of mass, (kg m^2/s)^2, [E]; velocity stage."""
+
+    sensor: str
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return view.sensor(self.sensor).square().sum(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkAccelerationL2(RewardTerm):
+    """Sum over bodies of |(v_t - v_{t-1}) / step_dt|^2, (m/s^2)^2, [E]: the mean acceleration over the env step.
+
+    `v` is the velocity of the body frame's origin in the world (velocity stage). An impact shows in full, whichever
+    substep it falls on, and so does a push that sets velocities. 0 in the first step of an episode.
+    """
+
+    bodies: Patterns
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        vel_EN3 = view.body_lin_vel_w(view.bodies(self.bodies))
+        last_EN3 = view.memory("last_vel_EN3", *vel_EN3.shape[1:])
+        acceleration_EN3 = (vel_EN3 - last_EN3) / view.step_dt
+        last_EN3.copy_(vel_EN3)
+        return torch.where(view.episode_step_E <= 1, 0.0, acceleration_EN3.square().sum((-2, -1)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionlessAtRest(RewardTerm):
+    """Sum of squared joint velocities while the command asks to stand, else 0, (rad/s)^2 or (m/s)^2, [E].
+
+    Attributes:
+        command, command_threshold: standing means that the commanded speed does not exceed the threshold.
+    """
+
+    command: str
+    command_threshold: float
+    joints: Patterns = ".*"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_in_range("command_threshold", self.command_threshold, low=0.0)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        motion_E = view.joint_vel_EL[:, view.joints(self.joints)].square().sum(-1)
+        return motion_E * (1.0 - is_commanded(view, self.command, self.command_threshold))

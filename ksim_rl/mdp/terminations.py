@@ -1,0 +1,198 @@
+"""Conditions that end an episode, bool [E]."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import check_in_range
+from ksim_rl.envs.term import TerminationTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.root_height import root_height
+from ksim_rl.scene.names import Patterns
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimeOut(TerminationTerm):
+    """The episode has lasted `episode_length_s`: a truncation, not a failure."""
+
+    time_out: bool = True
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return which envs end, bool [E]."""
+        return view.episode_step_E + view.time_out_offset_E >= view.max_episode_length
+
+
+@dataclass(frozen=True, kw_only=True)
+class BadOrientation(TerminationTerm):
+    """The root is tilted further than a limit: the angle between its z axis and the world's; position stage.
+
+    Attributes:
+        limit_angle: rad, in (0, pi).
+        entity: the robot or object; "" is the first robot.
+    """
+
+    limit_angle: float
+    entity: str = ""
+
+    def __post_init__(self) -> None:
+        check_in_range("limit_angle", self.limit_angle, low=0.0, high=math.pi, low_open=True)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return which envs end, bool [E]."""
+        # The cosine falls as the angle grows, so comparing cosines needs no acos, which is ill-conditioned at 0.
+        return -view.entity(self.entity).projected_gravity_EL[:, 2] < math.cos(self.limit_angle)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RootHeightBelow(TerminationTerm):
+    """The root body's frame is closer than `minimum_height` (m) to the ground below it; position stage.
+
+    Attributes:
+        minimum_height: m; on flat ground, in the world frame.
+        entity: the robot or object; "" is the first robot.
+    """
+
+    minimum_height: float
+    entity: str = ""
+
+    def __post_init__(self) -> None:
+        check_in_range("minimum_height", self.minimum_height)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return which envs end, bool [E]."""
+        return root_height(view, self.entity) < self.minimum_height
+
+
+@dataclass(frozen=True, kw_only=True)
+class FarFromOrigin(TerminationTerm):
+    """The root is further than `distance` (m) from where its env starts, in the horizontal plane; position stage.
+
+    Attributes:
+        distance: m from the env's origin on the terrain; on a plane, from the world's.
+        entity: the robot or object; "" is the first robot.
+    """
+
+    distance: float
+    entity: str = ""
+
+    def __post_init__(self) -> None:
+        check_in_range("distance", self.distance, low=0.0, low_open=True)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return which envs end, bool [E]."""
+        away_E3 = view.entity(self.entity).root_pos_EL - view.terrain.origins_E3
+        return torch.linalg.vector_norm(away_E3[:, :2], dim=-1) > self.distance
+
+
+@dataclass(frozen=True, kw_only=True)
+class RootVelocityAbove(TerminationTerm):
+    """The root body moves or turns faster than a robot can: the physics has gone wrong; velocity stage.
+
+    Attributes:
+        linear: m/s, of the root frame's origin; None sets no limit.
+        angular: rad/s; None sets no limit.
+        entity: the robot or object; "" is the first robot.
+    """
+
+    linear: float | None = None
+    angular: float | None = None
+    entity: str = ""
+
+    def __post_init__(self) -> None:
+        if self.linear is None and self.angular is None:
+            raise ValueError("linear=None, angular=None: give at least one limit")
+        for name in ("linear", "angular"):
+            if getattr(self, name) is not None:
+                check_in_range(name, getattr(self, name), low=0.0, low_open=True)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return which envs end, bool [E]."""
+        root = view.entity(self.entity)
+        ends_E = torch.zeros(view.num_envs, dtype=torch.bool, device=view.device)
+        if self.linear is not None:
+            ends_E = ends_E | (torch.linalg.vector_norm(root.root_lin_vel_w_EL, dim=-1) > self.linear)
+        if self.angular is not None:
+            ends_E = ends_E | (torch.linalg.vector_norm(root.root_ang_vel_b_EL, dim=-1) > self.angular)
+        return ends_E
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointVelocityAbove(TerminationTerm):
+    """A joint moves faster than `limit` (rad/s or m/s); velocity stage.
+
+    Attributes:
+        limit: rad/s or m/s.
+        joints: names or patterns.
+    """
+
+    limit: float
+    joints: Patterns = ".*"
+
+    def __post_init__(self) -> None:
+        check_in_range("limit", self.limit, low=0.0, low_open=True)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return which envs end, bool [E]."""
+        return (view.joint_vel_EL[:, view.joints(self.joints)].abs() > self.limit).any(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointLimitViolated(TerminationTerm):
+    """A joint is outside of its soft limits by more than `margin` (rad or m); position stage.
+
+    Attributes:
+        margin: rad or m.
+        joints: names or patterns.
+    """
+
+    margin: float = 0.0
+    joints: Patterns = ".*"
+
+    def __post_init__(self) -> None:
+        check_in_range("margin", self.margin, low=0.0)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return which envs end, bool [E]."""
+        index = view.joints(self.joints)
+        pos_EN, limits_N2 = view.joint_pos_EL[:, index], view.soft_joint_pos_limits_L2[index]
+        beyond_EN = torch.maximum(limits_N2[:, 0] - pos_EN, pos_EN - limits_N2[:, 1])
+        return (beyond_EN > self.margin).any(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class IllegalContact(TerminationTerm):
+    """Something touches that should not, with a net force of more than `threshold` (N); acceleration stage.
+
+    Attributes:
+        sensor: a contact sensor of `scene.sensors` on what must not touch.
+        threshold: N; sampled at the last physics substep of the env step.
+    """
+
+    sensor: str
+    threshold: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_in_range("threshold", self.threshold, low=0.0)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return which envs end, bool [E]."""
+        return (torch.linalg.vector_norm(view.contact(self.sensor).force_EN3, dim=-1) > self.threshold).any(
+            -1
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class NonFiniteState(TerminationTerm):
+    """A joint acceleration, an actuator's force or a sensor's reading is not finite; acceleration stage.
+
+    A world whose positions or velocities are not finite ends without this term, as `non_finite`; this one also catches
+    what has not reached them, such as a sensor that divides by zero.
+    """
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return which envs end, bool [E]."""
+        world = view.world
+        parts = (world.qacc_EL, world.actuator_force_EL, world.sensordata_EL)
+        return ~torch.isfinite(torch.cat(parts, dim=-1)).all(-1)

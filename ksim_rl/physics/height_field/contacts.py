@@ -1,0 +1,123 @@
+"""Height fields collide through a kernel of our own instead of MuJoCo Warp's general convex one.
+
+MuJoCo Warp (4.0) treats each triangle as the top of a prism and runs GJK and EPA on it. Where a prism's top is not
+level, some contacts (about one in 25 of a small ball on a slope or on rough ground) get a depth of centimetres and a
+normal straight up or down, which kicks robots. A ball, a capsule or a box against triangles needs no such search: our
+kernel is exact, and cheaper.
+"""
+
+from __future__ import annotations
+
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+
+from ksim_rl.physics.height_field.kernels import (
+    BOX,
+    CAPSULE,
+    SPHERE,
+    height_field_contacts,
+)
+
+HEIGHT_FIELD = int(mjw.GeomType.HFIELD)
+_SHAPES = (SPHERE, CAPSULE, BOX)
+
+
+def take_over_height_fields(warp_model: mjw.Model) -> None:
+    """Let our kernel find the contacts of height fields with spheres, capsules and boxes, in place.
+
+    Pairs with other geoms (cylinders, ellipsoids, meshes), and pairs that a distance sensor measures, stay with MuJoCo
+    Warp. Call it before anything copies the model.
+    """
+    geom_type = warp_model.geom_type.numpy()
+    pairs, pair_ids = warp_model.nxn_geom_pair.numpy(), warp_model.nxn_pairid.numpy()
+    types = geom_type[pairs]
+    height_first = np.where(types[:, :1] == HEIGHT_FIELD, pairs, pairs[:, ::-1])
+    taken = (types == HEIGHT_FIELD).any(-1) & np.isin(geom_type[height_first[:, 1]], _SHAPES)
+    taken &= (pair_ids[:, 0] >= -1) & (pair_ids[:, 1] < 0)
+    if not taken.any() or warp_model.flg_surfacevel:
+        return
+    contacts = _Contacts(height_first[taken], pair_ids[taken])
+    # What is left to MuJoCo Warp: all pairs by number, and those of them that may touch.
+    left_ids = np.where(taken[:, None], (-2, -1), pair_ids)
+    may_touch = (left_ids[:, 0] > -2) | (left_ids[:, 1] >= 0)
+    warp_model.nxn_pairid = wp.array(left_ids, dtype=wp.vec2i)
+    warp_model.nxn_pairid_filtered = wp.array(left_ids[may_touch], dtype=wp.vec2i)
+    warp_model.nxn_geom_pair_filtered = wp.array(pairs[may_touch], dtype=wp.vec2i)
+    warp_model.geom_pair_type_count = _pair_type_count(types[may_touch])
+    warp_model.callback.contactfilter = contacts
+
+
+class _Contacts:
+    """The hook that MuJoCo Warp calls after its own collision pass."""
+
+    def __init__(self, pairs: np.ndarray, pair_ids: np.ndarray) -> None:
+        self._pairs = wp.array(pairs, dtype=wp.vec2i)
+        self._pair_ids = wp.array(pair_ids, dtype=wp.vec2i)
+
+    def __call__(self, m: mjw.Model, d: mjw.Data) -> None:
+        """Append the contacts of all worlds."""
+        wp.launch(
+            height_field_contacts,
+            dim=(d.nworld, len(self._pairs)),
+            inputs=[
+                self._pairs,
+                self._pair_ids,
+                m.geom_type,
+                m.geom_condim,
+                m.geom_dataid,
+                m.geom_priority,
+                m.geom_solmix,
+                m.geom_solref,
+                m.geom_solimp,
+                m.geom_size,
+                m.geom_rbound,
+                m.geom_friction,
+                m.geom_margin,
+                m.geom_gap,
+                m.geom_adhesion,
+                m.hfield_size,
+                m.hfield_nrow,
+                m.hfield_ncol,
+                m.hfield_adr,
+                m.hfield_data,
+                m.pair_dim,
+                m.pair_solref,
+                m.pair_solreffriction,
+                m.pair_solimp,
+                m.pair_margin,
+                m.pair_gap,
+                m.pair_adhesion,
+                m.pair_friction,
+                d.geom_xpos,
+                d.geom_xmat,
+                d.naconmax,
+            ],
+            outputs=[
+                d.contact.dist,
+                d.contact.pos,
+                d.contact.frame,
+                d.contact.includemargin,
+                d.contact.friction,
+                d.contact.solref,
+                d.contact.solreffriction,
+                d.contact.solimp,
+                d.contact.dim,
+                d.contact.geom,
+                d.contact.efc_address,
+                d.contact.worldid,
+                d.contact.type,
+                d.contact.geomcollisionid,
+                d.contact.adhesion,
+                d.nacon,
+            ],
+        )
+
+
+def _pair_type_count(types: np.ndarray) -> tuple[int, ...]:
+    """Count pairs by their types, in the order of the upper triangle that MuJoCo Warp numbers them in."""
+    kinds = len(mjw.GeomType)
+    low, high = types.min(-1), types.max(-1)
+    return tuple(
+        np.bincount((low * (2 * kinds - low - 1)) // 2 + high, minlength=kinds * (kinds + 1) // 2).tolist()
+    )

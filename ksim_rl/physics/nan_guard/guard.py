@@ -1,0 +1,154 @@
+"""Keeps what led to a non-finite state: the last substeps of each world, on the device, written once per rollout."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from ksim_rl.physics.nan_guard import file as nan_file
+from ksim_rl.physics.nan_guard import kernels as nan_kernels
+from ksim_rl.physics.nan_guard.cfg import NanGuardCfg
+from ksim_rl.physics.views import float_rows
+
+# What a substep depends on; empty arrays are left out.
+BEFORE = (
+    "time",
+    "qpos",
+    "qvel",
+    "act",
+    "ctrl",
+    "qfrc_applied",
+    "xfrc_applied",
+    "mocap_pos",
+    "mocap_quat",
+    "qacc_warmstart",
+)
+_WATCHED, _FAILED, _KEPT = 0, 1, 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class NanReport:
+    """Which worlds became non-finite since the last report.
+
+    Args:
+        worlds: their numbers.
+        files: what was written, for `python -m ksim_rl.physics.nan_guard.replay FILE`.
+        messages: one line for each file, and one where a file could not be written; none beyond `max_files`.
+    """
+
+    worlds: tuple[int, ...] = ()
+    files: tuple[Path, ...] = ()
+    messages: tuple[str, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether all worlds stayed finite."""
+        return not self.worlds
+
+
+class NanGuard:
+    """Rings of the last substeps. A world's ring stops when its state becomes non-finite, until `report` reads it.
+
+    Raises:
+        OSError: if the folder cannot be made.
+    """
+
+    def __init__(
+        self,
+        cfg: NanGuardCfg,
+        mj_model: mujoco.MjModel,
+        warp_data_E: mjw.Data,
+        fields: Mapping[str, Tensor],
+    ) -> None:
+        self.cfg, self._mj_model, self._warp_data_E = cfg, mj_model, warp_data_E
+        self._folder = Path(cfg.folder)
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._written = 0
+        num_envs = warp_data_E.nworld
+        self._names = [name for name in BEFORE if getattr(warp_data_E, name).size]
+        self._rows = float_rows(warp_data_E, tuple(self._names))
+        self._rings = [wp.zeros((num_envs, cfg.history, rows.shape[1]), dtype=float) for rows in self._rows]
+        self._failed, self._count = wp.zeros(num_envs, dtype=int), wp.zeros(num_envs, dtype=int)
+        self._reached = {name: wp.zeros_like(getattr(warp_data_E, name)) for name in ("qpos", "qvel")}
+        self._failed_E, self._count_E = wp.to_torch(self._failed), wp.to_torch(self._count)
+        self._fields = dict(fields)
+        self._kept_fields = {name: tensor.clone() for name, tensor in fields.items()}
+
+    def before_substep(self) -> None:
+        """Launch the copies of the state that the substep starts from."""
+        for rows, ring in zip(self._rows, self._rings, strict=True):
+            wp.launch(
+                nan_kernels.keep_rows,
+                dim=rows.shape,
+                inputs=[rows, self._failed, self._count],
+                outputs=[ring],
+            )
+
+    def after_substep(self) -> None:
+        """Launch the search for worlds that failed in this substep."""
+        d = self._warp_data_E
+        wp.launch(
+            nan_kernels.mark_failed,
+            dim=d.nworld,
+            inputs=[d.qpos, d.qvel, self._failed, self._count],
+            outputs=[self._reached["qpos"], self._reached["qvel"]],
+        )
+
+    def keep_fields(self) -> None:
+        """Copy the model fields of the worlds that just failed, before a reset draws new ones."""
+        fails_E = self._failed_E == _FAILED
+        for name, field in self._fields.items():
+            kept = self._kept_fields[name]
+            torch.where(fails_E.view(-1, *[1] * (field.ndim - 1)), field, kept, out=kept)
+        self._failed_E.masked_fill_(fails_E, _KEPT)
+
+    def count(self) -> Tensor:
+        """Return the number of worlds that failed since the last report, [] on the device."""
+        return (self._failed_E != _WATCHED).sum()
+
+    def report(self) -> NanReport:
+        """Write the worlds that failed since the last report, and watch them again; reads the device."""
+        worlds = tuple(int(world) for world in (self._failed_E != _WATCHED).nonzero().flatten().cpu())
+        if not worlds:
+            return NanReport()
+        files, messages = [], []
+        try:
+            for world in worlds[: max(self.cfg.max_files - self._written, 0)]:
+                files.append(self._write(world))
+                messages.append(
+                    f"world {world} became non-finite: python -m ksim_rl.physics.nan_guard.replay {files[-1]}"
+                )
+        except OSError as error:
+            messages.append(f"world {worlds[len(files)]} became non-finite, and could not be saved: {error}")
+        self._failed_E.zero_()
+        self._count_E[list(worlds)] = 0
+        return NanReport(worlds=worlds, files=tuple(files), messages=tuple(messages))
+
+    def _write(self, world: int) -> Path:
+        count, history = int(self._count_E[world]), self.cfg.history
+        # The newest row stands at count - 1; fewer substeps than places leave the rest unused.
+        places = [place % history for place in range(max(0, count - history), count)]
+        failure = nan_file.Failure(
+            model=self._mj_model,
+            world=world,
+            substep=count,
+            states={
+                name: wp.to_torch(ring)[world].cpu().numpy()[places]
+                for name, ring in zip(self._names, self._rings, strict=True)
+            },
+            reached={name: wp.to_torch(array)[world].cpu().numpy() for name, array in self._reached.items()},
+            fields={name: np.asarray(kept[world].cpu()) for name, kept in self._kept_fields.items()},
+        )
+        path = self._folder / f"nan-{os.getpid()}-{self._written:03d}-world{world}.safetensors"
+        nan_file.write(path, failure)
+        self._written += 1
+        return path

@@ -1,0 +1,233 @@
+"""Replay, on MuJoCo's C engine, of the last substeps of a world that became non-finite.
+
+    python -m ksim_rl.physics.nan_guard.replay FILE
+
+Each row starts the C engine from the state that MuJoCo Warp had before that substep, with the same controls, applied
+forces and model fields, and takes one step in double precision.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from ksim_rl.physics.model_fields import write_fields
+from ksim_rl.physics.mujoco_messages import caught_warnings
+from ksim_rl.physics.nan_guard.file import Failure, read
+
+# The C engine sets all controls to zero if one exceeds 1e10 or is not finite.
+MOST_CONTROL = 1e9
+_WARNINGS = {
+    mujoco.mjtWarning.mjWARN_INERTIA: "singular inertia",
+    mujoco.mjtWarning.mjWARN_CONTACTFULL: "contacts full",
+    mujoco.mjtWarning.mjWARN_CNSTRFULL: "constraints full",
+    mujoco.mjtWarning.mjWARN_BADQPOS: "bad qpos",
+    mujoco.mjtWarning.mjWARN_BADQVEL: "bad qvel",
+    mujoco.mjtWarning.mjWARN_BADQACC: "bad qacc",
+    mujoco.mjtWarning.mjWARN_BADCTRL: "bad ctrl",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Substep:
+    """One substep on the C engine, from the state that Warp had before it.
+
+    Args:
+        time: s, before the substep.
+        energy: kinetic and potential, J, before the substep.
+        speed: largest |qvel| before the substep, and its dof.
+        acceleration: largest |qacc| that the C engine finds, and its dof. Controls beyond 1e9 count as 1e9 here, since
+            the C engine would drop all of them.
+        control: largest |ctrl|, and its actuator; 0 and -1 without actuators.
+        contacts: how many the C engine finds.
+        warnings: what the C engine warns of.
+        deviation: largest difference between the velocities that the C engine and Warp reach. Large also where an event
+            or a reset changed the state between two substeps.
+    """
+
+    time: float
+    energy: float
+    speed: tuple[float, int]
+    acceleration: tuple[float, int]
+    control: tuple[float, int]
+    contacts: int
+    warnings: tuple[str, ...]
+    deviation: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """What the C engine makes of a failure.
+
+    Args:
+        substeps: oldest first; the last one is the one that broke on Warp.
+        dofs: whose velocities or positions are not finite after it.
+        first: the dof that broke first. Warp's solver spreads a non-finite number over all dofs of a world within one
+            substep; then it is the one with the largest acceleration on the C engine, which does not. So it is where
+            all numbers are finite, but too large to be added up.
+        was_broken_before: whether the state before it was already not finite: something wrote it there.
+        breaks_on_c: whether the C engine warns of a bad state in that substep, or leaves it with non-finite numbers.
+    """
+
+    substeps: tuple[Substep, ...]
+    dofs: tuple[int, ...]
+    first: int
+    was_broken_before: bool
+    breaks_on_c: bool
+
+
+def replay(failure: Failure) -> Replay:
+    """Run each kept substep on the C engine."""
+    model = _with_fields(failure)
+    data = mujoco.MjData(model)
+    reached_qvel = [*failure.states["qvel"][1:], failure.reached["qvel"]]
+    with np.errstate(all="ignore"), caught_warnings():
+        substeps = tuple(_substep(model, data, failure, k, reached) for k, reached in enumerate(reached_qvel))
+    before = _broken_dofs(model, failure.states["qpos"][-1], failure.states["qvel"][-1])
+    after = _broken_dofs(model, failure.reached["qpos"], failure.reached["qvel"])
+    finite = np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()
+    spread = len(after) in (0, model.nv) and not before
+    return Replay(
+        substeps=substeps,
+        dofs=after,
+        first=substeps[-1].acceleration[1] if spread else (before or after)[0],
+        was_broken_before=bool(before),
+        breaks_on_c=not finite or any(text.startswith("bad") for text in substeps[-1].warnings),
+    )
+
+
+def dof_name(model: mujoco.MjModel, dof: int) -> str:
+    """Return the name of a dof: its joint's, with the place in it for joints of several dofs."""
+    joint = int(model.dof_jntid[dof])
+    name = model.joint(joint).name or f"joint {joint}"
+    several = model.jnt_type[joint] in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL))
+    return f"{name}[{dof - int(model.jnt_dofadr[joint])}]" if several else name
+
+
+def describe(failure: Failure, result: Replay, *, limit: int = 10) -> str:
+    """Return the replay as a table, with the verdict below it."""
+    model = failure.model
+    heads = (
+        "substep",
+        "time s",
+        "energy J",
+        "max |qvel|",
+        "of dof",
+        "max |qacc|",
+        "of dof",
+        "max |ctrl|",
+        "contacts",
+    )
+    rows: list[tuple[str, ...]] = [(*heads, "off Warp", "C engine")]
+    last = len(result.substeps) - 1
+    for k, substep in enumerate(result.substeps):
+        (speed, fast), (acceleration, pushed) = substep.speed, substep.acceleration
+        numbers = (f"{substep.time:.4f}", _short(substep.energy), _short(speed), dof_name(model, fast))
+        numbers += (_short(acceleration), dof_name(model, pushed), _short(substep.control[0]))
+        said = ", ".join(substep.warnings) or "ok"
+        rows.append((str(k - last), *numbers, str(substep.contacts), _short(substep.deviation), said))
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    names = [dof_name(model, dof) for dof in result.dofs]
+    shown = ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
+    kept = len(result.substeps)
+    title = f"world {failure.world}: its last {kept} of {failure.substep} substeps; 0 is the one that broke"
+    first = dof_name(model, result.first)
+    if result.was_broken_before:
+        verdict = f"First: {first}, before substep 0 already. An event, a command or a reset wrote it there."
+    else:
+        verdict = f"First: {first}. Not finite after substep 0 on Warp: {shown or 'the sum of all'}."
+    lines = [title, *lines, verdict]
+    size, actuator = result.substeps[-1].control
+    if size > MOST_CONTROL:
+        lines.append(f"The control of actuator {model.actuator(actuator).name!r} is {_short(size)}.")
+    lines.append(f"The C engine {'breaks in the same' if result.breaks_on_c else 'takes the'} substep.")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table of a file."""
+    parser = argparse.ArgumentParser(
+        prog="python -m ksim_rl.physics.nan_guard.replay", description="Show the step that became non-finite."
+    )
+    parser.add_argument("file", type=Path, help="a file that the NaN guard wrote (sim.nan_guard)")
+    path = parser.parse_args(arguments).file
+    try:
+        failure = read(path)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(describe(failure, replay(failure)))
+    return 0
+
+
+def _with_fields(failure: Failure) -> mujoco.MjModel:
+    """Return the model of the one world, which says what it finds instead of starting anew."""
+    model = failure.model
+    write_fields(model, failure.fields)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+    return model
+
+
+def _substep(
+    model: mujoco.MjModel, data: mujoco.MjData, failure: Failure, k: int, reached_qvel: np.ndarray
+) -> Substep:
+    mujoco.mj_resetData(model, data)
+    for name, values in failure.states.items():
+        if name == "time":
+            data.time = float(values[k, 0])
+        else:
+            target = getattr(data, name)
+            target[:] = values[k].reshape(target.shape)
+    speed, control = _largest(data.qvel), _largest(data.ctrl)
+    given = data.ctrl.copy()
+    data.ctrl[:] = np.clip(np.nan_to_num(given), -MOST_CONTROL, MOST_CONTROL)
+    mujoco.mj_forward(model, data)
+    data.ctrl[:] = given
+    energy, contacts, acceleration = float(data.energy.sum()), int(data.ncon), _largest(data.qacc)
+    time = float(data.time)
+    mujoco.mj_step(model, data)
+    return Substep(
+        time=time,
+        energy=energy,
+        speed=speed,
+        acceleration=acceleration,
+        control=control,
+        contacts=contacts,
+        warnings=tuple(text for kind, text in _WARNINGS.items() if data.warning[kind].number),
+        deviation=_largest(data.qvel - reached_qvel)[0],
+    )
+
+
+def _largest(values: np.ndarray) -> tuple[float, int]:
+    """Return the largest magnitude and its place; what is not finite is the largest."""
+    if not values.size:
+        return 0.0, -1
+    size = np.where(np.isfinite(values), np.abs(values), np.inf)
+    place = int(np.argmax(size))
+    return float(size[place]), place
+
+
+def _broken_dofs(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> tuple[int, ...]:
+    broken = ~np.isfinite(qvel)
+    for joint in range(model.njnt):
+        start = int(model.jnt_qposadr[joint])
+        end = int(model.jnt_qposadr[joint + 1]) if joint + 1 < model.njnt else model.nq
+        if not np.isfinite(qpos[start:end]).all() and not broken[model.dof_jntid == joint].any():
+            broken[model.dof_jntid == joint] = True
+    return tuple(int(dof) for dof in np.flatnonzero(broken))
+
+
+def _short(value: float) -> str:
+    return f"{value:.4g}"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,185 @@
+"""The constraint solver of the substeps, unless `unsuited` says why not: one kernel instead of some hundred."""
+
+import dataclasses
+from collections.abc import Callable
+
+import mujoco
+import mujoco_warp as mjw
+import warp as wp
+
+from ksim_rl.physics.newton.kernel import (
+    CUDA_LANES,
+    Problem,
+    floats_per_world,
+    newton_kernel,
+    row_stride,
+)
+from ksim_rl.physics.newton.order import put_longest_first
+
+# The shared memory that a block has without asking for more, in floats.
+SHARED_FLOATS = 48 * 1024 // 4
+# What a world may have of a multiprocessor's shared memory: ten such worlds live there at once. On an H200 with 4096
+# worlds of G1 that leaves room for 64 rows and takes 0.39 ms; 32 rows, with 15 worlds at once, take 0.49 ms.
+FLOATS_PER_WORLD = 5600
+MOST_DOFS = 64
+INTEGRATORS = (
+    mujoco.mjtIntegrator.mjINT_EULER,
+    mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Placement:
+    """How the worlds lie on a CUDA device; the CPU, which has no chip to fill, heeds `rows_on_chip` alone.
+
+    Args:
+        rows_on_chip: rows that the shared memory of a world holds; those beyond are in device memory.
+        worlds_per_block: worlds that share a block.
+        min_blocks: blocks that a multiprocessor is to hold at once, which bounds the registers; 0 does not.
+        longest_first: whether the worlds that will take longest start first.
+    """
+
+    rows_on_chip: int
+    worlds_per_block: int = 1
+    min_blocks: int = 0
+    longest_first: bool = True
+
+
+def unsuited(mj_model: mujoco.MjModel, *, njmax: int) -> str | None:
+    """Return why the kernel cannot solve this model, or None where it can."""
+    opt, nv = mj_model.opt, mj_model.nv
+    elliptic = bool(opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC)
+    floats = floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=0)
+    reasons = {
+        "the solver is not Newton's": opt.solver != mujoco.mjtSolver.mjSOL_NEWTON,
+        f"the integrator is {mujoco.mjtIntegrator(opt.integrator).name}": opt.integrator not in INTEGRATORS,
+        "the Jacobian is dense": opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE,
+        "no iterations are allowed": opt.iterations < 1,
+        "there are noslip iterations": opt.noslip_iterations > 0,
+        "warm starts are off": bool(opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART),
+        "bodies may sleep": bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP),
+        "energies are computed": bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY),
+        "there are flexes": mj_model.nflex > 0,
+        f"there are {nv} degrees of freedom, outside of 1 to {MOST_DOFS}": not 0 < nv <= MOST_DOFS,
+        "there are no constraint rows (njmax)": njmax < 1,
+        f"{njmax} constraint rows (njmax) do not fit shared memory": floats > SHARED_FLOATS,
+    }
+    return next((reason for reason, holds in reasons.items() if holds), None)
+
+
+def placement(*, nv: int, njmax: int, elliptic: bool) -> Placement:
+    """Return where the worlds go on CUDA: half of the rows, which few worlds exceed, on chip where that fits."""
+    room = FLOATS_PER_WORLD - floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=0)
+    return Placement(rows_on_chip=min(-(-njmax // 2), max(0, room // row_stride(nv))))
+
+
+def solver(
+    warp_model: mjw.Model, warp_data_E: mjw.Data, *, place: Placement | None = None
+) -> Callable[[], None]:
+    """Return what launches the solver: accelerations and forces from the constraint rows, which must be sparse.
+
+    Args:
+        warp_model: a model that is not `unsuited`.
+        warp_data_E: the worlds, with their arrays in their final place.
+        place: how they lie on a CUDA device; None is what was measured to be best.
+    """
+    m, d, efc = warp_model, warp_data_E, warp_data_E.efc
+    elliptic = bool(m.opt.cone == mjw.ConeType.ELLIPTIC)
+    on_cuda = d.qpos.device.is_cuda
+    lanes = CUDA_LANES if on_cuda else 1
+    if place is None:
+        place = (
+            placement(nv=m.nv, njmax=d.njmax, elliptic=elliptic)
+            if on_cuda
+            else Placement(rows_on_chip=d.njmax)
+        )
+    kernel = newton_kernel(
+        nv=m.nv,
+        njmax=d.njmax,
+        elliptic=elliptic,
+        ls_iterations=int(m.opt.ls_iterations),
+        lanes=lanes,
+        rows_on_chip=place.rows_on_chip,
+        worlds_per_block=place.worlds_per_block,
+        min_blocks=place.min_blocks,
+    )
+    far_floats = (d.njmax - place.rows_on_chip) * row_stride(m.nv)
+    problem = Problem()
+    problem.iterations = int(m.opt.iterations)
+    problem.tolerance = m.opt.tolerance
+    problem.ls_tolerance = m.opt.ls_tolerance
+    problem.impratio_invsqrt = m.opt.impratio_invsqrt
+    problem.M_row = m.M_hinit_i
+    problem.M_col = m.M_colind
+    problem.ne = d.ne
+    problem.nf = d.nf
+    problem.nefc = d.nefc
+    problem.M = d.M
+    problem.warmstart = d.qacc_warmstart
+    problem.qfrc_smooth = d.qfrc_smooth
+    problem.contact_friction = d.contact.friction
+    problem.efc_type = efc.type
+    problem.efc_id = efc.id
+    problem.J_rownnz = efc.J_rownnz
+    problem.J_rowadr = efc.J_rowadr
+    problem.J_colind = efc.J_colind.reshape((d.nworld, -1))
+    problem.J_values = efc.J.reshape((d.nworld, -1))
+    problem.efc_D = efc.D
+    problem.efc_aref = efc.aref
+    problem.efc_limit = efc.frictionloss
+    problem.scratch = wp.empty((d.nworld, far_floats), dtype=float, device=d.qpos.device)
+    problem.qacc = d.qacc
+    problem.efc_Ma = efc.Ma
+    problem.efc_force = efc.force
+    problem.efc_state = efc.state
+    problem.qfrc_constraint = d.qfrc_constraint
+    problem.solver_niter = d.solver_niter
+    problem.overflow = d.overflow
+    problem.order = wp.array(list(range(d.nworld)), dtype=int, device=d.qpos.device)
+    dim, block_dim = (d.nworld, lanes), place.worlds_per_block * lanes
+
+    def launch() -> None:
+        if on_cuda and place.longest_first:
+            put_longest_first(problem)
+        wp.launch(kernel, dim=dim, inputs=[problem], block_dim=block_dim)
+
+    return launch
+
+
+def step(
+    warp_model: mjw.Model,
+    warp_data_E: mjw.Data,
+    solve: Callable[[], None],
+    *,
+    sensors: bool,
+) -> None:
+    """Launch a physics step: that of MuJoCo Warp, with this solver.
+
+    Args:
+        warp_model: with `opt.run_qacc_smooth` off, since the solver does not need that acceleration.
+        warp_data_E: the worlds.
+        solve: their `solver`.
+        sensors: whether to compute them; they never change the state that is reached.
+    """
+    m, d = warp_model, warp_data_E
+    mjw.fwd_position(m, d, factorize=False)
+    if sensors:
+        d.sensordata.zero_()
+        mjw.sensor_pos(m, d)
+    mjw.fwd_velocity(m, d)
+    if sensors:
+        mjw.sensor_vel(m, d)
+    if m.callback.control and not m.opt.disableflags & mjw.DisableBit.ACTUATION:
+        m.callback.control(m, d)
+    mjw.fwd_actuation(m, d)
+    mjw.fwd_acceleration(m, d, factorize=True)
+    solve()
+    if sensors:
+        if m.sensor_rne_postconstraint:
+            mjw.rne_postconstraint(m, d)
+        mjw.sensor_acc(m, d, skip_rne_postconstraint=True)
+    if m.opt.integrator == mjw.IntegratorType.EULER:
+        mjw.euler(m, d)
+    else:
+        mjw.implicit(m, d)

@@ -1,0 +1,39 @@
+"""What drives joints: MuJoCo's own actuators, and motor models that compute an effort before each physics substep.
+
+A robot lists entries in its `actuators`, puts them into its model by `set_actuators(spec, self.actuators)`, and each
+entry says by name or pattern which joints it drives.
+"""
+
+from ksim_rl.scene.actuators.actuator import Actuator
+from ksim_rl.scene.actuators.actuator_params import ActuatorParams
+from ksim_rl.scene.actuators.builtin import (
+    GeneralActuator,
+    MotorActuator,
+    PositionActuator,
+    VelocityActuator,
+)
+from ksim_rl.scene.actuators.dc_motor import DCMotorActuator
+from ksim_rl.scene.actuators.delayed import DelayedActuator
+from ksim_rl.scene.actuators.ideal_pd import IdealPDActuator
+from ksim_rl.scene.actuators.joint_drives import JointDrives
+from ksim_rl.scene.actuators.joint_targets import JointTargets
+from ksim_rl.scene.actuators.lstm import LSTMActuator
+from ksim_rl.scene.actuators.mlp import MLPActuator
+from ksim_rl.scene.actuators.set_actuators import set_actuators
+
+__all__ = [
+    "Actuator",
+    "ActuatorParams",
+    "DCMotorActuator",
+    "DelayedActuator",
+    "GeneralActuator",
+    "IdealPDActuator",
+    "JointDrives",
+    "JointTargets",
+    "LSTMActuator",
+    "MLPActuator",
+    "MotorActuator",
+    "PositionActuator",
+    "VelocityActuator",
+    "set_actuators",
+]

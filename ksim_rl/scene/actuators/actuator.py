@@ -1,0 +1,150 @@
+"""What drives a joint: an edit of the model and, for motor models of our own, a law that runs before each substep."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import mujoco
+from torch import Tensor
+
+from ksim_rl.checks import check_in_range
+from ksim_rl.scene.names import Patterns
+
+if TYPE_CHECKING:
+    from ksim_rl.scene.actuators.drive import Drive
+
+TargetKind = Literal["pos", "vel", "effort"]
+
+
+class JointState(NamedTuple):
+    """Where N joints are before a substep: rad or m, and rad/s or m/s, [E, N]."""
+
+    pos_EN: Tensor
+    vel_EN: Tensor
+
+
+class JointTarget(NamedTuple):
+    """What N joints are asked for: position, velocity, and effort (N m or N) to add, [E, N]."""
+
+    pos_EN: Tensor
+    vel_EN: Tensor
+    effort_EN: Tensor
+
+
+Law = Callable[[JointState, JointTarget], Tensor]
+"""The control [E, N] of a law's motors; of explicit ones, the effort itself."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Actuator(ABC):
+    """What drives some joints of a robot, one actuator of the model for each of them.
+
+    MuJoCo computes the effort of built-in actuators from `ctrl`, which is their target. Explicit ones are plain motors
+    in the model, whose effort `law` computes before each substep.
+    """
+
+    @property
+    @abstractmethod
+    def driven(self) -> Patterns:
+        """The names or patterns of the joints."""
+
+    @property
+    @abstractmethod
+    def takes(self) -> frozenset[TargetKind]:
+        """The kinds of target that have an effect."""
+
+    @property
+    def is_explicit(self) -> bool:
+        """Whether `law` must run before each substep."""
+        return False
+
+    @property
+    def params(self) -> Mapping[str, float]:
+        """The numbers of the law by name: one float32 [E, L] buffer each, see `EnvView.actuator_param`."""
+        return {}
+
+    @property
+    def law_key(self) -> Hashable:
+        """Entries with equal keys differ in `params` only, so that one law computes all their joints."""
+        return id(self)
+
+    @abstractmethod
+    def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
+        """Set up the new `actuator` of one joint, and the joint's own passive properties."""
+
+    @abstractmethod
+    def law(self, drive: Drive) -> Law:
+        """Create what the law keeps, and return it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointActuator(Actuator):
+    """What all actuators of joints have.
+
+    Attributes:
+        joints: names or patterns; each hinge or slide that matches gets an actuator of its name.
+        effort_limit: bound of the effort, N m or N, symmetric; it takes the place of the joint's own limit in the MJCF.
+            None keeps that one.
+        armature: inertia of the motor as the joint feels it, kg m^2 or kg; None keeps the model's.
+        frictionloss: dry friction, N m or N; None keeps the model's.
+    """
+
+    joints: Patterns
+    effort_limit: float | None = None
+    armature: float | None = None
+    frictionloss: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.effort_limit is not None:
+            check_in_range("effort_limit", self.effort_limit, low=0.0, low_open=True)
+        for name in ("armature", "frictionloss"):
+            if getattr(self, name) is not None:
+                check_in_range(name, getattr(self, name), low=0.0)
+
+    @property
+    def driven(self) -> Patterns:
+        """The names or patterns of the joints."""
+        return self.joints
+
+    def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
+        """Set the limit of the force, and the joint's passive properties."""
+        # Each attribute is written: the model's default class may hold others.
+        actuator.gear = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+        actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        if self.effort_limit is not None:
+            actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+            actuator.forcerange = [-self.effort_limit, self.effort_limit]
+            joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        if self.armature is not None:
+            joint.armature = self.armature
+        if self.frictionloss is not None:
+            joint.frictionloss = self.frictionloss
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExplicitActuator(JointActuator):
+    """A plain motor whose effort a law of ours computes before each substep, and keeps inside `effort_limit`.
+
+    The law sees the state of the substep's start, so its damping is integrated explicitly: keep
+    `damping * timestep` well below the inertia that the joint feels, or use a built-in actuator.
+    """
+
+    @property
+    def is_explicit(self) -> bool:
+        """True."""
+        return True
+
+    @property
+    def params(self) -> Mapping[str, float]:
+        """The limit, which each world may change; infinite for None."""
+        return {"effort_limit": float("inf") if self.effort_limit is None else self.effort_limit}
+
+    def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
+        """Make a motor whose control is its effort; the law holds the limit, which may differ between worlds."""
+        super().configure(actuator, joint)
+        actuator.set_to_motor()
+        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE

@@ -1,0 +1,229 @@
+"""The actuators that MuJoCo computes itself. Their numbers are model fields, which may differ between worlds.
+
+MuJoCo's effort is `gain * ctrl + bias`, clamped to `forcerange`, times the gear. A position servo has
+`actuator_gainprm[0] = stiffness` and `actuator_biasprm[1:3] = (-stiffness, -damping)`, a velocity servo
+`actuator_gainprm[0] = damping` and `actuator_biasprm[2] = -damping`; the limit is `actuator_forcerange`.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import mujoco
+from torch import Tensor
+
+from ksim_rl.checks import check_choice, check_in_range, check_pair
+from ksim_rl.scene.actuators.actuator import (
+    JointActuator,
+    JointState,
+    JointTarget,
+    Law,
+    TargetKind,
+)
+from ksim_rl.scene.actuators.drive import Drive
+from ksim_rl.scene.names import Patterns
+
+GAINS = {
+    "fixed": mujoco.mjtGain.mjGAIN_FIXED,
+    "affine": mujoco.mjtGain.mjGAIN_AFFINE,
+    "muscle": mujoco.mjtGain.mjGAIN_MUSCLE,
+}
+BIASES = {
+    "none": mujoco.mjtBias.mjBIAS_NONE,
+    "affine": mujoco.mjtBias.mjBIAS_AFFINE,
+    "muscle": mujoco.mjtBias.mjBIAS_MUSCLE,
+}
+DYNAMICS = {
+    "none": mujoco.mjtDyn.mjDYN_NONE,
+    "integrator": mujoco.mjtDyn.mjDYN_INTEGRATOR,
+    "filter": mujoco.mjtDyn.mjDYN_FILTER,
+    "filterexact": mujoco.mjtDyn.mjDYN_FILTEREXACT,
+    "muscle": mujoco.mjtDyn.mjDYN_MUSCLE,
+}
+_NUM_PARAMETERS = 10
+
+
+def control_kind(biastype: int, biasprm: Sequence[float], dyntype: int) -> TargetKind:
+    """Return what the control of a MuJoCo actuator is a target for.
+
+    A bias that pulls back in proportion to the position makes a position servo (with an integrator in front of it,
+    one whose control is a velocity), one that is proportional to the velocity alone a velocity servo.
+    """
+    if biastype != mujoco.mjtBias.mjBIAS_AFFINE:
+        return "effort"
+    if biasprm[1] != 0.0:
+        return "vel" if dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR else "pos"
+    return "vel" if biasprm[2] != 0.0 else "effort"
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuiltinActuator(JointActuator):
+    """An actuator that MuJoCo computes from one kind of target."""
+
+    def law(self, drive: Drive) -> Law:
+        """Return the target itself, which is the control."""
+        (kind,) = self.takes
+
+        def control_EN(state: JointState, target: JointTarget) -> Tensor:
+            return getattr(target, f"{kind}_EN")
+
+        return control_EN
+
+
+@dataclass(frozen=True, kw_only=True)
+class PositionActuator(BuiltinActuator):
+    """MuJoCo's position servo: effort = stiffness * (target - position) - damping * velocity.
+
+    The control range that it writes is what can still change the effort at a joint limit, and does not clip: a clipped
+    target would hide from the policy what it asked for.
+
+    Attributes:
+        stiffness: N m / rad or N / m.
+        damping: N m s / rad or N s / m.
+    """
+
+    stiffness: float
+    damping: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_in_range("stiffness", self.stiffness, low=0.0, low_open=True)
+        check_in_range("damping", self.damping, low=0.0)
+
+    @classmethod
+    def tuned(
+        cls,
+        *,
+        joints: Patterns,
+        effort_limit: float,
+        armature: float,
+        natural_frequency: float = 10.0,
+        damping_ratio: float = 2.0,
+    ) -> "PositionActuator":
+        """Return the servo whose gains make the armature a second-order system of this frequency (Hz) and damping.
+
+        `stiffness = armature * w^2`, `damping = 2 * damping_ratio * armature * w`, `w = 2 pi * natural_frequency`.
+        """
+        return cls(
+            joints=joints,
+            effort_limit=effort_limit,
+            armature=armature,
+            stiffness=armature * (2.0 * math.pi * natural_frequency) ** 2,
+            damping=2.0 * damping_ratio * armature * 2.0 * math.pi * natural_frequency,
+        )
+
+    @property
+    def takes(self) -> frozenset[TargetKind]:
+        """A position."""
+        return frozenset({"pos"})
+
+    def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
+        """Make the servo."""
+        super().configure(actuator, joint)
+        actuator.set_to_position(kp=self.stiffness, kv=self.damping)
+        if self.effort_limit is not None:
+            reach = self.effort_limit / self.stiffness
+            actuator.ctrlrange = [joint.range[0] - reach, joint.range[1] + reach]
+
+
+@dataclass(frozen=True, kw_only=True)
+class VelocityActuator(BuiltinActuator):
+    """MuJoCo's velocity servo: effort = damping * (target - velocity).
+
+    Attributes:
+        damping: N m s / rad or N s / m.
+    """
+
+    damping: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_in_range("damping", self.damping, low=0.0, low_open=True)
+
+    @property
+    def takes(self) -> frozenset[TargetKind]:
+        """A velocity."""
+        return frozenset({"vel"})
+
+    def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
+        """Make the servo."""
+        super().configure(actuator, joint)
+        actuator.set_to_velocity(kv=self.damping)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotorActuator(BuiltinActuator):
+    """MuJoCo's motor: effort = target."""
+
+    @property
+    def takes(self) -> frozenset[TargetKind]:
+        """An effort."""
+        return frozenset({"effort"})
+
+    def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
+        """Make the motor; its control range is its effort limit."""
+        super().configure(actuator, joint)
+        actuator.set_to_motor()
+        if self.effort_limit is not None:
+            actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
+            actuator.ctrlrange = [-self.effort_limit, self.effort_limit]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeneralActuator(BuiltinActuator):
+    """MuJoCo's general actuator; the fields mean what MJCF's attributes of these names mean.
+
+    Attributes:
+        gaintype, biastype, dyntype: how effort depends on the control or activation.
+        gainprm, biasprm, dynprm: up to ten numbers each; the others are 0.
+        gear: the first number of MJCF's gear.
+        ctrlrange, actrange: clamp the control and the activation; None: no clamp.
+    """
+
+    gaintype: Literal["fixed", "affine", "muscle"] = "fixed"
+    gainprm: tuple[float, ...] = (1.0,)
+    biastype: Literal["none", "affine", "muscle"] = "none"
+    biasprm: tuple[float, ...] = ()
+    dyntype: Literal["none", "integrator", "filter", "filterexact", "muscle"] = "none"
+    dynprm: tuple[float, ...] = (1.0,)
+    gear: float = 1.0
+    ctrlrange: tuple[float, float] | None = None
+    actrange: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, choices in (("gaintype", GAINS), ("biastype", BIASES), ("dyntype", DYNAMICS)):
+            check_choice(name, getattr(self, name), choices)
+        for name in ("gainprm", "biasprm", "dynprm"):
+            numbers = getattr(self, name)
+            if len(numbers) > _NUM_PARAMETERS:
+                raise ValueError(f"{name} has {len(numbers)} numbers: expected at most {_NUM_PARAMETERS}")
+            for index, number in enumerate(numbers):
+                check_in_range(f"{name}[{index}]", number)
+        check_in_range("gear", self.gear)
+        for name in ("ctrlrange", "actrange"):
+            if getattr(self, name) is not None:
+                check_pair(name, getattr(self, name))
+
+    @property
+    def takes(self) -> frozenset[TargetKind]:
+        """What the bias makes the control a target for."""
+        return frozenset({control_kind(BIASES[self.biastype], _padded(self.biasprm), DYNAMICS[self.dyntype])})
+
+    def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
+        """Write all attributes."""
+        super().configure(actuator, joint)
+        actuator.gaintype, actuator.gainprm = GAINS[self.gaintype], _padded(self.gainprm)
+        actuator.biastype, actuator.biasprm = BIASES[self.biastype], _padded(self.biasprm)
+        actuator.dyntype, actuator.dynprm = DYNAMICS[self.dyntype], _padded(self.dynprm)
+        actuator.gear = [self.gear, 0.0, 0.0, 0.0, 0.0, 0.0]
+        if self.ctrlrange is not None:
+            actuator.ctrllimited, actuator.ctrlrange = mujoco.mjtLimited.mjLIMITED_TRUE, self.ctrlrange
+        actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        if self.actrange is not None:
+            actuator.actlimited, actuator.actrange = mujoco.mjtLimited.mjLIMITED_TRUE, self.actrange
+
+
+def _padded(numbers: Sequence[float]) -> list[float]:
+    return [*numbers, *[0.0] * (_NUM_PARAMETERS - len(numbers))]

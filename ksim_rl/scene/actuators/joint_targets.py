@@ -1,0 +1,189 @@
+"""What joints are asked for, and the way from there to the controls of actuators that take it as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
+
+import mujoco
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import near
+from ksim_rl.physics import World
+from ksim_rl.scene.actuators.actuator import TargetKind
+from ksim_rl.scene.actuators.builtin import control_kind
+from ksim_rl.scene.names import (
+    Index,
+    NameResolver,
+    Patterns,
+    as_index,
+    scalar_joint_ids,
+)
+from ksim_rl.scene.state.memory import Memory
+
+_WORDS = {"pos": "a position", "vel": "a velocity", "effort": "an effort"}
+
+
+class _Route(NamedTuple):
+    """Where the targets of some joints go: columns of the buffers, and controls of built-in actuators, if any."""
+
+    joints: Index
+    ctrl: Index | None
+    columns: Index
+    limits_K2: Tensor | None
+
+
+class JointTargets:
+    """Targets of all hinges and slides, in the model's order; rows that reset are asked for the default pose, at rest.
+
+    A target of a built-in actuator is its control and is written there too; a motor model reads it before each substep.
+    An actuator takes the kind of target that its gains make of its control (see `control_kind`), so that a position
+    never ends up as the torque of a plain motor.
+
+    Attributes:
+        pos_EL: rad or m.
+        vel_EL: rad/s or m/s.
+        effort_EL: N m or N; of a motor from the MJCF, its control, which its gear and gain multiply.
+    """
+
+    def __init__(
+        self, world: World, resolver: NameResolver, memories: Memory, *, default_joint_pos_EL: Tensor
+    ) -> None:
+        model, num_joints = world.mj_model, default_joint_pos_EL.shape[1]
+        self._world, self._resolver = world, resolver
+        self.pos_EL = memories.get("joint_pos_target_EL", num_joints, initial=default_joint_pos_EL)
+        self.vel_EL = memories.get("joint_vel_target_EL", num_joints)
+        self.effort_EL = memories.get("joint_effort_target_EL", num_joints)
+        self._buffers = {"pos": self.pos_EL, "vel": self.vel_EL, "effort": self.effort_EL}
+        self._driven_by_law: dict[int, Collection[TargetKind]] = {}
+        self._routes: dict[tuple[TargetKind, tuple[str, ...]], _Route] = {}
+
+        joint_of = {joint: number for number, joint in enumerate(scalar_joint_ids(model))}
+        self._actuators: dict[int, list[tuple[int, TargetKind]]] = {}
+        for actuator in range(model.nu):
+            joint = joint_of.get(int(model.actuator_trnid[actuator, 0]))
+            of_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
+            if not of_joint or joint is None:
+                continue
+            kind = control_kind(
+                model.actuator_biastype[actuator],
+                model.actuator_biasprm[actuator],
+                model.actuator_dyntype[actuator],
+            )
+            self._actuators.setdefault(joint, []).append((actuator, kind))
+        self._find_servos()
+
+    def motor(self, joint: int) -> int:
+        """Return the only actuator of a joint.
+
+        Raises:
+            ValueError: if it has none, or several.
+        """
+        found = self._actuators.get(joint, [])
+        if len(found) != 1:
+            name = self._resolver.names("joint")[joint]
+            raise ValueError(
+                f"joint {name!r} has {len(found)} actuators in the model, but an entry in its robot's `actuators`: "
+                "call `set_actuators(spec, self.actuators)` in the robot's spec()"
+            )
+        return found[0][0]
+
+    def leave_to_law(self, joints: Sequence[int], takes: Collection[TargetKind]) -> None:
+        """Keep the targets of these joints away from the controls: a law reads them, and writes those itself."""
+        self._driven_by_law |= dict.fromkeys(joints, takes)
+        self._routes.clear()
+        self._find_servos()
+
+    def write(self, kind: TargetKind, patterns: Patterns, value_EK: Tensor) -> None:
+        """Set the targets of the joints of `patterns`, in their order, in all rows.
+
+        Raises:
+            ValueError: if a joint has no actuator that takes this kind of target.
+        """
+        key = (kind, (patterns,) if isinstance(patterns, str) else tuple(patterns))
+        route = self._routes.get(key)
+        if route is None:
+            route = self._routes[key] = self._route(kind, key[1])
+        if route.limits_K2 is not None:
+            value_EK = torch.clamp(value_EK, route.limits_K2[:, 0], route.limits_K2[:, 1])
+        self._buffers[kind][:, route.joints] = value_EK
+        if route.ctrl is not None:
+            self._world.ctrl_EL[:, route.ctrl] = value_EK[:, route.columns]
+
+    def check_no_law(self, actuators: Sequence[int]) -> None:
+        """Refuse actuators whose controls a law writes.
+
+        Raises:
+            ValueError: naming the joint of the first one.
+        """
+        for joint in self._driven_by_law:
+            if self.motor(joint) in actuators:
+                raise ValueError(
+                    f"the control of joint {self._resolver.names('joint')[joint]!r} is written by a motor model before "
+                    "each substep: use an action on joints"
+                )
+
+    def reset(self, mask_E: Tensor) -> None:
+        """Let the position servos of the rows of `mask_E` hold the default pose, until an action says otherwise."""
+        if self._servo_ctrl is None:
+            return
+        ctrl_EL, held_EL = self._world.ctrl_EL, self.pos_EL[:, self._servo_joints]
+        ctrl_EL[:, self._servo_ctrl] = torch.where(mask_E[:, None], held_EL, ctrl_EL[:, self._servo_ctrl])
+
+    def _find_servos(self) -> None:
+        servos = [
+            (actuator, joint)
+            for joint, found in self._actuators.items()
+            for actuator, kind in found
+            if kind == "pos" and joint not in self._driven_by_law
+        ]
+        device = self._world.device
+        self._servo_ctrl = as_index([actuator for actuator, _ in servos], device) if servos else None
+        self._servo_joints = as_index([joint for _, joint in servos], device)
+
+    def _route(self, kind: TargetKind, patterns: tuple[str, ...]) -> _Route:
+        joints = self._resolver.ids("joint", patterns)
+        ctrl, columns = [], []
+        for column, joint in enumerate(joints):
+            if joint in self._driven_by_law:
+                if kind not in self._driven_by_law[joint]:
+                    raise self._refusal(kind, joint, self._driven_by_law[joint])
+                continue
+            found = self._actuators.get(joint, [])
+            fitting = [actuator for actuator, of_kind in found if of_kind == kind]
+            if not fitting:
+                raise self._refusal(kind, joint, {of_kind for _, of_kind in found})
+            ctrl.append(fitting[0])
+            columns.append(column)
+        device = self._world.device
+        return _Route(
+            joints=self._resolver.index("joint", patterns),
+            ctrl=as_index(ctrl, device) if ctrl else None,
+            columns=as_index(columns, device),
+            limits_K2=self._limits(dict(zip(columns, ctrl, strict=True)), len(joints))
+            if kind == "effort"
+            else None,
+        )
+
+    def _limits(self, ctrl_of_column: dict[int, int], num_columns: int) -> Tensor | None:
+        """Return the control ranges of motors, [K, 2], infinite where there is none; None if none has one."""
+        model = self._world.mj_model
+        limited = {c: a for c, a in ctrl_of_column.items() if model.actuator_ctrllimited[a]}
+        if not limited:
+            return None
+        limits_K2 = torch.tensor([-torch.inf, torch.inf], device=self._world.device).repeat(num_columns, 1)
+        for column, actuator in limited.items():
+            limits_K2[column] = torch.tensor(model.actuator_ctrlrange[actuator], device=self._world.device)
+        return limits_K2
+
+    def _refusal(self, kind: TargetKind, joint: int, takes: Collection[TargetKind]) -> ValueError:
+        name = self._resolver.names("joint")[joint]
+        if not takes:
+            driven = [self._resolver.names("joint")[i] for i in self._actuators]
+            return ValueError(f"no actuator drives joint {name!r}: {near(name, driven)}")
+        wanted = " or ".join(_WORDS[other] for other in sorted(takes))
+        return ValueError(
+            f"joint {name!r} is asked for {_WORDS[kind]}, but its actuator takes {wanted}: use that kind of action, or "
+            "give the robot another actuator (`actuators`, such as IdealPDActuator)"
+        )

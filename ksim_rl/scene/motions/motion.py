@@ -1,0 +1,248 @@
+"""Reference motions: recorded states of a scene, at any time between their frames."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import near
+from ksim_rl.scene.motions import motion_names, motion_path
+from ksim_rl.scene.names import Index, Patterns, scalar_joint_ids
+
+if TYPE_CHECKING:
+    from ksim_rl.envs.view import EnvView
+
+KEYS = ("fps", "qpos", "qvel")
+_OPTIONAL = ("joint_names",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceMotion:
+    """F frames of generalized positions and velocities in MuJoCo's layout, `fps` of them per second.
+
+    Attributes:
+        fps: frames per s.
+        qpos_FL, qvel_FL: float32 [F, nq] and [F, nv], on the env's device.
+        quats: the columns of qpos at which unit quaternions (w, x, y, z) begin.
+        joint_pos_FL, joint_vel_FL: the columns of hinges and slides, as in `view.joint_pos_EL`.
+        body_pos_FN3, body_quat_FN4: the poses of all bodies (N, the world first) in these states, world frame, m and
+            (w, x, y, z).
+    """
+
+    fps: float
+    qpos_FL: Tensor
+    qvel_FL: Tensor
+    quats: tuple[int, ...]
+    joint_pos_FL: Tensor
+    joint_vel_FL: Tensor
+    body_pos_FN3: Tensor
+    body_quat_FN4: Tensor
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first frame to the last."""
+        return (self.qpos_FL.shape[0] - 1) / self.fps
+
+    def sample(self, time_E: Tensor) -> tuple[Tensor, Tensor]:
+        """Return qpos [E, nq] and qvel [E, nv] at times, s, [E]; before the first and after the last frame those stay.
+
+        Between frames both are interpolated linearly, quaternions along the shorter arc and normalized.
+        """
+        low_E, share_E1 = self._between(time_E)
+        before_EL, after_EL = self.qpos_FL[low_E], self.qpos_FL[low_E + 1]
+        qpos_EL = torch.lerp(before_EL, after_EL, share_E1)
+        for start in self.quats:
+            columns = slice(start, start + 4)
+            qpos_EL[:, columns] = _blend(before_EL[:, columns], after_EL[:, columns], share_E1)
+        return qpos_EL, torch.lerp(self.qvel_FL[low_E], self.qvel_FL[low_E + 1], share_E1)
+
+    def sample_joints(self, time_E: Tensor, joints: Index) -> tuple[Tensor, Tensor]:
+        """Return positions and velocities of hinges and slides, [E, L] each, at times, s, [E]."""
+        low_E, share_E1 = self._between(time_E)
+        pos_EL, vel_EL = (
+            torch.lerp(_entries(table_FL, low_E, joints), _entries(table_FL, low_E + 1, joints), share_E1)
+            for table_FL in (self.joint_pos_FL, self.joint_vel_FL)
+        )
+        return pos_EL, vel_EL
+
+    def sample_bodies(self, time_E: Tensor, bodies: Index) -> tuple[Tensor, Tensor]:
+        """Return the poses of bodies, [E, N, 3] and [E, N, 4], at times, s, [E]; between frames as in `sample`."""
+        low_E, share_E1 = self._between(time_E)
+        (pos_EN3, next_pos_EN3), (quat_EN4, next_quat_EN4) = (
+            (_entries(table, low_E, bodies), _entries(table, low_E + 1, bodies))
+            for table in (self.body_pos_FN3, self.body_quat_FN4)
+        )
+        share_E11 = share_E1[:, None]
+        return torch.lerp(pos_EN3, next_pos_EN3, share_E11), _blend(quat_EN4, next_quat_EN4, share_E11)
+
+    def _between(self, time_E: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the frame before each time, [E], and the part of the way to the next one, [E, 1]."""
+        last = self.qpos_FL.shape[0] - 1
+        frame_E = (time_E * self.fps).clamp(0.0, float(last))
+        low_E = frame_E.floor().long().clamp(max=last - 1)
+        return low_E, (frame_E - low_E)[:, None]
+
+
+def load_motion(file: str | Path, model: mujoco.MjModel, device: torch.device) -> ReferenceMotion:
+    """Read an .npz file of the model: `fps`, `qpos` [F, nq], `qvel` [F, nv] and, if it has them, `joint_names`.
+
+    The file may be the name of a motion that comes with the package (`ksim_rl.scene.motions`).
+
+    Raises:
+        ValueError: naming the file and what does not fit the model, with the near names.
+    """
+    arrays = _read(motion_path(str(file)))
+    fps = arrays["fps"]
+    if fps.size != 1 or not np.isfinite(fps).all() or fps.item() <= 0.0:
+        raise ValueError(
+            f"motion {file}: fps={fps.tolist()!r}: expected one positive number of frames per second"
+        )
+    for key, width, kind in (("qpos", model.nq, "nq"), ("qvel", model.nv, "nv")):
+        array = arrays[key]
+        if array.ndim != 2 or array.shape[1] != width or array.shape[0] < 2:
+            raise ValueError(
+                f"motion {file}: {key} has shape {array.shape}: expected [F, {width}] ({kind} of the model), F >= 2"
+            )
+        if not np.isfinite(array).all():
+            raise ValueError(f"motion {file}: {key} holds a number that is not finite")
+    if arrays["qpos"].shape[0] != arrays["qvel"].shape[0]:
+        raise ValueError(
+            f"motion {file}: qpos has {arrays['qpos'].shape[0]} frames and qvel {arrays['qvel'].shape[0]}"
+        )
+    if "joint_names" in arrays:
+        _check_joints(file, [str(name) for name in arrays["joint_names"]], model)
+    quats = _quaternion_columns(model)
+    for start in quats:
+        norms = np.linalg.norm(arrays["qpos"][:, start : start + 4], axis=-1)
+        if np.abs(norms - 1.0).max() > 1e-3:
+            raise ValueError(
+                f"motion {file}: qpos[:, {start}:{start + 4}] holds quaternions of lengths {norms.min():g} to "
+                f"{norms.max():g}: expected unit quaternions (w, x, y, z)"
+            )
+    body_pos_FN3, body_quat_FN4 = _body_poses(model, arrays["qpos"])
+    joints = scalar_joint_ids(model)
+
+    def on_device(array: np.ndarray) -> Tensor:
+        return torch.tensor(array, dtype=torch.float32, device=device)
+
+    return ReferenceMotion(
+        fps=float(fps.item()),
+        qpos_FL=on_device(arrays["qpos"]),
+        qvel_FL=on_device(arrays["qvel"]),
+        quats=quats,
+        joint_pos_FL=on_device(arrays["qpos"][:, model.jnt_qposadr[joints]]),
+        joint_vel_FL=on_device(arrays["qvel"][:, model.jnt_dofadr[joints]]),
+        body_pos_FN3=on_device(body_pos_FN3),
+        body_quat_FN4=on_device(body_quat_FN4),
+    )
+
+
+def motion_start_time(view: EnvView, file: str) -> Tensor:
+    """Return the buffer of when in the motion each episode began, s, [E]; `ResetToMotion` writes it."""
+    return view.memories.get(f"motion/{file}.start_s_E")
+
+
+def motion_time(view: EnvView, file: str) -> Tensor:
+    """Return the present time in a motion that episodes follow from where `ResetToMotion` began them, s, [E]."""
+    return motion_start_time(view, file) + view.episode_time_E
+
+
+def motion_joints(view: EnvView, file: str, joints: Patterns) -> tuple[Tensor, Tensor]:
+    """Return positions and velocities that joints have in the motion now, [E, L] each; computed once per state."""
+    keys = [f"motion/{file}.{part} of {joints}" for part in ("joint_pos", "joint_vel")]
+    if keys[0] not in view.cache:
+        sampled = view.motion(file).sample_joints(motion_time(view, file), view.joints(joints))
+        view.cache.update(zip(keys, sampled, strict=True))
+    return view.cache[keys[0]], view.cache[keys[1]]
+
+
+def motion_bodies(view: EnvView, file: str, bodies: Patterns) -> tuple[Tensor, Tensor]:
+    """Return the poses that bodies have in the motion now, world frame, [E, N, 3] and [E, N, 4]; once per state.
+
+    On a terrain they are moved as `motion_shift` says.
+    """
+    keys = [f"motion/{file}.{part} of {bodies}" for part in ("body_pos", "body_quat")]
+    if keys[0] not in view.cache:
+        pos_EN3, quat_EN4 = view.motion(file).sample_bodies(motion_time(view, file), view.bodies(bodies))
+        shift_E3 = motion_shift(view)
+        pos_EN3 = pos_EN3 if shift_E3 is None else pos_EN3 + shift_E3[:, None]
+        view.cache.update(zip(keys, (pos_EN3, quat_EN4), strict=True))
+    return view.cache[keys[0]], view.cache[keys[1]]
+
+
+def motion_shift(view: EnvView) -> Tensor | None:
+    """Return how far motions are moved in each env, m, [E, 3]: to its origin, if the robot's root can go there."""
+    return None if view.terrain.is_flat or not view.robot.free_root else view.terrain.origins_E3
+
+
+def _read(path: Path) -> Mapping[str, np.ndarray]:
+    if not path.exists():
+        raise ValueError(
+            f"motion {path}: no such file, and none of that name comes with the package: {', '.join(motion_names())}"
+        )
+    try:
+        archive = np.load(path, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ValueError("it holds one array, not an archive of arrays")
+        with archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"motion {path}: cannot be read as .npz without pickles: {error}") from None
+    for key in KEYS:
+        if key not in arrays:
+            raise ValueError(f"motion {path}: no array {key!r}: it has {', '.join(sorted(arrays)) or 'none'}")
+    unknown = sorted(arrays.keys() - {*KEYS, *_OPTIONAL})
+    if unknown:
+        raise ValueError(
+            f"motion {path}: unknown array {unknown[0]!r}: {near(unknown[0], (*KEYS, *_OPTIONAL))}"
+        )
+    return arrays
+
+
+def _check_joints(file: str | Path, names: list[str], model: mujoco.MjModel) -> None:
+    own = [model.joint(i).name for i in range(model.njnt)]
+    for name in names:
+        if name not in own:
+            raise ValueError(f"motion {file}: the model has no joint {name!r}: {near(name, own)}")
+    if names != own:
+        raise ValueError(
+            f"motion {file}: joint_names={names}: expected the model's joints in their order, {own}"
+        )
+
+
+def _entries(table: Tensor, frame_E: Tensor, columns: Index) -> Tensor:
+    """Return some columns of a table [F, N, ...] in each env's frame, [E, N, ...]."""
+    return table[:, columns][frame_E] if isinstance(columns, slice) else table[frame_E[:, None], columns]
+
+
+def _blend(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
+    """Return unit quaternions [..., 4] between two, along the shorter arc."""
+    sign = torch.where((first * second).sum(-1, keepdim=True) < 0.0, -1.0, 1.0)
+    blend = torch.lerp(first, sign * second, share)
+    return blend / torch.linalg.vector_norm(blend, dim=-1, keepdim=True)
+
+
+def _body_poses(model: mujoco.MjModel, qpos_FL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the bodies are in each frame, [F, N, 3] and [F, N, 4]."""
+    data = mujoco.MjData(model)
+    pos_FN3, quat_FN4 = [], []
+    for qpos in qpos_FL:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        pos_FN3.append(data.xpos.copy())
+        quat_FN4.append(data.xquat.copy())
+    return np.stack(pos_FN3), np.stack(quat_FN4)
+
+
+def _quaternion_columns(model: mujoco.MjModel) -> tuple[int, ...]:
+    kinds = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
+    joints = zip(model.jnt_type, model.jnt_qposadr, strict=True)
+    return tuple(int(address) + kinds[int(kind)] for kind, address in joints if int(kind) in kinds)

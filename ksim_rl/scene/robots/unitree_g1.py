@@ -1,0 +1,194 @@
+"""Unitree G1 with 29 joints: the menagerie's model with reflected motor inertia, position servos and lean collisions.
+
+Frames: the root is `pelvis` (x forward, y left, z up). Masses, joints and ranges are those of
+mujoco_menagerie/unitree_g1. Servo gains follow from the motors' gear trains and a chosen 10 Hz, as in BeyondMimic
+(Liao et al., 2025) and mjlab 1.6.0, whose figures these are, the stance and the collision set included.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import mujoco
+
+from ksim_rl.physics import load_spec
+from ksim_rl.scene.actuators import Actuator, PositionActuator
+from ksim_rl.scene.robots.edit import (
+    CollisionGeom,
+    Site,
+    Vector,
+    exclude_contacts,
+    rebuild,
+    reflected_inertia,
+    spread,
+)
+
+SIDES = ("left", "right")
+_LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
+_ARM = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw")
+JOINTS = (
+    *(f"{side}_{kind}_joint" for side in SIDES for kind in _LEG),
+    *(f"waist_{axis}_joint" for axis in ("yaw", "roll", "pitch")),
+    *(f"{side}_{kind}_joint" for side in SIDES for kind in _ARM),
+)
+
+# Motors by Unitree's names: two-stage planetary gears, but for the 4010.
+_M5020 = reflected_inertia((0.139e-4, 0.017e-4, 0.169e-4), (1.0 + 46.0 / 18.0, 1.0 + 56.0 / 16.0))
+_M7520_14 = reflected_inertia((0.489e-4, 0.098e-4, 0.533e-4), (4.5, 1.0 + 48.0 / 22.0))
+_M7520_22 = reflected_inertia((0.489e-4, 0.109e-4, 0.738e-4), (4.5, 5.0))
+_M4010 = reflected_inertia((0.068e-4, 0.0, 0.0), (5.0, 5.0))
+_ARM_JOINTS = (".*_shoulder_.*", ".*_elbow_joint", ".*_wrist_roll_joint")
+_TURN_JOINTS = (".*_hip_pitch_joint", ".*_hip_yaw_joint", "waist_yaw_joint")
+_LIFT_JOINTS = (".*_hip_roll_joint", ".*_knee_joint")
+_HAND_JOINTS = (".*_wrist_pitch_joint", ".*_wrist_yaw_joint")
+_WAIST_JOINTS, _ANKLE_JOINTS = ("waist_roll_joint", "waist_pitch_joint"), (".*_ankle_.*",)
+
+SERVOS = (
+    PositionActuator.tuned(joints=_ARM_JOINTS, effort_limit=25.0, armature=_M5020),
+    PositionActuator.tuned(joints=_TURN_JOINTS, effort_limit=88.0, armature=_M7520_14),
+    PositionActuator.tuned(joints=_LIFT_JOINTS, effort_limit=139.0, armature=_M7520_22),
+    PositionActuator.tuned(joints=_HAND_JOINTS, effort_limit=5.0, armature=_M4010),
+    # Waist and ankles: two 5020 that drive a four-bar linkage together.
+    PositionActuator.tuned(joints=_WAIST_JOINTS, effort_limit=50.0, armature=2.0 * _M5020),
+    PositionActuator.tuned(joints=_ANKLE_JOINTS, effort_limit=50.0, armature=2.0 * _M5020),
+)
+# A unit action moves the target by a quarter of the deflection at which the servo saturates (effort_limit / kp).
+ACTION_SCALE = {
+    **dict.fromkeys((*_ARM_JOINTS, *_WAIST_JOINTS, *_ANKLE_JOINTS), 0.43858),
+    **dict.fromkeys(_TURN_JOINTS, 0.54755),
+    **dict.fromkeys(_LIFT_JOINTS, 0.35066),
+    **dict.fromkeys(_HAND_JOINTS, 0.0745),
+}
+STANCE = {
+    ".*_hip_pitch_joint": -0.312,
+    ".*_knee_joint": 0.669,
+    ".*_ankle_pitch_joint": -0.363,
+    ".*_shoulder_pitch_joint": 0.2,
+    "left_shoulder_roll_joint": 0.2,
+    "right_shoulder_roll_joint": -0.2,
+    ".*_elbow_joint": 0.6,
+}
+
+_SPHERE, _CAPSULE = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE
+# Seven capsules of 1 cm radius along each foot: (x, y) of their ends, in the ankle's frame.
+_SOLE = (
+    ((-0.044, -0.018), (0.123, -0.018)),
+    ((-0.052, -0.010), (0.130, -0.010)),
+    ((-0.054, 0.000), (0.132, 0.000)),
+    ((-0.052, 0.010), (0.130, 0.010)),
+    ((-0.044, 0.018), (0.123, 0.018)),
+)
+_INNER_EDGE = {"left": ((0.1, -0.026), (0.05, -0.027)), "right": ((0.1, -0.026), (0.05, -0.026))}
+_OUTER_EDGE = ((0.1, 0.026), (0.05, 0.026))
+_SOLE_Z = -0.025
+
+
+def _sphere(name: str, body: str, radius: float, pos: Vector) -> CollisionGeom:
+    return CollisionGeom(name=name, body=body, type=_SPHERE, size=(radius,), pos=pos, condim=1)
+
+
+def _capsule(name: str, body: str, radius: float, fromto: Vector) -> CollisionGeom:
+    """A capsule whose contacts with other parts of the robot are frictionless: fewer dimensions cost less."""
+    return CollisionGeom(name=name, body=body, type=_CAPSULE, size=(radius,), fromto=fromto, condim=1)
+
+
+def _foot_geoms(side: str) -> tuple[CollisionGeom, ...]:
+    ends = (_INNER_EDGE[side], *_SOLE, _OUTER_EDGE)
+    return tuple(
+        CollisionGeom(
+            name=f"{side}_foot{number}_collision",
+            body=f"{side}_ankle_roll_link",
+            type=_CAPSULE,
+            size=(0.01,),
+            fromto=(*first, _SOLE_Z, *second, _SOLE_Z),
+            friction=(0.6, 0.005, 0.0001),
+            priority=1,
+        )
+        for number, (first, second) in enumerate(ends, 1)
+    )
+
+
+def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:
+    y = 1.0 if side == "left" else -1.0
+    knee = f"{side}_knee_link"
+    return (
+        _capsule(f"{side}_hip_collision", f"{side}_hip_roll_link", 0.06, (0.02, 0, 0, 0.02, 0, -0.08)),
+        _capsule(f"{side}_thigh_collision", f"{side}_hip_yaw_link", 0.055, (0, 0, -0.03, -0.06, 0, -0.17)),
+        _capsule(f"{side}_shin_collision", knee, 0.045, (0.01, 0, 0, 0.01, 0, -0.15)),
+        _capsule(f"{side}_linkage_brace_collision", knee, 0.03, (0.01, 0, -0.2, 0.01, 0, -0.28)),
+        *_foot_geoms(side),
+        _capsule(
+            f"{side}_shoulder_yaw_collision", f"{side}_shoulder_yaw_link", 0.035, (0, 0, -0.08, 0, 0, 0.05)
+        ),
+        _capsule(
+            f"{side}_elbow_yaw_collision", f"{side}_elbow_link", 0.035, (-0.01, 0, -0.01, 0.08, 0, -0.01)
+        ),
+        _capsule(f"{side}_wrist_collision", f"{side}_wrist_pitch_link", 0.035, (-0.01, 0, 0, 0.06, 0, 0)),
+        _capsule(f"{side}_hand_collision", f"{side}_wrist_yaw_link", 0.035, (0.07, 0, 0, 0.15, -0.02 * y, 0)),
+    )
+
+
+COLLISION_GEOMS = (
+    _sphere("pelvis_collision", "pelvis", 0.07, (0.0, 0.0, -0.08)),
+    _capsule("torso_collision", "torso_link", 0.09, (0.01, 0.0, 0.08, 0.01, 0.0, 0.2)),
+    _sphere("head_collision", "torso_link", 0.06, (0.0, 0.0, 0.43)),
+    *(geom for side in SIDES for geom in _side_geoms(side)),
+)
+# Neighbours that the capsules would let touch in every pose.
+OVERLAPS = tuple(
+    pair
+    for side in SIDES
+    for pair in (("pelvis", f"{side}_hip_roll_link"), (f"{side}_elbow_link", f"{side}_wrist_pitch_link"))
+)
+SITES = tuple(
+    site
+    for side in SIDES
+    for site in (
+        Site(name=f"{side}_foot", body=f"{side}_ankle_roll_link", pos=(0.04, 0.0, -0.037)),
+        Site(name=f"{side}_palm", body=f"{side}_wrist_yaw_link", pos=(0.08, 0.0, 0.0), radius=0.01),
+    )
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnitreeG1:
+    """The facts of the robot, and `spec()`, the model that they describe.
+
+    Attributes:
+        joint_names: the actuated joints in policy order (that of actions and joint observations).
+        default_joint_pos: the stance with bent knees, rad, by joint name.
+        init_pos, init_quat: the root's pose in the stance: m, and a quaternion (w, x, y, z).
+        action_scale: rad per unit action, by joint name.
+        actuators: what drives the joints.
+        soft_joint_pos_limit_factor: the part of each joint's range, about its middle, that is free of penalty.
+    """
+
+    init_pos: tuple[float, float, float] = (0.0, 0.0, 0.76)
+    init_quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    default_joint_pos: Mapping[str, float] = field(
+        default_factory=lambda: spread(STANCE, JOINTS, default=0.0)
+    )
+    action_scale: Mapping[str, float] = field(default_factory=lambda: spread(ACTION_SCALE, JOINTS))
+    actuators: tuple[Actuator, ...] = SERVOS
+    soft_joint_pos_limit_factor: float = 0.9
+
+    name: ClassVar[str] = "g1"
+    root_body: ClassVar[str] = "pelvis"
+    torso_body: ClassVar[str] = "torso_link"
+    joint_names: ClassVar[tuple[str, ...]] = JOINTS
+    foot_bodies: ClassVar[tuple[str, ...]] = tuple(f"{side}_ankle_roll_link" for side in SIDES)
+    foot_geoms: ClassVar[tuple[str, ...]] = tuple(
+        f"{side}_foot{number}_collision" for side in SIDES for number in range(1, 8)
+    )
+    foot_sites: ClassVar[tuple[str, ...]] = tuple(f"{side}_foot" for side in SIDES)
+
+    def spec(self) -> mujoco.MjSpec:
+        """Return a fresh, editable model of the robot alone, with keyframe `init_state`.
+
+        Raises:
+            ValueError: in one line, how to get the menagerie's model, if it is not at hand.
+        """
+        spec = load_spec("unitree_g1/g1")
+        rebuild(spec, self, geoms=COLLISION_GEOMS, sites=SITES, imu="imu_in_pelvis")
+        exclude_contacts(spec, OVERLAPS)
+        return spec

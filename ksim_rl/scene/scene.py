@@ -1,0 +1,136 @@
+"""The scene of one world: robots on a terrain, with the sensors that terms read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import mujoco
+
+from ksim_rl.checks import check_in_range, near
+from ksim_rl.physics import load_model, load_spec
+from ksim_rl.scene.actuators import Actuator, set_actuators
+from ksim_rl.scene.placement import Placement
+from ksim_rl.scene.sensors import Sensor
+from ksim_rl.scene.terrains import Terrain
+
+
+@runtime_checkable
+class Robot(Protocol):
+    """What a scene needs from a robot: its model, as a spec that can still be edited.
+
+    A robot whose joints are driven by entries of `ksim_rl.scene.actuators` has them in an attribute `actuators`, and
+    its `spec` puts them into the model by `set_actuators`.
+    """
+
+    def spec(self) -> mujoco.MjSpec:
+        """Return a new spec of the robot; its first keyframe, if any, is the default pose."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class MjcfRobot:
+    """A robot, or a whole scene, as an MJCF file, an XML string or a menagerie name.
+
+    Attributes:
+        source: what `physics.load_spec` takes.
+        actuators: what drives the joints, in place of the model's own actuators of these joints.
+    """
+
+    source: str
+    actuators: tuple[Actuator, ...] = ()
+
+    def spec(self) -> mujoco.MjSpec:
+        """Return a new spec of the model."""
+        spec = load_spec(self.source)
+        set_actuators(spec, self.actuators)
+        return spec
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneCfg:
+    """What is in each world.
+
+    Attributes:
+        robots: by name. All start at their own default poses; gravity and the other options are the first robot's.
+        objects: by name, what else stands or lies there: a cube, a ball, a door. The elements of an entity (robot or
+            object) that is alone keep their names; those of several get the prefix "<name>/".
+        placements: where entities stand, by name; the others stand where their own models put them.
+        terrain: the ground, or None if the robot's own model has what it needs.
+        sensors: by name, for `view.contact(name)` and its kin. Sensors of the MJCF need no entry here.
+        num_envs: E, the number of worlds.
+        spacing: m between neighbouring envs when several are drawn in one picture.
+        soft_joint_pos_limit_factor: fraction of each joint's range, about its middle, that counts as soft limits.
+    """
+
+    robots: Mapping[str, Robot]
+    objects: Mapping[str, Robot] = field(default_factory=dict)
+    placements: Mapping[str, Placement] = field(default_factory=dict)
+    terrain: Terrain | None = None
+    sensors: Mapping[str, Sensor] = field(default_factory=dict)
+    num_envs: int = 1
+    spacing: float = 2.0
+    soft_joint_pos_limit_factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not self.robots:
+            raise ValueError("robots={}: name at least one robot")
+        for name in self.objects:
+            if name in self.robots:
+                raise ValueError(f"objects: {name!r} is the name of a robot: give it another")
+        for name in self.placements:
+            if name not in self.entities:
+                raise ValueError(f"placements: no robot or object {name!r}: {near(name, self.entities)}")
+        if isinstance(self.num_envs, bool) or not isinstance(self.num_envs, int) or self.num_envs < 1:
+            raise ValueError(f"num_envs={self.num_envs!r}: expected a whole number of at least 1")
+        check_in_range("spacing", self.spacing, low=0.0)
+        check_in_range("soft_joint_pos_limit_factor", self.soft_joint_pos_limit_factor, low=0.0, high=1.0)
+
+    @property
+    def entities(self) -> Mapping[str, Robot]:
+        """Robots, then objects, by name."""
+        return {**self.robots, **self.objects}
+
+
+def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
+    """Assemble the scene's spec: robots and objects, then terrain, then sensors.
+
+    Raises:
+        ValueError: if a robot cannot be loaded or a sensor names what the model does not have.
+    """
+    entities = {name: _placed(robot, cfg.placements.get(name)) for name, robot in cfg.entities.items()}
+    spec = _joined(entities) if len(entities) > 1 else next(iter(entities.values()))
+    if cfg.terrain is not None:
+        cfg.terrain.add_to(spec)
+    for name, sensor in cfg.sensors.items():
+        sensor.add_to(spec, name)
+    return spec
+
+
+def _placed(robot: Robot, placement: Placement | None) -> mujoco.MjSpec:
+    spec = robot.spec()
+    if placement is not None:
+        placement.move(spec)
+    return spec
+
+
+def _joined(entities: Mapping[str, mujoco.MjSpec]) -> mujoco.MjSpec:
+    """Put entities into one spec, with one keyframe that holds the default pose of each."""
+    spec = mujoco.MjSpec()
+    first = next(iter(entities.values()))
+    spec.option = first.option
+    pose: list[float] = []
+    for name, entity in entities.items():
+        entity.option = first.option
+        model = load_model(entity)
+        pose += list(model.key_qpos[0] if model.nkey else model.qpos0)
+        # An attached keyframe would cover its own entity only.
+        for key in list(entity.keys):
+            entity.delete(key)
+        # The view knows whose a body is by the name of its outermost ancestor.
+        for number, body in enumerate(entity.worldbody.bodies):
+            body.name = body.name or f"body{number}"
+        spec.attach(entity, prefix=f"{name}/", frame=spec.worldbody.add_frame())
+    spec.add_key(name="default", qpos=pose)
+    return spec

@@ -1,0 +1,153 @@
+"""Cameras that are drawn for all worlds at once, on the device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+import torch
+from torch import Tensor
+
+from ksim_rl.checks import check_in_range, near
+from ksim_rl.physics.batch_camera import BatchCamera
+from ksim_rl.scene.sensors.sensor import Sensor, SensorTracker
+
+if TYPE_CHECKING:
+    from ksim_rl.envs.view import EnvView
+    from ksim_rl.scene.rendering.visualizer import DebugVisualizer
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraSensor(Sensor):
+    """A camera of the model, or a new one on a body, drawn when a term reads it (position stage).
+
+    MuJoCo Warp's renderer casts a ray per pixel: colors, lights and textures resemble MuJoCo's own pictures without
+    being equal to them, and depth and segmentation agree with them up to the edges of things.
+
+    Attributes:
+        camera: a camera of the model; None puts a new one on `body`.
+        body: with `camera=None`, the body that carries it, such as "world".
+        pos: with `camera=None`, its place in the body's frame, m.
+        xyaxes: with `camera=None`, the directions in the body's frame of the picture's right and up.
+        fovy: with `camera=None`, the vertical field of view, degrees.
+        width, height: pixels.
+        rgb, depth, segmentation: what is drawn.
+        max_depth: m; what is farther, or not there at all, has this depth.
+        geom_groups: which of MuJoCo's geom groups are visible.
+        textures, shadows: whether they are drawn; the model's sky counts as a texture.
+    """
+
+    camera: str | None = None
+    body: str = "world"
+    pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    xyaxes: tuple[float, float, float, float, float, float] = (0.0, -1.0, 0.0, 0.0, 0.0, 1.0)
+    fovy: float = 45.0
+    width: int = 64
+    height: int = 64
+    rgb: bool = True
+    depth: bool = False
+    segmentation: bool = False
+    max_depth: float = 10.0
+    geom_groups: tuple[int, ...] = (0, 1, 2)
+    textures: bool = True
+    shadows: bool = False
+
+    def __post_init__(self) -> None:
+        for field in ("width", "height"):
+            value = getattr(self, field)
+            if isinstance(value, bool) or not isinstance(value, int):
+                raise ValueError(f"{field}={value!r}: expected a whole number >= 1")
+            check_in_range(field, value, low=1)
+        check_in_range("fovy", self.fovy, low=0.0, high=180.0, low_open=True)
+        check_in_range("max_depth", self.max_depth, low=0.0, low_open=True)
+        for index, group in enumerate(self.geom_groups):
+            check_in_range(f"geom_groups[{index}]", group, low=0, high=mujoco.mjNGROUP - 1)
+        if not (self.rgb or self.depth or self.segmentation):
+            raise ValueError("rgb=False, depth=False, segmentation=False: draw at least one of them")
+
+    def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
+        """Add the camera `<name>` to its body, unless the model has it.
+
+        Raises:
+            ValueError: if the model has no such camera or body.
+        """
+        if self.camera is not None:
+            cameras = [camera.name for camera in spec.cameras]
+            if self.camera not in cameras:
+                raise ValueError(
+                    f"scene.sensors.{name}: no camera {self.camera!r}: {near(self.camera, cameras)}"
+                )
+            return
+        bodies = [body.name for body in spec.bodies]
+        if self.body not in bodies:
+            raise ValueError(f"scene.sensors.{name}: no body {self.body!r}: {near(self.body, bodies)}")
+        spec.body(self.body).add_camera(
+            name=name, pos=list(self.pos), xyaxes=list(self.xyaxes), fovy=self.fovy
+        )
+
+    def track(self, name: str, view: EnvView) -> CameraTracker:
+        """Return the reader of this sensor in the worlds of `view`."""
+        return CameraTracker(name, self, view)
+
+
+class CameraTracker(SensorTracker):
+    """Draws the pictures of one camera, at most once per state, and only if something reads them."""
+
+    def __init__(self, name: str, sensor: CameraSensor, view: EnvView) -> None:
+        self._name, self._sensor, self._view = name, sensor, view
+        self._camera = BatchCamera(
+            view.world,
+            sensor.camera or name,
+            width=sensor.width,
+            height=sensor.height,
+            rgb=sensor.rgb,
+            depth=sensor.depth,
+            segmentation=sensor.segmentation,
+            geom_groups=sensor.geom_groups,
+            textures=sensor.textures,
+            shadows=sensor.shadows,
+        )
+
+    @property
+    def rgb_EHW3(self) -> Tensor:
+        """Colors, uint8 [E, H, W, 3]; the first row is the top of the picture."""
+        return self._read("rgb")
+
+    @property
+    def depth_EHW(self) -> Tensor:
+        """Distance along the camera's axis, m, at most `max_depth`, float32 [E, H, W]."""
+        return self._read("depth")
+
+    @property
+    def segmentation_EHW(self) -> Tensor:
+        """Ids of the geoms that are seen, -1 for none, int32 [E, H, W]."""
+        return self._read("segmentation")
+
+    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
+        """Draw the camera's axes: right in red, up in green, and back in blue."""
+        camera = view.world.mj_model.camera(self._sensor.camera or self._name).id
+        origin = view.world.view("cam_xpos")[env_index, camera].cpu().numpy()
+        visualizer.frame(origin, view.world.view("cam_xmat")[env_index, camera].cpu().numpy().reshape(3, 3))
+
+    def _read(self, output: str) -> Tensor:
+        cache, key = self._view.cache, f"camera/{self._name}."
+        if key + output not in cache:
+            if not getattr(self._sensor, output):
+                raise ValueError(f"scene.sensors.{self._name}.{output}=False: set it to True to read it")
+            self._view.derived()
+            self._camera.render()
+            cache.update({key + name: picture for name, picture in self._pictures().items()})
+        return cache[key + output]
+
+    def _pictures(self) -> dict[str, Tensor]:
+        """Copy what was drawn last: the next drawing overwrites it."""
+        camera, sensor, pictures = self._camera, self._sensor, {}
+        if sensor.rgb:
+            pictures["rgb"] = camera.rgb_EHW3
+        if sensor.depth:
+            depth_EHW, most = camera.depth_EHW, sensor.max_depth
+            pictures["depth"] = torch.where(depth_EHW > 0.0, depth_EHW.clamp(max=most), most)
+        if sensor.segmentation:
+            pictures["segmentation"] = camera.segmentation_EHW2[..., 0].clone()
+        return pictures

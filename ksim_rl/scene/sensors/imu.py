@@ -1,0 +1,88 @@
+"""Inertial measurement units: gyroscope, accelerometer and orientation at a place on a body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+import torch
+from torch import Tensor
+
+from ksim_rl.scene import quaternion
+from ksim_rl.scene.sensors.mount import MountedSensor
+from ksim_rl.scene.sensors.sensor import SensorTracker
+
+if TYPE_CHECKING:
+    from ksim_rl.envs.view import EnvView
+    from ksim_rl.scene.rendering.visualizer import DebugVisualizer
+
+_SENSORS = {
+    "gyro": mujoco.mjtSensor.mjSENS_GYRO,
+    "accelerometer": mujoco.mjtSensor.mjSENS_ACCELEROMETER,
+    "orientation": mujoco.mjtSensor.mjSENS_FRAMEQUAT,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuSensor(MountedSensor):
+    """An inertial measurement unit. Noise, bias and lag are transforms of the observations that read it."""
+
+    def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
+        """Add the MJCF sensors `<name>_gyro`, `<name>_accelerometer` and `<name>_orientation`, and a site if needed.
+
+        Raises:
+            ValueError: if the model has no such site or body.
+        """
+        super().add_to(spec, name)
+        for suffix, kind in _SENSORS.items():
+            spec.add_sensor(
+                name=f"{name}_{suffix}",
+                type=kind,
+                objtype=mujoco.mjtObj.mjOBJ_SITE,
+                objname=self.mounting_site(name),
+            )
+
+    def track(self, name: str, view: EnvView) -> ImuTracker:
+        """Return the reader of this sensor in the worlds of `view`."""
+        return ImuTracker(name, view, self.mounting_site(name))
+
+
+class ImuTracker(SensorTracker):
+    """What one inertial measurement unit reads, float32, in its own axes."""
+
+    def __init__(self, name: str, view: EnvView, site: str) -> None:
+        self._name, self._view, self._site = name, view, site
+        self._down = torch.tensor([0.0, 0.0, -1.0], device=view.device)
+
+    @property
+    def ang_vel_EL(self) -> Tensor:
+        """Angular velocity, rad/s, [E, 3]; velocity stage."""
+        return self._view.sensor(f"{self._name}_gyro")
+
+    @property
+    def lin_acc_EL(self) -> Tensor:
+        """Acceleration minus gravity, m/s^2, [E, 3]: at rest it points up and is 9.81, in free fall it is zero.
+
+        Acceleration stage: of the last physics substep, and zero in rows that were just reset.
+        """
+        return self._view.sensor(f"{self._name}_accelerometer")
+
+    @property
+    def quat_EL(self) -> Tensor:
+        """Orientation, from the unit's axes to the world's, (w, x, y, z), [E, 4]; position stage."""
+        return self._view.sensor(f"{self._name}_orientation")
+
+    @property
+    def projected_gravity_EL(self) -> Tensor:
+        """Unit vector of world -z, [E, 3]; position stage."""
+        cache, key = self._view.cache, f"imu/{self._name}.projected_gravity"
+        if key not in cache:
+            cache[key] = quaternion.rotate_inverse(self.quat_EL, self._down.expand(self._view.num_envs, 3))
+        return cache[key]
+
+    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
+        """Draw the unit's axes at its place."""
+        site = view.world.mj_model.site(self._site).id
+        origin = view.world.site_xpos_EL[env_index, site].cpu().numpy()
+        visualizer.frame(origin, view.world.site_xmat_EL[env_index, site].cpu().numpy().reshape(3, 3))

@@ -1,0 +1,46 @@
+"""What every sensor of a scene has: a config that edits the model, and a tracker that reads it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+
+if TYPE_CHECKING:
+    from ksim_rl.envs.view import EnvView
+    from ksim_rl.scene.rendering.visualizer import DebugVisualizer
+
+
+class SensorTracker:
+    """Reads one sensor. What it reads on demand belongs in `view.cache`, so that it is read once per state."""
+
+    def update(self) -> None:
+        """Advance by one env step; it runs in each step, after the refresh (nothing by default)."""
+
+    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
+        """Draw the reading of one env (nothing by default)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor(ABC):
+    """A sensor of `scene.sensors`, where its key is its name."""
+
+    @abstractmethod
+    def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
+        """Add what the sensor needs to the scene's spec.
+
+        Raises:
+            ValueError: if the model lacks what the sensor names.
+        """
+
+    @abstractmethod
+    def track(self, name: str, view: EnvView) -> SensorTracker:
+        """Return the reader of this sensor in the worlds of `view`."""
+
+
+def sensor_columns(model: mujoco.MjModel, name: str) -> range:
+    """Return where the reading of an MJCF sensor stands in `sensordata_EL`."""
+    found = model.sensor(name)
+    return range(int(found.adr[0]), int(found.adr[0] + found.dim[0]))

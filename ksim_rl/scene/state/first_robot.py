@@ -1,0 +1,64 @@
+"""The root of a scene's first robot, which most scenes have no other than."""
+
+from torch import Tensor
+
+from ksim_rl.scene.state.entity import Entity
+
+
+class FirstRobot:
+    """The part of `EnvView` that is `view.entity("")`, written shorter."""
+
+    robot: Entity
+
+    @property
+    def root_pos_EL(self) -> Tensor:
+        """Position of the first robot's root body frame in the world, m, [E, 3]."""
+        return self.robot.root_pos_EL
+
+    @property
+    def root_quat_EL(self) -> Tensor:
+        """Orientation of the first robot's root body, body to world, (w, x, y, z), [E, 4]."""
+        return self.robot.root_quat_EL
+
+    @property
+    def root_lin_vel_w_EL(self) -> Tensor:
+        """Linear velocity of the first robot's root body frame origin, world frame, m/s, [E, 3]."""
+        return self.robot.root_lin_vel_w_EL
+
+    @property
+    def root_ang_vel_w_EL(self) -> Tensor:
+        """Angular velocity of the first robot's root body, world frame, rad/s, [E, 3]."""
+        return self.robot.root_ang_vel_w_EL
+
+    @property
+    def root_lin_vel_b_EL(self) -> Tensor:
+        """Linear velocity of the first robot's root body frame origin, body frame, m/s, [E, 3]."""
+        return self.robot.root_lin_vel_b_EL
+
+    @property
+    def root_ang_vel_b_EL(self) -> Tensor:
+        """Angular velocity of the first robot's root body, body frame, rad/s, [E, 3]."""
+        return self.robot.root_ang_vel_b_EL
+
+    @property
+    def projected_gravity_EL(self) -> Tensor:
+        """Unit vector of gravity (world -z) in the first robot's root body frame, [E, 3]."""
+        return self.robot.projected_gravity_EL
+
+    @property
+    def heading_E(self) -> Tensor:
+        """Yaw of the first robot's root body, rad in [-pi, pi], [E]."""
+        return self.robot.heading_E
+
+    @property
+    def free_root(self) -> bool:
+        """Whether the first robot's root floats freely."""
+        return self.robot.free_root
+
+    def write_root_pose(self, mask_E: Tensor, pos_EL: Tensor, quat_EL: Tensor) -> None:
+        """Set position (m) and orientation (w, x, y, z) of the first robot's free root in the rows of `mask_E`."""
+        self.robot.write_root_pose(mask_E, pos_EL, quat_EL)
+
+    def write_root_velocity(self, mask_E: Tensor, lin_vel_w_EL: Tensor, ang_vel_w_EL: Tensor) -> None:
+        """Set velocities (m/s, rad/s, world frame) of the first robot's free root in the rows of `mask_E`."""
+        self.robot.write_root_velocity(mask_E, lin_vel_w_EL, ang_vel_w_EL)

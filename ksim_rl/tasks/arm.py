@@ -1,0 +1,145 @@
+"""A small arm reaches points, and pushes a cube to a place on the table."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from ksim_rl import mdp
+from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.task import Task
+from ksim_rl.envs.term import CommandTerm, EventTerm, MetricTerm, RewardTerm
+from ksim_rl.physics import SimCfg
+from ksim_rl.scene.objects import Box
+from ksim_rl.scene.placement import Placement
+from ksim_rl.scene.robots.arm import JOINTS, TIP, Arm
+from ksim_rl.scene.scene import SceneCfg
+from ksim_rl.scene.terrains import PlaneTerrain
+from ksim_rl.scene.viewer_cfg import ViewerCfg
+from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
+
+COMMAND = "target"
+CUBE_EDGE = 0.06
+
+
+def _cfg(
+    scene: SceneCfg,
+    *,
+    prefix: str,
+    observations: Mapping[str, ObservationTermCfg],
+    command: CommandTerm,
+    rewards: Mapping[str, RewardTerm],
+    events: Mapping[str, EventTerm],
+    metric: MetricTerm,
+) -> ManagerBasedRlEnvCfg:
+    """Put together what both tasks share; `prefix` stands before the names of the arm's elements."""
+    joints = tuple(f"{prefix}{joint}" for joint in JOINTS)
+    terms = {
+        "joint_pos": ObservationTermCfg(term=mdp.JointPosRel(joints=joints)),
+        "joint_vel": ObservationTermCfg(term=mdp.JointVel(joints=joints), scale=0.2),
+        **observations,
+        "last_action": ObservationTermCfg(term=mdp.LastAction()),
+    }
+    return ManagerBasedRlEnvCfg(
+        decimation=4,
+        scene=scene,
+        sim=SimCfg(iterations=10, ls_iterations=20),
+        observations={"actor": ObservationGroupCfg(terms=terms), "critic": ObservationGroupCfg(terms=terms)},
+        # A target is at most half a radian from where the joint is, so that the first policy moves slowly.
+        actions={"joints": mdp.RelativeJointPositionAction(joints=joints, scale=0.2, clip=(-2.5, 2.5))},
+        events={"arm": mdp.ResetJoints(joints=joints, position_range=(-0.1, 0.1)), **events},
+        commands={COMMAND: command},
+        rewards={
+            **rewards,
+            "action_rate": mdp.ActionRateL2(weight=-0.005),
+            "joint_vel": mdp.JointVelL2(joints=joints, weight=-0.005),
+        },
+        terminations={"time_out": mdp.TimeOut(time_out=True)},
+        metrics={"target_reached": metric},
+        episode_length_s=8.0,
+        viewer=ViewerCfg(lookat=(0.25, 0.0, 0.15), distance=1.4, elevation=-25.0, azimuth=140.0),
+    )
+
+
+def arm_reach() -> ManagerBasedRlEnvCfg:
+    """Return the config of bringing the tip to points in front of the arm, a new one every 3 to 5 s."""
+    here: dict[str, Any] = {"command": COMMAND, "site": TIP}
+    return _cfg(
+        SceneCfg(robots={"arm": Arm()}, terrain=PlaneTerrain(), num_envs=2048),
+        prefix="",
+        observations={"to_target": ObservationTermCfg(term=mdp.OffsetToCommand(**here))},
+        command=mdp.CartesianCommand(
+            position={"x": (0.2, 0.45), "y": (-0.25, 0.25), "z": (0.05, 0.4)},
+            resampling_time_range_s=(3.0, 5.0),
+        ),
+        rewards={
+            "coarse": mdp.TrackPosition(**here, std=0.25, weight=1.0),
+            "fine": mdp.TrackPosition(**here, std=0.05, weight=1.0),
+        },
+        events={},
+        metric=mdp.TargetReached(**here, tolerance=0.03, reduce="mean"),
+    )
+
+
+def arm_push() -> ManagerBasedRlEnvCfg:
+    """Return the config of pushing a cube over the table to a place that stays for the episode."""
+    cube = "cube/box"
+    here: dict[str, Any] = {"command": COMMAND, "body": cube}
+    return _cfg(
+        SceneCfg(
+            robots={"arm": Arm()},
+            objects={"cube": Box(size=(CUBE_EDGE, CUBE_EDGE, CUBE_EDGE), mass=0.15)},
+            placements={"cube": Placement(pos=(0.35, 0.0, 0.0))},
+            terrain=PlaneTerrain(),
+            num_envs=2048,
+        ),
+        prefix="arm/",
+        observations={
+            "to_cube": ObservationTermCfg(term=mdp.OffsetToBody(site=f"arm/{TIP}", body=cube)),
+            "to_target": ObservationTermCfg(term=mdp.OffsetToCommand(**here)),
+            "cube_pos": ObservationTermCfg(term=mdp.RootPos(entity="cube")),
+            "cube_rotation": ObservationTermCfg(term=mdp.RootRotation6d(entity="cube")),
+            "cube_lin_vel": ObservationTermCfg(term=mdp.RootLinVel(entity="cube", frame="world")),
+        },
+        command=mdp.CartesianCommand(
+            position={"x": (0.25, 0.45), "y": (-0.2, 0.2), "z": (CUBE_EDGE / 2, CUBE_EDGE / 2)},
+            resampling_time_range_s=(8.0, 8.0),
+        ),
+        rewards={
+            "near_cube": mdp.NearBody(site=f"arm/{TIP}", body=cube, std=0.15, weight=0.5),
+            "coarse": mdp.TrackPosition(**here, std=0.2, weight=1.0),
+            "fine": mdp.TrackPosition(**here, std=0.05, weight=2.0),
+        },
+        events={
+            "cube": mdp.ResetRootUniform(
+                entity="cube", pose_range={"x": (-0.07, 0.05), "y": (-0.12, 0.12), "yaw": (-3.14, 3.14)}
+            )
+        },
+        metric=mdp.TargetReached(**here, tolerance=0.04, reduce="last"),
+    )
+
+
+def _training(num_iterations: int) -> dict[str, Any]:
+    return {
+        "num_envs": 2048,
+        "modules.actor.hidden_dims": [256, 128],
+        "modules.critic.hidden_dims": [256, 128],
+        "data.num_env_states_per_minibatch": 12288,
+        "data.num_minibatches": 4,
+        "objective.entropy_coeff": 0.003,
+        "objective.clip_value": False,
+        "trainer.num_iterations": num_iterations,
+        "trainer.eval_interval": 50,
+    }
+
+
+REACH = Task(
+    name="arm_reach",
+    description="an arm brings its tip to points in space",
+    cfg=arm_reach,
+    training=_training(300),
+)
+PUSH = Task(
+    name="arm_push",
+    description="an arm pushes a cube to a place on the table",
+    cfg=arm_push,
+    training=_training(1000),
+)

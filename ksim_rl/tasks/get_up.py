@@ -1,0 +1,195 @@
+"""What the get-up tasks share: a legged robot that was dropped in any pose rises and then stands still.
+
+An episode starts with the robot in the air, turned and bent at random; within half a second it lies on the ground.
+The reward has no stages: height and uprightness lead up from any pose, and what a good stance adds on top is worth
+something only as far as the robot is up. Falling over ends nothing.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from ksim_rl import mdp
+from ksim_rl.checks import check_in_range
+from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.term import MetricTerm, RewardTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.root_height import root_height
+from ksim_rl.scene.robots.legged_robot import LeggedRobot
+from ksim_rl.scene.scene import SceneCfg
+from ksim_rl.scene.terrains import PlaneTerrain
+from ksim_rl.scene.viewer_cfg import ViewerCfg
+from ksim_rl.tasks import velocity
+from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
+
+
+@dataclass(frozen=True, kw_only=True)
+class Uprightness(RewardTerm):
+    """(1 + cos tilt) / 2 of the root, [E]: 1 upright, 0 upside down; position stage."""
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return uprightness(view)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RisenHeight(RewardTerm):
+    """The root's height above the ground as a fraction of the standing one, within [0, 1], [E]; position stage.
+
+    Attributes:
+        standing_height: m.
+    """
+
+    standing_height: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_in_range("standing_height", self.standing_height, low=0.0, low_open=True)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        return risen(view, self.standing_height)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Standing(RewardTerm):
+    """uprightness^2 * risen^2 * exp(-mean((q - q0)^2) / pose_std^2) * exp(-mean(dq^2) / speed_std^2), in [0, 1], [E].
+
+    Attributes:
+        standing_height: m.
+        pose_std: rad, about the default pose.
+        speed_std: rad/s; position and velocity stage.
+    """
+
+    standing_height: float
+    pose_std: float = 0.5
+    speed_std: float = 2.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for field in ("standing_height", "pose_std", "speed_std"):
+            check_in_range(field, getattr(self, field), low=0.0, low_open=True)
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the unweighted reward, [E]."""
+        up_E = (uprightness(view) * risen(view, self.standing_height)).square()
+        stray_E = view.joint_pos_rel_EL.square().mean(-1) / self.pose_std**2
+        motion_E = view.joint_vel_EL.square().mean(-1) / self.speed_std**2
+        return up_E * torch.exp(-stray_E - motion_E)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stands(MetricTerm):
+    """1 where the root is at 85 % of the standing height at least and tilted by at most 0.35 rad, else 0, [E].
+
+    `reduce="last"` (the default) asks whether it stands in the end.
+    """
+
+    standing_height: float
+    reduce: Literal["mean", "last", "max", "sum"] = "last"
+
+    def __call__(self, view: EnvView) -> Tensor:
+        """Return the value of the current state, [E]."""
+        is_high_E = root_height(view) > 0.85 * self.standing_height
+        is_upright_E = -view.projected_gravity_EL[:, 2] > math.cos(0.35)
+        return (is_high_E & is_upright_E).to(torch.float32)
+
+
+def uprightness(view: EnvView) -> Tensor:
+    """Return (1 + cos tilt) / 2 of the root, [E]; position stage."""
+    return 0.5 * (1.0 - view.projected_gravity_EL[:, 2])
+
+
+def risen(view: EnvView, standing_height: float) -> Tensor:
+    """Return the root's height as a fraction of the standing one, within [0, 1], [E]; position stage."""
+    return (root_height(view) / standing_height).clamp(0.0, 1.0)
+
+
+def get_up_cfg(
+    robot: LeggedRobot,
+    *,
+    standing_height: float,
+    drop_height: tuple[float, float],
+    bend: float,
+    action_scale: Mapping[str, float],
+    viewer: ViewerCfg,
+) -> ManagerBasedRlEnvCfg:
+    """Return the config: 50 Hz control for 6 s.
+
+    Args:
+        standing_height: of the root above the ground in the default pose, m.
+        drop_height: how far above that an episode starts, m.
+        bend: how far joints start from the default pose at most, rad.
+        action_scale: rad per unit action, by joint pattern.
+    """
+    return ManagerBasedRlEnvCfg(
+        decimation=4,
+        sim=velocity.sim(),
+        scene=SceneCfg(
+            robots={robot.name: robot},
+            terrain=PlaneTerrain(),
+            num_envs=4096,
+            soft_joint_pos_limit_factor=robot.soft_joint_pos_limit_factor,
+        ),
+        observations=_observations(robot),
+        actions={"joint_pos": mdp.JointPositionAction(joints=robot.joint_names, scale=action_scale)},
+        rewards={
+            "upright": Uprightness(weight=1.0),
+            "height": RisenHeight(weight=1.0, standing_height=standing_height),
+            "standing": Standing(weight=3.0, standing_height=standing_height),
+            "dof_pos_limits": mdp.JointPosLimits(weight=-1.0),
+            "action_rate_l2": mdp.ActionRateL2(weight=-0.01),
+            "joint_vel_l2": mdp.JointVelL2(weight=-1e-4),
+        },
+        events={
+            "drop": mdp.ResetRootUniform(
+                pose_range={
+                    "x": (-0.5, 0.5),
+                    "y": (-0.5, 0.5),
+                    "z": drop_height,
+                    "roll": (-math.pi, math.pi),
+                    "pitch": (-math.pi, math.pi),
+                    "yaw": (-math.pi, math.pi),
+                }
+            ),
+            "bend": mdp.ResetJoints(position_range=(-bend, bend)),
+            "encoder_bias": mdp.RandomizeEncoderBias(ranges=(-0.015, 0.015)),
+            "foot_friction": velocity.foot_friction(robot, low=0.4, high=1.2),
+        },
+        terminations={"time_out": mdp.TimeOut()},
+        metrics={"stands": Stands(standing_height=standing_height)},
+        episode_length_s=6.0,
+        viewer=viewer,
+    )
+
+
+def _observations(robot: LeggedRobot) -> dict[str, ObservationGroupCfg]:
+    ang_vel, gravity = mdp.SensorReading(sensor="imu_ang_vel"), mdp.ProjectedGravity()
+    joint_vel = mdp.JointVel(joints=robot.joint_names)
+    actions = ObservationTermCfg(term=mdp.LastAction())
+    actor = {
+        "base_ang_vel": velocity.noisy(ang_vel, 0.2),
+        "projected_gravity": velocity.noisy(gravity, 0.05),
+        "joint_pos_biased": velocity.noisy(mdp.JointPosRel(joints=robot.joint_names, biased=True), 0.01),
+        "joint_vel": velocity.noisy(joint_vel, 1.5),
+        "actions": actions,
+    }
+    critic = {
+        "base_lin_vel": ObservationTermCfg(term=mdp.SensorReading(sensor="imu_lin_vel")),
+        "base_ang_vel": ObservationTermCfg(term=ang_vel),
+        "projected_gravity": ObservationTermCfg(term=gravity),
+        "joint_pos": ObservationTermCfg(term=mdp.JointPosRel(joints=robot.joint_names)),
+        "joint_vel": ObservationTermCfg(term=joint_vel),
+        "actions": actions,
+        "imu_and_foot_height": ObservationTermCfg(term=mdp.FootHeight(sites=("imu", *robot.foot_sites))),
+    }
+    return {"actor": ObservationGroupCfg(terms=actor), "critic": ObservationGroupCfg(terms=critic)}
+
+
+def training(*, num_iterations: int) -> dict[str, Any]:
+    """Return the training settings: 24 steps of 4096 envs per update."""
+    return velocity.training(num_iterations=num_iterations) | {"objective.entropy_coeff": 0.005}

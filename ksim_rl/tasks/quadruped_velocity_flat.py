@@ -1,0 +1,36 @@
+"""Our own quadruped follows a velocity command on flat ground; nothing to download."""
+
+from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.task import Task
+from ksim_rl.scene.robots.quadruped import Quadruped
+from ksim_rl.scene.sensors import ContactSensor
+from ksim_rl.scene.viewer_cfg import ViewerCfg
+from ksim_rl.tasks import velocity
+
+ROBOT = Quadruped()
+POSE = velocity.PoseStd(
+    standing={".*_(roll|hip)": 0.05, ".*_knee": 0.1},
+    walking={".*_(roll|hip)": 0.3, ".*_knee": 0.6},
+    running={".*_(roll|hip)": 0.3, ".*_knee": 0.6},
+)
+
+
+def quadruped_velocity_flat() -> ManagerBasedRlEnvCfg:
+    """Return the config."""
+    return velocity.velocity_cfg(
+        ROBOT,
+        sim=velocity.sim(),
+        feet=ContactSensor(geoms=ROBOT.foot_geoms),
+        observations=velocity.observations(ROBOT),
+        rewards=velocity.rewards(ROBOT, pose=POSE, foot_height=0.08),
+        events=velocity.events(ROBOT) | {"foot_friction": velocity.foot_friction(ROBOT, low=0.3, high=1.2)},
+        viewer=ViewerCfg(body=ROBOT.root_body, distance=1.6, elevation=-15.0, azimuth=120.0),
+    )
+
+
+TASK = Task(
+    name="quadruped_velocity_flat",
+    description="our quadruped follows a velocity command on flat ground",
+    cfg=quadruped_velocity_flat,
+    training=velocity.training(num_iterations=2_000),
+)

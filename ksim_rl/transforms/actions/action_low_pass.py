@@ -1,0 +1,91 @@
+"""Smoothing of actions."""
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite
+
+from ksim_rl import checks
+from ksim_rl.transforms.actions.action_keys import checked_action
+from ksim_rl.transforms.row_transform import (
+    Keys,
+    RowTransform,
+    as_keys,
+    checked_out_keys,
+)
+from ksim_rl.transforms.specs import drop_leaf_spec, leaf_spec, set_leaf_spec
+
+
+class ActionLowPass(RowTransform):
+    """The env receives `y = y + alpha * (action - y)`, a first-order low-pass filter of the actions.
+
+    The tensordict keeps the action that the policy chose. A cut-off of f Hz at steps of dt s is
+    `alpha = 1 - exp(-2 pi f dt)`.
+
+    Args:
+        in_keys_inv: the actions that the env reads.
+        out_keys_inv: where the policy writes them. Default: the same keys.
+        alpha: in (0, 1]; 1 filters nothing.
+        initial: y before the first action of an episode; None passes that action unfiltered.
+
+    Example:
+        >>> low_pass = ActionLowPass(alpha=0.3)
+    """
+
+    fresh_E: Tensor
+
+    def __init__(
+        self,
+        in_keys_inv: Keys = "action",
+        out_keys_inv: Keys | None = None,
+        *,
+        alpha: float,
+        initial: float | None = None,
+    ) -> None:
+        keys = as_keys(in_keys_inv)
+        checks.check_in_range("alpha", alpha, low=0.0, high=1.0, low_open=True)
+        if initial is not None:
+            checks.check_in_range("initial", initial)
+        super().__init__(
+            in_keys_inv=keys,
+            out_keys_inv=checked_out_keys(keys, out_keys_inv),
+            row_buffers=["fresh_E", *(f"filtered_{index}" for index in range(len(keys)))],
+        )
+        self.alpha, self.initial = alpha, initial
+
+    def transform_action_spec(self, action_spec: Composite) -> Composite:
+        """Move the specs to where the policy writes."""
+        specs = [leaf_spec(action_spec, key, type(self).__name__) for key in self.in_keys_inv]
+        self._size_rows(action_spec.shape.numel(), action_spec.device)
+        self._size_buffer("fresh_E", (self.num_rows,), torch.bool, action_spec.device)
+        for index, (key, out_key, spec) in enumerate(
+            zip(self.in_keys_inv, self.out_keys_inv, specs, strict=True)
+        ):
+            if key != out_key:
+                drop_leaf_spec(action_spec, key)
+                set_leaf_spec(action_spec, out_key, spec.clone())
+            shape = (self.num_rows, *spec.shape[action_spec.ndim :])
+            self._size_buffer(f"filtered_{index}", shape, spec.dtype, action_spec.device)
+        return action_spec
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if self._buffers["fresh_E"] is None:
+            # The action's shape is in the specs only, and they size the buffers.
+            assert self.container is not None and self.container.input_spec is not None
+        self.fresh_E.logical_or_(self._reset_rows(tensordict, tensordict_reset))
+        return tensordict_reset
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self._buffers["fresh_E"] is None:
+            raise RuntimeError("ActionLowPass has state per env: use it in an env, not on a batch of samples")
+        for index, (key, out_key) in enumerate(zip(self.in_keys_inv, self.out_keys_inv, strict=True)):
+            filtered_E: Tensor = getattr(self, f"filtered_{index}")
+            action = checked_action(tensordict, out_key, filtered_E.shape[1:], filtered_E.dtype)
+            action_E = action.reshape(filtered_E.shape)
+            fresh_E = self.fresh_E.reshape(-1, *[1] * (action_E.ndim - 1))
+            before_E = torch.where(fresh_E, action_E if self.initial is None else self.initial, filtered_E)
+            filtered_E.copy_(torch.lerp(before_E, action_E, self.alpha))
+            # In memory of its own: the kept one changes in place.
+            tensordict.set(key, filtered_E.clone().reshape(action.shape))
+        self.fresh_E.zero_()
+        return tensordict

@@ -1,0 +1,177 @@
+"""Random commands that get harder for envs that follow them."""
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite
+
+from ksim_rl import checks
+from ksim_rl.device import random
+from ksim_rl.transforms.keyed_transform import KeyedTransform
+from ksim_rl.transforms.row_transform import as_keys
+from ksim_rl.transforms.specs import (
+    Device,
+    bounded,
+    leaf_spec,
+    set_leaf_spec,
+)
+
+Ranges = Sequence[tuple[float, float]]
+
+
+class RandomCommandCurriculum(KeyedTransform):
+    """A random command per env, float32 [E, K], from ranges that widen with the level of the env, [E, 1].
+
+    At the end of an episode the level of its env rises by `step` if the mean of the score over the episode's steps
+    exceeds `raise_above`, and falls by it below `lower_below`; it stays in [0, 1]. `set_level_` drives it from outside
+    instead.
+
+    Args:
+        in_keys: the one reward or observation that is the score; [] leaves the levels to `set_level_`.
+        out_keys: two keys, for the command and for the level.
+        start: (low, high) per column of the command at level 0.
+        end: the same at level 1, and linear in between.
+        raise_above, lower_below: mean scores; None never raises, or lowers.
+        step: by which a level moves.
+        initial_level: of each env at first.
+        resample_every: env steps after which a command is drawn anew within an episode; 0 keeps it.
+        seed, stream: see `KeyedTransform`.
+
+    Example:
+        >>> commands = RandomCommandCurriculum(start=[(0.0, 0.5)], end=[(-1.0, 2.0)], raise_above=0.8)
+    """
+
+    purposes = ("reset/command", "step/command")
+
+    level_E: Tensor
+    score_E: Tensor
+    age_E: Tensor
+    command_EL: Tensor
+    ends_22L: Tensor
+
+    def __init__(
+        self,
+        in_keys: list[NestedKey] | NestedKey = "reward",
+        out_keys: Sequence[NestedKey] = ("command", "command_level"),
+        *,
+        start: Ranges,
+        end: Ranges,
+        raise_above: float | None = None,
+        lower_below: float | None = None,
+        step: float = 0.1,
+        initial_level: float = 0.0,
+        resample_every: int = 0,
+        seed: int = 0,
+        stream: str | None = None,
+    ) -> None:
+        keys, outs = as_keys(in_keys), as_keys(list(out_keys))
+        if len(keys) > 1 or len(outs) != 2 or outs[0] == outs[1]:
+            raise ValueError(
+                f"in_keys={keys}, out_keys={outs}: expected at most one in key and two distinct out keys"
+            )
+        if not keys and (raise_above is not None or lower_below is not None):
+            raise ValueError("raise_above and lower_below need a score: give in_keys")
+        if len(start) != len(end) or not start:
+            raise ValueError(f"start has {len(start)} ranges and end {len(end)}: give one per column in each")
+        for name, ranges in (("start", start), ("end", end)):
+            for index, pair in enumerate(ranges):
+                checks.check_pair(f"{name}[{index}]", pair)
+        for name, value in (("raise_above", raise_above), ("lower_below", lower_below)):
+            if value is not None:
+                checks.check_in_range(name, value)
+        if raise_above is not None and lower_below is not None and lower_below > raise_above:
+            raise ValueError(f"lower_below={lower_below} exceeds raise_above={raise_above}")
+        checks.check_in_range("step", step, low=0.0, high=1.0, low_open=True)
+        checks.check_in_range("initial_level", initial_level, low=0.0, high=1.0)
+        if isinstance(resample_every, bool) or not isinstance(resample_every, int) or resample_every < 0:
+            raise ValueError(
+                f"resample_every={resample_every!r}: expected a whole number of env steps of at least 0"
+            )
+        names = ["level_E", "score_E", "age_E", "command_EL"]
+        super().__init__(keys, outs, row_buffers=names, seed=seed, stream=stream)
+        self.raise_above, self.lower_below, self.step = raise_above, lower_below, step
+        self.initial_level, self.resample_every = initial_level, resample_every
+        ends = [[[pair[side] for pair in ranges] for side in (0, 1)] for ranges in (start, end)]
+        self.register_buffer("ends_22L", torch.tensor(ends, dtype=torch.float32), persistent=False)
+
+    def set_level_(self, level: float | Tensor) -> None:
+        """Set the level of all envs, or of each, [E]; commands follow at their next draw.
+
+        Raises:
+            RuntimeError: if no env has asked for its specs yet.
+        """
+        if self._buffers["level_E"] is None:
+            raise RuntimeError("levels are there once an env holds the transform and has made its specs")
+        if not isinstance(level, Tensor):
+            checks.check_in_range("level", level, low=0.0, high=1.0)
+            self.level_E.fill_(level)
+        else:
+            self.level_E.copy_(level.clamp(0.0, 1.0))
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        """Add the command, bounded by its widest ranges, and the level to the observations."""
+        output_spec = output_spec.clone()
+        observations = output_spec["full_observation_spec"]
+        for key in self.in_keys:
+            if key not in observations.keys(True, True):
+                leaf_spec(output_spec["full_reward_spec"], key, type(self).__name__)
+        batch, device = observations.shape, observations.device
+        low_L, high_L = self.ends_22L[:, 0].amin(0).to(device), self.ends_22L[:, 1].amax(0).to(device)
+        ends = [end.expand(*batch, -1) for end in (low_L, high_L)]
+        set_leaf_spec(observations, self.out_keys[0], bounded(*ends, dtype=torch.float32, device=device))
+        level = Bounded(0.0, 1.0, torch.Size([*batch, 1]), dtype=torch.float32, device=device)
+        set_leaf_spec(observations, self.out_keys[1], level)
+        self._size(batch.numel(), device)
+        return output_spec
+
+    def _size(self, num_rows: int, device: Device) -> None:
+        self._size_rows(num_rows, device)
+        if self._buffers["level_E"] is None:
+            self._buffers["level_E"] = torch.full((num_rows,), float(self.initial_level), device=device)
+        self._size_buffer("score_E", (num_rows,), torch.float32, device)
+        self._size_buffer("age_E", (num_rows,), torch.int64, device)
+        self._size_buffer("command_EL", (num_rows, self.ends_22L.shape[-1]), torch.float32, device)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if self._buffers["level_E"] is None or not self.num_rows:
+            self._size(tensordict_reset.numel(), tensordict_reset.device)
+        mask_E = self._reset_rows(tensordict, tensordict_reset)
+        self._move_levels(mask_E)
+        self.score_E.masked_fill_(mask_E, 0.0)
+        self.age_E.masked_fill_(mask_E, 0)
+        self._draw(self._reset_keys("reset/command"), mask_E)
+        return self._write(tensordict_reset)
+
+    def _move_levels(self, mask_E: Tensor) -> None:
+        lived_E = mask_E & (self.age_E > 0)
+        mean_E = self.score_E / self.age_E.clamp_min(1)
+        level_E = self.level_E
+        if self.raise_above is not None:
+            level_E = torch.where(lived_E & (mean_E > self.raise_above), level_E + self.step, level_E)
+        if self.lower_below is not None:
+            level_E = torch.where(lived_E & (mean_E < self.lower_below), level_E - self.step, level_E)
+        self.level_E.copy_(level_E.clamp(0.0, 1.0))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self.step_count.add_(1)
+        self.age_E.add_(1)
+        for key in self.in_keys:
+            self.score_E.add_(next_tensordict.get(key).reshape(self.num_rows, -1).mean(-1))
+        if self.resample_every:
+            self._draw(self._step_keys("step/command"), self.age_E % self.resample_every == 0)
+        return self._write(next_tensordict)
+
+    def _draw(self, keys: random.RowKeys, mask_E: Tensor) -> None:
+        low_EL, high_EL = torch.lerp(
+            self.ends_22L[0, :, None], self.ends_22L[1, :, None], self.level_E[:, None]
+        )
+        drawn_EL = random.uniform(keys, low_EL.shape[1], low_EL, high_EL)
+        self.command_EL.copy_(torch.where(mask_E[:, None], drawn_EL, self.command_EL))
+
+    def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Give out copies: the kept ones change in place."""
+        batch = tensordict.batch_size
+        tensordict.set(self.out_keys[0], self.command_EL.clone().reshape(*batch, -1))
+        return tensordict.set(self.out_keys[1], self.level_E.clone().reshape(*batch, 1))

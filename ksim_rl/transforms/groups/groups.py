@@ -1,0 +1,163 @@
+"""Concatenation of observations into the vectors that networks read."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.transforms import Transform
+
+from ksim_rl import checks
+from ksim_rl.transforms.columns import side_by_side
+from ksim_rl.transforms.groups.group_spec import GroupSpec, spell
+from ksim_rl.transforms.row_transform import as_keys
+from ksim_rl.transforms.specs import (
+    Device,
+    bounded,
+    bounds,
+    drop_leaf_spec,
+    flat_size,
+    leaf_spec,
+    set_leaf_spec,
+)
+
+
+class ObservationGroups(Transform):
+    """Concatenate observations, each flattened per env, into one vector [E, L] per group.
+
+    Args:
+        groups: group name -> keys of its terms, in the order of the columns.
+        drop: keys to remove afterwards (all the terms for True), in the data and in the specs.
+
+    Example:
+        >>> groups = ObservationGroups({"actor": ["joint_pos", "joint_vel"], "critic": ["joint_pos", "height"]})
+        >>> groups.slice("actor", "joint_vel")  # once an env holds it: the columns of a term
+    """
+
+    def __init__(
+        self, groups: Mapping[NestedKey, Sequence[NestedKey]], *, drop: bool | Sequence[NestedKey] = False
+    ) -> None:
+        if not groups:
+            raise ValueError("groups={}: expected at least one group")
+        self.groups = {name: as_keys(terms) for name, terms in groups.items()}
+        for name, terms in self.groups.items():
+            if not terms or len(set(terms)) != len(terms):
+                raise ValueError(f"groups[{name!r}]={terms}: expected one or more distinct terms")
+        every = list(dict.fromkeys(term for terms in self.groups.values() for term in terms))
+        super().__init__(in_keys=every, out_keys=list(self.groups))
+        self.drop = [] if drop is False else every if drop is True else as_keys(drop)
+        self.group_specs: dict[NestedKey, GroupSpec] = {}
+        # Groups whose terms are known to be vectors [E, L] already.
+        self._concatenable: set[NestedKey] = set()
+        # Groups whose terms go nowhere else, so that their vector may lie where its terms do.
+        shared = [term for terms in self.groups.values() for term in terms]
+        self._owners = {
+            name
+            for name, terms in self.groups.items()
+            if all(term in self.drop and shared.count(term) == 1 for term in terms)
+        }
+
+    def slice(self, group: NestedKey, term: NestedKey) -> slice:
+        """Return the columns of a term in the vector of a group.
+
+        Raises:
+            ValueError: if there is no such group or term; it lists the near names.
+            RuntimeError: if no env has asked for its specs yet.
+        """
+        if group not in self.groups:
+            raise checks.unknown_name("group", str(group), map(str, self.groups))
+        if group not in self.group_specs:
+            raise RuntimeError("the columns are known once an env holds the transform and has made its specs")
+        return self.group_specs[group].slice(term)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the vectors' specs and remove the dropped ones."""
+        batch_size = observation_spec.shape
+        vectors = {}
+        for name, terms in self.groups.items():
+            if isinstance(observation_spec.get(name, None), Composite):
+                raise ValueError(
+                    f"group {name!r} would replace the observations under {name!r}: rename the group"
+                )
+            specs = [leaf_spec(observation_spec, term, type(self).__name__) for term in terms]
+            vectors[name] = self._vector_spec(specs, batch_size, observation_spec.device)
+            if all(spec.ndim == len(batch_size) + 1 for spec in specs):
+                self._concatenable.add(name)
+            else:
+                self._concatenable.discard(name)
+            sizes = tuple(flat_size(spec, len(batch_size)) for spec in specs)
+            self.group_specs[name] = GroupSpec(name=name, terms=tuple(terms), sizes=sizes)
+        for name, spec in vectors.items():
+            set_leaf_spec(observation_spec, name, spec)
+        for key in self.drop:
+            drop_leaf_spec(observation_spec, key)
+        return observation_spec
+
+    def _vector_spec(self, specs: list[TensorSpec], batch_size: torch.Size, device: Device) -> TensorSpec:
+        dtype = specs[0].dtype
+        for spec in specs[1:]:
+            dtype = torch.promote_types(dtype, spec.dtype)
+        if not all(spec.dtype.is_floating_point for spec in specs):
+            size = sum(flat_size(spec, len(batch_size)) for spec in specs)
+            return Unbounded(torch.Size([*batch_size, size]), dtype=dtype, device=device)
+        ends = [bounds(spec) for spec in specs]
+        low = torch.cat([low.reshape(*batch_size, -1) for low, _ in ends], dim=-1)
+        high = torch.cat([high.reshape(*batch_size, -1) for _, high in ends], dim=-1)
+        return bounded(low, high, dtype=dtype, device=device)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        get = next_tensordict.get
+        vectors = []
+        for name, terms in self.groups.items():
+            values = [get(term) for term in terms]
+            if name not in self._concatenable:
+                values = [value.reshape(*next_tensordict.batch_size, -1) for value in values]
+            if name in self._owners and len(next_tensordict.batch_size) == 1:
+                vectors.append(side_by_side(values, next_tensordict.batch_size[0]))
+            else:
+                vectors.append(torch.cat(values, -1) if len(values) > 1 else values[0])
+        # Only now: a group may have the name of a term of another one.
+        for name, vector in zip(self.groups, vectors):  # noqa: B905 (strict takes time in every step)
+            next_tensordict.set(name, vector)
+        for key in self.drop:
+            _drop(next_tensordict, key)
+        return next_tensordict
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self._call(next_tensordict)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Do the same to a batch of samples."""
+        return self._call(tensordict)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+
+def _drop(tensordict: TensorDictBase, key: NestedKey) -> None:
+    """Remove a leaf, and nested tensordicts that it leaves empty."""
+    tensordict.del_(key)
+    if isinstance(key, tuple) and len(key) > 1:
+        above = key[:-1] if len(key) > 2 else key[0]
+        if tensordict.get(above).is_empty():
+            _drop(tensordict, above)
+
+
+def group_specs(env: EnvBase) -> dict[NestedKey, GroupSpec]:
+    """Return which columns of each group's vector belong to which term, of all `ObservationGroups` of an env."""
+    found: dict[NestedKey, GroupSpec] = {}
+    inner: Any = env
+    while isinstance(inner, TransformedEnv):
+        assert inner.output_spec is not None  # making the specs is what counts the columns
+        for module in inner.transform.modules():
+            if isinstance(module, ObservationGroups):
+                found = module.group_specs | found
+        inner = inner.base_env
+    return found
+
+
+def observation_columns(env: EnvBase) -> dict[str, dict[str, list[int]]]:
+    """Return `group_specs` as plain data for a checkpoint or an export: group -> term -> [start, stop)."""
+    return {spell(name): spec.as_dict() for name, spec in group_specs(env).items()}

@@ -1,0 +1,147 @@
+"""The left-right symmetry of a robot, found in its names and joint axes."""
+
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+from tensordict import NestedKey
+
+from ksim_rl import checks
+from ksim_rl.transforms.groups.group_spec import GroupSpec, last_name
+from ksim_rl.transforms.mirror.mirror_map import MirrorMap, concatenate
+
+_SIDES = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "hl": "hr", "bl": "br", "ml": "mr"}
+_SIDES |= {"lf": "rf", "lh": "rh", "lr": "rr", "lb": "rb", "lm": "rm"}
+# Between the words of a name: anything that is no letter, and the humps of CamelCase.
+_WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[^A-Za-z]+")
+_ARM = re.compile(r"[A-Z][LR]")
+_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
+_TOLERANCE = 1e-3
+
+
+def mirror_name(name: str, names: Sequence[str]) -> str:
+    """Return which of `names` is the mirror image of `name`; itself if the name has no side.
+
+    Sides are words of a name: left and right, l and r, and FL, FR, RL, RR, LF, RH and the like, in any case; and two
+    capitals of which the second is L or R, where that gives another of `names`.
+
+    Raises:
+        ValueError: if a name has a side and `names` has no counterpart, or more than one.
+    """
+    words = _WORDS.findall(name)
+    images = [
+        "".join(image) for image in itertools.product(*[_counterparts(word) or [word] for word in words])
+    ]
+    if images == [name]:
+        # AL1 and AR1 are arms, but an AR tag has no counterpart.
+        arms = "".join(
+            word[0] + "LR"["RL".index(word[1])] if _ARM.fullmatch(word) else word for word in words
+        )
+        return arms if arms in names else name
+    found = [image for image in images if image in names]
+    if len(found) != 1:
+        hint = f"both {found}" if found else f"none of {images}: {checks.near(images[0], names)}"
+        raise ValueError(f"mirror image of {name!r}: {hint}")
+    return found[0]
+
+
+def _counterparts(word: str) -> list[str]:
+    swapped = [b for a, b in _SIDES.items() if a == word.lower()]
+    swapped += [a for a, b in _SIDES.items() if b == word.lower()]
+    if word.isupper():
+        return [other.upper() for other in swapped]
+    return [other.capitalize() for other in swapped] if word[0].isupper() else swapped
+
+
+def mirror_by_name(names: Sequence[str], each: MirrorMap | None = None) -> MirrorMap:
+    """Return the map of a vector that has one number per name, or one block per name that `each` mirrors.
+
+    Example:
+        >>> mirror_by_name(["FL", "FR"], POLAR)  # two forces, one after another
+
+    Raises:
+        ValueError: if a name has no counterpart.
+    """
+    each = MirrorMap(source=(0,)) if each is None else each
+    blocks = [list(names).index(mirror_name(name, names)) for name in names]
+    return MirrorMap(
+        source=tuple(block * each.size + column for block in blocks for column in each.source),
+        signs=each.signs * len(names),
+    )
+
+
+def mirror_joints(model: mujoco.MjModel, joints: Sequence[str] | None = None) -> MirrorMap:
+    """Return the map of a vector with one number per joint: position, velocity, effort, target, action.
+
+    The mirror is the plane y = 0 of the world, with the robot at `qpos0`. A hinge's sign is 1 if its counterpart
+    turns the mirrored way about its own axis, else -1; a slide's likewise. Positions have to be absolute or relative to
+    a pose that is its own mirror image.
+
+    Args:
+        model: the robot's model.
+        joints: hinges and slides, in the order of the columns; None for all of the model.
+
+    Raises:
+        ValueError: if a joint has no counterpart, or the two are not mirror images of each other.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:] = model.qpos0
+    mujoco.mj_kinematics(model, data)
+    scalar = (_HINGE, int(mujoco.mjtJoint.mjJNT_SLIDE))
+    valid = {model.joint(i).name: i for i in range(model.njnt) if model.jnt_type[i] in scalar}
+    names = list(valid) if joints is None else list(joints)
+    for name in names:
+        if name not in valid:
+            raise checks.unknown_name("hinge or slide", name, valid)
+    source, signs = [], []
+    for name in names:
+        other = mirror_name(name, names)
+        source.append(names.index(other))
+        signs.append(_sign(model, data, valid[name], valid[other]))
+    return MirrorMap(source=tuple(source), signs=tuple(signs))
+
+
+def _sign(model: mujoco.MjModel, data: mujoco.MjData, joint: int, other: int) -> float:
+    reflection = np.array([1.0, -1.0, 1.0])
+    apart = np.abs(data.xanchor[joint] * reflection - data.xanchor[other]).max()
+    # A rotation axis is a pseudovector: its mirror image turns the other way as well.
+    handed = -1.0 if model.jnt_type[joint] == _HINGE else 1.0
+    agreement = float(handed * reflection * data.xaxis[joint] @ data.xaxis[other])
+    extent = max(float(model.stat.extent), _TOLERANCE)
+    if (
+        model.jnt_type[joint] != model.jnt_type[other]
+        or abs(abs(agreement) - 1) > _TOLERANCE
+        or apart > 0.02 * extent
+    ):
+        raise ValueError(
+            f"joints {model.joint(joint).name!r} and {model.joint(other).name!r} are no mirror images of each other in "
+            f"the plane y = 0: axes {data.xaxis[joint]} and {data.xaxis[other]}, anchors {apart:.3g} m apart"
+        )
+    return 1.0 if agreement > 0 else -1.0
+
+
+def mirror_group(group: GroupSpec, terms: Mapping[NestedKey, MirrorMap]) -> MirrorMap:
+    """Return the map of a group vector from those of its terms; a flat history repeats its term's.
+
+    Args:
+        group: the columns of each term, as `ObservationGroups.group_specs` gives them.
+        terms: by key of the term, or by the last part of it.
+
+    Raises:
+        ValueError: if a term has no map, or one whose size does not divide the term's.
+    """
+    maps = []
+    for key, size in zip(group.terms, group.sizes, strict=True):
+        mirror = terms.get(key, terms.get(last_name(key)))
+        if mirror is None:
+            raise checks.unknown_name(
+                f"mirror map for a term of group {group.name!r}:", last_name(key), map(str, terms)
+            )
+        if size % mirror.size:
+            raise ValueError(
+                f"term {key!r} has {size} columns, and its mirror map {mirror.size}: expected a multiple"
+            )
+        maps.append(mirror.repeat(size // mirror.size))
+    return concatenate(maps)

@@ -1,0 +1,254 @@
+"""Noise on all observations of a transform as one kernel, which is also a torch operator.
+
+Each column's draws are those of `ksim_rl.device.random` at (seed, stream, counter, row, column).
+"""
+
+from typing import NamedTuple
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ksim_rl.device.quick_launch import QuickLaunch, address
+from ksim_rl.device.random import DRAWS
+
+GAUSSIAN, MULTIPLY, BIAS_GAUSSIAN, BIAS_MULTIPLY, BY_LEVEL, HOLD = (1 << bit for bit in range(6))
+"""What a column's flags say; the bits above them are the number of its observation."""
+KEY_SHIFT = 6
+
+HAS_BIAS, HAS_WALK, HAS_RESOLUTION, HAS_DROPOUT, HAS_GAUSSIAN = (1 << bit for bit in range(5))
+"""What any column of the transform has; the common combinations have loops of their own in the kernel."""
+
+OFFSET, SPREAD, BIAS_OFFSET, BIAS_SPREAD, WALK_STD, RESOLUTION, DROPOUT = range(7)
+"""The rows of the table of parameters."""
+NUM_PARAMETERS = 7
+
+_PLAIN, _STEP, _RESET = range(3)
+
+
+@wp.struct
+class _Noise:
+    n: int
+    mode: int
+    features: int
+    stream: wp.uint32
+    seed: wp.uint64
+    counter: wp.uint64
+    enabled: wp.uint64
+    level: wp.uint64
+    mask: wp.uint64
+    table: wp.uint64
+    flags: wp.uint64
+    clean: wp.uint64
+    bias: wp.uint64
+    walk: wp.uint64
+    last: wp.uint64
+    out: wp.uint64
+
+
+_COLUMNS = r"""
+    const int n = a.n, features = a.features, mode = a.mode;
+    const float* clean = (const float*)a.clean + (long long)row * n;
+    float* out = (float*)a.out + (long long)row * n;
+    float* bias = (float*)a.bias + (long long)row * n;
+    float* walk = (float*)a.walk + (long long)row * n;
+    float* last = (float*)a.last + (long long)row * n;
+    const float* table = (const float*)a.table;
+    const int* flags = (const int*)a.flags;
+    if (a.mask && !((const unsigned char*)a.mask)[row]) {
+        for (int i = lane; i < n; i += LANES) out[i] = clean[i];
+        return;
+    }
+    const long long seed = *(const long long*)a.seed;
+    long long* counter = (long long*)a.counter + (mode == 0 ? 0 : row);
+    const long long count = *counter + 1;
+    // The lanes of a row are one warp, so that all have read the count before it goes on.
+    SYNC
+    if (lane == 0 && mode != 0) *counter = count;
+    const float enabled = *(const unsigned char*)a.enabled ? 1.0f : 0.0f;
+    const float levelled = enabled * *(const float*)a.level;
+    const bool resets = mode == 2;
+
+    const RowKey key = key_of(seed, a.stream, count, row);
+    auto bits = [=](unsigned index) { return bits_of(key, index); };
+    auto sample = [&](int i, unsigned index, int parameter, bool is_normal, int features) {
+        const unsigned b = bits(index);
+        const float u = unit(b), z = features & 16 ? normal(b) : u;
+        return table[parameter * n + i] + table[(parameter + 1) * n + i] * (is_normal ? z : u);
+    };
+    auto apply = [](float x, float noise, float strength, bool multiplies) {
+        return x * (multiplies ? strength * noise + (1.0f - strength) : 1.0f) + (multiplies ? 0.0f : strength * noise);
+    };
+
+    auto column = [&](int i, int features) {
+        const int flag = flags[i];
+        const float strength = flag & 16 ? levelled : enabled;
+        float x = clean[i];
+        if (features & 1) {
+            if (resets) bias[i] = sample(i, (unsigned)i + 0x40000000u, 2, flag & 4, features);
+            x = apply(x, bias[i], strength, flag & 8);
+        }
+        if (features & 2) {
+            const float drift = resets ? 0.0f : walk[i] + table[4 * n + i] * normal(bits((unsigned)i + 0x80000000u));
+            walk[i] = drift;
+            x += strength * drift;
+        }
+        x = apply(x, sample(i, (unsigned)i, 0, flag & 1, features), strength, flag & 2);
+        if (features & 4) {
+            const float step = strength * table[5 * n + i];
+            x = step > 0.0f ? rintf(x / step) * step : x;
+        }
+        if (features & 8) {
+            const float chance = resets ? 0.0f : strength * table[6 * n + i];
+            const bool is_lost = unit(bits((unsigned)(flag >> 6) + 0xC0000000u)) < chance;
+            x = is_lost ? (flag & 32 ? last[i] : 0.0f) : x;
+            last[i] = x;
+        }
+        out[i] = x;
+    };
+    switch (features) {
+        case 0:
+            for (int i = lane; i < n; i += LANES) column(i, 0);
+            break;
+        case 16:
+            for (int i = lane; i < n; i += LANES) column(i, 16);
+            break;
+        case 17:
+            for (int i = lane; i < n; i += LANES) column(i, 17);
+            break;
+        default:
+            for (int i = lane; i < n; i += LANES) column(i, features);
+    }
+"""
+
+_LANES = 32
+"""Threads that share a row on the GPU; the CPU has one, which takes the columns in vector instructions."""
+
+_DEVICE = f"""
+    #if defined(__CUDA_ARCH__)
+        #define LANES {_LANES}
+        #define SYNC __syncwarp();
+    #else
+        #define LANES 1
+        #define SYNC
+    #endif
+"""
+
+
+@wp.func_native(_DEVICE + DRAWS + _COLUMNS)
+def _columns(row: int, lane: int, a: _Noise): ...
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def _apply_noise(a: _Noise):
+    row, lane = wp.tid()
+    _columns(row, lane, a)
+
+
+_quick = QuickLaunch(_apply_noise, _Noise)
+
+
+class NoiseState(NamedTuple):
+    """What the noise of a transform depends on, beside the readings.
+
+    Attributes:
+        table_PL: parameters of each column, float32; its rows are `OFFSET`, `SPREAD`, ...
+        flags_L: what kind of noise a column has, int32.
+        enabled: bool [].
+        level: float32 []; the strength of the columns with `BY_LEVEL`.
+        seed: int64 [].
+        bias_EL, walk_EL, last_EL: what lasts from step to step, float32; None where no column has it.
+    """
+
+    table_PL: Tensor
+    flags_L: Tensor
+    enabled: Tensor
+    level: Tensor
+    seed: Tensor
+    bias_EL: Tensor | None = None
+    walk_EL: Tensor | None = None
+    last_EL: Tensor | None = None
+
+
+def add_noise(clean_EL: Tensor, state: NoiseState, features: int, *, stream: int, counter: Tensor) -> Tensor:
+    """Return the noisy readings of samples, which belong to no episode: no bias, drift or dropout."""
+    return _run(clean_EL, *state, features & (HAS_GAUSSIAN | HAS_RESOLUTION), _PLAIN, None, stream, counter)
+
+
+def step_noise(
+    clean_EL: Tensor, state: NoiseState, features: int, *, stream: int, counter_E: Tensor
+) -> Tensor:
+    """Go on by one env step, which adds 1 to the counter of each row, and return the noisy readings.
+
+    Args:
+        clean_EL: E * L readings in any shape, float32; the result is like it.
+        state: see there; its `bias_EL`, `walk_EL` and `last_EL` change.
+        features: what any column has.
+        stream: the id of the stream of draws.
+        counter_E: int64; the draws are those of the count that it reaches.
+    """
+    return _run(clean_EL, *state, features, _STEP, None, stream, counter_E)
+
+
+def reset_noise(
+    clean_EL: Tensor, state: NoiseState, features: int, mask_E: Tensor, *, stream: int, counter_E: Tensor
+) -> Tensor:
+    """Begin the episodes of the masked rows, and count them; return their noisy readings and the others' clean ones."""
+    return _run(clean_EL, *state, features, _RESET, mask_E, stream, counter_E)
+
+
+def _run(*arguments: object) -> Tensor:
+    # Eager code goes past torch's dispatcher, which takes longer than the launch.
+    if torch.compiler.is_compiling():
+        return _noise(*arguments)  # pyright: ignore[reportArgumentType]
+    return _launch(*arguments)  # pyright: ignore[reportArgumentType]
+
+
+def _launch(
+    clean_EL: Tensor,
+    table_PL: Tensor,
+    flags_L: Tensor,
+    enabled: Tensor,
+    level: Tensor,
+    seed: Tensor,
+    bias_EL: Tensor | None,
+    walk_EL: Tensor | None,
+    last_EL: Tensor | None,
+    features: int,
+    moment: int,
+    mask_E: Tensor | None,
+    stream: int,
+    counter: Tensor,
+) -> Tensor:
+    clean_EL = clean_EL.contiguous()
+    out_EL = torch.empty_like(clean_EL)
+    num_columns = flags_L.numel()
+    num_rows = clean_EL.numel() // max(num_columns, 1)
+    device = clean_EL.device
+    tensors = (
+        seed,
+        counter,
+        enabled,
+        level,
+        mask_E,
+        table_PL,
+        flags_L,
+        clean_EL,
+        bias_EL,
+        walk_EL,
+        last_EL,
+        out_EL,
+    )
+    dim = (num_rows, 1 if device.type == "cpu" else _LANES)
+    _quick(device, dim, num_columns, moment, features, stream, *map(address, tensors))
+    return out_EL
+
+
+_noise = torch.library.custom_op(
+    "ksim_rl::noise", _launch, mutates_args=("bias_EL", "walk_EL", "last_EL", "counter")
+)
+
+
+@_noise.register_fake
+def _(clean_EL: Tensor, *others: object) -> Tensor:
+    return clean_EL.new_empty(clean_EL.shape)

@@ -1,0 +1,159 @@
+"""Normalization of observations by what has been observed so far."""
+
+from typing import Self
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import Composite, Unbounded
+
+from ksim_rl import checks
+from ksim_rl.device.running_moments import RunningMoments, has_ranks
+from ksim_rl.transforms.row_transform import (
+    Keys,
+    RowTransform,
+    as_keys,
+    checked_out_keys,
+)
+from ksim_rl.transforms.specs import Device, floating_spec, set_leaf_spec
+
+
+class ObservationNormalization(RowTransform):
+    """Observations as `(x - mean) / sqrt(var + eps)`, with the exact mean and variance of all env states so far.
+
+    Each env state counts once: the one that a step reaches at that step, and a reset observation at its reset, for the
+    rows that reset. Statistics are per element and float64 (`RunningMoments`); states that are not finite do not count.
+
+    `env.eval()` freezes the statistics and `env.train()` goes on, `enable_` does the same for one transform; both write
+    a device flag, so a captured or compiled step follows. With `torch.distributed`, the ranks merge their statistics in
+    each step (one collective per key, none while frozen), so they have to step alike; states of resets join in the next
+    step's.
+
+    Prefer `obs_normalization` of actor and critic where they fit: those go into the checkpoint by themselves.
+
+    Args:
+        in_keys: floating-point observations, of any shape; nested keys as tuples.
+        out_keys: where the normalized ones go. Default: in place.
+        eps: added to the variance. The default bounds the standard deviation below by 0.01.
+        until: stop updating once so many env states are counted (on each rank); None never stops.
+        enabled: whether statistics are updated from the start.
+
+    Example:
+        >>> normalization = ObservationNormalization(["joint_pos", "joint_vel"])
+    """
+
+    updating: Tensor
+
+    def __init__(
+        self,
+        in_keys: Keys,
+        out_keys: Keys | None = None,
+        *,
+        eps: float = 1e-4,
+        until: int | None = None,
+        enabled: bool = True,
+    ) -> None:
+        checks.check_in_range("eps", eps, low=0.0, low_open=True)
+        if until is not None:
+            checks.check_in_range("until", until, low=1)
+        in_keys = as_keys(in_keys)
+        super().__init__(in_keys, checked_out_keys(in_keys, out_keys))
+        self.eps, self.until = eps, until
+        self._wanted = self._collective = enabled
+        self.moments = nn.ModuleList()
+        self.register_buffer("updating", torch.tensor(enabled), persistent=False)
+
+    def enable_(self, enabled: bool = True) -> Self:
+        """Update the statistics or freeze them, in place."""
+        self._wanted = self._collective = enabled
+        self.updating.fill_(enabled)
+        return self
+
+    def train(self, mode: bool = True) -> Self:
+        """Follow the mode of the env: statistics are those of training."""
+        super().train(mode)
+        # TorchRL calls eval() on each transform that it attaches: that is no wish for evaluation.
+        if self._in_env():
+            self._collective = self._wanted and mode
+            self.updating.fill_(self._collective)
+        return self
+
+    def clone(self) -> Self:
+        """Copy with statistics of its own."""
+        copy = super().clone()
+        copy._modules = {**self._modules, "moments": nn.ModuleList(_copied(m) for m in self._each_moments())}
+        return copy
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Remove the bounds."""
+        batch_dims = observation_spec.ndim
+        specs = [floating_spec(observation_spec, key, type(self).__name__) for key in self.in_keys]
+        for out_key, spec in zip(self.out_keys, specs, strict=True):
+            set_leaf_spec(
+                observation_spec, out_key, Unbounded(spec.shape, dtype=spec.dtype, device=spec.device)
+            )
+        self._size_rows(observation_spec.shape.numel(), observation_spec.device)
+        self._size_moments([spec.shape[batch_dims:].numel() for spec in specs], observation_spec.device)
+        return observation_spec
+
+    def _size_moments(self, sizes: list[int], device: Device) -> None:
+        if [moments.dim for moments in self._each_moments()] != sizes:
+            self.moments = nn.ModuleList(RunningMoments(n, until=self.until, device=device) for n in sizes)
+
+    def _each_moments(self) -> list[RunningMoments]:
+        return list(self.moments)  # pyright: ignore[reportReturnType]
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if not self.num_rows:
+            self._size_rows(tensordict_reset.numel(), tensordict_reset.device)
+            leaves = [tensordict_reset.get(key).shape[tensordict_reset.ndim :] for key in self.in_keys]
+            self._size_moments([leaf.numel() for leaf in leaves], tensordict_reset.device)
+        mask_E = self._reset_rows(tensordict, tensordict_reset)
+        for values_EL, moments in self._flat(tensordict_reset, self.num_rows):
+            moments.count_rows(values_EL, mask_E & self.updating)
+            # Ranks reset at different times, so they cannot merge here.
+            if not has_ranks():
+                moments.publish()
+        return self._normalize(tensordict_reset)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        for values_EL, moments in self._flat(next_tensordict, self.num_rows):
+            moments.count_rows(values_EL, self.updating.expand(self.num_rows))
+            if self._collective or not has_ranks():
+                moments.publish()
+        return self._normalize(next_tensordict)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Normalize a batch of samples by the statistics as they are."""
+        if not len(self.moments):
+            raise RuntimeError("there are no statistics yet: an env, or `load_state_dict`, gives them")
+        return self._normalize(tensordict)
+
+    def _flat(self, tensordict: TensorDictBase, num_rows: int) -> list[tuple[Tensor, RunningMoments]]:
+        values = [tensordict.get(key).reshape(num_rows, -1) for key in self.in_keys]
+        return list(zip(values, self._each_moments(), strict=True))
+
+    def _normalize(self, tensordict: TensorDictBase) -> TensorDictBase:
+        num_rows = tensordict.numel()
+        for out_key, key, (values_EL, moments) in zip(
+            self.out_keys, self.in_keys, self._flat(tensordict, num_rows), strict=True
+        ):
+            normalized_EL = (values_EL - moments.mean).mul_(torch.rsqrt(moments.var + self.eps))
+            value = tensordict.get(key)
+            tensordict.set(out_key, normalized_EL.reshape(value.shape).to(value.dtype))
+        return tensordict
+
+    def _load_from_state_dict(self, state_dict: dict, prefix: str, *args: object) -> None:
+        # Children are loaded after their parent: those that no env has sized yet are made here.
+        sizes = []
+        while f"{prefix}moments.{len(sizes)}.mean" in state_dict:
+            sizes.append(state_dict[f"{prefix}moments.{len(sizes)}.mean"].shape[0])
+        if sizes and not len(self.moments):
+            self._size_moments(sizes, self.updating.device)
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def _copied(moments: RunningMoments) -> RunningMoments:
+    copy = RunningMoments(moments.dim, until=moments.until, device=moments.mean.device)
+    copy.load_state_dict(moments.state_dict())
+    return copy

@@ -1,0 +1,271 @@
+"""The last values of a signal, in a ring of slots per env, as one kernel that is also a torch operator.
+
+A step writes one value per env and reads the values of some steps ago; a reset writes the value that the masked rows
+begin with, and no lag reaches back beyond it. Where the ring of an env stands is its age, the steps since its reset,
+which the kernel counts on the device, so that a captured step goes on correctly.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ksim_rl.device.quick_launch import QuickLaunch, address
+from ksim_rl.device.random import DRAWS
+
+
+@wp.struct
+class _Ring:
+    width: int
+    lanes: int
+    num_bytes: int
+    value_stride: int
+    num_slots: int
+    num_frames: int
+    stride: int
+    num_parts: int
+    counts: int
+    stream: wp.uint32
+    lowest: int
+    span: int
+    seed: wp.uint64
+    draw_count: wp.uint64
+    age: wp.uint64
+    lag: wp.uint64
+    mask: wp.uint64
+    parts: wp.uint64
+    value: wp.uint64
+    ring: wp.uint64
+    out: wp.uint64
+
+
+# Rows of the ring are bytes, so that one kernel serves every dtype. The lanes of a row copy words of 16, 4 or 1 bytes,
+# a few at once, as the GPU waits for all of them together; on the CPU one lane copies whole parts.
+@wp.func_native(
+    DRAWS
+    + r"""
+    struct alignas(16) Wide { unsigned word[4]; };
+    const int num_bytes = a.num_bytes, num_slots = a.num_slots, num_frames = a.num_frames, lanes = a.lanes;
+    long long* age = (long long*)a.age + row;
+    const long long before = *age;
+    // All lanes of a row have to read the age before one of them counts on.
+    #if defined(__CUDA_ARCH__)
+        if (lanes == 32) __syncwarp(); else __syncthreads();
+    #endif
+    const bool resets = a.mask != 0;
+    const bool writes = !resets || ((const unsigned char*)a.mask)[row];
+    const long long now = resets ? 0 : before + 1;
+    if (lane == 0 && writes && a.counts) *age = now;
+    if (lane == 0 && resets && writes && a.draw_count) {
+        const long long count = ++((long long*)a.draw_count)[row];
+        const unsigned long long bits = bits_of(key_of(*(const long long*)a.seed, a.stream, count, row), 0u);
+        ((long long*)a.lag)[row] = a.lowest + (long long)((bits * (unsigned)a.span) >> 32);
+    }
+    // Whole numbers of 32 bits divide much faster.
+    const int slot = now >> 32 ? (int)(now % (unsigned)num_slots) : (int)((unsigned)now % (unsigned)num_slots);
+    const long long newest = a.lag && !resets ? ((const long long*)a.lag)[row] : 0;
+    const long long stride = resets ? 0 : a.stride;
+    unsigned char* ring = (unsigned char*)a.ring + (long long)row * num_slots * num_bytes;
+    const unsigned char* value = (const unsigned char*)a.value + (long long)row * a.value_stride;
+    unsigned char* out = (unsigned char*)a.out + (long long)row * num_frames * num_bytes;
+
+    auto frame_of = [=](int frame) {
+        const long long wanted = newest + (num_frames - 1 - frame) * stride;
+        const int lag = (int)(wanted < now ? wanted : now), from = slot - lag;
+        return lag == 0 ? value : ring + (long long)(from < 0 ? from + num_slots : from) * num_bytes;
+    };
+    auto copy_words = [=](auto zero) {
+        using Word = decltype(zero);
+        const int AT_ONCE = 4;
+        Word* slot_words = (Word*)(ring + (long long)slot * num_bytes);
+        const int words_per_row = num_bytes / (int)sizeof(Word);
+        if (writes)
+            for (int word = lane; word < words_per_row; word += lanes) slot_words[word] = ((const Word*)value)[word];
+        Word* to = (Word*)out;
+        int offset = 0;
+        for (int part = 0; part < a.num_parts; ++part) {
+            const unsigned words = (a.parts ? ((const int*)a.parts)[part] : num_bytes) / (unsigned)sizeof(Word);
+            const int items = num_frames * (int)words;
+            for (int begin = lane; begin < items; begin += AT_ONCE * lanes) {
+                Word found[AT_ONCE];
+                #pragma unroll
+                for (int k = 0; k < AT_ONCE; ++k) {
+                    const unsigned item = begin + k * lanes, frame = item / words;
+                    if (item < items) found[k] = ((const Word*)frame_of(frame))[offset + item - frame * words];
+                }
+                #pragma unroll
+                for (int k = 0; k < AT_ONCE; ++k)
+                    if (begin + k * lanes < items) to[begin + k * lanes] = found[k];
+            }
+            to += items;
+            offset += words;
+        }
+    };
+    if (a.width == 16) copy_words(Wide());
+    else if (a.width == 4) copy_words(0u);
+    else if (a.width == 1) copy_words((unsigned char)0);
+    else {
+        if (writes) memcpy(ring + (long long)slot * num_bytes, value, num_bytes);
+        for (int frame = 0; frame < num_frames; ++frame) {
+            const unsigned char* from = frame_of(frame);
+            int offset = 0;
+            for (int part = 0; part < a.num_parts; ++part) {
+                const int size = a.parts ? ((const int*)a.parts)[part] : num_bytes;
+                memcpy(out + offset * num_frames + frame * size, from + offset, size);
+                offset += size;
+            }
+        }
+    }
+"""
+)
+def _copy(row: int, lane: int, a: _Ring): ...
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def _push_and_read(a: _Ring):
+    row, lane = wp.tid()
+    _copy(row, lane, a)
+
+
+_quick = QuickLaunch(_push_and_read, _Ring)
+_LANES, _MANY_LANES = 32, 256
+"""Threads that share a row on the GPU: a warp, or a block for large rows."""
+
+
+class Lags(NamedTuple):
+    """Lags that rows draw as they begin: those of `ksim_rl.device.random.integers` at the counts that they reach.
+
+    Attributes:
+        lag_E: int64; changed in place.
+        seed: int64 [].
+        count_E: resets of each row, int64; changed in place.
+        stream: the id of the stream of draws.
+        lowest, highest: env steps, both included.
+    """
+
+    lag_E: Tensor | None
+    seed: Tensor | None
+    count_E: Tensor | None
+    stream: int
+    lowest: int
+    highest: int
+
+
+_NO_LAGS = Lags(None, None, None, 0, 0, 0)
+
+
+def push(
+    ring_EM: Tensor,
+    age_E: Tensor,
+    value_E: Tensor,
+    *,
+    lag_E: Tensor | None = None,
+    num_frames: int = 1,
+    stride: int = 0,
+    parts: Tensor | None = None,
+    counts: bool = True,
+) -> Tensor:
+    """Go on by one step: write its values, and return those of some steps ago.
+
+    Args:
+        ring_EM: M slots per env, [E, M, ...].
+        age_E: steps since each env's reset, int64; changed in place.
+        value_E: [E, ...], in the dtype of the ring.
+        lag_E: of the newest frame, int64; None for 0. All lags have to be below M.
+        num_frames: N, of each env; the newest is the last.
+        stride: steps from one frame to the next.
+        parts: int32 sizes in bytes of what a value consists of; what is returned has all frames of the first part,
+            then all of the second one, and so on. None for one part.
+        counts: whether the age goes on; of several rings with one age only the last one may do that.
+
+    Returns:
+        [E, N * L] for L elements per env. A lag that reaches back beyond the reset gives the value of that.
+    """
+    return _run(ring_EM, age_E, value_E, lag_E, None, num_frames, stride, parts, counts, *_NO_LAGS[1:])
+
+
+def begin(
+    ring_EM: Tensor,
+    age_E: Tensor,
+    value_E: Tensor,
+    mask_E: Tensor,
+    *,
+    num_frames: int = 1,
+    parts: Tensor | None = None,
+    lags: Lags | None = None,
+) -> Tensor:
+    """Let the masked rows begin with these values, and return each row's value `num_frames` times; see `push`.
+
+    With `lags`, these rows also draw new ones.
+    """
+    drawn = _NO_LAGS if lags is None else lags
+    return _run(ring_EM, age_E, value_E, drawn[0], mask_E, num_frames, 0, parts, True, *drawn[1:])
+
+
+def _run(*arguments: object) -> Tensor:
+    # Eager code goes past torch's dispatcher, which takes longer than the launch.
+    if torch.compiler.is_compiling():
+        return _ring(*arguments)  # pyright: ignore[reportArgumentType]
+    return _launch(*arguments)  # pyright: ignore[reportArgumentType]
+
+
+def _launch(
+    ring_EM: Tensor,
+    age_E: Tensor,
+    value_E: Tensor,
+    lag_E: Tensor | None,
+    mask_E: Tensor | None,
+    num_frames: int,
+    stride: int,
+    parts: Tensor | None,
+    counts: bool,
+    seed: Tensor | None,
+    draw_count_E: Tensor | None,
+    stream: int,
+    lowest: int,
+    highest: int,
+) -> Tensor:
+    if not _has_whole_rows(value_E):
+        value_E = value_E.contiguous()
+    num_rows, num_slots, *leaf = ring_EM.shape
+    device, item_size = value_E.device, value_E.element_size()
+    size = leaf[0] if len(leaf) == 1 else math.prod(leaf)
+    out_EL = torch.empty((num_rows, num_frames * size), dtype=value_E.dtype, device=device)
+    num_bytes, value_stride, value = size * item_size, value_E.stride(0) * item_size, value_E.data_ptr()
+    num_parts = 1 if parts is None else parts.shape[0]
+    if device.type == "cpu":
+        width, lanes = 0, 1
+    else:
+        bits = num_bytes | value_stride | value if parts is None else item_size
+        width = 16 if bits % 16 == 0 else 4 if bits % 4 == 0 else 1
+        lanes = _LANES if num_frames * num_bytes <= 32 * _LANES * width * num_parts else _MANY_LANES
+    layout = width, lanes, num_bytes, value_stride, num_slots, num_frames, stride, num_parts, counts
+    draws = stream, lowest, highest - lowest + 1, address(seed), address(draw_count_E)
+    tensors = age_E.data_ptr(), address(lag_E), address(mask_E), address(parts), value
+    _quick(device, (num_rows, lanes), *layout, *draws, *tensors, ring_EM.data_ptr(), out_EL.data_ptr())
+    return out_EL
+
+
+def _has_whole_rows(value_E: Tensor) -> bool:
+    """Whether each env's value is contiguous, as in columns of a wider tensor."""
+    return value_E.ndim == 1 or value_E.ndim == 2 and value_E.stride(1) == 1 or value_E.is_contiguous()
+
+
+_ring = torch.library.custom_op(
+    "ksim_rl::ring", _launch, mutates_args=("ring_EM", "age_E", "lag_E", "draw_count_E")
+)
+
+
+@_ring.register_fake
+def _(
+    ring_EM: Tensor,
+    age_E: Tensor,
+    value_E: Tensor,
+    lag_E: Tensor | None,
+    mask_E: Tensor | None,
+    num_frames: int,
+    *others: object,
+) -> Tensor:
+    return value_E.new_empty((ring_EM.shape[0], num_frames * ring_EM.shape[2:].numel()))

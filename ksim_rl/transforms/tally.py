@@ -1,0 +1,166 @@
+"""What trackers count per env, as kernels that are also torch operators: one launch counts and copies."""
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ksim_rl.device.quick_launch import QuickLaunch, address
+
+
+@wp.struct
+class _CountDown:
+    rows: int
+    horizon: float
+    divisor: float
+    mask: wp.uint64
+    left: wp.uint64
+    out: wp.uint64
+
+
+@wp.func_native(r"""
+    const unsigned char* mask = (const unsigned char*)a.mask;
+    float *left = (float*)a.left, *out = (float*)a.out;
+    for (int row = part * a.rows; row < (part + 1) * a.rows; ++row) {
+        const float less = left[row] - 1.0f;
+        const float next = mask ? (mask[row] ? a.horizon : left[row]) : (less > 0.0f ? less : 0.0f);
+        left[row] = next;
+        out[row] = next / a.divisor;
+    }
+""")
+def _count_down_part(part: int, a: _CountDown): ...
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def _count_down_kernel(a: _CountDown):
+    _count_down_part(wp.tid(), a)
+
+
+@wp.struct
+class _Tally:
+    rows: int
+    mask: wp.uint64
+    reward: wp.uint64
+    total: wp.uint64
+    step: wp.uint64
+    total_out: wp.uint64
+    step_out: wp.uint64
+
+
+# Parameters are what the CPU's compiler believes not to overlap, so that loops become vector instructions.
+@wp.func_native(r"""
+    const int begin = part * a.rows, end = begin + a.rows;
+    auto begin_anew = [=](auto* __restrict__ kept, auto* __restrict__ out, const unsigned char* __restrict__ mask) {
+        for (int row = begin; row < end; ++row) out[row] = kept[row] = mask[row] ? 0 : kept[row];
+    };
+    auto add = [=](float* __restrict__ kept, float* __restrict__ out, const float* __restrict__ reward) {
+        for (int row = begin; row < end; ++row) out[row] = kept[row] = kept[row] + reward[row];
+    };
+    auto count = [=](long long* __restrict__ kept, long long* __restrict__ out) {
+        for (int row = begin; row < end; ++row) out[row] = kept[row] = kept[row] + 1;
+    };
+    float *total = (float*)a.total, *total_out = (float*)a.total_out;
+    long long *step = (long long*)a.step, *step_out = (long long*)a.step_out;
+    if (a.mask) {
+        begin_anew(total, total_out, (const unsigned char*)a.mask);
+        begin_anew(step, step_out, (const unsigned char*)a.mask);
+    } else {
+        add(total, total_out, (const float*)a.reward);
+        count(step, step_out);
+    }
+""")
+def _tally_part(part: int, a: _Tally): ...
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def _tally_kernel(a: _Tally):
+    _tally_part(wp.tid(), a)
+
+
+_quick_count_down = QuickLaunch(_count_down_kernel, _CountDown)
+_quick_tally = QuickLaunch(_tally_kernel, _Tally)
+
+
+def count_down(left_E: Tensor, mask_E: Tensor | None, horizon: float, divisor: float) -> Tensor:
+    """Take one env step off what is left, down to 0, or, given the rows that reset, let those begin with the horizon.
+
+    Args:
+        left_E: env steps, float32, changed in place.
+        mask_E: bool; None for a step.
+
+    Returns:
+        What is left over the divisor, float32 [E].
+    """
+    run = _count_down_operator if torch.compiler.is_compiling() else _count_down_now
+    return run(left_E, mask_E, horizon, divisor)
+
+
+def tally(
+    step_E: Tensor, total_E: Tensor, reward_E: Tensor | None, mask_E: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Count one env step and add its reward, or, given the rows that reset, let those begin at 0.
+
+    Args:
+        step_E: steps since the reset, int64, changed in place.
+        total_E: sums of rewards since the reset, float32, one per env, changed in place.
+        reward_E: in the shape and dtype of the sums; None for a reset.
+        mask_E: bool; None for a step.
+
+    Returns:
+        Copies of the new steps and sums, in their shapes.
+    """
+    run = _tally_operator if torch.compiler.is_compiling() else _tally_now
+    return run(step_E, total_E, reward_E, mask_E)
+
+
+def _count_down_now(left_E: Tensor, mask_E: Tensor | None, horizon: float, divisor: float) -> Tensor:
+    out_E = torch.empty_like(left_E)
+    device, num_rows = left_E.device, left_E.numel()
+    dim, rows = _share(device, num_rows)
+    addresses = address(mask_E), left_E.data_ptr(), out_E.data_ptr()
+    _quick_count_down(device, dim, rows, horizon, divisor, *addresses)
+    return out_E
+
+
+def _tally_now(
+    step_E: Tensor, total_E: Tensor, reward_E: Tensor | None, mask_E: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    if reward_E is not None:
+        reward_E = reward_E.contiguous()
+    step_out_E, total_out_E = torch.empty_like(step_E), torch.empty_like(total_E)
+    device, num_rows = step_E.device, step_E.numel()
+    dim, rows = _share(device, num_rows)
+    _quick_tally(
+        device,
+        dim,
+        rows,
+        address(mask_E),
+        address(reward_E),
+        total_E.data_ptr(),
+        step_E.data_ptr(),
+        total_out_E.data_ptr(),
+        step_out_E.data_ptr(),
+    )
+    return step_out_E, total_out_E
+
+
+def _share(device: torch.device, num_rows: int) -> tuple[tuple[int], int]:
+    """Return the number of threads and of rows for each: one thread does all on the CPU, in vector instructions."""
+    return ((1,), num_rows) if device.type == "cpu" else ((num_rows,), 1)
+
+
+_count_down_operator = torch.library.custom_op(
+    "ksim_rl::count_down", _count_down_now, mutates_args=("left_E",)
+)
+_tally_operator = torch.library.custom_op("ksim_rl::tally", _tally_now, mutates_args=("step_E", "total_E"))
+
+
+@_count_down_operator.register_fake
+def _(left_E: Tensor, mask_E: Tensor | None, horizon: float, divisor: float) -> Tensor:
+    return torch.empty_like(left_E)
+
+
+@_tally_operator.register_fake
+def _(
+    step_E: Tensor, total_E: Tensor, reward_E: Tensor | None, mask_E: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    return torch.empty_like(step_E), torch.empty_like(total_E)

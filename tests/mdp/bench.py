@@ -1,0 +1,143 @@
+"""A bench for terms: a few worlds of a small model, put into states whose answers are known in closed form."""
+
+from collections.abc import Mapping
+
+import mujoco
+import torch
+from torch import Tensor
+
+from ksim_rl.envs.view import EnvView
+from ksim_rl.physics import World, load_model, prepare_spec
+from ksim_rl.scene.sensors import Sensor
+from ksim_rl.scene.terrains.ground import Ground
+
+FREE_BODY = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="0.002"/>
+  <worldbody>
+    <body name="trunk">
+      <freejoint name="root"/>
+      <inertial pos="0.1 0.2 -0.1" mass="2" diaginertia="0.02 0.03 0.04"/>
+      <geom name="hull" type="box" size="0.1 0.1 0.1" contype="0" conaffinity="0"/>
+      <site name="imu" pos="0.3 0 0"/>
+      <body name="left" pos="0 0.2 0">
+        <inertial pos="0 0 0" mass="0.1" diaginertia="0.001 0.001 0.001"/>
+        <joint name="left_hip" axis="0 1 0" range="-1 1" limited="true"/>
+        <site name="left_foot" pos="0 0 -0.4"/>
+      </body>
+      <body name="right" pos="0 -0.2 0">
+        <inertial pos="0 0 0" mass="0.1" diaginertia="0.001 0.001 0.001"/>
+        <joint name="right_hip" axis="0 1 0" range="0 2" limited="true"/>
+        <site name="right_foot" pos="0 0 -0.4"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="right" joint="right_hip" kp="10"/>
+    <motor name="left" joint="left_hip" ctrllimited="true" ctrlrange="-2 3" gear="4"/>
+  </actuator>
+  <sensor>
+    <gyro name="gyro" site="imu"/>
+    <velocimeter name="velocimeter" site="imu"/>
+    <subtreeangmom name="angmom" body="trunk"/>
+  </sensor>
+  <keyframe><key name="stand" qpos="1 2 3 1 0 0 0 0.25 0.5"/></keyframe>
+</mujoco>
+"""
+"""A trunk in free flight with two legs; joints and actuators stand in opposite orders."""
+
+BOXES = """
+<mujoco>
+  <option timestep="0.002" gravity="0 0 -10"/>
+  <worldbody>
+    <body name="terrain"><geom name="terrain" type="plane" size="0 0 0.01"/></body>
+    <body name="a" pos="0 0 0.1">
+      <freejoint/>
+      <geom name="a" type="box" size="0.1 0.1 0.1" mass="3"/>
+      <site name="a"/>
+    </body>
+    <body name="b" pos="1 0 0.1">
+      <freejoint/>
+      <geom name="b" type="box" size="0.1 0.1 0.1" mass="1"/>
+      <site name="b"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+"""Two boxes on a plane, at rest or in the air."""
+
+TWO_WHEELS = """
+<mujoco>
+  <option timestep="0.002" gravity="0 0 0"/>
+  <worldbody>
+    <body name="left"><joint name="left" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 .5"/></body>
+    <body name="right"><joint name="right" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 .25"/></body>
+  </worldbody>
+  <actuator><motor name="right" joint="right"/><motor name="left" joint="left" gear="2"/></actuator>
+</mujoco>
+"""
+"""Two wheels of 0.5 and 0.25 kg m^2 without friction; joints and actuators stand in opposite orders."""
+
+
+class Plateau(Ground):
+    """Flat ground that is 0.25 m high."""
+
+    is_flat = False
+
+    def heights(self, points_EN2: Tensor) -> Tensor:
+        return torch.full_like(points_EN2[..., 0], 0.25)
+
+
+class Bench:
+    """Worlds and their view, with what the env does around terms."""
+
+    def __init__(self, source: str, num_envs: int, contacts: Mapping[str, Sensor], **view: float) -> None:
+        spec = mujoco.MjSpec.from_string(source)
+        for name, sensor in contacts.items():
+            sensor.add_to(spec, name)
+        self.per_world = ("geom_friction", "body_ipos")
+        prepare_spec(spec, self.per_world)
+        self.world = World(load_model(spec), num_envs=num_envs, per_world_fields=self.per_world)
+        self.view = EnvView(self.world, step_dt=0.02, **view)
+        self.view.sensors.update((name, sensor.track(name, self.view)) for name, sensor in contacts.items())
+        self.everybody_E = torch.ones(num_envs, dtype=torch.bool)
+
+    def place(self, qpos=None, qvel=None) -> None:
+        """Write states [E, L] or [L], and refresh what derives from them."""
+        for target, value in ((self.world.qpos_EL, qpos), (self.world.qvel_EL, qvel)):
+            if value is not None:
+                target.copy_(torch.as_tensor(value, dtype=torch.float32).expand_as(target))
+        self.refresh()
+
+    def refresh(self) -> None:
+        self.world.refresh()
+        self.view.refreshed()
+
+    def step(self, substeps: int = 10) -> None:
+        """Advance by one env step of 20 ms, contact clocks included."""
+        self.view.step_count.add_(1)
+        view = self.view
+        self.world.step(
+            substeps, before=view.before_substep, after=view.after_substep, sensors=view.substep_sensors
+        )
+        self.refresh()
+        self.view.episode_step_E.add_(1)
+        for tracker in self.view.sensors.values():
+            tracker.update()
+
+    def command(self, values) -> None:
+        """Set the command "twist" [E, 3] or [3]."""
+        value = torch.as_tensor(values, dtype=torch.float32)
+        self.view.commands["twist"] = value.expand(self.world.num_envs, 3).clone()
+        self.view.command_cache.clear()
+
+    def read(self, term, scope: str = "observations/x") -> Tensor:
+        with self.view.scope(scope):
+            return term(self.view)
+
+    def fire(self, event, mask_E: Tensor | None = None, scope: str = "events/x") -> None:
+        """Run an event for some rows (all by default), and refresh."""
+        with self.view.scope(scope):
+            event(self.view, self.everybody_E if mask_E is None else mask_E)
+        self.refresh()

@@ -1,0 +1,156 @@
+import pytest
+import torch
+
+from ksim_rl import mdp
+from ksim_rl.scene.sensors import ContactSensor
+from tests.mdp.bench import BOXES, Plateau
+
+MOVING, IDLE = [0.3, 0.0, 0.0], [0.0, 0.04, 0.0]
+GATE = {"command": "twist", "command_threshold": 0.05}
+
+
+def boxes_at(*heights):
+    """Positions of boxes "a" and "b" whose undersides are at these heights."""
+    low, high = heights
+    return (0, 0, 0.1 + low, 1, 0, 0, 0, 1, 0, 0.1 + high, 1, 0, 0, 0)
+
+
+def test_clearance_weighs_the_height_error_by_the_horizontal_speed(free_body):
+    # Each hip turns its foot, 0.4 m below, at 0.4 |rate| m/s; the height is 0.55 - 0.4.
+    free_body.place(qpos=(0, 0, 0.55, 1, 0, 0, 0, 0, 0), qvel=(0, 0, 0, 0, 0, 0, 2.0, -1.0))
+    free_body.command([MOVING, IDLE, [0.0, 0.0, -0.06]])
+    term = mdp.FootClearance(sites=("left_foot", "right_foot"), target_height=0.1, **GATE)
+    value = free_body.read(term, "rewards/x")
+    torch.testing.assert_close(value, 0.05 * (0.8 + 0.4) * torch.tensor([1.0, 0.0, 1.0]), atol=1e-5, rtol=0)
+
+
+def test_clearance_ignores_vertical_motion(free_body):
+    free_body.place(qpos=(0, 0, 0.8, 1, 0, 0, 0, 0, 0), qvel=(0, 0, 3, 0, 0, 0, 0, 0))
+    free_body.command(MOVING)
+    term = mdp.FootClearance(sites=(".*_foot",), target_height=0.1, **GATE)
+    torch.testing.assert_close(free_body.read(term, "rewards/x"), torch.zeros(3), atol=1e-5, rtol=0)
+
+
+def test_slip_counts_feet_in_contact_only(boxes):
+    boxes.place(qpos=boxes_at(0.0, 0.5))
+    boxes.step()
+    boxes.place(qvel=(3, 4, 0, 0, 0, 0, 3, 4, 0, 0, 0, 0))
+    boxes.command([MOVING, IDLE])
+    value = boxes.read(mdp.FootSlip(sensor="touch", sites=("a", "b"), **GATE), "rewards/x")
+    torch.testing.assert_close(value, torch.tensor([25.0, 0.0]), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "term",
+    [
+        mdp.FootSlip(sensor="any", sites=("a", "b"), **GATE),
+        mdp.FootSwingHeight(sensor="any", sites=("a", "b"), target_height=0.2, **GATE),
+        mdp.FootSlipSpeed(sensor="any", sites=("a", "b")),
+    ],
+    ids=lambda term: type(term).__name__,
+)
+def test_one_contact_does_not_stand_for_all_feet(make_bench, term):
+    bench = make_bench(BOXES, 2, {"any": ContactSensor(geoms=("a",))})
+    bench.command(MOVING)
+    with pytest.raises(
+        ValueError, match=r"rewards\.x: sensor='any' has 1 elements, and sites=\('a', 'b'\) are 2"
+    ):
+        bench.read(term, "rewards/x")
+
+
+def test_swing_height_is_paid_at_landing_and_starts_anew(boxes):
+    term = mdp.FootSwingHeight(sensor="touch", sites=("a", "b"), target_height=0.2, **GATE)
+    boxes.command([MOVING, IDLE])
+
+    def read():
+        return boxes.read(term, "rewards/swing")
+
+    boxes.place(qpos=boxes_at(0.0, 0.0))
+    boxes.step()
+    # The first contact of an episode ends a swing whose peak is still 0.
+    torch.testing.assert_close(read(), torch.tensor([2.0, 0.0]))
+    boxes.step()
+    torch.testing.assert_close(read(), torch.zeros(2))
+
+    heights = []
+    for underside in (0.1, 0.3, 0.15):
+        boxes.place(qpos=boxes_at(0.0, underside), qvel=torch.zeros(12))
+        boxes.step()
+        heights.append(float(boxes.world.site_xpos_EL[0, 1, 2]))
+        torch.testing.assert_close(read(), torch.zeros(2))
+    assert max(heights) == heights[1]
+    boxes.place(qpos=boxes_at(0.0, 0.0), qvel=torch.zeros(12))
+    boxes.step()
+    paid = (max(heights) / 0.2 - 1.0) ** 2
+    torch.testing.assert_close(read(), torch.tensor([paid, 0.0]), atol=1e-5, rtol=0)
+
+    boxes.place(qpos=boxes_at(0.0, 0.05), qvel=torch.zeros(12))
+    boxes.step()
+    read()
+    lower = float(boxes.world.site_xpos_EL[0, 1, 2])
+    boxes.place(qpos=boxes_at(0.0, 0.0), qvel=torch.zeros(12))
+    boxes.step()
+    torch.testing.assert_close(read(), torch.tensor([(lower / 0.2 - 1.0) ** 2, 0.0]), atol=1e-5, rtol=0)
+
+
+def test_swing_height_forgets_at_a_reset(boxes):
+    term = mdp.FootSwingHeight(sensor="touch", sites=("a", "b"), target_height=0.2, **GATE)
+    boxes.command(MOVING)
+    boxes.place(qpos=boxes_at(0.4, 0.4))
+    boxes.step()
+    boxes.read(term, "rewards/swing")
+    boxes.view.memories.clear(torch.tensor([True, False]))
+    boxes.place(qpos=boxes_at(0.0, 0.0), qvel=torch.zeros(12))
+    boxes.step()
+    value = boxes.read(term, "rewards/swing")
+    assert value[0] == pytest.approx(2.0)
+    assert value[1] > 2.0
+
+
+def test_soft_landing_is_the_impact_force_at_touch_down_only(boxes):
+    term = mdp.SoftLanding(sensor="touch", **GATE)
+    boxes.command([MOVING, IDLE])
+    boxes.place(qpos=boxes_at(0.0, 0.5))
+    boxes.step()
+    force = boxes.view.contact("touch").force_EN3[0, 0].norm()
+    assert 15.0 < force < 60.0
+    torch.testing.assert_close(boxes.read(term, "rewards/x"), torch.stack((force, torch.zeros(()))))
+    boxes.step()
+    torch.testing.assert_close(boxes.read(term, "rewards/x"), torch.zeros(2))
+
+
+def test_air_time_counts_flights_between_the_thresholds(boxes):
+    term = mdp.FeetAirTime(sensor="touch", threshold_min=0.05, threshold_max=0.09, **GATE)
+    boxes.command([MOVING, IDLE])
+    boxes.place(qpos=boxes_at(1.0, 0.0))
+    counts = []
+    for _ in range(5):  # flights of 0.02, 0.04, ... 0.10 s
+        boxes.step()
+        counts.append(boxes.read(term, "rewards/x").tolist())
+    assert counts == [[0, 0], [0, 0], [1, 0], [1, 0], [0, 0]]
+
+
+def test_gait_phase_is_the_share_of_feet_in_the_wanted_phase(boxes):
+    term = mdp.GaitPhase(gait="gait", sensor="touch", **GATE)
+    boxes.command([MOVING, MOVING])
+    boxes.place(qpos=boxes_at(0.0, 0.5))
+    boxes.step()
+    # Box a stands, box b is in the air. Sines ask: swing where positive.
+    for sines, share in (((-0.5, 0.5), 1.0), ((0.5, -0.5), 0.0), ((-0.5, -0.5), 0.5), ((0.5, 0.5), 0.5)):
+        boxes.view.commands["gait"] = torch.tensor([[*sines, 9.0, 9.0]]).expand(2, 4)
+        assert boxes.read(term, "rewards/x").tolist() == [share, share]
+    boxes.command([MOVING, IDLE])
+    assert boxes.read(term, "rewards/x").tolist() == [0.5, 0.0]
+    boxes.view.commands["gait"] = torch.zeros(2, 6)
+    with pytest.raises(ValueError, match="'gait' has 3 feet, sensor='touch' has 2"):
+        boxes.read(term, "rewards/x")
+
+
+def test_heights_are_above_the_ground_below_the_foot(free_body):
+    free_body.place(qpos=(0, 0, 0.75, 1, 0, 0, 0, 0, 0), qvel=(0.5, 0, 0, 0, 0, 0, 0, 0))
+    free_body.command(MOVING)
+    free_body.view.terrain = Plateau(3, free_body.view.device)
+    term = mdp.FootClearance(sites=(".*_foot",), target_height=0.3, **GATE)
+    # Both feet are at 0.35 m, 0.1 m above the plateau.
+    value = free_body.read(term, "rewards/x")
+    torch.testing.assert_close(value, torch.full((3,), 2 * 0.2 * 0.5), atol=1e-5, rtol=0)

@@ -1,0 +1,121 @@
+"""Velocity and get-up tasks: a stance that holds without a policy, sizes, and rewards that rank states rightly."""
+
+import pytest
+import torch
+
+from ksim_rl import envs
+from tests.scene.robots.reference import loaded_spec
+
+OWN = ("quadruped_velocity_flat", "humanoid_velocity_flat")
+# Go1 has a file of its own.
+MENAGERIE = ("go2_velocity_flat", "t1_velocity_flat", "g1_velocity_flat")
+GET_UP = ("quadruped_get_up", "humanoid_get_up")
+# On flat ground nothing else pushes or pulls: what stands here is held by the default targets alone.
+CALM = ("~task.events.push_robot",)
+
+
+def slow(names):
+    return [pytest.param(name, marks=pytest.mark.full) for name in names]
+
+
+@pytest.fixture(scope="module", params=[*OWN, *slow(MENAGERIE)])
+def env(request):
+    (robot,) = envs.task(request.param).cfg().scene.robots.values()
+    loaded_spec(robot)
+    env = envs.make(request.param, num_envs=3, seed=3, overrides=CALM)
+    yield env
+    env.close()
+
+
+def test_zero_action_stands_for_two_seconds(env):
+    base = env.base_env
+    (robot,) = base.cfg.scene.robots.values()
+    seconds = 0.7 if robot.name == "g1" else 2.0  # whose reference gains are too soft to stand on for longer
+    td = env.reset()
+    zero = torch.zeros(env.action_spec.shape)
+    for _ in range(round(seconds / base.step_dt)):
+        td = env.step(td.set("action", zero))["next"].exclude("reward")
+        assert not td["done"].any()
+    view = base.view
+    assert (view.root_pos_EL[:, 2] > 0.75 * view.default_qpos_L[2]).all()
+    assert (view.projected_gravity_EL[:, 2] < -0.97).all()
+    contact = view.contact("feet_ground_contact")
+    assert (contact.found_EN.sum(-1) == len(robot.foot_sites)).all()
+    carried_E = -contact.force_EN3[..., 2].sum(-1)
+    weight = 9.81 * float(base.world.mj_model.body_subtreemass[1])
+    torch.testing.assert_close(carried_E, torch.full_like(carried_E, weight), rtol=0.3, atol=0.0)
+
+
+def test_groups_and_rewards_of_random_actions(env):
+    joints, feet = (
+        env.action_spec.shape[-1],
+        env.base_env.view.contact("feet_ground_contact").found_EN.shape[-1],
+    )
+    assert env.observation_spec["actor"].shape == (3, 3 * joints + 12)
+    assert env.observation_spec["critic"].shape == (3, 3 * joints + 12 + 6 * feet)
+    rollout = env.rollout(10, break_when_any_done=False)
+    assert torch.isfinite(rollout["next", "critic"]).all()
+    reward = rollout["next", "reward"]
+    assert torch.isfinite(reward).all() and reward.abs().max() < 1.0
+
+
+@pytest.fixture(scope="module", params=GET_UP)
+def fallen(request):
+    env = envs.make(request.param, num_envs=8, seed=1)
+    yield env
+    env.close()
+
+
+def test_get_up_starts_anywhere_and_rewards_standing(fallen):
+    base, view = fallen.base_env, fallen.base_env.view
+    roots = [fallen.reset() for _ in range(4)]
+    up = torch.cat([-root["obs", "projected_gravity"][:, 2] for root in roots])
+    assert up.min() < -0.7 and up.max() > 0.7 and up.std() > 0.4
+    # Nothing starts deep in the ground.
+    assert min(root["obs", "imu_and_foot_height"].min() for root in roots) > -0.03
+    td, zero = roots[-1], torch.zeros(fallen.action_spec.shape)
+    for _ in range(75):
+        td = fallen.step(td.set("action", zero))["next"].exclude("reward")
+        assert not td["done"].any()
+    height_E = view.root_pos_EL[:, 2]
+    tall_E = (-view.projected_gravity_EL[:, 2] > 0.97) & (
+        height_E > 0.9 * base.cfg.rewards["height"].standing_height
+    )
+    assert not tall_E.all()  # holding the default pose does not get up from everywhere
+    with view.scope("test"):
+        standing_E = base.cfg.rewards["standing"](view)
+        stands_E = base.cfg.metrics["stands"](view)
+    assert (standing_E >= 0).all() and (standing_E <= 1).all()
+    assert (standing_E[~tall_E] < 0.6).all()
+    assert not stands_E[~tall_E & (height_E < 0.6 * base.cfg.rewards["height"].standing_height)].any()
+
+
+def test_get_up_rates_the_stance_highest(fallen):
+    """Put robots into the stance, beside it and upside down; the terms must rank them so."""
+    view, base = fallen.base_env.view, fallen.base_env
+    everyone_E = torch.ones(8, dtype=torch.bool)
+    pos_E3 = view.default_qpos_L[:3].repeat(8, 1)
+    quat_E4 = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(8, 1)
+    quat_E4[1] = torch.tensor([0.7071068, 0.7071068, 0.0, 0.0])
+    quat_E4[2] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+    pos_E3[1:3, 2] *= 0.4
+    view.write_root_pose(everyone_E, pos_E3, quat_E4)
+    view.write_root_velocity(everyone_E, torch.zeros(8, 3), torch.zeros(8, 3))
+    view.write_joint_pos(everyone_E, view.default_joint_pos_EL)
+    speed_EL = torch.zeros_like(view.default_joint_pos_EL)
+    speed_EL[3] = 3.0
+    view.write_joint_vel(everyone_E, speed_EL)
+    view.world.refresh()
+    view.refreshed()
+    with view.scope("test"):
+        reward = {
+            name: term(view)
+            for name, term in base.cfg.rewards.items()
+            if name in ("upright", "height", "standing")
+        }
+        stands_E = base.cfg.metrics["stands"](view)
+    torch.testing.assert_close(reward["upright"][:3], torch.tensor([1.0, 0.5, 0.0]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(reward["height"][:2], torch.tensor([1.0, 0.4]), atol=0.03, rtol=0)
+    assert reward["standing"][0] > 0.99 and reward["standing"][1] < 0.1 and reward["standing"][2] == 0.0
+    assert reward["standing"][3] < 0.2  # it shakes
+    assert stands_E[:4].tolist() == [1.0, 0.0, 0.0, 1.0]

@@ -1,0 +1,50 @@
+"""Rough velocity tasks are the flat ones on a terrain in levels, seen by actor and critic."""
+
+import pytest
+import torch
+
+from ksim_rl import envs
+from ksim_rl.mdp import HeightScan
+from ksim_rl.scene.terrains import PlaneTerrain, TerrainGrid
+from tests.scene.robots.reference import loaded_spec
+
+POINTS = 17 * 11
+
+
+@pytest.mark.parametrize("robot", ["go1", "g1"])
+def test_it_is_the_flat_task_but_for_the_ground(robot):
+    flat, rough = (envs.task(f"{robot}_velocity_{ground}").cfg() for ground in ("flat", "rough"))
+    assert isinstance(flat.scene.terrain, PlaneTerrain) and isinstance(rough.scene.terrain, TerrainGrid)
+    for field in ("actions", "commands", "rewards", "events", "metrics", "decimation", "episode_length_s"):
+        assert getattr(rough, field) == getattr(flat, field), field
+    assert rough.scene.robots == flat.scene.robots and rough.scene.sensors == flat.scene.sensors
+    for name, group in flat.observations.items():
+        seen = dict(rough.observations[name].terms)
+        assert isinstance(seen.pop("height_scan").term, HeightScan) and seen == group.terms
+    assert dict(rough.terminations).keys() - flat.terminations.keys() == {"outside_terrain"}
+    assert list(rough.curriculum) == ["terrain_level"]
+
+
+def test_go1_stands_on_every_kind_of_ground():
+    loaded_spec(envs.task("go1_velocity_rough").cfg().scene.robots["go1"])
+    calm = ["task.events.push_robot.interval_range_s=[99,99]"]
+    env = envs.make("go1_velocity_rough", num_envs=10, seed=0, overrides=calm)
+    view, world = env.base_env.view, env.base_env.world
+    assert sorted(set(view.terrain.types_E.tolist())) == list(range(8))
+    view.terrain.set_levels(torch.ones(10, dtype=torch.bool), torch.full((10,), 5))
+    root_E = env.reset()
+    flat = envs.task("go1_velocity_flat").cfg().observations
+    assert root_E["actor"].shape == (10, 48 + POINTS) and "height_scan" not in flat["actor"].terms
+    for _ in range(25):
+        _, root_E = env.step_and_maybe_reset(root_E.set("action", torch.zeros(10, 12)))
+    height_E = view.terrain.clearance(view.root_pos_EL[:, None])[:, 0]
+    assert bool(((height_E > 0.15) & (height_E < 0.35)).all())
+    assert float(view.projected_gravity_EL[:, 2].max()) < -0.9
+    contact = view.contact("feet_ground_contact")
+    assert float(contact.found_EN.sum(-1).min()) >= 2
+    # Net upward force of the ground on the feet, summed over robots: their weight, in this sign downwards.
+    weight = 9.81 * float(world.mj_model.body_mass.sum())
+    assert float(-contact.force_EN3[..., 2].sum(-1).mean()) == pytest.approx(weight, rel=0.25)
+    report = world.overflow_report()
+    assert not report.messages, report.messages
+    env.close()
