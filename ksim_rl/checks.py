@@ -47,6 +47,16 @@ def check_in_range(
         raise ValueError(f"{field}={value!r}: expected a finite number in {bounds}")
 
 
+def check_count(field: str, value: object, *, low: int = 1) -> None:
+    """Refuse what is no whole number, or one below `low`.
+
+    Raises:
+        ValueError: naming the field, the value and the bound.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or value < low:
+        raise ValueError(f"{field}={value!r}: expected a whole number >= {low}")
+
+
 def check_choice(field: str, value: object, choices: Iterable[object]) -> None:
     """Refuse a value that is none of `choices`.
 

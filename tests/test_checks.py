@@ -2,7 +2,7 @@
 
 import pytest
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checks import check_count, check_in_range
 
 
 def test_bounds_of_large_ints_are_exact():
@@ -21,3 +21,15 @@ def test_an_open_bound_is_outside():
     check_in_range("rate", 0.0, low=0.0)
     with pytest.raises(ValueError, match=r"rate=0\.0: expected a finite number in \(0\.0, 1\.0\]"):
         check_in_range("rate", 0.0, low=0.0, high=1.0, low_open=True)
+
+
+@pytest.mark.parametrize("value", [0, -1, 2.0, True, "3", None, float("nan")])
+def test_what_is_no_count_is_refused(value):
+    with pytest.raises(ValueError, match=r"num_envs=.*: expected a whole number >= 1"):
+        check_count("num_envs", value)
+
+
+def test_a_count_may_start_at_zero():
+    check_count("burn_in", 0, low=0)
+    with pytest.raises(ValueError, match=r"burn_in=-1: expected a whole number >= 0"):
+        check_count("burn_in", -1, low=0)

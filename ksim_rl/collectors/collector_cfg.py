@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from ksim_rl.checks import check_count
+
 
 @dataclass(frozen=True, kw_only=True)
 class CollectorCfg:
@@ -24,5 +26,4 @@ class CollectorCfg:
             value = getattr(self, field)
             if not isinstance(value, bool):
                 raise ValueError(f"{field}={value!r}: expected True or False")
-        if isinstance(self.warmup, bool) or not isinstance(self.warmup, int) or self.warmup < 1:
-            raise ValueError(f"warmup={self.warmup!r}: expected a whole number of at least 1")
+        check_count("warmup", self.warmup)

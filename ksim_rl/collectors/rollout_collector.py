@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl import dims
+from ksim_rl.checks import check_count
 from ksim_rl.collectors.collector_cfg import CollectorCfg
 from ksim_rl.device.capture import Captured
 from ksim_rl.envs.masked_reset import MaskedReset
@@ -50,8 +51,7 @@ class RolloutCollector:
         keys: Sequence[NestedKey] | None = None,
         cfg: CollectorCfg | None = None,
     ) -> None:
-        if isinstance(rollout_length, bool) or not isinstance(rollout_length, int) or rollout_length < 1:
-            raise ValueError(f"rollout_length={rollout_length!r}: expected a whole number of at least 1")
+        check_count("rollout_length", rollout_length)
         if len(env.batch_size) != 1:
             raise ValueError(f"env.batch_size={tuple(env.batch_size)}: expected one dim, [E]")
         self._cfg = cfg = cfg or CollectorCfg()

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checks import check_count
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,12 +25,10 @@ class DatasetCfg:
     def __post_init__(self) -> None:
         """Refuse values that are no positive whole numbers, naming the field."""
         for field in ("num_env_states_per_minibatch", "num_minibatches"):
-            _check_count(field, getattr(self, field))
+            check_count(field, getattr(self, field))
         if self.sequence_length is not None:
-            _check_count("sequence_length", self.sequence_length)
-        check_in_range("burn_in", self.burn_in, low=0)
-        if not isinstance(self.burn_in, int):
-            raise ValueError(f"burn_in={self.burn_in!r}: expected a whole number >= 0")
+            check_count("sequence_length", self.sequence_length)
+        check_count("burn_in", self.burn_in, low=0)
 
     @property
     def num_env_states(self) -> int:
@@ -49,9 +47,9 @@ def rollout_length(num_env_states_per_minibatch: int, num_minibatches: int, num_
         ValueError: if T is no whole number; the message has the three numbers and the nearest working values
             of each.
     """
-    _check_count("num_env_states_per_minibatch", num_env_states_per_minibatch)
-    _check_count("num_minibatches", num_minibatches)
-    _check_count("num_envs", num_envs)
+    check_count("num_env_states_per_minibatch", num_env_states_per_minibatch)
+    check_count("num_minibatches", num_minibatches)
+    check_count("num_envs", num_envs)
     num_env_states = num_env_states_per_minibatch * num_minibatches
     if num_env_states % num_envs == 0:
         return num_env_states // num_envs
@@ -70,12 +68,6 @@ def rollout_length(num_env_states_per_minibatch: int, num_minibatches: int, num_
         f"{num_env_states / num_envs:.4g} steps. Change one of them: "
         f"num_env_states_per_minibatch={per_minibatch}, num_minibatches={minibatches} or num_envs={envs}"
     )
-
-
-def _check_count(field: str, value: int) -> None:
-    check_in_range(field, value, low=1)
-    if not isinstance(value, int):
-        raise ValueError(f"{field}={value!r}: expected a whole number >= 1")
 
 
 def _near_multiples(value: int, factor: int) -> str:

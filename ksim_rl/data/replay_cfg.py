@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checks import check_count, check_in_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,17 +42,9 @@ class ReplayCfg:
 
     def __post_init__(self) -> None:
         """Refuse sizes that are no positive whole numbers or do not fit each other, naming the field."""
-        for field, low in (
-            ("num_env_states_per_minibatch", 1),
-            ("num_minibatches", 1),
-            ("num_steps", 1),
-            ("capacity", 1),
-            ("n_step", 1),
-            ("learning_starts", 1),
-        ):
-            value = getattr(self, field)
-            if isinstance(value, bool) or not isinstance(value, int) or value < low:
-                raise ValueError(f"{field}={value!r}: expected a whole number >= {low}")
+        counts = ("num_env_states_per_minibatch", "num_minibatches", "num_steps", "capacity", "n_step")
+        for field in (*counts, "learning_starts"):
+            check_count(field, getattr(self, field))
         check_in_range("priority_alpha", self.priority_alpha, low=0.0)
         check_in_range("priority_beta", self.priority_beta, low=0.0, high=1.0)
         # A rollout whose episodes all end at once takes two places per env state, and must not overwrite itself.

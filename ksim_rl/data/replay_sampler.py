@@ -6,6 +6,7 @@ import torch
 from torchrl.data.replay_buffers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
+from ksim_rl.checks import check_count
 from ksim_rl.data.replay_storage import ReplayStorage
 
 
@@ -22,8 +23,7 @@ class ReplaySampler(Sampler):
     """
 
     def __init__(self, *, tries: int = 4) -> None:
-        if tries < 1:
-            raise ValueError(f"tries={tries!r}: expected a whole number >= 1")
+        check_count("tries", tries)
         self.tries = tries
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:

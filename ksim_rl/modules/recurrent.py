@@ -18,7 +18,7 @@ from torch.nn import functional
 from torchrl.data import Composite, Unbounded
 from torchrl.modules import SafeProbabilisticTensorDictSequential, recurrent_mode
 
-from ksim_rl.checks import check_choice
+from ksim_rl.checks import check_choice, check_count
 from ksim_rl.modules.actor import make_actor
 from ksim_rl.modules.actor_cfg import ActorCfg
 from ksim_rl.modules.critic import CriticCfg, make_critic
@@ -54,9 +54,7 @@ class RecurrentCfg:
         """Refuse values out of range, naming the field."""
         check_choice("kind", self.kind, STATES)
         for name in ("hidden_dim", "num_layers"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name}={value!r}: expected a whole number >= 1")
+            check_count(name, getattr(self, name))
 
 
 class RecurrentNetwork(nn.Module):
