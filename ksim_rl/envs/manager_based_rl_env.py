@@ -13,12 +13,14 @@ import mujoco_warp
 import numpy as np
 import torch
 import warp
+from jaxtyping import Float, Int64
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ksim_rl import dims
 from ksim_rl.device.streams import checked_device
 from ksim_rl.envs import specs
+from ksim_rl.envs.contract import DifficultyLevels, EpisodeClock, EpisodeSums, Pictures, SimulatedWorld
 from ksim_rl.envs.drawing import Drawing, drawings
 from ksim_rl.envs.explain import explain
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
@@ -45,7 +47,7 @@ from ksim_rl.scene.scene import build_spec
 RENDER_MODES = (None, "rgb_array")
 
 
-class ManagerBasedRlEnv(MaskedReset):
+class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels, SimulatedWorld, Pictures):
     """E parallel worlds that emit EnvStates `["E"]`.
 
     Keys of a root: `("obs", term)` and `("command", name)`, float32 [E, L]; `"action"`, float32 [E, L]; and under
@@ -184,6 +186,11 @@ class ManagerBasedRlEnv(MaskedReset):
         # Rounding first keeps 20 s / 0.02 s at 1000 steps in floating point.
         return math.ceil(round(self.cfg.episode_length_s / self.step_dt, 6))
 
+    @property
+    def episode_step_E(self) -> Int64[Tensor, " E"]:
+        """Env steps since each episode's start, int64 [E]."""
+        return self.view.episode_step_E
+
     def _make_specs(self) -> None:
         readings = {"obs": self.observation_manager.read(), "command": self.command_manager.values}
         self.observation_spec = specs.observation(readings, self.batch_size, self.device)
@@ -296,7 +303,7 @@ class ManagerBasedRlEnv(MaskedReset):
 
     # -- what trainers read --------------------------------------------------------------------------------------
 
-    def episode_log(self) -> dict[str, Tensor]:
+    def episode_log(self) -> dict[str, Float[Tensor, ""]]:
         """Return sums over the episodes that ended since `episode_log_reset_`, float32 [] on the device.
 
         Keys: `episodes`, `length_sum`, `return_sum`, `reward/<term>`, `termination/<term>` (with `non_finite`),
@@ -308,13 +315,13 @@ class ManagerBasedRlEnv(MaskedReset):
         """Start the sums of `episode_log` anew."""
         self._log.clear()
 
-    def curriculum_levels(self) -> dict[str, Tensor]:
+    def curriculum_levels(self) -> dict[str, Float[Tensor, ""]]:
         """Return the latest level of each curriculum, float32 [] on the device."""
         return dict(
             zip(self.curriculum_manager.names, self.curriculum_manager.levels_C.unbind(), strict=True)
         )
 
-    def command_levels(self) -> dict[str, Tensor]:
+    def command_levels(self) -> dict[str, Float[Tensor, ""]]:
         """Return the ranges that commands are drawn from now, float32 [] on the device.
 
         Keys: `<command>/<field>_low` and `<command>/<field>_high`. Without a curriculum they do not change, and the

@@ -1,0 +1,115 @@
+"""This module is all that trainers, collectors, evaluators and adapters may use of an env.
+
+An env is a TorchRL `EnvBase` of batch size [E] whose roots and steps are EnvStates: that alone trains. What is below
+are optional parts. An env has a part if it is an instance of its class, by inheritance or by `Part.register(MyEnv)`;
+`ManagerBasedRlEnv` has all of them. `part(env, EpisodeClock)` finds one in any env, however it is wrapped, and is the
+only way in which other modules look at what kind of env they were given.
+"""
+
+from abc import ABC, abstractmethod
+from typing import ClassVar, TypeVar
+
+import numpy as np
+from jaxtyping import Float, Int64
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ksim_rl.physics import World
+from ksim_rl.transforms.innermost import EpisodeLimit, innermost
+
+Part = TypeVar("Part")
+
+
+class EpisodeClock(EpisodeLimit):
+    """How long steps and episodes are.
+
+    Attributes:
+        step_dt: seconds of one env step.
+        max_episode_length_s: seconds after which an episode is cut; 0 for never.
+        max_episode_length: the same in env steps.
+        episode_step_E: env steps since each episode's start, int64 [E], one tensor that is written in place.
+    """
+
+    without: ClassVar[str] = (
+        "no episode clock: videos and staggered episodes are off, and episodes count as unlimited"
+    )
+
+    @property
+    @abstractmethod
+    def step_dt(self) -> float: ...  # noqa: D102
+
+    @property
+    @abstractmethod
+    def max_episode_length_s(self) -> float: ...  # noqa: D102
+
+    @property
+    @abstractmethod
+    def episode_step_E(self) -> Int64[Tensor, " E"]: ...  # noqa: D102
+
+    @abstractmethod
+    def stagger_episodes_(self) -> None:
+        """Let the running episodes time out at random steps, so that not all envs end together."""
+
+
+class EpisodeSums(ABC):
+    """Sums over finished episodes, kept on the device until they are read."""
+
+    without: ClassVar[str] = "no sums over episodes: returns and lengths come from evaluation only"
+
+    @abstractmethod
+    def episode_log(self) -> dict[str, Float[Tensor, ""]]:
+        """Return `episodes`, `length_sum`, `return_sum`, `reward/<term>`, `termination/<term>`, `metric/<name>`."""
+
+    @abstractmethod
+    def episode_log_reset_(self) -> None:
+        """Start the sums anew."""
+
+
+class DifficultyLevels(ABC):
+    """What curricula have come to."""
+
+    without: ClassVar[str] = "no curricula: nothing about difficulty is logged"
+
+    @abstractmethod
+    def curriculum_levels(self) -> dict[str, Float[Tensor, ""]]:
+        """Return the latest level of each curriculum."""
+
+    @abstractmethod
+    def command_levels(self) -> dict[str, Float[Tensor, ""]]:
+        """Return the ranges that commands are drawn from now, `<command>/<field>_low` and `<command>/<field>_high`."""
+
+
+class SimulatedWorld(ABC):
+    """The physics, for reports: overflows of contacts and constraints, and states that were not finite."""
+
+    without: ClassVar[str] = (
+        "no physics world: contacts that did not fit and states that were not finite go unseen"
+    )
+    world: World
+
+
+class Pictures(ABC):
+    """Pictures of the current state, in the mode that the env was built with."""
+
+    without: ClassVar[str] = "no pictures: videos are off"
+    render_mode: str | None
+
+    @abstractmethod
+    def render(self) -> np.ndarray | None:
+        """Return a picture, uint8 [H, W, 3], or None without a render mode."""
+
+
+PARTS = (EpisodeClock, EpisodeSums, DifficultyLevels, SimulatedWorld, Pictures)
+
+
+def part(env: EnvBase, kind: type[Part]) -> Part | None:
+    """Return the env inside all wrappers if it has the part `kind` (or is of this class), else None."""
+    inner = innermost(env)
+    return inner if isinstance(inner, kind) else None
+
+
+def missing_parts(env: EnvBase) -> list[str]:
+    """Return one line for each part that the env lacks, which says what a run goes without."""
+    return [
+        f"{type(innermost(env)).__name__} has {kind.without}" for kind in PARTS if part(env, kind) is None
+    ]
