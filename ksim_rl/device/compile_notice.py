@@ -8,7 +8,6 @@ first line of a burst to stderr; a program with its own display sets another:
         world.step(1)
 """
 
-import re
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -16,10 +15,10 @@ from contextlib import contextmanager
 
 import warp as wp
 
+from ksim_rl.device import upstream
+
 CompileHook = Callable[[str], None]
 
-# Warp ends a module's load line with "took 812.34 ms  (compiled)"; "(cached)" lines are not worth a word.
-COMPILED_LINE = re.compile(r"^\s*Module (?P<module>\S+).* took (?P<ms>[\d.]+) ms\s+\(compiled\)")
 # Compilations further apart than this belong to another model.
 BURST_GAP_S = 60.0
 
@@ -38,7 +37,7 @@ class CompileLogger:
 
     def info(self, message: str) -> None:
         """Drop Warp's information lines, and report those that tell of a compiled module."""
-        match = COMPILED_LINE.match(message)
+        match = upstream.COMPILED_LINE.match(message)
         if match is None:
             return
         now = time.monotonic()
@@ -72,7 +71,7 @@ _logger = CompileLogger(say_first)
 
 def install() -> None:
     """Route Warp's messages through the hook. A logger that the program set itself stays."""
-    if type(wp.get_logger()).__name__ == "LoggerBasic":
+    if upstream.has_default_logger():
         wp.set_logger(_logger)
 
 

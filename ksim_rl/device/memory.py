@@ -6,12 +6,8 @@ from contextlib import contextmanager
 
 import torch
 
-# What Warp, torch on CUDA and torch on the CPU say when they get no memory.
-_REFUSALS = (
-    r"Failed to allocate (?P<size>\d+) bytes",
-    r"Tried to allocate (?P<size>[\d.]+) (?P<unit>[KMG]iB)",
-    r"can't allocate memory: you tried to allocate (?P<size>\d+) bytes",
-)
+from ksim_rl.device.upstream import ALLOCATION_REFUSALS
+
 _UNITS = {None: 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 
 
@@ -45,7 +41,7 @@ def memory_for(num_envs: int, device: torch.device) -> Iterator[None]:
 
 def refused_bytes(error: RuntimeError) -> int | None:
     """Return how many bytes an allocation asked for that failed, or None if `error` is no such failure."""
-    for refusal in _REFUSALS:
+    for refusal in ALLOCATION_REFUSALS:
         if found := re.search(refusal, str(error)):
             parts = found.groupdict()
             return int(float(parts["size"]) * _UNITS[parts.get("unit")])

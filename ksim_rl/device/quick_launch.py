@@ -12,6 +12,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ksim_rl.device import upstream
 from ksim_rl.device.streams import CPU_LOCK, warp_scope, warp_stream
 
 MAX_RECORDED = 64
@@ -64,8 +65,7 @@ class QuickLaunch:
             launch = wp.launch(
                 self._kernel, dim, inputs=[self._arguments()], device=str(device), record_cmd=True
             )
-        # The first parameter is the size of the launch.
-        packed = launch.params[1]
+        packed = upstream.recorded_arguments(launch)
         self._packer = struct.Struct("@" + "".join(_CODES[field[1]] for field in packed._fields_))
         self._recorded[device, dim] = launch, packed
         return launch, packed
@@ -73,7 +73,7 @@ class QuickLaunch:
 
 def _current_stream(device: torch.device) -> wp.Stream:
     """Return Warp's wrapper of torch's current stream; the look-up by handle spares the making of a stream object."""
-    handle: int = torch._C._cuda_getCurrentRawStream(device.index)  # pyright: ignore[reportAttributeAccessIssue]
+    handle = upstream.current_stream_handle(device)
     found = _streams.get((device.index, handle))
     if found is None:
         # The wrapper keeps the stream for ever, so no other one gets its handle.

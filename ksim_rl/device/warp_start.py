@@ -8,7 +8,7 @@ from functools import cache
 import torch
 import warp as wp
 
-_ABSENT_DRIVER = "Could not find or load the NVIDIA CUDA driver"
+from ksim_rl.device.upstream import ABSENT_DRIVER
 
 
 @cache
@@ -34,4 +34,4 @@ def start_warp() -> None:
             lines = caught.read().decode(errors="replace").splitlines(keepends=True)
     finally:
         os.close(stderr)
-    sys.stderr.writelines(line for line in lines if _ABSENT_DRIVER not in line)
+    sys.stderr.writelines(line for line in lines if ABSENT_DRIVER not in line)

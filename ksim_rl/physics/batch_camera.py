@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import mujoco
 import mujoco_warp as mjw
 import torch
 import warp as wp
-from mujoco_warp._src.bvh import build_hfield_bvh
 from torch import Tensor
 
 from ksim_rl.device.streams import warp_scope
+from ksim_rl.physics.upstream import add_height_fields
 from ksim_rl.physics.world import World
 
 
@@ -62,7 +61,7 @@ class BatchCamera:
                 use_precomputed_rays=not {"cam_fovy", "cam_intrinsic"} & fields.keys(),
             )
             if "geom_dataid" in fields:
-                self._add_height_fields(model)
+                add_height_fields(self._context, model)
         self._shape = (world.num_envs, height, width)
 
     def render(self) -> None:
@@ -90,15 +89,3 @@ class BatchCamera:
         m, d = self._world.warp_model, self._world.warp_data_E
         mjw.refit_bvh(m, d, self._context)
         mjw.render(m, d, self._context)
-
-    def _add_height_fields(self, model: mujoco.MjModel) -> None:
-        """Prepare the height fields that only other worlds than the model's own collide with."""
-        context = self._context
-        ids, bounds = context.hfield_bvh_id.numpy(), context.hfield_bounds_size.numpy()
-        for field in range(model.nhfield):
-            if not ids[field]:
-                mesh, bounds[field] = build_hfield_bvh(model, field, constructor="cubql")
-                context.hfield_registry[mesh.id] = mesh
-                ids[field] = mesh.id
-        context.hfield_bvh_id = wp.array(ids, dtype=wp.uint64)
-        context.hfield_bounds_size = wp.array(bounds, dtype=wp.vec3)

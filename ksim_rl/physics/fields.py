@@ -1,14 +1,12 @@
 """Model fields that differ between worlds, and the constants that follow from them."""
 
-import dataclasses
 from collections.abc import Iterable, Sequence
 
 import mujoco
 import mujoco_warp as mjw
-import torch
-import warp as wp
 
 from ksim_rl.checks import unknown_name
+from ksim_rl.physics.upstream import per_world_fields
 
 FIXED, KIN0, INERT0 = (int(mjw.SetConstGroup[name]) for name in ("FIXED", "KIN0", "INERT0"))
 ALL = FIXED | KIN0 | INERT0
@@ -53,15 +51,6 @@ DERIVED_FIELDS = {
 GRAVITY = "gravity"
 
 
-def model_fields() -> tuple[str, ...]:
-    """Return the names of all model fields that may differ between worlds."""
-    return tuple(
-        field.name
-        for field in dataclasses.fields(mjw.Model)
-        if (getattr(field.type, "shape", None) or ("",))[0] == "*"
-    )
-
-
 def const_groups(fields: Iterable[str]) -> int:
     """Return the `SetConstGroup` bits of the constants that follow from `fields`."""
     groups = 0
@@ -83,7 +72,7 @@ def fields_to_expand(fields: Sequence[str]) -> tuple[str, ...]:
     """
     if isinstance(fields, str):
         raise ValueError(f"per_world_fields={fields!r}: expected a sequence of names, such as ({fields!r},)")
-    valid = model_fields()
+    valid = per_world_fields()
     for field in fields:
         if field != GRAVITY and field not in valid:
             raise unknown_name("per-world model field", field, (*valid, GRAVITY))
@@ -100,13 +89,3 @@ def prepare_spec(spec: mujoco.MjSpec, per_world_fields: Iterable[str]) -> None:
     if {"body_ipos", "body_iquat"} & set(per_world_fields):
         for body in spec.bodies:
             body.simple = False
-
-
-def expand_gravity(warp_model: mjw.Model, num_envs: int) -> torch.Tensor:
-    """Give each world its own gravity vector, and return the view [E, 3], in m/s^2."""
-    shared = wp.to_torch(warp_model.opt.gravity)
-    gravity = wp.from_torch(shared.expand(num_envs, 3).contiguous(), dtype=wp.vec3)
-    # Kernels index it modulo its length; the flag tells Warp's helpers that its first dim is the world.
-    setattr(gravity, "_is_batched", True)  # noqa: B010
-    warp_model.opt.gravity = gravity
-    return wp.to_torch(gravity)

@@ -13,6 +13,7 @@ import warp as wp
 
 from ksim_rl.physics import constant_kernels as kernels
 from ksim_rl.physics.fields import FIXED, INERT0, KIN0, const_groups
+from ksim_rl.physics.upstream import set_fixed_constants
 
 KINEMATIC = frozenset(("qpos0", "body_pos", "body_quat", "jnt_pos", "jnt_axis"))
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
@@ -71,7 +72,7 @@ class MaskedConstants:
         m, mask, num_envs = self._model, self._mask, self._mask.shape[0]
         if groups & FIXED:
             # Cheap, and the same bits again in rows whose fields did not change.
-            mjw.set_const(m, None, FIXED)  # pyright: ignore[reportArgumentType]
+            set_fixed_constants(m)
         if not groups & (KIN0 | INERT0):
             return
         if self._moves:

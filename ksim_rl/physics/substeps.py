@@ -7,7 +7,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from ksim_rl.physics import kernels
+from ksim_rl.physics import kernels, upstream
 from ksim_rl.physics.newton import solver as newton
 
 # These read the contacts of the last substep's collision pass, which a reset empties.
@@ -46,14 +46,14 @@ class Substeps:
         has_history = np.any(mj_model.sensor_history > 0, axis=-1)
         # A delayed sensor samples at every substep.
         self._always_senses = bool(has_history.any())
-        self._silent_model = warp_model if self._always_senses else _without_sensors(warp_model)
+        self._silent_model = warp_model if self._always_senses else upstream.without_sensors(warp_model)
         self._solver_model: mjw.Model | None = None
         if one_kernel_solver:
             # From the warm start even a world without constraints reaches qacc_smooth in one step.
             opt = dataclasses.replace(warp_model.opt, run_qacc_smooth=False)
             self._solver_model = dataclasses.replace(warp_model, opt=opt)
             self._solve = newton.solver(self._solver_model, warp_data_E)
-        self._refresh_model = _refreshable(
+        self._refresh_model = upstream.with_refreshable_sensors(
             warp_model, skip=has_history | np.isin(sensor_type, COLLISION_SENSORS), sensor_type=sensor_type
         )
         self._needs_transmission = bool(np.isin(sensor_type, TRANSMISSION_SENSORS).any())
@@ -100,38 +100,3 @@ class Substeps:
             mjw.subtree_vel(m, d)
         mjw.sensor_pos(m, d)
         mjw.sensor_vel(m, d)
-
-
-def _without_sensors(warp_model: mjw.Model) -> mjw.Model:
-    opt = dataclasses.replace(
-        warp_model.opt, disableflags=int(warp_model.opt.disableflags) | int(mjw.DisableBit.SENSOR)
-    )
-    return dataclasses.replace(warp_model, opt=opt)
-
-
-def _refreshable(warp_model: mjw.Model, *, skip: np.ndarray, sensor_type: np.ndarray) -> mjw.Model:
-    """Leave only the sensors that follow from qpos and qvel alone.
-
-    Contact, limit, touch-grid and geom-distance sensors read rows or contacts of the last substep's collision pass.
-    They keep that substep's value; rows that reset since then read zero.
-    """
-    none = wp.zeros(0, dtype=int)
-    pos, vel = (
-        wp.array([i for i in ids.numpy() if not skip[i]], dtype=int)
-        for ids in (warp_model.sensor_pos_adr, warp_model.sensor_vel_adr)
-    )
-    rangefinder = sensor_type == mujoco.mjtSensor.mjSENS_RANGEFINDER
-    return dataclasses.replace(
-        warp_model,
-        sensor_pos_adr=pos,
-        sensor_vel_adr=vel,
-        sensor_limitpos_adr=none,
-        sensor_limitvel_adr=none,
-        sensor_contact_pos_adr=none,
-        sensor_contact_vel_adr=none,
-        sensor_stage_pos_adr=none,
-        sensor_stage_vel_adr=none,
-        nsensorcollision=0,
-        nsensortaxel=0,
-        nrangefinder=0 if np.any(rangefinder & skip) else warp_model.nrangefinder,
-    )

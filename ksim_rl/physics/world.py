@@ -14,13 +14,12 @@ from ksim_rl.checks import check_choice, unknown_name
 from ksim_rl.device.kernel_loading import loaded_together
 from ksim_rl.device.memory import memory_for
 from ksim_rl.device.streams import checked_device, warp_scope
-from ksim_rl.physics import capacity, kernels, state, views
+from ksim_rl.physics import capacity, kernels, state, upstream, views
 from ksim_rl.physics.fields import (
     FIXED,
     GRAVITY,
     const_groups,
     derived_fields,
-    expand_gravity,
     fields_to_expand,
 )
 from ksim_rl.physics.graphs import WarpGraphs
@@ -102,7 +101,7 @@ class World(views.DataViews):
             self.warp_data_E = mjw.make_data(
                 self.mj_model, nworld=num_envs, nconmax=self.nconmax, njmax=self.njmax
             )
-            gravity_EL = expand_gravity(self.warp_model, num_envs)
+            gravity_EL = upstream.expand_gravity(self.warp_model, num_envs)
             self._overflow = OverflowRecord(self.warp_data_E)
             self._reset_mask = wp.zeros(num_envs, dtype=bool)
             self._zeroed_at_reset = views.float_rows(self.warp_data_E, views.ACCELERATION_STAGE)
@@ -352,7 +351,7 @@ class World(views.DataViews):
             return None
         if groups & FIXED:
             # From now on the same bits, however often they are recomputed.
-            mjw.set_const(self.warp_model, self.warp_data_E, FIXED)
+            upstream.set_fixed_constants(self.warp_model)
         return MaskedConstants(self.mj_model, self.warp_model, self._reset_mask, expanded)
 
     def _set_const_everywhere(self, groups: int) -> None:

@@ -12,6 +12,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
+from ksim_rl.physics import upstream
 from ksim_rl.physics.height_field.kernels import (
     BOX,
     CAPSULE,
@@ -30,21 +31,15 @@ def take_over_height_fields(warp_model: mjw.Model) -> None:
     Warp. Call it before anything copies the model.
     """
     geom_type = warp_model.geom_type.numpy()
-    pairs, pair_ids = warp_model.nxn_geom_pair.numpy(), warp_model.nxn_pairid.numpy()
+    pairs, pair_ids = upstream.geom_pairs(warp_model)
     types = geom_type[pairs]
     height_first = np.where(types[:, :1] == HEIGHT_FIELD, pairs, pairs[:, ::-1])
     taken = (types == HEIGHT_FIELD).any(-1) & np.isin(geom_type[height_first[:, 1]], _SHAPES)
-    taken &= (pair_ids[:, 0] >= -1) & (pair_ids[:, 1] < 0)
+    taken &= (pair_ids[:, 0] > upstream.NO_CONTACT) & (pair_ids[:, 1] == upstream.NO_SENSOR)
     if not taken.any() or warp_model.flg_surfacevel:
         return
     contacts = _Contacts(height_first[taken], pair_ids[taken])
-    # What is left to MuJoCo Warp: all pairs by number, and those of them that may touch.
-    left_ids = np.where(taken[:, None], (-2, -1), pair_ids)
-    may_touch = (left_ids[:, 0] > -2) | (left_ids[:, 1] >= 0)
-    warp_model.nxn_pairid = wp.array(left_ids, dtype=wp.vec2i)
-    warp_model.nxn_pairid_filtered = wp.array(left_ids[may_touch], dtype=wp.vec2i)
-    warp_model.nxn_geom_pair_filtered = wp.array(pairs[may_touch], dtype=wp.vec2i)
-    warp_model.geom_pair_type_count = _pair_type_count(types[may_touch])
+    upstream.drop_pairs(warp_model, taken)
     warp_model.callback.contactfilter = contacts
 
 
@@ -112,12 +107,3 @@ class _Contacts:
                 d.nacon,
             ],
         )
-
-
-def _pair_type_count(types: np.ndarray) -> tuple[int, ...]:
-    """Count pairs by their types, in the order of the upper triangle that MuJoCo Warp numbers them in."""
-    kinds = len(mjw.GeomType)
-    low, high = types.min(-1), types.max(-1)
-    return tuple(
-        np.bincount((low * (2 * kinds - low - 1)) // 2 + high, minlength=kinds * (kinds + 1) // 2).tolist()
-    )

@@ -9,8 +9,6 @@
 
 import mujoco_warp as mjw
 import warp as wp
-from mujoco_warp._src.collision_core import contact_params, write_contact
-from mujoco_warp._src.math import make_frame
 
 from ksim_rl.physics.height_field.geometry import (
     FAR,
@@ -22,6 +20,7 @@ from ksim_rl.physics.height_field.geometry import (
     ground_at,
     is_over,
 )
+from ksim_rl.physics.upstream import contact_params, make_frame, write_contact
 
 SPHERE, CAPSULE, BOX = (int(mjw.GeomType[name]) for name in ("SPHERE", "CAPSULE", "BOX"))
 

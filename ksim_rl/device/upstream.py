@@ -1,0 +1,83 @@
+"""This module holds what `device` uses of torch and Warp beyond their documented interfaces.
+
+Each part says why it is needed and with which version it was checked; `tests/device/test_upstream.py` names the part
+that a new version moved.
+"""
+
+import ctypes
+import re
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+import warp as wp
+
+# torch 2.10 to 2.13 and Warp 1.19: exceptions of a failed allocation carry no size, only these texts do (Warp's, then
+# torch's on CUDA and on the CPU).
+ALLOCATION_REFUSALS = (
+    r"Failed to allocate (?P<size>\d+) bytes",
+    r"Tried to allocate (?P<size>[\d.]+) (?P<unit>[KMG]iB)",
+    r"can't allocate memory: you tried to allocate (?P<size>\d+) bytes",
+)
+# Warp 1.19 has no hook for compilations. It ends a module's load line with "took 812.34 ms  (compiled)", or "(cached)".
+COMPILED_LINE = re.compile(r"^\s*Module (?P<module>\S+).* took (?P<ms>[\d.]+) ms\s+\(compiled\)")
+# Warp 1.19 writes this from native code when it starts without a driver, and has no setting against it.
+ABSENT_DRIVER = "Could not find or load the NVIDIA CUDA driver"
+
+
+def current_stream_handle(device: torch.device) -> int:
+    """Return the handle of torch's current CUDA stream.
+
+    The documented way makes a stream object, which takes longer than a launch. Checked with torch 2.10 to 2.13.
+    """
+    return torch._C._cuda_getCurrentRawStream(device.index)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def recorded_arguments(launch: wp.Launch) -> ctypes.Structure:
+    """Return the bytes of the one struct that a recorded launch passes to its kernel, for writing them in one go.
+
+    `Launch.set_param_at_index` packs field by field. The first parameter is the size of the launch. Checked with
+    Warp 1.19.
+    """
+    return launch.params[1]
+
+
+def has_default_logger() -> bool:
+    """Return whether the program has set no logger of its own. Checked with Warp 1.19, which does not tell."""
+    return type(wp.get_logger()).__name__ == "LoggerBasic"
+
+
+_diversion = threading.Lock()
+
+
+@contextmanager
+def launches_diverted(instead: Callable[[wp.Kernel, Any, int | None], None]) -> Iterator[None]:
+    """Call `instead(kernel, dim, block_dim)` for each launch that this thread issues in this block.
+
+    Loops of Warp go through their body once. Warp can only load modules that it is given, and which kernels a library
+    launches is known to nobody else. Replaces functions of the module `warp`, checked with Warp 1.19.
+    """
+    thread = threading.get_ident()
+
+    def note(kernel: wp.Kernel, dim: Any, *args: Any, **kwargs: Any) -> None:
+        instead(kernel, dim, kwargs.get("block_dim"))
+
+    def loop_once(condition: Any, while_body: Any, *args: Any, **kwargs: Any) -> None:
+        while_body(**kwargs)
+
+    def for_this_thread(original: Callable[..., Any], replacement: Callable[..., None]) -> Callable[..., Any]:
+        return lambda *args, **kwargs: (replacement if threading.get_ident() == thread else original)(
+            *args, **kwargs
+        )
+
+    namespace: Any = vars(wp)
+    replacements = {"launch": note, "launch_tiled": note, "capture_while": loop_once}
+    with _diversion:
+        saved = {name: namespace[name] for name in replacements}
+        namespace.update({name: for_this_thread(saved[name], new) for name, new in replacements.items()})
+        try:
+            yield
+        finally:
+            namespace.update(saved)

@@ -1,0 +1,132 @@
+"""This module holds what `physics` uses of MuJoCo Warp beyond its documented interface.
+
+Each part says why it is needed; all were checked with MuJoCo Warp 4.0.0 and Warp 1.19.0, which pyproject.toml bounds.
+`tests/physics/test_upstream.py` names the part that a new version moved.
+"""
+
+import dataclasses
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import torch
+import warp as wp
+
+# Building blocks of its contacts. A contact that another kernel appends has to look exactly like its own.
+from mujoco_warp._src.bvh import build_hfield_bvh
+from mujoco_warp._src.collision_core import contact_params as contact_params
+from mujoco_warp._src.collision_core import write_contact as write_contact
+from mujoco_warp._src.math import make_frame as make_frame
+
+FIXED = int(mjw.SetConstGroup.FIXED)
+# The two columns of `nxn_pairid` for a pair that never makes a contact, and for one that no sensor measures.
+NO_CONTACT, NO_SENSOR = -2, -1
+
+
+def per_world_fields() -> tuple[str, ...]:
+    """Return the names of all model fields that may differ between worlds.
+
+    `put_model(batch_sizes=...)` accepts them but does not list them; their annotations have "*" as the first size.
+    """
+    return tuple(
+        field.name
+        for field in dataclasses.fields(mjw.Model)
+        if (getattr(field.type, "shape", None) or ("",))[0] == "*"
+    )
+
+
+def expand_gravity(warp_model: mjw.Model, num_envs: int) -> torch.Tensor:
+    """Give each world its own gravity vector, and return the view [E, 3], in m/s^2.
+
+    `batch_sizes` refuses gravity, since it is a field of the options. Kernels index it modulo its length, and the flag
+    tells MuJoCo Warp's helpers that its first dim is the world.
+    """
+    shared = wp.to_torch(warp_model.opt.gravity)
+    gravity = wp.from_torch(shared.expand(num_envs, 3).contiguous(), dtype=wp.vec3)
+    setattr(gravity, "_is_batched", True)  # noqa: B010
+    warp_model.opt.gravity = gravity
+    return wp.to_torch(gravity)
+
+
+def set_fixed_constants(warp_model: mjw.Model) -> None:
+    """Launch `set_const` for the constants that follow from fields alone: it takes Data, and does not read it."""
+    mjw.set_const(warp_model, None, FIXED)  # pyright: ignore[reportArgumentType]
+
+
+def without_sensors(warp_model: mjw.Model) -> mjw.Model:
+    """Return a model on the same arrays that computes no sensors."""
+    disabled = int(warp_model.opt.disableflags) | int(mjw.DisableBit.SENSOR)
+    opt = dataclasses.replace(warp_model.opt, disableflags=disabled)
+    return dataclasses.replace(warp_model, opt=opt)
+
+
+def with_refreshable_sensors(
+    warp_model: mjw.Model, *, skip: np.ndarray, sensor_type: np.ndarray
+) -> mjw.Model:
+    """Return a model on the same arrays that computes only sensors that follow from qpos and qvel alone.
+
+    Contact, limit, touch-grid and geom-distance sensors read rows or contacts of the last substep's collision pass.
+    They keep that substep's value; rows that reset since then read zero. Sensors can only be switched off all at once,
+    so the lists that `put_model` makes of them, one for each kernel, are replaced.
+
+    Args:
+        warp_model: the model.
+        skip: bool [nsensor], further sensors to leave out.
+        sensor_type: int [nsensor].
+    """
+    none = wp.zeros(0, dtype=int)
+    pos, vel = (
+        wp.array([i for i in ids.numpy() if not skip[i]], dtype=int)
+        for ids in (warp_model.sensor_pos_adr, warp_model.sensor_vel_adr)
+    )
+    lists = ("limitpos", "limitvel", "contact_pos", "contact_vel", "stage_pos", "stage_vel")
+    skips_rays = np.any(skip & (sensor_type == mujoco.mjtSensor.mjSENS_RANGEFINDER))
+    return dataclasses.replace(
+        warp_model,
+        sensor_pos_adr=pos,
+        sensor_vel_adr=vel,
+        **{f"sensor_{name}_adr": none for name in lists},
+        nsensorcollision=0,
+        nsensortaxel=0,
+        nrangefinder=0 if skips_rays else warp_model.nrangefinder,
+    )
+
+
+def geom_pairs(warp_model: mjw.Model) -> tuple[np.ndarray, np.ndarray]:
+    """Return the geom pairs that the broad phase looks at, [N, 2], and their ids, [N, 2]."""
+    return warp_model.nxn_geom_pair.numpy(), warp_model.nxn_pairid.numpy()
+
+
+def drop_pairs(warp_model: mjw.Model, dropped: np.ndarray) -> None:
+    """Let MuJoCo Warp make no contacts of some geom pairs, in place: it has no setting for a pair.
+
+    Args:
+        warp_model: the model.
+        dropped: bool [N], in the order of `geom_pairs`.
+    """
+    pairs, pair_ids = geom_pairs(warp_model)
+    left_ids = np.where(dropped[:, None], (NO_CONTACT, NO_SENSOR), pair_ids)
+    may_touch = (left_ids[:, 0] > NO_CONTACT) | (left_ids[:, 1] > NO_SENSOR)
+    types = warp_model.geom_type.numpy()[pairs[may_touch]]
+    # The number of pairs by their types, in the order of the upper triangle of a matrix.
+    kinds, low, high = len(mjw.GeomType), types.min(-1), types.max(-1)
+    counts = np.bincount((low * (2 * kinds - low - 1)) // 2 + high, minlength=kinds * (kinds + 1) // 2)
+    warp_model.nxn_pairid = wp.array(left_ids, dtype=wp.vec2i)
+    warp_model.nxn_pairid_filtered = wp.array(left_ids[may_touch], dtype=wp.vec2i)
+    warp_model.nxn_geom_pair_filtered = wp.array(pairs[may_touch], dtype=wp.vec2i)
+    warp_model.geom_pair_type_count = tuple(counts.tolist())
+
+
+def add_height_fields(context: mjw.RenderContext, mj_model: mujoco.MjModel) -> None:
+    """Let a renderer draw all height fields of the model: its own are those that `geom_dataid` names in the model.
+
+    Worlds may differ in that field, and so show patches of ground that the model itself does not.
+    """
+    ids, bounds = context.hfield_bvh_id.numpy(), context.hfield_bounds_size.numpy()
+    for field in range(mj_model.nhfield):
+        if not ids[field]:
+            mesh, bounds[field] = build_hfield_bvh(mj_model, field, constructor="cubql")
+            context.hfield_registry[mesh.id] = mesh
+            ids[field] = mesh.id
+    context.hfield_bvh_id = wp.array(ids, dtype=wp.uint64)
+    context.hfield_bounds_size = wp.array(bounds, dtype=wp.vec3)
