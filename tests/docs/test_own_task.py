@@ -63,7 +63,7 @@ def test_it_trains_until_solved(installed: Installed) -> None:
 
 def test_without_the_package_its_classes_are_not_built() -> None:
     tree = {"_target_": "puck_rink.robot.Puck"}
-    code = f"from ksim_rl.envs import config_tree; config_tree.from_tree(object, {tree}, 'x')"
+    code = f"from ksim_rl.config import config_tree; config_tree.from_tree(object, {tree}, 'x')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "only classes of these packages are built: ksim_rl" in done.stderr
 

@@ -30,7 +30,7 @@ KINDS = {
 }
 HEAD = """# Terms
 
-All terms of `ksim_rl.mdp`, by kind: what each gives, with shape, unit, frame and stage, and its fields. Fields
+All terms of `ksim_rl.envs.mdp`, by kind: what each gives, with shape, unit, frame and stage, and its fields. Fields
 without a value must be given. The docstring of a term says more: `help(mdp.TrackLinearVelocity)`.
 
 Dims: `E` envs, `L` joints or other elements of a vector, `N` bodies, geoms or contacts, `F` feet, `K` columns of an
