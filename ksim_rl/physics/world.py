@@ -27,7 +27,7 @@ from ksim_rl.physics.height_field.contacts import take_over_height_fields
 from ksim_rl.physics.masked_constants import MaskedConstants
 from ksim_rl.physics.model_checks import check_not_simple, warp_model_of
 from ksim_rl.physics.nan_guard.guard import NanGuard, NanReport
-from ksim_rl.physics.newton.choice import one_kernel_unavailable, takes_conditional_nodes
+from ksim_rl.physics.newton.solver import one_kernel_unavailable, takes_conditional_nodes
 from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
 from ksim_rl.physics.sim_cfg import SimCfg
 from ksim_rl.physics.substeps import Substeps

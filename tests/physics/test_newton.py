@@ -11,7 +11,9 @@ import torch
 import warp as wp
 
 from ksim_rl.physics import SimCfg, World, load_model
+from ksim_rl.physics.newton import kernel
 from ksim_rl.physics.newton import solver as newton
+from ksim_rl.physics.newton.kernel import Invariant
 
 NUM_ENVS = 6
 ROWS_OF_ALL_KINDS = """
@@ -148,6 +150,43 @@ def test_rows_that_find_no_room_on_chip_solve_alike(cone):
     assert found[0].any()
     for other in found[1:]:
         torch.testing.assert_close(other, found[0], rtol=1e-5, atol=1e-5)
+
+
+def broken_invariants(world: World, substeps: int) -> Invariant:
+    with wp.ScopedDevice("cpu"):
+        model, data = world.warp_model, world.warp_data_E
+        broken = wp.zeros(NUM_ENVS, dtype=int)
+        solve = newton.solver(model, data, broken=broken)
+        for _ in range(substeps):
+            newton.step(model, data, solve, sensors=False)
+    return Invariant(int(np.bitwise_or.reduce(broken.numpy())))
+
+
+@pytest.mark.parametrize("cone", CONES)
+def test_a_debug_build_finds_no_broken_invariant(cone):
+    assert not broken_invariants(worlds(cone), 20)
+
+
+WRONG_LINES = {
+    "ROWS_ARE_WHOLE": ("efc_D[row] = row_of(problem.efc_D)", "efc_D[row] = -row_of(problem.efc_D)"),
+    "CONES_ARE_WHOLE": ("friction[0] * impratio", "-friction[0] * impratio"),
+    "FORCES_ARE_ADMISSIBLE": ("push = -efc_D[row] * residual[row]", "push = efc_D[row] * residual[row]"),
+    "HESSIAN_IS_POSITIVE": ("hessian[block][dof] = mass[", "hessian[block][dof] = -mass["),
+    "SEARCH_DESCENDS": ("search[block] *= -inverse_pivot", "search[block] *= inverse_pivot"),
+    "COST_FALLS": ("improvement = -improvement;", ""),
+}
+
+
+@pytest.mark.parametrize("invariant", WRONG_LINES)
+def test_a_debug_build_names_the_invariant_that_is_broken(monkeypatch, invariant):
+    right, wrong = WRONG_LINES[invariant]
+    assert kernel._SOURCE.count(right) == 1
+    monkeypatch.setattr(kernel, "_SOURCE", kernel._SOURCE.replace(right, wrong))
+    kernel.newton_kernel.cache_clear()
+    try:
+        assert Invariant[invariant] in broken_invariants(worlds("elliptic"), 1)
+    finally:
+        kernel.newton_kernel.cache_clear()
 
 
 def test_steps_follow_those_of_mujoco_warp():

@@ -1,82 +1,90 @@
-// The third part: H = M + J' D J, and the search direction - H^-1 slopes.
+// Part 4: the gradient M qacc - qfrc_smooth - J' force, the Hessian H = M + J' d2s/dr2 J, and the search direction
+// -H^-1 gradient by a Cholesky factorization (computation chapter, "Algorithms", Newton).
 
 // M times the vector that the lanes share, of which each has its own entries.
 auto times_mass = [&](float* result, const float* own) {
 UNROLL
-    for (int b = 0; b < BLOCKS; ++b) {
+    for (int block = 0; block < BLOCKS; ++block) {
         float product = 0.0f;
 UNROLL
-        for (int j = 0; j < NV; ++j)
-            product += mass[j * STRIDE + dof_of(b)] * shared[j];
-        result[b] = fabsf(own[b]) <= LARGEST ? product : own[b];
+        for (int dof = 0; dof < NV; ++dof)
+            product += mass[dof * STRIDE + dof_of(block)] * shared[dof];
+        result[block] = fabsf(own[block]) <= LARGEST ? product : own[block];
     }
 };
 // J' force.
 auto pull_back = [&] {
 UNROLL
-    for (int b = 0; b < BLOCKS; ++b) {
-        pull[b] = 0.0f;
-        each_row(0, 1, ByFours {}, [&](int row, const float* J) { pull[b] += J[dof_of(b)] * force[row]; });
+    for (int block = 0; block < BLOCKS; ++block) {
+        qfrc_constraint[block] = 0.0f;
+        each_row(0, 1, ByFours {}, [&](int row, const float* jacobian) {
+            qfrc_constraint[block] += jacobian[dof_of(block)] * force[row];
+        });
     }
 };
 auto add_outer_product = [&](float scale, const float* vector) {
 UNROLL
-    for (int b = 0; b < BLOCKS; ++b) {
-        const float weight = scale * vector[dof_of(b)];
+    for (int block = 0; block < BLOCKS; ++block) {
+        const float weight = scale * vector[dof_of(block)];
         if (LANES == 1 && weight == 0.0f)
             continue;
 UNROLL
-        for (int j = b * LANES; j < NV; ++j)
-            h[b][j] += weight * vector[j];
+        for (int dof = block * LANES; dof < NV; ++dof)
+            hessian[block][dof] += weight * vector[dof];
     }
 };
-// H = M + J' D J. A cone that slides adds, to the springs of its tangents, dm q q' - spring s s', where s is
-// the direction of its slip and q = mu (normal - s).
-auto build_h = [&] {
+// H = M + J' d2s/dr2 J. In the curved zone of a cone s = 1/2 Dm g^2 with g = N - mu T, so that
+//
+//     d2s = Dm dg dg' + Dm g d2g = Dm dg dg' + spring (I - t t'),   spring = force[0] / T,
+//
+// over the tangents scaled by their frictions, t being the direction of their slip. Of these terms spring I is the
+// stiffness of the rows of the tangents. With slip = sum_i t[i] friction[i] J[i], the others are
+// Dm gap gap' - spring slip slip', where gap = mu (J[0] - slip).
+auto build_hessian = [&] {
 UNROLL
-    for (int b = 0; b < BLOCKS; ++b)
+    for (int block = 0; block < BLOCKS; ++block)
 UNROLL
-        for (int j = b * LANES; j < NV; ++j)
-            h[b][j] = mass[j * STRIDE + dof_of(b)];
-    each_row(0, 1, Singly {}, [&](int row, const float* J) {
-        if (v[row] > 0.0f)
-            add_outer_product(v[row], J);
+        for (int dof = block * LANES; dof < NV; ++dof)
+            hessian[block][dof] = mass[dof * STRIDE + dof_of(block)];
+    each_row(0, 1, Singly {}, [&](int row, const float* jacobian) {
+        if (stiffness[row] > 0.0f)
+            add_outer_product(stiffness[row], jacobian);
     });
     if (!ELLIPTIC)
         return;
-    float* const q = columns;
-    float* const s = columns + COLUMN;
+    float* const gap = columns;
+    float* const slip = columns + COLUMN;
 #pragma unroll 1
     for (int unit = 0; unit < num_units; ++unit) {
         const int head = units[unit];
-        const float dm = -v[head];
-        if (dm <= 0.0f)
+        const float Dm = -stiffness[head];
+        if (Dm <= 0.0f)
             continue;
         const float mu = bound[head], by_push = -1.0f / force[head];
 UNROLL
-        for (int b = 0; b < BLOCKS; ++b) {
-            float slip = 0.0f;
+        for (int block = 0; block < BLOCKS; ++block) {
+            float along = 0.0f;
 #pragma unroll 1
             for (int mate = head + 1; mate < head + (kinds[head] >> 8); ++mate)
-                slip += force[mate] * row_at(mate)[dof_of(b)];
-            slip *= by_push;
-            if (is_dof(b)) {
-                s[dof_of(b)] = slip;
-                q[dof_of(b)] = mu * (row_at(head)[dof_of(b)] - slip);
+                along += force[mate] * jacobian_of(mate)[dof_of(block)];
+            along *= by_push;
+            if (is_dof(block)) {
+                slip[dof_of(block)] = along;
+                gap[dof_of(block)] = mu * (jacobian_of(head)[dof_of(block)] - along);
             }
         }
         sync();
-        add_outer_product(dm, q);
-        add_outer_product(-cones[4 * head], s);
+        add_outer_product(Dm, gap);
+        add_outer_product(-cones[4 * head], slip);
         sync();
     }
 };
-// Cholesky (H = L D L') of the rows of H in place, and y of L y = slopes in the place of the slopes. The
+// Cholesky (H = L D L') of the rows of H in place, and y of L y = gradient in the place of the gradient. The
 // columns of a whole block are eliminated in passes of the same code, which has to stay in the instruction
 // cache: after a pass the registers of a row rotate, so that the next columns lie where the last ones did,
 // and in the end all are in place.
-auto eliminate = [&](auto block) {
-    const int own = block.INDEX;
+auto eliminate = [&](auto own_block) {
+    const int own = own_block.INDEX;
     const int begin = own * LANES, size = wp::min(LANES, NV - begin), end = begin + size;
     const int passes = size == 32 ? 4 : 1, width = size / passes;
     // Where a shared column has the entries beyond the block; before them are those of the block, in passes
@@ -86,48 +94,49 @@ auto eliminate = [&](auto block) {
     for (int pass = 0; pass < passes; ++pass) {
 UNROLL
         for (int slot = 0; slot < width; ++slot) {
-            const int at = pass * width + slot;
+            const int pivot = pass * width + slot;
             float* const column = columns + (slot & 1) * COLUMN;
             if (is_dof(own)) {
-                column[lane] = h[own][begin + slot];
+                column[lane] = hessian[own][begin + slot];
                 if (passes > 1)
-                    column[size + lane] = h[own][begin + slot];
+                    column[size + lane] = hessian[own][begin + slot];
             }
-            if (lane == at) {
-                column[beyond + NV] = bounded(slopes[own]);
+            if (lane == pivot) {
+                column[beyond + NV] = bounded(gradient[own]);
 UNROLL
-                for (int j = end; j < NV; ++j)
-                    column[beyond + j] = h[own][j];
+                for (int dof = end; dof < NV; ++dof)
+                    column[beyond + dof] = hessian[own][dof];
             }
             sync();
-            const float by_pivot = 1.0f / wp::max(column[at], TINY);
+            require(column[pivot] > 0.0f, HESSIAN_IS_POSITIVE);
+            const float by_pivot = 1.0f / wp::max(column[pivot], TINY);
 UNROLL
-            for (int b = own; b < BLOCKS; ++b) {
-                const bool below = b > own || lane > at;
-                const float entry = b == own ? h[own][begin + slot] : column[beyond + dof_of(b)];
+            for (int block = own; block < BLOCKS; ++block) {
+                const bool below = block > own || lane > pivot;
+                const float entry = block == own ? hessian[own][begin + slot] : column[beyond + dof_of(block)];
                 const float factor = below ? entry * by_pivot : 0.0f;
-                if (b == own && lane == at)
-                    inverse[own] = by_pivot;
-                slopes[b] -= factor * column[beyond + NV];
+                if (block == own && lane == pivot)
+                    inverse_pivot[own] = by_pivot;
+                gradient[block] -= factor * column[beyond + NV];
                 if (LANES == 1 && factor == 0.0f)
                     continue;
-                if (b == own)
+                if (block == own)
 UNROLL
-                    for (int k = slot + 1; k < size; ++k)
-                        h[own][begin + k] -= factor * column[pass * width + k];
+                    for (int next = slot + 1; next < size; ++next)
+                        hessian[own][begin + next] -= factor * column[pass * width + next];
 UNROLL
-                for (int j = wp::max(end, b * LANES); j < NV; ++j)
-                    h[b][j] -= factor * column[beyond + j];
+                for (int dof = wp::max(end, block * LANES); dof < NV; ++dof)
+                    hessian[block][dof] -= factor * column[beyond + dof];
             }
         }
         if (passes > 1) {
             float first[LANES];
 UNROLL
-            for (int k = 0; k < size; ++k)
-                first[k] = h[own][begin + k];
+            for (int slot = 0; slot < size; ++slot)
+                first[slot] = hessian[own][begin + slot];
 UNROLL
-            for (int k = 0; k < size; ++k)
-                h[own][begin + k] = first[(k + width) % size];
+            for (int slot = 0; slot < size; ++slot)
+                hessian[own][begin + slot] = first[(slot + width) % size];
         }
     }
 };
@@ -137,7 +146,7 @@ struct FirstBlock {
 struct SecondBlock {
     enum { INDEX = 1 };
 };
-struct Block {
+struct AnyBlock {
     int INDEX;
 };
 auto factorize = [&] {
@@ -147,25 +156,25 @@ auto factorize = [&] {
         eliminate(SecondBlock {});
 #else
     for (int block = 0; block < BLOCKS; ++block)
-        eliminate(Block {block});
+        eliminate(AnyBlock {block});
 #endif
 };
-// The search direction, the negated solution of D L' x = y, in the place of y and for all lanes to read.
+// The search direction, the negated solution of D L' search = y, in the place of y and for all lanes to read.
 auto back_substitute = [&] {
 UNROLL
-    for (int c = NV - 1; c > 0; --c) {
-        const int own = c / LANES;
-        const float found = of_lane(bounded(slopes[own] * inverse[own]), c % LANES);
+    for (int column = NV - 1; column > 0; --column) {
+        const int own = column / LANES;
+        const float found = of_lane(bounded(search[own] * inverse_pivot[own]), column % LANES);
 UNROLL
-        for (int b = 0; b <= own; ++b)
-            if (b * LANES + lane < c)
-                slopes[b] -= h[b][c] * found;
+        for (int block = 0; block <= own; ++block)
+            if (block * LANES + lane < column)
+                search[block] -= hessian[block][column] * found;
     }
 UNROLL
-    for (int b = 0; b < BLOCKS; ++b) {
-        slopes[b] *= -inverse[b];
-        if (is_dof(b))
-            shared[dof_of(b)] = bounded(slopes[b]);
+    for (int block = 0; block < BLOCKS; ++block) {
+        search[block] *= -inverse_pivot[block];
+        if (is_dof(block))
+            shared[dof_of(block)] = bounded(search[block]);
     }
     sync();
 };

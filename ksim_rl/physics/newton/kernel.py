@@ -1,10 +1,11 @@
-"""MuJoCo's Newton solver as one kernel: a warp solves a world from its start until that world has converged.
+"""This module makes the one kernel of MuJoCo's Newton solver, in which a warp solves one world until it has converged.
 
 MuJoCo Warp launches about ten kernels per iteration, over all worlds, until the last of them has converged; here no
 world waits for another, and what an iteration computes stays on the chip. The algorithm is the same: exact line search
 by bracketed Newton steps, and the same tests of convergence, so that the results agree up to rounding. It is written in
-C++ (*.cpp), since its matrix lies in registers, which needs loops that are unrolled, shuffles and shared
-memory; the CPU compiles the same source, for a warp of one lane.
+C++, since its matrix lies in registers, which needs loops that are unrolled, shuffles and shared memory; the CPU
+compiles the same source, for a warp of one lane. Read its parts in their order: layout.cpp, constraints.cpp, cost.cpp,
+hessian.cpp, line_search.cpp, newton.cpp.
 
 Source of the algorithm: https://mujoco.readthedocs.io/en/stable/computation/index.html; of its bounds, line
 search and tests of convergence: mujoco_warp/_src/solver.py.
@@ -13,22 +14,41 @@ search and tests of convergence: mujoco_warp/_src/solver.py.
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportInvalidTypeForm=false
 
+import enum
 import functools
 from importlib.resources import files
 
+import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
 CUDA_LANES = 32
 vec5 = wp.types.vector(length=5, dtype=float)
-_PARTS = ("memory.cpp", "rows.cpp", "hessian.cpp", "solver.cpp")
-_SOURCE = "".join(files("ksim_rl.physics.newton").joinpath(part).read_text() for part in _PARTS)
+_PARTS = ("layout", "constraints", "cost", "hessian", "line_search", "newton")
+_SOURCE = "".join(files("ksim_rl.physics.newton").joinpath(f"{part}.cpp").read_text() for part in _PARTS)
+
+
+class Invariant(enum.IntFlag):
+    """What holds in every solve of finite numbers; a debug build notes for each world what did not."""
+
+    ROWS_ARE_WHOLE = enum.auto()
+    """Rows have a positive D, a bound >= 0 on dry friction, and columns among the degrees of freedom."""
+    CONES_ARE_WHOLE = enum.auto()
+    """A cone has the row of its normal and 2, 3 or 5 of its tangents, with positive friction."""
+    FORCES_ARE_ADMISSIBLE = enum.auto()
+    """Contacts and limits push, dry friction keeps to its bound, and forces of contacts lie in their cones."""
+    HESSIAN_IS_POSITIVE = enum.auto()
+    """Each pivot of its factorization is positive."""
+    SEARCH_DESCENDS = enum.auto()
+    """The cost falls along the search direction, up to rounding."""
+    COST_FALLS = enum.auto()
+    """A line search never returns a point that costs more than its start."""
 
 
 @wp.struct
 class Problem:
-    """What the kernel reads of a model and its worlds, what it writes, room for the rows that find none on chip, and
-    the order in which the worlds are taken up.
+    """What the kernel reads of a model and its worlds, what it writes, room for the rows that find none on chip, the
+    order in which the worlds are taken up, and the broken `Invariant`s of a debug build.
     """
 
     iterations: int
@@ -62,6 +82,7 @@ class Problem:
     solver_niter: wp.array[int]
     overflow: wp.array[int]
     order: wp.array[int]
+    broken: wp.array[int]
 
 
 def row_stride(nv: int) -> int:
@@ -89,34 +110,6 @@ def _column(nv: int) -> int:
     return _padded(nv + 1 + (CUDA_LANES if nv >= CUDA_LANES else 0))
 
 
-def constants(
-    *,
-    nv: int,
-    njmax: int,
-    elliptic: bool,
-    ls_iterations: int,
-    lanes: int,
-    rows_on_chip: int,
-    worlds_per_block: int,
-) -> dict[str, int]:
-    """Return what the C++ source has to know when it is compiled, by its names there."""
-    return {
-        "NV": nv,
-        "NJ": njmax,
-        "PADDED_ROWS": _padded(njmax),
-        "STRIDE": row_stride(nv),
-        "COLUMN": _column(nv),
-        "ROWS_ON_CHIP": rows_on_chip,
-        "LANES": lanes,
-        "WORLDS_PER_BLOCK": worlds_per_block,
-        "FLOATS": floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=rows_on_chip),
-        "MOST_TRIALS": ls_iterations,
-        "ELLIPTIC": int(elliptic),
-        "OUT_OF_ITERATIONS": int(mjw.OverflowType.ITERATIONS),
-        "OUT_OF_LS_ITERATIONS": int(mjw.OverflowType.LS_ITERATIONS),
-    }
-
-
 @functools.cache
 def newton_kernel(
     *,
@@ -128,6 +121,7 @@ def newton_kernel(
     rows_on_chip: int,
     worlds_per_block: int,
     min_blocks: int,
+    checked: bool = False,
 ) -> wp.Kernel:
     """Return the kernel of a `Problem` with `nv` degrees of freedom; launch it over (worlds, lanes).
 
@@ -140,17 +134,35 @@ def newton_kernel(
         rows_on_chip: rows that the shared memory of a world holds; those beyond are in the scratch.
         worlds_per_block: worlds that share a block.
         min_blocks: blocks that a multiprocessor is to hold at once, which bounds the registers; 0 does not.
+        checked: a debug build, which writes each world's broken `Invariant`s.
     """
-    known = constants(
-        nv=nv,
-        njmax=njmax,
-        elliptic=elliptic,
-        ls_iterations=ls_iterations,
-        lanes=lanes,
-        rows_on_chip=rows_on_chip,
-        worlds_per_block=worlds_per_block,
+    states, rows = mujoco.mjtConstraintState, mujoco.mjtConstraint
+    constants = {
+        "NV": nv,
+        "NJ": njmax,
+        "PADDED_ROWS": _padded(njmax),
+        "STRIDE": row_stride(nv),
+        "COLUMN": _column(nv),
+        "ROWS_ON_CHIP": rows_on_chip,
+        "LANES": lanes,
+        "WORLDS_PER_BLOCK": worlds_per_block,
+        "FLOATS": floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=rows_on_chip),
+        "MOST_TRIALS": ls_iterations,
+        "ELLIPTIC": elliptic,
+        "ELLIPTIC_CONTACT": rows.mjCNSTR_CONTACT_ELLIPTIC,
+        "SATISFIED": states.mjCNSTRSTATE_SATISFIED,
+        "QUADRATIC": states.mjCNSTRSTATE_QUADRATIC,
+        "LINEAR_NEGATIVE": states.mjCNSTRSTATE_LINEARNEG,
+        "LINEAR_POSITIVE": states.mjCNSTRSTATE_LINEARPOS,
+        "CURVED": states.mjCNSTRSTATE_CONE,
+        "OUT_OF_ITERATIONS": mjw.OverflowType.ITERATIONS,
+        "OUT_OF_LS_ITERATIONS": mjw.OverflowType.LS_ITERATIONS,
+        "CHECKED": checked,
+        **{str(invariant.name): invariant for invariant in Invariant},
+    }
+    snippet = (
+        "".join(f"constexpr int {name} = {int(value)};\n" for name, value in constants.items()) + _SOURCE
     )
-    snippet = "".join(f"constexpr int {name} = {value};\n" for name, value in known.items()) + _SOURCE
 
     @wp.func_native(snippet)
     def solve_world(world: int, lane: int, problem: Problem) -> None: ...

@@ -1,4 +1,4 @@
-"""The constraint solver of the substeps, unless `unsuited` says why not: one kernel instead of some hundred."""
+"""This module chooses the constraint solver of a world, and launches the one that is a single kernel."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,6 +15,7 @@ from ksim_rl.physics.newton.kernel import (
     row_stride,
 )
 from ksim_rl.physics.newton.order import put_longest_first
+from ksim_rl.physics.sim_cfg import SimCfg
 
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
@@ -22,6 +23,9 @@ SHARED_FLOATS = 48 * 1024 // 4
 # worlds of G1 that leaves room for 64 rows and takes 0.39 ms; 32 rows, with 15 worlds at once, take 0.49 ms.
 FLOATS_PER_WORLD = 5600
 MOST_DOFS = 64
+# MuJoCo Warp's solver ends its loop by a conditional node, which costs more than the few iterations that it saves
+# (H200, 4096 worlds, at most 10 iterations: Go1 8.22 ms without and 8.46 with it, G1 9.88 and 10.17).
+MOST_UNCONDITIONAL_ITERATIONS = 10
 INTEGRATORS = (
     mujoco.mjtIntegrator.mjINT_EULER,
     mujoco.mjtIntegrator.mjINT_IMPLICIT,
@@ -68,6 +72,20 @@ def unsuited(mj_model: mujoco.MjModel, *, njmax: int) -> str | None:
     return next((reason for reason, holds in reasons.items() if holds), None)
 
 
+def one_kernel_unavailable(mj_model: mujoco.MjModel, sim: SimCfg, *, njmax: int) -> str | None:
+    """Return why the worlds of this model take MuJoCo Warp's own solver, or None where one kernel solves them."""
+    if not sim.one_kernel_solver:
+        return "sim.one_kernel_solver is False"
+    if sim.deterministic:
+        return "sim.deterministic is True"
+    return unsuited(mj_model, njmax=njmax)
+
+
+def takes_conditional_nodes(warp_model: mjw.Model, *, supported: bool) -> bool:
+    """Whether the loop of MuJoCo Warp's own solver is to end when all worlds have converged."""
+    return supported and int(warp_model.opt.iterations) > MOST_UNCONDITIONAL_ITERATIONS
+
+
 def placement(*, nv: int, njmax: int, elliptic: bool) -> Placement:
     """Return where the worlds go on CUDA: half of the rows, which few worlds exceed, on chip where that fits."""
     room = FLOATS_PER_WORLD - floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=0)
@@ -75,7 +93,11 @@ def placement(*, nv: int, njmax: int, elliptic: bool) -> Placement:
 
 
 def solver(
-    warp_model: mjw.Model, warp_data_E: mjw.Data, *, place: Placement | None = None
+    warp_model: mjw.Model,
+    warp_data_E: mjw.Data,
+    *,
+    place: Placement | None = None,
+    broken: wp.array | None = None,
 ) -> Callable[[], None]:
     """Return what launches the solver: accelerations and forces from the constraint rows, which must be sparse.
 
@@ -83,6 +105,7 @@ def solver(
         warp_model: a model that is not `unsuited`.
         warp_data_E: the worlds, with their arrays in their final place.
         place: how they lie on a CUDA device; None is what was measured to be best.
+        broken: int32 [E], makes a debug build, which adds to each world's number the `Invariant`s that do not hold.
     """
     m, d, efc = warp_model, warp_data_E, warp_data_E.efc
     elliptic = bool(m.opt.cone == mjw.ConeType.ELLIPTIC)
@@ -103,6 +126,7 @@ def solver(
         rows_on_chip=place.rows_on_chip,
         worlds_per_block=place.worlds_per_block,
         min_blocks=place.min_blocks,
+        checked=broken is not None,
     )
     far_floats = (d.njmax - place.rows_on_chip) * row_stride(m.nv)
     problem = Problem()
@@ -137,6 +161,7 @@ def solver(
     problem.solver_niter = d.solver_niter
     problem.overflow = d.overflow
     problem.order = wp.array(list(range(d.nworld)), dtype=int, device=d.qpos.device)
+    problem.broken = wp.empty(0, dtype=int, device=d.qpos.device) if broken is None else broken
     dim, block_dim = (d.nworld, lanes), place.worlds_per_block * lanes
 
     def launch() -> None:

@@ -1,0 +1,81 @@
+// Part 2: the constraint model. Reads M, and of each row J, D, aref, its kind and its bound.
+//
+// MuJoCo orders rows as equalities, dry friction, limits and contacts (computation chapter, "Constraint model").
+// The rows of a contact with an elliptic cone stand one after another: that of the normal, here the head of the
+// cone, and those of its tangents. `kinds` of a head has the number of its rows above the lowest 8 bits.
+
+constexpr int EQUALITY = 0, FRICTION = 1, ONE_SIDED = 2, CONE_HEAD = 3, CONE_TANGENT = 4;
+
+#pragma unroll 1
+for (int entry = lane; entry < NV * STRIDE; entry += LANES)
+    mass[entry] = 0.0f;
+each_row(0, 1, Singly {}, [&](int row, float* jacobian) {
+#pragma unroll 1
+    for (int dof = lane; dof < STRIDE; dof += LANES)
+        jacobian[dof] = 0.0f;
+});
+UNROLL
+for (int block = 0; block < BLOCKS; ++block) {
+    qacc[block] = row_of(problem.warmstart)[dof_of(block)];
+    qfrc_smooth[block] = row_of(problem.qfrc_smooth)[dof_of(block)];
+    if (is_dof(block))
+        shared[dof_of(block)] = bounded(qacc[block]);
+}
+sync();
+#pragma unroll 4
+for (int entry = lane; entry < problem.M_row.shape[0]; entry += LANES) {
+    const int row = problem.M_row.data[entry], column = problem.M_col.data[entry];
+    mass[row * STRIDE + column] = mass[column * STRIDE + row] = row_of(problem.M)[entry];
+}
+each_row(lane, LANES, Singly {}, [&](int row, float* jacobian) {
+    const int begin = row_of(problem.J_rowadr)[row];
+    const int end = begin + row_of(problem.J_rownnz)[row];
+    const float* const values = row_of(problem.J_values);
+    const int* const dofs = row_of(problem.J_colind);
+    float product = 0.0f;
+#pragma unroll 4
+    for (int entry = begin; entry < end; ++entry) {
+        require(dofs[entry] >= 0 && dofs[entry] < NV, ROWS_ARE_WHOLE);
+        jacobian[dofs[entry]] = values[entry];
+        product += values[entry] * shared[dofs[entry]];
+    }
+    residual[row] = product - row_of(problem.efc_aref)[row];
+    efc_D[row] = row_of(problem.efc_D)[row];
+    kinds[row] = row < equalities ? EQUALITY : row < equalities + frictions ? FRICTION : ONE_SIDED;
+    bound[row] = row_of(problem.efc_limit)[row];
+    require(efc_D[row] > 0.0f && (kinds[row] != FRICTION || bound[row] >= 0.0f), ROWS_ARE_WHOLE);
+    if (ELLIPTIC) {
+        const int* const types = row_of(problem.efc_type);
+        const int* const contacts = row_of(problem.efc_id);
+        auto is_of_cone = [&](int mate) {
+            return mate >= 0 && mate < rows && types[mate] == ELLIPTIC_CONTACT && contacts[mate] == contacts[row];
+        };
+        if (is_of_cone(row)) {
+            const float* const friction = (const float*)(problem.contact_friction.data + contacts[row]);
+            int before = 0, after = 1;
+            while (is_of_cone(row - before - 1))
+                ++before;
+            while (is_of_cone(row + after))
+                ++after;
+            kinds[row] = before > 0 ? CONE_TANGENT : CONE_HEAD + (after << 8);
+            bound[row] = before > 0 ? friction[before - 1] : friction[0] * impratio;
+            require(before + after >= 3 && before + after <= 6 && bound[row] > 0.0f, CONES_ARE_WHOLE);
+        }
+    }
+});
+sync();
+#pragma unroll 1
+for (int first = 0; first < rows; first += LANES) {
+    const int row = first + lane;
+    const bool counts = row >= equalities && row < rows && (!ELLIPTIC || kinds[row] != CONE_TANGENT);
+#if defined(__CUDA_ARCH__)
+    const unsigned all = __ballot_sync(0xffffffffu, counts);
+    if (counts)
+        units[num_units + __popc(all & ((1u << lane) - 1u))] = row;
+    num_units += __popc(all);
+#else
+    if (counts)
+        units[num_units++] = row;
+#endif
+}
+sync();

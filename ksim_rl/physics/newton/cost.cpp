@@ -1,0 +1,72 @@
+// Part 3: the cost s(r) of the constraint rows, their forces -ds/dr and stiffnesses d2s/dr2 (computation chapter,
+// "Constraint model" and "Friction cones"; engine_core_constraint.c, mj_constraintUpdate_impl).
+//
+//   equality        1/2 D r^2
+//   limit, contact  1/2 D r^2 for r < 0, else 0: one-sided
+//   dry friction    1/2 D r^2 for |r| < R f with R = 1 / D and the bound f, else f (|r| - R f / 2)
+//   elliptic cone   with mu = friction[0] / sqrt(impratio), N = mu r[0], T = |(friction[i] r[i])|:
+//                   0 for N >= mu T; sum of 1/2 D[i] r[i]^2 for mu N + T <= 0;
+//                   else 1/2 Dm (N - mu T)^2 with Dm = D[0] / (mu^2 (1 + mu^2))
+
+auto cone_zone = [](float normal, float tangent, float mu) {
+    return normal >= mu * tangent ? SATISFIED : mu * normal + tangent <= 0.0f ? QUADRATIC : CURVED;
+};
+auto cone_Dm = [&](int head) {
+    const float mu = bound[head];
+    return ratio(efc_D[head], mu * mu * (1.0f + mu * mu));
+};
+// Sets the force, the stiffness and the state of a row, and those of a whole cone at its head. In the curved zone,
+// where the Hessian is no diagonal, the head has -Dm in the place of its stiffness, and `cones` has the spring
+// force[0] / T that the tangents share (part 4).
+auto update_row = [&](int row) {
+    const int kind = kinds[row] & 255;
+    if (kind == CONE_TANGENT)
+        return;
+    int state = QUADRATIC;
+    float curvature = efc_D[row], push = -efc_D[row] * residual[row];
+    if (kind == ONE_SIDED && residual[row] >= 0.0f) {
+        state = SATISFIED;
+        push = 0.0f;
+    } else if (kind == FRICTION) {
+        const float most = bound[row], reach = ratio(most, efc_D[row]);
+        state = residual[row] <= -reach ? LINEAR_NEGATIVE : residual[row] >= reach ? LINEAR_POSITIVE : QUADRATIC;
+        push = state == LINEAR_NEGATIVE ? most : state == LINEAR_POSITIVE ? -most : push;
+    }
+    if (state != QUADRATIC)
+        curvature = 0.0f;
+    if (ELLIPTIC && kind == CONE_HEAD) {
+        const int end = row + (kinds[row] >> 8);
+        const float mu = bound[row], normal = residual[row] * mu;
+        float tangent2 = 0.0f;
+#pragma unroll 1
+        for (int mate = row + 1; mate < end; ++mate)
+            tangent2 += residual[mate] * bound[mate] * residual[mate] * bound[mate];
+        const float tangent = sqrtf(tangent2);
+        state = cone_zone(normal, tangent, mu);
+        float spring = 0.0f;
+        if (state == SATISFIED)
+            push = curvature = 0.0f;
+        if (state == CURVED) {
+            const float Dm = cone_Dm(row);
+            push = Dm * (mu * tangent - normal) * mu;
+            spring = push / tangent;
+            curvature = -Dm;
+        }
+        cones[4 * row] = spring;
+        float pull2 = 0.0f;
+#pragma unroll 1
+        for (int mate = row + 1; mate < end; ++mate) {
+            const float each = state == QUADRATIC ? efc_D[mate] : spring * bound[mate] * bound[mate];
+            force[mate] = -each * residual[mate];
+            stiffness[mate] = each;
+            states[mate] = state;
+            if (CHECKED)
+                pull2 += force[mate] * force[mate] / (bound[mate] * bound[mate]);
+        }
+        require(sqrtf(pull2) <= push * (1.0f + 1e-3f), FORCES_ARE_ADMISSIBLE);
+    }
+    require(kind == EQUALITY || (kind == FRICTION ? fabsf(push) <= bound[row] : push >= 0.0f), FORCES_ARE_ADMISSIBLE);
+    force[row] = push;
+    stiffness[row] = curvature;
+    states[row] = state;
+};

@@ -1,0 +1,120 @@
+// Part 1: where the numbers of a world lie, and how its lanes share the work.
+//
+// These parts are the body of the function solve_world(world, lane, problem), before which kernel.py puts the
+// constants of the kernel: sizes, MuJoCo's enums and its own invariants. They follow MuJoCo's chapter on computation
+// (https://mujoco.readthedocs.io/en/stable/computation/index.html): constraint model, cost, gradient and Hessian,
+// line search, Newton's method. There, r = J qacc - aref is the residual of the constraint rows, s(r) their cost,
+// and qacc minimizes
+//
+//     1/2 (qacc - qacc_smooth)' M (qacc - qacc_smooth) + s(J qacc - aref),
+//
+// whose gradient is M qacc - qfrc_smooth - J' force with force = -ds/dr, and whose Hessian is M + J' d2s/dr2 J.
+//
+// The lanes of a world share out its degrees of freedom: lane l has l, l + LANES, ..., each of them a `block`. Of
+// each it has the row of the Hessian from the block's first column on: on CUDA these rows lie in registers, and
+// with one lane, on the CPU, they are the upper triangle. J and M lie on the chip as whole rows, zeros included:
+// then sums over them have no index to look up, and the lanes read one address or adjacent ones.
+
+#if defined(__CUDA_ARCH__)
+#define UNROLL _Pragma("unroll")
+#else
+#define UNROLL
+#endif
+
+constexpr float TINY = 1e-15f, LARGEST = 3e38f;
+constexpr float NOISE = 8.0f * 1.1920929e-07f;  // rounding of a sum of some float32 terms
+constexpr int BLOCKS = (NV + LANES - 1) / LANES;
+
+#if defined(__CUDA_ARCH__)
+__shared__ __align__(16) float floats[WORLDS_PER_BLOCK * FLOATS];
+float* const memory = floats + (threadIdx.x / LANES) * FLOATS;
+#else
+static float memory[FLOATS];
+#endif
+float* const mass = memory;  // M
+float* const chip = mass + NV * STRIDE;  // J of the rows that find room
+float* const columns = chip + ROWS_ON_CHIP * STRIDE;  // two
+float* const shared = columns + 2 * COLUMN;  // a vector of the degrees of freedom, for all lanes to read
+float* const residual = shared + STRIDE;  // J qacc - aref
+float* const rate = residual + PADDED_ROWS;  // J search, during a line search
+float* const stiffness = rate;  // d2s/dr2, between two line searches; 0 where a row is slack
+float* const force = rate + PADDED_ROWS;  // -ds/dr
+float* const efc_D = force + PADDED_ROWS;
+float* const bound = efc_D + PADDED_ROWS;  // most dry friction, mu of a cone's head, friction of its tangents
+int* const kinds = (int*)(bound + PADDED_ROWS);
+int* const units = kinds + PADDED_ROWS;  // the rows whose cost is measured: all but equalities and tangents
+float* const cones = (float*)(units + PADDED_ROWS);
+int num_units = 0;
+
+// What a lane has of the vectors of the degrees of freedom, and of the Hessian. The gradient, then y of
+// L y = gradient, then the search direction stand in one place.
+float qacc[BLOCKS], M_qacc[BLOCKS], M_search[BLOCKS], qfrc_smooth[BLOCKS], qfrc_constraint[BLOCKS];
+float search[BLOCKS], inverse_pivot[BLOCKS];
+auto& gradient = search;
+float hessian[BLOCKS][NV];
+
+// The arrays of this world.
+auto row_of = [=](auto& array) { return array.data + (size_t)world * array.shape[1]; };
+auto of_world = [=](auto& array) { return array.data[world % array.shape[0]]; };
+const int rows = wp::min(problem.nefc.data[world], NJ);
+const int equalities = problem.ne.data[world], frictions = problem.nf.data[world];
+const float impratio = of_world(problem.impratio_invsqrt);
+const float tolerance = of_world(problem.tolerance);
+const float ls_tolerance = of_world(problem.ls_tolerance);
+int* const states = row_of(problem.efc_state);
+const int near_rows = wp::min(rows, ROWS_ON_CHIP);
+float* const far = row_of(problem.scratch) - near_rows * STRIDE;
+
+// A debug build notes which invariants do not hold; any other one compiles to nothing here.
+auto require = [&](bool holds, int invariant) {
+    if (!CHECKED || holds)
+        return;
+#if defined(__CUDA_ARCH__)
+    atomicOr(problem.broken.data + world, invariant);
+#else
+    problem.broken.data[world] |= invariant;
+#endif
+};
+auto sync = [] {
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+#endif
+};
+auto total = [](float value) {
+#if defined(__CUDA_ARCH__)
+UNROLL
+    for (int distance = LANES / 2; distance > 0; distance >>= 1)
+        value += __shfl_xor_sync(0xffffffffu, value, distance);
+#endif
+    return value;
+};
+auto of_lane = [](float value, int lane) {
+#if defined(__CUDA_ARCH__)
+    value = __shfl_sync(0xffffffffu, value, lane);
+#endif
+    return value;
+};
+// What overflows in one tree stays there: in the sums of another tree infinity times zero would be NaN.
+auto bounded = [](float value) { return wp::clamp(value, -LARGEST, LARGEST); };
+auto ratio = [](float dividend, float divisor) { return dividend / (divisor == 0.0f ? TINY : divisor); };
+// A lane beyond the last degree of freedom does what the lane of the last one does, and writes nothing.
+auto is_dof = [&](int block) { return block * LANES + lane < NV; };
+auto dof_of = [&](int block) { return wp::min(block * LANES + lane, NV - 1); };
+// Calls body(row, its J) for the rows first, first + stride, ...: those on chip, then those that found no
+// room there.
+struct Singly {
+    enum { AT_ONCE = 1 };
+};
+struct ByFours {
+    enum { AT_ONCE = 4 };
+};
+auto each_row = [&](int first, int stride, auto pace, auto body) {
+#pragma unroll decltype(pace)::AT_ONCE
+    for (int row = first; row < near_rows; row += stride)
+        body(row, chip + row * STRIDE);
+    if (ROWS_ON_CHIP < NJ)
+#pragma unroll 1
+        for (int row = near_rows + first; row < rows; row += stride)
+            body(row, far + row * STRIDE);
+};
+auto jacobian_of = [&](int row) { return (row < near_rows ? chip : far) + row * STRIDE; };

@@ -1,0 +1,237 @@
+// Part 5: the exact line search along qacc + alpha search (computation chapter, "Algorithms"; mujoco_warp's
+// solver.py, _linesearch_iterative_kernel). Along it a row's residual is r + alpha rate, and the cost a sum of
+// functions of alpha, of each of which its value relative to alpha = 0, its slope and its curvature are needed.
+
+struct Point {
+    float cost, slope, curvature;  // the cost is relative to that at the start of the direction
+};
+// 1/2 D (r + alpha rate)^2 where that residual is negative.
+auto one_sided = [](float at_start, float rate, float efc_D, float alpha) {
+    const float slope = efc_D * rate * at_start, curvature = efc_D * rate * rate;
+    const float start = at_start < 0.0f ? 0.5f * efc_D * at_start * at_start : 0.0f;
+    if (at_start + alpha * rate >= 0.0f && !(alpha == 0.0f && at_start < 0.0f))
+        return Point {-start, 0.0f, 0.0f};
+    const float change = alpha * (slope + 0.5f * alpha * curvature);
+    return Point {
+        at_start < 0.0f ? change : change + 0.5f * efc_D * at_start * at_start,
+        slope + alpha * curvature,
+        curvature
+    };
+};
+// Quadratic up to the bound on the force, and linear from there on.
+auto dry_friction = [&](float at_start, float rate, float efc_D, float most, float alpha) {
+    const float reach = ratio(most, efc_D);
+    auto cost = [&](float at) {
+        return fabsf(at) >= reach ? most * (fabsf(at) - 0.5f * reach) : 0.5f * efc_D * at * at;
+    };
+    const float there = at_start + alpha * rate;
+    const bool linear = there <= -reach || there >= reach;
+    const float slope = there <= -reach ? -most * rate : there >= reach ? most * rate : efc_D * rate * there;
+    return Point {cost(there) - cost(at_start), slope, linear ? 0.0f : efc_D * rate * rate};
+};
+// A cone along the direction: N + alpha N_rate, and a slip whose part along its own rate is `along` + alpha
+// `speed`, while the square of its part across is `aside2` throughout. So T^2 = (along + alpha speed)^2 + aside2.
+struct Cone {
+    float mu, N, N_rate, along, speed, aside2, Dm, cost, slope, half_curvature, T, state;
+};
+auto prepare_cone = [&](int head, int size) {
+    Cone cone {};
+    cone.mu = bound[head];
+    cone.N = residual[head] * cone.mu;
+    cone.N_rate = rate[head] * cone.mu;
+    cone.Dm = cone_Dm(head);
+    float slip_slip = 0.0f, slip_rate = 0.0f, rate_rate = 0.0f;
+#pragma unroll 1
+    for (int row = head; row < head + size; ++row) {
+        const float push = efc_D[row] * residual[row];
+        cone.cost += 0.5f * push * residual[row];
+        cone.slope += push * rate[row];
+        cone.half_curvature += 0.5f * efc_D[row] * rate[row] * rate[row];
+        if (row == head)
+            continue;
+        const float slip = residual[row] * bound[row], faster = rate[row] * bound[row];
+        slip_slip += slip * slip;
+        slip_rate += slip * faster;
+        rate_rate += faster * faster;
+    }
+    cone.speed = sqrtf(rate_rate);
+    cone.along = rate_rate > 0.0f ? slip_rate / cone.speed : 0.0f;
+    const float when = rate_rate > 0.0f ? slip_rate / rate_rate : 0.0f;
+    // The part of the slip across its rate, term by term: as a difference of squares it would cancel.
+#pragma unroll 1
+    for (int row = head + 1; row < head + size; ++row) {
+        const float across = (residual[row] - when * rate[row]) * bound[row];
+        cone.aside2 += across * across;
+    }
+    cone.T = sqrtf(cone.along * cone.along + cone.aside2);
+    cone.state = (float)cone_zone(cone.N, cone.T, cone.mu);
+    *(Cone*)(cones + 4 * head) = cone;
+};
+auto cone_point = [&](const Cone& cone, float alpha) {
+    const int state_0 = (int)cone.state;
+    const float gap_0 = cone.N - cone.mu * cone.T;
+    const float start = state_0 == CURVED ? 0.5f * cone.Dm * gap_0 * gap_0 : state_0 == QUADRATIC ? cone.cost : 0.0f;
+    const float N = cone.N + alpha * cone.N_rate, ahead = cone.along + alpha * cone.speed;
+    const float T2 = ahead * ahead + cone.aside2, T = sqrtf(T2);
+    const int state = cone_zone(N, T, cone.mu);
+    if (state == SATISFIED)
+        return Point {-start, 0.0f, 0.0f};
+    // The quadratic cost of all rows exceeds that of the cone at the same point by Dm / 2 (mu N + T)^2.
+    const float half = alpha * cone.half_curvature, quadratic = alpha * (half + cone.slope);
+    if (state == QUADRATIC) {
+        const float excess = cone.mu * cone.N + cone.T;
+        const float change = state_0 == CURVED ? quadratic + 0.5f * cone.Dm * excess * excess
+            : state_0 == SATISFIED ? 0.5f * cone.Dm * (1.0f + cone.mu * cone.mu) * (N * N + T2)
+            : quadratic;
+        return Point {change, 2.0f * half + cone.slope, 2.0f * cone.half_curvature};
+    }
+    // Of 1/2 Dm (N - mu T)^2; T' = ahead speed / T, and T'' = aside2 speed^2 / T^3.
+    const float gap = N - cone.mu * T;
+    const float gap_rate = cone.N_rate - cone.mu * ahead * cone.speed / T;
+    const float bend = (cone.aside2 / T2) * (cone.speed * cone.speed / T);
+    float change = 0.5f * cone.Dm * gap * gap;
+    if (state_0 == CURVED) {  // T - T0 from T^2 - T0^2, which is small by itself
+        const float lengthening = alpha * cone.speed * (cone.along + ahead) / (T + cone.T);
+        const float further = alpha * cone.N_rate - cone.mu * lengthening;
+        change = 0.5f * cone.Dm * further * (2.0f * gap_0 + further);
+    } else if (state_0 == QUADRATIC) {
+        const float excess = cone.mu * N + T;
+        change = quadratic - 0.5f * cone.Dm * excess * excess;
+    }
+    return Point {change, cone.Dm * gap * gap_rate, cone.Dm * (gap_rate * gap_rate - cone.mu * gap * bend)};
+};
+// What the rows cost at a point of the search direction, summed over the units first, first + stride, ...
+auto measure = [&](float alpha, int first, int stride) {
+    Point sum {0.0f, 0.0f, 0.0f};
+#pragma unroll 1
+    for (int unit = first; unit < num_units; unit += stride) {
+        const int row = units[unit], kind = kinds[row] & 255;
+        Point point;
+        if (ELLIPTIC && kind == CONE_HEAD)
+            point = cone_point(*(const Cone*)(cones + 4 * row), alpha);
+        else if (kind == FRICTION)
+            point = dry_friction(residual[row], rate[row], efc_D[row], bound[row], alpha);
+        else
+            point = one_sided(residual[row], rate[row], efc_D[row], alpha);
+        sum.cost += point.cost;
+        sum.slope += point.slope;
+        sum.curvature += point.curvature;
+    }
+    return sum;
+};
+auto in_bracket = [](const Point& end, const Point& point) {
+    return end.slope * point.slope > 0.0f && fabsf(point.slope) < fabsf(end.slope);
+};
+
+// The step to take, and by how much it lowers the cost. `slope` and `half_curvature` are those of the terms that
+// are quadratic everywhere: the Gauss cost of M and the equalities.
+struct Step {
+    float alpha, improvement;
+};
+// The search keeps two points whose slopes it drives to zero, and takes the better one. Its trials measure three
+// points each, on CUDA by eight lanes each; the first trial is of the start and of the Newton step.
+auto search_line = [&](float slope, float half_curvature, float enough, float noise) {
+    float alpha = rows == 0 ? 1.0f : 0.0f, improvement = 0.0f, accepted = wp::max(enough, noise);
+    float alphas[3] = {0.0f, 1.0f, 1.0f}, low_alpha = 0.0f, high_alpha = 0.0f;
+    Point low {0.0f, 0.0f, 0.0f}, high = low;
+#pragma unroll 1
+    for (int trial = -1; rows > 0; ++trial) {
+        if (trial == MOST_TRIALS) {
+            if (lane == 0)
+                problem.overflow.data[world] |= OUT_OF_LS_ITERATIONS;
+            break;
+        }
+        if (trial >= 0) {
+            alphas[0] = low_alpha - ratio(low.slope, low.curvature);
+            alphas[1] = high_alpha - ratio(high.slope, high.curvature);
+            alphas[2] = 0.5f * (low_alpha + high_alpha);
+        }
+        Point points[3];
+#if defined(__CUDA_ARCH__)
+        const int mine = lane >> 3;
+        const float at = mine == 0 ? alphas[0] : mine == 1 ? alphas[1] : alphas[2];
+        Point sum = measure(at, mine == 3 ? NJ : lane & 7, 8);
+UNROLL
+        for (int distance = 4; distance > 0; distance >>= 1) {
+            sum.cost += __shfl_xor_sync(0xffffffffu, sum.cost, distance);
+            sum.slope += __shfl_xor_sync(0xffffffffu, sum.slope, distance);
+            sum.curvature += __shfl_xor_sync(0xffffffffu, sum.curvature, distance);
+        }
+#endif
+UNROLL
+        for (int i = 0; i < 3; ++i) {
+#if defined(__CUDA_ARCH__)
+            points[i].cost = __shfl_sync(0xffffffffu, sum.cost, 8 * i);
+            points[i].slope = __shfl_sync(0xffffffffu, sum.slope, 8 * i);
+            points[i].curvature = __shfl_sync(0xffffffffu, sum.curvature, 8 * i);
+#else
+            points[i] = i == 2 && trial < 0 ? points[1] : measure(alphas[i], 0, 1);
+#endif
+        }
+UNROLL
+        for (int i = 0; i < 3; ++i) {
+            points[i].cost += alphas[i] * (alphas[i] * half_curvature + slope);
+            points[i].slope += 2.0f * alphas[i] * half_curvature + slope;
+            points[i].curvature += 2.0f * half_curvature;
+        }
+        if (trial < 0) {
+            low = high = points[0];
+            require(low.slope <= noise, SEARCH_DESCENDS);
+            if (fabsf(low.slope) < noise)
+                break;
+        }
+        int best = -1;
+#pragma unroll
+        for (int i = 0; i < 3; ++i)
+            if ((i > 0 || trial >= 0) && fabsf(points[i].slope) < accepted
+                && points[i].cost < (best < 0 ? 0.0f : improvement)) {
+                best = i;
+                improvement = points[i].cost;
+                alpha = alphas[i];
+            }
+        if (best >= 0) {
+            improvement = -improvement;
+            break;
+        }
+        if (trial < 0) {
+            if (points[1].slope < low.slope) {
+                low = points[1];
+                low_alpha = alphas[1];
+            } else {
+                high = points[1];
+                high_alpha = alphas[1];
+            }
+            continue;
+        }
+        bool moved = false;
+#pragma unroll
+        for (int i = 0; i < 3; ++i) {
+            const int which = i == 0 ? 0 : i == 1 ? 2 : 1;
+            if (in_bracket(low, points[which])) {
+                low = points[which];
+                low_alpha = alphas[which];
+                moved = true;
+            }
+        }
+#pragma unroll
+        for (int i = 0; i < 3; ++i) {
+            const int which = i == 0 ? 1 : i == 1 ? 2 : 0;
+            // A step from a point that fell short and lands beyond the minimum makes a bracket.
+            const bool crosses = i == 0 && high.slope < 0.0f && points[which].slope > 0.0f;
+            if (crosses || in_bracket(high, points[which])) {
+                high = points[which];
+                high_alpha = alphas[which];
+                moved = true;
+            }
+        }
+        if (low.cost < 0.0f || high.cost < 0.0f) {
+            alpha = low.cost < high.cost ? low_alpha : high_alpha;
+            improvement = -wp::min(low.cost, high.cost);
+        }
+        const bool low_is_flat = low.cost < 0.0f && low.slope < 0.0f && low.slope > -enough;
+        const bool high_is_flat = high.cost < 0.0f && high.slope > 0.0f && high.slope < enough;
+        if (!moved || low_is_flat || high_is_flat)
+            break;
+    }
+    return Step {alpha, improvement};
+};

@@ -1,0 +1,107 @@
+// Part 6: Newton's method, from the warm start to the accelerations and forces (computation chapter, "Algorithms").
+// It ends, as mujoco_warp's solver.py (_solve_done) does, once the scaled gradient, Newton decrement or improvement
+// is below the tolerance, or a line search finds nothing better.
+
+times_mass(M_qacc, qacc);
+float trace = 0.0f;
+UNROLL
+for (int block = 0; block < BLOCKS; ++block)
+    trace += is_dof(block) ? mass[dof_of(block) * (STRIDE + 1)] : 0.0f;
+const float scale = 1.0f / wp::max(TINY, total(trace));
+
+int iteration = 0;
+bool last = false;
+while (true) {
+#pragma unroll 1
+    for (int row = lane; row < rows; row += LANES)
+        update_row(row);
+    sync();
+    pull_back();
+    float gradient2 = 0.0f;
+UNROLL
+    for (int block = 0; block < BLOCKS; ++block) {
+        gradient[block] = M_qacc[block] - qfrc_smooth[block] - qfrc_constraint[block];
+        gradient2 += is_dof(block) ? gradient[block] * gradient[block] : 0.0f;
+    }
+    if (last || (iteration > 0 && scale * sqrtf(total(gradient2)) < tolerance))
+        break;
+    build_hessian();
+    factorize();
+    // gradient' H^-1 gradient, from y and D of L D L' = H.
+    float decrement = 0.0f;
+UNROLL
+    for (int block = 0; block < BLOCKS; ++block)
+        decrement += is_dof(block) ? gradient[block] * gradient[block] * inverse_pivot[block] : 0.0f;
+    if (iteration > 0 && 0.5f * scale * total(decrement) < tolerance)
+        break;
+    if (iteration == problem.iterations) {
+        if (lane == 0)
+            problem.overflow.data[world] |= OUT_OF_ITERATIONS;
+        break;
+    }
+    back_substitute();
+
+    // Along the search direction: M search, J search, and the terms of the cost that are quadratic everywhere.
+    times_mass(M_search, search);
+    float search2 = 0.0f, slope = 0.0f, half_curvature = 0.0f, noise = 0.0f;
+UNROLL
+    for (int block = 0; block < BLOCKS; ++block)
+        if (is_dof(block)) {
+            search2 += search[block] * search[block];
+            slope += search[block] * (M_qacc[block] - qfrc_smooth[block]);
+            half_curvature += 0.5f * search[block] * M_search[block];
+        }
+    each_row(lane, LANES, Singly {}, [&](int row, const float* jacobian) {
+        float product = 0.0f;
+UNROLL
+        for (int dof = 0; dof < NV; ++dof)
+            product += jacobian[dof] * shared[dof];
+        rate[row] = product;
+        noise += fabsf(force[row] * product);
+        if (row < equalities) {
+            slope += efc_D[row] * product * residual[row];
+            half_curvature += 0.5f * efc_D[row] * product * product;
+        }
+    });
+    sync();
+    search2 = total(search2);
+    slope = total(slope);
+    half_curvature = total(half_curvature);
+    noise = NOISE * (total(noise) + fabsf(slope));
+    if (ELLIPTIC) {
+#pragma unroll 1
+        for (int unit = lane; unit < num_units; unit += LANES)
+            if ((kinds[units[unit]] & 255) == CONE_HEAD)
+                prepare_cone(units[unit], kinds[units[unit]] >> 8);
+        sync();
+    }
+
+    const float enough = wp::max(tolerance * ls_tolerance * sqrtf(search2) / scale, 1e-6f);
+    const Step step = search_line(slope, half_curvature, enough, noise);
+    require(step.alpha >= 0.0f && step.improvement >= 0.0f, COST_FALLS);
+UNROLL
+    for (int block = 0; block < BLOCKS; ++block) {
+        qacc[block] += step.alpha * search[block];
+        M_qacc[block] += step.alpha * M_search[block];
+    }
+#pragma unroll 1
+    for (int row = lane; row < rows; row += LANES)
+        residual[row] += step.alpha * rate[row];
+    sync();
+    ++iteration;
+    last = rows == 0 || step.alpha == 0.0f || (step.improvement > 0.0f && scale * step.improvement < tolerance);
+}
+
+UNROLL
+for (int block = 0; block < BLOCKS; ++block)
+    if (is_dof(block)) {
+        row_of(problem.qacc)[dof_of(block)] = qacc[block];
+        row_of(problem.efc_Ma)[dof_of(block)] = M_qacc[block];
+        row_of(problem.qfrc_constraint)[dof_of(block)] = qfrc_constraint[block];
+    }
+#pragma unroll 1
+for (int row = lane; row < rows; row += LANES)
+    row_of(problem.efc_force)[row] = force[row];
+if (lane == 0)
+    problem.solver_niter.data[world] = iteration;
+#undef UNROLL
