@@ -248,7 +248,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         view.reset_count_E.add_(mask_E)
         self.curriculum_manager.reset(mask_E)
         self.world.reset(mask_E)
-        view.memories.clear(mask_E)
+        view.buffers.clear(mask_E)
         view.targets.reset(mask_E)
         self.joint_drives.reset(mask_E)
         view.episode_step_E.masked_fill_(mask_E, 0)
@@ -337,7 +337,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         }
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """Return all that the env needs to continue bit-exactly: physics, clocks, commands, counters, memories."""
+        """Return all that the env needs to continue bit-exactly: physics, clocks, commands, counters, buffers."""
         state = {f"world.{name}": value for name, value in self.world.state_dict().items()}
         state |= {f"env.{name}": tensor.clone() for name, tensor in self._buffers_to_save().items()}
         return state
@@ -388,8 +388,8 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             "curriculum_levels_C": self.curriculum_manager.levels_C,
             "episode_log_N": self._log.totals_N,
         }
-        shared = {f"shared/{name}": tensor for name, tensor in view.shared_values.tensors().items()}
-        return counters | shared | view.memories.buffers()
+        shared = {f"shared/{name}": tensor for name, tensor in view.shared_values.by_name().items()}
+        return counters | shared | view.buffers.by_name()
 
     def explain(self) -> str:
         """Return what the env is made of: a table per manager with index, name, shape, weight, mode and parameters."""

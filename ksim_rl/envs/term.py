@@ -2,7 +2,7 @@
 
 A term's parameters are its fields, so that the same object is written in Python and as a Hydra `_target_`. Terms hold
 no tensors: names are resolved through the view, which remembers them, and what a term must keep from step to step is
-a named buffer of the view (`view.memory`). A term must not branch on tensor values, read a tensor on the host or
+a named buffer of the view (`view.buffer`). A term must not branch on tensor values, read a tensor on the host or
 allocate sizes that depend on data: the step that calls it is captured into a CUDA graph.
 """
 
@@ -139,7 +139,7 @@ class CommandTerm(ABC):
 
     @abstractmethod
     def resample(self, view: EnvView, mask_E: Tensor) -> None:
-        """Draw new targets for the rows of `mask_E`, bool [E], into `view.memory` buffers."""
+        """Draw new targets for the rows of `mask_E`, bool [E], into `view.buffer` buffers."""
 
     @abstractmethod
     def __call__(self, view: EnvView) -> Tensor:
@@ -196,4 +196,4 @@ class CurriculumTerm(ABC):
 
     @abstractmethod
     def __call__(self, view: EnvView, mask_E: Tensor) -> Tensor:
-        """Adapt and return the level to report, float32 []; its state lives in `view.memory(..., keep=True)`."""
+        """Adapt and return the level to report, float32 []; its state lives in `view.buffer(..., keep=True)`."""

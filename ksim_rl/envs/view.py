@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import near
@@ -20,6 +21,7 @@ from ksim_rl.scene.names import (
     NameResolver,
     Patterns,
     as_index,
+    as_patterns,
     scalar_joint_ids,
 )
 from ksim_rl.scene.sensors import (
@@ -30,19 +32,20 @@ from ksim_rl.scene.sensors import (
     RayTracker,
     SensorTracker,
 )
-from ksim_rl.scene.state.bodies_and_sites import BodiesAndSites
+from ksim_rl.scene.state.bodies_and_sites import Bodies, Body, Site, Sites
+from ksim_rl.scene.state.buffers import Buffers, SharedValues
 from ksim_rl.scene.state.entity import Entity
 from ksim_rl.scene.state.first_robot import FirstRobot
+from ksim_rl.scene.state.ground import Ground
 from ksim_rl.scene.state.guarded_state import GuardedState
-from ksim_rl.scene.state.memory import Memory
+from ksim_rl.scene.state.joints import Joints, JointTables
 from ksim_rl.scene.state.quantity import quantity
-from ksim_rl.scene.state.shared_values import SharedValues
-from ksim_rl.scene.terrains.ground import Ground
 
 Tracker = TypeVar("Tracker", bound=SensorTracker)
+Points = TypeVar("Points", Bodies, Sites)
 
 
-class EnvView(FirstRobot, BodiesAndSites):
+class EnvView(FirstRobot):
     """A typed view of the world for terms.
 
     Position- and velocity-stage quantities (poses, velocities, most sensors) are those of the current state.
@@ -79,16 +82,16 @@ class EnvView(FirstRobot, BodiesAndSites):
         self._state = GuardedState(world)
         self.cache = self._state.new_cache()
         self.command_cache = self._state.new_cache()
-        self.memories = Memory(world.num_envs, world.device)
+        self.buffers = Buffers(world.num_envs, world.device)
         self.shared_values = SharedValues(world.device)
         self.level = self.shared_values.get("curriculum.level", 1.0)
-        self.terrain = Ground(world.num_envs, world.device)
         self.sensors: dict[str, SensorTracker] = {}
         self.commands: dict[str, Tensor] = {}
         self.reward_weights: dict[str, Tensor] = {}
         self.episode_rewards: dict[str, Tensor] = {}
         self.command_ranges: dict[str, dict[str, Tensor]] = {}
         self.terminations: dict[str, Tensor] = {}
+        self._named: dict[tuple[str, tuple[str, ...]], Any] = {}
         self._motions: dict[str, ReferenceMotion] = {}
         self.terminated_E = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.truncated_E = torch.zeros_like(self.terminated_E)
@@ -98,10 +101,7 @@ class EnvView(FirstRobot, BodiesAndSites):
         self.substep_sensors: Literal["last", "every"] = "last"
 
         joints = scalar_joint_ids(model)
-        self._qpos_index = as_index([model.jnt_qposadr[j] for j in joints], self.device)
-        self._qvel_index = as_index([model.jnt_dofadr[j] for j in joints], self.device)
         self.num_joints = len(joints)
-        self._site_body = torch.tensor(model.site_bodyid, device=self.device, dtype=torch.int64)
         self._sensor_slices = {
             model.sensor(i).name: slice(
                 int(model.sensor_adr[i]), int(model.sensor_adr[i] + model.sensor_dim[i])
@@ -113,26 +113,37 @@ class EnvView(FirstRobot, BodiesAndSites):
             model.key_qpos[0] if model.nkey else model.qpos0, device=self.device, dtype=torch.float32
         )
         self.default_qpos_L = default_qpos
+        default_joint_pos_L = default_qpos[as_index([model.jnt_qposadr[j] for j in joints], self.device)]
+        self.default_joint_pos_EL = self.buffers.get(
+            "default_joint_pos_EL", self.num_joints, keep=True, initial=default_joint_pos_L
+        )
+        self.targets = JointTargets(
+            world, self.resolver, self.buffers, default_joint_pos_EL=self.default_joint_pos_EL
+        )
+        self.actuator_params = ActuatorParams(self.buffers, self.resolver.names("joint"), self.device)
+        ctrl_range = torch.tensor(model.actuator_ctrlrange, device=self.device, dtype=torch.float32)
+        self.ctrl_limits_L2 = self._limited(ctrl_range.view(-1, 2), model.actuator_ctrllimited)
+        self.soft_joint_pos_limits_L2 = self._soft_limits(joints, soft_joint_pos_limit_factor)
+        self.time_out_offset_E = self.buffers.get("time_out_offset_E", dtype=torch.int64)
+        self.encoder_bias_EL = self.buffers.get("encoder_bias_EL", self.num_joints, keep=True)
+        self._joint_tables = JointTables(
+            self.default_joint_pos_EL, self.soft_joint_pos_limits_L2, self.encoder_bias_EL
+        )
+        self._every_joint = Joints(
+            self._state, range(self.num_joints), self.resolver.names("joint"), self._joint_tables
+        )
         several = len(entities) > 1
         self.entities = {
             name: Entity(
-                self._state, name=name, prefix=f"{name}/" if several else "", default_qpos_L=default_qpos
+                self._state,
+                name=name,
+                prefix=f"{name}/" if several else "",
+                default_qpos_L=default_qpos,
+                every_joint=self._every_joint,
             )
             for name in entities or ("robot",)
         }
         self.robot = next(iter(self.entities.values()))
-        self.default_joint_pos_EL = self.memories.get(
-            "default_joint_pos_EL", self.num_joints, keep=True, initial=default_qpos[self._qpos_index]
-        )
-        self.targets = JointTargets(
-            world, self.resolver, self.memories, default_joint_pos_EL=self.default_joint_pos_EL
-        )
-        self.actuator_params = ActuatorParams(self.memories, self.resolver.names("joint"), self.device)
-        ctrl_range = torch.tensor(model.actuator_ctrlrange, device=self.device, dtype=torch.float32)
-        self.ctrl_limits_L2 = self._limited(ctrl_range.view(-1, 2), model.actuator_ctrllimited)
-        self.soft_joint_pos_limits_L2 = self._soft_limits(joints, soft_joint_pos_limit_factor)
-        self.time_out_offset_E = self.memories.get("time_out_offset_E", dtype=torch.int64)
-        self.encoder_bias_EL = self.memories.get("encoder_bias_EL", self.num_joints, keep=True)
 
         zero = torch.zeros((), dtype=torch.int64, device=self.device)
         self.seed = zero.clone()
@@ -148,57 +159,83 @@ class EnvView(FirstRobot, BodiesAndSites):
 
     # -- names ---------------------------------------------------------------------------------------------------
 
-    def joints(self, patterns: Patterns) -> Index:
-        """Return the index of matching hinges and slides into the L dim of `joint_pos_EL` and its kin."""
-        return self.resolver.index("joint", patterns)
+    def joints(self, patterns: Patterns | None = None) -> Joints:
+        """Return the matching hinges and slides, all of them without `patterns`: `view.joints("hip.*").pos_EL`."""
+        if patterns is None:
+            return self._every_joint
+        key = ("joint", as_patterns(patterns))
+        if key not in self._named:
+            self._named[key] = self._every_joint.some(self.resolver.ids("joint", patterns))
+        return self._named[key]
 
-    def joint_names(self, patterns: Patterns = ".*") -> list[str]:
-        """Return the names of the matching hinges and slides, in the order that `joints` gives."""
-        names = self.resolver.names("joint")
-        return [names[i] for i in self.resolver.ids("joint", patterns)]
+    def bodies(self, patterns: Patterns) -> Bodies:
+        """Return the matching bodies: `view.bodies(".*_foot").pos_EN3`."""
+        return self._points(Bodies, "body", patterns)
 
-    def bodies(self, patterns: Patterns) -> Index:
-        """Return the index of matching bodies."""
-        return self.resolver.index("body", patterns)
+    def body(self, name: str) -> Body:
+        """Return the one body of this name (or pattern): `view.body("torso").lin_vel_EL`.
 
-    def geoms(self, patterns: Patterns) -> Index:
-        """Return the index of matching geoms."""
-        return self.resolver.index("geom", patterns)
+        Raises:
+            ValueError: if several match.
+        """
+        self.resolver.one("body", name)
+        return Body(self.bodies(name))
 
-    def sites(self, patterns: Patterns) -> Index:
-        """Return the index of matching sites."""
-        return self.resolver.index("site", patterns)
+    def sites(self, patterns: Patterns) -> Sites:
+        """Return the matching sites: `view.sites(".*_foot").height_EN`."""
+        return self._points(Sites, "site", patterns)
 
-    def actuators(self, patterns: Patterns) -> Index:
-        """Return the index of matching actuators."""
-        return self.resolver.index("actuator", patterns)
+    def site(self, name: str) -> Site:
+        """Return the one site of this name (or pattern): `view.site("finger").pos_EL`.
+
+        Raises:
+            ValueError: if several match.
+        """
+        self.resolver.one("site", name)
+        return Site(self.sites(name))
+
+    def _points(self, kind: type[Points], element: str, patterns: Patterns) -> Points:
+        key = (element, as_patterns(patterns))
+        if key not in self._named:
+            ids, names = self.resolver.ids(element, patterns), self.resolver.names(element)
+            self._named[key] = kind(self._state, ids, [names[i] for i in ids])
+        return self._named[key]
 
     # -- joints --------------------------------------------------------------------------------------------------
 
-    @quantity
-    def joint_pos_EL(self) -> Tensor:
-        """Positions of the hinges (rad) and slides (m), in the model's order, [E, L]."""
-        return self.world.qpos_EL[:, self._qpos_index]
+    @property
+    def joint_pos_EL(self) -> Float[Tensor, "E L"]:
+        """Positions of all hinges (rad) and slides (m), in the model's order, [E, L]."""
+        return self._every_joint.pos_EL
 
-    @quantity
-    def joint_vel_EL(self) -> Tensor:
-        """Velocities of the hinges (rad/s) and slides (m/s), in the model's order, [E, L]."""
-        return self.world.qvel_EL[:, self._qvel_index]
+    @property
+    def joint_vel_EL(self) -> Float[Tensor, "E L"]:
+        """Velocities of all hinges (rad/s) and slides (m/s), in the model's order, [E, L]."""
+        return self._every_joint.vel_EL
 
-    @quantity
-    def joint_acc_EL(self) -> Tensor:
-        """Accelerations of the hinges (rad/s^2) and slides (m/s^2); acceleration stage, [E, L]."""
-        return self.world.qacc_EL[:, self._qvel_index]
+    @property
+    def joint_acc_EL(self) -> Float[Tensor, "E L"]:
+        """Accelerations of all hinges (rad/s^2) and slides (m/s^2); acceleration stage, [E, L]."""
+        return self._every_joint.acc_EL
 
-    @quantity
-    def joint_effort_EL(self) -> Tensor:
-        """What actuators exert on the hinges (N m) and slides (N), behind the gears; acceleration stage, [E, L]."""
-        return self.world.qfrc_actuator_EL[:, self._qvel_index]
+    @property
+    def joint_effort_EL(self) -> Float[Tensor, "E L"]:
+        """What actuators exert on all hinges (N m) and slides (N), behind the gears; acceleration stage, [E, L]."""
+        return self._every_joint.effort_EL
 
-    @quantity
-    def joint_pos_rel_EL(self) -> Tensor:
+    @property
+    def joint_pos_rel_EL(self) -> Float[Tensor, "E L"]:
         """Joint positions minus the default pose, [E, L]."""
-        return self.joint_pos_EL - self.default_joint_pos_EL
+        return self._every_joint.pos_rel_EL
+
+    @property
+    def terrain(self) -> Ground:
+        """The ground under each env."""
+        return self._state.ground
+
+    @terrain.setter
+    def terrain(self, ground: Ground) -> None:
+        self._state.ground = ground
 
     # -- entities -------------------------------------------------------------------------------------------------
 
@@ -313,7 +350,7 @@ class EnvView(FirstRobot, BodiesAndSites):
 
     @contextmanager
     def scope(self, name: str, counter: Tensor | None = None, *, draws: str = "") -> Iterator[None]:
-        """Run a term under a name, which separates its memory and its random draws from all others'.
+        """Run a term under a name, which separates its buffers and its random draws from all others'.
 
         `counter` keys the draws (the step count unless given), and `draws` tells apart the moments of one term whose
         counters may coincide.
@@ -332,11 +369,11 @@ class EnvView(FirstRobot, BodiesAndSites):
         finally:
             self._scope = self._state.reader = ""
 
-    def memory(
+    def buffer(
         self, name: str, *shape: int, dtype: torch.dtype = torch.float32, keep: bool = False
     ) -> Tensor:
         """Return a buffer [E, *shape] that belongs to the calling term; rows that reset are zeroed unless `keep`."""
-        return self.memories.get(f"{self._scope}.{name}", *shape, dtype=dtype, keep=keep)
+        return self.buffers.get(f"{self._scope}.{name}", *shape, dtype=dtype, keep=keep)
 
     def shared(self, name: str, initial: float | Sequence[float] | Sequence[Sequence[float]]) -> Tensor:
         """Return a float32 tensor of the calling term that all envs share; it starts at `initial` and is saved."""
@@ -368,14 +405,6 @@ class EnvView(FirstRobot, BodiesAndSites):
     def write_qvel(self, mask_E: Tensor, qvel_EL: Tensor) -> None:
         """Set all generalized velocities, MuJoCo's layout, in the rows of `mask_E`."""
         self._state.write(self.world.qvel_EL, mask_E, qvel_EL)
-
-    def write_joint_pos(self, mask_E: Tensor, pos_EL: Tensor, joints: Index = slice(None)) -> None:
-        """Set positions (rad or m) of the joints of `joints` in the rows of `mask_E`."""
-        self._state.write_columns(self.world.qpos_EL, self._qpos_index, joints, mask_E, pos_EL)
-
-    def write_joint_vel(self, mask_E: Tensor, vel_EL: Tensor, joints: Index = slice(None)) -> None:
-        """Set velocities (rad/s or m/s) of the joints of `joints` in the rows of `mask_E`."""
-        self._state.write_columns(self.world.qvel_EL, self._qvel_index, joints, mask_E, vel_EL)
 
     def write_joint_pos_target(self, joints: Patterns, target_EK: Tensor) -> None:
         """Ask joints for positions, rad or m, in all rows; one column per joint, in the order of `joints`.
@@ -430,11 +459,12 @@ class EnvView(FirstRobot, BodiesAndSites):
         return value.clone() if value.untyped_storage().data_ptr() in self._persistent else value
 
     def freeze(self) -> None:
-        """End construction: no new memory, and all that lives on is known to `detached`."""
-        self.memories.freeze()
+        """End construction: no new buffers, and all that lives on is known to `detached`."""
+        self._state.is_frozen = True
+        self.buffers.freeze()
         self.shared_values.freeze()
-        lasting = [*self.memories.buffers().values(), *self.world.views().values()]
-        lasting += [*self.shared_values.tensors().values(), *self.world.per_world_fields().values()]
+        lasting = [*self.buffers.by_name().values(), *self.world.views().values()]
+        lasting += [*self.shared_values.by_name().values(), *self.world.per_world_fields().values()]
         lasting += [self.episode_step_E, self.default_joint_pos_EL, self.default_qpos_L]
         self._persistent = {tensor.untyped_storage().data_ptr() for tensor in lasting}
 

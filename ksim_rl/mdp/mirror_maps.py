@@ -199,12 +199,12 @@ def _action(env: ManagerBasedRlEnv) -> MirrorMap:
 
 
 def _joints(env: ManagerBasedRlEnv, joints: Patterns) -> MirrorMap:
-    return mirror_joints(env.view.world.mj_model, env.view.joint_names(joints))
+    return mirror_joints(env.view.world.mj_model, env.view.joints(joints).names)
 
 
 def _relative_joints(env: ManagerBasedRlEnv, joints: Patterns) -> MirrorMap:
     mirror = _joints(env, joints)
-    default_K = env.view.default_joint_pos_EL[0, env.view.joints(joints)]
+    default_K = env.view.joints(joints).default_pos_EL[0]
     _check_symmetric("the default pose", default_K, mirror(default_K))
     return mirror
 

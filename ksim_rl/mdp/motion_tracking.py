@@ -63,7 +63,7 @@ class MotionJoints(ObservationTerm):
         if self.ahead_s == 0.0:
             return torch.cat(motion_joints(view, self.file, self.joints), dim=-1)
         time_E = motion_time(view, self.file) + self.ahead_s
-        return torch.cat(view.motion(self.file).sample_joints(time_E, view.joints(self.joints)), dim=-1)
+        return torch.cat(view.motion(self.file).sample_joints(time_E, view.joints(self.joints).index), dim=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +101,7 @@ class TrackMotionJointPos(MotionReward):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
         pos_EL, _ = motion_joints(view, self.file, self.joints)
-        own_EL = view.joint_pos_EL[:, view.joints(self.joints)]
+        own_EL = view.joints(self.joints).pos_EL
         return self.rate((own_EL - pos_EL).square().sum(-1))
 
 
@@ -114,7 +114,7 @@ class TrackMotionJointVel(MotionReward):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
         _, vel_EL = motion_joints(view, self.file, self.joints)
-        own_EL = view.joint_vel_EL[:, view.joints(self.joints)]
+        own_EL = view.joints(self.joints).vel_EL
         return self.rate((own_EL - vel_EL).square().sum(-1))
 
 
@@ -138,7 +138,7 @@ class TrackMotionBodyQuat(MotionReward):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
         _, quat_EN4 = motion_bodies(view, self.file, self.bodies)
-        own_EN4 = view.body_quat_w(view.bodies(self.bodies))
+        own_EN4 = view.bodies(self.bodies).quat_EN4
         return self.rate(quaternion.angle_between(own_EN4, quat_EN4).square().sum(-1))
 
 
@@ -178,4 +178,4 @@ class MotionFinished(TerminationTerm):
 def _body_offset(view: EnvView, file: str, bodies: Patterns) -> Tensor:
     """Return the motion's positions of bodies minus their own, world frame, m, [E, N, 3]."""
     pos_EN3, _ = motion_bodies(view, file, bodies)
-    return pos_EN3 - view.body_pos_w(view.bodies(bodies))
+    return pos_EN3 - view.bodies(bodies).pos_EN3

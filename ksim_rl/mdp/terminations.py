@@ -135,7 +135,7 @@ class JointVelocityAbove(TerminationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return which envs end, bool [E]."""
-        return (view.joint_vel_EL[:, view.joints(self.joints)].abs() > self.limit).any(-1)
+        return (view.joints(self.joints).vel_EL.abs() > self.limit).any(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,8 +155,8 @@ class JointLimitViolated(TerminationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return which envs end, bool [E]."""
-        index = view.joints(self.joints)
-        pos_EN, limits_N2 = view.joint_pos_EL[:, index], view.soft_joint_pos_limits_L2[index]
+        joints = view.joints(self.joints)
+        pos_EN, limits_N2 = joints.pos_EL, joints.soft_limits_L2
         beyond_EN = torch.maximum(limits_N2[:, 0] - pos_EN, pos_EN - limits_N2[:, 1])
         return (beyond_EN > self.margin).any(-1)
 

@@ -44,7 +44,7 @@ class NameResolver:
 
     def ids(self, kind: str, patterns: Patterns) -> tuple[int, ...]:
         """Return the ids that the patterns match; a joint's id counts hinges and slides only."""
-        key = (kind, (patterns,) if isinstance(patterns, str) else tuple(patterns))
+        key = (kind, as_patterns(patterns))
         if key not in self._ids:
             self._ids[key] = match_names(kind, key[1], self._tables[kind])
         return self._ids[key]
@@ -63,10 +63,15 @@ class NameResolver:
 
     def index(self, kind: str, patterns: Patterns) -> Index:
         """Return the ids as a slice if they are contiguous, else as an int64 tensor on the device."""
-        key = (kind, (patterns,) if isinstance(patterns, str) else tuple(patterns))
+        key = (kind, as_patterns(patterns))
         if key not in self._indices:
             self._indices[key] = as_index(self.ids(kind, patterns), self._device)
         return self._indices[key]
+
+
+def as_patterns(patterns: Patterns) -> tuple[str, ...]:
+    """Return one pattern or several as a tuple."""
+    return (patterns,) if isinstance(patterns, str) else tuple(patterns)
 
 
 def scalar_joint_ids(mj_model: mujoco.MjModel) -> list[int]:

@@ -31,8 +31,8 @@ class CartpolePosition(ObservationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading, [E, 3]."""
-        cart_E = view.joint_pos_EL[:, view.joints("slider")]
-        angle_E = view.joint_pos_EL[:, view.joints("hinge")]
+        cart_E = view.joints("slider").pos_EL
+        angle_E = view.joints("hinge").pos_EL
         return torch.cat((cart_E, torch.cos(angle_E), torch.sin(angle_E)), dim=-1)
 
 
@@ -45,9 +45,9 @@ class CartpoleReward(RewardTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reward, [E]."""
-        cart_E = view.joint_pos_EL[:, view.joints("slider")][:, 0]
-        angle_E = view.joint_pos_EL[:, view.joints("hinge")][:, 0]
-        velocity_E = view.joint_vel_EL[:, view.joints("hinge")][:, 0]
+        cart_E = view.joints("slider").pos_EL[:, 0]
+        angle_E = view.joints("hinge").pos_EL[:, 0]
+        velocity_E = view.joints("hinge").vel_EL[:, 0]
         upright_E = (torch.cos(angle_E) + 1.0) / 2.0
         centered_E = (1.0 + tolerance(cart_E, low=0.0, high=0.0, margin=2.0)) / 2.0
         small_control_E = (4.0 + (1.0 - view.action_EL[:, 0].clamp(-1.0, 1.0).square())) / 5.0
@@ -67,7 +67,7 @@ class PoleFallen(TerminationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return which poles have fallen, bool [E]."""
-        angle_E = view.joint_pos_EL[:, view.joints("hinge")][:, 0]
+        angle_E = view.joints("hinge").pos_EL[:, 0]
         return torch.cos(angle_E) < math.cos(self.limit)
 
 
@@ -98,8 +98,9 @@ class ResetCartpole(EventTerm):
         spread_EL = view.uniform(2, -1.0, 1.0)
         cart_E1 = spread_EL[:, :1] * self.cart_range
         angle_E1 = self.angle + spread_EL[:, 1:] * self.angle_range
-        view.write_joint_pos(mask_E, torch.cat((cart_E1, angle_E1), dim=-1), view.joints(("slider", "hinge")))
-        view.write_joint_vel(mask_E, view.normal(2) * self.velocity_std, view.joints(("slider", "hinge")))
+        joints = view.joints(("slider", "hinge"))
+        joints.write_pos(mask_E, torch.cat((cart_E1, angle_E1), dim=-1))
+        joints.write_vel(mask_E, view.normal(2) * self.velocity_std)
 
 
 def _cfg(reset: ResetCartpole, **terminations: TerminationTerm) -> ManagerBasedRlEnvCfg:

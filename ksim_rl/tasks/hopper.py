@@ -38,7 +38,7 @@ class HopperReward(RewardTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reward, [E]."""
-        foot_E = view.body_pos_w(view.bodies("foot"))[:, 0, 2]
+        foot_E = view.bodies("foot").pos_EN3[:, 0, 2]
         tall_E = tolerance(planar.height(view) - foot_E, low=STAND_HEIGHT, margin=STAND_HEIGHT / 2)
         stand_E = tall_E * planar.upright(view)
         if self.speed == 0.0:

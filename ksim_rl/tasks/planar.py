@@ -26,7 +26,7 @@ SIM = SimCfg(iterations=10, ls_iterations=20)
 
 def height(view: EnvView) -> Tensor:
     """Return the torso's height, m, [E]; position stage."""
-    return view.joint_pos_EL[:, view.joints("root_z")][:, 0]
+    return view.joints("root_z").pos_EL[:, 0]
 
 
 def upright(view: EnvView) -> Tensor:

@@ -64,7 +64,7 @@ class ReacherTarget(CommandTerm):
         visualizer.sphere((x, y, PLANE_HEIGHT), radius=TARGET_RADIUS, rgba=(0.2, 0.6, 0.2, 0.8))
 
     def _held(self, view: EnvView) -> Tensor:
-        return view.memory("target_E2", 2)
+        return view.buffer("target_E2", 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +106,7 @@ class ReacherReward(RewardTerm):
 
 def _offset(view: EnvView, command: str) -> Tensor:
     """Return target minus finger, x and y in the world frame, m, [E, 2]."""
-    return view.command(command) - view.site_pos_w(view.sites("finger"))[:, 0, :2]
+    return view.command(command) - view.sites("finger").pos_EN3[:, 0, :2]
 
 
 def reacher() -> ManagerBasedRlEnvCfg:

@@ -58,7 +58,7 @@ class PoseDistance(MetricTerm):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the value, [E]."""
         joints = view.joints(self.joints)
-        poses_FL, own_EL = view.motion(self.file).joint_pos_FL[:, joints], view.joint_pos_EL[:, joints]
+        poses_FL, own_EL = view.motion(self.file).joint_pos_FL[:, joints.index], joints.pos_EL
         return torch.cdist(own_EL, poses_FL).amin(-1) / own_EL.shape[-1] ** 0.5
 
 

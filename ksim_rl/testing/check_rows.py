@@ -21,7 +21,7 @@ def check_determinism(env: EnvBase, num_steps: int) -> None:
             differing(one, other, rows),
             f"differ at step {step} between two runs of the same seed and actions. Draw all random numbers from "
             "`view.uniform` and `view.normal` (or another generator that `set_seed` seeds), and keep what changes from "
-            "step to step in `view.memory`, so that `state_dict` has it",
+            "step to step in `view.buffer`, so that `state_dict` has it",
         )
 
 

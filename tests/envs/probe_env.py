@@ -54,8 +54,8 @@ class Launch(EventTerm):
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
         speed_E1 = self.speed * torch.arange(1, view.num_envs + 1, device=view.device).float()[:, None]
-        view.write_joint_pos(mask_E, torch.zeros_like(speed_E1))
-        view.write_joint_vel(mask_E, speed_E1)
+        view.joints().write_pos(mask_E, torch.zeros_like(speed_E1))
+        view.joints().write_vel(mask_E, speed_E1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +63,8 @@ class RandomLaunch(EventTerm):
     """Start at x = 0 with a random velocity in [0, 1) m/s."""
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        view.write_joint_pos(mask_E, torch.zeros(view.num_envs, 1, device=view.device))
-        view.write_joint_vel(mask_E, view.uniform(1))
+        view.joints().write_pos(mask_E, torch.zeros(view.num_envs, 1, device=view.device))
+        view.joints().write_vel(mask_E, view.uniform(1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +72,7 @@ class Kick(EventTerm):
     """Add 1 m/s."""
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        view.write_joint_vel(mask_E, view.joint_vel_EL + 1.0)
+        view.joints().write_vel(mask_E, view.joint_vel_EL + 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,11 +106,11 @@ class Target(CommandTerm):
     """A uniform number in [0, 1)."""
 
     def resample(self, view: EnvView, mask_E: Tensor) -> None:
-        target_E1 = view.memory("target_E1", 1)
+        target_E1 = view.buffer("target_E1", 1)
         target_E1.copy_(torch.where(mask_E[:, None], view.uniform(1), target_E1))
 
     def __call__(self, view: EnvView) -> Tensor:
-        return view.memory("target_E1", 1).clone()
+        return view.buffer("target_E1", 1).clone()
 
 
 def puck_cfg(

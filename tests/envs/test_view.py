@@ -71,19 +71,19 @@ def test_root_velocity_in_world_and_body_frame(bench, part):
 def test_body_poses_and_velocities(bench):
     view, model = bench.view, bench.world.mj_model
     bodies = list(range(1, model.nbody))
-    index = view.bodies(".*(trunk|left|right|turret|wrist|rod)")
-    close(view.body_pos_w(index), engine(bench, lambda m, d: d.xpos[bodies]))
-    close(view.body_lin_vel_w(index), engine(bench, lambda m, d: velocity(m, d, bodies, part="linear")))
-    close(view.body_ang_vel_w(index), engine(bench, lambda m, d: velocity(m, d, bodies, part="angular")))
+    named = view.bodies(".*(trunk|left|right|turret|wrist|rod)")
+    close(named.pos_EN3, engine(bench, lambda m, d: d.xpos[bodies]))
+    close(named.lin_vel_EN3, engine(bench, lambda m, d: velocity(m, d, bodies, part="linear")))
+    close(named.ang_vel_EN3, engine(bench, lambda m, d: velocity(m, d, bodies, part="angular")))
 
 
 def test_names_give_their_own_order_and_scattered_bodies(free):
-    index = free.view.bodies(("right", "trunk"))
+    named = free.view.bodies(("right", "trunk"))
     model = free.world.mj_model
     ids = [model.body("right").id, model.body("trunk").id]
-    close(free.view.body_pos_w(index), engine(free, lambda m, d: d.xpos[ids]))
+    close(named.pos_EN3, engine(free, lambda m, d: d.xpos[ids]))
     close(
-        free.view.body_lin_vel_w(index),
+        named.lin_vel_EN3,
         engine(free, lambda m, d: velocity(m, d, ids, part="linear")),
     )
 
@@ -91,10 +91,10 @@ def test_names_give_their_own_order_and_scattered_bodies(free):
 def test_site_positions_and_velocities(bench):
     view = bench.view
     sites = list(range(bench.world.mj_model.nsite))
-    index = view.sites(".*")
-    close(view.site_pos_w(index), engine(bench, lambda m, d: d.site_xpos[sites]))
+    named = view.sites(".*")
+    close(named.pos_EN3, engine(bench, lambda m, d: d.site_xpos[sites]))
     expected = engine(bench, lambda m, d: velocity(m, d, sites, part="linear", kind=SITE))
-    close(view.site_lin_vel_w(index), expected)
+    close(named.lin_vel_EN3, expected)
 
 
 def test_sensors_by_name(bench):

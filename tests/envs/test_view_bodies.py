@@ -4,7 +4,6 @@ import mujoco
 import pytest
 import torch
 
-from ksim_rl.scene.state.quantity import indexed_quantity
 from tests.envs.random_states import FIXED_BASE, E, close, engine, random_bench, scalar_joints
 from tests.mdp.bench import FREE_BODY, Plateau
 
@@ -15,14 +14,12 @@ def bench(request):
 
 
 def test_orientations_as_quaternions_and_axes(bench):
-    index = slice(1, bench.world.mj_model.nbody)
+    bodies = bench.view.bodies(bench.view.resolver.names("body")[1:])
     quat = engine(bench, lambda m, d: d.xquat[1:])
-    ours = bench.view.body_quat_w(index)
+    ours = bodies.quat_EN4
     close(ours * torch.sign((ours * quat).sum(-1, keepdim=True)), quat)
     # The axes are the columns of the rotation matrix.
-    close(
-        bench.view.body_axes_w(index), engine(bench, lambda m, d: d.xmat[1:].reshape(-1, 3, 3).swapaxes(1, 2))
-    )
+    close(bodies.axes_EN33, engine(bench, lambda m, d: d.xmat[1:].reshape(-1, 3, 3).swapaxes(1, 2)))
 
 
 def test_centres_of_mass_of_subtrees(bench):
@@ -30,11 +27,11 @@ def test_centres_of_mass_of_subtrees(bench):
         mujoco.mj_subtreeVel(m, d)
         return d.subtree_linvel[1:]
 
-    index = slice(1, bench.world.mj_model.nbody)
-    close(bench.view.subtree_com_pos_w(index), engine(bench, lambda m, d: d.subtree_com[1:]))
-    close(bench.view.subtree_com_vel_w(index), engine(bench, speeds))
+    bodies = bench.view.bodies(bench.view.resolver.names("body")[1:])
+    close(bodies.subtree_com_pos_EN3, engine(bench, lambda m, d: d.subtree_com[1:]))
+    close(bodies.subtree_com_vel_EN3, engine(bench, speeds))
     bench.place(qvel=bench.world.qvel_EL.flip(0).clone())
-    close(bench.view.subtree_com_vel_w(index), engine(bench, speeds))
+    close(bodies.subtree_com_vel_EN3, engine(bench, speeds))
 
 
 def test_subtree_velocities_must_be_asked_for_during_construction():
@@ -42,7 +39,7 @@ def test_subtree_velocities_must_be_asked_for_during_construction():
     assert not bench.world.has_subtree_velocities
     bench.view.freeze()
     with pytest.raises(RuntimeError, match="let a term of the config read them"):
-        bench.view.subtree_com_vel_w(slice(1, 2))
+        assert bench.view.bodies(".*").subtree_com_vel_EN3
 
 
 def test_efforts_at_the_joints(bench):
@@ -61,42 +58,63 @@ def test_efforts_at_the_joints(bench):
 
 
 def test_heights_of_sites_are_above_the_ground(bench):
-    index = bench.view.sites(".*")
-    close(bench.view.site_height(index), engine(bench, lambda m, d: d.site_xpos[:, 2]))
+    sites = bench.view.sites(".*")
+    close(sites.height_EN, engine(bench, lambda m, d: d.site_xpos[:, 2]))
     flat, bench.view.terrain = bench.view.terrain, Plateau(E, bench.view.device)
     bench.refresh()
-    close(bench.view.site_height(index), engine(bench, lambda m, d: d.site_xpos[:, 2] - 0.25))
+    close(sites.height_EN, engine(bench, lambda m, d: d.site_xpos[:, 2] - 0.25))
     bench.view.terrain = flat
     bench.refresh()
 
 
-class Counting:
-    """Counts how often its quantity is computed."""
-
-    def __init__(self):
-        self.cache, self.computed = {}, 0
-
-    @indexed_quantity
-    def doubled(self, index):
-        """Twice the numbers from 0 to 9."""
-        self.computed += 1
-        return 2 * torch.arange(10)[index]
+def test_named_elements_are_resolved_once_and_computed_once_per_state(bench):
+    view = bench.view
+    assert view.bodies(".*") is view.bodies((".*",)) and view.joints(".*") is not view.joints()
+    bodies = view.bodies(".*")
+    assert bodies.pos_EN3 is bodies.pos_EN3 and view.sites(".*").pos_EN3 is view.sites(".*").pos_EN3
+    before = bodies.pos_EN3
+    bench.refresh()
+    assert bodies.pos_EN3 is not before
 
 
-def test_an_indexed_quantity_is_computed_once_per_index_and_state():
-    owner, index = Counting(), torch.tensor([3, 1])
-    assert owner.doubled(index).tolist() == [6, 2]
-    assert owner.doubled(index) is owner.doubled(index)
-    assert owner.doubled(slice(2, 4)).tolist() == [4, 6]
-    assert owner.doubled(slice(2, 4)) is owner.doubled(slice(2, 4))
-    assert owner.doubled(slice(2, 8, 3)).tolist() == [4, 10]
-    assert owner.computed == 3
-    owner.cache.clear()
-    assert owner.doubled(index).tolist() == [6, 2] and owner.computed == 4
-    assert owner.doubled.__doc__ == "Twice the numbers from 0 to 9."
+def test_one_body_and_one_site_by_name(bench):
+    view = bench.view
+    names = view.resolver.names("body")[1:]
+    for number, name in enumerate(names):
+        body, bodies = view.body(name), view.bodies(names)
+        assert (body.name, body.id) == (name, number + 1)
+        for one, all_of_them in (
+            (body.pos_EL, bodies.pos_EN3),
+            (body.quat_EL, bodies.quat_EN4),
+            (body.axes_E33, bodies.axes_EN33),
+            (body.lin_vel_EL, bodies.lin_vel_EN3),
+            (body.ang_vel_EL, bodies.ang_vel_EN3),
+        ):
+            assert torch.equal(one, all_of_them[:, number])
+    sites = view.sites(".*")
+    site = view.site(sites.names[0])
+    assert torch.equal(site.pos_EL, sites.pos_EN3[:, 0]) and torch.equal(site.height_E, sites.height_EN[:, 0])
+    assert torch.equal(site.lin_vel_EL, sites.lin_vel_EN3[:, 0])
+    with pytest.raises(ValueError, match="name one of them"):
+        view.body(".*")
+    with pytest.raises(ValueError, match="no body matches"):
+        view.body("tors")
 
 
-def test_passing_index_tensors_are_never_mistaken_for_each_other():
-    # Tensors that die give their ids to new ones.
-    owner = Counting()
-    assert [owner.doubled(torch.tensor([i])).item() for i in range(10)] == list(range(0, 20, 2))
+def test_joints_by_name_are_columns_of_all_joints(bench):
+    view = bench.view
+    view.joints().default_pos_EL.add_(0.1)
+    view.encoder_bias_EL.add_(torch.arange(2.0))
+    chosen, columns = view.joints(view.joints().names[::-1]), [1, 0]
+    assert len(chosen) == 2 and chosen.names == view.joints().names[::-1] and chosen.ids == (1, 0)
+    for one, every in (
+        (chosen.pos_EL, view.joint_pos_EL),
+        (chosen.vel_EL, view.joint_vel_EL),
+        (chosen.acc_EL, view.joint_acc_EL),
+        (chosen.effort_EL, view.joint_effort_EL),
+        (chosen.pos_rel_EL, view.joint_pos_rel_EL),
+        (chosen.default_pos_EL, view.default_joint_pos_EL),
+        (chosen.encoder_bias_EL, view.encoder_bias_EL),
+    ):
+        assert torch.equal(one, every[:, columns])
+    assert torch.equal(chosen.soft_limits_L2, view.soft_joint_pos_limits_L2[columns])

@@ -47,13 +47,13 @@ def test_written_root_velocity_reads_back_in_the_world_frame():
 def test_joint_writes_by_slice_and_by_index(source, order):
     bench = random_bench(source)
     view, mask_E = bench.view, odd_rows()
-    names = view.joint_names()
+    names = view.joints().names
     chosen = {"all": names, "slice": names[1:], "reversed": names[::-1]}[order]
-    index = slice(None) if order == "all" else view.joints(tuple(chosen))
+    joints = view.joints() if order == "all" else view.joints(tuple(chosen))
     pos, vel = torch.rand(E, len(chosen)), torch.rand(E, len(chosen))
     before = {"qpos": bench.world.qpos_EL.clone(), "qvel": bench.world.qvel_EL.clone()}
-    view.write_joint_pos(mask_E, pos, index)
-    view.write_joint_vel(mask_E, vel, index)
+    joints.write_pos(mask_E, pos)
+    joints.write_vel(mask_E, vel)
     model = bench.world.mj_model
     for state, after, value, address in (
         ("qpos", bench.world.qpos_EL, pos, model.jnt_qposadr),
@@ -69,28 +69,28 @@ def test_joint_writes_by_slice_and_by_index(source, order):
 def test_a_derived_quantity_after_a_write_is_refused_until_the_refresh():
     bench = random_bench(FREE_BODY)
     view, everybody_E = bench.view, bench.everybody_E
-    view.write_joint_pos(everybody_E, torch.zeros(E, 2))
+    view.joints().write_pos(everybody_E, torch.zeros(E, 2))
     assert view.joint_pos_EL.eq(0).all(), "the joint state itself is never stale"
     assert torch.equal(view.root_lin_vel_w_EL, bench.world.qvel_EL[:, :3])
     with view.scope("events/push"):
         for read in (
-            lambda: view.body_pos_w(slice(1, 2)),
-            lambda: view.body_lin_vel_w(slice(1, 2)),
-            lambda: view.body_ang_vel_w(slice(1, 2)),
-            lambda: view.site_pos_w(slice(0, 1)),
-            lambda: view.site_lin_vel_w(slice(0, 1)),
+            lambda: view.bodies("trunk").pos_EN3,
+            lambda: view.bodies("trunk").lin_vel_EN3,
+            lambda: view.bodies("trunk").ang_vel_EN3,
+            lambda: view.sites(".*").pos_EN3,
+            lambda: view.sites(".*").lin_vel_EN3,
             lambda: view.sensor("gyro"),
         ):
             with pytest.raises(RuntimeError, match="events/push reads a derived quantity"):
                 read()
     bench.refresh()
-    assert view.body_pos_w(slice(1, 2)).shape == (E, 1, 3)
+    assert view.bodies("trunk").pos_EN3.shape == (E, 1, 3)
 
 
 def test_a_fixed_roots_pose_after_a_write_is_refused():
     bench = random_bench(FIXED_BASE)
     assert bench.view.heading_E.shape == (E,)
-    bench.view.write_joint_vel(bench.everybody_E, torch.zeros(E, 2))
+    bench.view.joints().write_vel(bench.everybody_E, torch.zeros(E, 2))
     for name in ("root_pos_EL", "heading_E", "root_lin_vel_w_EL", "root_ang_vel_b_EL"):
         with pytest.raises(RuntimeError, match="derived"):
             getattr(bench.view, name)

@@ -46,7 +46,7 @@ def test_all_motor_models_captured_move_the_joints_as_in_the_c_engine(tmp_path):
     action_EL = torch.zeros(E, 6, device="cuda")
     mask_E1 = torch.zeros(E, 1, dtype=torch.bool, device="cuda")
     start_EL, reached_EL = torch.zeros(E, 12, device="cuda"), torch.zeros(E, 12, device="cuda")
-    lags = [buffer for name, buffer in env.view.memories.buffers().items() if name.endswith("lag_E")]
+    lags = [buffer for name, buffer in env.view.buffers.by_name().items() if name.endswith("lag_E")]
 
     def joint_states() -> torch.Tensor:
         return torch.cat((env.world.qpos_EL, env.world.qvel_EL), dim=-1)

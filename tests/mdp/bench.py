@@ -9,7 +9,7 @@ from torch import Tensor
 from ksim_rl.envs.view import EnvView
 from ksim_rl.physics import World, load_model, prepare_spec
 from ksim_rl.scene.sensors import Sensor
-from ksim_rl.scene.terrains.ground import Ground
+from ksim_rl.scene.state.ground import Ground
 
 FREE_BODY = """
 <mujoco>

@@ -121,7 +121,7 @@ def test_the_filter_answers_a_step_like_a_first_order_system(arms):
     for steps, answer in enumerate(answers, start=1):
         expected = 1.0 + 3.0 * (1.0 - math.exp(-2.0 * math.pi * 4.0 * steps * arms.view.step_dt))
         torch.testing.assert_close(answer, torch.full((3,), expected))
-    arms.view.memories.clear(torch.tensor([False, True, False]))
+    arms.view.buffers.clear(torch.tensor([False, True, False]))
     after = run(arms, term, 0.0 * one, scope="actions/filtered")[:, WRIST]
     assert after[1] == 1.0, "no action at all"
     assert after[0] == after[2] > 1.0

@@ -16,10 +16,10 @@ class Faster(CommandTerm):
     """(3, 4, -k) with a `k` that grows by 1 at each resampling: a commanded speed of 5 + k."""
 
     def resample(self, view: EnvView, mask_E: Tensor) -> None:
-        view.memory("k_E").add_(mask_E.float())
+        view.buffer("k_E").add_(mask_E.float())
 
     def __call__(self, view: EnvView) -> Tensor:
-        k_E = view.memory("k_E")
+        k_E = view.buffer("k_E")
         return torch.stack((torch.full_like(k_E, 3.0), torch.full_like(k_E, 4.0), -k_E), dim=-1)
 
 

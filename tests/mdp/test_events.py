@@ -5,7 +5,7 @@ import torch
 
 from ksim_rl import mdp
 from ksim_rl.scene.quaternion import yaw
-from ksim_rl.scene.terrains.ground import Ground
+from ksim_rl.scene.state.ground import Ground
 from tests.mdp.bench import FREE_BODY
 
 E = 500

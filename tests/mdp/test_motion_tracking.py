@@ -94,8 +94,8 @@ def test_what_the_policy_sees(bench):
     whole = read(bench, mdp.MotionPhase(file=CLIP))
     torch.testing.assert_close(whole[2], torch.tensor([math.sin(math.pi / 4), math.cos(math.pi / 4)]))
     joints = read(bench, mdp.MotionJoints(file=CLIP, joints=LEGS))
-    index = bench.view.joints(LEGS)
-    own = torch.cat((bench.view.joint_pos_EL[:, index], bench.view.joint_vel_EL[:, index]), dim=-1)
+    legs = bench.view.joints(LEGS)
+    own = torch.cat((legs.pos_EL, legs.vel_EL), dim=-1)
     torch.testing.assert_close(joints, own)
     # The walk repeats after a second.
     ahead = read(bench, mdp.MotionJoints(file=CLIP, joints=LEGS, ahead_s=1.0))

@@ -89,7 +89,7 @@ def test_lagging_gravity_answers_a_step_exponentially(free_body):
         close(free_body.read(term), blend / blend.norm())
     # A reset fills the filter of its row with the new orientation, and leaves the others alone.
     reset = torch.tensor([True, False, False])
-    free_body.view.memories.clear(reset)
+    free_body.view.buffers.clear(reset)
     free_body.view.episode_step_E.masked_fill_(reset, 0)
     reading = free_body.read(term)
     close(reading[0], [0.0, -1.0, 0.0])

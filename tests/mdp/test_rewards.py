@@ -26,7 +26,7 @@ def test_action_acceleration_is_the_second_difference(free_body):
     # Of 1, 1, 1, ...: 1, -1, 0, ...; of k^2 it is 2 throughout, once k = -1 is out of sight.
     values = act(free_body, mdp.ActionAccelerationL2(), lambda k: 1.0, 4)
     assert values.tolist() == [[2.0, 2.0, 0.0, 0.0]] * 3
-    free_body.view.memories.clear(torch.tensor([True, True, True]))
+    free_body.view.buffers.clear(torch.tensor([True, True, True]))
     values = act(free_body, mdp.ActionAccelerationL2(), lambda k: k**2, 6)
     assert values[:, 2:].tolist() == [[2 * 2.0**2] * 4] * 3
 
@@ -34,7 +34,7 @@ def test_action_acceleration_is_the_second_difference(free_body):
 def test_action_jerk_is_the_third_difference(free_body):
     values = act(free_body, mdp.ActionJerkL2(), lambda k: 1.0, 5)
     assert values.tolist() == [[2.0, 8.0, 2.0, 0.0, 0.0]] * 3
-    free_body.view.memories.clear(torch.tensor([True, False, True]))
+    free_body.view.buffers.clear(torch.tensor([True, False, True]))
     values = act(free_body, mdp.ActionJerkL2(), lambda k: k**3, 7)
     assert values[:, 3:].tolist() == [[2 * 6.0**2] * 4] * 3
     # The row that was not cleared remembers the rate 0 and the acceleration 0 of before; the others start with them.

@@ -99,7 +99,7 @@ def test_swing_height_forgets_at_a_reset(boxes):
     boxes.place(qpos=boxes_at(0.4, 0.4))
     boxes.step()
     boxes.read(term, "rewards/swing")
-    boxes.view.memories.clear(torch.tensor([True, False]))
+    boxes.view.buffers.clear(torch.tensor([True, False]))
     boxes.place(qpos=boxes_at(0.0, 0.0), qvel=torch.zeros(12))
     boxes.step()
     value = boxes.read(term, "rewards/swing")

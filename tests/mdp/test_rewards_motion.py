@@ -54,7 +54,7 @@ def test_links_of_a_falling_body_accelerate_with_gravity(free_body):
     check(free_body, term, 2 * 9.81**2, atol=0.05)
     # After a reset there is no earlier velocity to compare with.
     reset = torch.tensor([False, True, False])
-    free_body.view.memories.clear(reset)
+    free_body.view.buffers.clear(reset)
     free_body.view.episode_step_E.masked_fill_(reset, 0)
     free_body.step()
     check(free_body, term, [2 * 9.81**2, 0.0, 2 * 9.81**2], atol=0.05)

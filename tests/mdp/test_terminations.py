@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ksim_rl import mdp
-from ksim_rl.scene.terrains.ground import Ground
+from ksim_rl.scene.state.ground import Ground
 from tests.mdp.bench import Plateau
 
 

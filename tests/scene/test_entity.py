@@ -56,7 +56,7 @@ def scene():
 @pytest.mark.parametrize("name", ROOTS)
 def test_root_pose_and_velocity_of_each_entity(scene, name):
     entity, body = scene.view.entity(name), scene.model.body(ROOTS[name]).id
-    assert (entity.root_body, entity.root_body_name) == (body, ROOTS[name])
+    assert (entity.root.id, entity.root.name) == (body, ROOTS[name])
     assert entity.free_root == (name != "turret")
 
     close(entity.root_pos_EL, engine(scene, lambda m, d: d.xpos[body]))
@@ -95,16 +95,16 @@ def test_the_views_root_is_the_first_robots(scene):
 
 def test_joints_of_an_entity_are_its_columns_of_the_views(scene):
     view = scene.view
-    names = view.joint_names()
-    assert [name for name in names if name.startswith("right/")] == names[view.entity("right").joints]
+    names = view.joints().names
+    assert [name for name in names if name.startswith("right/")] == list(view.entity("right").joints.names)
     for name, own in (
         ("left", ["left/left_hip", "left/right_hip"]),
         ("turret", ["turret/pan", "turret/reach"]),
     ):
         entity = view.entity(name)
-        assert torch.equal(entity.joint_pos_EL, view.joint_pos_EL[:, view.joints(own)])
-        assert torch.equal(entity.joint_vel_EL, view.joint_vel_EL[:, entity.joints])
-    assert view.entity("cube").joint_pos_EL.shape == (E, 0)
+        assert torch.equal(entity.joints.pos_EL, view.joints(own).pos_EL)
+        assert torch.equal(entity.joints.vel_EL, view.joint_vel_EL[:, entity.joints.index])
+    assert view.entity("cube").joints.pos_EL.shape == (E, 0)
 
 
 def test_entities_start_where_their_models_and_placements_say(scene):
@@ -115,7 +115,7 @@ def test_entities_start_where_their_models_and_placements_say(scene):
     close(view.entity("right").default_root_quat_L, torch.tensor(QUARTER_TURN))
     close(view.entity("turret").default_root_pos_L, torch.tensor([0.3, -0.2, 0.7]))
     close(view.entity("cube").default_root_pos_L, torch.tensor([0.0, 0.0, 0.1]))
-    assert view.default_joint_pos_EL[0, view.entity("right").joints].tolist() == [0.25, 0.5]
+    assert view.entity("right").joints.default_pos_EL[0].tolist() == [0.25, 0.5]
 
 
 def test_writes_change_one_entity_in_the_masked_rows(scene):
@@ -132,7 +132,7 @@ def test_writes_change_one_entity_in_the_masked_rows(scene):
         assert torch.equal(after[unchanged], before[unchanged])
     world.refresh()
     scene.view.refreshed()
-    body = cube.root_body
+    body = cube.root.id
     close(engine(scene, lambda m, d: d.xpos[body])[mask_E], pos[mask_E])
     close(engine(scene, lambda m, d: velocity(m, d, [body], part="linear")[0])[mask_E], lin[mask_E])
     close(engine(scene, lambda m, d: velocity(m, d, [body], part="angular")[0])[mask_E], ang[mask_E])

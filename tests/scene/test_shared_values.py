@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ksim_rl.envs import EnvView
 from ksim_rl.envs.term import CurriculumTerm
-from ksim_rl.scene.state.shared_values import SharedValues
+from ksim_rl.scene.state.buffers import SharedValues
 from tests.envs.probe_env import puck_env
 
 

@@ -20,7 +20,9 @@ def hold(bench, **targets):
     """Let the servos hold the default pose, but for some joints, for half a second."""
     bench.world.ctrl_EL.copy_(bench.view.default_joint_pos_EL)
     for name, value in targets.items():
-        bench.world.ctrl_EL[:, bench.view.actuators(f"arm/{name}")] = torch.tensor(value)[:, None]
+        bench.world.ctrl_EL[:, bench.view.resolver.index("actuator", f"arm/{name}")] = torch.tensor(value)[
+            :, None
+        ]
     bench.world.step(100)
     bench.world.refresh()
     bench.view.refreshed()
@@ -29,11 +31,11 @@ def hold(bench, **targets):
 def test_the_arm_carries_its_weight_and_points_down(bench):
     bench.set({})
     hold(bench)
-    tip = bench.view.site_pos_w(bench.view.sites("arm/tip"))[:, 0]
+    tip = bench.view.sites("arm/tip").pos_EN3[:, 0]
     torch.testing.assert_close(
-        bench.view.entity("arm").joint_pos_EL, bench.view.default_joint_pos_EL, atol=1e-3, rtol=0.0
+        bench.view.entity("arm").joints.pos_EL, bench.view.default_joint_pos_EL, atol=1e-3, rtol=0.0
     )
-    wrist = bench.view.body_pos_w(bench.view.bodies("arm/hand"))[:, 0]
+    wrist = bench.view.bodies("arm/hand").pos_EN3[:, 0]
     assert (wrist[:, 2] - tip[:, 2] > 0.99 * 0.142).all(), "the pusher hangs from the wrist, 0.142 m long"
 
 
@@ -46,7 +48,7 @@ def test_the_cube_rests_on_the_table_until_it_is_pushed(bench):
     # The pusher beside the cube, low; then each env turns the arm another way: toward it, not at all, away.
     low = {"arm/yaw": 0.4, "arm/shoulder": 0.8, "arm/elbow": 1.55, "arm/wrist": 0.75}
     bench.set(low)
-    tip = bench.view.site_pos_w(bench.view.sites("arm/tip"))[0, 0]
+    tip = bench.view.sites("arm/tip").pos_EN3[0, 0]
     assert 0.01 < tip[2] < 0.06 and abs(tip[:2].norm() - 0.35) < 0.06, tip
     still = {"shoulder": [0.8] * E, "elbow": [1.55] * E, "wrist": [0.75] * E}
     hold(bench, yaw=[-0.3, 0.4, 0.8], **still)
@@ -64,7 +66,7 @@ def test_terms_name_their_entity(bench):
     ).tolist() == pytest.approx([math.exp(-1.0)] * E, abs=1e-4)
     offset = bench.reward(mdp.OffsetToCommand(command="target", body="cube/box"))
     torch.testing.assert_close(offset, torch.tensor([[0.0, 0.1, 0.0]]).expand(E, 3), atol=1e-6, rtol=0.0)
-    tip = view.site_pos_w(view.sites("arm/tip"))[:, 0]
+    tip = view.sites("arm/tip").pos_EN3[:, 0]
     to_cube = bench.reward(mdp.OffsetToBody(site="arm/tip", body="cube/box"))
     torch.testing.assert_close(to_cube, torch.tensor([[0.35, 0.0, 0.03]]) - tip)
     near = bench.reward(mdp.NearBody(site="arm/tip", body="cube/box", std=0.2))

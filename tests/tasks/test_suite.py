@@ -83,7 +83,7 @@ def test_hopper():
     bench = Placed("hopper_hop", 3)
     # In the air, upright, the leg as in the stand; then with the knee fully bent, which brings the foot up.
     bench.set({"root_y": 0.0, "root_z": 1.2, "knee": [0.8, 0.8, 2.4]}, {"root_x": [1.5, 0.75, 1.5]})
-    foot = bench.view.body_pos_w(bench.view.bodies("foot"))[:, 0, 2]
+    foot = bench.view.bodies("foot").pos_EN3[:, 0, 2]
     assert foot[2] > foot[0] + 0.1
     rated = bench.reward(hopper.HopperReward(speed=1.5))
     close(rated[:2], [1.0, 0.5])
@@ -103,10 +103,10 @@ def test_they_stand_on_the_ground_at_the_start(name):
     bench = Placed(name, 2)
     bench.set({})
     lowest = bench.world.geom_xpos_EL[..., 2].min().item()
-    before = bench.view.joint_pos_EL[:, bench.view.joints("root_z")].clone()
+    before = bench.view.joints("root_z").pos_EL.clone()
     bench.world.step(20)
     bench.world.refresh()
     bench.view.refreshed()
-    after = bench.view.joint_pos_EL[:, bench.view.joints("root_z")]
+    after = bench.view.joints("root_z").pos_EL
     assert lowest > -0.001
     assert (before - after).abs().max() < 0.06, "they neither fall through the ground nor are thrown up"

@@ -101,10 +101,10 @@ def test_get_up_rates_the_stance_highest(fallen):
     pos_E3[1:3, 2] *= 0.4
     view.write_root_pose(everyone_E, pos_E3, quat_E4)
     view.write_root_velocity(everyone_E, torch.zeros(8, 3), torch.zeros(8, 3))
-    view.write_joint_pos(everyone_E, view.default_joint_pos_EL)
+    view.joints().write_pos(everyone_E, view.default_joint_pos_EL)
     speed_EL = torch.zeros_like(view.default_joint_pos_EL)
     speed_EL[3] = 3.0
-    view.write_joint_vel(everyone_E, speed_EL)
+    view.joints().write_vel(everyone_E, speed_EL)
     view.world.refresh()
     view.refreshed()
     with view.scope("test"):

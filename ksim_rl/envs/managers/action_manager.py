@@ -24,8 +24,8 @@ class ActionManager:
             self._parts.append((f"actions/{name}", term, slice(start, stop)))
             start = stop
         self.size = start
-        view.action_EL = view.memories.get("actions.action_EL", start)
-        view.last_action_EL = view.memories.get("actions.last_action_EL", start)
+        view.action_EL = view.buffers.get("actions.action_EL", start)
+        view.last_action_EL = view.buffers.get("actions.last_action_EL", start)
         self._run_terms(view.action_EL)
 
     def apply(self, action_EL: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ class CommandManager:
         self._view = view
         self._terms = dict(terms)
         self._clocks = {
-            name: view.memories.get(f"commands/{name}.time_left_E")
+            name: view.buffers.get(f"commands/{name}.time_left_E")
             for name, term in terms.items()
             if term.resampling_time_range_s is not None
         }
@@ -39,7 +39,7 @@ class CommandManager:
                     f"command term {name!r} returns shape {tuple(value_EK.shape)}: expected [{view.num_envs}, K], one "
                     "row per env"
                 )
-            view.commands[name] = view.memories.get(f"commands/{name}.value_EK", value_EK.shape[1])
+            view.commands[name] = view.buffers.get(f"commands/{name}.value_EK", value_EK.shape[1])
 
     @property
     def values(self) -> dict[str, Tensor]:

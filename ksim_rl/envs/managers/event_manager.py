@@ -28,7 +28,7 @@ class EventManager:
         }
         self._clocks: dict[str, Tensor] = {}
         for scope, _ in self._by_mode.get("interval", []):
-            self._clocks[scope] = view.memories.get(f"{scope}.time_left_E")
+            self._clocks[scope] = view.buffers.get(f"{scope}.time_left_E")
         nobody_E = torch.zeros(view.num_envs, dtype=torch.bool, device=view.device)
         for name, term in terms.items():
             with view.scope(f"events/{name}"):

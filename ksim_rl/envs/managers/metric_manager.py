@@ -19,7 +19,7 @@ class MetricManager:
         self._view = view
         self._terms = dict(terms)
         self.names = tuple(terms)
-        self._held_EM = view.memories.get("metrics.held_EM", len(self.names))
+        self._held_EM = view.buffers.get("metrics.held_EM", len(self.names))
         reductions = [term.reduce for term in terms.values()]
         self._occurring = frozenset(reductions)
         self._is_mean_M, self._is_last_M, self._is_max_M = (

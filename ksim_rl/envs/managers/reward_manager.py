@@ -30,7 +30,7 @@ class RewardManager:
         self._terms = {name: term for name, term in terms.items() if term.weight != 0.0 or name in adapted}
         self.names = tuple(self._terms)
         self.weights_R = torch.tensor([term.weight for term in self._terms.values()], device=view.device)
-        self.episode_sums_ER = view.memories.get("rewards.episode_sums_ER", len(self.names))
+        self.episode_sums_ER = view.buffers.get("rewards.episode_sums_ER", len(self.names))
         self.step(torch.ones(view.num_envs, dtype=torch.bool, device=view.device))
 
     def step(self, finite_E: Tensor) -> Tensor:

@@ -50,7 +50,7 @@ class JointAction(ActionTerm):
 
     def size(self, view: EnvView) -> int:
         """Return the number of joints."""
-        return len(view.joint_names(self.joints))
+        return len(view.joints(self.joints))
 
     def shaped(self, view: EnvView, action_EK: Tensor) -> Tensor:
         """Return the action after clip, tanh, scale, filter and offset, [E, K]."""
@@ -67,7 +67,7 @@ class JointAction(ActionTerm):
         action_EK = action_EK * per_joint(view, field, scale, self.joints)
         if self.cutoff_hz is None:
             return action_EK
-        filtered_EK = view.memory(f"filtered_{field}_EK", action_EK.shape[1])
+        filtered_EK = view.buffer(f"filtered_{field}_EK", action_EK.shape[1])
         return filtered_EK.lerp_(action_EK, 1.0 - math.exp(-2.0 * math.pi * self.cutoff_hz * view.step_dt))
 
 
@@ -86,4 +86,4 @@ def per_joint(view: EnvView, field: str, value: PerJoint, joints: Patterns) -> f
     """Return the number for all joints, or those by joint as a tensor [K]."""
     if not isinstance(value, Mapping):
         return float(value)
-    return constant(values_by_name(field, value, view.joint_names(joints)), view.device)
+    return constant(values_by_name(field, value, view.joints(joints).names), view.device)

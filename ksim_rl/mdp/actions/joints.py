@@ -22,7 +22,7 @@ class JointPositionAction(JointAction):
         """Write the position targets."""
         target_EK = self.shaped(view, action_EK)
         if self.use_default_offset:
-            target_EK = target_EK + view.default_joint_pos_EL[:, view.joints(self.joints)]
+            target_EK = target_EK + view.joints(self.joints).default_pos_EL
         view.write_joint_pos_target(self.joints, target_EK)
 
 
@@ -32,7 +32,7 @@ class RelativeJointPositionAction(JointAction):
 
     def __call__(self, view: EnvView, action_EK: Tensor) -> None:
         """Write the position targets."""
-        now_EK = view.joint_pos_EL[:, view.joints(self.joints)]
+        now_EK = view.joints(self.joints).pos_EL
         view.write_joint_pos_target(self.joints, now_EK + self.shaped(view, action_EK))
 
 
@@ -113,6 +113,6 @@ class ActuatorAction(ActionTerm):
 
     def __call__(self, view: EnvView, action_EK: Tensor) -> None:
         """Write the controls."""
-        index = view.actuators(self.actuators)
+        index = view.resolver.index("actuator", self.actuators)
         limits_K2 = view.ctrl_limits_L2[index]
         view.write_ctrl(index, torch.clamp(action_EK * self.scale, limits_K2[:, 0], limits_K2[:, 1]))

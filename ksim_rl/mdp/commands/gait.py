@@ -69,4 +69,4 @@ class SinusoidalGaitCommand(CommandTerm):
 
     def _held(self, view: EnvView) -> Tensor:
         """Frequency (Hz), time of its drawing (s), and cycles at that time, [E, 3]."""
-        return view.memory("rhythm_E3", 3)
+        return view.buffer("rhythm_E3", 3)

@@ -74,4 +74,4 @@ class JoystickCommand(CommandTerm):
         visualizer.text((x, y, z + 0.3), ", ".join(f"{axis} {value:+.2f}" for axis, value in values))
 
     def _held(self, view: EnvView) -> Tensor:
-        return view.memory("held_EK", len(self.axes), keep=True)
+        return view.buffer("held_EK", len(self.axes), keep=True)

@@ -59,7 +59,7 @@ class BaseHeightCommand(CommandTerm):
         visualizer.sphere((x, y, z + rise), radius=0.03, rgba=_WANTED)
 
     def _held(self, view: EnvView) -> Tensor:
-        return view.memory("height_E1", 1)
+        return view.buffer("height_E1", 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,8 +85,8 @@ class JointPositionCommand(CommandTerm):
 
     def resample(self, view: EnvView, mask_E: Tensor) -> None:
         """Draw positions for the rows of `mask_E`."""
-        index = view.joints(self.joints)
-        default_EN, limits_N2 = view.default_joint_pos_EL[:, index], view.soft_joint_pos_limits_L2[index]
+        joints = view.joints(self.joints)
+        default_EN, limits_N2 = joints.default_pos_EL, joints.soft_limits_L2
         offset_EN = view.uniform(default_EN.shape[1], *self.shared_ranges(view).unbind(0))
         drawn_EN = torch.clamp(default_EN + offset_EN, limits_N2[:, 0], limits_N2[:, 1])
         held_EN = self._held(view)
@@ -100,12 +100,12 @@ class JointPositionCommand(CommandTerm):
         """Draw the robot as it should be."""
         qpos = view.world.qpos_EL[env_index].cpu().numpy().copy()
         targets = self._held(view)[env_index].tolist()
-        for name, target in zip(view.joint_names(self.joints), targets, strict=True):
+        for name, target in zip(view.joints(self.joints).names, targets, strict=True):
             qpos[view.world.mj_model.joint(name).qposadr[0]] = target
         visualizer.ghost(qpos, rgba=_WANTED)
 
     def _held(self, view: EnvView) -> Tensor:
-        return view.memory("pos_EN", len(view.joint_names(self.joints)))
+        return view.buffer("pos_EN", len(view.joints(self.joints)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,7 +161,7 @@ class CartesianCommand(CommandTerm):
             visualizer.frame(origin, _axes(quat_E4[env_index]))
 
     def _held(self, view: EnvView) -> Tensor:
-        return view.memory("target_EK", 3 if self.orientation is None else 7)
+        return view.buffer("target_EK", 3 if self.orientation is None else 7)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,7 +183,7 @@ class StartPoseCommand(CommandTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the command, float32 [E, 7]."""
-        robot, is_due_E, held_E7 = view.entity(self.entity), self._is_due(view), view.memory("pose_E7", 7)
+        robot, is_due_E, held_E7 = view.entity(self.entity), self._is_due(view), view.buffer("pose_E7", 7)
         pose_E7 = torch.cat((robot.root_pos_EL, robot.root_quat_EL), dim=-1)
         held_E7.copy_(torch.where(is_due_E[:, None], pose_E7, held_E7))
         is_due_E.zero_()
@@ -191,11 +191,11 @@ class StartPoseCommand(CommandTerm):
 
     def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw the pose's axes."""
-        pose_7 = view.memory("pose_E7", 7)[env_index]
+        pose_7 = view.buffer("pose_E7", 7)[env_index]
         visualizer.frame(pose_7[:3].cpu().numpy(), _axes(pose_7[3:]), scale=0.2)
 
     def _is_due(self, view: EnvView) -> Tensor:
-        return view.memory("is_due_E", dtype=torch.bool)
+        return view.buffer("is_due_E", dtype=torch.bool)
 
 
 def _axes(quat_4: Tensor) -> np.ndarray:

@@ -36,11 +36,9 @@ def point_pos_w(view: EnvView, *, body: str | None, site: str | None) -> Tensor:
         ValueError: if several match the name.
     """
     if site is not None:
-        place = view.resolver.one("site", site)
-        return view.site_pos_w(slice(place, place + 1))[:, 0]
+        return view.site(site).pos_EL
     assert body is not None
-    place = view.resolver.one("body", body)
-    return view.body_pos_w(slice(place, place + 1))[:, 0]
+    return view.body(body).pos_EL
 
 
 def check_one_point(body: str | None, site: str | None) -> None:

@@ -107,8 +107,8 @@ class UniformVelocityCommand(CommandTerm):
 
     def _target(self, view: EnvView) -> Tensor:
         """Drawn vx, vy, wz and heading, [E, 4]."""
-        return view.memory("target_E4", 4)
+        return view.buffer("target_E4", 4)
 
     def _kind(self, view: EnvView) -> Tensor:
         """Whether each env stands and whether it is heading-controlled, bool [E, 2]."""
-        return view.memory("kind_E2", 2, dtype=torch.bool)
+        return view.buffer("kind_E2", 2, dtype=torch.bool)

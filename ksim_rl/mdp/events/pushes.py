@@ -40,8 +40,8 @@ class PushByForce(EventTerm):
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
         """Begin a push in the rows of `mask_E`, and go on with or end those of the others; once per env step."""
-        held_E6, applied_E6 = view.memory("wrench_E6", 6), view.memory("applied_E6", 6)
-        left_E = view.memory("left_s_E")
+        held_E6, applied_E6 = view.buffer("wrench_E6", 6), view.buffer("applied_E6", 6)
+        left_E = view.buffer("left_s_E")
         drawn_E6 = se3_ranges.draw(view, self.wrench_range)
         duration_E = view.uniform(1, *self.duration_s)[:, 0].clamp(min=view.step_dt)
         left_E.copy_(torch.where(mask_E, duration_E, left_E - view.step_dt))

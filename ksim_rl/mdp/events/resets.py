@@ -81,12 +81,12 @@ class ResetJoints(EventTerm):
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
         """Write the rows of `mask_E`."""
-        index = view.joints(self.joints)
-        default_EL, limits_L2 = view.default_joint_pos_EL[:, index], view.soft_joint_pos_limits_L2[index]
+        joints = view.joints(self.joints)
+        default_EL, limits_L2 = joints.default_pos_EL, joints.soft_limits_L2
         count = default_EL.shape[1]
         pos_EL = default_EL + self._draw(view, count, self.position_range)
-        view.write_joint_pos(mask_E, torch.clamp(pos_EL, limits_L2[:, 0], limits_L2[:, 1]), index)
-        view.write_joint_vel(mask_E, self._draw(view, count, self.velocity_range), index)
+        joints.write_pos(mask_E, torch.clamp(pos_EL, limits_L2[:, 0], limits_L2[:, 1]))
+        joints.write_vel(mask_E, self._draw(view, count, self.velocity_range))
 
     def _draw(self, view: EnvView, count: int, pair: tuple[float, float]) -> Tensor:
         first, second = float(pair[0]), float(pair[1])

@@ -36,12 +36,12 @@ class ResetJointsByScale(EventTerm):
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
         """Write the rows of `mask_E`."""
-        index = view.joints(self.joints)
-        default_EN, limits_N2 = view.default_joint_pos_EL[:, index], view.soft_joint_pos_limits_L2[index]
+        joints = view.joints(self.joints)
+        default_EN, limits_N2 = joints.default_pos_EL, joints.soft_limits_L2
         count = default_EN.shape[1]
         pos_EN = default_EN * view.uniform(count, *self.position_scale)
-        view.write_joint_pos(mask_E, torch.clamp(pos_EN, limits_N2[:, 0], limits_N2[:, 1]), index)
-        view.write_joint_vel(mask_E, view.uniform(count, *self.velocity_range), index)
+        joints.write_pos(mask_E, torch.clamp(pos_EN, limits_N2[:, 0], limits_N2[:, 1]))
+        joints.write_vel(mask_E, view.uniform(count, *self.velocity_range))
 
 
 @dataclass(frozen=True, kw_only=True)

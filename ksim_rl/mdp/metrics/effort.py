@@ -60,10 +60,10 @@ class CostOfTransport(MetricTerm):
             ValueError: if nothing weighs anything.
         """
         robot, model = view.entity(self.entity), view.world.mj_model
-        weight = float(model.body_subtreemass[robot.root_body] * np.linalg.norm(model.opt.gravity))
+        weight = float(model.body_subtreemass[robot.root.id] * np.linalg.norm(model.opt.gravity))
         if weight == 0.0:
             raise ValueError("CostOfTransport without gravity: a weight of 0 N has no cost of transport")
-        energy_E, distance_E = view.memory("energy_E"), view.memory("distance_E")
+        energy_E, distance_E = view.buffer("energy_E"), view.buffer("distance_E")
         energy_E.add_(mechanical_power(view, self.joints) * view.step_dt)
         distance_E.add_(torch.linalg.vector_norm(robot.root_lin_vel_w_EL[:, :2], dim=-1) * view.step_dt)
         return energy_E / (weight * distance_E.clamp(min=self.min_distance))
@@ -71,5 +71,5 @@ class CostOfTransport(MetricTerm):
 
 def mechanical_power(view: EnvView, joints: Patterns) -> Tensor:
     """Return sum_j |effort_j * velocity_j| over joints, W, [E]."""
-    index = view.joints(joints)
-    return (view.joint_effort_EL[:, index] * view.joint_vel_EL[:, index]).abs().sum(-1)
+    driven = view.joints(joints)
+    return (driven.effort_EL * driven.vel_EL).abs().sum(-1)

@@ -31,7 +31,7 @@ class FootSlipSpeed(MetricTerm):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the value of the current state, [E]."""
         found_EF = foot_contact(view, self.sensor, self.sites).found_EN
-        speed_EF = torch.linalg.vector_norm(view.site_lin_vel_w(view.sites(self.sites))[..., :2], dim=-1)
+        speed_EF = torch.linalg.vector_norm(view.sites(self.sites).lin_vel_EN3[..., :2], dim=-1)
         return (speed_EF * found_EF).sum(-1) / found_EF.sum(-1).clamp(min=1.0)
 
 
@@ -48,7 +48,7 @@ class PeakFootHeight(MetricTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the value of the current state, [E]."""
-        return view.terrain.clearance(view.site_pos_w(view.sites(self.sites))).amax(-1)
+        return view.terrain.clearance(view.sites(self.sites).pos_EN3).amax(-1)
 
 
 @dataclass(frozen=True, kw_only=True)

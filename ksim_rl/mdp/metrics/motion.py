@@ -54,7 +54,7 @@ class ActionAcceleration(MetricTerm):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the value of the current state, [E]."""
         rate_EL = view.action_EL - view.last_action_EL
-        last_rate_EL = view.memory("last_rate_EL", rate_EL.shape[-1])
+        last_rate_EL = view.buffer("last_rate_EL", rate_EL.shape[-1])
         acceleration_E = (rate_EL - last_rate_EL).abs().mean(-1)
         last_rate_EL.copy_(rate_EL)
         return acceleration_E

@@ -27,7 +27,7 @@ class BodyPos(BodyObservation):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return self.points(view, view.body_pos_w(view.bodies(self.bodies)))
+        return self.points(view, view.bodies(self.bodies).pos_EN3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,7 @@ class BodyQuat(BodyObservation):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        quat_EN4 = view.body_quat_w(view.bodies(self.bodies))
+        quat_EN4 = view.bodies(self.bodies).quat_EN4
         if self.frame == "root":
             root_E14 = view.entity(self.entity).root_quat_EL[:, None]
             quat_EN4 = quaternion.multiply(quaternion.conjugate(root_E14), quat_EN4)
@@ -52,7 +52,7 @@ class BodyRotation6d(BodyObservation):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        axes_EN23 = view.body_axes_w(view.bodies(self.bodies))[:, :, :2]
+        axes_EN23 = view.bodies(self.bodies).axes_EN33[:, :, :2]
         return self.vectors(view, axes_EN23.flatten(start_dim=1, end_dim=2))
 
 
@@ -62,7 +62,7 @@ class BodyLinVel(BodyObservation):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return self.vectors(view, view.body_lin_vel_w(view.bodies(self.bodies)))
+        return self.vectors(view, view.bodies(self.bodies).lin_vel_EN3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +71,7 @@ class BodyAngVel(BodyObservation):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return self.vectors(view, view.body_ang_vel_w(view.bodies(self.bodies)))
+        return self.vectors(view, view.bodies(self.bodies).ang_vel_EN3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +80,7 @@ class CenterOfMassPos(BodyObservation):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return self.points(view, view.subtree_com_pos_w(view.bodies(self.bodies)))
+        return self.points(view, view.bodies(self.bodies).subtree_com_pos_EN3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,4 +89,4 @@ class CenterOfMassVel(BodyObservation):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return self.vectors(view, view.subtree_com_vel_w(view.bodies(self.bodies)))
+        return self.vectors(view, view.bodies(self.bodies).subtree_com_vel_EN3)

@@ -67,7 +67,7 @@ class FootPos(FramedObservation):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return self.points(view, view.site_pos_w(view.sites(self.sites)))
+        return self.points(view, view.sites(self.sites).pos_EN3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +78,7 @@ class FootHeight(ObservationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return view.site_height(view.sites(self.sites))
+        return view.sites(self.sites).height_EN
 
 
 @dataclass(frozen=True, kw_only=True)

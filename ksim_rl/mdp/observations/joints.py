@@ -11,6 +11,7 @@ from torch import Tensor
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.scene.names import Patterns
+from ksim_rl.scene.state.joints import Joints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +27,8 @@ class JointPos(ObservationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return _with_bias(view, view.joint_pos_EL, self.joints, self.biased)
+        joints = view.joints(self.joints)
+        return _with_bias(joints, joints.pos_EL, self.biased)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +44,8 @@ class JointPosRel(ObservationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return _with_bias(view, view.joint_pos_rel_EL, self.joints, self.biased)
+        joints = view.joints(self.joints)
+        return _with_bias(joints, joints.pos_rel_EL, self.biased)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +56,7 @@ class JointVel(ObservationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return view.joint_vel_EL[:, view.joints(self.joints)]
+        return view.joints(self.joints).vel_EL
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +67,7 @@ class JointAcc(ObservationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return view.joint_acc_EL[:, view.joints(self.joints)]
+        return view.joints(self.joints).acc_EL
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +78,7 @@ class JointEffort(ObservationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return view.joint_effort_EL[:, view.joints(self.joints)]
+        return view.joints(self.joints).effort_EL
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,9 +89,8 @@ class ActuatorForce(ObservationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return view.world.actuator_force_EL[:, view.actuators(self.actuators)]
+        return view.world.actuator_force_EL[:, view.resolver.index("actuator", self.actuators)]
 
 
-def _with_bias(view: EnvView, pos_EL: Tensor, joints: Patterns, biased: bool) -> Tensor:
-    index = view.joints(joints)
-    return pos_EL[:, index] + view.encoder_bias_EL[:, index] if biased else pos_EL[:, index]
+def _with_bias(joints: Joints, pos_EL: Tensor, biased: bool) -> Tensor:
+    return pos_EL + joints.encoder_bias_EL if biased else pos_EL

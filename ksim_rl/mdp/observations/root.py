@@ -57,7 +57,7 @@ class RootRotation6d(RootObservation):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the reading."""
-        return view.body_axes_w(view.entity(self.entity).root_index)[:, 0, :2].flatten(start_dim=1)
+        return view.entity(self.entity).root.axes_E33[:, :2].flatten(start_dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +116,7 @@ class ProjectedGravity(RootObservation):
         if self.time_constant == 0.0:
             return gravity_E3
         # Readings are also taken when other rows reset: the filter moves on only if an env step has passed.
-        steps_E, filtered_E3 = view.memory("steps_E", dtype=torch.int64), view.memory("filtered_E3", 3)
+        steps_E, filtered_E3 = view.buffer("steps_E", dtype=torch.int64), view.buffer("filtered_E3", 3)
         now_E = view.episode_step_E + 1
         gain = 1.0 - math.exp(-view.step_dt / self.time_constant)
         gain_E = torch.where(steps_E == 0, 1.0, torch.where(steps_E == now_E, 0.0, gain))

@@ -161,7 +161,7 @@ class RandomizeEffortLimit(RandomizeActuator):
     def _write_ranges(
         self, view: EnvView, field: str, place_of: dict[int, int], mask_E: Tensor, drawn_EN: Tensor
     ) -> None:
-        rows, names = list(place_of), [view.joint_names(self.joints)[i] for i in place_of.values()]
+        rows, names = list(place_of), [view.joints(self.joints).names[i] for i in place_of.values()]
         # The lower bound as a size, like the upper one.
         own = getattr(view.world.mj_model, field)[rows] * np.array((-1.0, 1.0))
         check_not_negative(self, "ranges", names, own, self.ranges)

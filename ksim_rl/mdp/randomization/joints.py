@@ -135,7 +135,7 @@ class RandomizeDefaultJointPos(Randomize):
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
         """Draw for the rows of `mask_E`."""
-        joints = view.joints(self.joints)
+        joints = view.joints(self.joints).index
         model = view.world.mj_model
         pose = model.key_qpos[0] if model.nkey else model.qpos0
         own = pose[model.jnt_qposadr[scalar_joint_ids(model)]]
@@ -167,7 +167,7 @@ class RandomizeEncoderBias(Randomize):
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
         """Draw for the rows of `mask_E`."""
-        joints = view.joints(self.joints)
+        joints = view.joints(self.joints).index
         held_EN = view.encoder_bias_EL[:, joints]
         drawn_EN = self.draw(view, held_EN.shape[1], [self.ranges])[..., 0]
         view.encoder_bias_EL[:, joints] = torch.where(mask_E[:, None], drawn_EN, held_EN)

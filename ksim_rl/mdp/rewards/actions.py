@@ -64,7 +64,7 @@ class ActionJerkL2(RewardTerm):
 
 def _change(view: EnvView, name: str, value_EL: Tensor) -> Tensor:
     """Return the change of a value since the last step, and remember the value."""
-    last_EL = view.memory(name, value_EL.shape[-1])
+    last_EL = view.buffer(name, value_EL.shape[-1])
     change_EL = value_EL - last_EL
     last_EL.copy_(value_EL)
     return change_EL

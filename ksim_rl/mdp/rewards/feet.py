@@ -30,9 +30,9 @@ class FootClearance(RewardWhileCommanded):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        index = view.sites(self.sites)
-        miss_EF = (view.site_height(index) - self.target_height).abs()
-        speed_EF = torch.linalg.vector_norm(view.site_lin_vel_w(index)[..., :2], dim=-1)
+        feet = view.sites(self.sites)
+        miss_EF = (feet.height_EN - self.target_height).abs()
+        speed_EF = torch.linalg.vector_norm(feet.lin_vel_EN3[..., :2], dim=-1)
         return self.while_commanded(view, (miss_EF * speed_EF).sum(-1))
 
 
@@ -59,8 +59,8 @@ class FootSwingHeight(RewardWhileCommanded):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
         contact = foot_contact(view, self.sensor, self.sites)
-        height_EF = view.site_height(view.sites(self.sites))
-        memory_EF = view.memory("peak_EF", height_EF.shape[-1])
+        height_EF = view.sites(self.sites).height_EN
+        memory_EF = view.buffer("peak_EF", height_EF.shape[-1])
         peak_EF = torch.where(contact.found_EN > 0, memory_EF, torch.maximum(memory_EF, height_EF))
         memory_EF.copy_(torch.where(contact.first_contact_EN > 0, 0.0, peak_EF))
         cost_E = ((peak_EF / self.target_height - 1.0).square() * contact.first_contact_EN).sum(-1)
@@ -80,7 +80,7 @@ class FootSlip(RewardWhileCommanded):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        speed2_EF = view.site_lin_vel_w(view.sites(self.sites))[..., :2].square().sum(-1)
+        speed2_EF = view.sites(self.sites).lin_vel_EN3[..., :2].square().sum(-1)
         cost_E = (speed2_EF * foot_contact(view, self.sensor, self.sites).found_EN).sum(-1)
         return self.while_commanded(view, cost_E)
 

@@ -37,10 +37,10 @@ class JointLimitReward(RewardTerm):
         check_in_range("soft_factor", self.soft_factor, low=0.0, high=1.0, low_open=True)
 
     def overshoot(self, view: EnvView, value_EL: Tensor) -> Tensor:
-        """Return the sum for values of all joints, [E]."""
-        limit_L = values_by_name("limits", self.limits, view.joint_names(self.joints))
+        """Return the sum for the values of `joints`, [E]."""
+        limit_L = values_by_name("limits", self.limits, view.joints(self.joints).names)
         free_L = constant([self.soft_factor * limit for limit in limit_L], view.device)
-        return (value_EL[:, view.joints(self.joints)].abs() - free_L).clamp(min=0.0).sum(-1)
+        return (value_EL.abs() - free_L).clamp(min=0.0).sum(-1)
 
 
 # -- position ----------------------------------------------------------------------------------------------------
@@ -57,8 +57,8 @@ class JointPosLimits(RewardTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        index = view.joints(self.joints)
-        pos_EL, limits_L2 = view.joint_pos_EL[:, index], view.soft_joint_pos_limits_L2[index]
+        joints = view.joints(self.joints)
+        pos_EL, limits_L2 = joints.pos_EL, joints.soft_limits_L2
         inside_EL = torch.clamp(pos_EL, limits_L2[:, 0], limits_L2[:, 1])
         return (pos_EL - inside_EL).abs().sum(-1)
 
@@ -71,7 +71,7 @@ class JointDeviationL1(RewardTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        return view.joint_pos_rel_EL[:, view.joints(self.joints)].abs().sum(-1)
+        return view.joints(self.joints).pos_rel_EL.abs().sum(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +82,7 @@ class JointDeviationL2(RewardTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        return view.joint_pos_rel_EL[:, view.joints(self.joints)].square().sum(-1)
+        return view.joints(self.joints).pos_rel_EL.square().sum(-1)
 
 
 # -- velocity and acceleration -----------------------------------------------------------------------------------
@@ -96,7 +96,7 @@ class JointVelL2(RewardTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        return view.joint_vel_EL[:, view.joints(self.joints)].square().sum(-1)
+        return view.joints(self.joints).vel_EL.square().sum(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +105,7 @@ class JointVelLimits(JointLimitReward):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        return self.overshoot(view, view.joint_vel_EL)
+        return self.overshoot(view, view.joints(self.joints).vel_EL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +116,7 @@ class JointAccL2(RewardTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        return view.joint_acc_EL[:, view.joints(self.joints)].square().sum(-1)
+        return view.joints(self.joints).acc_EL.square().sum(-1)
 
 
 # -- effort ------------------------------------------------------------------------------------------------------
@@ -130,7 +130,7 @@ class JointEffortL2(RewardTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        return view.joint_effort_EL[:, view.joints(self.joints)].square().sum(-1)
+        return view.joints(self.joints).effort_EL.square().sum(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +142,7 @@ class JointEffortLimits(JointLimitReward):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        return self.overshoot(view, view.joint_effort_EL)
+        return self.overshoot(view, view.joints(self.joints).effort_EL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +153,9 @@ class ActuatorForceL2(RewardTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        return view.world.actuator_force_EL[:, view.actuators(self.actuators)].square().sum(-1)
+        return (
+            view.world.actuator_force_EL[:, view.resolver.index("actuator", self.actuators)].square().sum(-1)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,5 +169,5 @@ class Energy(RewardTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        index = view.joints(self.joints)
-        return (view.joint_effort_EL[:, index] * view.joint_vel_EL[:, index]).abs().sum(-1)
+        joints = view.joints(self.joints)
+        return (joints.effort_EL * joints.vel_EL).abs().sum(-1)

@@ -50,7 +50,7 @@ class BodyAngularVelocity(RewardTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        return view.body_ang_vel_w(view.bodies(self.body))[..., :2].square().sum((-2, -1))
+        return view.bodies(self.body).ang_vel_EN3[..., :2].square().sum((-2, -1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,8 +76,8 @@ class LinkAccelerationL2(RewardTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        vel_EN3 = view.body_lin_vel_w(view.bodies(self.bodies))
-        last_EN3 = view.memory("last_vel_EN3", *vel_EN3.shape[1:])
+        vel_EN3 = view.bodies(self.bodies).lin_vel_EN3
+        last_EN3 = view.buffer("last_vel_EN3", *vel_EN3.shape[1:])
         acceleration_EN3 = (vel_EN3 - last_EN3) / view.step_dt
         last_EN3.copy_(vel_EN3)
         return torch.where(view.episode_step_E <= 1, 0.0, acceleration_EN3.square().sum((-2, -1)))
@@ -101,5 +101,5 @@ class MotionlessAtRest(RewardTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        motion_E = view.joint_vel_EL[:, view.joints(self.joints)].square().sum(-1)
+        motion_E = view.joints(self.joints).vel_EL.square().sum(-1)
         return motion_E * (1.0 - is_commanded(view, self.command, self.command_threshold))

@@ -110,11 +110,11 @@ class Pose(RewardTerm):
                 self._std(view, "std_running"),
             ),
         )
-        error_EL = view.joint_pos_rel_EL[:, view.joints(self.joints)]
+        error_EL = view.joints(self.joints).pos_rel_EL
         return torch.exp(-(error_EL / std_EL).square().mean(-1))
 
     def _std(self, view: EnvView, field: str) -> Tensor:
-        names = view.joint_names(self.joints)
+        names = view.joints(self.joints).names
         return constant(values_by_name(field, getattr(self, field), names), view.device)
 
 
@@ -123,4 +123,4 @@ def _tilt(view: EnvView, body: str | None, entity: str) -> Tensor:
     if body is None:
         return view.entity(entity).projected_gravity_EL[:, :2].square().sum(-1)
     # The world's z axis in the body's frame: the z components of the body's x and y axes.
-    return view.body_axes_w(view.bodies(body))[:, 0, :2, 2].square().sum(-1)
+    return view.bodies(body).axes_EN33[:, 0, :2, 2].square().sum(-1)

@@ -38,7 +38,7 @@ class Symmetry(RewardTerm):
         Raises:
             ValueError: if their numbers differ.
         """
-        left, right = view.joint_names(self.left), view.joint_names(self.right)
+        left, right = view.joints(self.left).names, view.joints(self.right).names
         if len(left) != len(right):
             raise ValueError(
                 f"left matches {left}, right matches {right}: give each left joint one right joint"
@@ -61,8 +61,7 @@ class JointSymmetryL2(Symmetry):
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
         left, right = self._pairs(view)
-        pos_EL = view.joint_pos_rel_EL
-        return self._mismatch(view, pos_EL[:, view.joints(left)], pos_EL[:, view.joints(right)])
+        return self._mismatch(view, view.joints(left).pos_rel_EL, view.joints(right).pos_rel_EL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +80,7 @@ class ActionSymmetryL2(Symmetry):
         Raises:
             ValueError: if a joint of a pair is not among `joints`.
         """
-        names = view.joint_names(self.joints)
+        names = view.joints(self.joints).names
         columns = []
         for side in self._pairs(view):
             missing = [name for name in side if name not in names]

@@ -140,7 +140,7 @@ class TrackOrientation(GaussianReward):
             raise ValueError(
                 f"command={self.command!r} has {command_EK.shape[1]} numbers: expected position and quaternion"
             )
-        quat_E4 = view.body_quat_w(view.bodies(self.body))[:, 0]
+        quat_E4 = view.bodies(self.body).quat_EN4[:, 0]
         return self.rate(quaternion.angle_between(quat_E4, target_E4).square())
 
 
@@ -157,5 +157,5 @@ class TrackJointPosition(GaussianReward):
 
     def __call__(self, view: EnvView) -> Tensor:
         """Return the unweighted reward, [E]."""
-        error_EL = view.command(self.command) - view.joint_pos_EL[:, view.joints(self.joints)]
+        error_EL = view.command(self.command) - view.joints(self.joints).pos_EL
         return self.rate(error_EL.square().mean(-1))

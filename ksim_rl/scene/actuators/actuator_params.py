@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checks import unknown_name
-from ksim_rl.scene.state.memory import Memory
+from ksim_rl.scene.state.buffers import Buffers
 
 
 class ActuatorParams:
@@ -18,8 +18,8 @@ class ActuatorParams:
     actuator is built-in, or of another kind) has 0 there, which nothing reads.
     """
 
-    def __init__(self, memories: Memory, joint_names: Sequence[str], device: torch.device) -> None:
-        self._memories, self._joint_names, self._device = memories, list(joint_names), device
+    def __init__(self, buffers: Buffers, joint_names: Sequence[str], device: torch.device) -> None:
+        self._all_buffers, self._joint_names, self._device = buffers, list(joint_names), device
         self._buffers: dict[str, Tensor] = {}
         self._nominal: dict[str, Tensor] = {}
         self._owners: dict[str, dict[int, float]] = {}
@@ -28,7 +28,7 @@ class ActuatorParams:
         """Give some joints a number; during construction only."""
         if name not in self._buffers:
             nominal_L = self._nominal[name] = torch.zeros(len(self._joint_names), device=self._device)
-            self._buffers[name] = self._memories.get(
+            self._buffers[name] = self._all_buffers.get(
                 f"actuators.{name}_EL", len(self._joint_names), keep=True, initial=nominal_L
             )
         self._nominal[name][list(joints)] = value

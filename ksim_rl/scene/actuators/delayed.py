@@ -73,7 +73,7 @@ class DelayedActuator(Actuator):
     def law(self, drive: Drive) -> Law:
         """Return the law inside, on targets of some substeps ago."""
         inner = self.actuator.law(drive)
-        lag_E = drive.memory("lag_E", dtype=torch.int64, keep=True)
+        lag_E = drive.buffer("lag_E", dtype=torch.int64, keep=True)
         fields = [f"{kind}_EN" for kind in sorted(self.takes)]
         ring = SubstepRing(drive, "targets", self.max_lag + 1, len(fields) * drive.num_joints)
 

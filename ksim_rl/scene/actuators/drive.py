@@ -37,11 +37,11 @@ class Drive:
         """Return the present values of a number of `Actuator.params`, [E, N]."""
         return self._view.actuator_param(name)[:, self._joints]
 
-    def memory(
+    def buffer(
         self, name: str, *shape: int, dtype: torch.dtype = torch.float32, keep: bool = False
     ) -> Tensor:
         """Return a buffer [E, *shape] of the law; rows that reset are zeroed unless `keep`."""
-        return self._view.memories.get(f"{self._name}.{name}", *shape, dtype=dtype, keep=keep)
+        return self._view.buffers.get(f"{self._name}.{name}", *shape, dtype=dtype, keep=keep)
 
     def on_reset(self, draw: Callable[[Tensor], None]) -> None:
         """Call `draw` with the mask of the rows that reset, bool [E]; it may draw by `integers`."""

@@ -30,7 +30,7 @@ class JointDrives:
 
     def __init__(self, actuators: Mapping[str, Sequence[Actuator]], view: EnvView) -> None:
         groups: dict[Hashable, tuple[Actuator, list[int]]] = {}
-        names = view.joint_names() if view.num_joints else []
+        names = view.joints().names if view.num_joints else []
         for prefix, entries in actuators.items():
             ids = {name.removeprefix(prefix): i for i, name in enumerate(names) if name.startswith(prefix)}
             for actuator, driven in driven_joints(entries, list(ids)):

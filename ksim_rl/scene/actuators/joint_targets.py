@@ -18,9 +18,10 @@ from ksim_rl.scene.names import (
     NameResolver,
     Patterns,
     as_index,
+    as_patterns,
     scalar_joint_ids,
 )
-from ksim_rl.scene.state.memory import Memory
+from ksim_rl.scene.state.buffers import Buffers
 
 _WORDS = {"pos": "a position", "vel": "a velocity", "effort": "an effort"}
 
@@ -48,13 +49,13 @@ class JointTargets:
     """
 
     def __init__(
-        self, world: World, resolver: NameResolver, memories: Memory, *, default_joint_pos_EL: Tensor
+        self, world: World, resolver: NameResolver, buffers: Buffers, *, default_joint_pos_EL: Tensor
     ) -> None:
         model, num_joints = world.mj_model, default_joint_pos_EL.shape[1]
         self._world, self._resolver = world, resolver
-        self.pos_EL = memories.get("joint_pos_target_EL", num_joints, initial=default_joint_pos_EL)
-        self.vel_EL = memories.get("joint_vel_target_EL", num_joints)
-        self.effort_EL = memories.get("joint_effort_target_EL", num_joints)
+        self.pos_EL = buffers.get("joint_pos_target_EL", num_joints, initial=default_joint_pos_EL)
+        self.vel_EL = buffers.get("joint_vel_target_EL", num_joints)
+        self.effort_EL = buffers.get("joint_effort_target_EL", num_joints)
         self._buffers = {"pos": self.pos_EL, "vel": self.vel_EL, "effort": self.effort_EL}
         self._driven_by_law: dict[int, Collection[TargetKind]] = {}
         self._routes: dict[tuple[TargetKind, tuple[str, ...]], _Route] = {}
@@ -101,7 +102,7 @@ class JointTargets:
         Raises:
             ValueError: if a joint has no actuator that takes this kind of target.
         """
-        key = (kind, (patterns,) if isinstance(patterns, str) else tuple(patterns))
+        key = (kind, as_patterns(patterns))
         route = self._routes.get(key)
         if route is None:
             route = self._routes[key] = self._route(kind, key[1])

@@ -36,7 +36,7 @@ class LSTMActuator(NetActuator):
         size = head.shape[1]
         num_rows = drive.num_envs * drive.num_joints
         memories = [
-            tuple(drive.memory(f"{kind}{layer}_ENH", drive.num_joints, size) for kind in ("hidden", "cell"))
+            tuple(drive.buffer(f"{kind}{layer}_ENH", drive.num_joints, size) for kind in ("hidden", "cell"))
             for layer in range(len(layers))
         ]
 

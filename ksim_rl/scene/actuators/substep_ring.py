@@ -11,8 +11,8 @@ class SubstepRing:
 
     def __init__(self, drive: Drive, name: str, depth: int, width: int) -> None:
         # Of a row that resets, what lies there is never read again, so there is no need to clear it.
-        self._ring_EKL = drive.memory(f"{name}_EKL", depth, width, keep=True)
-        self._started_E = drive.memory(f"{name}_started_E", dtype=torch.bool)
+        self._ring_EKL = drive.buffer(f"{name}_EKL", depth, width, keep=True)
+        self._started_E = drive.buffer(f"{name}_started_E", dtype=torch.bool)
 
     def push(self, value_EL: Tensor) -> None:
         """Add the value of this substep."""

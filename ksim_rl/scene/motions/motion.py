@@ -147,7 +147,7 @@ def load_motion(file: str | Path, model: mujoco.MjModel, device: torch.device) -
 
 def motion_start_time(view: EnvView, file: str) -> Tensor:
     """Return the buffer of when in the motion each episode began, s, [E]; `ResetToMotion` writes it."""
-    return view.memories.get(f"motion/{file}.start_s_E")
+    return view.buffers.get(f"motion/{file}.start_s_E")
 
 
 def motion_time(view: EnvView, file: str) -> Tensor:
@@ -159,7 +159,7 @@ def motion_joints(view: EnvView, file: str, joints: Patterns) -> tuple[Tensor, T
     """Return positions and velocities that joints have in the motion now, [E, L] each; computed once per state."""
     keys = [f"motion/{file}.{part} of {joints}" for part in ("joint_pos", "joint_vel")]
     if keys[0] not in view.cache:
-        sampled = view.motion(file).sample_joints(motion_time(view, file), view.joints(joints))
+        sampled = view.motion(file).sample_joints(motion_time(view, file), view.joints(joints).index)
         view.cache.update(zip(keys, sampled, strict=True))
     return view.cache[keys[0]], view.cache[keys[1]]
 
@@ -171,7 +171,9 @@ def motion_bodies(view: EnvView, file: str, bodies: Patterns) -> tuple[Tensor, T
     """
     keys = [f"motion/{file}.{part} of {bodies}" for part in ("body_pos", "body_quat")]
     if keys[0] not in view.cache:
-        pos_EN3, quat_EN4 = view.motion(file).sample_bodies(motion_time(view, file), view.bodies(bodies))
+        pos_EN3, quat_EN4 = view.motion(file).sample_bodies(
+            motion_time(view, file), view.bodies(bodies).index
+        )
         shift_E3 = motion_shift(view)
         pos_EN3 = pos_EN3 if shift_E3 is None else pos_EN3 + shift_E3[:, None]
         view.cache.update(zip(keys, (pos_EN3, quat_EN4), strict=True))

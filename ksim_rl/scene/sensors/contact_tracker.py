@@ -65,7 +65,7 @@ class ContactTracker(SensorTracker):
         ]
         self._columns = as_index(columns, view.device)
         self._clocks = {
-            clock: view.memories.get(f"{self._key}.{clock}", self._count)
+            clock: view.buffers.get(f"{self._key}.{clock}", self._count)
             for clock in (
                 "found",
                 "air_time",
@@ -80,7 +80,7 @@ class ContactTracker(SensorTracker):
         self._substep = 0
         if every_substep:
             substeps = round(view.step_dt / view.physics_dt)
-            self._history_ESN3 = view.memories.get(f"{self._key}.force_history", substeps, self._count, 3)
+            self._history_ESN3 = view.buffers.get(f"{self._key}.force_history", substeps, self._count, 3)
             view.after_substep.append(self._read_substep)
             view.substep_sensors = "every"
 

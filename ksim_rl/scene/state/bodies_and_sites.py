@@ -1,81 +1,171 @@
-"""Poses and velocities of bodies and sites."""
+"""This module gives terms the bodies and sites that they name: `view.body("torso").lin_vel_EL`."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.scene.names import Index
+from ksim_rl.scene.names import as_index
 from ksim_rl.scene.state.guarded_state import GuardedState
-from ksim_rl.scene.state.memory import Memory
-from ksim_rl.scene.state.quantity import indexed_quantity
-from ksim_rl.scene.terrains.ground import Ground
+from ksim_rl.scene.state.quantity import quantity
 
 
-class BodiesAndSites:
-    """The part of `EnvView` that reads bodies and sites by index (`view.bodies`, `view.sites`).
+class _Points:
+    """Named elements of one kind, in the order of the patterns that match them; N of them.
 
-    Each is computed at most once per index and state, whoever reads it; all are of the current state.
+    Quantities are float32, of the current state, in the world frame, and computed at most once per state, whoever
+    reads them.
+
+    Attributes:
+        names: of the elements.
+        ids: theirs in the model.
+        index: the same, to index the dim of this kind: a slice, or int64 on the device.
     """
 
-    cache: dict[str, Tensor]
-    memories: Memory
-    terrain: Ground
-    _state: GuardedState
-    _site_body: Tensor
+    def __init__(self, state: GuardedState, ids: Sequence[int], names: Sequence[str]) -> None:
+        self.ids, self.names = tuple(ids), list(names)
+        self.index = as_index(ids, state.world.device)
+        self.cache = state.new_cache()
+        self._state = state
 
-    @indexed_quantity
-    def body_pos_w(self, index: Index) -> Tensor:
-        """Return positions of body frames in the world, m, [E, N, 3]."""
-        return self._state.derived().xpos_EL[:, index]
+    def __len__(self) -> int:
+        return len(self.ids)
 
-    @indexed_quantity
-    def body_quat_w(self, index: Index) -> Tensor:
-        """Return orientations of bodies, body to world, (w, x, y, z), [E, N, 4]."""
-        return self._state.derived().xquat_EL[:, index]
 
-    @indexed_quantity
-    def body_axes_w(self, index: Index) -> Tensor:
-        """Return the x, y and z axes of bodies, unit vectors in the world, [E, N, axis 3, 3]."""
-        return self._state.derived().xmat_EL[:, index].transpose(-1, -2)
+class Bodies(_Points):
+    """The bodies that some patterns match: `view.bodies(".*_foot").pos_EN3`."""
 
-    @indexed_quantity
-    def body_lin_vel_w(self, index: Index) -> Tensor:
-        """Return linear velocities of body frame origins, world frame, m/s, [E, N, 3]."""
-        return self._state.point_velocity(self.body_pos_w(index), index)
+    @quantity
+    def pos_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Positions of the body frames, m."""
+        return self._state.derived().xpos_EL[:, self.index]
 
-    @indexed_quantity
-    def body_ang_vel_w(self, index: Index) -> Tensor:
-        """Return angular velocities of bodies, world frame, rad/s, [E, N, 3]."""
-        return self._state.derived().cvel_EL[:, index, 0:3]
+    @quantity
+    def quat_EN4(self) -> Float[Tensor, "E N 4"]:
+        """Orientations, body to world, (w, x, y, z)."""
+        return self._state.derived().xquat_EL[:, self.index]
 
-    @indexed_quantity
-    def subtree_com_pos_w(self, index: Index) -> Tensor:
-        """Return centres of mass of bodies with all that hangs on them, world frame, m, [E, N, 3]."""
-        return self._state.derived().subtree_com_EL[:, index]
+    @quantity
+    def axes_EN33(self) -> Float[Tensor, "E N 3 3"]:
+        """The x, y and z axes of the bodies, a unit vector each: [E, N, axis, 3]."""
+        return self._state.derived().xmat_EL[:, self.index].transpose(-1, -2)
 
-    @indexed_quantity
-    def subtree_com_vel_w(self, index: Index) -> Tensor:
-        """Return velocities of centres of mass of bodies with all that hangs on them, world frame, m/s, [E, N, 3].
+    @quantity
+    def lin_vel_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Linear velocities of the origins of the body frames, m/s."""
+        return self._state.point_velocity(self.pos_EN3, self.index)
+
+    @quantity
+    def ang_vel_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Angular velocities, rad/s."""
+        return self._state.derived().cvel_EL[:, self.index, 0:3]
+
+    @quantity
+    def subtree_com_pos_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Centres of mass of the bodies with all that hangs on them, m."""
+        return self._state.derived().subtree_com_EL[:, self.index]
+
+    @quantity
+    def subtree_com_vel_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Velocities of the centres of mass of the bodies with all that hangs on them, m/s.
 
         Raises:
             RuntimeError: if no term asked for them while the env was constructed.
         """
         world = self._state.derived()
-        if not self.memories.is_frozen:
+        if not self._state.is_frozen:
             world.refresh_subtree_velocities()
         elif not world.has_subtree_velocities:
             raise RuntimeError("subtree velocities are not computed: let a term of the config read them")
-        return world.view("subtree_linvel")[:, index]
+        return world.view("subtree_linvel")[:, self.index]
 
-    @indexed_quantity
-    def site_pos_w(self, index: Index) -> Tensor:
-        """Return positions of sites in the world, m, [E, N, 3]."""
-        return self._state.derived().site_xpos_EL[:, index]
 
-    @indexed_quantity
-    def site_height(self, index: Index) -> Tensor:
-        """Return heights of sites above the ground right below them, m, [E, N]."""
-        return self.terrain.clearance(self.site_pos_w(index))
+class Body:
+    """One body: `view.body("torso").lin_vel_EL`; the world frame, as in `Bodies`.
 
-    @indexed_quantity
-    def site_lin_vel_w(self, index: Index) -> Tensor:
-        """Return linear velocities of sites, world frame, m/s, [E, N, 3]."""
-        return self._state.point_velocity(self.site_pos_w(index), self._site_body[index])
+    Attributes:
+        name, id: in the model.
+    """
+
+    def __init__(self, bodies: Bodies) -> None:
+        (self.name,), (self.id,) = bodies.names, bodies.ids
+        self._bodies = bodies
+
+    @property
+    def pos_EL(self) -> Float[Tensor, "E 3"]:
+        """Position of the body frame, m."""
+        return self._bodies.pos_EN3[:, 0]
+
+    @property
+    def quat_EL(self) -> Float[Tensor, "E 4"]:
+        """Orientation, body to world, (w, x, y, z)."""
+        return self._bodies.quat_EN4[:, 0]
+
+    @property
+    def axes_E33(self) -> Float[Tensor, "E 3 3"]:
+        """The x, y and z axis, a unit vector each: [E, axis, 3]."""
+        return self._bodies.axes_EN33[:, 0]
+
+    @property
+    def lin_vel_EL(self) -> Float[Tensor, "E 3"]:
+        """Linear velocity of the origin of the body frame, m/s."""
+        return self._bodies.lin_vel_EN3[:, 0]
+
+    @property
+    def ang_vel_EL(self) -> Float[Tensor, "E 3"]:
+        """Angular velocity, rad/s."""
+        return self._bodies.ang_vel_EN3[:, 0]
+
+
+class Sites(_Points):
+    """The sites that some patterns match: `view.sites(".*_foot").height_EN`."""
+
+    def __init__(self, state: GuardedState, ids: Sequence[int], names: Sequence[str]) -> None:
+        super().__init__(state, ids, names)
+        bodies = [int(state.world.mj_model.site_bodyid[i]) for i in ids]
+        self._bodies = torch.tensor(bodies, device=state.world.device, dtype=torch.int64)
+
+    @quantity
+    def pos_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Positions, m."""
+        return self._state.derived().site_xpos_EL[:, self.index]
+
+    @quantity
+    def height_EN(self) -> Float[Tensor, "E N"]:
+        """Heights above the ground right below, m."""
+        return self._state.ground.clearance(self.pos_EN3)
+
+    @quantity
+    def lin_vel_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Linear velocities, m/s."""
+        return self._state.point_velocity(self.pos_EN3, self._bodies)
+
+
+class Site:
+    """One site: `view.site("finger").pos_EL`; the world frame, as in `Sites`.
+
+    Attributes:
+        name, id: in the model.
+    """
+
+    def __init__(self, sites: Sites) -> None:
+        (self.name,), (self.id,) = sites.names, sites.ids
+        self._sites = sites
+
+    @property
+    def pos_EL(self) -> Float[Tensor, "E 3"]:
+        """Position, m."""
+        return self._sites.pos_EN3[:, 0]
+
+    @property
+    def height_E(self) -> Float[Tensor, " E"]:
+        """Height above the ground right below, m."""
+        return self._sites.height_EN[:, 0]
+
+    @property
+    def lin_vel_EL(self) -> Float[Tensor, "E 3"]:
+        """Linear velocity, m/s."""
+        return self._sites.lin_vel_EN3[:, 0]

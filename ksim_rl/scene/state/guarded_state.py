@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.physics import World
 from ksim_rl.scene.names import Index
+from ksim_rl.scene.state.ground import Ground
 
 
 class GuardedState:
     """Gives out the world for reading and writing, and knows whether derived quantities still fit the state.
 
     Attributes:
+        ground: what heights are measured from.
         reader: who reads at the moment, for the error about stale quantities.
+        is_frozen: whether construction has ended.
     """
 
     def __init__(self, world: World) -> None:
         self.world = world
+        self.ground = Ground(world.num_envs, world.device)
         self.reader = ""
+        self.is_frozen = False
         self._is_stale = False
         self._caches: list[dict[str, Tensor]] = []
         self._body_root = torch.tensor(world.mj_model.body_rootid, device=world.device, dtype=torch.int64)
@@ -57,16 +63,14 @@ class GuardedState:
         self.changed()
 
     def write_columns(
-        self, state_EL: Tensor, address: Index, chosen: Index, mask_E: Tensor, value: Tensor
+        self,
+        state_EL: Float[Tensor, "E L"],
+        columns: Index,
+        mask_E: Bool[Tensor, " E"],
+        value_EK: Float[Tensor, "E K"],
     ) -> None:
-        """Write the rows of `mask_E` into the columns `address[chosen]` of `state_EL`."""
-        if isinstance(address, slice) and isinstance(chosen, slice):
-            self.write(state_EL[:, address][:, chosen], mask_E, value)
-            return
-        if isinstance(address, slice):
-            address = torch.arange(address.start, address.stop, device=self.world.device)
-        columns = address[chosen]
-        state_EL[:, columns] = torch.where(mask_E[:, None], value, state_EL[:, columns])
+        """Copy the rows of `mask_E` into some columns of the state."""
+        state_EL[:, columns] = torch.where(mask_E[:, None], value_EK, state_EL[:, columns])
         self.changed()
 
     def point_velocity(self, point_EN3: Tensor, body: Index) -> Tensor:

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import wraps
 from typing import Any, Protocol
 
 from torch import Tensor
-
-from ksim_rl.scene.names import Index
 
 
 class HasCache(Protocol):
@@ -28,22 +25,3 @@ def quantity(compute: Callable[[Any], Tensor]) -> property:
         return value
 
     return property(read, doc=compute.__doc__)
-
-
-def indexed_quantity(compute: Callable[[Any, Index], Tensor]) -> Callable[[Any, Index], Tensor]:
-    """Make a method that is computed at most once per index between two changes of the state."""
-
-    @wraps(compute)
-    def read(owner: HasCache, index: Index) -> Tensor:
-        if isinstance(index, slice):
-            key = f"{compute.__name__}[{index.start}:{index.stop}:{index.step}]"
-        else:
-            key = f"{compute.__name__}[{id(index)}]"
-            # Kept beside its values: while it lives, no other tensor can have its id.
-            owner.cache[f"index {id(index)}"] = index
-        value = owner.cache.get(key)
-        if value is None:
-            value = owner.cache[key] = compute(owner, index)
-        return value
-
-    return read

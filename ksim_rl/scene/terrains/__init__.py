@@ -1,9 +1,9 @@
 """Terrains: what a scene stands on."""
 
+from ksim_rl.scene.state.ground import Ground
 from ksim_rl.scene.terrains.flat import FlatPatch
 from ksim_rl.scene.terrains.gaps import Gaps
 from ksim_rl.scene.terrains.grid import TerrainGrid
-from ksim_rl.scene.terrains.ground import Ground
 from ksim_rl.scene.terrains.obstacles import DiscreteObstacles
 from ksim_rl.scene.terrains.patch import Lattice, TerrainPatch
 from ksim_rl.scene.terrains.patched_ground import PatchedGround

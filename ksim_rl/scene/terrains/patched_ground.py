@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ksim_rl.scene.terrains.ground import Ground
+from ksim_rl.scene.state.ground import Ground
 from ksim_rl.scene.terrains.terrain import BODY
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class PatchedGround(Ground):
         self._first_level_E = (place_E - first_E) % (max_initial_level + 1)
         self._types_E = torch.tensor(kinds_of_columns, device=device)[self._column_E]
         # Memories start at zero, so what is kept is how far each env has moved.
-        self._moved_E = view.memories.get("terrain.moved_E", dtype=torch.int64, keep=True)
+        self._moved_E = view.buffers.get("terrain.moved_E", dtype=torch.int64, keep=True)
         self._place(torch.ones(view.num_envs, dtype=torch.bool, device=device))
 
     @property

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 
-from ksim_rl.scene.terrains.ground import Ground
+from ksim_rl.scene.state.ground import Ground
 from ksim_rl.scene.terrains.look import MATERIAL
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ class WeightByEpisodes(CurriculumTerm):
         return (self.reward,)
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> Tensor:
-        episodes_E = view.memory("episodes_E", keep=True)
+        episodes_E = view.buffer("episodes_E", keep=True)
         episodes_E.add_(mask_E)
         level = (episodes_E - 1.0).clamp(min=0.0).sum()
         if self.reward in view.reward_weights:

@@ -31,8 +31,8 @@ class WritesThenReads(EventTerm):
     """Reads where a body is after it has moved it."""
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        view.write_joint_pos(mask_E, torch.ones(view.num_envs, 1))
-        view.body_pos_w(view.bodies("puck"))
+        view.joints().write_pos(mask_E, torch.ones(view.num_envs, 1))
+        assert view.bodies("puck").pos_EN3.isfinite().all()
 
 
 def env_of(events, *, source=PUCK_XML, **fields):

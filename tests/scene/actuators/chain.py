@@ -124,7 +124,7 @@ class ChainBench:
         mask_E = torch.zeros(self.world.num_envs, dtype=torch.bool)
         mask_E[list(rows)] = True
         self.view.reset_count_E.add_(mask_E)
-        self.view.memories.clear(mask_E)
+        self.view.buffers.clear(mask_E)
         self.drives.reset(mask_E)
 
     def efforts(self, joint: str) -> torch.Tensor:

@@ -180,7 +180,7 @@ def run_by_hand(
 def test_the_trajectory_is_that_of_the_c_engine_with_the_laws_by_hand(env):
     env.seed(5)
     env.reset()
-    buffers = env.view.memories.buffers()
+    buffers = env.view.buffers.by_name()
     ankle_lags, neck_lags = (buffer.tolist() for name, buffer in buffers.items() if name.endswith("lag_E"))
     start = torch.cat((env.world.qpos_EL, env.world.qvel_EL), dim=-1).double().numpy()
     actions_TEL = actions(6)
@@ -205,9 +205,9 @@ def test_a_partial_reset_leaves_the_other_rows_bit_identical(env):
     env.seed(6)
     env.reset()
     run(env, actions_TEL[:3])
-    before = {name: buffer.clone() for name, buffer in env.view.memories.buffers().items()}
+    before = {name: buffer.clone() for name, buffer in env.view.buffers.by_name().items()}
     env.reset(env_ids=[1])
-    for name, buffer in env.view.memories.buffers().items():
+    for name, buffer in env.view.buffers.by_name().items():
         assert torch.equal(buffer[others], before[name][others]), name
         if "hidden" in name or "cell" in name or "started" in name or "filtered" in name:
             assert before[name][1].any() and not buffer[1].any(), name

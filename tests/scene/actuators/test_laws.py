@@ -108,7 +108,7 @@ def late():
 
 
 def lags(bench, number):
-    return bench.view.memories.buffers()[f"actuators/{number}.lag_E"]
+    return bench.view.buffers.by_name()[f"actuators/{number}.lag_E"]
 
 
 def test_lags_are_drawn_from_the_whole_range_and_from_nothing_else(late):

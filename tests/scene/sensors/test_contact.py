@@ -60,8 +60,8 @@ class Drop(EventTerm):
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
         height_E2 = torch.tensor(self.heights)[:, None].expand(-1, 2)
-        view.write_joint_pos(mask_E, height_E2)
-        view.write_joint_vel(mask_E, torch.zeros_like(height_E2))
+        view.joints().write_pos(mask_E, height_E2)
+        view.joints().write_vel(mask_E, torch.zeros_like(height_E2))
 
 
 def falling_env(

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ksim_rl.scene.state.memory import Memory
+from ksim_rl.scene.state.buffers import Buffers
 from tests.mdp.bench import FREE_BODY, Bench
 
 E = 16
@@ -16,34 +16,34 @@ def odd_rows():
 def test_memory_belongs_to_the_calling_term():
     view = Bench(FREE_BODY, E, {}).view
     with view.scope("rewards/a"):
-        first = view.memory("peak", 2)
+        first = view.buffer("peak", 2)
     with view.scope("rewards/b"):
-        second = view.memory("peak", 3, dtype=torch.int64)
+        second = view.buffer("peak", 3, dtype=torch.int64)
     with view.scope("rewards/a"):
-        assert view.memory("peak", 2) is first
+        assert view.buffer("peak", 2) is first
         with pytest.raises(ValueError, match=r"'rewards/a\.peak' is torch.float32 \(2,\), asked for"):
-            view.memory("peak", 3)
+            view.buffer("peak", 3)
     assert first.shape == (E, 2) and second.dtype == torch.int64
 
 
 def test_rows_that_reset_forget_unless_told_to_keep():
     view, mask_E = Bench(FREE_BODY, E, {}).view, odd_rows()
     with view.scope("rewards/a"):
-        forgets, keeps = view.memory("forgets", 2, 2), view.memory("keeps", keep=True)
+        forgets, keeps = view.buffer("forgets", 2, 2), view.buffer("keeps", keep=True)
     forgets.fill_(1.0), keeps.fill_(1.0)
-    view.memories.clear(mask_E)
+    view.buffers.clear(mask_E)
     assert keeps.eq(1.0).all() and forgets[mask_E].eq(0.0).all() and forgets[~mask_E].eq(1.0).all()
 
 
 def test_memory_cannot_come_into_being_after_construction():
     view = Bench(FREE_BODY, E, {}).view
     with view.scope("rewards/a"):
-        held = view.memory("held")
+        held = view.buffer("held")
         held.fill_(1.0)
         view.freeze()
-        assert view.memory("held") is held and held.eq(0.0).all()
+        assert view.buffer("held") is held and held.eq(0.0).all()
         with pytest.raises(ValueError, match=r"'rewards/a\.late' is new after construction"):
-            view.memory("late")
+            view.buffer("late")
 
 
 def drawn(view, scope, counter=None, *, times=1, draws="", normal=False):
@@ -103,7 +103,7 @@ def test_what_observations_return_shares_no_memory_with_the_state():
 
 
 def test_a_buffer_starts_at_its_initial_value_whenever_it_starts():
-    memory = Memory(3, torch.device("cpu"))
+    memory = Buffers(3, torch.device("cpu"))
     pose_L = torch.tensor([1.0, 2.0])
     target_EL = memory.get("target", 2, initial=pose_L)
     gain_EL = memory.get("gain", 2, keep=True, initial=pose_L)

@@ -1,6 +1,7 @@
-"""What terms keep from step to step: named per-env buffers that are cleared for the rows that reset."""
+"""This module holds what terms keep from step to step: buffers with a row per env, and values that all envs share."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -36,7 +37,7 @@ class Arena:
         self.values[: self._used].masked_fill_(mask_E.index_select(0, self._row_N), 0)
 
 
-class Memory:
+class Buffers:
     """Named buffers of shape [E, ...], allocated once, cleared by mask, saved with the env.
 
     Buffers come into being while the env is constructed (each term runs once then). Afterwards the set is frozen:
@@ -79,7 +80,7 @@ class Memory:
         if buffer is None:
             if self._frozen:
                 raise ValueError(
-                    f"memory {name!r} is new after construction: create it on every path of the term"
+                    f"buffer {name!r} is new after construction: create it on every path of the term"
                 )
             if keep or initial is not None:
                 buffer = torch.zeros(self._num_envs, *shape, dtype=dtype, device=self._device)
@@ -93,7 +94,7 @@ class Memory:
                 buffer.copy_(initial.expand_as(buffer))
         elif tuple(buffer.shape[1:]) != shape or buffer.dtype != dtype:
             raise ValueError(
-                f"memory {name!r} is {buffer.dtype} {tuple(buffer.shape[1:])}, asked for {dtype} {shape}"
+                f"buffer {name!r} is {buffer.dtype} {tuple(buffer.shape[1:])}, asked for {dtype} {shape}"
             )
         return buffer
 
@@ -120,7 +121,7 @@ class Memory:
                 mask = mask_E.view(-1, *[1] * (buffer.ndim - 1))
                 buffer.copy_(torch.where(mask, initial, buffer))
 
-    def buffers(self) -> dict[str, Tensor]:
+    def by_name(self) -> dict[str, Tensor]:
         """Return the buffers by name."""
         return dict(self._buffers)
 
@@ -132,3 +133,39 @@ class Memory:
         made = Arena(self._num_envs, max(width, ARENA_WIDTH), dtype, self._device)
         self._arenas.append(made)
         return made
+
+
+class SharedValues:
+    """Named float32 tensors without an env dim, saved with the env.
+
+    Like `Buffers` they come into being while the env is constructed; unlike those they keep
+    what they start with, and no reset touches them.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._tensors: dict[str, Tensor] = {}
+        self._frozen = False
+
+    def get(self, name: str, initial: float | Sequence[float] | Sequence[Sequence[float]]) -> Tensor:
+        """Return the tensor `name`, which starts at `initial` and has its shape; the same tensor at each call.
+
+        Raises:
+            ValueError: if it is new after construction.
+        """
+        tensor = self._tensors.get(name)
+        if tensor is None:
+            if self._frozen:
+                raise ValueError(f"shared value {name!r} is new after construction: ask for it on every path")
+            with torch.inference_mode(False):
+                tensor = torch.tensor(initial, dtype=torch.float32, device=self._device)
+            self._tensors[name] = tensor
+        return tensor
+
+    def freeze(self) -> None:
+        """Refuse new tensors from now on."""
+        self._frozen = True
+
+    def by_name(self) -> dict[str, Tensor]:
+        """Return the tensors by name."""
+        return dict(self._tensors)
