@@ -28,8 +28,8 @@ from benchmarks.stopwatch import milliseconds
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.device.capture import live_launches
 from ksim_rl.trainers import RunCfg
+from ksim_rl.trainers.algorithm import make_update
 from ksim_rl.trainers.build import build_env
-from ksim_rl.trainers.updates import make_update
 
 ROUNDS = 7
 WARMUP = 3

@@ -34,12 +34,12 @@ from benchmarks import command_line, report
 from benchmarks.raw_physics import physics_ms, record_steps
 from benchmarks.stopwatch import milliseconds
 from ksim_rl import conf, envs
+from ksim_rl.algorithms.ppo.wiring import build_networks
 from ksim_rl.checks import check_choice
 from ksim_rl.collectors import CollectorCfg, RolloutCollector
 from ksim_rl.device.streams import checked_device
 from ksim_rl.testing import check_env, count_syncs
 from ksim_rl.trainers.build import build_env
-from ksim_rl.trainers.networks import build_networks
 from ksim_rl.transforms.innermost import innermost
 
 NAME = "tasks"

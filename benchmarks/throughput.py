@@ -33,7 +33,7 @@ from benchmarks.stopwatch import milliseconds
 from ksim_rl.device.capture import Captured
 from ksim_rl.physics import World
 from ksim_rl.trainers import RunCfg, Trainer, build
-from ksim_rl.trainers.updates import make_update
+from ksim_rl.trainers.algorithm import make_update
 
 
 @dataclass(frozen=True, kw_only=True)

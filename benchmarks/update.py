@@ -32,12 +32,12 @@ from torchrl.objectives.value import GAE
 
 from benchmarks import command_line, report
 from benchmarks.stopwatch import milliseconds
+from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.data import DatasetCfg, EpochSampler
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.streams import checked_device
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
 from ksim_rl.objectives import PPOCfg
-from ksim_rl.trainers.ppo_update import PPOUpdate
 
 STEPS, OBS, ACTIONS, MINIBATCHES = 24, 48, 12, 4
 # Of the dataset whose `update_ms` on a GPU stands in the results by that name alone.

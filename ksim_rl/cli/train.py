@@ -18,7 +18,6 @@ from ksim_rl import conf
 from ksim_rl.cli.command_line import check_command_line
 from ksim_rl.cli.errors import report
 from ksim_rl.cli.report import run_and_report
-from ksim_rl.objectives import DistillationCfg
 from ksim_rl.trainers import RunCfg
 
 
@@ -93,9 +92,7 @@ def _train_one(config: DictConfig) -> int:
     # The run's own config must find what it names from anywhere.
     if cfg.checkpoint is not None:
         cfg = dataclasses.replace(cfg, checkpoint=str(Path(cfg.checkpoint).resolve()))
-    if isinstance(cfg.objective, DistillationCfg):
-        objective = dataclasses.replace(cfg.objective, teacher=str(Path(cfg.objective.teacher).resolve()))
-        cfg = dataclasses.replace(cfg, objective=objective)
+    cfg = dataclasses.replace(cfg, objective=cfg.objective.with_absolute_paths())
     return run_and_report(cfg, _unused(Path(HydraConfig.get().runtime.output_dir)))
 
 

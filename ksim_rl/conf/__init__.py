@@ -1,9 +1,8 @@
-"""The Hydra configs of `ksim-rl train` as YAML, one folder per group, and their composition in Python."""
+"""This room composes the config of `ksim-rl train` with Hydra, from YAML, the dataclasses and what is registered."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -12,20 +11,14 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from ksim_rl import envs
-from ksim_rl.conf import search_path
+from ksim_rl import algorithms, envs
+from ksim_rl.conf import choices, search_path
+from ksim_rl.conf.training import objective_defaults, training_defaults
 from ksim_rl.config import stored_configs
 from ksim_rl.trainers import RunCfg
 
 MODULE, NAME = "ksim_rl.conf", "train"
 RUN_AGAIN, RUN_CONFIG = "run_again", "config.yaml"
-PPO = "ppo"
-# What objectives take of a task's settings for PPO, unless it has some for them.
-TAKEN_FROM_PPO = {
-    PPO: ("objective", "data", "modules"),
-    "amp": ("objective", "data", "modules"),
-    "distillation": ("data", "modules"),
-}
 
 
 def compose(overrides: Sequence[str] = ()) -> RunCfg:
@@ -49,16 +42,17 @@ def compose_within(overrides: Sequence[str], *, name: str = NAME) -> RunCfg:
 
 @cache
 def register() -> None:
-    """Let Hydra find other packages' configs, and store the tasks and their training defaults.
+    """Let Hydra find other packages' configs, and store the groups' choices, the tasks and their training defaults.
 
-    They go to the groups `task`, `task/training` (what holds for any objective) and `task/objective_training`.
+    The last go to the groups `task`, `task/training` (what holds for any objective) and `task/objective_training`.
     """
     search_path.register()
     envs.register_configs()
     store = partial(stored_configs.store, package="_global_")
+    choices.store_choices()
     for name in envs.names():
         store("task/training", name, partial(training_defaults, name))
-        for objective in (*TAKEN_FROM_PPO, *envs.task(name).training_by_objective):
+        for objective in algorithms.names():
             make = partial(objective_defaults, name, objective)
             store("task/objective_training", f"{name}_{objective}", make)
     stored_configs.quicken()
@@ -87,39 +81,3 @@ def register_run(folder: Path) -> bool:
         task["seed"] = "${seed}"
     ConfigStore.instance().store(name=RUN_AGAIN, node={"defaults": ["launch", "_self_"], **tree})
     return True
-
-
-def training_defaults(name: str) -> dict[str, Any]:
-    """Return what a task sets over the groups' defaults whatever the objective is, as a config tree."""
-    task = envs.task(name)
-    # The env's own number of envs and seed follow the run's.
-    tree = {
-        "task_name": name,
-        "num_envs": task.cfg().scene.num_envs,
-        "task": {"scene": {"num_envs": "${num_envs}"}, "seed": "${seed}"},
-    }
-    of_all = {key: value for key, value in task.training.items() if _group(key) not in TAKEN_FROM_PPO[PPO]}
-    return _with(tree, of_all)
-
-
-def objective_defaults(name: str, objective: str) -> dict[str, Any]:
-    """Return what a task sets for one objective, as a config tree."""
-    task = envs.task(name)
-    if objective in task.training_by_objective:
-        return _with({}, task.training_by_objective[objective])
-    taken = TAKEN_FROM_PPO[objective]
-    return _with({}, {key: value for key, value in task.training.items() if _group(key) in taken})
-
-
-def _group(key: str) -> str:
-    return key.partition(".")[0]
-
-
-def _with(tree: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a tree with values set at dotted keys."""
-    config = OmegaConf.create(dict(tree))
-    for key, value in values.items():
-        OmegaConf.update(config, key, value)
-    plain = OmegaConf.to_container(config)
-    assert isinstance(plain, dict)
-    return {str(key): value for key, value in plain.items()}

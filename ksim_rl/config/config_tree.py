@@ -49,6 +49,20 @@ def to_tree(value: Any, annotation: Any = None) -> Any:
     return value
 
 
+def default_tree(cls: type, annotation: Any = None) -> dict[str, Any]:
+    """Return the plain tree of a dataclass's defaults, with Hydra's "???" for fields that have none."""
+    hints, tree = typing.get_type_hints(cls), {}
+    if annotation is not None and cls is not _default_class(annotation):
+        tree[TARGET] = f"{cls.__module__}.{cls.__qualname__}"
+    for field in dataclasses.fields(cls):
+        default = field.default
+        if field.default_factory is not dataclasses.MISSING:
+            default = field.default_factory()
+        missing = default is dataclasses.MISSING
+        tree[field.name] = "???" if missing else to_tree(default, hints[field.name])
+    return tree
+
+
 def from_tree(annotation: type[Config], tree: Any, path: str = "") -> Config:
     """Build the dataclass that a tree describes.
 

@@ -5,11 +5,14 @@ In the package's pyproject.toml:
     [project.entry-points."ksim_rl.tasks"]
     my_robots = "my_robots.tasks"      # a module, or a package whose modules are all read
 
+    [project.entry-points."ksim_rl.algorithms"]
+    my_robots = "my_robots.learning"   # the same
+
     [project.entry-points."ksim_rl.conf"]
     my_robots = "my_robots.conf"       # a package of YAML files, laid out like ksim_rl/conf
 
-Each `Task` at the top level of such a module is registered. Declaring either also lets configs name the package's
-dataclasses (terms, robots, transforms) as `_target_`: who may be installed may also be built.
+Each `Task` or `Algorithm` at the top level of such a module is registered. Declaring any of them also lets configs name
+the package's dataclasses (terms, robots, transforms) as `_target_`: who may be installed may also be built.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from types import ModuleType
 
-TASKS, CONF = "ksim_rl.tasks", "ksim_rl.conf"
+TASKS, ALGORITHMS, CONF = "ksim_rl.tasks", "ksim_rl.algorithms", "ksim_rl.conf"
 
 
 @cache
@@ -32,16 +35,18 @@ def declared(group: str) -> tuple[EntryPoint, ...]:
 
 def packages() -> frozenset[str]:
     """Return the top-level packages that declare an entry point of ours; nothing is imported."""
-    return frozenset(point.module.split(".")[0] for group in (TASKS, CONF) for point in declared(group))
+    return frozenset(
+        point.module.split(".")[0] for group in (TASKS, ALGORITHMS, CONF) for point in declared(group)
+    )
 
 
-def task_modules() -> Iterator[tuple[str, ModuleType]]:
-    """Import the modules that hold tasks, with the origin of each for messages.
+def modules(group: str) -> Iterator[tuple[str, ModuleType]]:
+    """Import the modules that a group of entry points names, with the origin of each for messages.
 
     Raises:
         ValueError: if one cannot be imported; the message names the package.
     """
-    for point in declared(TASKS):
+    for point in declared(group):
         origin = f"entry point {point.name} = {point.value!r} of {_distribution(point)}"
         try:
             module = importlib.import_module(point.module)

@@ -34,7 +34,7 @@ OWN_TASKS = "ksim_rl.tasks"
 def _tasks() -> dict[str, Task]:
     """Import all task modules once, ours and those of other packages, and collect their `Task`s."""
     found: dict[str, tuple[str, Task]] = {}
-    for origin, module in (*_own_modules(), *plugins.task_modules()):
+    for origin, module in (*_own_modules(), *plugins.modules(plugins.TASKS)):
         for value in vars(module).values():
             if not isinstance(value, Task):
                 continue

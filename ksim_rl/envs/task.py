@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
 
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+
+
+class Training(Protocol):
+    """What this room knows of the settings of training, which stand in rooms above."""
+
+    @property
+    def num_envs(self) -> int:
+        """E, parallel envs."""
+        ...
+
+    @property
+    def seed(self) -> int:
+        """Of all draws."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,16 +33,15 @@ class Task:
         name: as in `task=<name>`.
         description: one line for the table of tasks.
         cfg: returns the env's config.
-        training: defaults for training by dotted config key, such as `{"objective.gamma": 0.99}`; the command line
-            overrides them. Those of `objective`, `data` and `modules` are PPO's.
-        training_by_objective: the same for other objectives, by the name of the config, such as
-            `{"fast_td3": {"objective.gamma": 0.97}}`; they lie over those of `training` that are not PPO's.
+        training: how it is trained, a `ksim_rl.trainers.TrainingCfg`; the command line overrides it. Other algorithms
+            than its `objective`'s take of it what fits them. None leaves all to the defaults.
+        other_trainings: the same with the settings of other algorithms.
         solved_at: the mean evaluation return that counts as solved; None if there is no such figure.
     """
 
     name: str
     description: str
     cfg: Callable[[], ManagerBasedRlEnvCfg]
-    training: Mapping[str, Any] = field(default_factory=dict)
-    training_by_objective: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    training: Training | None = None
+    other_trainings: tuple[Training, ...] = ()
     solved_at: float | None = None

@@ -1,6 +1,7 @@
 """Objectives: what is estimated from a rollout, and the losses and gradient steps that improve the policy."""
 
 from ksim_rl.objectives.adaptive_learning_rate import adapt_learning_rate_
+from ksim_rl.objectives.algorithm_cfg import AlgorithmCfg
 from ksim_rl.objectives.amp_cfg import AMPCfg
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.discriminator_loss import discriminator_loss, style_reward
@@ -34,6 +35,7 @@ from ksim_rl.objectives.vtrace import VTrace
 
 __all__ = [
     "AMPCfg",
+    "AlgorithmCfg",
     "GAE",
     "ClipPPOLoss",
     "DistillationCfg",

@@ -42,6 +42,11 @@ class AMPCfg(PPOCfg):
     num_transitions_per_step: int = 4096
     replay_rollouts: int = 10
 
+    @property
+    def observation_groups(self) -> tuple[str, ...]:
+        """The group that is compared."""
+        return (self.style_group,)
+
     def __post_init__(self) -> None:
         """Refuse values out of range, naming the field."""
         super().__post_init__()

@@ -1,15 +1,18 @@
 """The settings of distillation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar, Self
 
 from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.objectives.algorithm_cfg import AlgorithmCfg
 from ksim_rl.objectives.ppo_cfg import check_schedule
 
 LOSSES = ("kl", "mse")
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistillationCfg:
+class DistillationCfg(AlgorithmCfg):
     """A student learns to act as a teacher does in the states that the student itself visits.
 
     That is DAgger (Ross et al., arXiv 1011.0686) without its aggregate of all data: the newest rollout of thousands of
@@ -33,6 +36,8 @@ class DistillationCfg:
         max_skipped_steps: so many gradient steps in a row that are not finite end the run.
     """
 
+    learns_on_sequences: ClassVar[bool] = True
+
     teacher: str = ""
     loss: str = "kl"
     num_epochs: int = 2
@@ -48,6 +53,10 @@ class DistillationCfg:
     adam_eps: float = 1e-8
     weight_decay: float = 0.0
     max_skipped_steps: int = 100
+
+    def with_absolute_paths(self) -> Self:
+        """Return the same settings, whose teacher is found from any folder."""
+        return replace(self, teacher=str(Path(self.teacher).resolve()))
 
     def __post_init__(self) -> None:
         """Refuse values out of range, naming the field."""

@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 
 from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.objectives.algorithm_cfg import AlgorithmCfg
 
 VALUE_REDUCTIONS = ("min", "mean")
 
 
 @dataclass(frozen=True, kw_only=True)
-class OffPolicyCfg:
+class OffPolicyCfg(AlgorithmCfg):
     """What all off-policy objectives share.
 
     Attributes:

@@ -1,8 +1,10 @@
 """The settings of proximal policy optimization."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.objectives.algorithm_cfg import AlgorithmCfg
 
 ADVANTAGES = ("gae", "td_lambda", "vtrace")
 SCHEDULES = ("adaptive", "fixed")
@@ -13,7 +15,7 @@ KERNELS = ("auto", "torch")
 
 
 @dataclass(frozen=True, kw_only=True)
-class PPOCfg:
+class PPOCfg(AlgorithmCfg):
     """Proximal policy optimization (Schulman et al., arXiv 1707.06347); the defaults suit legged locomotion.
 
     Attributes:
@@ -47,6 +49,8 @@ class PPOCfg:
             never does. They differ by the order of sums. The metric `update/fused` says which it is.
     """
 
+    learns_on_sequences: ClassVar[bool] = True
+
     num_epochs: int = 5
     advantage: str = "gae"
     gamma: float = 0.99
@@ -78,6 +82,14 @@ class PPOCfg:
     def estimates_each_epoch(self) -> bool:
         """Whether advantages are estimated anew before each epoch."""
         return self.estimate_each_epoch or self.advantage == "vtrace"
+
+    def check_memory(self) -> None:
+        """Refuse a symmetry, of which memories know nothing."""
+        if self.symmetry != "none":
+            raise ValueError(
+                f"objective.symmetry={self.symmetry!r}: the state of a memory has no known mirror image; use none, or "
+                "modules=mlp"
+            )
 
     def __post_init__(self) -> None:
         """Refuse values out of range, naming the field."""

@@ -4,9 +4,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from ksim_rl import mdp
+from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import CommandTerm, EventTerm, MetricTerm, RewardTerm
+from ksim_rl.modules import ActorCfg, CriticCfg
+from ksim_rl.objectives import PPOCfg
 from ksim_rl.physics import SimCfg
 from ksim_rl.scene.objects import Box
 from ksim_rl.scene.placement import Placement
@@ -14,6 +17,7 @@ from ksim_rl.scene.robots.arm import JOINTS, TIP, Arm
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.terrains import PlaneTerrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
+from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 
 COMMAND = "target"
@@ -117,18 +121,17 @@ def arm_push() -> ManagerBasedRlEnvCfg:
     )
 
 
-def _training(num_iterations: int) -> dict[str, Any]:
-    return {
-        "num_envs": 2048,
-        "modules.actor.hidden_dims": [256, 128],
-        "modules.critic.hidden_dims": [256, 128],
-        "data.num_env_states_per_minibatch": 12288,
-        "data.num_minibatches": 4,
-        "objective.entropy_coeff": 0.003,
-        "objective.clip_value": False,
-        "trainer.num_iterations": num_iterations,
-        "trainer.eval_interval": 50,
-    }
+def _training(num_iterations: int) -> TrainingCfg:
+    return TrainingCfg(
+        num_envs=2048,
+        objective=PPOCfg(entropy_coeff=0.003, clip_value=False),
+        data=DatasetCfg(num_env_states_per_minibatch=12288, num_minibatches=4),
+        modules=ModulesCfg(
+            actor=ActorCfg(hidden_dims=(256, 128)),
+            critic=CriticCfg(hidden_dims=(256, 128)),
+        ),
+        trainer=TrainerCfg(num_iterations=num_iterations, eval_interval=50),
+    )
 
 
 REACH = Task(

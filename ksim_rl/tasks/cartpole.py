@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
+from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import EventTerm, ObservationTerm, RewardTerm, TerminationTerm
@@ -21,7 +22,7 @@ from ksim_rl.mdp.rewards.tolerance import tolerance
 from ksim_rl.scene.robots.cartpole import Cartpole
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.viewer_cfg import ViewerCfg
-from ksim_rl.tasks.small_networks import SMALL_NETWORKS
+from ksim_rl.tasks import small_networks
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 
 
@@ -137,17 +138,14 @@ BALANCE = Task(
     name="cartpole_balance",
     description="keep a pole upright on a cart",
     cfg=cartpole_balance,
-    training=SMALL_NETWORKS
-    | {
-        "num_envs": 512,
-        "data.num_env_states_per_minibatch": 2048,
-        "data.num_minibatches": 8,
-        "objective.learning_rate": 1e-3,
-        "objective.num_epochs": 4,
-        "objective.entropy_coeff": 0.0,
-        "trainer.num_iterations": 120,
-        "trainer.eval_interval": 10,
-    },
+    training=small_networks.training(
+        num_envs=512,
+        data=DatasetCfg(num_env_states_per_minibatch=2048, num_minibatches=8),
+        num_iterations=120,
+        learning_rate=1e-3,
+        num_epochs=4,
+        entropy_coeff=0.0,
+    ),
     # Upright, centered and at rest with little force gives 1 per step for 1000 steps; 950 leaves half a second of that.
     solved_at=950.0,
 )
@@ -155,18 +153,16 @@ SWINGUP = Task(
     name="cartpole_swingup",
     description="swing a hanging pole up and keep it upright",
     cfg=cartpole_swingup,
-    training=SMALL_NETWORKS
-    | {
-        "num_envs": 256,
-        "data.num_env_states_per_minibatch": 2048,
-        "data.num_minibatches": 8,
-        "objective.learning_rate": 5e-4,
-        "objective.num_epochs": 8,
-        "objective.gamma": 0.995,
-        "objective.entropy_coeff": 0.003,
-        "trainer.num_iterations": 300,
-        "trainer.eval_interval": 20,
-    },
+    training=small_networks.training(
+        num_envs=256,
+        data=DatasetCfg(num_env_states_per_minibatch=2048, num_minibatches=8),
+        num_iterations=300,
+        eval_interval=20,
+        learning_rate=5e-4,
+        num_epochs=8,
+        gamma=0.995,
+        entropy_coeff=0.003,
+    ),
     # What a pole gives that is up, centered and at rest from 2 s on (800 of 1000 steps), with nothing before that.
     solved_at=800.0,
 )

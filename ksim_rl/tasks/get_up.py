@@ -8,7 +8,7 @@ something only as far as the robot is up. Falling over ends nothing.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -24,6 +24,7 @@ from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.terrains import PlaneTerrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import velocity
+from ksim_rl.trainers import TrainingCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 
 
@@ -190,6 +191,6 @@ def _observations(robot: LeggedRobot) -> dict[str, ObservationGroupCfg]:
     return {"actor": ObservationGroupCfg(terms=actor), "critic": ObservationGroupCfg(terms=critic)}
 
 
-def training(*, num_iterations: int) -> dict[str, Any]:
+def training(*, num_iterations: int) -> TrainingCfg:
     """Return the training settings: 24 steps of 4096 envs per update."""
-    return velocity.training(num_iterations=num_iterations) | {"objective.entropy_coeff": 0.005}
+    return velocity.training(num_iterations=num_iterations, entropy_coeff=0.005)

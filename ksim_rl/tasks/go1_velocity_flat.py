@@ -46,5 +46,5 @@ TASK = Task(
     description="Unitree Go1 follows a velocity command on flat ground",
     cfg=go1_velocity_flat,
     training=velocity.training(num_iterations=10_000),
-    training_by_objective=velocity.off_policy_training(),
+    other_trainings=velocity.off_policy_trainings(),
 )

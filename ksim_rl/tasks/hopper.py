@@ -76,5 +76,5 @@ HOP = Task(
     name="hopper_hop",
     description="a one-legged planar robot hops forward at 1.5 m/s",
     cfg=hopper_hop,
-    training=planar.training(**{"trainer.num_iterations": 1000}),
+    training=planar.training(num_iterations=1000),
 )

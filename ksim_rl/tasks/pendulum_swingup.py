@@ -4,11 +4,14 @@ Their reward is 1 within 8 degrees of upright and 0 elsewhere; ours rates the wa
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from ksim_rl.algorithms import fast_td3
+from ksim_rl.algorithms.fast_td3 import FastTD3Cfg
+from ksim_rl.data import DatasetCfg, ReplayCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import ObservationTerm, RewardTerm
@@ -23,7 +26,8 @@ from ksim_rl.mdp.rewards.tolerance import tolerance
 from ksim_rl.scene.robots.pendulum import Pendulum
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.viewer_cfg import ViewerCfg
-from ksim_rl.tasks.small_networks import SMALL_NETWORKS
+from ksim_rl.tasks import small_networks
+from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 
 UPRIGHT = math.cos(math.radians(8.0))
@@ -77,43 +81,43 @@ SWINGUP = Task(
     name="pendulum_swingup",
     description="swing a pendulum up with little torque and hold it there",
     cfg=pendulum_swingup,
-    training=SMALL_NETWORKS
-    | {
-        "num_envs": 256,
-        "data.num_env_states_per_minibatch": 2048,
-        "data.num_minibatches": 8,
-        "objective.learning_rate": 1e-3,
-        "objective.num_epochs": 8,
-        "objective.entropy_coeff": 0.0,
-        "trainer.num_iterations": 150,
-        "trainer.eval_interval": 10,
-    },
+    training=small_networks.training(
+        num_envs=256,
+        data=DatasetCfg(num_env_states_per_minibatch=2048, num_minibatches=8),
+        num_iterations=150,
+        learning_rate=1e-3,
+        num_epochs=8,
+        entropy_coeff=0.0,
+    ),
     # Few envs, small networks and small minibatches, for a CPU.
-    training_by_objective={
-        "fast_td3": {
-            "num_envs": 16,
-            "data.num_env_states_per_minibatch": 256,
-            "data.num_minibatches": 32,
-            "data.num_steps": 8,
-            "data.capacity": 4000,
-            "data.learning_starts": 64,
-            "objective.gamma": 0.98,
-            "objective.tau": 0.02,
-            "objective.critic_learning_rate": 1e-3,
-            "objective.actor_learning_rate": 1e-3,
-            "objective.exploration_noise_min": 0.05,
-            "objective.exploration_noise_max": 0.5,
-            "objective.target_noise": 0.05,
-            "objective.weight_decay": 0.0,
-            "modules.actor.hidden_dims": [64, 64],
-            "modules.critic.hidden_dims": [128, 128],
-            # Rewards lie in [0, 1], returns in [0, 50].
-            "modules.critic.v_min": -5.0,
-            "modules.critic.v_max": 55.0,
-            "trainer.num_iterations": 400,
-            "trainer.eval_interval": 50,
-        },
-    },
+    other_trainings=(
+        TrainingCfg(
+            num_envs=16,
+            objective=FastTD3Cfg(
+                gamma=0.98,
+                tau=0.02,
+                critic_learning_rate=1e-3,
+                actor_learning_rate=1e-3,
+                exploration_noise_min=0.05,
+                exploration_noise_max=0.5,
+                target_noise=0.05,
+                weight_decay=0.0,
+            ),
+            data=ReplayCfg(
+                num_env_states_per_minibatch=256,
+                num_minibatches=32,
+                num_steps=8,
+                capacity=4000,
+                learning_starts=64,
+            ),
+            modules=ModulesCfg(
+                actor=replace(fast_td3.ACTOR, hidden_dims=(64, 64)),
+                # Rewards lie in [0, 1], returns in [0, 50].
+                critic=replace(fast_td3.CRITIC, hidden_dims=(128, 128), v_min=-5.0, v_max=55.0),
+            ),
+            trainer=TrainerCfg(num_iterations=400, eval_interval=50),
+        ),
+    ),
     # Upright and at rest from 3 s on, on average over all starts (850 of 1000 steps), with nothing before that.
     solved_at=850.0,
 )

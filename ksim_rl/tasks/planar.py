@@ -4,20 +4,23 @@ The tasks are those of dm_control's suite (Tassa et al., "DeepMind Control Suite
 rewards in [0, 1], 1000 steps per episode, no early end. Unlike there, episodes start standing; who falls has to get up.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
 
 from ksim_rl import mdp
+from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import MetricTerm, RewardTerm
 from ksim_rl.envs.view import EnvView
+from ksim_rl.modules import ActorCfg, CriticCfg
+from ksim_rl.objectives import PPOCfg
 from ksim_rl.physics import SimCfg
 from ksim_rl.scene.scene import Robot, SceneCfg
 from ksim_rl.scene.terrains import PlaneTerrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
+from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 
 STEPS_PER_EPISODE = 1000
@@ -89,19 +92,18 @@ def planar_cfg(
     )
 
 
-def training(**changes: Any) -> Mapping[str, Any]:
-    """Return PPO's settings for a planar runner."""
-    return {
-        "num_envs": 2048,
-        "modules.actor.hidden_dims": [256, 128],
-        "modules.critic.hidden_dims": [256, 128],
-        "modules.actor.init_std": 0.6,
-        "data.num_env_states_per_minibatch": 16384,
-        "data.num_minibatches": 4,
-        "objective.num_epochs": 5,
-        "objective.gamma": 0.99,
-        "objective.entropy_coeff": 0.002,
-        "objective.clip_value": False,
-        "trainer.num_iterations": 500,
-        "trainer.eval_interval": 50,
-    } | changes
+OBJECTIVE: dict[str, Any] = {"entropy_coeff": 0.002, "clip_value": False}
+
+
+def training(*, num_iterations: int = 500, objective: PPOCfg | None = None) -> TrainingCfg:
+    """Return the training settings of a planar runner."""
+    return TrainingCfg(
+        num_envs=2048,
+        objective=objective or PPOCfg(**OBJECTIVE),
+        data=DatasetCfg(num_env_states_per_minibatch=16384, num_minibatches=4),
+        modules=ModulesCfg(
+            actor=ActorCfg(hidden_dims=(256, 128), init_std=0.6),
+            critic=CriticCfg(hidden_dims=(256, 128)),
+        ),
+        trainer=TrainerCfg(num_iterations=num_iterations, eval_interval=50),
+    )

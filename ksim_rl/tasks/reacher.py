@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checks import check_pair
+from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import CommandTerm, ObservationTerm, RewardTerm
@@ -24,7 +25,7 @@ from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.robots.reacher import PLANE_HEIGHT, Reacher
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.viewer_cfg import ViewerCfg
-from ksim_rl.tasks.small_networks import SMALL_NETWORKS
+from ksim_rl.tasks import small_networks
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 
 TARGET_RADIUS = 0.015
@@ -138,17 +139,14 @@ REACHER = Task(
     name="reacher",
     description="a planar arm reaches a point",
     cfg=reacher,
-    training=SMALL_NETWORKS
-    | {
-        "num_envs": 512,
-        "data.num_env_states_per_minibatch": 4096,
-        "data.num_minibatches": 4,
-        "objective.learning_rate": 1e-3,
-        "objective.num_epochs": 6,
-        "objective.entropy_coeff": 0.0,
-        "trainer.num_iterations": 150,
-        "trainer.eval_interval": 10,
-    },
+    training=small_networks.training(
+        num_envs=512,
+        data=DatasetCfg(num_env_states_per_minibatch=4096, num_minibatches=4),
+        num_iterations=150,
+        learning_rate=1e-3,
+        num_epochs=6,
+        entropy_coeff=0.0,
+    ),
     # On the target from 1 s on (950 of 1000 steps), with nothing before that.
     solved_at=930.0,
 )

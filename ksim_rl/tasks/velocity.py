@@ -7,20 +7,29 @@ two (see `training`). Two more things are ours: the actor's joint positions are 
 servo targets.
 """
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from ksim_rl import mdp
+from ksim_rl.algorithms import fast_sac, fast_td3
+from ksim_rl.algorithms.fast_sac import FastSACCfg
+from ksim_rl.algorithms.fast_td3 import FastTD3Cfg
+from ksim_rl.algorithms.off_policy import MANY_ENVS
+from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import CurriculumTerm, EventTerm, ObservationTerm, RewardTerm
+from ksim_rl.modules import ActorCfg, QNetworkCfg
+from ksim_rl.objectives import PPOCfg
 from ksim_rl.physics import SimCfg
 from ksim_rl.scene.robots.legged_robot import LeggedRobot
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.sensors import ContactSensor, Sensor
 from ksim_rl.scene.terrains import PlaneTerrain, Terrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
+from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.transforms.noise.cfg import UniformNoise
 
@@ -274,44 +283,23 @@ def velocity_cfg(
     )
 
 
-def training(*, num_iterations: int) -> dict[str, Any]:
+def training(*, num_iterations: int, entropy_coeff: float = 0.01) -> TrainingCfg:
     """Return the training settings: 24 steps of 4096 envs per update.
 
     They are the peer's but for two: with a discount of 0.98 (it has 0.99) and an output layer of ordinary scale Go1
     tracks both velocities better after 30 M env states (linear 1.64, angular 1.35, against 1.48 and 1.07).
     """
-    return {
-        "num_envs": 4096,
-        "seed": 42,
-        "data.num_env_states_per_minibatch": 24 * 4096 // 4,
-        "data.num_minibatches": 4,
-        "objective.num_epochs": 5,
-        "objective.learning_rate": 1e-3,
-        "objective.schedule": "adaptive",
-        "objective.desired_kl": 0.01,
-        "objective.gamma": 0.98,
-        "objective.lmbda": 0.95,
-        "objective.entropy_coeff": 0.01,
-        "objective.critic_coeff": 1.0,
-        "objective.clip_epsilon": 0.2,
-        "objective.clip_value": True,
-        "objective.normalize_advantage": "dataset",
-        "objective.max_grad_norm": 1.0,
-        "objective.precision": "auto",
-        "modules.actor.hidden_dims": [512, 256, 128],
-        "modules.actor.activation": "elu",
-        "modules.actor.obs_normalization": True,
-        "modules.actor.init_std": 1.0,
-        "modules.actor.std_type": "scalar",
-        "modules.actor.output_gain": 1.0,
-        "modules.critic.hidden_dims": [512, 256, 128],
-        "modules.critic.activation": "elu",
-        "modules.critic.obs_normalization": True,
-        "trainer.num_iterations": num_iterations,
-    }
+    return TrainingCfg(
+        num_envs=4096,
+        seed=42,
+        objective=PPOCfg(gamma=0.98, entropy_coeff=entropy_coeff, precision="auto"),
+        data=DatasetCfg(num_env_states_per_minibatch=24 * 4096 // 4, num_minibatches=4),
+        modules=ModulesCfg(actor=ActorCfg(output_gain=1.0)),
+        trainer=TrainerCfg(num_iterations=num_iterations),
+    )
 
 
-def off_policy_training() -> dict[str, dict[str, Any]]:
+def off_policy_trainings() -> tuple[TrainingCfg, TrainingCfg]:
     """Return the training settings of FastSAC and FastTD3: 4 steps of 4096 envs and 16 or 32 gradient steps in turn.
 
     Gradient steps per env state and noise are near those that the two papers have for quadrupeds (arXiv 2512.01996,
@@ -320,32 +308,31 @@ def off_policy_training() -> dict[str, dict[str, Any]]:
     entropy is that of a standard deviation of 0.09 of them: with the paper's 0, one of 0.24, the noise alone costs Go1
     half of what it can get for its turning rate.
     """
-    shared = {
-        "num_envs": 4096,
-        "seed": 42,
-        "data.num_steps": 4,
-        "data.capacity": 1024,
-        # 2.2 GB for Go1; without it a resumed run fills the replay anew.
-        "data.save_replay": False,
-        "modules.actor.action_bound": 2.0,
-        "modules.critic.v_min": -2.0,
-        "modules.critic.v_max": 6.0,
-        "objective.autocast": True,
-        "trainer.num_iterations": 6_000,
-        "trainer.eval_interval": 500,
-        "trainer.checkpoint_interval": 500,
-        "trainer.log_interval": 10,
-    }
-    fast_sac = {
-        "data.num_env_states_per_minibatch": 8192,
-        "data.num_minibatches": 32,
-        "objective.gamma": 0.98,
-        "objective.target_entropy_per_action": -1.0,
-    }
-    fast_td3 = {
-        "data.num_env_states_per_minibatch": 32768,
-        "data.num_minibatches": 16,
-        "objective.gamma": 0.97,
-        "objective.target_noise": 0.1,
-    }
-    return {"fast_sac": shared | fast_sac, "fast_td3": shared | fast_td3}
+    # 2.2 GB for Go1; without it a resumed run fills the replay anew.
+    data = dataclasses.replace(MANY_ENVS, save_replay=False)
+    trainer = TrainerCfg(num_iterations=6_000, eval_interval=500, checkpoint_interval=500, log_interval=10)
+
+    def networks(actor: Any, critic: QNetworkCfg) -> ModulesCfg:
+        return ModulesCfg(
+            actor=dataclasses.replace(actor, action_bound=2.0),
+            critic=dataclasses.replace(critic, v_min=-2.0, v_max=6.0),
+        )
+
+    return (
+        TrainingCfg(
+            num_envs=4096,
+            seed=42,
+            objective=FastSACCfg(gamma=0.98, target_entropy_per_action=-1.0, autocast=True),
+            data=dataclasses.replace(data, num_env_states_per_minibatch=8192, num_minibatches=32),
+            modules=networks(fast_sac.ACTOR, fast_sac.CRITIC),
+            trainer=trainer,
+        ),
+        TrainingCfg(
+            num_envs=4096,
+            seed=42,
+            objective=FastTD3Cfg(target_noise=0.1, autocast=True),
+            data=data,
+            modules=networks(fast_td3.ACTOR, fast_td3.CRITIC),
+            trainer=trainer,
+        ),
+    )

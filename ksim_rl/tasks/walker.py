@@ -90,5 +90,5 @@ RUN = Task(
     name="walker_run",
     description="a planar biped runs at 5 m/s",
     cfg=walker_run,
-    training=planar.training(**{"trainer.num_iterations": 1000}),
+    training=planar.training(num_iterations=1000),
 )

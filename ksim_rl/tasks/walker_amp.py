@@ -15,6 +15,7 @@ from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import MetricTerm, RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.rewards.tolerance import tolerance
+from ksim_rl.objectives import AMPCfg
 from ksim_rl.scene.motions.walker_walk import SPEED
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.robots.walker import LEGS, SERVOS, Walker
@@ -89,20 +90,12 @@ def walker_amp() -> ManagerBasedRlEnvCfg:
     )
 
 
-TRAINING = planar.training(**{"trainer.num_iterations": 400})
 AMP = Task(
     name="walker_amp",
     description="a planar biped walks at 0.8 m/s, with objective=amp as a recorded walk does",
     cfg=walker_amp,
-    training=TRAINING,
-    training_by_objective={
-        "amp": {
-            **{
-                key: value
-                for key, value in TRAINING.items()
-                if key.startswith(("data.", "modules.", "objective."))
-            },
-            "objective.motions": [MOTION],
-        }
-    },
+    training=planar.training(num_iterations=400),
+    other_trainings=(
+        planar.training(num_iterations=400, objective=AMPCfg(motions=(MOTION,), **planar.OBJECTIVE)),
+    ),
 )

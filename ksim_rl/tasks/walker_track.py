@@ -57,5 +57,5 @@ TRACK = Task(
     name="walker_track",
     description="a planar biped follows a walk",
     cfg=walker_track,
-    training=planar.training(**{"trainer.num_iterations": 400}),
+    training=planar.training(num_iterations=400),
 )

@@ -1,34 +1,45 @@
 """The training loop, and what surrounds it: evaluation, checkpoints, logs, progress, pictures."""
 
+import importlib
+from typing import Any
+
+from ksim_rl.trainers.algorithm import Algorithm, Update
 from ksim_rl.trainers.build import build
 from ksim_rl.trainers.checkpoint import Checkpoint, CheckpointError
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
 from ksim_rl.trainers.hook import Hook
-from ksim_rl.trainers.off_policy_update import OffPolicyUpdate
-from ksim_rl.trainers.ppo_update import PPOUpdate
 from ksim_rl.trainers.progress import RunProgress
-from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg
+from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg, TrainingCfg
 from ksim_rl.trainers.run_folder import Policy, load_policy, record_video, run
 from ksim_rl.trainers.trainer import Outcome, Trainer
 from ksim_rl.trainers.trainer_cfg import TrainerCfg
 
 __all__ = [
+    "Algorithm",
     "Checkpoint",
     "CheckpointError",
     "Evaluation",
     "Evaluator",
     "Hook",
     "ModulesCfg",
-    "OffPolicyUpdate",
     "Outcome",
-    "PPOUpdate",
     "Policy",
     "RunCfg",
     "RunProgress",
     "Trainer",
     "TrainerCfg",
+    "TrainingCfg",
+    "Update",
     "build",
     "load_policy",
     "record_video",
     "run",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Find the updates, which users import from here as well, in the room above."""
+    algorithms = importlib.import_module("ksim_rl.algorithms")
+    if name.endswith("Update") and name in algorithms.__all__:
+        return getattr(algorithms, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

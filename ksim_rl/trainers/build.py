@@ -8,19 +8,19 @@ from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
 from ksim_rl import envs
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.device import state_tree
+from ksim_rl.modules import RecurrentStatePrimer, recurrent_transforms, state_spec
+from ksim_rl.trainers.algorithm import make_update
 from ksim_rl.trainers.checkpoint import Checkpoint
 from ksim_rl.trainers.evaluation import Evaluator
 from ksim_rl.trainers.hook import Hook
 from ksim_rl.trainers.loggers import check_installed, make_loggers
-from ksim_rl.trainers.networks import with_recurrent_state
-from ksim_rl.trainers.run_cfg import RunCfg
+from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg
 from ksim_rl.trainers.trainer import Trainer
-from ksim_rl.trainers.updates import make_update
 from ksim_rl.transforms.innermost import innermost
 
 # Evaluations see other initial states than training does.
@@ -95,7 +95,17 @@ def build_env(cfg: RunCfg, *, num_envs: int, seed: int, render_mode: str | None 
     scene = dataclasses.replace(cfg.task.scene, num_envs=num_envs)
     task = dataclasses.replace(cfg.task, scene=scene, seed=seed)
     env = envs.build(task, device=cfg.resolved_device(), render_mode=render_mode)
-    return with_recurrent_state(env, cfg.modules)
+    return _with_recurrent_state(env, cfg.modules)
+
+
+def _with_recurrent_state(env: TransformedEnv, modules: ModulesCfg) -> TransformedEnv:
+    """Let an env carry what the policy remembers, and tell networks with a memory where episodes begin."""
+    if modules.recurrent:
+        cfg = modules.recurrent_actor
+        primers = [] if cfg is None else [RecurrentStatePrimer(state_spec(cfg, "actor"))]
+        for transform in recurrent_transforms(env, *primers):
+            env.append_transform(transform)
+    return env
 
 
 def load_actor(actor: TensorDictModuleBase, state: Mapping[str, Any]) -> None:

@@ -23,8 +23,9 @@ from ksim_rl.modules import (
     SharedTrunkCfg,
     SquashedActorCfg,
 )
-from ksim_rl.objectives import AMPCfg, DistillationCfg, PPOCfg, SACCfg, TD3Cfg
+from ksim_rl.objectives import AlgorithmCfg
 from ksim_rl.trainers.loggers import LoggerCfg
+from ksim_rl.trainers.old_configs import up_to_date
 from ksim_rl.trainers.trainer_cfg import TrainerCfg
 
 # Seeds of evaluations lie above a run's own, and must fit 64 bits as well.
@@ -66,6 +67,11 @@ class ModulesCfg:
         """Whether a network has a memory."""
         return self.recurrent_actor is not None or self.recurrent_critic is not None
 
+    @property
+    def kinds(self) -> tuple[type, type]:
+        """The classes of the settings of actor and critic."""
+        return type(self.actor), type(self.critic)
+
     def observation_keys(self, *names: str) -> list[ObservationKey]:
         """Return what the networks read of an EnvState; given "actor" or "critic", what that one reads."""
         shared = () if self.trunk is None else self.trunk.in_keys
@@ -79,30 +85,44 @@ class ModulesCfg:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunCfg:
-    """A training run.
+class TrainingCfg:
+    """What training needs to know beside the env: what a task recommends, and the larger part of a run's config.
+
+    Attributes:
+        num_envs: E, parallel envs.
+        seed: of all draws.
+        objective: the settings of an algorithm; its class says which one.
+        data: what an update learns from.
+        modules: the networks.
+        collector, trainer: of `RolloutCollector` and `Trainer`.
+    """
+
+    num_envs: int
+    seed: int = 1
+    objective: AlgorithmCfg
+    data: DatasetCfg | ReplayCfg
+    modules: ModulesCfg = field(default_factory=ModulesCfg)
+    collector: CollectorCfg = field(default_factory=lambda: CollectorCfg(stagger_episodes=True))
+    trainer: TrainerCfg = field(default_factory=TrainerCfg)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunCfg(TrainingCfg):
+    """A training run: what `TrainingCfg` holds, and where and of what it is.
 
     Attributes:
         task_name: the registered task that `task` began as; names the run and its threshold.
-        num_envs: E, parallel envs.
+        task: the env.
         device: "cpu", "cuda", "cuda:<index>", or "auto" for CUDA where there is a GPU.
-        seed: of all draws.
         checkpoint: a run folder or a checkpoint whose networks and normalizers this run starts from; None starts
             anew.
-        task: the env.
+        logger: where metrics go.
     """
 
     task_name: str
-    num_envs: int
     task: ManagerBasedRlEnvCfg
-    data: DatasetCfg | ReplayCfg
     device: str = "auto"
-    seed: int = 1
     checkpoint: str | None = None
-    collector: CollectorCfg = field(default_factory=CollectorCfg)
-    objective: PPOCfg | AMPCfg | DistillationCfg | SACCfg | TD3Cfg = field(default_factory=PPOCfg)
-    modules: ModulesCfg = field(default_factory=ModulesCfg)
-    trainer: TrainerCfg = field(default_factory=TrainerCfg)
     logger: LoggerCfg = field(default_factory=LoggerCfg)
 
     def __post_init__(self) -> None:
@@ -123,7 +143,7 @@ class RunCfg:
                 "set num_envs, which sets both"
             )
         groups = {key for key in self.modules.observation_keys() if isinstance(key, str)}
-        groups |= {self.objective.style_group} if isinstance(self.objective, AMPCfg) else set()
+        groups |= set(self.objective.observation_groups)
         missing = sorted(groups - set(self.task.observations))
         if missing:
             raise ValueError(
@@ -135,7 +155,6 @@ class RunCfg:
 
     def _check_sequences(self) -> None:
         """Refuse sequences where nothing remembers, memories without sequences, and sizes that do not fit."""
-        on_sequences = isinstance(self.objective, (PPOCfg, DistillationCfg))
         if not self.modules.recurrent:
             if isinstance(self.data, DatasetCfg) and (self.data.sequence_length or self.data.burn_in):
                 raise ValueError(
@@ -143,17 +162,12 @@ class RunCfg:
                     "networks with a memory learn on sequences; use modules=lstm or modules=gru, or null and 0"
                 )
             return
-        if not on_sequences or not isinstance(self.data, DatasetCfg):
+        if not self.objective.learns_on_sequences or not isinstance(self.data, DatasetCfg):
             raise ValueError(
                 f"modules.recurrent_actor or recurrent_critic is set, and {type(self.objective).__name__} learns on "
                 "single env states: set both to null, or use objective=ppo, amp or distillation"
             )
-        symmetry = getattr(self.objective, "symmetry", "none")
-        if symmetry != "none":
-            raise ValueError(
-                f"objective.symmetry={symmetry!r}: the state of a memory has no known mirror image; use none, or "
-                "modules=mlp"
-            )
+        self.objective.check_memory()
         sequence_length(
             self.data.rollout_length(self.num_envs),
             self.data.sequence_length,
@@ -163,12 +177,12 @@ class RunCfg:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> "RunCfg":
-        """Build the config from plain data, such as a resolved Hydra config.
+        """Build the config from plain data, such as a resolved Hydra config or what an earlier version wrote.
 
         Raises:
             ValueError: with the full path of the field that is unknown, missing, of a wrong type or out of range.
         """
-        return from_tree(cls, tree)
+        return from_tree(cls, up_to_date(tree))
 
     def to_tree(self) -> dict[str, Any]:
         """Return the config as plain data, from which `from_tree` builds an equal one."""

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from ksim_rl.device.memory import memory_for
 from ksim_rl.trainers import checkpoint, video
+from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build, build_env, load_actor
 from ksim_rl.trainers.columns import check_columns
 from ksim_rl.trainers.evaluation import Evaluation
@@ -19,7 +20,6 @@ from ksim_rl.trainers.hook import Hook
 from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_cfg import RunCfg
 from ksim_rl.trainers.trainer import Outcome, Trainer
-from ksim_rl.trainers.updates import make_policy
 from ksim_rl.transforms import observation_columns
 from ksim_rl.transforms.innermost import innermost
 

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from ksim_rl.checks import near
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.trainers import checkpoint
+from ksim_rl.trainers.algorithm import Update
 from ksim_rl.trainers.checkpoint_hook import CheckpointHook
 from ksim_rl.trainers.columns import check_columns
 from ksim_rl.trainers.episode_metrics import episode_means, read_episode_sums
@@ -25,7 +26,6 @@ from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_clock import RunClock
 from ksim_rl.trainers.run_state import load_random_state, random_state
 from ksim_rl.trainers.trainer_cfg import TrainerCfg
-from ksim_rl.trainers.update import Update
 from ksim_rl.transforms import observation_columns
 from ksim_rl.transforms.innermost import innermost
 

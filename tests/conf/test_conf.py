@@ -1,55 +1,79 @@
-"""The YAML files say what the dataclasses say, and each choice composes."""
+"""Each choice of a group composes, and tasks set what differs from the defaults."""
 
-from importlib.resources import files
+import dataclasses
 
 import pytest
-from omegaconf import OmegaConf
 
-from ksim_rl import conf, envs
+from ksim_rl import algorithms, conf, envs
 from ksim_rl.collectors import CollectorCfg
-from ksim_rl.data import DatasetCfg
-from ksim_rl.envs import to_tree
+from ksim_rl.conf.choices import CHOICES
+from ksim_rl.envs import Task
 from ksim_rl.objectives import PPOCfg
-from ksim_rl.trainers import ModulesCfg, TrainerCfg
+from ksim_rl.trainers import TrainerCfg, TrainingCfg
 from ksim_rl.trainers.loggers import LoggerCfg, MLflowCfg, WandbCfg
 
-FOLDER = files("ksim_rl.conf")
-DATA = DatasetCfg(num_env_states_per_minibatch=4096, num_minibatches=4)
+
+def test_without_a_task_of_its_own_settings_a_run_has_the_dataclasses_defaults(monkeypatch):
+    bare = dataclasses.replace(envs.task("cartpole_balance"), training=None)
+    monkeypatch.setattr(envs, "task", lambda name: bare)
+    from ksim_rl.conf import training
+
+    assert training.objective_defaults("cartpole_balance", "ppo") == {}
+    assert set(training.training_defaults("cartpole_balance")) == {"task_name", "num_envs", "task"}
 
 
-def read(name):
-    return OmegaConf.to_container(OmegaConf.create((FOLDER / name).read_text()))
+def test_the_defaults_are_those_of_the_dataclasses():
+    cfg = conf.compose(["task=go1_velocity_flat"])
+    assert cfg.collector == CollectorCfg(stagger_episodes=True)
+    assert cfg.logger == LoggerCfg()
+    assert cfg.trainer == TrainerCfg(num_iterations=10_000)
+    assert cfg.objective == PPOCfg(gamma=0.98, precision="auto")
 
 
 @pytest.mark.parametrize(
     ("name", "cfg"),
     [
-        ("collector/rollout.yaml", CollectorCfg(stagger_episodes=True)),
-        ("data/on_policy.yaml", DATA),
-        ("objective/ppo.yaml", PPOCfg()),
-        ("modules/mlp.yaml", ModulesCfg()),
-        ("trainer/on_policy.yaml", TrainerCfg()),
-        ("logger/local.yaml", LoggerCfg()),
-        ("logger/none.yaml", LoggerCfg(csv=False, tensorboard=False)),
-        ("logger/wandb.yaml", LoggerCfg(tensorboard=False, wandb=WandbCfg())),
-        ("logger/mlflow.yaml", LoggerCfg(tensorboard=False, mlflow=MLflowCfg())),
+        ("none", LoggerCfg(csv=False, tensorboard=False)),
+        ("wandb", LoggerCfg(tensorboard=False, wandb=WandbCfg())),
+        ("mlflow", LoggerCfg(tensorboard=False, mlflow=MLflowCfg())),
     ],
 )
-def test_a_yaml_file_lists_every_field(name, cfg):
-    assert read(name) == to_tree(cfg, type(cfg))
+def test_a_logger_is_chosen_by_name(name, cfg):
+    assert conf.compose([f"logger={name}"]).logger == cfg
 
 
 @pytest.mark.parametrize("name", envs.names())
-def test_each_task_composes_with_its_training_defaults(name):
-    cfg = conf.compose([f"task={name}"])
-    tree = cfg.to_tree()
-    assert cfg.task_name == name
+def test_each_task_composes_with_its_training(name):
+    cfg, training = conf.compose([f"task={name}"]), envs.task(name).training
+    assert isinstance(training, TrainingCfg) and cfg.task_name == name
     assert cfg.task.scene.num_envs == cfg.num_envs
-    for path, value in envs.task(name).training.items():
-        node = tree
-        for key in path.split("."):
-            node = node[key]
-        assert node == (list(value) if isinstance(value, tuple) else value), path
+    for field in dataclasses.fields(TrainingCfg):
+        assert getattr(cfg, field.name) == getattr(training, field.name), field.name
+
+
+@pytest.mark.parametrize("name", [name for name in envs.names() if envs.task(name).other_trainings])
+def test_each_task_composes_with_its_training_by_other_algorithms(name):
+    for training in envs.task(name).other_trainings:
+        objective = algorithms.registry.serving(type(training.objective)).name
+        cfg = conf.compose([f"task={name}", f"objective={objective}"])
+        for field in dataclasses.fields(TrainingCfg):
+            assert getattr(cfg, field.name) == getattr(training, field.name), field.name
+
+
+@pytest.mark.parametrize("name", [name for name in CHOICES["modules"] if name != "mlp"])
+def test_what_a_task_sets_lies_over_other_networks(name):
+    cfg, choice = conf.compose(["task=walker_walk", f"modules={name}"]), CHOICES["modules"][name]
+    assert cfg.modules.actor.hidden_dims == (256, 128) and cfg.modules.actor.init_std == 0.6
+    assert cfg.modules.recurrent_actor == choice.recurrent_actor and cfg.modules.trunk == choice.trunk
+
+
+def test_a_task_with_settings_as_they_were_in_0_1_is_refused(monkeypatch):
+    old = Task(name="old", description="", cfg=envs.task("arm_reach").cfg, training={"objective.gamma": 0.9})
+    monkeypatch.setattr(envs, "task", lambda name: old)
+    from ksim_rl.conf import training
+
+    with pytest.raises(ValueError, match="task 'old': training is a dict; expected a .*TrainingCfg"):
+        training.training_defaults("old")
 
 
 def test_the_command_line_overrides_the_tasks_defaults():

@@ -1,37 +1,11 @@
 """Distillation and AMP compose to whole configs, with what tasks set for PPO where it means the same."""
 
-from importlib.resources import files
-
 import pytest
-from omegaconf import OmegaConf
 
 from ksim_rl import conf
-from ksim_rl.envs import to_tree
-from ksim_rl.objectives import AMPCfg, DistillationCfg, PPOCfg
 from ksim_rl.trainers import RunCfg
 
-FOLDER = files("ksim_rl.conf") / "objective"
 TEACHER = ["objective=distillation", "objective.teacher=runs/teacher"]
-
-
-def read(name):
-    tree = OmegaConf.to_container(OmegaConf.create((FOLDER / name).read_text()))
-    tree.pop("defaults", None)
-    target = tree.pop("_target_")
-    return target, tree
-
-
-def test_the_yaml_files_list_every_field_with_its_default():
-    target, tree = read("distillation.yaml")
-    assert target == "ksim_rl.objectives.DistillationCfg"
-    assert tree | {"teacher": "x"} == to_tree(DistillationCfg(teacher="x"), DistillationCfg)
-    target, tree = read("amp.yaml")
-    assert target == "ksim_rl.objectives.AMPCfg"
-    # The rest is in ppo.yaml, on which it builds.
-    cfg = to_tree(AMPCfg(motions=("x",)), AMPCfg)
-    assert tree | {"motions": ["x"]} == {
-        key: value for key, value in cfg.items() if key not in to_tree(PPOCfg(), PPOCfg)
-    }
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from benchmarks.update import make_rollout
+from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.data import DatasetCfg
 from ksim_rl.device.capture import Captured
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
 from ksim_rl.objectives import PPOCfg
-from ksim_rl.trainers.ppo_update import PPOUpdate
 from tests.gpu.no_syncs import no_syncs
 
 pytestmark = pytest.mark.gpu

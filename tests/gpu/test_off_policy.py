@@ -8,8 +8,8 @@ from tensordict import TensorDict
 from torchrl.data import Unbounded
 
 from ksim_rl.objectives import SACCfg, TD3Cfg
+from tests.algorithms.off_policy_problem import make_update
 from tests.gpu.no_syncs import no_syncs
-from tests.trainers.off_policy_problem import make_update
 
 pytestmark = pytest.mark.gpu
 NUM_ENVS, LENGTH = 64, 4

@@ -156,32 +156,33 @@ def test_command_is_that_of_the_page(ref):
 
 def test_training_defaults(ref):
     ppo, training = ref.figures["ppo"], ref.task.training
-    dataset = training["data.num_env_states_per_minibatch"] * training["data.num_minibatches"]
-    assert dataset / training["num_envs"] == ppo["num_steps_per_env"]
-    assert training["trainer.num_iterations"] == ppo["max_iterations"]
-    assert training["seed"] == ppo["seed"]
-    for network in ("actor", "critic"):
-        for field in ("hidden_dims", "activation", "obs_normalization"):
-            assert training[f"modules.{network}.{field}"] == ppo[network][field]
+    assert training.data.num_env_states / training.num_envs == ppo["num_steps_per_env"]
+    assert training.trainer.num_iterations == ppo["max_iterations"]
+    assert training.seed == ppo["seed"]
+    actor, critic, objective = training.modules.actor, training.modules.critic, training.objective
+    for name, network in (("actor", actor), ("critic", critic)):
+        assert list(network.hidden_dims) == ppo[name]["hidden_dims"]
+        for field in ("activation", "obs_normalization"):
+            assert getattr(network, field) == ppo[name][field]
     for field in ("init_std", "std_type"):
-        assert training[f"modules.actor.{field}"] == ppo["actor"]["distribution_cfg"][field]
+        assert getattr(actor, field) == ppo["actor"]["distribution_cfg"][field]
     algorithm = ppo["algorithm"]
     names = {
-        "num_learning_epochs": "objective.num_epochs",
-        "num_mini_batches": "data.num_minibatches",
-        "learning_rate": "objective.learning_rate",
-        "schedule": "objective.schedule",
-        "lam": "objective.lmbda",
-        "entropy_coef": "objective.entropy_coeff",
-        "desired_kl": "objective.desired_kl",
-        "max_grad_norm": "objective.max_grad_norm",
-        "value_loss_coef": "objective.critic_coeff",
-        "use_clipped_value_loss": "objective.clip_value",
-        "clip_param": "objective.clip_epsilon",
+        "num_learning_epochs": "num_epochs",
+        "learning_rate": "learning_rate",
+        "schedule": "schedule",
+        "lam": "lmbda",
+        "entropy_coef": "entropy_coeff",
+        "desired_kl": "desired_kl",
+        "max_grad_norm": "max_grad_norm",
+        "value_loss_coef": "critic_coeff",
+        "use_clipped_value_loss": "clip_value",
+        "clip_param": "clip_epsilon",
     }
     for theirs, ours in names.items():
-        assert training[ours] == algorithm[theirs], ours
+        assert getattr(objective, ours) == algorithm[theirs], ours
+    assert training.data.num_minibatches == algorithm["num_mini_batches"]
     # Ours on purpose; see `velocity.training`.
-    assert (training["objective.gamma"], algorithm["gamma"]) == (0.98, 0.99)
+    assert (objective.gamma, algorithm["gamma"]) == (0.98, 0.99)
     assert not algorithm["normalize_advantage_per_mini_batch"]
-    assert training["objective.normalize_advantage"] == "dataset"
+    assert objective.normalize_advantage == "dataset"

@@ -1,0 +1,257 @@
+"""PPO with an adversarial motion prior: style reward, discriminator, then PPO; one CUDA graph on CUDA."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
+from tensordict.utils import unravel_key
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ksim_rl.algorithms.gradient_steps import StepMeans, check_skipped_steps, in_columns
+from ksim_rl.algorithms.optimizer_state import load_optimizer_state, optimizer_state
+from ksim_rl.algorithms.ppo.update import PPOUpdate
+from ksim_rl.algorithms.ppo.wiring import make_ppo_update
+from ksim_rl.data import ReplayCfg, ReplayRing
+from ksim_rl.device import state_tree
+from ksim_rl.device.capture import Captured
+from ksim_rl.mdp.motion_observations import observe_motion
+from ksim_rl.modules import Discriminator
+from ksim_rl.objectives import (
+    AMPCfg,
+    StepGuard,
+    descend,
+    discriminator_loss,
+    make_optimizer,
+    style_reward,
+)
+from ksim_rl.trainers.run_cfg import RunCfg
+
+# Names of the logged means, by the names that `discriminator_loss` gives them.
+LOGGED = {
+    "loss": "loss/discriminator",
+    "penalty": "style/gradient_penalty",
+    "reference_score": "style/reference_score",
+    "policy_score": "style/policy_score",
+    "accuracy": "style/accuracy",
+}
+# What the replay stores beside the features.
+_SIGNALS = [("next", "reward"), ("next", "done"), ("next", "terminated")]
+
+
+def make_amp_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> "AMPUpdate":
+    """Build PPO and the discriminator of a run, and observe its reference motions."""
+    objective: Any = cfg.objective
+    assert isinstance(objective, AMPCfg)
+    ppo = make_ppo_update(cfg, env)
+    group = objective.style_group
+    motions = [observe_motion(env, group=group, file=file) for file in objective.motions]
+    return AMPUpdate(
+        objective,
+        ppo=ppo,
+        reference_N2L=torch.cat([torch.stack((seen_FL[:-1], seen_FL[1:]), 1) for seen_FL in motions]),
+        num_envs=cfg.num_envs,
+    )
+
+
+class AMPUpdate:
+    """Rewards a rollout's transitions for looking like the reference motions, and improves the policy with that.
+
+    In turn: the discriminator scores the rollout, PPO learns from it with both rewards, and the discriminator learns
+    from the motions and the policy's last rollouts. Nothing makes a host sync. Each rollout must be the same memory,
+    which is what `RolloutCollector` gives.
+
+    Args:
+        cfg: of the objective.
+        ppo: improves the policy; its networks are the policy's.
+        reference_N2L: transitions of the motions: the features before and after an env step, float32 [N, 2, L].
+        num_envs: E.
+
+    Attributes:
+        discriminator: tells transitions of the motions from those of the policy.
+        replay: the policy's transitions of the last rollouts.
+    """
+
+    def __init__(self, cfg: AMPCfg, *, ppo: PPOUpdate, reference_N2L: Tensor, num_envs: int) -> None:
+        self.cfg, self.ppo, self.device = cfg, ppo, ppo.device
+        if not bool(reference_N2L.isfinite().all()):
+            raise ValueError(
+                f"motions={cfg.motions!r}: group {cfg.style_group!r} is not finite in their states"
+            )
+        self.reference_N2L = reference_N2L.to(self.device)
+        self.discriminator = Discriminator(
+            reference_N2L.shape[-1],
+            hidden_dims=cfg.discriminator_hidden_dims,
+            activation=cfg.discriminator_activation,
+            device=self.device,
+        )
+        # So that the first scores are of features in a fitting range.
+        self.discriminator.normalizer.update(self.reference_N2L)
+        own = {
+            "learning_rate": cfg.discriminator_learning_rate,
+            "weight_decay": cfg.discriminator_weight_decay,
+            "schedule": "fixed",
+        }
+        self.optimizer = make_optimizer(dataclasses.replace(cfg, **own), self.discriminator)
+        num_steps = ppo.num_env_states // num_envs
+        self.replay = ReplayRing(
+            ReplayCfg(
+                num_env_states_per_minibatch=cfg.num_transitions_per_step,
+                num_minibatches=cfg.num_discriminator_steps,
+                num_steps=num_steps,
+                capacity=cfg.replay_rollouts * num_steps,
+            ),
+            num_envs=num_envs,
+            observations=[cfg.style_group],
+            device=self.device,
+        )
+        self.guard = StepGuard(device=self.device)
+        self._rollout_ET: TensorDictBase | None = None
+        self._means = StepMeans(LOGGED)
+        self._style = torch.zeros((), device=self.device)
+        self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
+        self._run = Captured(self._update, device=self.device)
+
+    @property
+    def actor(self) -> ProbabilisticTensorDictSequential:
+        """The policy."""
+        return self.ppo.actor
+
+    @property
+    def behavior(self) -> ProbabilisticTensorDictSequential:
+        """The policy that collects: the actor, which samples."""
+        return self.ppo.behavior
+
+    @property
+    def num_env_states(self) -> int:
+        """D, the env states of one rollout."""
+        return self.ppo.num_env_states
+
+    @property
+    def rollout_keys(self) -> list[Any]:
+        """The leaves of an env state that an update reads."""
+        return list(dict.fromkeys([*self.ppo.rollout_keys, *self._features]))
+
+    @property
+    def _features(self) -> tuple[Any, Any]:
+        """Where the features before and after a step lie."""
+        return self.cfg.style_group, unravel_key(("next", self.cfg.style_group))
+
+    def __call__(self, rollout_ET: TensorDictBase) -> None:
+        """Update discriminator and policy with a rollout `["E","T"]` of the dataset's size."""
+        self._rollout_ET = rollout_ET
+        self._run()
+
+    def metrics(self) -> dict[str, Tensor]:
+        """Return what the last update measured, each a tensor [] on the device.
+
+        `style/reward` is the mean style reward of the rollout, in [0, 1]; the rest of `style/` are means over the
+        discriminator's steps.
+        """
+        metrics = self.ppo.metrics()
+        in_a_row = torch.maximum(metrics["update/skipped_in_a_row"], self._longest_skip)
+        return (
+            metrics
+            | self._means
+            | {
+                "style/reward": self._style,
+                "update/skipped_steps": metrics["update/skipped_steps"] + self.guard.skipped,
+                "update/skipped_in_a_row": in_a_row,
+            }
+        )
+
+    def check(self, metrics: Mapping[str, float]) -> None:
+        """Stop a run that skips its gradient steps; `metrics` are those of `metrics()`, on the host.
+
+        Raises:
+            NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped, of PPO or the discriminator.
+        """
+        check_skipped_steps(metrics, self.cfg.max_skipped_steps)
+
+    def _update(self) -> None:
+        rollout_ET = self._rollout_ET
+        assert rollout_ET is not None
+        self.ppo(self._rewarded(rollout_ET))
+        self._learn_style(rollout_ET)
+
+    @torch.no_grad()
+    def _rewarded(self, rollout_ET: TensorDictBase) -> TensorDictBase:
+        """Return the rollout with the sum of both rewards, which leaves the env's own as it was."""
+        style_ET = style_reward(self.discriminator(_transitions(rollout_ET, *self._features))).unsqueeze(-1)
+        self._style.copy_(style_ET.nanmean())
+        reward_ET = rollout_ET.get(("next", "reward"))
+        rewarded_ET = rollout_ET.copy()
+        total_ET = self.cfg.task_coeff * reward_ET + self.cfg.style_coeff * style_ET
+        return rewarded_ET.set(("next", "reward"), total_ET)
+
+    def _learn_style(self, rollout_ET: TensorDictBase) -> None:
+        self.replay.extend(rollout_ET.select(*self._features, *_SIGNALS))
+        net, made, shown = self.discriminator, [], []
+        for minibatch_B in self.replay.minibatches(self.cfg.num_discriminator_steps):
+            drawn_B = torch.randint(
+                len(self.reference_N2L), minibatch_B.batch_size, device=self.reference_N2L.device
+            )
+            reference_B2L = self.reference_N2L[drawn_B]
+            policy_B2L = _transitions(minibatch_B, *self._features)
+            loss, logged = discriminator_loss(
+                net.judge,
+                net.normalized(reference_B2L),
+                net.normalized(policy_B2L),
+                gradient_penalty=self.cfg.gradient_penalty,
+                mask_B=minibatch_B.get(("collector", "mask")).squeeze(-1),
+            )
+            loss = loss + self.cfg.logit_decay * net.logit_weight.square().sum()
+            _, skipped = descend(loss, self.optimizer, max_grad_norm=self.cfg.max_grad_norm)
+            self.guard.count_(skipped)
+            made.append(
+                logged | {"skipped": skipped, "skipped_in_a_row": self.guard.skipped_in_a_row.clone()}
+            )
+            shown += [reference_B2L, policy_B2L]
+        # Only now, so that all steps see the statistics that the rollout was scored with.
+        net.normalizer.update(torch.cat(shown))
+        steps = in_columns(made)
+        self._means.take_(steps)
+        self._longest_skip.copy_(steps["skipped_in_a_row"].max())
+
+    def state_dict(self) -> state_tree.State:
+        """Return PPO's state, and beside it the discriminator with its optimizer and its replay."""
+        return self.ppo.state_dict() | {
+            "discriminator": self.discriminator.state_dict(),
+            "discriminator_optimizer": optimizer_state(self.optimizer),
+            "discriminator_guard": self.guard.state_dict(),
+            "replay": self.replay.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue where `state_dict` was taken; tensors keep their addresses.
+
+        Raises:
+            ValueError: naming the tensor that is missing, unknown or of another shape or type.
+        """
+        self.ppo.load_state_dict(state)
+        state_tree.copy_into(self.discriminator.state_dict(), state["discriminator"], what="discriminator")
+        load_optimizer_state(
+            self.optimizer, state["discriminator_optimizer"], what="optimizer of the discriminator"
+        )
+        guard = state["discriminator_guard"]
+        state_tree.copy_into(self.guard.state_dict(), guard, what="guard of the discriminator")
+        self.replay.load_state_dict(state["replay"])
+
+    def load_weights(self, state: Mapping[str, Any]) -> None:
+        """Take only the networks of a `state_dict`; from a run of plain PPO, those of the policy.
+
+        Raises:
+            ValueError: naming the tensor that is missing, unknown or of another shape or type.
+        """
+        self.ppo.load_weights(state)
+        if "discriminator" in state:
+            own = self.discriminator.state_dict()
+            state_tree.copy_into(own, state["discriminator"], what="discriminator")
+
+
+def _transitions(env_states: TensorDictBase, before: Any, after: Any) -> Tensor:
+    """Return the features before and after each step, [*batch, 2, L]."""
+    return torch.stack((env_states.get(before), env_states.get(after)), -2)

@@ -1,0 +1,92 @@
+"""The policy of another run, as a teacher: its weights, and all that is needed to build it once more."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
+from ksim_rl.device import state_tree
+from ksim_rl.modules import memories
+from ksim_rl.trainers import checkpoint
+from ksim_rl.trainers.algorithm import make_policy
+from ksim_rl.trainers.columns import check_columns
+from ksim_rl.trainers.run_cfg import RunCfg
+from ksim_rl.transforms import observation_columns
+
+
+@dataclass(frozen=True, kw_only=True)
+class Teacher:
+    """A policy that does not change.
+
+    Attributes:
+        policy: the network, its normalizers included.
+        description: the config of its run and the columns of what it reads, as JSON: enough to build it once more.
+    """
+
+    policy: TensorDictModuleBase
+    description: Mapping[str, str] = field(default_factory=dict)
+
+    def state_dict(self) -> state_tree.State:
+        """Return weights and description: `restored_teacher` builds the same one, without the folder of its run."""
+        return {"actor": self.policy.state_dict(), **self.description}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take the weights of a `state_dict`; tensors keep their addresses.
+
+        Raises:
+            ValueError: naming the tensor that does not fit.
+        """
+        state_tree.copy_into(self.policy.state_dict(), state["actor"], what="teacher")
+
+
+def load_teacher(path: Path, env: EnvBase, *, cfg: RunCfg) -> Teacher:
+    """Read the policy of a run folder or a checkpoint, for the env of a student.
+
+    Args:
+        path: the folder, or one of its checkpoints.
+        env: that the student acts in, and that shows what the teacher reads.
+        cfg: of the student's run, for the device.
+
+    Raises:
+        ValueError: when there is none, or it is damaged; naming the observations or the tensor that this env does not
+            have, or has otherwise.
+    """
+    try:
+        saved = checkpoint.load(checkpoint.latest(path))
+        state = {
+            "actor": saved.state["update"]["actor"],
+            "config": json.dumps(saved.config),
+            "columns": json.dumps(saved.state["observation_columns"]),
+        }
+        return restored_teacher(state, env, cfg=cfg)
+    except ValueError as error:
+        raise ValueError(f"objective.teacher={str(path)!r}: {error}") from error
+
+
+def restored_teacher(state: Mapping[str, Any], env: EnvBase, *, cfg: RunCfg) -> Teacher:
+    """Build the teacher of a `Teacher.state_dict`; see `load_teacher`."""
+    teacher_cfg = RunCfg.from_tree({**json.loads(state["config"]), "device": str(cfg.resolved_device())})
+    read = teacher_cfg.modules.observation_keys("actor")
+    theirs: Any = json.loads(state["columns"])
+    ours: Any = observation_columns(env)
+    shown: Any = env.observation_spec
+    for key in read:
+        if key not in shown.keys(True):
+            raise ValueError(
+                f"the teacher reads {key!r}, and this env shows {', '.join(map(repr, ours))}: add it to "
+                "task.observations as the teacher's run has it"
+            )
+    groups = [key for key in read if isinstance(key, str)]
+    check_columns(
+        *({group: columns[group] for group in groups if group in columns} for columns in (theirs, ours))
+    )
+    policy = make_policy(teacher_cfg, env)
+    if memories(policy):
+        raise ValueError("the teacher has a memory, and has to label single env states: take one without")
+    state_tree.copy_into(policy.state_dict(), state["actor"], what="teacher")
+    description = {name: state[name] for name in ("config", "columns")}
+    return Teacher(policy=policy.requires_grad_(False).eval(), description=description)

@@ -1,0 +1,256 @@
+"""One iteration of off-policy learning: env states into the replay, then gradient steps; one CUDA graph on CUDA."""
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from ksim_rl.algorithms.gradient_steps import check_skipped_steps
+from ksim_rl.algorithms.optimizer_state import load_optimizer_state, optimizer_state
+from ksim_rl.data import ReplayCfg, ReplayRing
+from ksim_rl.device import state_tree
+from ksim_rl.device.capture import Captured
+from ksim_rl.modules import ExploringPolicy, update_normalizers
+from ksim_rl.objectives import OffPolicyCfg, OffPolicyLoss, SACCfg, SACLoss, StepGuard, descend, make_adamw
+
+# Names of the logged means, by the names that the losses give them.
+OF_CRITIC_STEPS = {
+    "loss_qvalue": "loss/value",
+    "value": "update/q_value",
+    "td_error": "update/td_error",
+    "critic_grad_norm": "update/critic_grad_norm",
+}
+OF_ACTOR_STEPS = {"loss_actor": "loss/policy", "actor_grad_norm": "update/actor_grad_norm"}
+OF_TEMPERATURE = {"entropy": "loss/entropy", "alpha": "update/alpha"}
+
+
+class OffPolicyUpdate:
+    """Adds a rollout to the replay and improves actor and critics with minibatches of it, without a host sync.
+
+    Until each env has made `learning_starts` steps, rollouts have random actions and there are no gradient steps. From
+    then on an update is `num_minibatches` gradient steps of the critics, each followed by one of the target networks,
+    and by one of the actor (and the temperature) every `policy_delay`. Each rollout must be the same memory, which is
+    what `RolloutCollector` gives.
+
+    Args:
+        cfg: of the objective.
+        loss: of actor and critics; the networks are its own.
+        behavior: the policy that collects, around the loss's actor.
+        data: sizes of rollout, replay and minibatch.
+        num_envs: E.
+        device: where all of it lives.
+
+    Raises:
+        ValueError: if `num_minibatches` is no multiple of `policy_delay`.
+    """
+
+    def __init__(
+        self,
+        cfg: OffPolicyCfg,
+        *,
+        loss: OffPolicyLoss,
+        behavior: ExploringPolicy,
+        data: ReplayCfg,
+        num_envs: int,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        if data.num_minibatches % cfg.policy_delay:
+            raise ValueError(
+                f"data.num_minibatches={data.num_minibatches} is no multiple of objective.policy_delay="
+                f"{cfg.policy_delay}: each iteration makes the same gradient steps"
+            )
+        self.cfg, self.loss, self.data, self.num_envs = cfg, loss, data, num_envs
+        self.device = torch.device(device)
+        self.actor: TensorDictModuleBase = loss.actor_network
+        self.critic = loss.critic_network
+        self.behavior = behavior
+        observations = [key for key in (*self.actor.in_keys, *self.critic.in_keys) if key != "action"]
+        self._observations: list[Any] = list(dict.fromkeys(observations))
+        self.replay = ReplayRing(
+            data, num_envs=num_envs, observations=self._observations, gamma=cfg.gamma, device=self.device
+        )
+        decay = {"weight_decay": cfg.weight_decay}
+        self.optimizers = {
+            "critic": make_adamw(
+                cfg, self.critic.parameters(), learning_rate=cfg.critic_learning_rate, **decay
+            ),
+            "actor": make_adamw(cfg, self.actor.parameters(), learning_rate=cfg.actor_learning_rate, **decay),
+        }
+        if isinstance(cfg, SACCfg) and isinstance(loss, SACLoss) and loss.log_alpha.requires_grad:
+            rate = cfg.alpha_learning_rate
+            self.optimizers["alpha"] = make_adamw(cfg, [loss.log_alpha], learning_rate=rate, weight_decay=0.0)
+        self.guard = StepGuard(device=self.device)
+        self.steps_made = 0
+        self._rollout_ET: TensorDictBase | None = None
+        logged = OF_CRITIC_STEPS | OF_ACTOR_STEPS | (OF_TEMPERATURE if isinstance(loss, SACLoss) else {})
+        self._sums = {name: self._zero() for name in logged.values()}
+        self._counts = {name: self._zero() for name in ("critic", "actor")}
+        self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
+        self._store_only = Captured(self._store, device=self.device)
+        self._store_and_learn = Captured(self._learn, device=self.device)
+
+    @property
+    def num_env_states(self) -> int:
+        """Env states of one rollout, E * T."""
+        return self.num_envs * self.data.num_steps
+
+    @property
+    def rollout_keys(self) -> list[Any]:
+        """The leaves of an env state that an update reads."""
+        following = [("next", key) for key in (*self._observations, "reward", "done", "terminated")]
+        return [*self._observations, "action", *following]
+
+    def __call__(self, rollout_ET: TensorDictBase) -> None:
+        """Learn from a rollout `["E","T"]`, or only keep it while the actions are random."""
+        self._rollout_ET = rollout_ET
+        self.steps_made += self.data.num_steps
+        learns = self.steps_made >= self.data.learning_starts
+        (self._store_and_learn if learns else self._store_only)()
+        self.behavior.random.fill_(not learns)
+
+    def metrics(self) -> dict[str, Tensor]:
+        """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
+        means = {
+            name: total / self._counts["critic" if name in OF_CRITIC_STEPS.values() else "actor"].clamp_min(1)
+            for name, total in self._sums.items()
+        }
+        return means | {
+            "replay/env_states": self.replay.num_stored,
+            "update/skipped_steps": self.guard.skipped,
+            "update/skipped_in_a_row": self._longest_skip,
+            "update/non_finite_env_states": self.replay.non_finite_count,
+        }
+
+    def check(self, metrics: Mapping[str, float]) -> None:
+        """Stop a run that skips its gradient steps; `metrics` are those of `metrics()`, on the host.
+
+        Raises:
+            NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped.
+        """
+        check_skipped_steps(metrics, self.cfg.max_skipped_steps)
+
+    def _store(self) -> None:
+        rollout_ET = self._rollout_ET
+        assert rollout_ET is not None
+        self.replay.extend(rollout_ET)
+        # Unlike on policy, gradient steps need not see the statistics that the actions were drawn with.
+        update_normalizers(rollout_ET, self.actor, self.critic)
+        self.behavior.end_episodes_(rollout_ET.get(("next", "done")).squeeze(-1).any(1))
+
+    def _learn(self) -> None:
+        self._store()
+        for tensor in (*self._sums.values(), *self._counts.values(), self._longest_skip):
+            tensor.zero_()
+        for step, minibatch_B in enumerate(self.replay.minibatches(self.data.num_minibatches), start=1):
+            skipped = self._improve_critic(minibatch_B)
+            if step % self.cfg.policy_delay == 0:
+                skipped = torch.maximum(skipped, self._improve_actor(minibatch_B))
+            self.loss.update_target_(self.cfg.tau)
+            self.guard.count_(skipped)
+            torch.maximum(self._longest_skip, self.guard.skipped_in_a_row, out=self._longest_skip)
+
+    def _improve_critic(self, minibatch_B: TensorDictBase) -> Tensor:
+        """Make one gradient step of the critics, and return 1 if it was skipped, else 0."""
+        with self._precision():
+            loss, logged = self.loss.critic_loss(minibatch_B)
+        norm, skipped = self._descend(loss, "critic")
+        if self.data.prioritized:
+            self.replay.update_priority(minibatch_B.get("index"), minibatch_B.get("td_error"))
+        logged = logged | {"loss_qvalue": loss, "critic_grad_norm": norm}
+        self._measure("critic", logged, OF_CRITIC_STEPS, skipped)
+        return skipped
+
+    def _improve_actor(self, minibatch_B: TensorDictBase) -> Tensor:
+        """Make one gradient step of the actor and the temperature, and return 1 if it was skipped, else 0."""
+        with self._precision():
+            losses, logged = self.loss.actor_losses(minibatch_B)
+        norm, skipped = self._descend(losses["loss_actor"], "actor")
+        if "alpha" in self.optimizers:
+            skipped = torch.maximum(skipped, self._descend(losses["loss_alpha"], "alpha")[1])
+        logged = logged | {"loss_actor": losses["loss_actor"], "actor_grad_norm": norm}
+        self._measure("actor", logged, OF_ACTOR_STEPS | OF_TEMPERATURE, skipped)
+        return skipped
+
+    def _descend(self, loss: Tensor, which: str) -> tuple[Tensor, Tensor]:
+        return descend(loss, self.optimizers[which], max_grad_norm=self.cfg.max_grad_norm)
+
+    def _measure(
+        self, which: str, measured: Mapping[str, Tensor], names: Mapping[str, str], skipped: Tensor
+    ) -> None:
+        made = skipped == 0.0
+        self._counts[which].add_(made)
+        for name, value in measured.items():
+            # A skipped step is counted; its numbers would spoil the means.
+            self._sums[names[name]].add_(torch.where(made, value.detach(), 0.0))
+
+    def _precision(self) -> AbstractContextManager[Any]:
+        # The cache of casted weights would outlive the steps that change them in a captured graph.
+        return torch.autocast(
+            self.device.type, torch.bfloat16, enabled=self.cfg.autocast, cache_enabled=False
+        )
+
+    def _zero(self) -> Tensor:
+        return torch.zeros((), device=self.device)
+
+    def state_dict(self) -> state_tree.State:
+        """Return networks, optimizers, replay, exploration and counters."""
+        state = {
+            "actor": self.actor.state_dict(),
+            "critic": self.critic.state_dict(),
+            "target_critic": self.loss.target_critic_network.state_dict(),
+            "optimizers": {name: optimizer_state(own) for name, own in self.optimizers.items()},
+            "guard": self.guard.state_dict(),
+            "replay": self.replay.state_dict(),
+            "exploration": self.behavior.exploration_state(),
+            "steps_made": self.steps_made,
+        }
+        if isinstance(self.loss, SACLoss):
+            state["log_alpha"] = self.loss.log_alpha
+        return state
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue where `state_dict` was taken; tensors keep their addresses.
+
+        Without a replay in it the run begins with random actions again, until there is one.
+
+        Raises:
+            ValueError: naming the tensor that is missing, unknown or of another shape or type.
+        """
+        self.load_weights(state)
+        for name, optimizer in self.optimizers.items():
+            load_optimizer_state(optimizer, state["optimizers"][name], what=f"{name} optimizer")
+        state_tree.copy_into(self.guard.state_dict(), state["guard"], what="guard")
+        state_tree.copy_into(self.behavior.exploration_state(), state["exploration"], what="exploration")
+        self.replay.load_state_dict(state["replay"])
+        self.steps_made = state["steps_made"] if state["replay"] else 0
+        self.behavior.random.fill_(self.steps_made < self.data.learning_starts)
+
+    def load_weights(self, state: Mapping[str, Any]) -> None:
+        """Take only the networks and the temperature of a `state_dict`.
+
+        Raises:
+            ValueError: naming the tensor that is missing, unknown or of another shape or type, or the bound of actions
+                that is another.
+        """
+        self._check_action_bounds(state["actor"])
+        state_tree.copy_into(self.actor.state_dict(), state["actor"], what="actor")
+        state_tree.copy_into(self.critic.state_dict(), state["critic"], what="critic")
+        target = self.loss.target_critic_network.state_dict()
+        state_tree.copy_into(target, state["target_critic"], what="target critic")
+        if isinstance(self.loss, SACLoss):
+            with torch.no_grad():
+                self.loss.log_alpha.copy_(state["log_alpha"])
+
+    def _check_action_bounds(self, saved: Mapping[str, Any]) -> None:
+        """Refuse an actor that was trained for other actions: its bounds are not weights, and come from the config."""
+        for name, bound in self.actor.state_dict().items():
+            own = bound.cpu()
+            if name.endswith((".low", ".high")) and name in saved and not torch.equal(saved[name].cpu(), own):
+                raise ValueError(
+                    f"modules.actor.action_bound: {name!r} is {own.tolist()} in this run and {saved[name].tolist()} in "
+                    "the checkpoint; take that of the checkpoint's run"
+                )

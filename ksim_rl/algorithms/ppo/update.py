@@ -1,0 +1,235 @@
+"""One RL update: advantages, dataset, gradient steps, observation statistics; one CUDA graph where there is CUDA."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.utils import unravel_key
+from torch import Tensor
+
+from ksim_rl.algorithms.gradient_steps import (
+    StepMeans,
+    check_skipped_steps,
+    epoch_of_steps,
+    in_columns,
+    make_dataset,
+)
+from ksim_rl.algorithms.optimizer_state import load_optimizer_state, optimizer_state
+from ksim_rl.algorithms.ppo.fused import make_fused_ppo
+from ksim_rl.data import DatasetCfg
+from ksim_rl.device import state_tree
+from ksim_rl.device.capture import Captured
+from ksim_rl.modules import CarriedState, memories, update_normalizers
+from ksim_rl.objectives import (
+    PPOCfg,
+    StepGuard,
+    distribution_keys,
+    in_precision,
+    make_advantage,
+    make_loss,
+    make_optimizer,
+    make_symmetric,
+    observation_keys,
+    with_precision_of,
+)
+from ksim_rl.transforms import MirrorMap
+
+# Names of the logged means, by the names that `ppo_step` gives them.
+LOGGED = {
+    "loss_objective": "loss/policy",
+    "loss_critic": "loss/value",
+    "loss_mirror": "loss/mirror",
+    "entropy": "loss/entropy",
+    "kl": "update/kl",
+    "clip_fraction": "update/clip_fraction",
+    "explained_variance": "update/explained_variance",
+    "grad_norm": "update/grad_norm",
+}
+
+
+class PPOUpdate:
+    """Improves actor and critic with one rollout, without a host sync.
+
+    On CUDA the first updates run eagerly and the next is captured. So each rollout must be the same memory, which is
+    what `RolloutCollector` gives.
+
+    Args:
+        cfg: of the objective.
+        actor: any probabilistic module; writes actions, their log-probabilities and parameters of the distribution.
+        critic: writes `state_value`.
+        data: sizes of dataset and minibatch.
+        seed: of the order of the env states in the minibatches.
+        device: where all of it lives.
+        mirror: the mirror images of what the networks read and of the action, for `cfg.symmetry`.
+
+    Attributes:
+        fused: the kernels that make the gradient steps, or why torch makes them.
+    """
+
+    def __init__(
+        self,
+        cfg: PPOCfg,
+        *,
+        actor: ProbabilisticTensorDictSequential,
+        critic: TensorDictModule,
+        data: DatasetCfg,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        mirror: Mapping[Any, MirrorMap] | None = None,
+    ) -> None:
+        self.cfg = cfg = with_precision_of(cfg, device)
+        self.actor, self.critic = actor, critic
+        self.device = torch.device(device)
+        self.advantage = make_advantage(cfg, actor, critic)
+        self.loss = make_loss(cfg, actor, critic)
+        losses = make_symmetric(cfg, self.loss, mirror, device=self.device)
+        self._losses = in_precision(losses, cfg.precision, device=self.device)
+        self.optimizer = make_optimizer(cfg, actor, critic)
+        # The rollouts hold the states of the actor's memory, and not those of the critic's.
+        self._memories = memories(actor, critic)
+        self._carried = CarriedState(critic, acting=actor)
+        self.dataset = make_dataset(
+            data, keys=self.loss.dataset_keys, memories=self._memories, seed=seed, device=self.device
+        )
+        self.guard = StepGuard(device=self.device)
+        self.fused = make_fused_ppo(
+            cfg,
+            actor=actor,
+            critic=critic,
+            optimizer=self.optimizer,
+            guard=self.guard,
+            dataset=self.dataset,
+            device=self.device,
+        )
+        self._is_fused = torch.tensor(float(not isinstance(self.fused, str)), device=self.device)
+        self._rollout_ET: TensorDictBase | None = None
+        self._means = StepMeans(LOGGED)
+        self._std = torch.zeros((), device=self.device)
+        self._scale_keys = [key for key in distribution_keys(actor) if key == "scale" or key[-1] == "scale"]
+        self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
+        self._run = Captured(self._update, device=self.device)
+
+    @property
+    def behavior(self) -> ProbabilisticTensorDictSequential:
+        """The policy that collects: the actor, which samples."""
+        return self.actor
+
+    @property
+    def num_env_states(self) -> int:
+        """D, the env states of one rollout."""
+        return self.dataset.cfg.num_env_states
+
+    @property
+    def rollout_keys(self) -> list[Any]:
+        """The leaves of an env state that an update reads."""
+        actor = self.actor
+        written = [*actor.dist_sample_keys, *actor.log_prob_keys, *distribution_keys(actor)]
+        valued = [key for key in self.critic.in_keys if key not in self._carried.keys]
+        following = [unravel_key(("next", key)) for key in (*valued, "reward", "done", "terminated")]
+        return list(dict.fromkeys([*observation_keys(actor), *valued, *written, *following]))
+
+    def __call__(self, rollout_ET: TensorDictBase) -> None:
+        """Update the networks with a rollout `["E","T"]` of the dataset's size."""
+        self._rollout_ET = rollout_ET
+        self._run()
+
+    def metrics(self) -> dict[str, Tensor]:
+        """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
+        std = {"policy/std": self._std} if self._scale_keys else {}
+        return (
+            self._means
+            | std
+            | {
+                "update/learning_rate": self.optimizer.param_groups[0]["lr"],
+                "update/fused": self._is_fused,
+                "update/skipped_steps": self.guard.skipped,
+                "update/skipped_in_a_row": self._longest_skip,
+                "update/non_finite_env_states": self.dataset.non_finite_count,
+            }
+        )
+
+    def check(self, metrics: Mapping[str, float]) -> None:
+        """Stop a run that skips its gradient steps; `metrics` are those of `metrics()`, on the host.
+
+        Raises:
+            NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped.
+        """
+        check_skipped_steps(metrics, self.cfg.max_skipped_steps)
+
+    def _update(self) -> None:
+        assert self._rollout_ET is not None
+        rollout_ET = self._rollout_ET
+        if isinstance(self.fused, str):
+            steps = self._torch_steps(rollout_ET)
+        else:
+            orders = [self.dataset.epoch_order() for _ in range(self.cfg.num_epochs)]
+            steps, left_out = self.fused(rollout_ET, orders)
+            self.dataset.non_finite_count.add_(left_out)
+        self._means.take_(steps)
+        self._longest_skip.copy_(steps["skipped_in_a_row"].max())
+        if self._scale_keys:
+            self._std.copy_(torch.stack([rollout_ET.get(key).nanmean() for key in self._scale_keys]).mean())
+        # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
+        update_normalizers(rollout_ET, self.actor, self.critic)
+
+    def _torch_steps(self, rollout_ET: TensorDictBase) -> dict[str, Tensor]:
+        """Make all gradient steps with torch; return what each measured, [steps]."""
+        self._carried.begin_(rollout_ET)
+        rollout_ET = self.advantage(rollout_ET)
+        self._carried.end_(rollout_ET)
+        self.dataset.extend(rollout_ET)
+        steps: list[dict[str, Tensor]] = []
+        for epoch in range(self.cfg.num_epochs):
+            if epoch > 0 and self.cfg.estimates_each_epoch:
+                self._estimate_anew(rollout_ET)
+            steps += epoch_of_steps(
+                self.dataset,
+                self._losses,
+                self.optimizer,
+                cfg=self.cfg,
+                guard=self.guard,
+                memories=self._memories,
+            )
+        return in_columns(steps)
+
+    def _estimate_anew(self, rollout_ET: TensorDictBase) -> None:
+        # The rows that are not finite were counted with the first estimate.
+        count = self.dataset.non_finite_count.clone()
+        self.dataset.extend(self.advantage(rollout_ET))
+        self.dataset.non_finite_count.copy_(count)
+
+    def state_dict(self) -> state_tree.State:
+        """Return networks, optimizer, sampler and counters."""
+        return {
+            "actor": self.actor.state_dict(),
+            "critic": self.critic.state_dict(),
+            "optimizer": optimizer_state(self.optimizer),
+            "sampler": self.dataset.sampler.state_dict(),
+            "guard": self.guard.state_dict(),
+            "non_finite_env_states": self.dataset.non_finite_count,
+            "recurrent_state": self._carried.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue where `state_dict` was taken; tensors keep their addresses.
+
+        Raises:
+            ValueError: naming the tensor that is missing, unknown or of another shape or type.
+        """
+        self.load_weights(state)
+        state_tree.copy_into(self.guard.state_dict(), state["guard"], what="guard")
+        load_optimizer_state(self.optimizer, state["optimizer"], what="optimizer")
+        self.dataset.sampler.load_state_dict(state["sampler"])
+        self.dataset.non_finite_count.copy_(state["non_finite_env_states"])
+        self._carried.load_state_dict(state["recurrent_state"], device=self.device)
+
+    def load_weights(self, state: Mapping[str, Any]) -> None:
+        """Take only the networks of a `state_dict`.
+
+        Raises:
+            ValueError: naming the tensor that is missing, unknown or of another shape or type.
+        """
+        state_tree.copy_into(self.actor.state_dict(), state["actor"], what="actor")
+        state_tree.copy_into(self.critic.state_dict(), state["critic"], what="critic")

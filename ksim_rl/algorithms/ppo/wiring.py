@@ -1,0 +1,92 @@
+"""This module builds PPO for a run: actor and critic for what its env observes and does, and their update."""
+
+from functools import partial
+from typing import Any
+
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from torchrl.envs import EnvBase
+from torchrl.modules import ActorValueOperator
+
+from ksim_rl.algorithms.ppo.update import PPOUpdate
+from ksim_rl.data import DatasetCfg
+from ksim_rl.mdp.mirror_maps import mirror_maps
+from ksim_rl.modules import (
+    FEATURES,
+    ActorCfg,
+    CriticCfg,
+    ObservationKey,
+    make_actor,
+    make_critic,
+    make_recurrent_actor,
+    make_recurrent_critic,
+    make_shared_trunk,
+    observation_dim,
+)
+from ksim_rl.objectives import PPOCfg, observation_keys
+from ksim_rl.trainers.run_cfg import RunCfg
+
+
+def make_ppo_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> PPOUpdate:
+    """Build the PPO update of a run; one that is resumed is built like a new one."""
+    assert isinstance(cfg.objective, PPOCfg)
+    if not isinstance(cfg.data, DatasetCfg):
+        raise ValueError(
+            f"data is a {type(cfg.data).__name__}, and PPO needs a DatasetCfg: use data=on_policy"
+        )
+    actor, critic = build_networks(cfg, env)
+    read = list(dict.fromkeys((*observation_keys(actor), *critic.in_keys)))
+    return PPOUpdate(
+        cfg.objective,
+        actor=actor,
+        critic=critic,
+        data=cfg.data,
+        seed=cfg.seed,
+        device=cfg.resolved_device(),
+        mirror=mirror_maps(env, read) if cfg.objective.symmetry != "none" else None,
+    )
+
+
+def make_ppo_policy(cfg: RunCfg, env: EnvBase) -> ProbabilisticTensorDictSequential:
+    """Build the policy of a run."""
+    actor, _ = build_networks(cfg, env)
+    return actor
+
+
+def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
+    """Build actor and critic for the observation groups and actions of an env.
+
+    Raises:
+        ValueError: if the networks are those of an off-policy method.
+    """
+    device, modules = cfg.resolved_device(), cfg.modules
+    if not isinstance(modules.actor, ActorCfg) or not isinstance(modules.critic, CriticCfg):
+        raise ValueError(
+            f"modules are {type(modules.actor).__name__} and {type(modules.critic).__name__}, and a state value needs "
+            "ActorCfg and CriticCfg: use modules=mlp"
+        )
+    spec: Any = env.observation_spec
+
+    def width(keys: tuple[ObservationKey, ...]) -> int:
+        own = [key for key in keys if key != FEATURES]
+        shared = modules.trunk.hidden_dims[-1] if modules.trunk is not None else 0
+        return observation_dim(spec, own) + shared
+
+    trunk = None
+    if modules.trunk is not None:
+        trunk = make_shared_trunk(
+            modules.trunk, obs_dim=observation_dim(spec, modules.trunk.in_keys), device=device
+        )
+    # Behind a memory, where there is one.
+    new_actor = partial(make_recurrent_actor, m) if (m := modules.recurrent_actor) else make_actor
+    new_critic = partial(make_recurrent_critic, m) if (m := modules.recurrent_critic) else make_critic
+    actor = new_actor(
+        modules.actor,
+        obs_dim=width(modules.actor.in_keys),
+        action_spec=env.full_action_spec,
+        device=device,
+    )
+    critic = new_critic(modules.critic, obs_dim=width(modules.critic.in_keys), device=device)
+    if trunk is None:
+        return actor, critic
+    both = ActorValueOperator(trunk, actor, critic)
+    return both.get_policy_operator(), both.get_value_operator()  # type: ignore[return-value]

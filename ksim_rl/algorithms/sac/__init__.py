@@ -1,0 +1,17 @@
+"""Soft actor-critic (Haarnoja et al., arXiv 1812.05905) learns a policy with much entropy from a replay."""
+
+from ksim_rl.algorithms.off_policy import FEW_ENVS
+from ksim_rl.algorithms.sac.wiring import make_sac_policy, make_sac_update
+from ksim_rl.modules import QNetworkCfg, SquashedActorCfg
+from ksim_rl.objectives import SACCfg
+from ksim_rl.trainers.algorithm import Algorithm
+from ksim_rl.trainers.run_cfg import ModulesCfg
+
+SAC = Algorithm(
+    name="sac",
+    cfg=SACCfg,
+    update=make_sac_update,
+    policy=make_sac_policy,
+    data=FEW_ENVS,
+    modules=ModulesCfg(actor=SquashedActorCfg(), critic=QNetworkCfg()),
+)

@@ -1,0 +1,116 @@
+"""This module says what a trainer asks of an algorithm, and finds that of a run's config."""
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import torch
+from jaxtyping import Float
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ksim_rl.data import DatasetCfg, ReplayCfg
+from ksim_rl.device.state_tree import State
+from ksim_rl.objectives import AlgorithmCfg
+from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg
+
+# Imported by name when an algorithm is first asked for: the algorithms stand above this room and import it.
+REGISTRY = "ksim_rl.algorithms.registry"
+
+
+class Update(Protocol):
+    """Improves a policy with one rollout at a time. `PPOUpdate` and its siblings are such; so may be a class of yours.
+
+    Attributes:
+        device: where all of it lives.
+        actor: the policy that is evaluated, recorded and saved.
+        behavior: the policy that collects; often the actor itself.
+        num_env_states: how many env states a rollout has, E * T.
+    """
+
+    device: torch.device
+
+    @property
+    def actor(self) -> TensorDictModuleBase:
+        """The policy that is evaluated, recorded and saved."""
+        ...
+
+    @property
+    def behavior(self) -> TensorDictModuleBase:
+        """The policy that collects."""
+        ...
+
+    @property
+    def num_env_states(self) -> int:
+        """Env states of one rollout, E * T."""
+        ...
+
+    @property
+    def rollout_keys(self) -> list[Any]:
+        """The leaves of an env state that an update reads."""
+        ...
+
+    def __call__(self, rollout_ET: TensorDictBase) -> None:
+        """Learn from a rollout `["E","T"]`, without a host sync; on CUDA it is the same memory at each call."""
+
+    def metrics(self) -> dict[str, Float[Tensor, ""]]:
+        """Return what the last update measured, each a tensor [] on the device, `update/skipped_steps` among them."""
+        ...
+
+    def check(self, metrics: Mapping[str, float]) -> None:
+        """Raise where `metrics`, read on the host, say that the run cannot go on."""
+
+    def state_dict(self) -> State:
+        """Return everything that the next update depends on."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue where `state_dict` was taken; tensors keep their addresses."""
+
+    def load_weights(self, state: Mapping[str, Any]) -> None:
+        """Take only the networks of a `state_dict`: a new run that starts from them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Algorithm:
+    """How the parts of an algorithm are made for a run and its env, and which data and networks suit it.
+
+    A module of a registered package that holds one at its top level registers it.
+
+    Attributes:
+        name: as in `objective=<name>`.
+        cfg: its settings; a run whose objective is one of these, or of a subclass, is trained by this algorithm.
+        update: builds everything that learns. Its third argument is the `state_dict` of the update that a resumed run
+            goes on from, for parts that are made from it; the trainer loads it afterwards. None begins anew.
+        policy: builds the policy alone, whose weights a checkpoint holds under `update/actor`.
+        data, modules: what `objective=<name>` chooses beside its settings.
+    """
+
+    name: str
+    cfg: type[AlgorithmCfg]
+    update: Callable[[RunCfg, EnvBase, Mapping[str, Any] | None], Update]
+    policy: Callable[[RunCfg, EnvBase], TensorDictModuleBase]
+    data: DatasetCfg | ReplayCfg
+    modules: ModulesCfg = field(default_factory=ModulesCfg)
+
+
+def algorithm_of(cfg: RunCfg) -> Algorithm:
+    """Return the algorithm of a run.
+
+    Raises:
+        ValueError: if none is registered for its objective.
+    """
+    return importlib.import_module(REGISTRY).serving(type(cfg.objective))
+
+
+def make_update(cfg: RunCfg, env: EnvBase, *, resumed: Mapping[str, Any] | None = None) -> Update:
+    """Build everything that learns in a run, with all its memory allocated; see `Algorithm.update`."""
+    return algorithm_of(cfg).update(cfg, env, resumed)
+
+
+def make_policy(cfg: RunCfg, env: EnvBase) -> TensorDictModuleBase:
+    """Build the policy of a run, and nothing else of it."""
+    return algorithm_of(cfg).policy(cfg, env)

@@ -1,0 +1,249 @@
+"""The fused kernels, run by Triton's interpreter, make the same of a rollout as torch does."""
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from ksim_rl.algorithms.ppo.fused import fused_networks, make_fused_ppo, observer
+from ksim_rl.algorithms.ppo.update import PPOUpdate
+from ksim_rl.data import DatasetCfg
+from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
+from ksim_rl.objectives import PPOCfg
+from ksim_rl.objectives.fused_ppo import FusedLayout, Tuning, why_not_fused
+
+ENVS, STEPS, ACTIONS, ACTOR_OBS, CRITIC_OBS = 8, 6, 3, 20, 24
+DATA = DatasetCfg(num_env_states_per_minibatch=24, num_minibatches=2)
+HIDDEN = (32, 32, 16)
+# Blocks that do not divide the 24 rows of a minibatch or the layers; few, since the interpreter is slow.
+TUNING = Tuning(block=16, chunk=16, stages=1, depth=16, tile=32, tile_stages=1, splits=2, size=1024)
+
+needs_interpreter = pytest.mark.skipif(
+    torch.cuda.is_available(), reason="tests/gpu runs the kernels themselves"
+)
+
+
+@pytest.fixture(scope="module")
+def fused_ppo():
+    # tests/conftest.py turns the interpreter on where there is no CUDA.
+    pytest.importorskip("triton", reason="Triton is not installed")
+    from ksim_rl.objectives.fused_ppo.fused_ppo import FusedPPO
+
+    return FusedPPO
+
+
+def networks(**actor_options):
+    torch.manual_seed(3)
+    actor = make_actor(
+        ActorCfg(hidden_dims=HIDDEN, output_gain=0.5, **actor_options), obs_dim=ACTOR_OBS, action_dim=ACTIONS
+    )
+    return actor, make_critic(CriticCfg(hidden_dims=HIDDEN), obs_dim=CRITIC_OBS)
+
+
+def rollout(actor, *, seed=0):
+    """Return a rollout `["E","T"]` in time-major memory, with ends of both kinds and two env states to leave out."""
+    torch.manual_seed(seed)
+    shape = STEPS, ENVS
+    terminated, truncated = torch.rand(*shape, 1) < 0.1, torch.rand(*shape, 1) < 0.1
+    data = TensorDict(
+        {
+            "actor": torch.randn(*shape, ACTOR_OBS) * 2.0 + 1.0,
+            "critic": torch.randn(*shape, CRITIC_OBS),
+            "next": {
+                "critic": torch.randn(*shape, CRITIC_OBS),
+                "reward": torch.randn(*shape, 1),
+                "terminated": terminated,
+                "done": terminated | truncated,
+            },
+        },
+        shape,
+    )
+    with torch.no_grad():
+        actor(data)
+    data["next", "reward"][2, 3] = float("nan")
+    data["actor"][1, 5, 2] = float("inf")
+    return data.transpose(0, 1)
+
+
+def update(cfg, actor, critic, fused_ppo=None, *, data=DATA):
+    made = PPOUpdate(cfg, actor=copy.deepcopy(actor), critic=copy.deepcopy(critic), data=data, seed=5)
+    if fused_ppo is not None:
+        made.fused = fused_ppo(
+            cfg,
+            fused_networks(made.actor, made.critic),
+            observe_actor=observer(made.actor[0]),
+            observe_critic=observer(made.critic),
+            optimizer=made.optimizer,
+            guard=made.guard,
+            num_env_states_per_minibatch=DATA.num_env_states_per_minibatch,
+            num_minibatches=DATA.num_minibatches,
+            tuning=TUNING,
+        )
+    return made
+
+
+def flat(state, path=""):
+    if isinstance(state, dict):
+        return {k: v for name, entry in state.items() for k, v in flat(entry, f"{path}/{name}").items()}
+    return {path: torch.as_tensor(state)}
+
+
+def assert_equal_states(one, other, *, atol=1e-4):
+    one, other = flat(one.state_dict()), flat(other.state_dict())
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        torch.testing.assert_close(
+            value.float(),
+            other[name].float(),
+            atol=atol,
+            rtol=1e-4,
+            msg=lambda text, name=name: f"{name}: {text}",
+        )
+
+
+@needs_interpreter
+@pytest.mark.parametrize(
+    ("options", "actor_options"),
+    [
+        ({}, {}),
+        (
+            {
+                "clip_value": False,
+                "schedule": "fixed",
+                "max_grad_norm": None,
+                "weight_decay": 0.1,
+                "normalize_advantage": "none",
+                "entropy_coeff": 0.3,
+                "critic_coeff": 0.7,
+            },
+            {"std_type": "log", "init_std": 0.6, "obs_normalization": False},
+        ),
+    ],
+)
+def test_updates_equal_those_of_torch(fused_ppo, options, actor_options):
+    cfg = PPOCfg(num_epochs=1, learning_rate=3e-3, **options)
+    actor, critic = networks(**actor_options)
+    torch_s, fused = update(cfg, actor, critic), update(cfg, actor, critic, fused_ppo)
+    for seed in range(2):
+        data = rollout(actor, seed=seed)
+        torch_s(data.clone())
+        fused(data)
+    assert_equal_states(torch_s, fused)
+    ours, theirs = fused.metrics(), torch_s.metrics()
+    assert ours.keys() == theirs.keys()
+    assert ours["update/non_finite_env_states"] == 4
+    assert 0.0 < ours["update/clip_fraction"] < 1.0
+    # Torch's has other numbers in the place of the env states that are left out, and takes their variance too.
+    for name in theirs.keys() - {"update/explained_variance"}:
+        torch.testing.assert_close(
+            ours[name].float(),
+            theirs[name].float(),
+            atol=1e-4,
+            rtol=1e-3,
+            msg=lambda text, name=name: f"{name}: {text}",
+        )
+
+
+@needs_interpreter
+def test_a_run_goes_on_with_the_other_kind(fused_ppo):
+    cfg = PPOCfg(num_epochs=1)
+    actor, critic = networks()
+    torch_s, fused = update(cfg, actor, critic), update(cfg, actor, critic, fused_ppo)
+    data = [rollout(actor, seed=seed) for seed in range(2)]
+    torch_s(data[0].clone())
+    fused.load_state_dict(torch_s.state_dict())
+    torch_s(data[1].clone())
+    fused(data[1])
+    assert_equal_states(torch_s, fused)
+
+
+@needs_interpreter
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_steps_that_are_not_finite_change_nothing_and_are_counted(fused_ppo):
+    actor, critic = networks()
+    fused = update(PPOCfg(num_epochs=1), actor, critic, fused_ppo)
+    data = rollout(actor)
+    fused(data.clone())
+    with torch.no_grad():
+        fused.critic.module.layers[0].weight.fill_(1e30)
+    before = copy.deepcopy(flat(fused.state_dict()))
+    fused(data)
+    after = flat(fused.state_dict())
+    learned = [name for name in before if "trunk" in name or "moments" in name]
+    assert learned
+    assert all(torch.equal(before[name], after[name]) for name in learned)
+    metrics = fused.metrics()
+    assert metrics["update/skipped_in_a_row"] == metrics["update/skipped_steps"] == 2
+    assert all(value.isfinite() for value in metrics.values())
+
+
+def test_layout_places_every_parameter_once():
+    made = fused_networks(*networks())
+    layout = FusedLayout(made)
+    index = layout.padded_index(made)
+    assert len(index) == layout.num_flat == sum(parameter.numel() for parameter in made.parameters)
+    assert len(index.unique()) == len(index)
+    # The weights' tiles cover the padded weights of both networks once each.
+    covered = torch.zeros(2, layout.num_weights, dtype=torch.int64)
+    for network, _, _, place, stride, columns, rows, _ in layout.weight_tiles(16).tolist():
+        for row in range(rows):
+            covered[network, place + row * stride : place + row * stride + columns] += 1
+    assert (covered == 1).all()
+    assert index[0] == 0
+    last_bias = layout.num_padded + layout.num_weights + sum(layout.hidden)
+    assert index[-1] == last_bias
+
+
+def test_what_the_kernels_cannot_do_is_said():
+    actor, critic = networks()
+    made = fused_networks(actor, critic)
+    assert why_not_fused(PPOCfg(precision="bfloat16"), made, data=DATA) is None
+    assert "float32" in why_not_fused(PPOCfg(), made, data=DATA)
+    for option in (
+        {"kernels": "torch"},
+        {"advantage": "vtrace"},
+        {"symmetry": "loss"},
+        {"estimate_each_epoch": True},
+        {"normalize_advantage": "minibatch"},
+    ):
+        cfg = PPOCfg(precision="bfloat16", **option)
+        assert next(iter(option)) in why_not_fused(cfg, made, data=DATA)
+    assert "ELU" in fused_networks(*networks(activation="tanh"))
+    assert "std" in fused_networks(*networks(state_dependent_std=True))
+    other = make_actor(ActorCfg(hidden_dims=(32, 32)), obs_dim=ACTOR_OBS, action_dim=ACTIONS)
+    assert "hidden layers" in why_not_fused(
+        PPOCfg(precision="bfloat16"), fused_networks(other, critic), data=DATA
+    )
+    assert isinstance(fused_networks(actor, torch.nn.Identity()), str)
+    assert update(PPOCfg(), actor, critic).metrics()["update/fused"] == 0.0
+
+
+def test_on_the_cpu_torch_makes_the_steps():
+    actor, critic = networks()
+    made = update(PPOCfg(), actor, critic)
+    reason = make_fused_ppo(
+        PPOCfg(),
+        actor=actor,
+        critic=critic,
+        optimizer=made.optimizer,
+        guard=made.guard,
+        dataset=made.dataset,
+        device=torch.device("cpu"),
+    )
+    assert reason == made.fused == "they need CUDA and Triton"
+
+
+def test_bfloat16_products_change_a_gradient_step_a_little():
+    actor, critic = networks()
+    data = rollout(actor)
+    # The mean after one step of Adam is a tenth of the gradient.
+    one = {"num_epochs": 1, "schedule": "fixed", "max_grad_norm": None}
+    sizes = DatasetCfg(num_env_states_per_minibatch=48, num_minibatches=1)
+    moved = {}
+    for precision in ("float32", "bfloat16"):
+        made = update(PPOCfg(precision=precision, **one), actor, critic, data=sizes)
+        made(data.clone())
+        moved[precision] = torch.cat([entry["exp_avg"].flatten() for entry in made.optimizer.state.values()])
+    error = (moved["bfloat16"] - moved["float32"]).norm() / moved["float32"].norm()
+    assert 1e-5 < error < 0.03

@@ -1,0 +1,43 @@
+"""What the updates share: means over the steps that were made, and the end of a run that skips its steps."""
+
+import pytest
+import torch
+
+from ksim_rl.algorithms.gradient_steps import StepMeans, check_skipped_steps
+from ksim_rl.objectives import NonFiniteStepsError
+from tests.trainers.target_env import make_trainer
+
+
+def test_means_are_over_the_steps_that_were_made():
+    means = StepMeans({"kl": "update/kl", "loss": "loss/policy"})
+    skipped = torch.tensor([0.0, 1.0, 0.0])
+    means.take_({"kl": torch.tensor([1.0, torch.nan, 3.0]), "skipped": skipped})
+    assert means == {"update/kl": torch.tensor(2.0)}
+    kept = means["update/kl"]
+    means.take_({"kl": torch.full((3,), torch.nan), "skipped": torch.ones(3)})
+    assert kept is means["update/kl"] and kept == 0.0
+
+
+def test_the_limit_counts_all_steps_in_a_row():
+    metrics = {"update/skipped_in_a_row": 4.0, "update/skipped_steps": 9.0}
+    check_skipped_steps(metrics, 5)
+    with pytest.raises(NonFiniteStepsError, match="4 gradient steps in a row.*limit 4, 9 since the start"):
+        check_skipped_steps(metrics, 4)
+
+
+def test_a_run_ends_even_if_steps_are_made_after_those_in_a_row():
+    trainer = make_trainer(ppo={"max_skipped_steps": 5})
+    update = trainer.update
+    steps, losses = 0, update._losses
+
+    def bad_at_first(minibatch_B):
+        nonlocal steps
+        steps += 1
+        out = losses(minibatch_B)
+        return out.set("loss_critic", out["loss_critic"] * torch.nan) if steps <= 5 else out
+
+    update._losses = bad_at_first
+    update(trainer.collector.collect())
+    assert update.guard.skipped == 5 and update.guard.skipped_in_a_row == 0
+    with pytest.raises(NonFiniteStepsError, match="5 gradient steps in a row"):
+        update.check({name: value.item() for name, value in update.metrics().items()})
