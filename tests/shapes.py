@@ -75,7 +75,7 @@ def _axis_error(axis: str, size: int, sizes: dict[str, Any]) -> bool:
         if size == 1:
             return False
         axis = axis[1:]
-    if axis == "_":
+    if axis == "_" or axis.startswith("?"):  # ?L: another size in each item of a container
         return False
     if axis.isidentifier():
         return sizes.setdefault(axis, size) != size
@@ -85,9 +85,7 @@ def _axis_error(axis: str, size: int, sizes: dict[str, Any]) -> bool:
 def _array_check(annotation: type[AbstractArray]) -> Check:
     axes = annotation.dim_str.split()
     kind = annotation.array_type
-    (several, *more) = [
-        index for index, axis in enumerate(axes) if axis.startswith("*") or axis == "..."
-    ] or [-1]
+    (several, *more) = [index for index, axis in enumerate(axes) if "*" in axis[:2] or axis == "..."] or [-1]
     assert not more, annotation
     count = len(axes)
     fixed = [(index, int(axis)) for index, axis in enumerate(axes) if axis.isdecimal()]
@@ -116,7 +114,11 @@ def _array_check(annotation: type[AbstractArray]) -> Check:
                 return f"has shape {tuple(shape)}"
             width = len(shape) - count + 1
             inner = tuple(shape[several : several + width])
-            if axes[several] != "..." and sizes.setdefault(axes[several], inner) != inner:
+            if (
+                axes[several][0] == "*"
+                and "?" not in axes[several]
+                and sizes.setdefault(axes[several], inner) != inner
+            ):
                 return f"has shape {tuple(shape)}"
             names = [*axes[:several], *["_"] * width, *axes[several + 1 :]]
         if len(shape) != len(names) or any(

@@ -59,6 +59,16 @@ def test_a_wrong_shape_is_an_error():
         (Float[Tensor, " E"] | float, 1.0, torch.ones(5)),
         (Mapping[str, Float[Tensor, " E"]], {"a": torch.ones(4)}, {"a": torch.ones(4), "b": torch.ones(5)}),
         (dict[str, Float[Tensor, " E"]], {}, [torch.ones(4)]),
+        (
+            dict[str, Float[Tensor, "E ?L"]],
+            {"a": torch.ones(4, 2), "b": torch.ones(4, 3)},
+            {"a": torch.ones(4, 2), "b": torch.ones(5, 3)},
+        ),
+        (
+            dict[str, Float[Tensor, "E *?leaf"]],
+            {"a": torch.ones(4, 2), "b": torch.ones(4)},
+            {"a": torch.ones(4, 2), "b": torch.ones(5)},
+        ),
         (list[Float[Tensor, " E"]], [torch.ones(4)], [torch.ones(4), torch.ones(3)]),
         (tuple[Float[Tensor, " E"], Float[Tensor, " L"]], (torch.ones(4), torch.ones(5)), (torch.ones(4),)),
         (tuple[Float[Tensor, " E"], ...], (torch.ones(4),) * 3, (torch.ones(4), torch.ones(3))),

@@ -1,1 +1,1 @@
-"""Our envs as the envs of other libraries: one module each, named after the library, which is imported only there."""
+"""This room shows our envs as those of other libraries, one module each, which alone imports the library."""

@@ -1,19 +1,18 @@
-"""An env as Gymnasium's `VectorEnv`, with NumPy arrays or with tensors that stay on the device."""
+"""This module shows an env as Gymnasium's `VectorEnv`, with NumPy arrays or with tensors that stay on the device."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import NestedKey
+from jaxtyping import Float
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl.adapters.spaces import box
-from ksim_rl.adapters.stepper import Stepper
-from ksim_rl.transforms.innermost import innermost
+from ksim_rl.adapters.stepper import Keys, Observations, Stepper, to_numpy
+from ksim_rl.envs.contract import EpisodeClock, part
 
 try:
     from gymnasium import spaces
@@ -41,18 +40,17 @@ class GymnasiumVectorEnv(VectorEnv):
         self,
         env: EnvBase,
         *,
-        keys: Mapping[str, NestedKey] | Sequence[NestedKey] | None = None,
+        keys: Keys = None,
         tensors: bool = False,
     ) -> None:
         self.env, self.tensors = env, tensors
         self._stepper = Stepper(env, keys)
-        base_env = innermost(env)
-        self.num_envs = env.batch_size[0]
-        self.render_mode = getattr(base_env, "render_mode", None)
+        self.num_envs, self.render_mode = self._stepper.num_envs, self._stepper.render_mode
+        clock = part(env, EpisodeClock)
         self.metadata = {
             "autoreset_mode": AutoresetMode.SAME_STEP,
             "render_modes": [mode for mode in (self.render_mode,) if mode],
-            "render_fps": round(1.0 / getattr(base_env, "step_dt", 1.0)),
+            "render_fps": round(1.0 / clock.step_dt) if clock else 1,
         }
         self.single_observation_space = spaces.Dict(
             {name: box(env.full_observation_spec[key]) for name, key in self._stepper.keys.items()}
@@ -74,31 +72,33 @@ class GymnasiumVectorEnv(VectorEnv):
         super().reset(seed=seed)
         return self._out(self._stepper.reset(seed)), {}
 
-    def step(self, actions: np.ndarray | Tensor) -> tuple[dict[str, Any], Any, Any, Any, dict[str, Any]]:
+    def step(
+        self, action_EL: Float[np.ndarray, "E L"] | Float[Tensor, "E L"]
+    ) -> tuple[dict[str, Any], Any, Any, Any, dict[str, Any]]:
         """Step all envs."""
         device = self._stepper.device
-        step = self._stepper.step(torch.as_tensor(actions, dtype=torch.float32, device=device))
-        done_E = step.terminated_E | step.truncated_E
+        step = self._stepper.step(torch.as_tensor(action_EL, dtype=torch.float32, device=device))
+        done_E = step.done_E
         infos: dict[str, Any] = {}
         if self.tensors:
             infos = {"final_obs": step.final_obs, "_final_obs": done_E}
         elif bool(done_E.any()):
-            infos = _final_obs(self._out(step.final_obs), done_E.cpu().numpy())
+            infos = _final_obs(to_numpy(step.final_obs), done_E.cpu().numpy())
         flags = (step.reward_E, step.terminated_E, step.truncated_E)
         reward, terminated, truncated = flags if self.tensors else (value.cpu().numpy() for value in flags)
         return self._out(step.obs), reward, terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Return one picture of the envs that `cfg.viewer` shows, in a tuple, or None without a render mode."""
-        picture = innermost(self.env).render()
+        """Return the picture of the envs that `cfg.viewer` shows, in a tuple, or None without a render mode."""
+        picture = self._stepper.picture()
         return None if picture is None else (picture,)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the env's memory."""
         self.env.close()
 
-    def _out(self, obs: Mapping[str, Tensor]) -> dict[str, Any]:
-        return dict(obs) if self.tensors else {name: value.cpu().numpy() for name, value in obs.items()}
+    def _out(self, obs: Observations) -> dict[str, Any]:
+        return obs if self.tensors else to_numpy(obs)
 
 
 def _final_obs(obs: dict[str, np.ndarray], done_E: np.ndarray) -> dict[str, Any]:

@@ -1,15 +1,16 @@
-"""An env as rsl_rl's `VecEnv`, so that rsl_rl's runners train on it."""
+"""This module shows an env as rsl_rl's `VecEnv`, so that rsl_rl's runners train on it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tensordict import NestedKey, TensorDict
+from jaxtyping import Float, Int64
+from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.adapters.stepper import Stepper
+from ksim_rl.adapters.stepper import Keys, Observations, Stepper
+from ksim_rl.envs.contract import part
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.transforms.innermost import innermost
 
@@ -37,13 +38,13 @@ class RslRlVecEnv(VecEnv):
         self,
         env: EnvBase,
         *,
-        keys: Mapping[str, NestedKey] | Sequence[NestedKey] | None = None,
+        keys: Keys = None,
         log_interval: int = 24,
     ) -> None:
-        base_env = innermost(env)
-        if not isinstance(base_env, ManagerBasedRlEnv):
+        base_env = part(env, ManagerBasedRlEnv)
+        if base_env is None:
             raise ValueError(
-                f"env is a {type(base_env).__name__} inside: rsl_rl needs a ManagerBasedRlEnv, which has episode clocks"
+                f"env is a {type(innermost(env)).__name__} inside: rsl_rl needs a ManagerBasedRlEnv"
             )
         if log_interval < 1:
             raise ValueError(f"log_interval={log_interval}: expected at least 1")
@@ -55,12 +56,12 @@ class RslRlVecEnv(VecEnv):
         self._log_interval, self._steps = log_interval, 0
 
     @property
-    def episode_length_buf(self) -> Tensor:
-        """Env steps since each episode's start, int64 [E]; rsl_rl writes it to spread the time-outs."""
+    def episode_length_buf(self) -> Int64[Tensor, " E"]:
+        """Env steps since each episode's start; rsl_rl writes it to spread the time-outs."""
         return self.unwrapped.view.episode_step_E
 
     @episode_length_buf.setter
-    def episode_length_buf(self, steps_E: Tensor) -> None:
+    def episode_length_buf(self, steps_E: Int64[Tensor, " E"]) -> None:
         self.unwrapped.view.episode_step_E.copy_(steps_E)
 
     def get_observations(self) -> TensorDict:
@@ -71,22 +72,23 @@ class RslRlVecEnv(VecEnv):
         """Reset all envs."""
         return self._tensordict(self._stepper.reset()), {}
 
-    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+    def step(
+        self, action_EL: Float[Tensor, "E L"]
+    ) -> tuple[TensorDict, Float[Tensor, " E"], Int64[Tensor, " E"], dict[str, Any]]:
         """Step all envs; rows that ended come back with the first observation of their next episode."""
-        step = self._stepper.step(actions)
+        step = self._stepper.step(action_EL)
         # A row that also failed has no value to bootstrap.
         extras: dict[str, Any] = {"time_outs": step.truncated_E & ~step.terminated_E}
         self._steps += 1
         if self._steps % self._log_interval == 0:
             extras["log"] = self._episode_means()
-        done_E = step.terminated_E | step.truncated_E
-        return self._tensordict(step.obs), step.reward_E, done_E.long(), extras
+        return self._tensordict(step.obs), step.reward_E, step.done_E.long(), extras
 
     def close(self) -> None:
         """Free the env's memory."""
         self.env.close()
 
-    def _tensordict(self, obs: Mapping[str, Tensor]) -> TensorDict:
+    def _tensordict(self, obs: Observations) -> TensorDict:
         return TensorDict(dict(obs), batch_size=[self.num_envs], device=self.device)
 
     def _episode_means(self) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""TorchRL specs of one leaf as Gymnasium spaces of one env."""
+"""This module turns the TorchRL spec of one leaf into the Gymnasium space of one row."""
 
 from __future__ import annotations
 

@@ -1,19 +1,17 @@
-"""An env as stable-baselines3's `VecEnv`, so that its algorithms train on it."""
+"""This module shows an env as stable-baselines3's `VecEnv`, so that its algorithms train on it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import NestedKey
+from jaxtyping import Float
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.adapters.stepper import Stepper
+from ksim_rl.adapters.stepper import Keys, Observations, Stepper, to_numpy
 from ksim_rl.checks import check_in_range
-from ksim_rl.transforms.innermost import innermost
 
 try:
     from gymnasium import spaces
@@ -42,19 +40,19 @@ class StableBaselines3VecEnv(VecEnv):
         self,
         env: EnvBase,
         *,
-        keys: Mapping[str, NestedKey] | Sequence[NestedKey] | None = None,
+        keys: Keys = None,
         action_limit: float = 1.0,
     ) -> None:
         check_in_range("action_limit", action_limit, low=0.0, low_open=True)
         self.env, self._stepper = env, Stepper(env, keys)
-        self.render_mode = getattr(innermost(env), "render_mode", None)
+        self.render_mode = self._stepper.render_mode
         boxes = {name: box(env.full_observation_spec[key]) for name, key in self._stepper.keys.items()}
         self._single = next(iter(boxes)) if len(boxes) == 1 else None
         action = box(env.full_action_spec[env.action_key])
         low = np.where(np.isfinite(action.low), action.low, -action_limit)
         high = np.where(np.isfinite(action.high), action.high, action_limit)
         super().__init__(
-            num_envs=env.batch_size[0],
+            num_envs=self._stepper.num_envs,
             observation_space=spaces.Dict(dict(boxes)) if self._single is None else boxes[self._single],
             action_space=spaces.Box(low, high, dtype=np.float32),
         )
@@ -62,31 +60,29 @@ class StableBaselines3VecEnv(VecEnv):
 
     def reset(self) -> np.ndarray | dict[str, np.ndarray]:
         """Reset all envs, with the seed that `seed` was given, if any."""
-        seed = self._seeds[0]
-        obs = self._stepper.reset(seed)
+        obs = self._stepper.reset(self._seeds[0])
         self._reset_seeds()
         self._reset_options()
         return self._out(obs)
 
-    def step_async(self, actions: np.ndarray) -> None:
+    def step_async(self, action_EL: Float[np.ndarray, "E L"]) -> None:
         """Take the actions of the next `step_wait`."""
-        self._action_EL = torch.as_tensor(actions, dtype=torch.float32, device=self._stepper.device)
+        self._action_EL = torch.as_tensor(action_EL, dtype=torch.float32, device=self._stepper.device)
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Step all envs."""
         if self._action_EL is None:
             raise RuntimeError("step_wait without actions: call step_async first")
         step, self._action_EL = self._stepper.step(self._action_EL), None
-        terminated_E, truncated_E = step.terminated_E.cpu().numpy(), step.truncated_E.cpu().numpy()
-        done_E = terminated_E | truncated_E
+        done_E, terminated_E = step.done_E.cpu().numpy(), step.terminated_E.cpu().numpy()
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done_E.any():
-            final = {name: value.cpu().numpy() for name, value in step.final_obs.items()}
+            final = to_numpy(step.final_obs)
             for row in np.flatnonzero(done_E):
                 last = {name: value[row] for name, value in final.items()}
                 infos[row] = {
                     "terminal_observation": last if self._single is None else last[self._single],
-                    "TimeLimit.truncated": bool(truncated_E[row] and not terminated_E[row]),
+                    "TimeLimit.truncated": bool(not terminated_E[row]),
                 }
         return self._out(step.obs), step.reward_E.cpu().numpy(), done_E, infos
 
@@ -95,8 +91,8 @@ class StableBaselines3VecEnv(VecEnv):
         self.env.close()
 
     def get_images(self) -> list[np.ndarray | None]:
-        """Return one picture of the envs that `cfg.viewer` shows."""
-        return [innermost(self.env).render()]
+        """Return the picture of the envs that `cfg.viewer` shows."""
+        return [self._stepper.picture()]
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of the env, once per index: all rows are one env."""
@@ -120,6 +116,6 @@ class StableBaselines3VecEnv(VecEnv):
         """Return False for each index: there are no Gymnasium wrappers inside."""
         return [False for _ in self._get_indices(indices)]
 
-    def _out(self, obs: Mapping[str, Tensor]) -> np.ndarray | dict[str, np.ndarray]:
-        arrays = {name: value.cpu().numpy() for name, value in obs.items()}
+    def _out(self, obs: Observations) -> np.ndarray | dict[str, np.ndarray]:
+        arrays = to_numpy(obs)
         return arrays if self._single is None else arrays[self._single]

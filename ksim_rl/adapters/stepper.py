@@ -1,37 +1,51 @@
-"""What all adapters share: an env that is driven by actions alone and resets itself, one graph per step on CUDA."""
+"""This module drives an env by actions alone, for all adapters: it resets itself, and a step is one graph on CUDA."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from jaxtyping import Bool, Float32, Shaped
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl.checks import near
 from ksim_rl.device.capture import Captured
+from ksim_rl.envs.contract import Pictures, part
 from ksim_rl.envs.masked_reset import MaskedReset
 
+Keys = Mapping[str, NestedKey] | Sequence[NestedKey] | None
+Observations = dict[str, Shaped[Tensor, "E *?leaf"]]
+"""Observations by name, each with its own leaf dims (most often one, L)."""
 
-@dataclass(frozen=True, kw_only=True)
+
+@dataclass(frozen=True)
 class Step:
     """One env step of E envs; rows that ended have been reset already.
 
     Attributes:
-        obs: the next root observations by name, [E, L] each: after a reset, those of the new episode.
-        final_obs: the observations of the states reached, [E, L] each; they differ from `obs` in rows that ended.
-        reward_E: float32 [E].
-        terminated_E: bool [E].
-        truncated_E: bool [E].
+        obs: the next root observations by name: after a reset, those of the new episode.
+        final_obs: the observations of the states reached; they differ from `obs` in rows that ended.
     """
 
-    obs: dict[str, Tensor]
-    final_obs: dict[str, Tensor]
-    reward_E: Tensor
-    terminated_E: Tensor
-    truncated_E: Tensor
+    obs: Observations
+    final_obs: Observations
+    reward_E: Float32[Tensor, " E"]
+    terminated_E: Bool[Tensor, " E"]
+    truncated_E: Bool[Tensor, " E"]
+
+    @property
+    def done_E(self) -> Bool[Tensor, " E"]:
+        """The rows that ended, in either way."""
+        return self.terminated_E | self.truncated_E
+
+
+def to_numpy(obs: Observations) -> dict[str, np.ndarray]:
+    """Copy observations to the host."""
+    return {name: value.cpu().numpy() for name, value in obs.items()}
 
 
 class Stepper:
@@ -46,14 +60,15 @@ class Stepper:
         ValueError: if a key names no observation of the env.
     """
 
-    def __init__(
-        self, env: EnvBase, keys: Mapping[str, NestedKey] | Sequence[NestedKey] | None = None
-    ) -> None:
+    def __init__(self, env: EnvBase, keys: Keys = None) -> None:
         if len(env.batch_size) != 1:
             raise ValueError(f"env.batch_size={tuple(env.batch_size)}: expected one dim, [E]")
         self.env = env
         self.device = env.device or torch.device("cpu")
         self.keys = _named(env, keys)
+        self.num_envs = env.batch_size[0]
+        self.pictures = part(env, Pictures)
+        self.render_mode = self.pictures.render_mode if self.pictures else None
         self._root: TensorDictBase | None = None
         self._out: dict[str, TensorDictBase] = {}
         self._action = env.full_action_spec[env.action_key].zero()
@@ -68,9 +83,14 @@ class Stepper:
         return self._root
 
     @torch.no_grad()
-    def reset(self, seed: int | None = None) -> dict[str, Tensor]:
+    def reset(self, seed: int | None = None) -> Observations:
         """Reset all envs and return their observations."""
-        root_E = self.env.reset(seed=seed) if isinstance(self.env, MaskedReset) else self._reset_foreign(seed)
+        if isinstance(self.env, MaskedReset):
+            root_E = self.env.reset(seed=seed)
+        else:
+            if seed is not None:
+                self.env.set_seed(seed)
+            root_E = self.env.reset()
         if self._root is None:
             self._root = root_E.clone()
         else:
@@ -78,16 +98,17 @@ class Stepper:
         return self.read(self._root)
 
     @torch.no_grad()
-    def step(self, action_EL: Tensor) -> Step:
+    def step(self, action_EL: Shaped[Tensor, "E L"]) -> Step:
         """Step all envs.
 
         Raises:
             ValueError: if the action's shape or dtype is not the env's.
         """
-        if action_EL.shape != self._action.shape or action_EL.dtype != self._action.dtype:
+        wanted = self._action
+        if action_EL.shape != wanted.shape or action_EL.dtype != wanted.dtype:
             raise ValueError(
-                f"action is {action_EL.dtype} of shape {tuple(action_EL.shape)}: expected {self._action.dtype} of "
-                f"shape {tuple(self._action.shape)}"
+                f"action is {action_EL.dtype} of shape {tuple(action_EL.shape)}: "
+                f"expected {wanted.dtype} of shape {tuple(wanted.shape)}"
             )
         root = self.root
         self._action.copy_(action_EL)
@@ -100,17 +121,15 @@ class Stepper:
         reward_E, terminated_E, truncated_E = (
             next_E.get(key).flatten().clone() for key in ("reward", "terminated", "truncated")
         )
-        return Step(
-            obs=self.read(root),
-            final_obs=self.read(next_E),
-            reward_E=reward_E,
-            terminated_E=terminated_E,
-            truncated_E=truncated_E,
-        )
+        return Step(self.read(root), self.read(next_E), reward_E, terminated_E, truncated_E)
 
-    def read(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+    def read(self, tensordict: TensorDictBase) -> Observations:
         """Return copies of the observations by name."""
         return {name: tensordict.get(key).clone() for name, key in self.keys.items()}
+
+    def picture(self) -> np.ndarray | None:
+        """Return a picture of the envs that `cfg.viewer` shows, or None without a render mode."""
+        return self.pictures.render() if self.pictures else None
 
     def _step(self) -> None:
         assert self._root is not None
@@ -119,13 +138,8 @@ class Stepper:
         # Outputs of a replay stay where they were recorded.
         self._out = {"next": env_state_E.get("next"), "root": root_E.select(*self._root.keys(True, True))}
 
-    def _reset_foreign(self, seed: int | None) -> TensorDictBase:
-        if seed is not None:
-            self.env.set_seed(seed)
-        return self.env.reset()
 
-
-def _named(env: EnvBase, keys: Mapping[str, NestedKey] | Sequence[NestedKey] | None) -> dict[str, NestedKey]:
+def _named(env: EnvBase, keys: Keys) -> dict[str, NestedKey]:
     spec = env.full_observation_spec
     present = list(spec.keys(True, True))
     if keys is None:

@@ -1,4 +1,4 @@
-"""Checks for envs and data, for our tests and for yours."""
+"""This room checks envs and data, for our tests and for yours: begin with `check_env(env)`."""
 
 from ksim_rl.testing.check_env import check_env
 from ksim_rl.testing.counter_env import CounterEnv

@@ -1,4 +1,4 @@
-"""Findings about host syncs and about memory that grows."""
+"""This module finds steps that make the host wait, and tensors that steps leave behind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The checks that every env has to pass, ours and yours."""
+"""This module runs the checks that every env has to pass, ours and yours, and reports all findings at once."""
 
 from collections.abc import Callable, Collection
 

@@ -1,4 +1,4 @@
-"""Findings about the physics of a `ManagerBasedRlEnv`, against MuJoCo's C engine."""
+"""This module compares one physics substep of an env with MuJoCo's C engine."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import mujoco
 import numpy as np
 from torchrl.envs import EnvBase
 
-from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
+from ksim_rl.envs.contract import SimulatedWorld, part
 from ksim_rl.physics import World
 from ksim_rl.testing.replays import Replays
-from ksim_rl.transforms.innermost import innermost
 
 # Of the scale of a velocity, per substep: float32 and a solver that stops early stay far below; a field or an option
 # that one engine does not know of goes far beyond.
@@ -24,14 +23,14 @@ _INPUTS = ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap
 
 def check_c_engine(env: EnvBase, num_steps: int) -> None:
     """One physics substep from the states that random actions lead to agrees with MuJoCo's C engine, in most rows."""
-    base_env = innermost(env)
-    if not isinstance(base_env, ManagerBasedRlEnv):
+    simulated = part(env, SimulatedWorld)
+    if simulated is None:
         return
     replays = Replays(env, num_steps)
     root = replays.start()
     for index in range(num_steps):
         _, root = replays.step(root, index)
-    world = base_env.world
+    world = simulated.world
     expected_EL = np.stack([_c_step(world, row) for row in range(world.num_envs)])
     world.step(1)
     actual_EL = world.qvel_EL.cpu().numpy().astype(np.float64)
@@ -50,14 +49,14 @@ def check_c_engine(env: EnvBase, num_steps: int) -> None:
 
 def _c_step(world: World, row: int) -> np.ndarray:
     """Return qvel after one step of the C engine from the state, and with the model, of a row."""
-    model = copy.copy(world.mj_model)
+    mj_model = copy.copy(world.mj_model)
     for name, values_E in world.per_world_fields().items():
         values = values_E[row].cpu().numpy()
         if name == "gravity":
-            model.opt.gravity[:] = values
+            mj_model.opt.gravity[:] = values
         else:
-            getattr(model, name)[:] = values.reshape(getattr(model, name).shape)
-    data = mujoco.MjData(model)
+            getattr(mj_model, name)[:] = values.reshape(getattr(mj_model, name).shape)
+    data = mujoco.MjData(mj_model)
     for name in _INPUTS:
         target = np.asarray(getattr(data, name))
         if target.size:
@@ -66,5 +65,5 @@ def _c_step(world: World, row: int) -> np.ndarray:
                 data.time = float(values)
             else:
                 target[:] = values.reshape(target.shape)
-    mujoco.mj_step(model, data)
+    mujoco.mj_step(mj_model, data)
     return np.array(data.qvel)

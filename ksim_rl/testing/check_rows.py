@@ -1,4 +1,4 @@
-"""Findings about reproducibility, about what a partial reset touches, and about the end of an episode."""
+"""This module finds rows that do not repeat, that a reset of others changes, or whose last observation is lost."""
 
 from __future__ import annotations
 
@@ -69,12 +69,9 @@ def check_episode_end(env: EnvBase, num_steps: int) -> None:
         if index == num_steps // 2:
             end_episodes_at_next_step(env)
         env_state_E, root = replays.step(root, index)
+        observed = set(env.full_observation_spec.keys(True, True))
         next_E = env_state_E.get("next")
-        _check_end(
-            next_E,
-            root,
-            [key for key in next_E.keys(True, True) if key in env.full_observation_spec.keys(True, True)],
-        )
+        _check_end(next_E, root, [key for key in next_E.keys(True, True) if key in observed])
 
 
 def _check_end(next_E: TensorDictBase, root: TensorDictBase, keys: list[NestedKey]) -> None:
@@ -100,7 +97,7 @@ def _check_end(next_E: TensorDictBase, root: TensorDictBase, keys: list[NestedKe
 
 
 def _others_changed(before: Tensor, after: Tensor, num_envs: int) -> bool:
-    """Whether anything but row 0 changed, for each dim that may be that of the envs (a ring may have E frames)."""
+    """Say if anything but row 0 changed, for each dim that may be that of the envs (a ring may have E frames)."""
     dims = [dim for dim, size in enumerate(before.shape) if size == num_envs]
     return all(
         not torch.equal(before.narrow(dim, 1, num_envs - 1), after.narrow(dim, 1, num_envs - 1))
@@ -119,7 +116,5 @@ def _rows_of_state(env: EnvBase) -> dict[str, Tensor]:
 
 def _refuse(keys: list[NestedKey] | list[str], message: str) -> None:
     if keys:
-        shown = ", ".join(repr(key) for key in keys[:5]) + (
-            f", ... ({len(keys)} in all)" if len(keys) > 5 else ""
-        )
-        raise AssertionError(f"{shown} {message}")
+        more = f", ... ({len(keys)} in all)" if len(keys) > 5 else ""
+        raise AssertionError(f"{', '.join(map(repr, keys[:5]))}{more} {message}")

@@ -1,4 +1,4 @@
-"""Findings about specs, dim names and values, and about actions that should be refused."""
+"""This module finds wrong specs, dim names and values, and wrong actions that an env takes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A probe env whose every answer is known in closed form."""
+"""This module has a probe env whose every answer is known in closed form."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -64,12 +64,13 @@ class CounterEnv(EnvBase):
         self.full_done_spec = Composite(
             done=done, terminated=done.clone(), truncated=done.clone(), shape=batch, device=self.device
         )
-        for spec in (
+        specs = (
             self.full_observation_spec,
             self.full_action_spec,
             self.full_reward_spec,
             self.full_done_spec,
-        ):
+        )
+        for spec in specs:
             spec.names = [dims.E] * len(batch)
 
     def _observe(self) -> dict[str, Any]:
@@ -82,9 +83,7 @@ class CounterEnv(EnvBase):
             "row": self.row_E.float().reshape(*batch, 1),
             "drawn": random.uniform(keys, 1).reshape(*batch, 1),
             "obs": TensorDict(
-                {"vector": (count_E1 + self.offset_L).reshape(*batch, 3)},
-                batch_size=batch,
-                device=self.device,
+                {"vector": (count_E1 + self.offset_L).reshape(*batch, 3)}, batch, device=self.device
             ),
         }
 

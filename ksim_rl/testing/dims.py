@@ -1,4 +1,4 @@
-"""Assertions on dim names, for unit tests that say what shape a datum has."""
+"""This module asserts dim names, for unit tests that say what shape a datum has."""
 
 from tensordict import TensorDictBase
 

@@ -1,4 +1,4 @@
-"""The same actions from the same start, as often as a check needs them."""
+"""This module gives a check the same actions from the same start, as often as it needs them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from ksim_rl.envs.contract import part
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
-from ksim_rl.transforms.innermost import innermost
 
 SEED = 11
 
@@ -59,8 +59,8 @@ def reset_rows(env: EnvBase, root: TensorDictBase, rows: Sequence[int]) -> Tenso
 
 def end_episodes_at_next_step(env: EnvBase) -> None:
     """Let the episodes of a `ManagerBasedRlEnv` with a time limit end at the next step; other envs do not change."""
-    base_env = innermost(env)
-    if isinstance(base_env, ManagerBasedRlEnv) and base_env.max_episode_length:
+    base_env = part(env, ManagerBasedRlEnv)
+    if base_env is not None and base_env.max_episode_length:
         view = base_env.view
         view.time_out_offset_E.copy_(base_env.max_episode_length - view.episode_step_E - 1)
 
