@@ -10,6 +10,7 @@ import threading
 
 import torch
 import warp as wp
+from jaxtyping import Shaped
 from torch import Tensor
 
 from ksim_rl.device import upstream
@@ -81,6 +82,6 @@ def _current_stream(device: torch.device) -> wp.Stream:
     return found
 
 
-def address(tensor: Tensor | None) -> int:
+def address(tensor: Shaped[Tensor, "*shape"] | None) -> int:
     """Return where a tensor lies; 0 for None."""
     return 0 if tensor is None else tensor.data_ptr()

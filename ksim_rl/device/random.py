@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import torch
 import warp as wp
+from jaxtyping import Float32, Int, Int64
 from torch import Tensor
 
 from ksim_rl.device.quick_launch import QuickLaunch
@@ -104,27 +105,29 @@ def stream_id(name: str) -> int:
     return zlib.crc32(name.encode()) & 0x7FFFFFFF
 
 
-def row_keys(seed: Tensor, stream: int, counter: Tensor, num_rows: int) -> RowKeys:
+def row_keys(seed: Int64[Tensor, ""], stream: int, counter: Int[Tensor, "*rows"], num_rows: int) -> RowKeys:
     """Name the coordinates of one draw for each env row.
 
     Args:
-        seed: int64, shape [].
+        seed: of the run.
         stream: the id of what is drawn (see `stream_id`); two streams never share numbers.
-        counter: int64, shape [] (all rows at the same count) or [E].
+        counter: of shape [] (all rows at the same count) or [E].
         num_rows: E.
     """
     return RowKeys(seed, stream, counter, num_rows)
 
 
-def uniform(keys: RowKeys, n: int, low: float | Tensor = 0.0, high: float | Tensor = 1.0) -> Tensor:
+def uniform(
+    keys: RowKeys,
+    n: int,
+    low: float | Float32[Tensor, "*low"] = 0.0,
+    high: float | Float32[Tensor, "*high"] = 1.0,
+) -> Float32[Tensor, "E L"]:
     """Draw from the uniform distribution on [low, high).
 
     Args:
-        n: numbers per env row.
-        low, high: floats, or float32 tensors that broadcast to [E, n].
-
-    Returns:
-        float32 [E, n].
+        n: L, numbers per env row.
+        low, high: floats, or tensors that broadcast to [E, L].
     """
     if isinstance(low, Tensor) and isinstance(high, Tensor):
         return torch.lerp(low, high, _draw(keys, n, _UNIFORM))
@@ -133,20 +136,19 @@ def uniform(keys: RowKeys, n: int, low: float | Tensor = 0.0, high: float | Tens
     return _draw(keys, n, _UNIFORM, low=float(low), high=float(high))
 
 
-def normal(keys: RowKeys, n: int) -> Tensor:
-    """Draw from the standard normal distribution, float32 [E, n]."""
+def normal(keys: RowKeys, n: int) -> Float32[Tensor, "E L"]:
+    """Draw `n` numbers per env row from the standard normal distribution."""
     return _draw(keys, n, _NORMAL)
 
 
-def integers(keys: RowKeys, n: int, low: int | Tensor, high: int | Tensor) -> Tensor:
+def integers(
+    keys: RowKeys, n: int, low: int | Int64[Tensor, "*low"], high: int | Int64[Tensor, "*high"]
+) -> Int64[Tensor, "E L"]:
     """Draw integers from {low, ..., high}, both included.
 
     Args:
-        n: numbers per env row.
-        low, high: ints, or int64 tensors that broadcast to [E, n]. `high - low` must be below 2^31.
-
-    Returns:
-        int64 [E, n].
+        n: L, numbers per env row.
+        low, high: ints, or tensors that broadcast to [E, L]. `high - low` must be below 2^31.
 
     Raises:
         ValueError: if both are ints, and low exceeds high or is too far from it.

@@ -2,6 +2,7 @@
 
 import torch
 import torch.distributed as dist
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ksim_rl.checks import check_in_range
@@ -48,7 +49,7 @@ class RunningMoments(nn.Module):
         self.register_buffer("exact_sum_of_squares", torch.zeros(dim, dtype=torch.float64, device=device))
 
     @torch.no_grad()
-    def update(self, values: Tensor, valid: Tensor | None = None) -> None:
+    def update(self, values: Float[Tensor, "*batch L"], valid: Bool[Tensor, "*rows"] | None = None) -> None:
         """Count every row of `values` once, and publish.
 
         Rows with a non-finite element, and rows that `valid` marks False, are left out.
@@ -64,7 +65,9 @@ class RunningMoments(nn.Module):
         self.publish()
 
     @torch.no_grad()
-    def count_rows(self, values: Tensor, valid: Tensor | None = None) -> None:
+    def count_rows(
+        self, values: Float[Tensor, "*batch L"], valid: Bool[Tensor, "*rows"] | None = None
+    ) -> None:
         """Count every row of `values` once, as `update` does, and leave `mean` and `var` as they are."""
         if values.shape[-1] != self.dim:
             raise ValueError(f"obs has shape {tuple(values.shape)}: the last dim must be {self.dim}")

@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from jaxtyping import Shaped
 from torch import Tensor
 
 State = dict[str, Any]
 
 
-def split(state: Mapping[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def split(state: Mapping[str, Any]) -> tuple[dict[str, Shaped[Tensor, "*?leaf"]], dict[str, Any]]:
     """Separate nested state into tensors (detached copies on the host) and JSON values, each by path.
 
     Raises:
@@ -43,7 +44,7 @@ def split(state: Mapping[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, values
 
 
-def join(tensors: Mapping[str, Tensor], values: Mapping[str, Any]) -> State:
+def join(tensors: Mapping[str, Shaped[Tensor, "*?leaf"]], values: Mapping[str, Any]) -> State:
     """Undo `split`."""
     if list(values) == [""] and not tensors:
         return {}
@@ -59,7 +60,7 @@ def join(tensors: Mapping[str, Tensor], values: Mapping[str, Any]) -> State:
     return state
 
 
-def copy_into(live: Mapping[str, Tensor], saved: Mapping[str, Any], *, what: str) -> None:
+def copy_into(live: Mapping[str, Shaped[Tensor, "*?leaf"]], saved: Mapping[str, Any], *, what: str) -> None:
     """Copy saved tensors into live ones, in place, so that captured graphs keep their addresses.
 
     Raises:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import mujoco_warp as mjw
 import torch
 import warp as wp
+from jaxtyping import Float32, Int32, UInt8
 from torch import Tensor
 
 from ksim_rl.device.streams import warp_scope
@@ -69,20 +70,20 @@ class BatchCamera:
         self._world.launch(self, self._launch)
 
     @property
-    def rgb_EHW3(self) -> Tensor:
-        """Colors, uint8 [E, H, W, 3]."""
+    def rgb_EHW3(self) -> UInt8[Tensor, "E H W 3"]:
+        """Colors."""
         # Four bytes per pixel, the lowest first: blue, green, red, alpha.
         bytes_EHW4 = wp.to_torch(self._context.rgb_data).view(torch.uint8).view(*self._shape, 4)
         return bytes_EHW4[..., :3].flip(-1)
 
     @property
-    def depth_EHW(self) -> Tensor:
-        """Distance along the camera's axis (not along the ray), m, 0 where nothing is hit, float32 [E, H, W]."""
+    def depth_EHW(self) -> Float32[Tensor, "E H W"]:
+        """Distance along the camera's axis (not along the ray), m, 0 where nothing is hit."""
         return wp.to_torch(self._context.depth_data).view(self._shape)
 
     @property
-    def segmentation_EHW2(self) -> Tensor:
-        """MuJoCo's object id and object type of what is hit, -1 for nothing, int32 [E, H, W, 2]."""
+    def segmentation_EHW2(self) -> Int32[Tensor, "E H W 2"]:
+        """MuJoCo's object id and object type of what is hit, -1 for nothing."""
         return wp.to_torch(self._context.seg_data).view(*self._shape, 2)
 
     def _launch(self) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import mujoco_warp as mjw
 import torch
 import warp as wp
+from jaxtyping import Int
 from torch import Tensor
 
 from ksim_rl.physics import kernels
@@ -93,8 +94,8 @@ class OverflowRecord:
         self.most_nefc_E.zero_()
         self.most_pool.zero_()
 
-    def counts(self) -> Tensor:
-        """Return the period in whole numbers on the device, [N]: worlds by bit, most rows, most contacts and pairs."""
+    def counts(self) -> Int[Tensor, " N"]:
+        """Return the period in whole numbers on the device: worlds by bit, most rows, most contacts and pairs."""
         bits = torch.arange(len(BIT_NAMES), device=self.sticky_E.device, dtype=torch.int32)
         worlds = ((self.sticky_E[:, None] >> bits) & 1).sum(0)
         return torch.cat([worlds, self.most_nefc_E.max().view(1), self.most_pool])

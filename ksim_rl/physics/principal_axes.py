@@ -6,6 +6,7 @@
 
 import torch
 import warp as wp
+from jaxtyping import Float32
 from torch import Tensor
 
 from ksim_rl.device.streams import warp_scope
@@ -66,15 +67,15 @@ def _(matrices: Tensor) -> tuple[Tensor, Tensor]:
     return matrices.new_empty(matrices.shape[0], 3), matrices.new_empty(matrices.shape[0], 4)
 
 
-def principal_axes(inertia: Tensor) -> tuple[Tensor, Tensor]:
+def principal_axes(
+    inertia_33: Float32[Tensor, "*batch 3 3"],
+) -> tuple[Float32[Tensor, "*batch 3"], Float32[Tensor, "*batch 4"]]:
     """Diagonalize symmetric matrices by cyclic Jacobi rotations (Golub and Van Loan, section 8.5).
 
-    Args:
-        inertia: float32 [..., 3, 3].
-
     Returns:
-        The principal moments [..., 3], and the orientation of their axes, a unit quaternion (w, x, y, z) [..., 4]. A
-        diagonal matrix keeps its order and its axes.
+        The principal moments, and the orientation of their axes, a unit quaternion (w, x, y, z). A diagonal matrix
+        keeps its order and its axes.
     """
-    moments, quats = _principal_axes(inertia.reshape(-1, 3, 3))
-    return moments.view(*inertia.shape[:-2], 3), quats.view(*inertia.shape[:-2], 4)
+    moments, quats = _principal_axes(inertia_33.reshape(-1, 3, 3))
+    batch = inertia_33.shape[:-2]
+    return moments.view(*batch, 3), quats.view(*batch, 4)

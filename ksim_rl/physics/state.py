@@ -2,6 +2,7 @@
 
 import mujoco_warp as mjw
 import warp as wp
+from jaxtyping import Shaped
 from torch import Tensor
 
 # Integrated or set by the user; empty arrays are left out.
@@ -47,13 +48,13 @@ LAST_SUBSTEP = (
 )
 
 
-def data_tensors(warp_data_E: mjw.Data) -> dict[str, Tensor]:
+def data_tensors(warp_data_E: mjw.Data) -> dict[str, Shaped[Tensor, "*?leaf"]]:
     """Return views of the arrays that make up the state of a world."""
     tensors = {name: wp.to_torch(getattr(warp_data_E, name)) for name in (*STATE, *LAST_SUBSTEP)}
     return {name: tensor for name, tensor in tensors.items() if tensor.numel()}
 
 
-def load(present: dict[str, Tensor], saved: dict[str, Tensor]) -> None:
+def load(present: dict[str, Shaped[Tensor, "*?leaf"]], saved: dict[str, Shaped[Tensor, "*?leaf"]]) -> None:
     """Copy `saved` into `present`, in place, after checking all of it.
 
     Raises:

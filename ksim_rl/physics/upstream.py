@@ -9,14 +9,15 @@ import dataclasses
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
-import torch
 import warp as wp
+from jaxtyping import Float32
 
 # Building blocks of its contacts. A contact that another kernel appends has to look exactly like its own.
 from mujoco_warp._src.bvh import build_hfield_bvh
 from mujoco_warp._src.collision_core import contact_params as contact_params
 from mujoco_warp._src.collision_core import write_contact as write_contact
 from mujoco_warp._src.math import make_frame as make_frame
+from torch import Tensor
 
 FIXED = int(mjw.SetConstGroup.FIXED)
 # The two columns of `nxn_pairid` for a pair that never makes a contact, and for one that no sensor measures.
@@ -35,8 +36,8 @@ def per_world_fields() -> tuple[str, ...]:
     )
 
 
-def expand_gravity(warp_model: mjw.Model, num_envs: int) -> torch.Tensor:
-    """Give each world its own gravity vector, and return the view [E, 3], in m/s^2.
+def expand_gravity(warp_model: mjw.Model, num_envs: int) -> Float32[Tensor, "E 3"]:
+    """Give each world its own gravity vector, and return the view, in m/s^2.
 
     `batch_sizes` refuses gravity, since it is a field of the options. Kernels index it modulo its length, and the flag
     tells MuJoCo Warp's helpers that its first dim is the world.

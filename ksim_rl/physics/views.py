@@ -4,33 +4,11 @@ import dataclasses
 
 import mujoco_warp as mjw
 import warp as wp
+from jaxtyping import Shaped
 from torch import Tensor
 
 from ksim_rl.checks import unknown_name
 
-# A view `<name>_EL` for each; shapes [E, ...], float32, named as MuJoCo names them.
-VIEW_NAMES = (
-    "qpos",
-    "qvel",
-    "qacc",
-    "act",
-    "ctrl",
-    "sensordata",
-    "actuator_force",
-    "qfrc_actuator",
-    "qfrc_applied",
-    "xfrc_applied",
-    "xpos",
-    "xquat",
-    "xmat",
-    "xipos",
-    "cvel",
-    "subtree_com",
-    "geom_xpos",
-    "geom_xmat",
-    "site_xpos",
-    "site_xmat",
-)
 # Left as they were by mujoco_warp.reset_data, though they belong to the episode that ended.
 ACCELERATION_STAGE = (
     "actuator_force",
@@ -71,7 +49,10 @@ def arrays(data: object, prefix: str = "") -> dict[str, wp.array]:
 
 
 class DataViews:
-    """The torch views of a Data. They share its memory, and so show each change at once."""
+    """The torch views of a Data. They share its memory, and so show each change at once.
+
+    Each attribute is float32 of shape [E, ...], named as MuJoCo names it.
+    """
 
     qpos_EL: Tensor
     qvel_EL: Tensor
@@ -98,11 +79,10 @@ class DataViews:
     def __init__(self, warp_data_E: mjw.Data) -> None:
         self._arrays = arrays(warp_data_E)
         self._views: dict[str, Tensor] = {}
-        for name in VIEW_NAMES:
-            setattr(self, f"{name}_EL", self.view(name))
-        self.time_E = self.view("time")
+        for attribute in DataViews.__annotations__:
+            setattr(self, attribute, self.view(attribute.rpartition("_")[0]))
 
-    def view(self, name: str) -> Tensor:
+    def view(self, name: str) -> Shaped[Tensor, "*shape"]:
         """Return the view of any array of the Warp data, such as "qfrc_constraint", "efc.force" or "contact.dist".
 
         Vectors, quaternions (w x y z) and matrices become trailing dims. Rows of `efc` beyond `nefc`, and all of
@@ -117,7 +97,7 @@ class DataViews:
             self._views[name] = wp.to_torch(self._arrays[name])
         return self._views[name]
 
-    def views(self) -> dict[str, Tensor]:
+    def views(self) -> dict[str, Shaped[Tensor, "*?leaf"]]:
         """Return the views made so far, by name."""
         return dict(self._views)
 
@@ -125,6 +105,5 @@ class DataViews:
         """Forget the views, so that their memory can be freed."""
         self._arrays.clear()
         self._views.clear()
-        for name in [*(f"{name}_EL" for name in VIEW_NAMES), "time_E"]:
-            if hasattr(self, name):
-                delattr(self, name)
+        for attribute in DataViews.__annotations__.keys() & vars(self).keys():
+            delattr(self, attribute)

@@ -8,6 +8,7 @@ import mujoco
 import mujoco_warp as mjw
 import torch
 import warp as wp
+from jaxtyping import Bool, Int, Shaped
 from torch import Tensor
 
 from ksim_rl.checks import check_choice, unknown_name
@@ -191,8 +192,8 @@ class World(views.DataViews):
             self._graphs.clear()
             self._record_resets()
 
-    def reset(self, mask_E: Tensor) -> None:
-        """Put the worlds where `mask_E` (bool [E]) is true back to the model's `qpos0`, at rest, time 0.
+    def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
+        """Put the worlds where `mask_E` is true back to the model's `qpos0`, at rest, time 0.
 
         Their acceleration-stage quantities and sensors read zero until the next step; the other rows do not change.
         Call `refresh` afterwards (and after writing another pose), before reading poses or stepping on: the rows of
@@ -201,8 +202,8 @@ class World(views.DataViews):
         self._take_mask(mask_E)
         self._graphs.run("reset", self._launch_reset)
 
-    def field(self, name: str) -> Tensor:
-        """Return the view [E, ...] of a model field that differs between worlds.
+    def field(self, name: str) -> Shaped[Tensor, " E *leaf"]:
+        """Return the view of a model field that differs between worlds.
 
         Raises:
             ValueError: if the field is not expanded per world.
@@ -216,12 +217,12 @@ class World(views.DataViews):
             raise unknown_name("per-world model field", name, self._fields)
         return self._fields[name]
 
-    def set_const(self, fields: Sequence[str], mask_E: Tensor | None = None) -> None:
+    def set_const(self, fields: Sequence[str], mask_E: Bool[Tensor, " E"] | None = None) -> None:
         """Recompute the constants that MuJoCo derives from `fields`, after writing into them.
 
         Args:
             fields: model fields that have changed, by MuJoCo's names; those that nothing derives from cost nothing.
-            mask_E: bool [E], the worlds in which they have changed; the others keep their constants bit for bit. On
+            mask_E: the worlds in which they have changed; the others keep their constants bit for bit. On
                 most robots this is much cheaper than all worlds. On models with tendons or flexes, with actuators on
                 anything but hinges and slides, or with moved frames of bodies that equality constraints tie, it costs
                 as much.
@@ -259,8 +260,8 @@ class World(views.DataViews):
         """
         self._graphs.run(("of others", key), launches)
 
-    def per_world_fields(self) -> dict[str, Tensor]:
-        """Return the views [E, ...] of the model fields that differ between worlds, by name."""
+    def per_world_fields(self) -> dict[str, Shaped[Tensor, " E *?leaf"]]:
+        """Return the views of the model fields that differ between worlds, by name."""
         return dict(self._fields)
 
     def record_overflow(self) -> None:
@@ -271,8 +272,8 @@ class World(views.DataViews):
         """Read what the physics needed since the last report; one transfer to the host. Call it once per rollout."""
         return self.explain_overflow(self.overflow_counts(clear=clear).tolist())
 
-    def overflow_counts(self, *, clear: bool = True) -> Tensor:
-        """Return what `explain_overflow` explains, whole numbers [N] on the device, without waiting for it."""
+    def overflow_counts(self, *, clear: bool = True) -> Int[Tensor, " N"]:
+        """Return what `explain_overflow` explains, whole numbers on the device, without waiting for it."""
         counts = self._overflow.counts()
         if clear:
             self._overflow.clear()
@@ -282,8 +283,8 @@ class World(views.DataViews):
         """Make the report of `overflow_counts` that were read on the host."""
         return self._overflow.explain(numbers)
 
-    def nan_count(self) -> Tensor:
-        """Return how many worlds became non-finite since the last `nan_report`, [] on the device; 0 without a guard."""
+    def nan_count(self) -> Int[Tensor, ""]:
+        """Return how many worlds became non-finite since the last `nan_report`, on the device; 0 without a guard."""
         if self._nan_guard is None:
             return torch.zeros((), dtype=torch.int64, device=self.device)
         return self._nan_guard.count()
@@ -295,11 +296,11 @@ class World(views.DataViews):
         """
         return NanReport() if self._nan_guard is None else self._nan_guard.report()
 
-    def state_dict(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Shaped[Tensor, "*?leaf"]]:
         """Copy everything that the next steps depend on, so that a restored world continues bit for bit on CPU."""
         return {name: tensor.clone() for name, tensor in self._state_tensors().items()}
 
-    def load_state_dict(self, state_dict: dict[str, Tensor]) -> None:
+    def load_state_dict(self, state_dict: dict[str, Shaped[Tensor, "*?leaf"]]) -> None:
         """Write a saved state into the present arrays, then `refresh`.
 
         Raises:

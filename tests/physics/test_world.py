@@ -202,9 +202,9 @@ def test_arguments_are_checked():
     with pytest.raises(ValueError, match="n=0"):
         world.step(0)
     with pytest.raises(ValueError, match="expected torch.bool of shape"):
-        world.reset(torch.ones(3, dtype=torch.bool))
+        world._take_mask(torch.ones(3, dtype=torch.bool))
     with pytest.raises(ValueError, match=r"expected torch.bool of shape \(2,\)"):
-        world.reset(torch.ones(2))
+        world._take_mask(torch.ones(2))
     with pytest.raises(ValueError, match="device='meta'"):
         World(cartpole(), num_envs=2, device="meta")
     if not torch.cuda.is_available():

@@ -12,6 +12,7 @@ import mujoco_warp as mjw
 import numpy as np
 import torch
 import warp as wp
+from jaxtyping import Int, Shaped
 from torch import Tensor
 
 from ksim_rl.physics.nan_guard import file as nan_file
@@ -67,7 +68,7 @@ class NanGuard:
         cfg: NanGuardCfg,
         mj_model: mujoco.MjModel,
         warp_data_E: mjw.Data,
-        fields: Mapping[str, Tensor],
+        fields: Mapping[str, Shaped[Tensor, " E *?leaf"]],
     ) -> None:
         self.cfg, self._mj_model, self._warp_data_E = cfg, mj_model, warp_data_E
         self._folder = Path(cfg.folder)
@@ -111,8 +112,8 @@ class NanGuard:
             torch.where(fails_E.view(-1, *[1] * (field.ndim - 1)), field, kept, out=kept)
         self._failed_E.masked_fill_(fails_E, _KEPT)
 
-    def count(self) -> Tensor:
-        """Return the number of worlds that failed since the last report, [] on the device."""
+    def count(self) -> Int[Tensor, ""]:
+        """Return the number of worlds that failed since the last report, on the device."""
         return (self._failed_E != _WATCHED).sum()
 
     def report(self) -> NanReport:
