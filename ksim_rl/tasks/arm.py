@@ -13,7 +13,7 @@ from ksim_rl.objectives import PPOCfg
 from ksim_rl.physics import SimCfg
 from ksim_rl.scene.objects import Box
 from ksim_rl.scene.placement import Placement
-from ksim_rl.scene.robots.arm import JOINTS, TIP, Arm
+from ksim_rl.scene.robots.control_models import Arm
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.terrains import PlaneTerrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
@@ -35,7 +35,7 @@ def _cfg(
     metric: MetricTerm,
 ) -> ManagerBasedRlEnvCfg:
     """Put together what both tasks share; `prefix` stands before the names of the arm's elements."""
-    joints = tuple(f"{prefix}{joint}" for joint in JOINTS)
+    joints = tuple(f"{prefix}{joint}" for joint in Arm.joints)
     terms = {
         "joint_pos": ObservationTermCfg(term=mdp.JointPosRel(joints=joints)),
         "joint_vel": ObservationTermCfg(term=mdp.JointVel(joints=joints), scale=0.2),
@@ -65,7 +65,7 @@ def _cfg(
 
 def arm_reach() -> ManagerBasedRlEnvCfg:
     """Return the config of bringing the tip to points in front of the arm, a new one every 3 to 5 s."""
-    here: dict[str, Any] = {"command": COMMAND, "site": TIP}
+    here: dict[str, Any] = {"command": COMMAND, "site": Arm.tip}
     return _cfg(
         SceneCfg(robots={"arm": Arm()}, terrain=PlaneTerrain(), num_envs=2048),
         prefix="",
@@ -97,7 +97,7 @@ def arm_push() -> ManagerBasedRlEnvCfg:
         ),
         prefix="arm/",
         observations={
-            "to_cube": ObservationTermCfg(term=mdp.OffsetToBody(site=f"arm/{TIP}", body=cube)),
+            "to_cube": ObservationTermCfg(term=mdp.OffsetToBody(site=f"arm/{Arm.tip}", body=cube)),
             "to_target": ObservationTermCfg(term=mdp.OffsetToCommand(**here)),
             "cube_pos": ObservationTermCfg(term=mdp.RootPos(entity="cube")),
             "cube_rotation": ObservationTermCfg(term=mdp.RootRotation6d(entity="cube")),
@@ -108,7 +108,7 @@ def arm_push() -> ManagerBasedRlEnvCfg:
             resampling_time_range_s=(8.0, 8.0),
         ),
         rewards={
-            "near_cube": mdp.NearBody(site=f"arm/{TIP}", body=cube, std=0.15, weight=0.5),
+            "near_cube": mdp.NearBody(site=f"arm/{Arm.tip}", body=cube, std=0.15, weight=0.5),
             "coarse": mdp.TrackPosition(**here, std=0.2, weight=1.0),
             "fine": mdp.TrackPosition(**here, std=0.05, weight=2.0),
         },

@@ -19,7 +19,7 @@ from ksim_rl.envs.term import EventTerm, ObservationTerm, RewardTerm, Terminatio
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp import JointEffortAction, JointVel, TimeOut
 from ksim_rl.mdp.rewards.tolerance import tolerance
-from ksim_rl.scene.robots.cartpole import Cartpole
+from ksim_rl.scene.robots.control_models import Cartpole
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import small_networks

@@ -9,7 +9,7 @@ from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.rewards.tolerance import tolerance
-from ksim_rl.scene.robots.cheetah import LEGS, Cheetah
+from ksim_rl.scene.robots.control_models import Cheetah
 from ksim_rl.tasks import planar
 
 RUN_SPEED = 8.0
@@ -28,7 +28,7 @@ class CheetahReward(RewardTerm):
 def cheetah_run() -> ManagerBasedRlEnvCfg:
     """Return the config of running as fast as 8 m/s."""
     return planar.planar_cfg(
-        Cheetah(), motors=LEGS, reward=CheetahReward(), decimation=2, step_dt=0.01, distance=3.5
+        Cheetah(), motors=Cheetah.joints, reward=CheetahReward(), decimation=2, step_dt=0.01, distance=3.5
     )
 
 

@@ -10,7 +10,7 @@ from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.rewards.tolerance import tolerance
-from ksim_rl.scene.robots.hopper import LEG, Hopper
+from ksim_rl.scene.robots.control_models import Hopper
 from ksim_rl.tasks import planar
 
 STAND_HEIGHT = 0.7
@@ -51,7 +51,12 @@ class HopperReward(RewardTerm):
 
 def _cfg(speed: float) -> ManagerBasedRlEnvCfg:
     return planar.planar_cfg(
-        Hopper(), motors=LEG, reward=HopperReward(speed=speed), decimation=4, step_dt=0.02, distance=3.5
+        Hopper(),
+        motors=Hopper.joints,
+        reward=HopperReward(speed=speed),
+        decimation=4,
+        step_dt=0.02,
+        distance=3.5,
     )
 
 

@@ -2,7 +2,7 @@
 
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
-from ksim_rl.scene.robots.humanoid import Humanoid
+from ksim_rl.scene.robots.own_robots import Humanoid
 from ksim_rl.scene.sensors import ContactSensor
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import velocity

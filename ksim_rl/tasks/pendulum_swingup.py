@@ -23,7 +23,7 @@ from ksim_rl.mdp import (
     TimeOut,
 )
 from ksim_rl.mdp.rewards.tolerance import tolerance
-from ksim_rl.scene.robots.pendulum import Pendulum
+from ksim_rl.scene.robots.control_models import Pendulum
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import small_networks

@@ -22,7 +22,7 @@ from ksim_rl.mdp import (
 )
 from ksim_rl.mdp.rewards.tolerance import tolerance
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
-from ksim_rl.scene.robots.reacher import PLANE_HEIGHT, Reacher
+from ksim_rl.scene.robots.control_models import Reacher
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import small_networks
@@ -62,7 +62,7 @@ class ReacherTarget(CommandTerm):
     def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw the target."""
         x, y = self._held(view)[env_index].tolist()
-        visualizer.sphere((x, y, PLANE_HEIGHT), radius=TARGET_RADIUS, rgba=(0.2, 0.6, 0.2, 0.8))
+        visualizer.sphere((x, y, Reacher.plane_height), radius=TARGET_RADIUS, rgba=(0.2, 0.6, 0.2, 0.8))
 
     def _held(self, view: EnvView) -> Tensor:
         return view.buffer("target_E2", 2)

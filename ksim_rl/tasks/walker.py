@@ -10,7 +10,7 @@ from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.rewards.tolerance import tolerance
-from ksim_rl.scene.robots.walker import LEGS, Walker
+from ksim_rl.scene.robots.control_models import Walker
 from ksim_rl.tasks import planar
 
 STAND_HEIGHT = 1.15
@@ -53,7 +53,12 @@ class WalkerReward(RewardTerm):
 
 def _cfg(speed: float) -> ManagerBasedRlEnvCfg:
     return planar.planar_cfg(
-        Walker(), motors=LEGS, reward=WalkerReward(speed=speed), decimation=5, step_dt=0.025, distance=4.0
+        Walker(),
+        motors=Walker.joints,
+        reward=WalkerReward(speed=speed),
+        decimation=5,
+        step_dt=0.025,
+        distance=4.0,
     )
 
 

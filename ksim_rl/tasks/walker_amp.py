@@ -18,7 +18,7 @@ from ksim_rl.mdp.rewards.tolerance import tolerance
 from ksim_rl.objectives import AMPCfg
 from ksim_rl.scene.motions.walker_walk import SPEED
 from ksim_rl.scene.names import Patterns
-from ksim_rl.scene.robots.walker import LEGS, SERVOS, Walker
+from ksim_rl.scene.robots.control_models import WALKER_SERVOS, Walker
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.terrains import PlaneTerrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
@@ -67,22 +67,24 @@ def walker_amp() -> ManagerBasedRlEnvCfg:
     """Return the config."""
     terms = {
         "gravity": ObservationTermCfg(term=mdp.ProjectedGravity()),
-        "joint_pos": ObservationTermCfg(term=mdp.JointPos(joints=("root_z", LEGS))),
+        "joint_pos": ObservationTermCfg(term=mdp.JointPos(joints=("root_z", Walker.joints))),
         "joint_vel": ObservationTermCfg(term=mdp.JointVel()),
     }
     group = ObservationGroupCfg(terms=terms)
     return ManagerBasedRlEnvCfg(
         decimation=4,
-        scene=SceneCfg(robots={"walker": Walker(actuators=SERVOS)}, terrain=PlaneTerrain(), num_envs=2048),
+        scene=SceneCfg(
+            robots={"walker": Walker(actuators=WALKER_SERVOS)}, terrain=PlaneTerrain(), num_envs=2048
+        ),
         sim=planar.SIM,
         observations={"actor": group, "critic": group, "style": group},
-        actions={"legs": mdp.JointPositionAction(joints=LEGS, scale=0.5)},
+        actions={"legs": mdp.JointPositionAction(joints=Walker.joints, scale=0.5)},
         events={"reset": mdp.ResetToMotion(file=MOTION)},
         rewards={"walk": WalkAt(speed=SPEED)},
         terminations={"time_out": mdp.TimeOut(), "fallen": mdp.RootHeightBelow(minimum_height=0.8)},
         metrics={
             "forward_speed": planar.ForwardSpeed(),
-            "pose_distance": PoseDistance(file=MOTION, joints=LEGS),
+            "pose_distance": PoseDistance(file=MOTION, joints=Walker.joints),
         },
         episode_length_s=8.0,
         scale_rewards_by_dt=False,

@@ -7,7 +7,7 @@ theirs; the robot's own root stands in for the centre of mass.
 from ksim_rl import mdp
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
-from ksim_rl.scene.robots.walker import LEGS, SERVOS, Walker
+from ksim_rl.scene.robots.control_models import WALKER_SERVOS, Walker
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.terrains import PlaneTerrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
@@ -23,22 +23,24 @@ def walker_track() -> ManagerBasedRlEnvCfg:
     """Return the config of walking as the motion `walker_walk` does."""
     terms = {
         "gravity": ObservationTermCfg(term=mdp.ProjectedGravity()),
-        "joint_pos": ObservationTermCfg(term=mdp.JointPos(joints=("root_z", LEGS))),
+        "joint_pos": ObservationTermCfg(term=mdp.JointPos(joints=("root_z", Walker.joints))),
         "joint_vel": ObservationTermCfg(term=mdp.JointVel()),
         "phase": ObservationTermCfg(term=mdp.MotionPhase(file=MOTION, cycle_s=CYCLE_S)),
-        "reference": ObservationTermCfg(term=mdp.MotionJoints(file=MOTION, joints=LEGS)),
+        "reference": ObservationTermCfg(term=mdp.MotionJoints(file=MOTION, joints=Walker.joints)),
         "drift": ObservationTermCfg(term=mdp.MotionBodyOffset(file=MOTION, bodies="torso")),
     }
     return ManagerBasedRlEnvCfg(
         decimation=4,
-        scene=SceneCfg(robots={"walker": Walker(actuators=SERVOS)}, terrain=PlaneTerrain(), num_envs=2048),
+        scene=SceneCfg(
+            robots={"walker": Walker(actuators=WALKER_SERVOS)}, terrain=PlaneTerrain(), num_envs=2048
+        ),
         sim=planar.SIM,
         observations={"actor": ObservationGroupCfg(terms=terms), "critic": ObservationGroupCfg(terms=terms)},
-        actions={"legs": mdp.JointPositionAction(joints=LEGS, scale=0.5)},
+        actions={"legs": mdp.JointPositionAction(joints=Walker.joints, scale=0.5)},
         events={"reset": mdp.ResetToMotion(file=MOTION, start_range=(0.0, 0.9))},
         rewards={
-            "joint_pos": mdp.TrackMotionJointPos(file=MOTION, joints=LEGS, std=0.7, weight=0.65),
-            "joint_vel": mdp.TrackMotionJointVel(file=MOTION, joints=LEGS, std=3.2, weight=0.1),
+            "joint_pos": mdp.TrackMotionJointPos(file=MOTION, joints=Walker.joints, std=0.7, weight=0.65),
+            "joint_vel": mdp.TrackMotionJointVel(file=MOTION, joints=Walker.joints, std=3.2, weight=0.1),
             "feet": mdp.TrackMotionBodyPos(file=MOTION, bodies=FEET, std=0.16, weight=0.15),
             "root": mdp.TrackMotionBodyPos(file=MOTION, bodies="torso", std=0.32, weight=0.05),
             "root_rotation": mdp.TrackMotionBodyQuat(file=MOTION, bodies="torso", std=0.32, weight=0.05),

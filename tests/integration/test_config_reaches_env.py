@@ -56,7 +56,7 @@ def test_scene_num_envs():
 
 def test_scene_robots():
     with pytest.raises(ValueError, match="did you mean 'other/slider'"):  # several robots have prefixes
-        made("+task.scene.robots.other={_target_: ksim_rl.scene.robots.cartpole.Cartpole}")
+        made("+task.scene.robots.other={_target_: ksim_rl.scene.robots.Cartpole}")
 
 
 def test_scene_terrain_and_sensors():

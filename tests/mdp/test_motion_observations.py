@@ -8,7 +8,7 @@ import torch
 from ksim_rl import envs
 from ksim_rl.mdp.motion_observations import observe_motion
 from ksim_rl.scene.motions import motion_path
-from ksim_rl.scene.robots.walker import Walker
+from ksim_rl.scene.robots.control_models import Walker
 from ksim_rl.transforms.innermost import innermost
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ksim_rl.scene.robots.walker import Walker
+from ksim_rl.scene.robots.control_models import Walker
 
 FPS = 50
 DURATION_S = 8.0

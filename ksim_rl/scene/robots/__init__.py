@@ -1,20 +1,13 @@
 """The robots that come with this package, and how MJCF files of others are edited."""
 
 from ksim_rl.scene.robots import edit
-from ksim_rl.scene.robots.arm import Arm
 from ksim_rl.scene.robots.booster_t1 import BoosterT1
-from ksim_rl.scene.robots.cartpole import Cartpole
-from ksim_rl.scene.robots.cheetah import Cheetah
-from ksim_rl.scene.robots.hopper import Hopper
-from ksim_rl.scene.robots.humanoid import Humanoid
-from ksim_rl.scene.robots.legged_robot import LeggedRobot
-from ksim_rl.scene.robots.pendulum import Pendulum
-from ksim_rl.scene.robots.quadruped import Quadruped
-from ksim_rl.scene.robots.reacher import Reacher
+from ksim_rl.scene.robots.control_models import Arm, Cartpole, Cheetah, Hopper, Pendulum, Reacher, Walker
+from ksim_rl.scene.robots.legged_robot import LeggedRobot, MenagerieRobot
+from ksim_rl.scene.robots.own_robots import Humanoid, Quadruped
 from ksim_rl.scene.robots.unitree_g1 import UnitreeG1
 from ksim_rl.scene.robots.unitree_go1 import UnitreeGo1
 from ksim_rl.scene.robots.unitree_go2 import UnitreeGo2
-from ksim_rl.scene.robots.walker import Walker
 
 __all__ = [
     "Arm",
@@ -24,6 +17,7 @@ __all__ = [
     "Hopper",
     "Humanoid",
     "LeggedRobot",
+    "MenagerieRobot",
     "Pendulum",
     "Quadruped",
     "Reacher",

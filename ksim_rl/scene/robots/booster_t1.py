@@ -7,19 +7,11 @@ gains here are chosen per group: legs and waist stiff enough to stand on, arms a
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
-import mujoco
-
-from ksim_rl.physics import load_spec
 from ksim_rl.scene.actuators import Actuator, PositionActuator
-from ksim_rl.scene.robots.edit import (
-    CollisionGeom,
-    Site,
-    Vector,
-    rebuild,
-    spread,
-)
+from ksim_rl.scene.robots.edit import CollisionGeom, Site, capsule, sphere, spread
+from ksim_rl.scene.robots.legged_robot import MenagerieRobot
 
 SIDES = ("Left", "Right")
 _LEG = ("Hip_Pitch", "Hip_Roll", "Hip_Yaw", "Knee_Pitch", "Ankle_Pitch", "Ankle_Roll")
@@ -59,84 +51,49 @@ STANCE = {
     ".*_Ankle_Pitch": -0.2,
 }
 
-_SPHERE, _CAPSULE = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE
-
-
-def _capsule(name: str, body: str, radius: float, fromto: Vector) -> CollisionGeom:
-    """A capsule without friction, on the ground as well, where its priority decides: contacts then cost a quarter."""
-    return CollisionGeom(
-        name=name, body=body, type=_CAPSULE, size=(radius,), fromto=fromto, condim=1, priority=1
-    )
+# Without friction, on the ground as well, where the priority decides: such contacts cost a quarter.
+_SMOOTH: dict[str, Any] = {"condim": 1, "priority": 1}
 
 
 def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:
     y, low = (1.0 if side == "Left" else -1.0), side.lower()
     upper_arm, shank = f"A{side[0]}3", f"Shank_{side}"
     soles = tuple(
-        CollisionGeom(
-            name=f"{low}_foot{number}_collision",
-            body=f"{low}_foot_link",
-            type=_CAPSULE,
-            size=(0.015,),
+        capsule(
+            f"{low}_foot{number}_collision",
+            f"{low}_foot_link",
+            0.015,
             # The two long edges of the sole, which is 22 cm long and 10 cm wide.
-            fromto=(-0.0865, 0.035 * edge, -0.015, 0.1065, 0.035 * edge, -0.015),
+            (-0.0865, 0.035 * edge, -0.015, 0.1065, 0.035 * edge, -0.015),
             friction=(0.8, 0.005, 0.0001),
             priority=1,
         )
         for number, edge in ((1, -1.0), (2, 1.0))
     )
     return (
-        _capsule(f"{low}_upper_arm_collision", upper_arm, 0.03, (0, -0.01 * y, 0, 0, 0.11 * y, 0)),
-        _capsule(f"{low}_forearm_collision", f"{low}_hand_link", 0.03, (0, 0.05 * y, 0, 0, 0.2 * y, 0)),
-        _capsule(f"{low}_thigh_collision", f"Hip_Yaw_{side}", 0.05, (0, 0, 0.04, -0.01, 0, -0.08)),
-        _capsule(f"{low}_shin_collision", shank, 0.045, (0, 0, -0.05, 0, 0, -0.2)),
+        capsule(f"{low}_upper_arm_collision", upper_arm, 0.03, (0, -0.01 * y, 0, 0, 0.11 * y, 0), **_SMOOTH),
+        capsule(
+            f"{low}_forearm_collision", f"{low}_hand_link", 0.03, (0, 0.05 * y, 0, 0, 0.2 * y, 0), **_SMOOTH
+        ),
+        capsule(f"{low}_thigh_collision", f"Hip_Yaw_{side}", 0.05, (0, 0, 0.04, -0.01, 0, -0.08), **_SMOOTH),
+        capsule(f"{low}_shin_collision", shank, 0.045, (0, 0, -0.05, 0, 0, -0.2), **_SMOOTH),
         *soles,
     )
 
 
-COLLISION_GEOMS = (
-    _capsule("trunk_collision", "Trunk", 0.1, (0.06, 0.0, 0.03, 0.06, 0.0, 0.17)),
-    CollisionGeom(
-        name="head_collision",
-        body="H2",
-        type=_SPHERE,
-        size=(0.08,),
-        pos=(0.01, 0.0, 0.11),
-        condim=1,
-        priority=1,
-    ),
-    *(geom for side in SIDES for geom in _side_geoms(side)),
-)
-SITES = (
-    Site(name="imu", body="Trunk"),
-    *(
-        Site(name=f"{side.lower()}_foot", body=f"{side.lower()}_foot_link", pos=(0.01, 0, -0.03))
-        for side in SIDES
-    ),
-)
-
-
 @dataclass(frozen=True, kw_only=True)
-class BoosterT1:
-    """The facts of the robot, and `spec()`, the model that they describe.
+class BoosterT1(MenagerieRobot):
+    """The facts of the robot, and `spec()`, the model that they describe; fields as of `MenagerieRobot`.
 
-    Attributes:
-        joint_names: the actuated joints in policy order (that of actions and joint observations).
-        default_joint_pos: the stance with bent knees and hanging arms, rad, by joint name.
-        init_pos, init_quat: the root's pose in the stance: m, and a quaternion (w, x, y, z).
-        action_scale: rad per unit action, by joint name.
-        actuators: what drives the joints.
-        soft_joint_pos_limit_factor: the part of each joint's range, about its middle, that is free of penalty.
+    It stands with bent knees and hanging arms.
     """
 
     init_pos: tuple[float, float, float] = (0.0, 0.0, 0.665)
-    init_quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     default_joint_pos: Mapping[str, float] = field(
         default_factory=lambda: spread(STANCE, JOINTS, default=0.0)
     )
     action_scale: Mapping[str, float] = field(default_factory=lambda: spread(ACTION_SCALE, JOINTS))
     actuators: tuple[Actuator, ...] = SERVOS
-    soft_joint_pos_limit_factor: float = 0.9
 
     name: ClassVar[str] = "t1"
     root_body: ClassVar[str] = "Trunk"
@@ -146,13 +103,16 @@ class BoosterT1:
         f"{side.lower()}_foot{number}_collision" for side in SIDES for number in (1, 2)
     )
     foot_sites: ClassVar[tuple[str, ...]] = tuple(f"{side.lower()}_foot" for side in SIDES)
-
-    def spec(self) -> mujoco.MjSpec:
-        """Return a fresh, editable model of the robot alone, with keyframe `init_state`.
-
-        Raises:
-            ValueError: in one line, how to get the menagerie's model, if it is not at hand.
-        """
-        spec = load_spec("booster_t1/t1")
-        rebuild(spec, self, geoms=COLLISION_GEOMS, sites=SITES, imu="imu")
-        return spec
+    model: ClassVar[str] = "booster_t1/t1"
+    collision_geoms: ClassVar[tuple[CollisionGeom, ...]] = (
+        capsule("trunk_collision", "Trunk", 0.1, (0.06, 0.0, 0.03, 0.06, 0.0, 0.17), **_SMOOTH),
+        sphere("head_collision", "H2", 0.08, (0.01, 0.0, 0.11), **_SMOOTH),
+        *(geom for side in SIDES for geom in _side_geoms(side)),
+    )
+    sites: ClassVar[tuple[Site, ...]] = (
+        Site(name="imu", body="Trunk"),
+        *(
+            Site(name=f"{side.lower()}_foot", body=f"{side.lower()}_foot_link", pos=(0.01, 0, -0.03))
+            for side in SIDES
+        ),
+    )

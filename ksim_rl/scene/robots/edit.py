@@ -5,7 +5,7 @@ A robot file holds tables of the small dataclasses below; adding a robot adds ta
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import mujoco
 
@@ -35,6 +35,18 @@ class CollisionGeom:
     solimp: Vector = (0.9, 0.95, 0.001, 0.5, 2.0)
     margin: float = 0.0
     group: int = 3
+
+
+def capsule(name: str, body: str, radius: float, fromto: Vector, **attributes: Any) -> CollisionGeom:
+    """Return a capsule between two points; `attributes` are fields of `CollisionGeom`."""
+    kind = mujoco.mjtGeom.mjGEOM_CAPSULE
+    return CollisionGeom(name=name, body=body, type=kind, size=(radius,), fromto=fromto, **attributes)
+
+
+def sphere(name: str, body: str, radius: float, pos: Vector, **attributes: Any) -> CollisionGeom:
+    """Return a sphere; `attributes` are fields of `CollisionGeom`."""
+    kind = mujoco.mjtGeom.mjGEOM_SPHERE
+    return CollisionGeom(name=name, body=body, type=kind, size=(radius,), pos=pos, **attributes)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,19 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-import mujoco
-
-from ksim_rl.physics import load_spec
 from ksim_rl.scene.actuators import Actuator, PositionActuator
-from ksim_rl.scene.robots.edit import (
-    CollisionGeom,
-    Site,
-    Vector,
-    exclude_contacts,
-    rebuild,
-    reflected_inertia,
-    spread,
-)
+from ksim_rl.scene.robots.edit import CollisionGeom, Site, capsule, reflected_inertia, sphere, spread
+from ksim_rl.scene.robots.legged_robot import MenagerieRobot
 
 SIDES = ("left", "right")
 _LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
@@ -69,7 +59,6 @@ STANCE = {
     ".*_elbow_joint": 0.6,
 }
 
-_SPHERE, _CAPSULE = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE
 # Seven capsules of 1 cm radius along each foot: (x, y) of their ends, in the ankle's frame.
 _SOLE = (
     ((-0.044, -0.018), (0.123, -0.018)),
@@ -83,24 +72,14 @@ _OUTER_EDGE = ((0.1, 0.026), (0.05, 0.026))
 _SOLE_Z = -0.025
 
 
-def _sphere(name: str, body: str, radius: float, pos: Vector) -> CollisionGeom:
-    return CollisionGeom(name=name, body=body, type=_SPHERE, size=(radius,), pos=pos, condim=1)
-
-
-def _capsule(name: str, body: str, radius: float, fromto: Vector) -> CollisionGeom:
-    """A capsule whose contacts with other parts of the robot are frictionless: fewer dimensions cost less."""
-    return CollisionGeom(name=name, body=body, type=_CAPSULE, size=(radius,), fromto=fromto, condim=1)
-
-
 def _foot_geoms(side: str) -> tuple[CollisionGeom, ...]:
     ends = (_INNER_EDGE[side], *_SOLE, _OUTER_EDGE)
     return tuple(
-        CollisionGeom(
-            name=f"{side}_foot{number}_collision",
-            body=f"{side}_ankle_roll_link",
-            type=_CAPSULE,
-            size=(0.01,),
-            fromto=(*first, _SOLE_Z, *second, _SOLE_Z),
+        capsule(
+            f"{side}_foot{number}_collision",
+            f"{side}_ankle_roll_link",
+            0.01,
+            (*first, _SOLE_Z, *second, _SOLE_Z),
             friction=(0.6, 0.005, 0.0001),
             priority=1,
         )
@@ -112,65 +91,55 @@ def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:
     y = 1.0 if side == "left" else -1.0
     knee = f"{side}_knee_link"
     return (
-        _capsule(f"{side}_hip_collision", f"{side}_hip_roll_link", 0.06, (0.02, 0, 0, 0.02, 0, -0.08)),
-        _capsule(f"{side}_thigh_collision", f"{side}_hip_yaw_link", 0.055, (0, 0, -0.03, -0.06, 0, -0.17)),
-        _capsule(f"{side}_shin_collision", knee, 0.045, (0.01, 0, 0, 0.01, 0, -0.15)),
-        _capsule(f"{side}_linkage_brace_collision", knee, 0.03, (0.01, 0, -0.2, 0.01, 0, -0.28)),
+        capsule(
+            f"{side}_hip_collision", f"{side}_hip_roll_link", 0.06, (0.02, 0, 0, 0.02, 0, -0.08), condim=1
+        ),
+        capsule(
+            f"{side}_thigh_collision", f"{side}_hip_yaw_link", 0.055, (0, 0, -0.03, -0.06, 0, -0.17), condim=1
+        ),
+        capsule(f"{side}_shin_collision", knee, 0.045, (0.01, 0, 0, 0.01, 0, -0.15), condim=1),
+        capsule(f"{side}_linkage_brace_collision", knee, 0.03, (0.01, 0, -0.2, 0.01, 0, -0.28), condim=1),
         *_foot_geoms(side),
-        _capsule(
-            f"{side}_shoulder_yaw_collision", f"{side}_shoulder_yaw_link", 0.035, (0, 0, -0.08, 0, 0, 0.05)
+        capsule(
+            f"{side}_shoulder_yaw_collision",
+            f"{side}_shoulder_yaw_link",
+            0.035,
+            (0, 0, -0.08, 0, 0, 0.05),
+            condim=1,
         ),
-        _capsule(
-            f"{side}_elbow_yaw_collision", f"{side}_elbow_link", 0.035, (-0.01, 0, -0.01, 0.08, 0, -0.01)
+        capsule(
+            f"{side}_elbow_yaw_collision",
+            f"{side}_elbow_link",
+            0.035,
+            (-0.01, 0, -0.01, 0.08, 0, -0.01),
+            condim=1,
         ),
-        _capsule(f"{side}_wrist_collision", f"{side}_wrist_pitch_link", 0.035, (-0.01, 0, 0, 0.06, 0, 0)),
-        _capsule(f"{side}_hand_collision", f"{side}_wrist_yaw_link", 0.035, (0.07, 0, 0, 0.15, -0.02 * y, 0)),
+        capsule(
+            f"{side}_wrist_collision", f"{side}_wrist_pitch_link", 0.035, (-0.01, 0, 0, 0.06, 0, 0), condim=1
+        ),
+        capsule(
+            f"{side}_hand_collision",
+            f"{side}_wrist_yaw_link",
+            0.035,
+            (0.07, 0, 0, 0.15, -0.02 * y, 0),
+            condim=1,
+        ),
     )
-
-
-COLLISION_GEOMS = (
-    _sphere("pelvis_collision", "pelvis", 0.07, (0.0, 0.0, -0.08)),
-    _capsule("torso_collision", "torso_link", 0.09, (0.01, 0.0, 0.08, 0.01, 0.0, 0.2)),
-    _sphere("head_collision", "torso_link", 0.06, (0.0, 0.0, 0.43)),
-    *(geom for side in SIDES for geom in _side_geoms(side)),
-)
-# Neighbours that the capsules would let touch in every pose.
-OVERLAPS = tuple(
-    pair
-    for side in SIDES
-    for pair in (("pelvis", f"{side}_hip_roll_link"), (f"{side}_elbow_link", f"{side}_wrist_pitch_link"))
-)
-SITES = tuple(
-    site
-    for side in SIDES
-    for site in (
-        Site(name=f"{side}_foot", body=f"{side}_ankle_roll_link", pos=(0.04, 0.0, -0.037)),
-        Site(name=f"{side}_palm", body=f"{side}_wrist_yaw_link", pos=(0.08, 0.0, 0.0), radius=0.01),
-    )
-)
 
 
 @dataclass(frozen=True, kw_only=True)
-class UnitreeG1:
-    """The facts of the robot, and `spec()`, the model that they describe.
+class UnitreeG1(MenagerieRobot):
+    """The facts of the robot, and `spec()`, the model that they describe; fields as of `MenagerieRobot`.
 
-    Attributes:
-        joint_names: the actuated joints in policy order (that of actions and joint observations).
-        default_joint_pos: the stance with bent knees, rad, by joint name.
-        init_pos, init_quat: the root's pose in the stance: m, and a quaternion (w, x, y, z).
-        action_scale: rad per unit action, by joint name.
-        actuators: what drives the joints.
-        soft_joint_pos_limit_factor: the part of each joint's range, about its middle, that is free of penalty.
+    It stands with bent knees. Contacts of the robot with itself are frictionless: fewer dimensions cost less.
     """
 
     init_pos: tuple[float, float, float] = (0.0, 0.0, 0.76)
-    init_quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     default_joint_pos: Mapping[str, float] = field(
         default_factory=lambda: spread(STANCE, JOINTS, default=0.0)
     )
     action_scale: Mapping[str, float] = field(default_factory=lambda: spread(ACTION_SCALE, JOINTS))
     actuators: tuple[Actuator, ...] = SERVOS
-    soft_joint_pos_limit_factor: float = 0.9
 
     name: ClassVar[str] = "g1"
     root_body: ClassVar[str] = "pelvis"
@@ -181,14 +150,28 @@ class UnitreeG1:
         f"{side}_foot{number}_collision" for side in SIDES for number in range(1, 8)
     )
     foot_sites: ClassVar[tuple[str, ...]] = tuple(f"{side}_foot" for side in SIDES)
-
-    def spec(self) -> mujoco.MjSpec:
-        """Return a fresh, editable model of the robot alone, with keyframe `init_state`.
-
-        Raises:
-            ValueError: in one line, how to get the menagerie's model, if it is not at hand.
-        """
-        spec = load_spec("unitree_g1/g1")
-        rebuild(spec, self, geoms=COLLISION_GEOMS, sites=SITES, imu="imu_in_pelvis")
-        exclude_contacts(spec, OVERLAPS)
-        return spec
+    model: ClassVar[str] = "unitree_g1/g1"
+    imu: ClassVar[str] = "imu_in_pelvis"
+    collision_geoms: ClassVar[tuple[CollisionGeom, ...]] = (
+        sphere("pelvis_collision", "pelvis", 0.07, (0.0, 0.0, -0.08), condim=1),
+        capsule("torso_collision", "torso_link", 0.09, (0.01, 0.0, 0.08, 0.01, 0.0, 0.2), condim=1),
+        sphere("head_collision", "torso_link", 0.06, (0.0, 0.0, 0.43), condim=1),
+        *(geom for side in SIDES for geom in _side_geoms(side)),
+    )
+    sites: ClassVar[tuple[Site, ...]] = tuple(
+        site
+        for side in SIDES
+        for site in (
+            Site(name=f"{side}_foot", body=f"{side}_ankle_roll_link", pos=(0.04, 0.0, -0.037)),
+            Site(name=f"{side}_palm", body=f"{side}_wrist_yaw_link", pos=(0.08, 0.0, 0.0), radius=0.01),
+        )
+    )
+    # Neighbours that the capsules would let touch in every pose.
+    overlaps: ClassVar[tuple[tuple[str, str], ...]] = tuple(
+        pair
+        for side in SIDES
+        for pair in (
+            ("pelvis", f"{side}_hip_roll_link"),
+            (f"{side}_elbow_link", f"{side}_wrist_pitch_link"),
+        )
+    )

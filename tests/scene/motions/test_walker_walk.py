@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ksim_rl.scene.motions import motion_path, walker_walk
-from ksim_rl.scene.robots.walker import Walker
+from ksim_rl.scene.robots.control_models import Walker
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from ksim_rl.scene.robots.humanoid import Humanoid
-from ksim_rl.scene.robots.quadruped import Quadruped
+from ksim_rl.scene.robots.own_robots import Humanoid, Quadruped
 from tests.scene.robots.standing import on_a_plane, stand, uprightness
 
 MASS = {Quadruped: (11.0, 14.0), Humanoid: (17.0, 20.0)}

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from ksim_rl.scene.robots.booster_t1 import BoosterT1
-from ksim_rl.scene.robots.humanoid import Humanoid
-from ksim_rl.scene.robots.quadruped import Quadruped
+from ksim_rl.scene.robots.own_robots import Humanoid, Quadruped
 from ksim_rl.scene.robots.unitree_g1 import UnitreeG1
 from ksim_rl.scene.robots.unitree_go1 import UnitreeGo1
 from ksim_rl.scene.robots.unitree_go2 import UnitreeGo2
