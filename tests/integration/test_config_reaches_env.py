@@ -61,7 +61,7 @@ def test_scene_robots():
 
 def test_scene_terrain_and_sensors():
     env = made(
-        "task.scene.terrain={_target_: ksim_rl.scene.terrains.plane.PlaneTerrain, friction: [0.5, 0.1, 0.2]}",
+        "task.scene.terrain={_target_: ksim_rl.scene.terrains.PlaneTerrain, friction: [0.5, 0.1, 0.2]}",
         "+task.scene.sensors.touch={_target_: ksim_rl.scene.sensors.contact.ContactSensor, geoms: [pole], "
         "against: terrain}",
     ).base_env

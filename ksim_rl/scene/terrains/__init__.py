@@ -1,19 +1,20 @@
-"""Terrains: what a scene stands on."""
+"""Terrains are what a scene stands on: an endless plane, or a grid of patches of several kinds."""
 
 from ksim_rl.scene.state.ground import Ground
-from ksim_rl.scene.terrains.flat import FlatPatch
-from ksim_rl.scene.terrains.gaps import Gaps
 from ksim_rl.scene.terrains.grid import TerrainGrid
-from ksim_rl.scene.terrains.obstacles import DiscreteObstacles
+from ksim_rl.scene.terrains.kinds import (
+    DiscreteObstacles,
+    FlatPatch,
+    Gaps,
+    PyramidSlope,
+    PyramidStairs,
+    RoughGround,
+    SteppingStones,
+    Waves,
+)
 from ksim_rl.scene.terrains.patch import Lattice, TerrainPatch
 from ksim_rl.scene.terrains.patched_ground import PatchedGround
-from ksim_rl.scene.terrains.plane import PlaneTerrain
-from ksim_rl.scene.terrains.rough import RoughGround
-from ksim_rl.scene.terrains.slope import PyramidSlope
-from ksim_rl.scene.terrains.stairs import PyramidStairs
-from ksim_rl.scene.terrains.stones import SteppingStones
-from ksim_rl.scene.terrains.terrain import Terrain
-from ksim_rl.scene.terrains.waves import Waves
+from ksim_rl.scene.terrains.terrain import PlaneTerrain, Terrain
 
 __all__ = [
     "DiscreteObstacles",

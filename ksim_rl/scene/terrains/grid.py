@@ -11,10 +11,9 @@ import mujoco
 import numpy as np
 
 from ksim_rl.checks import check_in_range
-from ksim_rl.scene.terrains.look import add_look
 from ksim_rl.scene.terrains.patch import TIE, Lattice, TerrainPatch
 from ksim_rl.scene.terrains.patched_ground import GEOM_FIELDS, PatchedGround, patch_name
-from ksim_rl.scene.terrains.terrain import Terrain, add_ground
+from ksim_rl.scene.terrains.terrain import Terrain, add_ground, add_look
 
 if TYPE_CHECKING:
     from ksim_rl.envs.view import EnvView

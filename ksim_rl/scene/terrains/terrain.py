@@ -9,14 +9,47 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 
+from ksim_rl.checks import check_in_range
 from ksim_rl.scene.state.ground import Ground
-from ksim_rl.scene.terrains.look import MATERIAL
 
 if TYPE_CHECKING:
     from ksim_rl.envs.view import EnvView
 
+MATERIAL = "terrain"
 BODY = "terrain"
 """Name of the body, and of the geom, that a terrain adds to the world."""
+
+
+def add_look(spec: mujoco.MjSpec, *, repeat: float) -> None:
+    """Add sky, light and the material `MATERIAL`.
+
+    Args:
+        spec: the scene's spec; its own sky stays if it has one.
+        repeat: repetitions of the pattern (two tiles) per metre.
+    """
+    if not any(texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
+        spec.add_texture(
+            name="terrain_sky",
+            type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+            builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+            rgb1=[0.75, 0.82, 0.9],
+            rgb2=[0.95, 0.97, 1.0],
+            width=64,
+            height=384,
+        )
+    spec.add_texture(
+        name=MATERIAL,
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.28, 0.32, 0.36],
+        rgb2=[0.22, 0.25, 0.29],
+        width=256,
+        height=256,
+    )
+    textures = [""] * mujoco.mjtTextureRole.mjNTEXROLE
+    textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = MATERIAL
+    spec.add_material(name=MATERIAL, textures=textures, texuniform=True, texrepeat=[repeat, repeat])
+    spec.worldbody.add_light(pos=[0, 0, 4], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 
 
 def add_ground(spec: mujoco.MjSpec, *, friction: Sequence[float], **shape: Any) -> None:
@@ -50,3 +83,23 @@ class Terrain(ABC):
     def ground(self, view: EnvView) -> Ground:
         """Return the ground of the worlds of `view` (flat, at z = 0, by default)."""
         return Ground(view.num_envs, view.device)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneTerrain(Terrain):
+    """An infinite plane at z = 0: body and geom are both called "terrain".
+
+    Attributes:
+        friction: sliding (1), torsional (m) and rolling (m) coefficients, as in MJCF.
+    """
+
+    friction: tuple[float, float, float] = (1.0, 0.005, 0.0001)
+
+    def __post_init__(self) -> None:
+        for index, value in enumerate(self.friction):
+            check_in_range(f"friction[{index}]", value, low=0.0)
+
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Add the plane to the world body, with a checker pattern and a sky for rendering."""
+        add_look(spec, repeat=2)
+        add_ground(spec, friction=self.friction, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.01])

@@ -1,0 +1,246 @@
+"""Each class is a kind of ground: a rule that gives the heights of a square patch at a difficulty in [0, 1]."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ksim_rl.checks import check_in_range, check_pair
+from ksim_rl.scene.terrains.patch import TIE, Lattice, TerrainPatch, between, check_ends
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlatPatch(TerrainPatch):
+    """Even ground at every difficulty."""
+
+    cell: float = 1.0
+
+    def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
+        """Return zeros, [R, C]."""
+        return np.zeros_like(lattice.x_RC)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoughGround(TerrainPatch):
+    """Heights drawn independently and uniformly from [-amplitude, amplitude] at points `cell` apart.
+
+    Attributes:
+        amplitude: m, at difficulty 0 and 1.
+    """
+
+    amplitude: tuple[float, float] = (0.01, 0.06)
+    cell: float = 0.15
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ends("amplitude", self.amplitude, low=0.0)
+
+    def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
+        """Return the heights, m, [R, C]."""
+        return between(self.amplitude, difficulty) * rng.uniform(-1.0, 1.0, lattice.x_RC.shape)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Waves(TerrainPatch):
+    """Two crossed standing waves: amplitude / 2 * (cos(2 pi x / length) + cos(2 pi y / length)).
+
+    Attributes:
+        amplitude: m, at difficulty 0 and 1; crests are 2 amplitudes above the deepest troughs.
+        wave_length: m.
+    """
+
+    amplitude: tuple[float, float] = (0.02, 0.2)
+    wave_length: float = 2.0
+    cell: float = 0.2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ends("amplitude", self.amplitude, low=0.0)
+        check_in_range("wave_length", self.wave_length, low=4 * self.cell)
+
+    def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
+        """Return the heights, m, [R, C]."""
+        per_metre = 2 * math.pi / self.wave_length
+        crests_RC = np.cos(per_metre * lattice.x_RC) + np.cos(per_metre * lattice.y_RC)
+        return between(self.amplitude, difficulty) / 2 * crests_RC
+
+
+@dataclass(frozen=True, kw_only=True)
+class PyramidSlope(TerrainPatch):
+    """A square pyramid with a platform on top; inverted, a pit with the platform at its bottom.
+
+    Envs start on the platform: they walk down a pyramid, and up out of a pit.
+
+    Attributes:
+        gradient: rise over run (the tangent of the slope's angle), at difficulty 0 and 1.
+        platform_width: edge of the platform, m.
+        inverted: a pit instead of a pyramid.
+    """
+
+    gradient: tuple[float, float] = (0.0, 0.5)
+    platform_width: float = 2.0
+    inverted: bool = False
+    cell: float = 0.25
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ends("gradient", self.gradient, low=0.0)
+        check_in_range("platform_width", self.platform_width, low=0.0, low_open=True)
+
+    def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
+        """Return the heights, m, [R, C]."""
+        run_RC = np.maximum(lattice.ring_RC - self.platform_width / 2, 0.0)
+        return between(self.gradient, difficulty) * (run_RC if self.inverted else -run_RC)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PyramidStairs(TerrainPatch):
+    """A square pyramid of steps with a platform on top; inverted, a pit with the platform at its bottom.
+
+    Envs start on the platform: they walk down a pyramid, and up out of a pit. Each riser is one `cell` wide.
+
+    Attributes:
+        step_height: m, at difficulty 0 and 1.
+        step_width: m from one riser to the next.
+        platform_width: edge of the platform, m.
+        inverted: a pit instead of a pyramid.
+    """
+
+    step_height: tuple[float, float] = (0.02, 0.2)
+    step_width: float = 0.3
+    platform_width: float = 2.0
+    inverted: bool = False
+    cell: float = 0.05
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ends("step_height", self.step_height, low=0.0)
+        check_in_range("step_width", self.step_width, low=2 * self.cell)
+        check_in_range("platform_width", self.platform_width, low=0.0, low_open=True)
+
+    def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
+        """Return the heights, m, [R, C]; as many steps as fit."""
+        from_platform_RC = (lattice.ring_RC - self.platform_width / 2 - TIE) / self.step_width
+        num_steps = int((lattice.size - self.platform_width) / 2 / self.step_width)
+        step_RC = np.clip(np.ceil(from_platform_RC), 0, num_steps)
+        return between(self.step_height, difficulty) * (step_RC if self.inverted else -step_RC)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiscreteObstacles(TerrainPatch):
+    """Rectangular blocks and pits at random places, around an even platform; later ones cover earlier ones.
+
+    Attributes:
+        height: m of blocks, and depth of pits, at difficulty 0 and 1.
+        width: edges are drawn from this range, m.
+        num_obstacles: how many there are.
+        platform_width: edge of the platform, m.
+    """
+
+    height: tuple[float, float] = (0.02, 0.2)
+    width: tuple[float, float] = (0.3, 1.0)
+    num_obstacles: int = 60
+    platform_width: float = 1.5
+    cell: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ends("height", self.height, low=0.0)
+        check_pair("width", self.width, low=0.0)
+        check_in_range("num_obstacles", self.num_obstacles, low=0)
+        check_in_range("platform_width", self.platform_width, low=0.0)
+
+    def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
+        """Return the heights, m, [R, C]."""
+        height, reach = between(self.height, difficulty), lattice.size / 2
+        ground_RC = np.zeros_like(lattice.x_RC)
+        for _ in range(self.num_obstacles):
+            half_x, half_y = rng.uniform(*self.width, size=2) / 2
+            x, y = rng.uniform(-reach, reach, size=2)
+            inside_RC = (np.abs(lattice.x_RC - x) <= half_x) & (np.abs(lattice.y_RC - y) <= half_y)
+            ground_RC[inside_RC] = rng.choice((-height, height))
+        ground_RC[lattice.ring_RC <= self.platform_width / 2 + TIE] = 0.0
+        return ground_RC
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteppingStones(TerrainPatch):
+    """Square stones in rows and columns around a platform, with holes between them.
+
+    The flanks of stones are one `cell` wide, within the gaps, and all lengths are whole cells.
+
+    Attributes:
+        stone_width: edge of a stone's top, m, at difficulty 0 and 1.
+        gap: m between the tops of neighbouring stones, at difficulty 0 and 1.
+        unevenness: tops are drawn from [-unevenness, unevenness], m, at difficulty 0 and 1.
+        depth: m of the holes.
+        platform_width: edge of the platform, m.
+    """
+
+    stone_width: tuple[float, float] = (0.8, 0.35)
+    gap: tuple[float, float] = (0.1, 0.3)
+    unevenness: tuple[float, float] = (0.0, 0.05)
+    depth: float = 0.5
+    platform_width: float = 1.5
+    cell: float = 0.05
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ends("stone_width", self.stone_width, low=self.cell)
+        check_ends("gap", self.gap, low=2 * self.cell)
+        check_ends("unevenness", self.unevenness, low=0.0)
+        check_in_range("depth", self.depth, low=0.0)
+        check_in_range("platform_width", self.platform_width, low=0.0)
+
+    def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
+        """Return the heights, m, [R, C]."""
+        cell = lattice.spacing
+        width = max(1, round(between(self.stone_width, difficulty) / cell))
+        gap = max(2, round(between(self.gap, difficulty) / cell))
+        place_C = np.arange(lattice.num_cells + 1)
+        stone_C, within_C = place_C // (width + gap), place_C % (width + gap)
+        on_stone_C = within_C <= width
+        unevenness = between(self.unevenness, difficulty)
+        tops = rng.uniform(-unevenness, unevenness, size=(stone_C[-1] + 1,) * 2)
+        ground_RC = np.where(
+            on_stone_C[:, None] & on_stone_C, tops[stone_C[:, None], stone_C[None, :]], -self.depth
+        )
+        ground_RC[lattice.ring_RC <= self.platform_width / 2 + TIE] = 0.0
+        return ground_RC
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gaps(TerrainPatch):
+    """Square trenches around a platform, one after the other, with even ground between them.
+
+    The flanks of a trench are one `cell` wide, and all lengths are whole cells.
+
+    Attributes:
+        width: m from brink to brink, at difficulty 0 and 1.
+        spacing: m of ground between two trenches.
+        depth: m.
+        platform_width: edge of the platform, m.
+    """
+
+    width: tuple[float, float] = (0.1, 0.6)
+    spacing: float = 0.8
+    depth: float = 0.5
+    platform_width: float = 1.5
+    cell: float = 0.05
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ends("width", self.width, low=2 * self.cell)
+        check_in_range("spacing", self.spacing, low=self.cell)
+        check_in_range("depth", self.depth, low=0.0)
+        check_in_range("platform_width", self.platform_width, low=0.0, low_open=True)
+
+    def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
+        """Return the heights, m, [R, C]."""
+        cell = lattice.spacing
+        width = max(2, round(between(self.width, difficulty) / cell)) * cell
+        ground = max(1, round(self.spacing / cell)) * cell
+        outside_RC = lattice.ring_RC - round(self.platform_width / 2 / cell) * cell
+        place_RC = np.mod(outside_RC, width + ground)
+        in_gap_RC = (outside_RC > TIE) & (place_RC > TIE) & (place_RC < width - TIE)
+        return np.where(in_gap_RC, -self.depth, 0.0)
