@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from ksim_rl.checks import check_choice, check_in_range, check_pair
@@ -26,7 +27,15 @@ METRIC_REDUCTIONS = ("mean", "last", "max", "sum")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObservationTerm(ABC):
+class Term(ABC):  # noqa: B024
+    """What all kinds of term are, so that fields can be shared across kinds (`ksim_rl.mdp.fields`)."""
+
+    def __post_init__(self) -> None:  # noqa: B027
+        """Check the fields; each class checks its own after its bases have checked theirs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationTerm(Term):
     """A clean reading: float32 [E, L]. Noise, delay and history are transforms, not part of the term.
 
     A term with `is_image` gives float32, int32 or uint8 of shape [E, H, W] or [E, H, W, C] instead, and stands alone in
@@ -36,12 +45,12 @@ class ObservationTerm(ABC):
     is_image: ClassVar[bool] = False
 
     @abstractmethod
-    def __call__(self, view: EnvView) -> Tensor:
+    def __call__(self, view: EnvView) -> Shaped[Tensor, " E *leaf"]:
         """Return the reading of the current state, float32 [E, L], or an image."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RewardTerm(ABC):
+class RewardTerm(Term):
     """A reward per second (or per step, if the env does not scale by dt), before its weight.
 
     A term of weight 0 is not computed.
@@ -50,45 +59,45 @@ class RewardTerm(ABC):
     weight: float = 1.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_in_range("weight", self.weight)
 
     @abstractmethod
-    def __call__(self, view: EnvView) -> Tensor:
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         """Return the unweighted reward of the current state, float32 [E]."""
 
-    def draw_debug(  # noqa: B027
-        self, view: EnvView, visualizer: DebugVisualizer, env_index: int
-    ) -> None:
+    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw what the reward of one env looks at (nothing by default)."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class TerminationTerm(ABC):
+class TerminationTerm(Term):
     """A condition that ends the episode; `time_out` marks it as a truncation."""
 
     time_out: bool = False
 
     @abstractmethod
-    def __call__(self, view: EnvView) -> Tensor:
+    def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         """Return which envs end, bool [E]."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class MetricTerm(ABC):
+class MetricTerm(Term):
     """A value per step that is reduced over the episode and reported when it ends."""
 
     reduce: Literal["mean", "last", "max", "sum"] = "mean"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_choice("reduce", self.reduce, METRIC_REDUCTIONS)
 
     @abstractmethod
-    def __call__(self, view: EnvView) -> Tensor:
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         """Return the value of the current state, float32 [E]."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class EventTerm(ABC):
+class EventTerm(Term):
     """A write to the simulation: `startup` once, `reset` for rows that reset, `interval` by per-env clocks, `step`.
 
     An event must not read a derived quantity (a body or site pose, a sensor) after state was written, as it is before
@@ -99,6 +108,7 @@ class EventTerm(ABC):
     interval_range_s: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_choice("mode", self.mode, EVENT_MODES)
         if (self.mode == "interval") != (self.interval_range_s is not None):
             raise ValueError(
@@ -114,17 +124,18 @@ class EventTerm(ABC):
         return ()
 
     @abstractmethod
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Apply the event to the rows of `mask_E`, bool [E]; other rows must stay bit-identical."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class CommandTerm(ABC):
+class CommandTerm(Term):
     """A generator of commands with a per-env clock that resamples; None as its range draws at resets only."""
 
     resampling_time_range_s: tuple[float, float] | None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.resampling_time_range_s is not None:
             check_pair("resampling_time_range_s", self.resampling_time_range_s, low=0.0)
 
@@ -133,19 +144,19 @@ class CommandTerm(ABC):
         """The ranges by field that `resample` draws from and that a curriculum may change: see `shared_ranges`."""
         return {}
 
-    def shared_ranges(self, view: EnvView) -> Tensor:
+    def shared_ranges(self, view: EnvView) -> Float[Tensor, "2 N"]:
         """Return the present ranges, (low, high) [2, N] in the order of `ranges`; they start at those."""
         return view.shared("ranges_2N", tuple(zip(*self.ranges.values(), strict=True)))
 
     @abstractmethod
-    def resample(self, view: EnvView, mask_E: Tensor) -> None:
+    def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Draw new targets for the rows of `mask_E`, bool [E], into `view.buffer` buffers."""
 
     @abstractmethod
-    def __call__(self, view: EnvView) -> Tensor:
+    def __call__(self, view: EnvView) -> Float[Tensor, "E K"]:
         """Return the command of the current state and targets, float32 [E, K]."""
 
-    def set(self, view: EnvView, value_EK: Tensor, mask_E: Tensor) -> None:
+    def set(self, view: EnvView, value_EK: Float[Tensor, "*rows K"], mask_E: Bool[Tensor, " E"]) -> None:
         """Take values from outside for the rows of `mask_E`, bool [E].
 
         Raises:
@@ -155,14 +166,12 @@ class CommandTerm(ABC):
             f"a {type(self).__name__} draws its values; a JoystickCommand takes them from outside"
         )
 
-    def draw_debug(  # noqa: B027
-        self, view: EnvView, visualizer: DebugVisualizer, env_index: int
-    ) -> None:
+    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw the command of one env (nothing by default)."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ActionTerm(ABC):
+class ActionTerm(Term):
     """A map from some columns of the action to the controls of actuators."""
 
     @abstractmethod
@@ -170,12 +179,12 @@ class ActionTerm(ABC):
         """Return how many columns of the action this term takes."""
 
     @abstractmethod
-    def __call__(self, view: EnvView, action_EK: Tensor) -> None:
+    def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         """Write the controls that `action_EK` (this term's columns, finite) asks for, for the whole env step."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class CurriculumTerm(ABC):
+class CurriculumTerm(Term):
     """A rule that adapts difficulty; it runs for the rows that reset, before the reset events.
 
     It may write `view.reward_weights[name]`, a tensor [] per reward term, for the rewards that it names in
@@ -195,5 +204,5 @@ class CurriculumTerm(ABC):
         return None
 
     @abstractmethod
-    def __call__(self, view: EnvView, mask_E: Tensor) -> Tensor:
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         """Adapt and return the level to report, float32 []; its state lives in `view.buffer(..., keep=True)`."""

@@ -1,18 +1,20 @@
-"""Constants of terms as device tensors, made once: a step must not upload any."""
+"""Terms keep their constants here as device tensors, made once: a step must not upload any."""
 
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 
+import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import near
 from ksim_rl.scene.names import Index, as_index
 
 
-def constant(values: Sequence[float], device: torch.device) -> Tensor:
-    """Return `values` as a float32 tensor [L] on the device; the same tensor for the same values, for ever."""
+def constant(values: Sequence[float], device: torch.device) -> Float[Tensor, " L"]:
+    """Return `values` as a float32 tensor on the device; the same tensor for the same values, for ever."""
     return _constant(tuple(values), device)
 
 
@@ -21,6 +23,11 @@ def _constant(values: tuple[float, ...], device: torch.device) -> Tensor:
     # Made outside of inference mode: the tensor outlives the mode of the call that happens to come first.
     with torch.inference_mode(False):
         return torch.tensor(values, dtype=torch.float32, device=device)
+
+
+def array_constant(values: np.ndarray, device: torch.device) -> Float[Tensor, "*shape"]:
+    """Return an array, such as a model's own values, as a float32 tensor; the same for the same values, for ever."""
+    return constant(values.ravel().tolist(), device).view(values.shape)
 
 
 def index_constant(ids: Sequence[int], device: torch.device) -> Index:

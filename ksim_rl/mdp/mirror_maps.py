@@ -1,4 +1,4 @@
-"""The left-right mirror image of what a policy reads and does, found from the env's own terms."""
+"""The left-right mirror image of what a policy reads and does is found here from the env's own terms."""
 
 import functools
 from collections.abc import Sequence
@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from ksim_rl import mdp
 from ksim_rl.checks import near
+from ksim_rl.envs.contract import part
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.mdp.actions.joint_action import JointAction, per_joint
 from ksim_rl.scene.names import Patterns
@@ -28,7 +29,6 @@ from ksim_rl.transforms import (
     mirror_group,
     mirror_joints,
 )
-from ksim_rl.transforms.innermost import innermost
 from ksim_rl.transforms.mirror.mirror_map import concatenate, unchanged
 
 _SENSORS = {
@@ -59,13 +59,17 @@ def mirror_maps(
         ValueError: if the image of a term is not known (register it with `term_mirror.register`), or if joints, default
             pose or action scale are not symmetric.
     """
-    inner, specs = innermost(env), group_specs(env)
+    inner, specs = part(env, ManagerBasedRlEnv), group_specs(env)
+    if inner is None:
+        raise ValueError(
+            f"mirror_maps of a {type(env).__name__}: needs a ManagerBasedRlEnv, whose terms it reads"
+        )
     maps: dict[NestedKey, MirrorMap] = {}
     for group in groups:
         if group not in specs:
             raise ValueError(f"no observation group {group!r}: {near(str(group), map(str, specs))}")
-        terms = inner.cfg.observations[group].terms
-        images = {
+        terms = inner.cfg.observations[str(group)].terms
+        images: dict[NestedKey, MirrorMap] = {
             name: _named(f"observations.{group}.{name}", cfg.term, inner) for name, cfg in terms.items()
         }
         maps[group] = mirror_group(specs[group], images)
@@ -99,22 +103,15 @@ def term_mirror(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
 
 # -- root, sensors, time -----------------------------------------------------------------------------------------
 
-
-@term_mirror.register(mdp.RootPos)
-@term_mirror.register(mdp.RootLinVel)
-@term_mirror.register(mdp.ProjectedGravity)
-def _(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
-    return POLAR
-
-
-@term_mirror.register
-def _(term: mdp.RootAngVel, env: ManagerBasedRlEnv) -> MirrorMap:
-    return AXIAL
-
-
-@term_mirror.register
-def _(term: mdp.RootQuat, env: ManagerBasedRlEnv) -> MirrorMap:
-    return QUATERNION
+_FIXED = {
+    **dict.fromkeys((mdp.RootPos, mdp.RootLinVel, mdp.ProjectedGravity), POLAR),
+    mdp.RootAngVel: AXIAL,
+    mdp.RootQuat: QUATERNION,
+    **dict.fromkeys((mdp.EpisodeTime, mdp.RemainingTime), unchanged(1)),
+    mdp.UniformVelocityCommand: PLANAR_VELOCITY,
+}
+for _kind, _image in _FIXED.items():
+    term_mirror.register(_kind, lambda term, env, image=_image: image)
 
 
 @term_mirror.register
@@ -129,12 +126,6 @@ def _(term: mdp.SensorReading, env: ManagerBasedRlEnv) -> MirrorMap:
 @term_mirror.register
 def _(term: mdp.ImuReading, env: ManagerBasedRlEnv) -> MirrorMap:
     return _IMU[term.quantity]
-
-
-@term_mirror.register(mdp.EpisodeTime)
-@term_mirror.register(mdp.RemainingTime)
-def _(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
-    return unchanged(1)
 
 
 @term_mirror.register
@@ -152,11 +143,6 @@ def _(term: mdp.HeightScan, env: ManagerBasedRlEnv) -> MirrorMap:
 @term_mirror.register
 def _(term: mdp.Command, env: ManagerBasedRlEnv) -> MirrorMap:
     return term_mirror(env.cfg.commands[term.command], env)
-
-
-@term_mirror.register
-def _(term: mdp.UniformVelocityCommand, env: ManagerBasedRlEnv) -> MirrorMap:
-    return PLANAR_VELOCITY
 
 
 @term_mirror.register(mdp.JointVel)
@@ -179,7 +165,7 @@ def _(term: mdp.LastAction, env: ManagerBasedRlEnv) -> MirrorMap:
 
 @term_mirror.register
 def _(term: JointAction, env: ManagerBasedRlEnv) -> MirrorMap:
-    relative = getattr(term, "use_default_offset", False)
+    relative = isinstance(term, mdp.JointPositionAction) and term.use_default_offset
     mirror = _relative_joints(env, term.joints) if relative else _joints(env, term.joints)
     view, (source, signs) = env.view, mirror.tensors(env.view.device)
     scale = per_joint(view, "scale", term.scale, term.joints)
@@ -216,46 +202,28 @@ def _check_symmetric(what: str, value_K: Tensor, image_K: Tensor) -> None:
 
 # -- bodies, feet and contacts: one number or vector for each name -----------------------------------------------
 
-
-@term_mirror.register(mdp.BodyPos)
-@term_mirror.register(mdp.BodyLinVel)
-@term_mirror.register(mdp.CenterOfMassPos)
-@term_mirror.register(mdp.CenterOfMassVel)
-def _(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
-    return mirror_by_name(_names(env, "body", term.bodies), POLAR)
-
-
-@term_mirror.register
-def _(term: mdp.BodyAngVel, env: ManagerBasedRlEnv) -> MirrorMap:
-    return mirror_by_name(_names(env, "body", term.bodies), AXIAL)
-
-
-@term_mirror.register
-def _(term: mdp.BodyQuat, env: ManagerBasedRlEnv) -> MirrorMap:
-    return mirror_by_name(_names(env, "body", term.bodies), QUATERNION)
-
-
-@term_mirror.register
-def _(term: mdp.FootPos, env: ManagerBasedRlEnv) -> MirrorMap:
-    return mirror_by_name(_names(env, "site", term.sites), POLAR)
-
-
-@term_mirror.register
-def _(term: mdp.FootHeight, env: ManagerBasedRlEnv) -> MirrorMap:
-    return mirror_by_name(_names(env, "site", term.sites))
-
-
-@term_mirror.register(mdp.Contact)
-@term_mirror.register(mdp.FootContact)
-@term_mirror.register(mdp.FootAirTime)
-def _(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
-    return mirror_by_name(_elements(env, term.sensor))
-
-
-@term_mirror.register(mdp.ContactForce)
-@term_mirror.register(mdp.FootContactForces)
-def _(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
-    return mirror_by_name(_elements(env, term.sensor), POLAR)
+_BODIES = {
+    **dict.fromkeys((mdp.BodyPos, mdp.BodyLinVel, mdp.CenterOfMassPos, mdp.CenterOfMassVel), POLAR),
+    mdp.BodyAngVel: AXIAL,
+    mdp.BodyQuat: QUATERNION,
+}
+_SITES = {mdp.FootPos: POLAR, mdp.FootHeight: None}
+_CONTACTS = {
+    **dict.fromkeys((mdp.Contact, mdp.FootContact, mdp.FootAirTime)),
+    **dict.fromkeys((mdp.ContactForce, mdp.FootContactForces), POLAR),
+}
+for _kind, _image in _BODIES.items():
+    term_mirror.register(
+        _kind, lambda term, env, image=_image: mirror_by_name(_names(env, "body", term.bodies), image)
+    )
+for _kind, _image in _SITES.items():
+    term_mirror.register(
+        _kind, lambda term, env, image=_image: mirror_by_name(_names(env, "site", term.sites), image)
+    )
+for _kind, _image in _CONTACTS.items():
+    term_mirror.register(
+        _kind, lambda term, env, image=_image: mirror_by_name(_elements(env, term.sensor), image)
+    )
 
 
 def _names(env: ManagerBasedRlEnv, kind: str, patterns: Patterns) -> list[str]:

@@ -1,19 +1,20 @@
-"""What an env would observe if a reference motion were played in it."""
+"""A reference motion is turned here into what an env would observe if the motion were played in it."""
 
 import dataclasses
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from ksim_rl.envs.contract import part
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.registry import build
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.scene.motions.motion import load_motion, motion_start_time
 from ksim_rl.scene.terrains import PlaneTerrain
-from ksim_rl.transforms.innermost import innermost
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,8 +23,7 @@ class PlayMotion(EventTerm):
 
     file: str
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        """Write the rows of `mask_E`."""
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         start_E = motion_start_time(view, self.file)
         start_E.copy_(torch.arange(view.num_envs, device=view.device) * view.step_dt)
         qpos_EL, qvel_EL = view.motion(self.file).sample(start_E)
@@ -31,8 +31,8 @@ class PlayMotion(EventTerm):
         view.write_qvel(mask_E, qvel_EL)
 
 
-def observe_motion(env: EnvBase, *, group: str, file: str) -> Tensor:
-    """Return an observation group along a reference motion, one row per env step, float32 [F, L] on the env's device.
+def observe_motion(env: EnvBase, *, group: str, file: str) -> Float[Tensor, "F L"]:
+    """Return an observation group along a reference motion, one row per env step, on the env's device.
 
     Envs of their own, on a plane, are put into the motion's states, and the group's terms and transforms compute what
     they always do; noise is off. Terms that read more than positions and velocities (commands, actions, contacts,
@@ -44,9 +44,13 @@ def observe_motion(env: EnvBase, *, group: str, file: str) -> Tensor:
         file: a reference motion, as `view.motion` reads it.
 
     Raises:
-        ValueError: if the motion does not fit the model, or is shorter than an env step.
+        ValueError: if the env is another, the motion does not fit the model, or is shorter than an env step.
     """
-    base: ManagerBasedRlEnv = innermost(env)
+    base = part(env, ManagerBasedRlEnv)
+    if base is None:
+        raise ValueError(
+            f"observe_motion of a {type(env).__name__}: needs a ManagerBasedRlEnv, whose terms it runs"
+        )
     cfg, device = base.cfg, base.device
     assert device is not None
     duration_s = load_motion(file, base.world.mj_model, torch.device("cpu")).duration_s

@@ -1,4 +1,4 @@
-"""Terms of following a reference motion, from where `ResetToMotion` began the episode.
+"""These terms read, rate and end episodes that follow a reference motion, from where `ResetToMotion` began them.
 
 `file` is what `view.motion` reads. Kernels are those of Peng et al., "DeepMimic" (2018), with their scales k written as
 std = 1 / sqrt(k): joint positions 2, joint velocities 0.1, ends of limbs 40, root or centre of mass 10.
@@ -8,11 +8,13 @@ import math
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import ObservationTerm, TerminationTerm
 from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.fields import OfJoints
 from ksim_rl.mdp.rewards.gaussian_reward import GaussianReward
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.motions.motion import motion_bodies, motion_joints, motion_time
@@ -36,15 +38,14 @@ class MotionPhase(ObservationTerm):
         if self.cycle_s is not None:
             check_in_range("cycle_s", self.cycle_s, low=0.0, low_open=True)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         cycle_s = self.cycle_s or view.motion(self.file).duration_s
         angle_E = motion_time(view, self.file) * (2.0 * math.pi / cycle_s)
         return torch.stack((torch.sin(angle_E), torch.cos(angle_E)), dim=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionJoints(ObservationTerm):
+class MotionJoints(OfJoints, ObservationTerm):
     """Positions (rad or m), then velocities (per s), that joints have in the motion, [E, 2L].
 
     Attributes:
@@ -52,14 +53,12 @@ class MotionJoints(ObservationTerm):
     """
 
     file: str
-    joints: Patterns = ".*"
     ahead_s: float = 0.0
 
     def __post_init__(self) -> None:
         check_in_range("ahead_s", self.ahead_s)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         if self.ahead_s == 0.0:
             return torch.cat(motion_joints(view, self.file, self.joints), dim=-1)
         time_E = motion_time(view, self.file) + self.ahead_s
@@ -73,8 +72,7 @@ class MotionBodyOffset(ObservationTerm):
     file: str
     bodies: Patterns
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return _body_offset(view, self.file, self.bodies).flatten(start_dim=1)
 
 
@@ -93,26 +91,20 @@ class MotionReward(GaussianReward):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackMotionJointPos(MotionReward):
+class TrackMotionJointPos(OfJoints, MotionReward):
     """exp(-sum_j (q_j - qref_j)^2 / std^2), rad or m, [E]; position stage."""
 
-    joints: Patterns = ".*"
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         pos_EL, _ = motion_joints(view, self.file, self.joints)
         own_EL = view.joints(self.joints).pos_EL
         return self.rate((own_EL - pos_EL).square().sum(-1))
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackMotionJointVel(MotionReward):
+class TrackMotionJointVel(OfJoints, MotionReward):
     """exp(-sum_j (v_j - vref_j)^2 / std^2), rad/s or m/s, [E]; velocity stage."""
 
-    joints: Patterns = ".*"
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         _, vel_EL = motion_joints(view, self.file, self.joints)
         own_EL = view.joints(self.joints).vel_EL
         return self.rate((own_EL - vel_EL).square().sum(-1))
@@ -124,8 +116,7 @@ class TrackMotionBodyPos(MotionReward):
 
     bodies: Patterns
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return self.rate(_body_offset(view, self.file, self.bodies).square().sum((-2, -1)))
 
 
@@ -135,8 +126,7 @@ class TrackMotionBodyQuat(MotionReward):
 
     bodies: Patterns
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         _, quat_EN4 = motion_bodies(view, self.file, self.bodies)
         own_EN4 = view.bodies(self.bodies).quat_EN4
         return self.rate(quaternion.angle_between(own_EN4, quat_EN4).square().sum(-1))
@@ -156,8 +146,7 @@ class FarFromMotion(TerminationTerm):
     def __post_init__(self) -> None:
         check_in_range("distance", self.distance, low=0.0, low_open=True)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return which envs end, bool [E]."""
+    def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         offset_EN3 = _body_offset(view, self.file, self.bodies)
         return (torch.linalg.vector_norm(offset_EN3, dim=-1) > self.distance).any(-1)
 
@@ -169,8 +158,7 @@ class MotionFinished(TerminationTerm):
     file: str
     time_out: bool = True
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return which envs end, bool [E]."""
+    def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         # Half a step early: sums of float32 steps may fall short of the end by some rounding.
         return motion_time(view, self.file) > view.motion(self.file).duration_s - 0.5 * view.step_dt
 

@@ -1,7 +1,8 @@
-"""Uniform draws of a pose or a velocity: ranges by axis name, 0 for the axes that are left out."""
+"""Poses and velocities are drawn uniformly from ranges by axis name; axes that are left out are 0."""
 
 from collections.abc import Mapping, Sequence
 
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import check_pair, unknown_name
@@ -24,8 +25,8 @@ def check_ranges(field: str, ranges: Ranges, axes: Sequence[str] = AXES) -> None
         check_pair(f"{field}.{axis}", pair)
 
 
-def draw(view: EnvView, ranges: Ranges) -> Tensor:
-    """Draw x, y, z, roll, pitch, yaw (m and rad, or m/s and rad/s), float32 [E, 6]."""
+def draw(view: EnvView, ranges: Ranges) -> Float[Tensor, "E 6"]:
+    """Draw x, y, z, roll, pitch, yaw (m and rad, or m/s and rad/s)."""
     pairs = [ranges.get(axis, (0.0, 0.0)) for axis in AXES]
     low_6 = constant([float(low) for low, _ in pairs], view.device)
     if all(low == high for low, high in pairs):

@@ -1,16 +1,17 @@
-"""Conditions that end an episode, bool [E]."""
+"""Terminations are the conditions that end an episode."""
 
 import math
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import TerminationTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.root_height import root_height
-from ksim_rl.scene.names import Patterns
+from ksim_rl.mdp.fields import OfContacts, OfEntity, OfJoints
+from ksim_rl.mdp.quantities import contact_force, distance_from_origin, root_height
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,86 +20,94 @@ class TimeOut(TerminationTerm):
 
     time_out: bool = True
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return which envs end, bool [E]."""
+    def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         return view.episode_step_E + view.time_out_offset_E >= view.max_episode_length
 
 
 @dataclass(frozen=True, kw_only=True)
-class BadOrientation(TerminationTerm):
+class BadOrientation(OfEntity, TerminationTerm):
     """The root is tilted further than a limit: the angle between its z axis and the world's; position stage.
 
     Attributes:
         limit_angle: rad, in (0, pi).
-        entity: the robot or object; "" is the first robot.
     """
 
     limit_angle: float
-    entity: str = ""
 
     def __post_init__(self) -> None:
         check_in_range("limit_angle", self.limit_angle, low=0.0, high=math.pi, low_open=True)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return which envs end, bool [E]."""
+    def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         # The cosine falls as the angle grows, so comparing cosines needs no acos, which is ill-conditioned at 0.
         return -view.entity(self.entity).projected_gravity_EL[:, 2] < math.cos(self.limit_angle)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RootHeightBelow(TerminationTerm):
+class RootHeightBelow(OfEntity, TerminationTerm):
     """The root body's frame is closer than `minimum_height` (m) to the ground below it; position stage.
 
     Attributes:
         minimum_height: m; on flat ground, in the world frame.
-        entity: the robot or object; "" is the first robot.
     """
 
     minimum_height: float
-    entity: str = ""
 
     def __post_init__(self) -> None:
         check_in_range("minimum_height", self.minimum_height)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return which envs end, bool [E]."""
+    def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         return root_height(view, self.entity) < self.minimum_height
 
 
 @dataclass(frozen=True, kw_only=True)
-class FarFromOrigin(TerminationTerm):
+class FarFromOrigin(OfEntity, TerminationTerm):
     """The root is further than `distance` (m) from where its env starts, in the horizontal plane; position stage.
 
     Attributes:
         distance: m from the env's origin on the terrain; on a plane, from the world's.
-        entity: the robot or object; "" is the first robot.
     """
 
     distance: float
-    entity: str = ""
 
     def __post_init__(self) -> None:
         check_in_range("distance", self.distance, low=0.0, low_open=True)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return which envs end, bool [E]."""
-        away_E3 = view.entity(self.entity).root_pos_EL - view.terrain.origins_E3
-        return torch.linalg.vector_norm(away_E3[:, :2], dim=-1) > self.distance
+    def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
+        return distance_from_origin(view, self.entity) > self.distance
 
 
 @dataclass(frozen=True, kw_only=True)
-class RootVelocityAbove(TerminationTerm):
+class OutsideTerrain(OfEntity, TerminationTerm):
+    """The root is beyond the edge of its env's ground, or nearer to it than a margin: a truncation, not a failure.
+
+    On ground without end it never is.
+
+    Attributes:
+        margin: m inside of the edge; robots whose feet must not step over it need about their own reach.
+    """
+
+    time_out: bool = True
+    margin: float = 0.5
+
+    def __post_init__(self) -> None:
+        check_in_range("margin", self.margin, low=0.0)
+
+    def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
+        reach_E = view.entity(self.entity).root_pos_EL[:, :2].abs().amax(-1)
+        return reach_E > view.terrain.half_width - self.margin
+
+
+@dataclass(frozen=True, kw_only=True)
+class RootVelocityAbove(OfEntity, TerminationTerm):
     """The root body moves or turns faster than a robot can: the physics has gone wrong; velocity stage.
 
     Attributes:
         linear: m/s, of the root frame's origin; None sets no limit.
         angular: rad/s; None sets no limit.
-        entity: the robot or object; "" is the first robot.
     """
 
     linear: float | None = None
     angular: float | None = None
-    entity: str = ""
 
     def __post_init__(self) -> None:
         if self.linear is None and self.angular is None:
@@ -107,8 +116,7 @@ class RootVelocityAbove(TerminationTerm):
             if getattr(self, name) is not None:
                 check_in_range(name, getattr(self, name), low=0.0, low_open=True)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return which envs end, bool [E]."""
+    def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         root = view.entity(self.entity)
         ends_E = torch.zeros(view.num_envs, dtype=torch.bool, device=view.device)
         if self.linear is not None:
@@ -119,42 +127,36 @@ class RootVelocityAbove(TerminationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointVelocityAbove(TerminationTerm):
+class JointVelocityAbove(OfJoints, TerminationTerm):
     """A joint moves faster than `limit` (rad/s or m/s); velocity stage.
 
     Attributes:
         limit: rad/s or m/s.
-        joints: names or patterns.
     """
 
     limit: float
-    joints: Patterns = ".*"
 
     def __post_init__(self) -> None:
         check_in_range("limit", self.limit, low=0.0, low_open=True)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return which envs end, bool [E]."""
+    def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         return (view.joints(self.joints).vel_EL.abs() > self.limit).any(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointLimitViolated(TerminationTerm):
+class JointLimitViolated(OfJoints, TerminationTerm):
     """A joint is outside of its soft limits by more than `margin` (rad or m); position stage.
 
     Attributes:
         margin: rad or m.
-        joints: names or patterns.
     """
 
     margin: float = 0.0
-    joints: Patterns = ".*"
 
     def __post_init__(self) -> None:
         check_in_range("margin", self.margin, low=0.0)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return which envs end, bool [E]."""
+    def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         joints = view.joints(self.joints)
         pos_EN, limits_N2 = joints.pos_EL, joints.soft_limits_L2
         beyond_EN = torch.maximum(limits_N2[:, 0] - pos_EN, pos_EN - limits_N2[:, 1])
@@ -162,25 +164,13 @@ class JointLimitViolated(TerminationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class IllegalContact(TerminationTerm):
-    """Something touches that should not, with a net force of more than `threshold` (N); acceleration stage.
+class IllegalContact(OfContacts, TerminationTerm):
+    """Something touches that should not: its sensor sees more than `threshold`; acceleration stage."""
 
-    Attributes:
-        sensor: a contact sensor of `scene.sensors` on what must not touch.
-        threshold: N; sampled at the last physics substep of the env step.
-    """
-
-    sensor: str
     threshold: float = 0.0
 
-    def __post_init__(self) -> None:
-        check_in_range("threshold", self.threshold, low=0.0)
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return which envs end, bool [E]."""
-        return (torch.linalg.vector_norm(view.contact(self.sensor).force_EN3, dim=-1) > self.threshold).any(
-            -1
-        )
+    def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
+        return (contact_force(view, self.sensor) > self.threshold).any(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,8 +181,7 @@ class NonFiniteState(TerminationTerm):
     what has not reached them, such as a sensor that divides by zero.
     """
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return which envs end, bool [E]."""
+    def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         world = view.world
         parts = (world.qacc_EL, world.actuator_force_EL, world.sensordata_EL)
         return ~torch.isfinite(torch.cat(parts, dim=-1)).all(-1)

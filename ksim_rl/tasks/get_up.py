@@ -18,7 +18,7 @@ from ksim_rl.checks import check_in_range
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import MetricTerm, RewardTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.root_height import root_height
+from ksim_rl.mdp.quantities import root_height
 from ksim_rl.scene.robots.legged_robot import LeggedRobot
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.terrains import PlaneTerrain

@@ -6,8 +6,8 @@ import torch
 
 from ksim_rl.physics import Captured
 from tests.gpu.no_syncs import no_syncs
-from tests.mdp.randomize_bench import INERTIAL, Runners
-from tests.mdp.test_randomize_physics import EVENTS, SUBSTEPS
+from tests.mdp.randomization.randomize_bench import INERTIAL, Runners
+from tests.mdp.randomization.test_randomize_physics import EVENTS, SUBSTEPS
 
 E = 64
 CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")

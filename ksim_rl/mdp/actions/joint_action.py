@@ -1,10 +1,11 @@
-"""What actions on joints have in common: the way from a raw action to a number per joint."""
+"""Actions on joints turn a raw action into a number per joint; this is their base."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range, check_pair
@@ -49,17 +50,18 @@ class JointAction(ActionTerm):
             check_in_range("cutoff_hz", self.cutoff_hz, low=0.0, low_open=True)
 
     def size(self, view: EnvView) -> int:
-        """Return the number of joints."""
         return len(view.joints(self.joints))
 
-    def shaped(self, view: EnvView, action_EK: Tensor) -> Tensor:
-        """Return the action after clip, tanh, scale, filter and offset, [E, K]."""
+    def shaped(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> Float[Tensor, "E K"]:
+        """Return the action after clip, tanh, scale, filter and offset."""
         scaled_EK = self.scaled(view, action_EK, "scale", self.scale)
         offset = per_joint(view, "offset", self.offset, self.joints)
         return scaled_EK if isinstance(offset, float) and offset == 0.0 else scaled_EK + offset
 
-    def scaled(self, view: EnvView, action_EK: Tensor, field: str, scale: PerJoint) -> Tensor:
-        """Return the action after clip, tanh, a scale (the field of that name) and the filter, [E, K]."""
+    def scaled(
+        self, view: EnvView, action_EK: Float[Tensor, "E K"], field: str, scale: PerJoint
+    ) -> Float[Tensor, "E K"]:
+        """Return the action after clip, tanh, a scale (the field of that name) and the filter."""
         if self.clip is not None:
             action_EK = action_EK.clamp(*self.clip)
         if self.tanh:
@@ -82,8 +84,8 @@ def check_per_joint(field: str, value: PerJoint) -> None:
         check_in_range(field if pattern is None else f"{field}[{pattern!r}]", number)
 
 
-def per_joint(view: EnvView, field: str, value: PerJoint, joints: Patterns) -> float | Tensor:
-    """Return the number for all joints, or those by joint as a tensor [K]."""
+def per_joint(view: EnvView, field: str, value: PerJoint, joints: Patterns) -> float | Float[Tensor, " K"]:
+    """Return the number for all joints, or those by joint."""
     if not isinstance(value, Mapping):
         return float(value)
     return constant(values_by_name(field, value, view.joints(joints).names), view.device)

@@ -1,8 +1,9 @@
-"""Maps from actions to what joints are asked for."""
+"""These terms map actions to what joints or actuators are asked for."""
 
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
@@ -18,8 +19,7 @@ class JointPositionAction(JointAction):
 
     use_default_offset: bool = True
 
-    def __call__(self, view: EnvView, action_EK: Tensor) -> None:
-        """Write the position targets."""
+    def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         target_EK = self.shaped(view, action_EK)
         if self.use_default_offset:
             target_EK = target_EK + view.joints(self.joints).default_pos_EL
@@ -30,8 +30,7 @@ class JointPositionAction(JointAction):
 class RelativeJointPositionAction(JointAction):
     """Positions (rad or m): the shaped action, relative to where the joints are when the env step begins."""
 
-    def __call__(self, view: EnvView, action_EK: Tensor) -> None:
-        """Write the position targets."""
+    def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         now_EK = view.joints(self.joints).pos_EL
         view.write_joint_pos_target(self.joints, now_EK + self.shaped(view, action_EK))
 
@@ -40,8 +39,7 @@ class RelativeJointPositionAction(JointAction):
 class JointVelocityAction(JointAction):
     """Velocities (rad/s or m/s): the shaped action."""
 
-    def __call__(self, view: EnvView, action_EK: Tensor) -> None:
-        """Write the velocity targets."""
+    def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         view.write_joint_vel_target(self.joints, self.shaped(view, action_EK))
 
 
@@ -54,8 +52,7 @@ class JointEffortAction(JointAction):
 
     joints: Patterns = ".*"
 
-    def __call__(self, view: EnvView, action_EK: Tensor) -> None:
-        """Write the effort targets."""
+    def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         view.write_joint_effort_target(self.joints, self.shaped(view, action_EK))
 
 
@@ -76,11 +73,9 @@ class JointPositionVelocityAction(JointPositionAction):
         check_per_joint("velocity_scale", self.velocity_scale)
 
     def size(self, view: EnvView) -> int:
-        """Return twice the number of joints."""
         return 2 * super().size(view)
 
-    def __call__(self, view: EnvView, action_EK: Tensor) -> None:
-        """Write both targets."""
+    def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         pos_EK, vel_EK = action_EK.chunk(2, dim=1)
         super().__call__(view, pos_EK)
         view.write_joint_vel_target(
@@ -106,13 +101,11 @@ class ActuatorAction(ActionTerm):
         check_in_range("scale", self.scale)
 
     def size(self, view: EnvView) -> int:
-        """Return the number of actuators."""
         ids = view.resolver.ids("actuator", self.actuators)
         view.targets.check_no_law(ids)
         return len(ids)
 
-    def __call__(self, view: EnvView, action_EK: Tensor) -> None:
-        """Write the controls."""
+    def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         index = view.resolver.index("actuator", self.actuators)
         limits_K2 = view.ctrl_limits_L2[index]
         view.write_ctrl(index, torch.clamp(action_EK * self.scale, limits_K2[:, 0], limits_K2[:, 1]))

@@ -1,10 +1,11 @@
-"""A command that is a rhythm: the phase that each foot should be in."""
+"""A gait command is a rhythm: it gives the phase that each foot should be in."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range, check_pair
@@ -40,17 +41,16 @@ class SinusoidalGaitCommand(CommandTerm):
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
-        """What a curriculum may change."""
         return {"frequency": self.frequency}
 
-    def resample(self, view: EnvView, mask_E: Tensor) -> None:
+    def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Draw frequencies for the rows of `mask_E`; their phases go on from where they are."""
         held_E3 = self._held(view)
         drawn_E1 = view.uniform(1, *self.shared_ranges(view).unbind(0))
         fresh_E3 = torch.cat((drawn_E1, view.episode_time_E[:, None], self._cycles(view)[:, None]), dim=-1)
         held_E3.copy_(torch.where(mask_E[:, None], fresh_E3, held_E3))
 
-    def __call__(self, view: EnvView) -> Tensor:
+    def __call__(self, view: EnvView) -> Float[Tensor, "E K"]:
         """Return the command of the present time, float32 [E, 2F]."""
         offsets_F = constant(self.offsets, view.device)
         angle_EF = 2.0 * math.pi * (self._cycles(view)[:, None] + offsets_F)

@@ -1,9 +1,10 @@
-"""A command that a person or a program sets."""
+"""A joystick command is set by a person or a program, never drawn."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checks import check_pair
@@ -43,10 +44,10 @@ class JoystickCommand(CommandTerm):
         """The axes' limits, which a curriculum may change."""
         return self.axes
 
-    def resample(self, view: EnvView, mask_E: Tensor) -> None:
+    def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Draw nothing: what was set stays."""
 
-    def set(self, view: EnvView, value_EK: Tensor, mask_E: Tensor) -> None:
+    def set(self, view: EnvView, value_EK: Float[Tensor, "*rows K"], mask_E: Bool[Tensor, " E"]) -> None:
         """Take values [E, K], or [K] for all alike, for the rows of `mask_E`.
 
         Raises:
@@ -62,8 +63,7 @@ class JoystickCommand(CommandTerm):
             raise ValueError("values hold a number that is not finite: give finite ones")
         held_EK.copy_(torch.where(mask_E[:, None], value_EK.to(held_EK), held_EK))
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the command, float32 [E, K]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E K"]:
         low_K, high_K = self.shared_ranges(view).unbind(0)
         return torch.clamp(self._held(view), low_K, high_K)
 

@@ -1,8 +1,9 @@
-"""How fast a velocity command asks to move: what pose and foot rewards switch on. Each is computed once per command."""
+"""Rewards of poses and feet read here how fast a velocity command asks to move; it is computed once per command."""
 
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
@@ -25,13 +26,13 @@ class RewardWhileCommanded(RewardTerm):
         super().__post_init__()
         check_in_range("command_threshold", self.command_threshold, low=0.0)
 
-    def while_commanded(self, view: EnvView, value_E: Tensor) -> Tensor:
-        """Return the value where the command asks to move, else 0, [E]."""
+    def while_commanded(self, view: EnvView, value_E: Float[Tensor, " E"]) -> Float[Tensor, " E"]:
+        """Return the value where the command asks to move, else 0."""
         return value_E * is_commanded(view, self.command, self.command_threshold)
 
 
-def commanded_speed(view: EnvView, command: str) -> Tensor:
-    """Return |c_xy| + |c_z| of the command (vx, vy, wz), m/s and rad/s added as numbers, [E]."""
+def commanded_speed(view: EnvView, command: str) -> Float[Tensor, " E"]:
+    """Return |c_xy| + |c_z| of the command (vx, vy, wz), m/s and rad/s added as numbers."""
     key = f"speed of {command}"
     speed_E = view.command_cache.get(key)
     if speed_E is None:
@@ -41,8 +42,8 @@ def commanded_speed(view: EnvView, command: str) -> Tensor:
     return speed_E
 
 
-def is_commanded(view: EnvView, command: str, threshold: float) -> Tensor:
-    """Return 1 where the commanded speed exceeds the threshold, else 0, float32 [E]."""
+def is_commanded(view: EnvView, command: str, threshold: float) -> Float[Tensor, " E"]:
+    """Return 1 where the commanded speed exceeds the threshold, else 0."""
     key = f"speed of {command} > {threshold}"
     moves_E = view.command_cache.get(key)
     if moves_E is None:

@@ -1,25 +1,53 @@
-"""Commanded poses in the world frame, and how far a body or site is from them."""
+"""Terms compare a commanded pose with where a body or site is; what they share stands here."""
 
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.fields import InFrame
 from ksim_rl.scene import quaternion
 
-FRAMES = ("root", "world")
+
+@dataclass(frozen=True, kw_only=True)
+class OfTarget(InFrame):
+    """A term of a body or site and of the position that a command asks it to take.
+
+    Attributes:
+        command: a position, with an orientation or not, such as `CartesianCommand` or `StartPoseCommand`, in `frame`.
+        body, site: what should be there; name one of the two.
+    """
+
+    command: str
+    body: str | None = None
+    site: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.body is None) == (self.site is None):
+            raise ValueError(f"body={self.body!r}, site={self.site!r}: name exactly one of the two")
+
+    def offset(self, view: EnvView) -> Float[Tensor, "E 3"]:
+        """Return the commanded position minus where the body or site is, world frame, m; position stage."""
+        target_E3, _ = target_pose_w(view, view.command(self.command), frame=self.frame, entity=self.entity)
+        return target_E3 - point_pos_w(view, body=self.body, site=self.site)
+
+    def distance(self, view: EnvView) -> Float[Tensor, " E"]:
+        """Return how far the body or site is from the commanded position, m; position stage."""
+        return torch.linalg.vector_norm(self.offset(view), dim=-1)
 
 
 def target_pose_w(
-    view: EnvView, target_EK: Tensor, *, frame: Literal["root", "world"], entity: str = ""
-) -> tuple[Tensor, Tensor | None]:
-    """Return a target pose in the world frame: position, m, [E, 3], and quaternion [E, 4] if the target has one.
+    view: EnvView, target_EK: Float[Tensor, "E K"], *, frame: Literal["root", "world"], entity: str = ""
+) -> tuple[Float[Tensor, "E 3"], Float[Tensor, "E 4"] | None]:
+    """Return a target's position in the world frame, m, and its quaternion there if the target has one.
 
     Args:
         target_EK: position [E, 3], or position and quaternion (w, x, y, z) [E, 7], in `frame`.
-        frame: "root": the frame of the root body of `entity`; "world".
-        entity: "" is the first robot.
+        frame, entity: see `InFrame`.
     """
     pos_E3, quat_E4 = target_EK[:, :3], target_EK[:, 3:] if target_EK.shape[1] == 7 else None
     if frame == "world":
@@ -29,8 +57,8 @@ def target_pose_w(
     return pos_E3, None if quat_E4 is None else quaternion.multiply(root.root_quat_EL, quat_E4)
 
 
-def point_pos_w(view: EnvView, *, body: str | None, site: str | None) -> Tensor:
-    """Return the position of the one body or site that is named, world frame, m, [E, 3]; position stage.
+def point_pos_w(view: EnvView, *, body: str | None, site: str | None) -> Float[Tensor, "E 3"]:
+    """Return the position of the one body or site that is named, world frame, m; position stage.
 
     Raises:
         ValueError: if several match the name.
@@ -39,27 +67,3 @@ def point_pos_w(view: EnvView, *, body: str | None, site: str | None) -> Tensor:
         return view.site(site).pos_EL
     assert body is not None
     return view.body(body).pos_EL
-
-
-def check_one_point(body: str | None, site: str | None) -> None:
-    """Refuse anything but exactly one name.
-
-    Raises:
-        ValueError: naming both fields.
-    """
-    if (body is None) == (site is None):
-        raise ValueError(f"body={body!r}, site={site!r}: name exactly one of the two")
-
-
-def distance_to_target(
-    view: EnvView,
-    command: str,
-    *,
-    frame: Literal["root", "world"],
-    body: str | None,
-    site: str | None,
-    entity: str = "",
-) -> Tensor:
-    """Return how far a body or site is from the position that a command asks for, m, [E]."""
-    pos_E3, _ = target_pose_w(view, view.command(command), frame=frame, entity=entity)
-    return torch.linalg.vector_norm(point_pos_w(view, body=body, site=site) - pos_E3, dim=-1)

@@ -1,4 +1,4 @@
-"""The command of a velocity task. Others: `commands_pose`, `commands_gait`, `commands_joystick`."""
+"""Velocity tasks command a planar velocity, drawn anew from time to time."""
 
 import math
 from collections.abc import Mapping
@@ -6,12 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range, check_pair
 from ksim_rl.envs.term import CommandTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
+from ksim_rl.mdp.fields import OfEntity
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer, Rgba
 
@@ -21,7 +23,7 @@ _REACHED: Rgba = (0.2, 0.3, 0.8, 0.8)
 
 
 @dataclass(frozen=True, kw_only=True)
-class UniformVelocityCommand(CommandTerm):
+class UniformVelocityCommand(OfEntity, CommandTerm):
     """A planar velocity (vx, vy, wz) in the root's frame, m/s and rad/s, [E, 3], drawn uniformly.
 
     Each resampling makes some envs special, independently of each other:
@@ -38,7 +40,6 @@ class UniformVelocityCommand(CommandTerm):
         heading_stiffness: 1/s.
         rel_standing_envs, rel_heading_envs, rel_forward_envs: probabilities.
         forward_min_speed: m/s.
-        entity: the robot that it is for; "" is the first one.
     """
 
     lin_vel_x: Range
@@ -50,7 +51,6 @@ class UniformVelocityCommand(CommandTerm):
     rel_heading_envs: float = 0.0
     rel_forward_envs: float = 0.0
     forward_min_speed: float = 0.3
-    entity: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -63,15 +63,13 @@ class UniformVelocityCommand(CommandTerm):
 
     @property
     def ranges(self) -> Mapping[str, Range]:
-        """What a curriculum may change."""
         return {name: getattr(self, name) for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z", "heading")}
 
-    def shared_ranges(self, view: EnvView) -> Tensor:
+    def shared_ranges(self, view: EnvView) -> Float[Tensor, "2 7"]:
         """Return the present ranges, and after them three of [0, 1) for the kinds, (low, high) [2, 7]."""
         return view.shared("ranges_2N", tuple(zip(*self.ranges.values(), *[(0.0, 1.0)] * 3, strict=True)))
 
-    def resample(self, view: EnvView, mask_E: Tensor) -> None:
-        """Draw velocities, heading targets and kinds for the rows of `mask_E`."""
+    def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         # One draw for all: targets in their ranges, then three numbers in [0, 1) that decide the kinds.
         target_E4, kind_E3 = view.uniform(7, *self.shared_ranges(view).unbind(0)).split((4, 3), dim=-1)
         shares_3 = (self.rel_standing_envs, self.rel_heading_envs, self.rel_forward_envs)
@@ -85,8 +83,7 @@ class UniformVelocityCommand(CommandTerm):
         held_E4.copy_(torch.where(mask_E[:, None], drawn_E4, held_E4))
         held_E2.copy_(torch.where(mask_E[:, None], is_kind_E3[:, :2], held_E2))
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the command of the current heading and targets, float32 [E, 3]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E 3"]:
         target_E4, kind_E2 = self._target(view), self._kind(view)
         error_E = quaternion.wrap_to_pi(target_E4[:, 3] - view.entity(self.entity).heading_E)
         steer_E = (self.heading_stiffness * error_E).clamp(*self.shared_ranges(view)[:, 2].unbind())

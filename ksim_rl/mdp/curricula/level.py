@@ -1,4 +1,4 @@
-"""Curricula that drive `view.level`, the one difficulty in [0, 1] that ranges, weights and noise may scale with.
+"""These curricula drive `view.level`, the one difficulty in [0, 1] that ranges, weights and noise may scale with.
 
 An env has at most one of them. All move the level only when envs reset.
 """
@@ -7,11 +7,14 @@ from abc import abstractmethod
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range, unknown_name
 from ksim_rl.envs.term import CurriculumTerm
 from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.fields import OfEntity
+from ksim_rl.mdp.quantities import distance_from_origin
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +32,6 @@ class LevelCurriculum(CurriculumTerm):
 
     @property
     def first_level(self) -> float:
-        """The level to begin with."""
         return self.initial_level
 
 
@@ -49,8 +51,7 @@ class LinearLevel(LevelCurriculum):
         check_in_range("begin_step", self.begin_step, low=0)
         check_in_range("end_step", self.end_step, low=self.begin_step, low_open=True)
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> Tensor:
-        """Adapt and return the level."""
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         share = (view.step_count - self.begin_step) / (self.end_step - self.begin_step)
         level = self.initial_level + (1.0 - self.initial_level) * share.clamp(0.0, 1.0)
         view.level.copy_(torch.where(mask_E.any(), level.to(torch.float32), view.level))
@@ -84,10 +85,10 @@ class SteppedLevel(LevelCurriculum):
             check_in_range("min_episodes", self.min_episodes, low=1)
 
     @abstractmethod
-    def score(self, view: EnvView) -> Tensor:
+    def score(self, view: EnvView) -> Float[Tensor, " E"]:
         """Return how well the running episodes have gone so far, float32 [E]."""
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> Tensor:
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         """Take in the episodes that ended, adapt, and return the level."""
         ended_E = mask_E & (view.episode_step_E > 0)
         held_2 = view.shared("episodes_and_score_2", (0.0, 0.0))
@@ -110,7 +111,7 @@ class EpisodeLengthLevel(SteppedLevel):
 
     raise_above: float = 0.8
 
-    def score(self, view: EnvView) -> Tensor:
+    def score(self, view: EnvView) -> Float[Tensor, " E"]:
         """Return the shares, [E].
 
         Raises:
@@ -124,19 +125,12 @@ class EpisodeLengthLevel(SteppedLevel):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistanceLevel(SteppedLevel):
-    """Moves with how far robots get: the score is the horizontal distance from the env's origin at the end, m.
+class DistanceLevel(OfEntity, SteppedLevel):
+    """Moves with how far robots get: the score is the horizontal distance from the env's origin at the end, m."""
 
-    Attributes:
-        entity: the robot; "" is the first one.
-    """
-
-    entity: str = ""
-
-    def score(self, view: EnvView) -> Tensor:
+    def score(self, view: EnvView) -> Float[Tensor, " E"]:
         """Return the distances, m, [E]."""
-        away_E3 = view.entity(self.entity).root_pos_EL - view.terrain.origins_E3
-        return torch.linalg.vector_norm(away_E3[:, :2], dim=-1)
+        return distance_from_origin(view, self.entity)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +146,7 @@ class SaturationLevel(SteppedLevel):
 
     reward: str
 
-    def score(self, view: EnvView) -> Tensor:
+    def score(self, view: EnvView) -> Float[Tensor, " E"]:
         """Return the episodes' rewards, [E].
 
         Raises:

@@ -1,13 +1,15 @@
-"""Curricula that change ranges of commands and weights of rewards: by stages of env steps, or with `view.level`.
+"""These curricula change ranges of commands and weights of rewards, by stages of env steps or with `view.level`.
 
 All change what they change only when envs reset. Those that follow the level stand after the term that drives it, if
 they are to follow it in the same reset.
 """
 
+from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range, check_pair, unknown_name
@@ -19,67 +21,69 @@ Ranges = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RewardWeightByStage(CurriculumTerm):
-    """Gives a reward another weight from certain env steps on; until the first stage it has its own.
-
-    The reported level is the weight.
+class RewardWeight(CurriculumTerm):
+    """A curriculum of a reward's weight, which is also the reported level.
 
     Attributes:
         reward: its name.
-        stages: weights by the env step (since the env was seeded) from which on they hold.
     """
 
     reward: str
-    stages: Mapping[int, float]
-
-    def __post_init__(self) -> None:
-        _check_steps(self.stages)
-        for step, weight in self.stages.items():
-            check_in_range(f"stages.{step}", weight)
 
     @property
     def adapted_rewards(self) -> tuple[str, ...]:
-        """The one reward."""
         return (self.reward,)
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> Tensor:
-        """Adapt and return the weight."""
+    @abstractmethod
+    def weight(self, view: EnvView, held: Float[Tensor, ""]) -> Float[Tensor, ""]:
+        """Return the weight that the reward should have; `held` is its present one."""
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         held = view.reward_weights[self.reward]
-        weight = held
-        for step, value in sorted(self.stages.items()):
-            weight = torch.where(view.step_count >= step, float(value), weight)
-        held.copy_(torch.where(mask_E.any(), weight, held))
+        held.copy_(torch.where(mask_E.any(), self.weight(view, held), held))
         return held.clone()
 
 
 @dataclass(frozen=True, kw_only=True)
-class RewardWeightByLevel(CurriculumTerm):
-    """Moves a reward's weight linearly with `view.level`. The reported level is the weight.
+class RewardWeightByStage(RewardWeight):
+    """Gives a reward another weight from certain env steps on; until the first stage it has its own.
 
     Attributes:
-        reward: its name.
+        stages: weights by the env step (since the env was seeded) from which on they hold.
+    """
+
+    stages: Mapping[int, float]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_steps(self.stages)
+        for step, weight in self.stages.items():
+            check_in_range(f"stages.{step}", weight)
+
+    def weight(self, view: EnvView, held: Float[Tensor, ""]) -> Float[Tensor, ""]:
+        for step, value in sorted(self.stages.items()):
+            held = torch.where(view.step_count >= step, float(value), held)
+        return held
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardWeightByLevel(RewardWeight):
+    """Moves a reward's weight linearly with `view.level`.
+
+    Attributes:
         start, end: the weights at level 0 and at level 1.
     """
 
-    reward: str
     start: float
     end: float
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_in_range("start", self.start)
         check_in_range("end", self.end)
 
-    @property
-    def adapted_rewards(self) -> tuple[str, ...]:
-        """The one reward."""
-        return (self.reward,)
-
-    def __call__(self, view: EnvView, mask_E: Tensor) -> Tensor:
-        """Adapt and return the weight."""
-        held = view.reward_weights[self.reward]
-        weight = self.start + (self.end - self.start) * view.level
-        held.copy_(torch.where(mask_E.any(), weight, held))
-        return held.clone()
+    def weight(self, view: EnvView, held: Float[Tensor, ""]) -> Float[Tensor, ""]:
+        return self.start + (self.end - self.start) * view.level
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +106,7 @@ class CommandRangesByStage(CurriculumTerm):
         for step, ranges in self.stages.items():
             _check_ranges(f"stages.{step}", ranges)
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> Tensor:
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         """Adapt and return the number of the stage."""
         held = _ranges_of(view, self.command, {field for ranges in self.stages.values() for field in ranges})
         wanted = dict(held)
@@ -140,8 +144,7 @@ class CommandRangesByLevel(CurriculumTerm):
                 f"start has the fields {sorted(self.start)} and end {sorted(self.end)}: give the same"
             )
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> Tensor:
-        """Adapt and return the level."""
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         for field, held_2 in _ranges_of(view, self.command, self.start).items():
             start_2, end_2 = constant(self.start[field], view.device), constant(self.end[field], view.device)
             held_2.copy_(torch.where(mask_E.any(), torch.lerp(start_2, end_2, view.level), held_2))

@@ -1,17 +1,20 @@
-"""The curriculum of a terrain grid: each env moves through its levels by how far its robot walks."""
+"""The curriculum of a terrain grid moves each env through its levels by how far its robot walks."""
 
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import CurriculumTerm
 from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.fields import OfEntity
+from ksim_rl.mdp.quantities import distance_from_origin
 
 
 @dataclass(frozen=True, kw_only=True)
-class TerrainLevels(CurriculumTerm):
+class TerrainLevels(OfEntity, CurriculumTerm):
     """Moves the envs whose episodes ended to other levels of `scene.terrain`, a `TerrainGrid`; reports the mean level.
 
     An env moves up one level when its robot got at least `up_distance` away from its origin (horizontally, at the end
@@ -23,24 +26,21 @@ class TerrainLevels(CurriculumTerm):
         command: the velocity command, (vx, vy, ...) in m/s.
         up_distance: share of the distance from the centre of a patch to its edge, in (0, 1].
         down_share: of the commanded way.
-        entity: the robot; "" is the first one.
     """
 
     command: str
     up_distance: float = 0.8
     down_share: float = 0.5
-    entity: str = ""
 
     def __post_init__(self) -> None:
         check_in_range("up_distance", self.up_distance, low=0.0, high=1.0, low_open=True)
         check_in_range("down_share", self.down_share, low=0.0)
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> Tensor:
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         """Move the rows of `mask_E` that have had an episode, and return the mean level of all envs, float32 []."""
         terrain = view.terrain
         level_E, top = terrain.levels_E, terrain.num_levels - 1
-        away_E3 = view.entity(self.entity).root_pos_EL - terrain.origins_E3
-        distance_E = torch.linalg.vector_norm(away_E3[:, :2], dim=-1)
+        distance_E = distance_from_origin(view, self.entity)
         speed_E = torch.linalg.vector_norm(view.command(self.command)[:, :2], dim=-1)
         asked_E = speed_E * (view.max_episode_length * view.step_dt)
         up_E = distance_E >= self.up_distance * terrain.half_width

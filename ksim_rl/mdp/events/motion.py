@@ -1,8 +1,9 @@
-"""Episodes that begin somewhere in a reference motion."""
+"""This event lets episodes begin somewhere in a reference motion."""
 
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.checks import check_pair
@@ -29,8 +30,7 @@ class ResetToMotion(EventTerm):
         super().__post_init__()
         check_pair("start_range", self.start_range, low=0.0, high=1.0)
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        """Write the rows of `mask_E`."""
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         motion, start_E = view.motion(self.file), motion_start_time(view, self.file)
         drawn_E = view.uniform(1, *self.start_range)[:, 0] * motion.duration_s
         start_E.copy_(torch.where(mask_E, drawn_E, start_E))

@@ -1,17 +1,40 @@
-"""Events that disturb a robot: a force that lasts, and a jump. A kick by velocity: `PushByVelocity`."""
+"""These events disturb a robot: by a kick, by a force that lasts, by a jump."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.checks import check_pair
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp import se3_ranges
-from ksim_rl.mdp.events.resets import free_root_of
+from ksim_rl.mdp.events.free_root import OfFreeRoot
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushByVelocity(OfFreeRoot, EventTerm):
+    """Kick the free root body: add a uniform draw to its velocity, whatever its mass.
+
+    Attributes:
+        velocity_range: by axis: x, y, z (m/s), roll, pitch, yaw (rad/s), world frame.
+    """
+
+    velocity_range: Mapping[str, tuple[float, float]]
+    mode: Literal["startup", "reset", "interval", "step"] = "interval"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        se3_ranges.check_ranges("velocity_range", self.velocity_range)
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        body = self.root_of(view)
+        kick_E6 = se3_ranges.draw(view, self.velocity_range)
+        lin_vel_E3 = body.root_lin_vel_w_EL + kick_E6[:, :3]
+        body.write_root_velocity(mask_E, lin_vel_E3, body.root_ang_vel_w_EL + kick_E6[:, 3:])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +61,7 @@ class PushByForce(EventTerm):
         if self.mode != "interval":
             raise ValueError(f"mode={self.mode!r}: expected 'interval', which also says when a push ends")
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Begin a push in the rows of `mask_E`, and go on with or end those of the others; once per env step."""
         held_E6, applied_E6 = view.buffer("wrench_E6", 6), view.buffer("applied_E6", 6)
         left_E = view.buffer("left_s_E")
@@ -53,25 +76,22 @@ class PushByForce(EventTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Jump(EventTerm):
+class Jump(OfFreeRoot, EventTerm):
     """Throw the free root body up: add the upward velocity sqrt(2 g h) that carries it a drawn height h further.
 
     Attributes:
         height_range: h, m, in free flight.
-        entity: the robot or object; "" is the first robot.
     """
 
     height_range: tuple[float, float]
     mode: Literal["startup", "reset", "interval", "step"] = "interval"
-    entity: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_pair("height_range", self.height_range, low=0.0)
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        """Write the rows of `mask_E`."""
-        body = free_root_of(view, self, self.entity)
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        body = self.root_of(view)
         height_E = view.uniform(1, *self.height_range)[:, 0]
         up_E = torch.sqrt(2.0 * torch.linalg.vector_norm(view.world.gravity_EL, dim=-1) * height_E)
         lin_vel_E3 = body.root_lin_vel_w_EL.clone()

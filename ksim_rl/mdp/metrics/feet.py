@@ -1,4 +1,4 @@
-"""How feet move, and what they press with.
+"""These metrics say how feet move, and what they press with.
 
 Poses and velocities are of the current state; contacts and forces belong to the last physics substep (acceleration
 stage).
@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.envs.term import MetricTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.foot_contact import foot_contact
+from ksim_rl.mdp.quantities import contact_force, foot_contact
 from ksim_rl.scene.names import Patterns
 
 
@@ -28,8 +29,7 @@ class FootSlipSpeed(MetricTerm):
     sensor: str
     sites: Patterns
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the value of the current state, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         found_EF = foot_contact(view, self.sensor, self.sites).found_EN
         speed_EF = torch.linalg.vector_norm(view.sites(self.sites).lin_vel_EN3[..., :2], dim=-1)
         return (speed_EF * found_EF).sum(-1) / found_EF.sum(-1).clamp(min=1.0)
@@ -46,9 +46,8 @@ class PeakFootHeight(MetricTerm):
     sites: Patterns
     reduce: Literal["mean", "last", "max", "sum"] = "max"
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the value of the current state, [E]."""
-        return view.terrain.clearance(view.sites(self.sites).pos_EN3).amax(-1)
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        return view.sites(self.sites).height_EN.amax(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +63,6 @@ class PeakContactForce(MetricTerm):
     sensor: str
     reduce: Literal["mean", "last", "max", "sum"] = "max"
 
-    def __call__(self, view: EnvView) -> Tensor:
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         """Return the value of the last substep, [E]."""
-        return torch.linalg.vector_norm(view.contact(self.sensor).force_EN3, dim=-1).amax(-1)
+        return contact_force(view, self.sensor).amax(-1)

@@ -1,15 +1,16 @@
-"""Whether an episode did what it should: shares in [0, 1]."""
+"""These metrics say which share of the episodes did what it should, in [0, 1]."""
 
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checks import check_choice, check_in_range, unknown_name
+from ksim_rl.checks import check_in_range, unknown_name
 from ksim_rl.envs.term import MetricTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.commands.target_pose import FRAMES, check_one_point, distance_to_target
+from ksim_rl.mdp.commands.target_pose import OfTarget
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +31,7 @@ class Success(MetricTerm):
         if not self.terminations:
             raise ValueError("terminations=(): name at least one, such as ('time_out',)")
 
-    def __call__(self, view: EnvView) -> Tensor:
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         """Return the value of this step, [E].
 
         Raises:
@@ -48,37 +49,22 @@ class Success(MetricTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TargetReached(MetricTerm):
-    """1 while a body or site is within a tolerance of the position that a `CartesianCommand` asks for, else 0, [E].
+class TargetReached(OfTarget, MetricTerm):
+    """1 while a body or site is within a tolerance of the position that a `CartesianCommand` asks for, else 0.
 
     Position stage, with the command that the policy saw. `reduce="last"` (the default) asks whether it is there in the
     end, "max" whether it ever was, "mean" for which share of the time.
 
     Attributes:
-        command: its name.
         tolerance: m.
-        frame: as in the command.
-        body, site: the name of one or the other.
-        entity: as in the command.
     """
 
-    command: str
     tolerance: float
-    frame: Literal["root", "world"] = "root"
-    body: str | None = None
-    site: str | None = None
-    entity: str = ""
     reduce: Literal["mean", "last", "max", "sum"] = "last"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_in_range("tolerance", self.tolerance, low=0.0, low_open=True)
-        check_choice("frame", self.frame, FRAMES)
-        check_one_point(self.body, self.site)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the value of the current state, [E]."""
-        distance_E = distance_to_target(
-            view, self.command, frame=self.frame, body=self.body, site=self.site, entity=self.entity
-        )
-        return (distance_E <= self.tolerance).to(torch.float32)
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        return (self.distance(view) <= self.tolerance).to(torch.float32)

@@ -1,7 +1,8 @@
-"""Observation terms of bodies by name, float32 [E, L]: those of all matching bodies, one after the other."""
+"""Each of these observations has one block for each body that its names match."""
 
 from dataclasses import dataclass
 
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.envs.view import EnvView
@@ -25,8 +26,7 @@ class BodyObservation(FramedObservation):
 class BodyPos(BodyObservation):
     """Positions of body frames, m, [E, 3N]; position stage."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return self.points(view, view.bodies(self.bodies).pos_EN3)
 
 
@@ -34,8 +34,7 @@ class BodyPos(BodyObservation):
 class BodyQuat(BodyObservation):
     """Orientations of bodies, (w, x, y, z), [E, 4N]; position stage."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         quat_EN4 = view.bodies(self.bodies).quat_EN4
         if self.frame == "root":
             root_E14 = view.entity(self.entity).root_quat_EL[:, None]
@@ -50,8 +49,7 @@ class BodyRotation6d(BodyObservation):
     Orientations without jumps (Zhou et al. 2019).
     """
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         axes_EN23 = view.bodies(self.bodies).axes_EN33[:, :, :2]
         return self.vectors(view, axes_EN23.flatten(start_dim=1, end_dim=2))
 
@@ -60,8 +58,7 @@ class BodyRotation6d(BodyObservation):
 class BodyLinVel(BodyObservation):
     """Linear velocities of body frame origins, m/s, [E, 3N]; velocity stage."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return self.vectors(view, view.bodies(self.bodies).lin_vel_EN3)
 
 
@@ -69,8 +66,7 @@ class BodyLinVel(BodyObservation):
 class BodyAngVel(BodyObservation):
     """Angular velocities of bodies, rad/s, [E, 3N]; velocity stage."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return self.vectors(view, view.bodies(self.bodies).ang_vel_EN3)
 
 
@@ -78,8 +74,7 @@ class BodyAngVel(BodyObservation):
 class CenterOfMassPos(BodyObservation):
     """Centre of mass of each body with all that hangs on it, m, [E, 3N]; position stage. The root's is the robot's."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return self.points(view, view.bodies(self.bodies).subtree_com_pos_EN3)
 
 
@@ -87,6 +82,5 @@ class CenterOfMassPos(BodyObservation):
 class CenterOfMassVel(BodyObservation):
     """Velocity of the centre of mass of each body with all that hangs on it, m/s, [E, 3N]; velocity stage."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return self.vectors(view, view.bodies(self.bodies).subtree_com_vel_EN3)

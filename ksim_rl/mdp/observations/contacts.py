@@ -1,4 +1,4 @@
-"""Observation terms of contacts and feet, float32 [E, L].
+"""These observations read contacts and feet.
 
 Contacts and their forces are those of the last physics substep (acceleration stage), in the order of the sensor's
 elements; poses and velocities are of the current state.
@@ -8,36 +8,27 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.fields import OfContacts
 from ksim_rl.mdp.observations.framed_observation import FramedObservation
+from ksim_rl.mdp.quantities import contact_force
 from ksim_rl.scene.names import Patterns
 
 # -- any contact sensor ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
-class Contact(ObservationTerm):
-    """1 where the net contact force exceeds a threshold, else 0, [E, N]; acceleration stage.
+class Contact(OfContacts, ObservationTerm):
+    """1 where the net contact force exceeds a threshold, else 0, [E, N]; acceleration stage."""
 
-    Attributes:
-        sensor: a contact sensor of `scene.sensors`.
-        threshold: N.
-    """
-
-    sensor: str
     threshold: float = 0.0
 
-    def __post_init__(self) -> None:
-        check_in_range("threshold", self.threshold, low=0.0)
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
-        force_EN = torch.linalg.vector_norm(view.contact(self.sensor).force_EN3, dim=-1)
-        return (force_EN > self.threshold).to(torch.float32)
+    def __call__(self, view: EnvView) -> Float[Tensor, "E N"]:
+        return (contact_force(view, self.sensor) > self.threshold).to(torch.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +42,7 @@ class ContactForce(FramedObservation):
     sensor: str
     frame: Literal["root", "world"] = "world"
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return self.vectors(view, view.contact(self.sensor).force_EN3)
 
 
@@ -65,8 +55,7 @@ class FootPos(FramedObservation):
 
     sites: Patterns
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return self.points(view, view.sites(self.sites).pos_EN3)
 
 
@@ -76,8 +65,7 @@ class FootHeight(ObservationTerm):
 
     sites: Patterns
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.sites(self.sites).height_EN
 
 
@@ -87,8 +75,7 @@ class FootAirTime(ObservationTerm):
 
     sensor: str
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.contact(self.sensor).air_time_EN
 
 
@@ -98,8 +85,7 @@ class FootContact(ObservationTerm):
 
     sensor: str
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.contact(self.sensor).found_EN
 
 
@@ -113,7 +99,6 @@ class FootContactForces(ObservationTerm):
 
     sensor: str
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         force_EL = view.contact(self.sensor).force_EN3.flatten(start_dim=1)
         return torch.sign(force_EL) * torch.log1p(torch.abs(force_EL))

@@ -1,20 +1,22 @@
-"""The shape of the ground around a robot, looked up in the terrain itself."""
+"""A height scan looks up the shape of the ground around a robot in the terrain itself."""
 
 from dataclasses import dataclass
 from functools import cache
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range, check_pair
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
+from ksim_rl.mdp.fields import OfEntity
 from ksim_rl.scene.sensors.ray_patterns import grid_points
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeightScan(ObservationTerm):
+class HeightScan(OfEntity, ObservationTerm):
     """How far the ground is below the root at the points of a grid, minus `offset`, clipped, m, [E, L]; position stage.
 
     The grid is centred on the root and turns with its yaw only. Points run along x (forward) first, from back to front,
@@ -27,14 +29,12 @@ class HeightScan(ObservationTerm):
         resolution: m between neighbouring points.
         offset: m, about the root's height on flat ground, so that readings are around zero.
         clip: readings are clipped to this range, m.
-        entity: the robot or object; "" is the first robot.
     """
 
     size: tuple[float, float] = (1.6, 1.0)
     resolution: float = 0.1
     offset: float = 0.5
     clip: tuple[float, float] = (-1.0, 1.0)
-    entity: str = ""
 
     def __post_init__(self) -> None:
         check_in_range("resolution", self.resolution, low=0.0, low_open=True)
@@ -43,8 +43,7 @@ class HeightScan(ObservationTerm):
         check_in_range("offset", self.offset)
         check_pair("clip", self.clip)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         body = view.entity(self.entity)
         x_N, y_N = _grid(tuple(self.size), self.resolution, view.device)
         sin_E1, cos_E1 = torch.sin(body.heading_E)[:, None], torch.cos(body.heading_E)[:, None]

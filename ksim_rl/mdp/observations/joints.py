@@ -1,83 +1,68 @@
-"""Observation terms of joints and actuators, float32 [E, L].
-
-Joints (hinges and slides) come in the order of the term's `joints`; ".*" is the model's order. The same holds for
-`actuators`.
-"""
+"""These observations read joints and actuators, one column each in the order of the term's patterns."""
 
 from dataclasses import dataclass
 
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.fields import OfJoints
 from ksim_rl.scene.names import Patterns
-from ksim_rl.scene.state.joints import Joints
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointPos(ObservationTerm):
-    """Positions of joints, rad or m, [E, L]; position stage.
+class EncodedJoints(OfJoints, ObservationTerm):
+    """A reading of joint positions.
 
     Attributes:
         biased: add the encoders' bias (`RandomizeEncoderBias`), as the robot itself would read them.
     """
 
-    joints: Patterns = ".*"
     biased: bool = False
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
-        joints = view.joints(self.joints)
-        return _with_bias(joints, joints.pos_EL, self.biased)
+    def read(self, view: EnvView, pos_EL: Float[Tensor, "E L"]) -> Float[Tensor, "E L"]:
+        """Return what encoders read at these positions of the joints."""
+        return pos_EL + view.joints(self.joints).encoder_bias_EL if self.biased else pos_EL
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointPosRel(ObservationTerm):
-    """Positions of joints minus the default pose, rad or m, [E, L]; position stage.
+class JointPos(EncodedJoints):
+    """Positions of joints, rad or m; position stage."""
 
-    Attributes:
-        biased: add the encoders' bias (`RandomizeEncoderBias`), as the robot itself would read them.
-    """
-
-    joints: Patterns = ".*"
-    biased: bool = False
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
-        joints = view.joints(self.joints)
-        return _with_bias(joints, joints.pos_rel_EL, self.biased)
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return self.read(view, view.joints(self.joints).pos_EL)
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointVel(ObservationTerm):
+class JointPosRel(EncodedJoints):
+    """Positions of joints minus the default pose, rad or m; position stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return self.read(view, view.joints(self.joints).pos_rel_EL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointVel(OfJoints, ObservationTerm):
     """Velocities of joints, rad/s or m/s, [E, L]; velocity stage."""
 
-    joints: Patterns = ".*"
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.joints(self.joints).vel_EL
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointAcc(ObservationTerm):
+class JointAcc(OfJoints, ObservationTerm):
     """Accelerations of joints, rad/s^2 or m/s^2, [E, L]; acceleration stage."""
 
-    joints: Patterns = ".*"
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.joints(self.joints).acc_EL
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointEffort(ObservationTerm):
+class JointEffort(OfJoints, ObservationTerm):
     """What the actuators exert on joints, behind their gears, N m or N, [E, L]; acceleration stage."""
 
-    joints: Patterns = ".*"
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.joints(self.joints).effort_EL
 
 
@@ -87,10 +72,5 @@ class ActuatorForce(ObservationTerm):
 
     actuators: Patterns = ".*"
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.world.actuator_force_EL[:, view.resolver.index("actuator", self.actuators)]
-
-
-def _with_bias(joints: Joints, pos_EL: Tensor, biased: bool) -> Tensor:
-    return pos_EL + joints.encoder_bias_EL if biased else pos_EL

@@ -1,7 +1,8 @@
-"""Observations of what a `RayCaster` of `scene.sensors` hits."""
+"""These observations read what a `RayCaster` of `scene.sensors` hits."""
 
 from dataclasses import dataclass
 
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range, check_pair
@@ -15,8 +16,7 @@ class RayDistance(ObservationTerm):
 
     sensor: str
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.rays(self.sensor).state.distance_EN
 
 
@@ -39,8 +39,7 @@ class RayHeight(ObservationTerm):
         check_in_range("offset", self.offset)
         check_pair("clip", self.clip)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         tracker = view.rays(self.sensor)
         below_EN = tracker.origin_E3[:, 2:] - tracker.state.point_EN3[..., 2] - self.offset
         return below_EN.clamp(*self.clip)

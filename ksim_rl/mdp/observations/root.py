@@ -1,101 +1,67 @@
-"""Observation terms of the root, of sensors, actions and commands: clean readings, float32 [E, L].
-
-Noise, delay and history are transforms. Others: `observations_joints`, `observations_bodies`, `observations_contacts`,
-`observations_time`.
-"""
+"""These observations read a root, a sensor of the MJCF, the last action and commands."""
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.commands.target_pose import FRAMES
+from ksim_rl.mdp.fields import InFrame, OfEntity
 
 # -- root --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
-class RootObservation(ObservationTerm):
-    """What the terms of a root share.
-
-    Attributes:
-        entity: the robot or object that is meant; "" is the first robot.
-    """
-
-    entity: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RootPos(RootObservation):
+class RootPos(OfEntity, ObservationTerm):
     """Position of the root body's frame in the world, m, [E, 3]; position stage."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.entity(self.entity).root_pos_EL
 
 
 @dataclass(frozen=True, kw_only=True)
-class RootQuat(RootObservation):
+class RootQuat(OfEntity, ObservationTerm):
     """Orientation of the root body, body to world, (w, x, y, z), [E, 4]; position stage."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.entity(self.entity).root_quat_EL
 
 
 @dataclass(frozen=True, kw_only=True)
-class RootRotation6d(RootObservation):
+class RootRotation6d(OfEntity, ObservationTerm):
     """The root body's x axis, then its y axis, in the world, [E, 6]; position stage.
 
     An orientation without jumps (Zhou et al. 2019).
     """
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.entity(self.entity).root.axes_E33[:, :2].flatten(start_dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RootVelocity(RootObservation):
-    """What the terms of a root's velocity share.
+class RootLinVel(InFrame, ObservationTerm):
+    """Linear velocity of the root body's frame origin, in the axes of `frame`, m/s, [E, 3]; velocity stage."""
 
-    Attributes:
-        frame: the axes in which it is given: the root's own, or the world's.
-    """
-
-    frame: Literal["root", "world"] = "root"
-
-    def __post_init__(self) -> None:
-        check_choice("frame", self.frame, FRAMES)
-
-
-@dataclass(frozen=True, kw_only=True)
-class RootLinVel(RootVelocity):
-    """Linear velocity of the root body's frame origin, m/s, [E, 3]; velocity stage."""
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         entity = view.entity(self.entity)
         return entity.root_lin_vel_b_EL if self.frame == "root" else entity.root_lin_vel_w_EL
 
 
 @dataclass(frozen=True, kw_only=True)
-class RootAngVel(RootVelocity):
-    """Angular velocity of the root body, rad/s, [E, 3]; velocity stage."""
+class RootAngVel(InFrame, ObservationTerm):
+    """Angular velocity of the root body, in the axes of `frame`, rad/s, [E, 3]; velocity stage."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         entity = view.entity(self.entity)
         return entity.root_ang_vel_b_EL if self.frame == "root" else entity.root_ang_vel_w_EL
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProjectedGravity(RootObservation):
+class ProjectedGravity(OfEntity, ObservationTerm):
     """Direction of gravity (world -z) in the root's frame, a unit vector, [E, 3]; (0, 0, -1) when upright.
 
     Position stage. Dead time, as of a bus, is the business of the group's delay.
@@ -110,8 +76,7 @@ class ProjectedGravity(RootObservation):
     def __post_init__(self) -> None:
         check_in_range("time_constant", self.time_constant, low=0.0)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         gravity_E3 = view.entity(self.entity).projected_gravity_EL
         if self.time_constant == 0.0:
             return gravity_E3
@@ -137,8 +102,7 @@ class SensorReading(ObservationTerm):
 
     sensor: str
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.sensor(self.sensor)
 
 
@@ -149,8 +113,7 @@ class LastAction(ObservationTerm):
     Earlier ones: the history of the group's term.
     """
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.action_EL
 
 
@@ -160,6 +123,5 @@ class Command(ObservationTerm):
 
     command: str
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.command(self.command)

@@ -1,8 +1,9 @@
-"""Observation terms of inertial measurement units and cameras."""
+"""These observations read inertial measurement units and cameras."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from ksim_rl.checks import check_choice
@@ -29,8 +30,7 @@ class ImuReading(ObservationTerm):
     def __post_init__(self) -> None:
         check_choice("quantity", self.quantity, IMU_QUANTITIES)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return getattr(view.imu(self.sensor), f"{self.quantity}_EL")
 
 
@@ -52,7 +52,6 @@ class CameraImage(ObservationTerm):
     def __post_init__(self) -> None:
         check_choice("output", self.output, CAMERA_OUTPUTS)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the picture."""
+    def __call__(self, view: EnvView) -> Shaped[Tensor, " E *image"]:
         camera = view.camera(self.sensor)
         return camera.rgb_EHW3 if self.output == "rgb" else getattr(camera, f"{self.output}_EHW")

@@ -1,9 +1,10 @@
-"""Observation terms of the episode's clock, float32 [E, L]."""
+"""These observations read how long the episode has lasted and how much of it is left."""
 
 import math
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
@@ -16,8 +17,7 @@ from ksim_rl.mdp.constants import constant
 class EpisodeTime(ObservationTerm):
     """Time since the start of the episode, s, [E, 1]."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.episode_time_E[:, None]
 
 
@@ -25,7 +25,7 @@ class EpisodeTime(ObservationTerm):
 class RemainingTime(ObservationTerm):
     """Time until the episode times out (`TimeOut`), s, [E, 1]. Needs `episode_length_s`."""
 
-    def __call__(self, view: EnvView) -> Tensor:
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         """Return the reading.
 
         Raises:
@@ -58,8 +58,7 @@ class Clock(ObservationTerm):
         for index, phase in enumerate(self.phases):
             check_in_range(f"phases[{index}]", phase)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         offsets_P = constant([2.0 * math.pi * phase for phase in self.phases], view.device)
         angle_EP = view.episode_time_E[:, None] * (2.0 * math.pi * self.frequency) + offsets_P
         return torch.cat((angle_EP.sin(), angle_EP.cos()), dim=-1)

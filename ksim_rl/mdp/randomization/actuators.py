@@ -1,4 +1,4 @@
-"""Randomization of actuators, by the joints that they drive: MuJoCo's own and explicit ones alike."""
+"""These events draw gains and limits of actuators, MuJoCo's own and explicit ones alike."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.constants import constant, index_constant
+from ksim_rl.mdp.constants import array_constant, constant, index_constant
 from ksim_rl.mdp.randomization.randomize import (
     Operation,
     Pair,
@@ -37,7 +38,7 @@ class RandomizeActuator(Randomize):
         view: EnvView,
         name: str,
         joints: Sequence[int],
-        mask_E: Tensor,
+        mask_E: Bool[Tensor, " E"],
         drawn_EN: Tensor,
         *,
         finite: bool = False,
@@ -80,8 +81,7 @@ class RandomizeActuatorGains(RandomizeActuator):
         """The fields that built-in servos keep their gains in."""
         return ("actuator_gainprm", "actuator_biasprm")
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        """Draw for the rows of `mask_E`."""
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         joints = view.resolver.ids("joint", self.joints)
         for name in ("stiffness", "damping"):
             pair = getattr(self, name)
@@ -94,7 +94,13 @@ class RandomizeActuatorGains(RandomizeActuator):
                 self._write_servos(view, name, [joints[i] for i in builtin], pair, mask_E, drawn_EN)
 
     def _write_servos(
-        self, view: EnvView, name: str, joints: Sequence[int], pair: Pair, mask_E: Tensor, drawn_EN: Tensor
+        self,
+        view: EnvView,
+        name: str,
+        joints: Sequence[int],
+        pair: Pair,
+        mask_E: Bool[Tensor, " E"],
+        drawn_EN: Tensor,
     ) -> None:
         model = view.world.mj_model
         places = [_servo(model, scalar_joint_ids(model)[joint], name) for joint in joints]
@@ -102,7 +108,7 @@ class RandomizeActuatorGains(RandomizeActuator):
         column = 1 if name == "stiffness" else 2
         own = -model.actuator_biasprm[servos, column]
         check_not_negative(self, name, [view.resolver.names("joint")[j] for j in joints], own, pair)
-        value_EN1 = self.combine(constant(own.tolist(), view.device), drawn_EN)[..., None]
+        value_EN1 = self.combine(array_constant(own, view.device), drawn_EN)[..., None]
         write_entries(view.field("actuator_biasprm"), servos, (column,), mask_E, -value_EN1)
         in_gain = [i for i, (_, also_gain) in enumerate(places) if also_gain]
         if in_gain:
@@ -134,8 +140,7 @@ class RandomizeEffortLimit(RandomizeActuator):
         """The force ranges of actuators and of joints."""
         return ("actuator_forcerange", "jnt_actfrcrange")
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        """Draw for the rows of `mask_E`."""
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         joints = view.resolver.ids("joint", self.joints)
         drawn_EN = self.draw(view, len(joints), [self.ranges])[..., 0].expand(-1, len(joints))
         # A factor or an offset cannot limit what has no limit: there, the limit of the joint itself may be meant.
@@ -159,13 +164,18 @@ class RandomizeEffortLimit(RandomizeActuator):
                 self._write_ranges(view, field, place_of, mask_E, drawn_EN)
 
     def _write_ranges(
-        self, view: EnvView, field: str, place_of: dict[int, int], mask_E: Tensor, drawn_EN: Tensor
+        self,
+        view: EnvView,
+        field: str,
+        place_of: dict[int, int],
+        mask_E: Bool[Tensor, " E"],
+        drawn_EN: Tensor,
     ) -> None:
         rows, names = list(place_of), [view.joints(self.joints).names[i] for i in place_of.values()]
         # The lower bound as a size, like the upper one.
         own = getattr(view.world.mj_model, field)[rows] * np.array((-1.0, 1.0))
         check_not_negative(self, "ranges", names, own, self.ranges)
-        own_N2 = constant(own.ravel().tolist(), view.device).view(-1, 2)
+        own_N2 = array_constant(own, view.device)
         drawn_EN = drawn_EN[:, index_constant(list(place_of.values()), view.device)]
         size_EN2 = self.combine(own_N2, drawn_EN[..., None])
         signs_2 = constant((-1.0, 1.0), view.device)
@@ -189,25 +199,25 @@ def check_not_negative(
         )
 
 
-def _actuators(model: mujoco.MjModel, joint: int) -> list[int]:
-    on_joints = np.isin(model.actuator_trntype, _JOINT_TRANSMISSIONS)
-    return [int(a) for a in np.flatnonzero(on_joints & (model.actuator_trnid[:, 0] == joint))]
+def _actuators(mj_model: mujoco.MjModel, joint: int) -> list[int]:
+    on_joints = np.isin(mj_model.actuator_trntype, _JOINT_TRANSMISSIONS)
+    return [int(a) for a in np.flatnonzero(on_joints & (mj_model.actuator_trnid[:, 0] == joint))]
 
 
-def _servo(model: mujoco.MjModel, joint: int, gain: str) -> tuple[int, bool]:
+def _servo(mj_model: mujoco.MjModel, joint: int, gain: str) -> tuple[int, bool]:
     """Return the servo that has this gain, and whether the number is also its `gainprm[0]`.
 
     A position servo's bias is (0, -stiffness, -damping) with the gain stiffness, a velocity servo's (0, 0, -damping)
     with the gain damping.
     """
     position, velocity = None, None
-    for actuator in _actuators(model, joint):
+    for actuator in _actuators(mj_model, joint):
         if (
-            model.actuator_gaintype[actuator] != mujoco.mjtGain.mjGAIN_FIXED
-            or model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE
+            mj_model.actuator_gaintype[actuator] != mujoco.mjtGain.mjGAIN_FIXED
+            or mj_model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE
         ):
             continue
-        force, bias = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator]
+        force, bias = mj_model.actuator_gainprm[actuator, 0], mj_model.actuator_biasprm[actuator]
         if bias[1] == -force:
             position = actuator
         elif bias[1] == 0.0 and bias[2] == -force:
@@ -217,6 +227,6 @@ def _servo(model: mujoco.MjModel, joint: int, gain: str) -> tuple[int, bool]:
     if position is not None:
         return position, gain == "stiffness"
     raise ValueError(
-        f"RandomizeActuatorGains.{gain}: joint {model.joint(joint).name!r} has no servo with this gain; expected a "
+        f"RandomizeActuatorGains.{gain}: joint {mj_model.joint(joint).name!r} has no servo with this gain; expected a "
         "position or velocity actuator, or an explicit actuator"
     )

@@ -1,15 +1,16 @@
-"""Randomization of bodies: mass, centre of mass and inertia, so that each stays one that a real body can have."""
+"""These events draw mass, centre of mass and inertia of bodies, each of them one that a real body can have."""
 
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.checks import check_choice
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.constants import constant, index_constant
+from ksim_rl.mdp.constants import array_constant, index_constant
 from ksim_rl.mdp.randomization.randomize import Operation, RandomizeModelField, write_entries
 from ksim_rl.scene.names import Patterns
 
@@ -30,7 +31,6 @@ class RandomizeBodyField(RandomizeModelField):
 
     @property
     def elements(self) -> Patterns:
-        """The bodies."""
         return self.bodies
 
 
@@ -50,13 +50,10 @@ class RandomizeBodyMass(RandomizeBodyField):
         """Mass and principal moments."""
         return ("body_mass", "body_inertia")
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        """Draw for the rows of `mask_E`."""
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         super().__call__(view, mask_E)
         ids = self.ids(view)
-        own_N3 = constant(view.world.mj_model.body_inertia[list(ids)].ravel().tolist(), view.device).view(
-            -1, 3
-        )
+        own_N3 = array_constant(view.world.mj_model.body_inertia[list(ids)], view.device)
         inertia_EN3 = own_N3 * _mass_ratio(view, ids)[..., None]
         write_entries(view.field("body_inertia"), ids, range(3), mask_E, inertia_EN3)
 
@@ -92,15 +89,14 @@ class RandomizeBodyInertia(RandomizeBodyField):
         """Principal moments, and the mass that they go with."""
         return ("body_mass", "body_inertia")
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        """Draw for the rows of `mask_E`."""
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         ids, pairs = self.ids(view), self.pairs()
         self._check_reach(view, np.ones((len(ids), 3)), pairs)
         factor_EN3 = torch.ones(view.num_envs, 1 if self.shared else len(ids), 3, device=view.device)
         factor_EN3[..., index_constant(tuple(pairs), view.device)] = self.draw(
             view, len(ids), list(pairs.values())
         )
-        own_N3 = constant(second_moments(view, ids).ravel().tolist(), view.device).view(-1, 3)
+        own_N3 = array_constant(second_moments(view, ids), view.device)
         spread_EN3 = own_N3 * factor_EN3 * _mass_ratio(view, ids)[..., None]
         inertia_EN3 = spread_EN3.sum(-1, keepdim=True) - spread_EN3
         write_entries(view.field("body_inertia"), ids, range(3), mask_E, inertia_EN3)
@@ -123,6 +119,4 @@ def _mass_ratio(view: EnvView, ids: tuple[int, ...]) -> Tensor:
     if np.any(masses <= 0.0):
         name = view.world.mj_model.body(ids[int(masses.argmin())]).name
         raise ValueError(f"body {name!r} has no mass: leave it out")
-    return view.field("body_mass")[:, index_constant(ids, view.device)] / constant(
-        masses.tolist(), view.device
-    )
+    return view.field("body_mass")[:, index_constant(ids, view.device)] / array_constant(masses, view.device)

@@ -1,4 +1,4 @@
-"""Randomization of geoms: friction, size and pose."""
+"""These events draw friction, size and pose of geoms."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -6,11 +6,12 @@ from typing import ClassVar
 
 import mujoco
 import numpy as np
+from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.checks import unknown_name
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.constants import constant
+from ksim_rl.mdp.constants import array_constant
 from ksim_rl.mdp.randomization.randomize import (
     Operation,
     Pair,
@@ -46,7 +47,6 @@ class RandomizeGeomField(RandomizeModelField):
 
     @property
     def elements(self) -> Patterns:
-        """The geoms."""
         return self.geoms
 
 
@@ -130,14 +130,11 @@ class RandomizeGeomQuat(Randomize):
         """The geoms' quaternions."""
         return ("geom_quat",)
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        """Draw for the rows of `mask_E`."""
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         ids = view.resolver.ids("geom", self.geoms)
         pairs = [self.ranges.get(angle, (0.0, 0.0)) for angle in ANGLES]
         turn_EN4 = quaternion.from_euler_xyz(*self.draw(view, len(ids), pairs).unbind(-1))
         if self.operation == "add":
             own = view.world.mj_model.geom_quat[list(ids)]
-            turn_EN4 = quaternion.multiply(
-                constant(own.ravel().tolist(), view.device).view(1, -1, 4), turn_EN4
-            )
+            turn_EN4 = quaternion.multiply(array_constant(own, view.device)[None], turn_EN4)
         write_entries(view.field("geom_quat"), ids, range(4), mask_E, turn_EN4)

@@ -1,13 +1,14 @@
-"""Randomization of gravity."""
+"""This event draws another gravity for each world."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.checks import check_choice
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.constants import constant
+from ksim_rl.mdp.constants import array_constant
 from ksim_rl.mdp.randomization.randomize import (
     Operation,
     Pair,
@@ -38,12 +39,11 @@ class RandomizeGravity(Randomize):
         """Gravity, which differs between worlds without more memory."""
         return ("gravity",)
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        """Draw for the rows of `mask_E`."""
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         if not self.ranges:
             return
         axes = tuple(sorted(self.ranges))
         own = view.world.mj_model.opt.gravity[list(axes)]
         drawn_E1C = self.draw(view, 1, [self.ranges[axis] for axis in axes])
-        value_E1C = self.combine(constant(own.tolist(), view.device), drawn_E1C)
+        value_E1C = self.combine(array_constant(own, view.device), drawn_E1C)
         write_entries(view.field("gravity")[:, None], (0,), axes, mask_E, value_E1C)

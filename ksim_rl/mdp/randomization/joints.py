@@ -1,4 +1,4 @@
-"""Randomization of hinges and slides: what they are made of, where they stand, and how they are read."""
+"""These events draw what hinges and slides are made of, where they stand, and how they are read."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,11 +6,13 @@ from typing import ClassVar
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.checks import check_choice
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.constants import constant
+from ksim_rl.mdp.constants import array_constant
+from ksim_rl.mdp.fields import OfJoints
 from ksim_rl.mdp.randomization.randomize import (
     Operation,
     Pair,
@@ -21,20 +23,13 @@ from ksim_rl.scene.names import Patterns, scalar_joint_ids
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointField(RandomizeModelField):
-    """Draw entries of a field of hinges and slides per world.
-
-    Attributes:
-        joints: names or patterns.
-    """
-
-    joints: Patterns = ".*"
+class RandomizeJointField(OfJoints, RandomizeModelField):
+    """Draw entries of a field of hinges and slides per world."""
 
     kind: ClassVar[str] = "joint"
 
     @property
     def elements(self) -> Patterns:
-        """The joints."""
         return self.joints
 
     def ids(self, view: EnvView) -> tuple[int, ...]:
@@ -115,17 +110,15 @@ class RandomizeJointZero(RandomizeJointField):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeDefaultJointPos(Randomize):
+class RandomizeDefaultJointPos(OfJoints, Randomize):
     """The default pose, rad or m: what resets, position actions and relative joint positions start from.
 
     In mode "reset" let it run before the event that resets the joints.
 
     Attributes:
-        joints: names or patterns.
         ranges: what to draw from; the model's own value is that of its first keyframe or, without one, `qpos0`.
     """
 
-    joints: Patterns = ".*"
     ranges: Pair
     operation: Operation = "add"
 
@@ -133,40 +126,36 @@ class RandomizeDefaultJointPos(Randomize):
         super().__post_init__()
         self.check_range("ranges", self.ranges)
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        """Draw for the rows of `mask_E`."""
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         joints = view.joints(self.joints).index
         model = view.world.mj_model
         pose = model.key_qpos[0] if model.nkey else model.qpos0
         own = pose[model.jnt_qposadr[scalar_joint_ids(model)]]
         ids = view.resolver.ids("joint", self.joints)
         drawn_EN = self.draw(view, len(ids), [self.ranges])[..., 0]
-        value_EN = self.combine(constant(own[list(ids)].tolist(), view.device), drawn_EN)
+        value_EN = self.combine(array_constant(own[list(ids)], view.device), drawn_EN)
         held_EN = view.default_joint_pos_EL[:, joints]
         view.default_joint_pos_EL[:, joints] = torch.where(mask_E[:, None], value_EN, held_EN)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeEncoderBias(Randomize):
+class RandomizeEncoderBias(OfJoints, Randomize):
     """Offset between a joint's position and what its encoder reads, rad or m.
 
     Observations show it where they ask for it (`JointPosRel(biased=True)`); nothing else feels it.
 
     Attributes:
         ranges: what to draw from.
-        joints: names or patterns.
     """
 
     ranges: Pair
-    joints: Patterns = ".*"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choice("operation", self.operation, ("abs",))
         self.check_range("ranges", self.ranges)
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        """Draw for the rows of `mask_E`."""
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         joints = view.joints(self.joints).index
         held_EN = view.encoder_bias_EL[:, joints]
         drawn_EN = self.draw(view, held_EN.shape[1], [self.ranges])[..., 0]

@@ -1,14 +1,15 @@
-"""Randomization of all ten inertial parameters of a body at once."""
+"""This event draws all ten inertial parameters of a body at once."""
 
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.checks import check_choice
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.constants import constant
+from ksim_rl.mdp.constants import array_constant
 from ksim_rl.mdp.randomization.bodies import second_moments
 from ksim_rl.mdp.randomization.randomize import Pair, Randomize, write_entries
 from ksim_rl.physics.principal_axes import principal_axes
@@ -56,14 +57,13 @@ class RandomizePseudoInertia(Randomize):
         """All inertial parameters."""
         return ("body_mass", "body_ipos", "body_inertia", "body_iquat")
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        """Draw for the rows of `mask_E`."""
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         ids, model = view.resolver.ids("body", self.bodies), view.world.mj_model
         rows = list(ids)
         mass_N1, com_N3, axes_N4, spread_N3 = (
-            constant(values.ravel().tolist(), view.device).view(len(ids), -1)
+            array_constant(values, view.device)
             for values in (
-                model.body_mass[rows],
+                model.body_mass[rows][:, None],
                 model.body_ipos[rows],
                 model.body_iquat[rows],
                 second_moments(view, ids),

@@ -1,4 +1,4 @@
-"""Events that make each world's model differ: domain randomization. What all of them share.
+"""Domain randomization makes each world's model differ; this is the base of its events.
 
 Each draw starts from the model's own values, so that neither the order of resets nor their number matters.
 """
@@ -11,12 +11,13 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checks import check_choice, check_in_range, check_pair
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.constants import constant, index_constant
+from ksim_rl.mdp.constants import array_constant, constant, index_constant
 from ksim_rl.scene.names import Patterns
 
 Pair = tuple[float, float]
@@ -66,8 +67,8 @@ class Randomize(EventTerm):
         if self.distribution == "log_uniform":
             check_in_range(f"{name}[0] (log_uniform)", pair[0], low=0.0, low_open=True)  # pyright: ignore
 
-    def draw(self, view: EnvView, count: int, pairs: Sequence[Pair]) -> Tensor:
-        """Draw float32 [E, count, C], one column per range; [E, 1, C] if shared."""
+    def draw(self, view: EnvView, count: int, pairs: Sequence[Pair]) -> Float[Tensor, "E N C"]:
+        """Draw `count` rows per world, or one if shared, with one column per range."""
         size = (1 if self.shared else count) * len(pairs)
         first = [float(pair[0]) for pair in pairs]
         second = [float(pair[1]) for pair in pairs]
@@ -83,8 +84,10 @@ class Randomize(EventTerm):
         drawn_ENC = torch.addcmul(low_C, drawn_ENC, width_C)
         return torch.exp(drawn_ENC) if self.distribution == "log_uniform" else drawn_ENC
 
-    def combine(self, nominal: Tensor, drawn: Tensor) -> Tensor:
-        """Return the values that the draws make of the model's own."""
+    def combine(
+        self, nominal: Float[Tensor, "*own"], drawn: Float[Tensor, "*draws"]
+    ) -> Float[Tensor, "*values"]:
+        """Return the values that the draws make of the model's own; these broadcast to the draws."""
         if self.operation == "abs":
             return drawn
         return nominal + drawn if self.operation == "add" else nominal * drawn
@@ -102,8 +105,23 @@ class Randomize(EventTerm):
         return np.full_like(nominal, low), np.full_like(nominal, high)
 
     @abstractmethod
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Draw for the rows of `mask_E`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeNumber(Randomize):
+    """Draw one number per element and world.
+
+    Attributes:
+        ranges: what to draw from.
+    """
+
+    ranges: Pair
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_range("ranges", self.ranges)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,14 +174,13 @@ class RandomizeModelField(Randomize):
             return dict(sorted(self.ranges.items()))
         return dict.fromkeys(range(self.columns), self.ranges)
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        """Draw for the rows of `mask_E`."""
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         ids, pairs, nominal = self.ids(view), self.pairs(), self.nominal(view)
         if not pairs:
             return
         self._check_reach(view, nominal, pairs)
         columns = tuple(pairs)
-        own_NC = constant(nominal[:, list(columns)].ravel().tolist(), view.device).view(len(ids), -1)
+        own_NC = array_constant(nominal[:, list(columns)], view.device)
         value_ENC = self.combine(own_NC, self.draw(view, len(ids), list(pairs.values())))
         write_entries(view.field(self.field), ids, columns, mask_E, value_ENC)
 
@@ -182,16 +199,19 @@ class RandomizeModelField(Randomize):
 
 
 def write_entries(
-    field: Tensor, ids: Sequence[int], columns: Sequence[int], mask_E: Tensor, value_ENC: Tensor
+    field_E: Float[Tensor, " E *field"],
+    ids: Sequence[int],
+    columns: Sequence[int],
+    mask_E: Bool[Tensor, " E"],
+    value_ENC: Float[Tensor, "E N C"],
 ) -> None:
-    """Write entries of a per-world field [E, rows] or [E, rows, columns] in the worlds of `mask_E`, bool [E]."""
-    entries = field.unsqueeze(-1) if field.ndim == 2 else field
-    rows, across = index_constant(ids, field.device), index_constant(columns, field.device)
-    held_ENC = entries[:, rows][..., across]
-    new_ENC = torch.where(mask_E[:, None, None], value_ENC, held_ENC)
+    """Write entries of a per-world field, [E, rows] or [E, rows, columns], in the worlds of `mask_E`."""
+    entries_ERC = field_E.unsqueeze(-1) if field_E.ndim == 2 else field_E
+    rows, across = index_constant(ids, field_E.device), index_constant(columns, field_E.device)
+    new_ENC = torch.where(mask_E[:, None, None], value_ENC, entries_ERC[:, rows][..., across])
     if isinstance(rows, Tensor) and isinstance(across, Tensor):
         rows = rows[:, None]
-    entries[:, rows, across] = new_ENC
+    entries_ERC[:, rows, across] = new_ENC
 
 
 def _is_pair(value: object) -> bool:

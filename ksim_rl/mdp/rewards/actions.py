@@ -1,11 +1,9 @@
-"""Rewards of being alive and of the policy's actions.
-
-Others: `rewards_tracking`, `rewards_posture`, `rewards_motion`, `rewards_joints`, `rewards_contacts`, `rewards_feet`.
-"""
+"""These rewards rate the policy's actions as such, and whether the episode goes on or fails."""
 
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.envs.term import RewardTerm
@@ -16,8 +14,7 @@ from ksim_rl.envs.view import EnvView
 class Alive(RewardTerm):
     """1 in every step, [E]."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return torch.ones(view.num_envs, device=view.device)
 
 
@@ -28,8 +25,7 @@ class Terminated(RewardTerm):
     With `scale_rewards_by_dt` the weight counts `step_dt` times. A world whose physics failed gets no reward at all.
     """
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return view.terminated_E.to(torch.float32)
 
 
@@ -37,8 +33,7 @@ class Terminated(RewardTerm):
 class ActionRateL2(RewardTerm):
     """|a_t - a_{t-1}|^2 of the policy's raw actions, [E]; the action before the first of an episode is 0."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return (view.action_EL - view.last_action_EL).square().sum(-1)
 
 
@@ -46,8 +41,7 @@ class ActionRateL2(RewardTerm):
 class ActionAccelerationL2(RewardTerm):
     """|a_t - 2 a_{t-1} + a_{t-2}|^2 of the policy's raw actions, [E]; actions before an episode are 0."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         rate_EL = view.action_EL - view.last_action_EL
         return _change(view, "last_rate_EL", rate_EL).square().sum(-1)
 
@@ -56,8 +50,7 @@ class ActionAccelerationL2(RewardTerm):
 class ActionJerkL2(RewardTerm):
     """|a_t - 3 a_{t-1} + 3 a_{t-2} - a_{t-3}|^2 of the policy's raw actions, [E]; actions before an episode are 0."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         acceleration_EL = _change(view, "last_rate_EL", view.action_EL - view.last_action_EL)
         return _change(view, "last_acceleration_EL", acceleration_EL).square().sum(-1)
 

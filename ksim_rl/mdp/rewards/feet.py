@@ -1,4 +1,4 @@
-"""Rewards for how feet move, 0 unless the commanded speed exceeds `command_threshold` (`active` below).
+"""These rewards rate how feet move; they are 0 unless the commanded speed exceeds a threshold (`active` below).
 
 Foot poses and velocities are of the current state (position and velocity stage); contacts and forces belong to the
 last physics substep (acceleration stage).
@@ -7,12 +7,13 @@ last physics substep (acceleration stage).
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.commands.speed import RewardWhileCommanded
-from ksim_rl.mdp.foot_contact import foot_contact
+from ksim_rl.mdp.quantities import contact_force, foot_contact
 from ksim_rl.scene.names import Patterns
 
 
@@ -28,8 +29,7 @@ class FootClearance(RewardWhileCommanded):
     sites: Patterns
     target_height: float
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         feet = view.sites(self.sites)
         miss_EF = (feet.height_EN - self.target_height).abs()
         speed_EF = torch.linalg.vector_norm(feet.lin_vel_EN3[..., :2], dim=-1)
@@ -56,13 +56,12 @@ class FootSwingHeight(RewardWhileCommanded):
         super().__post_init__()
         check_in_range("target_height", self.target_height, low=0.0, low_open=True)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         contact = foot_contact(view, self.sensor, self.sites)
         height_EF = view.sites(self.sites).height_EN
-        memory_EF = view.buffer("peak_EF", height_EF.shape[-1])
-        peak_EF = torch.where(contact.found_EN > 0, memory_EF, torch.maximum(memory_EF, height_EF))
-        memory_EF.copy_(torch.where(contact.first_contact_EN > 0, 0.0, peak_EF))
+        held_EF = view.buffer("peak_EF", height_EF.shape[-1])
+        peak_EF = torch.where(contact.found_EN > 0, held_EF, torch.maximum(held_EF, height_EF))
+        held_EF.copy_(torch.where(contact.first_contact_EN > 0, 0.0, peak_EF))
         cost_E = ((peak_EF / self.target_height - 1.0).square() * contact.first_contact_EN).sum(-1)
         return self.while_commanded(view, cost_E)
 
@@ -78,8 +77,7 @@ class FootSlip(RewardWhileCommanded):
     sensor: str
     sites: Patterns
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         speed2_EF = view.sites(self.sites).lin_vel_EN3[..., :2].square().sum(-1)
         cost_E = (speed2_EF * foot_contact(view, self.sensor, self.sites).found_EN).sum(-1)
         return self.while_commanded(view, cost_E)
@@ -91,12 +89,9 @@ class SoftLanding(RewardWhileCommanded):
 
     sensor: str
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
-        contact = view.contact(self.sensor)
-        force_EF = torch.linalg.vector_norm(contact.force_EN3, dim=-1)
-        cost_E = (force_EF * contact.first_contact_EN).sum(-1)
-        return self.while_commanded(view, cost_E)
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        landed_EF = view.contact(self.sensor).first_contact_EN
+        return self.while_commanded(view, (contact_force(view, self.sensor) * landed_EF).sum(-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,12 +106,10 @@ class FeetAirTime(RewardWhileCommanded):
         super().__post_init__()
         check_in_range("threshold_max", self.threshold_max, low=self.threshold_min)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         air_time_EF = view.contact(self.sensor).air_time_EN
         inside_EF = (air_time_EF > self.threshold_min) & (air_time_EF < self.threshold_max)
-        count_E = inside_EF.to(torch.float32).sum(-1)
-        return self.while_commanded(view, count_E)
+        return self.while_commanded(view, inside_EF.to(torch.float32).sum(-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +124,7 @@ class GaitPhase(RewardWhileCommanded):
     gait: str
     sensor: str
 
-    def __call__(self, view: EnvView) -> Tensor:
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         """Return the unweighted reward, [E].
 
         Raises:

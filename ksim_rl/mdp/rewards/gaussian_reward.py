@@ -1,8 +1,9 @@
-"""Rewards that fall with an error like a bell curve."""
+"""Rewards of errors fall like a bell curve; this is their base."""
 
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
@@ -23,6 +24,6 @@ class GaussianReward(RewardTerm):
         super().__post_init__()
         check_in_range("std", self.std, low=0.0, low_open=True)
 
-    def rate(self, squared_error_E: Tensor) -> Tensor:
-        """Return the reward of a squared error, [E]."""
+    def rate(self, squared_error_E: Float[Tensor, " E"]) -> Float[Tensor, " E"]:
+        """Return the reward of a squared error."""
         return torch.exp(squared_error_E / -(self.std**2))

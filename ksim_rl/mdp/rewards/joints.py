@@ -1,24 +1,27 @@
-"""Rewards for what joints and actuators do, [E]; weights are usually negative.
+"""These rewards rate what joints and actuators do; weights are usually negative.
 
 Positions and velocities are of the current state; accelerations, efforts and forces belong to the last physics substep
-(acceleration stage). `joints` and `actuators` take names or regular expressions; ".*" is all.
+(acceleration stage).
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant, values_by_name
+from ksim_rl.mdp.fields import OfJoints
+from ksim_rl.mdp.quantities import mechanical_power
 from ksim_rl.scene.names import Patterns
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointLimitReward(RewardTerm):
+class JointLimitReward(OfJoints, RewardTerm):
     """Sum over joints of how far the size of something is above `soft_factor` of its limit, [E].
 
     Attributes:
@@ -27,7 +30,6 @@ class JointLimitReward(RewardTerm):
     """
 
     limits: Mapping[str, float]
-    joints: Patterns = ".*"
     soft_factor: float = 1.0
 
     def __post_init__(self) -> None:
@@ -36,8 +38,8 @@ class JointLimitReward(RewardTerm):
             check_in_range(f"limits[{pattern!r}]", limit, low=0.0, low_open=True)
         check_in_range("soft_factor", self.soft_factor, low=0.0, high=1.0, low_open=True)
 
-    def overshoot(self, view: EnvView, value_EL: Tensor) -> Tensor:
-        """Return the sum for the values of `joints`, [E]."""
+    def overshoot(self, view: EnvView, value_EL: Float[Tensor, "E L"]) -> Float[Tensor, " E"]:
+        """Return the sum for the values of the joints."""
         limit_L = values_by_name("limits", self.limits, view.joints(self.joints).names)
         free_L = constant([self.soft_factor * limit for limit in limit_L], view.device)
         return (value_EL.abs() - free_L).clamp(min=0.0).sum(-1)
@@ -47,16 +49,13 @@ class JointLimitReward(RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointPosLimits(RewardTerm):
+class JointPosLimits(OfJoints, RewardTerm):
     """Sum over joints of how far each is beyond its soft limits, rad or m, [E]; position stage.
 
     Soft limits: `scene.soft_joint_pos_limit_factor` of the range, about its middle.
     """
 
-    joints: Patterns = ".*"
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         joints = view.joints(self.joints)
         pos_EL, limits_L2 = joints.pos_EL, joints.soft_limits_L2
         inside_EL = torch.clamp(pos_EL, limits_L2[:, 0], limits_L2[:, 1])
@@ -64,24 +63,18 @@ class JointPosLimits(RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointDeviationL1(RewardTerm):
+class JointDeviationL1(OfJoints, RewardTerm):
     """Sum of |q - q0| from the default pose, rad or m, [E]; position stage."""
 
-    joints: Patterns = ".*"
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return view.joints(self.joints).pos_rel_EL.abs().sum(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointDeviationL2(RewardTerm):
+class JointDeviationL2(OfJoints, RewardTerm):
     """Sum of (q - q0)^2 from the default pose, rad^2 or m^2, [E]; position stage."""
 
-    joints: Patterns = ".*"
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return view.joints(self.joints).pos_rel_EL.square().sum(-1)
 
 
@@ -89,13 +82,10 @@ class JointDeviationL2(RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointVelL2(RewardTerm):
+class JointVelL2(OfJoints, RewardTerm):
     """Sum of squared joint velocities, (rad/s)^2 or (m/s)^2, [E]; velocity stage."""
 
-    joints: Patterns = ".*"
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return view.joints(self.joints).vel_EL.square().sum(-1)
 
 
@@ -103,19 +93,15 @@ class JointVelL2(RewardTerm):
 class JointVelLimits(JointLimitReward):
     """Sum over joints of how far each speed is above `soft_factor` of its limit, rad/s or m/s, [E]; velocity stage."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return self.overshoot(view, view.joints(self.joints).vel_EL)
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointAccL2(RewardTerm):
+class JointAccL2(OfJoints, RewardTerm):
     """Sum of squared joint accelerations, (rad/s^2)^2 or (m/s^2)^2, [E]; acceleration stage."""
 
-    joints: Patterns = ".*"
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return view.joints(self.joints).acc_EL.square().sum(-1)
 
 
@@ -123,13 +109,10 @@ class JointAccL2(RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointEffortL2(RewardTerm):
+class JointEffortL2(OfJoints, RewardTerm):
     """Sum of squared efforts (torques) of the actuators at joints, (N m)^2 or N^2, [E]; acceleration stage."""
 
-    joints: Patterns = ".*"
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return view.joints(self.joints).effort_EL.square().sum(-1)
 
 
@@ -140,8 +123,7 @@ class JointEffortLimits(JointLimitReward):
     Actuators that clamp at their limit never exceed it: there, choose a factor below 1.
     """
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return self.overshoot(view, view.joints(self.joints).effort_EL)
 
 
@@ -151,23 +133,15 @@ class ActuatorForceL2(RewardTerm):
 
     actuators: Patterns = ".*"
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return (
             view.world.actuator_force_EL[:, view.resolver.index("actuator", self.actuators)].square().sum(-1)
         )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Energy(RewardTerm):
-    """Sum over joints of |effort * velocity|, W, [E]: braking costs as much as driving.
+class Energy(OfJoints, RewardTerm):
+    """Sum over joints of |effort * velocity|, W: braking costs as much as driving (`mechanical_power`)."""
 
-    Efforts belong to the last physics substep (acceleration stage), velocities to the state that it reached.
-    """
-
-    joints: Patterns = ".*"
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
-        joints = view.joints(self.joints)
-        return (joints.effort_EL * joints.vel_EL).abs().sum(-1)
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        return mechanical_power(view, self.joints)

@@ -1,44 +1,32 @@
-"""Rewards for how bodies move, [E]; weights are usually negative. Velocities are of the current state."""
+"""These rewards rate how bodies move; weights are usually negative. Velocities are of the current state."""
 
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.commands.speed import is_commanded
+from ksim_rl.mdp.fields import OfEntity, OfJoints
 from ksim_rl.scene.names import Patterns
 
 
 @dataclass(frozen=True, kw_only=True)
-class LinVelZL2(RewardTerm):
-    """v_z^2, `v` the root's linear velocity in its own frame, (m/s)^2, [E]; velocity stage.
+class LinVelZL2(OfEntity, RewardTerm):
+    """v_z^2, `v` the root's linear velocity in its own frame, (m/s)^2, [E]; velocity stage."""
 
-    Attributes:
-        entity: the robot that is meant; "" is the first one.
-    """
-
-    entity: str = ""
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return view.entity(self.entity).root_lin_vel_b_EL[:, 2].square()
 
 
 @dataclass(frozen=True, kw_only=True)
-class AngVelXYL2(RewardTerm):
-    """|w_xy|^2, `w` the root's angular velocity in its own frame, (rad/s)^2, [E]; velocity stage.
+class AngVelXYL2(OfEntity, RewardTerm):
+    """|w_xy|^2, `w` the root's angular velocity in its own frame, (rad/s)^2, [E]; velocity stage."""
 
-    Attributes:
-        entity: the robot that is meant; "" is the first one.
-    """
-
-    entity: str = ""
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return view.entity(self.entity).root_ang_vel_b_EL[:, :2].square().sum(-1)
 
 
@@ -48,9 +36,8 @@ class BodyAngularVelocity(RewardTerm):
 
     body: str
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
-        return view.bodies(self.body).ang_vel_EN3[..., :2].square().sum((-2, -1))
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        return view.body(self.body).ang_vel_EL[:, :2].square().sum(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +46,7 @@ class AngularMomentum(RewardTerm):
 
     sensor: str
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return view.sensor(self.sensor).square().sum(-1)
 
 
@@ -74,8 +60,7 @@ class LinkAccelerationL2(RewardTerm):
 
     bodies: Patterns
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         vel_EN3 = view.bodies(self.bodies).lin_vel_EN3
         last_EN3 = view.buffer("last_vel_EN3", *vel_EN3.shape[1:])
         acceleration_EN3 = (vel_EN3 - last_EN3) / view.step_dt
@@ -84,7 +69,7 @@ class LinkAccelerationL2(RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionlessAtRest(RewardTerm):
+class MotionlessAtRest(OfJoints, RewardTerm):
     """Sum of squared joint velocities while the command asks to stand, else 0, (rad/s)^2 or (m/s)^2, [E].
 
     Attributes:
@@ -93,13 +78,11 @@ class MotionlessAtRest(RewardTerm):
 
     command: str
     command_threshold: float
-    joints: Patterns = ".*"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_in_range("command_threshold", self.command_threshold, low=0.0)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         motion_E = view.joints(self.joints).vel_EL.square().sum(-1)
         return motion_E * (1.0 - is_commanded(view, self.command, self.command_threshold))

@@ -1,9 +1,10 @@
-"""Rewards for how the body is held: orientation, height, pose."""
+"""These rewards rate how a robot holds itself: its tilt, its height, its joints."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
@@ -11,68 +12,65 @@ from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.commands.speed import commanded_speed
 from ksim_rl.mdp.constants import constant, values_by_name
+from ksim_rl.mdp.fields import OfEntity, OfJoints
+from ksim_rl.mdp.quantities import root_height
 from ksim_rl.mdp.rewards.gaussian_reward import GaussianReward
-from ksim_rl.mdp.root_height import root_height
-from ksim_rl.scene.names import Patterns
 
 
 @dataclass(frozen=True, kw_only=True)
-class Upright(GaussianReward):
-    """exp(-|g_xy|^2 / std^2), `g` the direction of gravity in the body's frame, [E]; position stage.
+class OfTilt(OfEntity):
+    """A reward of the tilt of a body.
 
     Attributes:
-        body: the body to hold upright; None is the root.
-        entity: whose root; "" is the first robot.
+        body: its name; None is the root of `entity`.
     """
 
     body: str | None = None
-    entity: str = ""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
-        return self.rate(_tilt(view, self.body, self.entity))
-
-
-@dataclass(frozen=True, kw_only=True)
-class TiltL2(RewardTerm):
-    """|g_xy|^2, `g` the direction of gravity in the body's frame, the squared sine of the tilt, [E]; position stage.
-
-    Attributes:
-        body: the body that is meant; None is the root.
-        entity: whose root; "" is the first robot.
-    """
-
-    body: str | None = None
-    entity: str = ""
-
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
-        return _tilt(view, self.body, self.entity)
+    def tilt(self, view: EnvView) -> Float[Tensor, " E"]:
+        """Return |g_xy|^2, `g` the direction of gravity in the body's frame: the squared sine of the tilt."""
+        if self.body is None:
+            return view.entity(self.entity).projected_gravity_EL[:, :2].square().sum(-1)
+        # The world's z axis in the body's frame: the z components of the body's x and y axes.
+        return view.body(self.body).axes_E33[:, :2, 2].square().sum(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RootHeightL2(RewardTerm):
+class Upright(OfTilt, GaussianReward):
+    """exp(-|g_xy|^2 / std^2), `g` the direction of gravity in the body's frame; position stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        return self.rate(self.tilt(view))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TiltL2(OfTilt, RewardTerm):
+    """|g_xy|^2, `g` the direction of gravity in the body's frame, the squared sine of the tilt; position stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        return self.tilt(view)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RootHeightL2(OfEntity, RewardTerm):
     """(h - target_height)^2, `h` the height of the root body's frame above the ground, m^2, [E]; position stage.
 
     Attributes:
         target_height: m.
-        entity: the robot that is meant; "" is the first one.
     """
 
     target_height: float
-    entity: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_in_range("target_height", self.target_height)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return (root_height(view, self.entity) - self.target_height).square()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pose(RewardTerm):
+class Pose(OfJoints, RewardTerm):
     """exp(-mean_j((q_j - q0_j)^2 / std_j^2)) about the default pose, [E]; position stage.
 
     How far a joint may stray depends on the commanded speed s = |c_xy| + |c_z|: standing below `walking_threshold`,
@@ -89,7 +87,6 @@ class Pose(RewardTerm):
     std_running: Mapping[str, float]
     walking_threshold: float
     running_threshold: float
-    joints: Patterns = ".*"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -98,8 +95,7 @@ class Pose(RewardTerm):
                 check_in_range(f"{field}[{pattern!r}]", std, low=0.0, low_open=True)
         check_in_range("running_threshold", self.running_threshold, low=self.walking_threshold)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         speed_E1 = commanded_speed(view, self.command).unsqueeze(-1)
         std_EL = torch.where(
             speed_E1 < self.walking_threshold,
@@ -116,11 +112,3 @@ class Pose(RewardTerm):
     def _std(self, view: EnvView, field: str) -> Tensor:
         names = view.joints(self.joints).names
         return constant(values_by_name(field, getattr(self, field), names), view.device)
-
-
-def _tilt(view: EnvView, body: str | None, entity: str) -> Tensor:
-    """Return the squared sine of a body's tilt, [E]."""
-    if body is None:
-        return view.entity(entity).projected_gravity_EL[:, :2].square().sum(-1)
-    # The world's z axis in the body's frame: the z components of the body's x and y axes.
-    return view.bodies(body).axes_EN33[:, 0, :2, 2].square().sum(-1)

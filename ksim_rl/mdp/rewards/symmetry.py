@@ -1,9 +1,10 @@
-"""Rewards for left-right symmetry, [E]: 0 for what is its own mirror image; weights are usually negative."""
+"""These rewards are 0 for what is its own left-right mirror image; weights are usually negative."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import check_choice
@@ -58,8 +59,7 @@ class JointSymmetryL2(Symmetry):
     `x` is the deviation from the default pose.
     """
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         left, right = self._pairs(view)
         return self._mismatch(view, view.joints(left).pos_rel_EL, view.joints(right).pos_rel_EL)
 
@@ -74,7 +74,7 @@ class ActionSymmetryL2(Symmetry):
 
     joints: Patterns
 
-    def __call__(self, view: EnvView) -> Tensor:
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         """Return the unweighted reward, [E].
 
         Raises:

@@ -1,28 +1,28 @@
-"""A value that is right inside an interval and rated by its distance outside of it."""
+"""Rewards may rate a value by its distance from an interval in which it is right."""
 
 import math
 from typing import Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
 def tolerance(
-    value: Tensor,
+    value: Float[Tensor, "*shape"],
     *,
     low: float = -math.inf,
     high: float = math.inf,
     margin: float,
     value_at_margin: float = 0.1,
     shape: Literal["gaussian", "linear"] = "gaussian",
-) -> Tensor:
+) -> Float[Tensor, "*shape"]:
     """Return 1 inside [low, high], falling to `value_at_margin` at `margin` outside of it and on towards 0.
 
     Formula: Tassa et al., "DeepMind Control Suite" (2018), section 4. With d the distance to the interval in margins,
     "gaussian" is `value_at_margin ** (d ** 2)` and "linear" is `max(0, 1 - (1 - value_at_margin) d)`.
 
     Args:
-        value: of any shape.
         low, high: the interval, in the unit of `value`.
         margin: > 0, in the unit of `value`.
         value_at_margin: in (0, 1), or 0 for "linear".

@@ -179,3 +179,36 @@ def test_an_unknown_body_is_refused_with_the_near_names(make_bench):
     push = mdp.PushByForce(body="trunc", wrench_range={}, duration_s=(1.0, 1.0), interval_range_s=(1.0, 1.0))
     with pytest.raises(ValueError, match="no body matches 'trunc': did you mean 'trunk'"):
         bench.fire(push)
+
+
+def test_push_adds_to_the_velocity_in_the_world_frame(crowd):
+    half = math.pi / 4
+    crowd.place(
+        qpos=(0, 0, 1, math.cos(half), 0, 0, math.sin(half), 0, 0), qvel=(0.5, 0, 0, 0.25, 0, 0, 7, 8)
+    )
+    before = crowd.world.qvel_EL.clone()
+    mask = torch.arange(500) % 2 == 1
+    event = mdp.PushByVelocity(
+        velocity_range={"x": (1.0, 1.0), "pitch": (2.0, 2.0)}, interval_range_s=(1.0, 3.0)
+    )
+    crowd.fire(event, mask)
+    # A spin about world y is one about x of the body, which is turned by 90 degrees.
+    kick = torch.tensor([1.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0])
+    torch.testing.assert_close(crowd.world.qvel_EL[mask], before[mask] + kick, atol=1e-5, rtol=0)
+    assert torch.equal(crowd.world.qvel_EL[~mask], before[~mask])
+
+
+def test_two_pushes_of_one_moment_add_up(crowd):
+    event = mdp.PushByVelocity(velocity_range={"yaw": (1.0, 1.0)}, interval_range_s=(1.0, 3.0))
+    crowd.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0, 0))
+    for scope in ("events/first", "events/second"):
+        with crowd.view.scope(scope):
+            event(crowd.view, crowd.everybody_E)
+    torch.testing.assert_close(crowd.world.qvel_EL[:, 5], torch.full((500,), 2.0))
+
+
+def test_push_needs_an_interval_and_known_axes():
+    with pytest.raises(ValueError, match="interval_range_s"):
+        mdp.PushByVelocity(velocity_range={})
+    with pytest.raises(ValueError, match=r"velocity_range.*'jaw'.*'yaw'"):
+        mdp.PushByVelocity(velocity_range={"jaw": (0.0, 1.0)}, interval_range_s=(1.0, 2.0))

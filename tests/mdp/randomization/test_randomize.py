@@ -10,8 +10,8 @@ from ksim_rl import mdp
 from ksim_rl.config.config_tree import from_tree, to_tree
 from ksim_rl.envs.term import EventTerm
 from tests.mdp.bench import BOXES, FREE_BODY
-from tests.mdp.randomize_bench import Runners
-from tests.mdp.test_randomize_physics import EVENTS
+from tests.mdp.randomization.randomize_bench import Runners
+from tests.mdp.randomization.test_randomize_physics import EVENTS
 
 E = 1000
 

@@ -6,7 +6,7 @@ import torch
 
 from ksim_rl import mdp
 from ksim_rl.testing.sync_count import count_syncs
-from tests.mdp.randomize_bench import FIELDS, Runners
+from tests.mdp.randomization.randomize_bench import FIELDS, Runners
 
 E = 3
 SUBSTEPS = 60

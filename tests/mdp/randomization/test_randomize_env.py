@@ -21,7 +21,7 @@ from ksim_rl.envs.reset_to_default import ResetToDefault
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.physics import SimCfg
 from ksim_rl.scene.actuators import IdealPDActuator
-from tests.mdp.randomize_bench import RUNNER
+from tests.mdp.randomization.randomize_bench import RUNNER
 
 E = 4
 CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")

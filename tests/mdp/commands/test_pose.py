@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ksim_rl import mdp
-from ksim_rl.mdp.commands.target_pose import distance_to_target, target_pose_w
+from ksim_rl.mdp.commands.target_pose import target_pose_w
 from tests.mdp.bench import FREE_BODY, Bench
 from tests.mdp.recorder import Recorder
 
@@ -103,9 +103,9 @@ def test_the_distance_to_a_target_is_that_of_the_named_point(free_body):
     free_body.place(qpos=TURNED)
     free_body.view.commands["reach"] = torch.tensor([[0.3, 0.0, 0.0], [0.3, 0.4, 0.0], [0.0, 0.0, 0.0]])
     # The site "imu" is 0.3 m ahead of the trunk's frame.
-    imu_E = distance_to_target(free_body.view, "reach", frame="root", body=None, site="imu")
+    imu_E = mdp.OffsetToCommand(command="reach", site="imu").distance(free_body.view)
     torch.testing.assert_close(imu_E, torch.tensor([0.0, 0.4, 0.3]), atol=1e-5, rtol=0)
-    trunk_E = distance_to_target(free_body.view, "reach", frame="root", body="trunk", site=None)
+    trunk_E = mdp.OffsetToCommand(command="reach", body="trunk").distance(free_body.view)
     torch.testing.assert_close(trunk_E, torch.tensor([0.3, 0.5, 0.0]), atol=1e-5, rtol=0)
 
 

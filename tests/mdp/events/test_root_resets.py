@@ -6,14 +6,14 @@ import pytest
 import torch
 
 from ksim_rl import mdp
-from tests.mdp.bench import FREE_BODY, Bench, Plateau
+from ksim_rl.scene.quaternion import yaw
+from ksim_rl.scene.state.ground import Ground
+from tests.mdp.bench import FREE_BODY, Plateau
 
-E = 400
-
-
-@pytest.fixture(scope="module")
-def crowd():
-    return Bench(FREE_BODY, E, {}, soft_joint_pos_limit_factor=0.5)
+E = 500
+FIXED_ROOT = """
+<mujoco><worldbody><body><joint name="hinge"/><geom size="0.1"/></body></worldbody></mujoco>
+"""
 
 
 def odd_rows():
@@ -31,14 +31,59 @@ def trunk_axes(crowd):
     return np.stack(axes)
 
 
-def test_joints_are_scaled_about_zero_within_the_soft_limits(crowd):
-    crowd.fire(mdp.ResetJointsByScale(position_scale=(0.0, 3.0), velocity_range=(-1.0, 2.0)))
-    left_E, right_E = crowd.world.qpos_EL[:, 7], crowd.world.qpos_EL[:, 8]
-    # Defaults 0.25 and 0.5, soft limits (-0.5, 0.5) and (0.5, 1.5).
-    assert left_E.min() >= 0.0 and left_E.max() == 0.5 and right_E.min() == 0.5 and right_E.max() <= 1.5
-    assert float((left_E == 0.5).float().mean()) == pytest.approx(1 / 3, abs=0.1)
-    velocity = crowd.world.qvel_EL[:, 6:]
-    assert velocity.min() >= -1.0 and velocity.max() <= 2.0 and velocity.std() > 0.7
+def test_root_starts_around_its_default_pose(crowd):
+    event = mdp.ResetRootUniform(pose_range={"x": (-0.5, 0.5), "z": (0.01, 0.05), "yaw": (-3.0, 3.0)})
+    crowd.fire(event)
+    offset = crowd.world.qpos_EL[:, :3] - torch.tensor([1.0, 2.0, 3.0])
+    assert offset[:, 0].min() < -0.45 and offset[:, 0].max() > 0.45
+    assert (offset[:, 1] == 0.0).all()
+    assert offset[:, 2].min() >= 0.01 - 1e-6 and offset[:, 2].max() <= 0.05 + 1e-6
+    angle = yaw(crowd.world.qpos_EL[:, 3:7])
+    assert angle.min() < -2.8 and angle.max() > 2.8
+    torch.testing.assert_close(crowd.view.projected_gravity_EL[:, 2], torch.full((E,), -1.0))
+    assert (crowd.world.qvel_EL[:, :6] == 0.0).all()
+
+
+def test_reset_velocity_is_in_the_world_frame(crowd):
+    # Turned by 90 degrees of yaw, a spin about world x is one about minus y of the body.
+    event = mdp.ResetRootUniform(
+        pose_range={"yaw": (math.pi / 2, math.pi / 2)}, velocity_range={"y": (1.0, 1.0), "roll": (2.0, 2.0)}
+    )
+    crowd.fire(event)
+    expected = torch.tensor([0.0, 1.0, 0.0, 0.0, -2.0, 0.0]).expand(E, 6)
+    torch.testing.assert_close(crowd.world.qvel_EL[:, :6], expected, atol=1e-5, rtol=0)
+
+
+def test_reset_leaves_other_rows_bit_identical(crowd):
+    before_qpos, before_qvel = crowd.world.qpos_EL.clone(), crowd.world.qvel_EL.clone()
+    mask = odd_rows()
+    crowd.fire(mdp.ResetRootUniform(pose_range={"x": (1.0, 2.0)}, velocity_range={"x": (1.0, 2.0)}), mask)
+    crowd.fire(mdp.ResetJoints(velocity_range=(1.0, 2.0)), mask)
+    assert torch.equal(crowd.world.qpos_EL[~mask], before_qpos[~mask])
+    assert torch.equal(crowd.world.qvel_EL[~mask], before_qvel[~mask])
+    assert (crowd.world.qpos_EL[mask, 0] != before_qpos[mask, 0]).all()
+    assert (crowd.world.qvel_EL[mask, 6:] != 0.0).all()
+
+
+def test_fixed_roots_are_refused(make_bench):
+    bench = make_bench(FIXED_ROOT, 2)
+    with pytest.raises(ValueError, match="ResetRootUniform needs a robot whose first joint is free"):
+        bench.fire(mdp.ResetRootUniform())
+
+
+def test_on_a_terrain_the_default_pose_stands_at_the_envs_origin(crowd):
+    class Hill(Ground):
+        """Ground on which envs start at (5, -3, 0.5)."""
+
+        is_flat = False
+
+        @property
+        def origins_E3(self):
+            return torch.tensor([5.0, -3.0, 0.5]).expand(E, 3)
+
+    crowd.view.terrain = Hill(E, crowd.view.device)
+    crowd.fire(mdp.ResetRootUniform(pose_range={"z": (0.1, 0.1)}))
+    torch.testing.assert_close(crowd.world.qpos_EL[:, :3], torch.tensor([6.0, -1.0, 3.6]).expand(E, 3))
 
 
 def test_the_heading_is_the_drawn_one_and_the_tilt_stays(crowd):
@@ -80,7 +125,7 @@ def test_they_may_follow_one_another_in_one_reset(crowd):
 @pytest.mark.parametrize(
     ("make", "field"),
     [
-        (lambda: mdp.ResetJointsByScale(position_scale=(1.0, 0.5)), "position_scale"),
+        (lambda: mdp.ResetRootUniform(pose_range={"x": (1.0, -1.0)}), r"pose_range\.x"),
         (lambda: mdp.ResetHeading(heading_range=(0.0, math.nan)), r"heading_range\[1\]"),
         (lambda: mdp.ResetHeight(height_range=(1.0, 0.5)), "height_range"),
     ],

@@ -1,0 +1,62 @@
+"""Terms take the fields of these classes, so that each is explained and checked once."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.envs.term import Term
+from ksim_rl.scene.names import Patterns
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfEntity(Term):
+    """A term of one robot or object.
+
+    Attributes:
+        entity: its name in `scene.robots` or `scene.objects`; "" is the first robot.
+    """
+
+    entity: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InFrame(OfEntity):
+    """A term of something that is given in a frame.
+
+    Attributes:
+        frame: "root" is the frame of the root body of `entity`; "world".
+    """
+
+    frame: Literal["root", "world"] = "root"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("frame", self.frame, ("root", "world"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfJoints(Term):
+    """A term of some joints.
+
+    Attributes:
+        joints: names or regular expressions of hinges and slides; ".*" is all, in the model's order.
+    """
+
+    joints: Patterns = ".*"
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfContacts(Term):
+    """A term of contacts that are stronger than a threshold.
+
+    Attributes:
+        sensor: a contact sensor of `scene.sensors`.
+        threshold: N, which the net force must exceed, sampled at the last physics substep of the env step.
+    """
+
+    sensor: str
+    threshold: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_in_range("threshold", self.threshold, low=0.0)

@@ -1,0 +1,49 @@
+"""Several terms read these quantities, which are derived from those of the view."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ksim_rl.envs.view import EnvView
+from ksim_rl.scene.names import Patterns
+from ksim_rl.scene.sensors import ContactState
+
+
+def root_height(view: EnvView, entity: str = "") -> Float[Tensor, " E"]:
+    """Return the height of an entity's root frame above the ground right below it, m; position stage."""
+    return view.terrain.clearance(view.entity(entity).root_pos_EL[:, None])[:, 0]
+
+
+def distance_from_origin(view: EnvView, entity: str) -> Float[Tensor, " E"]:
+    """Return the horizontal distance of an entity's root from where its env starts, m; position stage."""
+    away_E3 = view.entity(entity).root_pos_EL - view.terrain.origins_E3
+    return torch.linalg.vector_norm(away_E3[:, :2], dim=-1)
+
+
+def mechanical_power(view: EnvView, joints: Patterns) -> Float[Tensor, " E"]:
+    """Return the sum over joints of |effort * velocity|, W: braking costs as much as driving.
+
+    Efforts belong to the last physics substep (acceleration stage), velocities to the state that it reached.
+    """
+    driven = view.joints(joints)
+    return (driven.effort_EL * driven.vel_EL).abs().sum(-1)
+
+
+def contact_force(view: EnvView, sensor: str) -> Float[Tensor, "E N"]:
+    """Return the magnitude of the net force on each element of a contact sensor, N; acceleration stage."""
+    return torch.linalg.vector_norm(view.contact(sensor).force_EN3, dim=-1)
+
+
+def foot_contact(view: EnvView, sensor: str, sites: Patterns) -> ContactState:
+    """Return the state of a contact sensor that has one element for each of `sites`.
+
+    Raises:
+        ValueError: if it has another number of elements: one alone would count for every foot.
+    """
+    contact, num_feet = view.contact(sensor), len(view.resolver.ids("site", sites))
+    if contact.found_EN.shape[-1] != num_feet:
+        raise ValueError(
+            f"sensor={sensor!r} has {contact.found_EN.shape[-1]} elements, and sites={sites!r} are {num_feet} feet: "
+            "give the sensor one geom or body per foot, in the order of the sites"
+        )
+    return contact
