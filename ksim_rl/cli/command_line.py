@@ -14,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ksim_rl import conf
 from ksim_rl.checks import unknown_name
-from ksim_rl.config.overrides import check_key
+from ksim_rl.config.overrides import check_parsed
 
 # A sweep over more combinations than this is checked in part here; each job checks its own config again.
 MAX_CHECKED_JOBS = 50
@@ -85,13 +85,11 @@ def _check_names(overrides: Sequence[Override], loader: ConfigLoader, name: str)
             # A group that is not in the defaults list, such as another package's, is added with "+".
             added = "+" if override.is_add() else ""
             choices.append(f"{added}{override.key_or_group}={_values(override)[0]}")
-        elif not override.is_add() and not override.is_hydra_override():
-            fields.append(override.key_or_group)
+        elif not override.is_hydra_override():
+            fields.append(override)
     tree = OmegaConf.to_container(hydra.compose(name, overrides=choices))
     assert isinstance(tree, dict)
-    for field in fields:
-        known = tree if "." in field else {**tree, **dict.fromkeys(groups)}
-        check_key({str(key): value for key, value in known.items()}, field)
+    check_parsed({**dict.fromkeys(groups), **{str(key): value for key, value in tree.items()}}, fields)
 
 
 def _groups(loader: ConfigLoader) -> list[str]:

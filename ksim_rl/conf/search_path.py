@@ -12,8 +12,8 @@ class DeclaredConfigs(SearchPathPlugin):
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         """Append them."""
-        for point in plugins.declared(plugins.CONF):
-            search_path.append(provider=f"ksim_rl.conf:{point.name}", path=f"pkg://{point.module}")
+        for origin, package in plugins.conf_packages():
+            search_path.append(provider=f"ksim_rl.conf:{origin}", path=f"pkg://{package}")
 
 
 def register() -> None:

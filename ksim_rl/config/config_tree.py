@@ -1,4 +1,4 @@
-"""Dataclasses to plain trees and back: what YAML and Hydra see, checked field by field on the way in.
+"""This module turns dataclasses into plain trees, which YAML and Hydra see, and builds them from checked trees.
 
 A tree is made of dicts, lists and scalars. A dataclass becomes a dict of its fields; where the annotation does not say
 which class it is (any term, any robot), the key `_target_` does. Only classes of allowed packages are ever imported
@@ -10,34 +10,48 @@ from __future__ import annotations
 import collections.abc
 import dataclasses
 import functools
-import importlib
 import operator
 import types
 import typing
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, TypeVar, Union
+from typing import Any, Literal, Self, TypeVar, Union
+
+from tensordict import NestedKey
 
 from ksim_rl.checks import near
-from ksim_rl.config import plugins
-
-TARGET = "_target_"
-_allowed_packages = {"ksim_rl"}
+from ksim_rl.config import class_paths
+from ksim_rl.config.class_paths import TARGET
 
 Config = TypeVar("Config")
 
 
-def allow_package(name: str) -> None:
-    """Let configs build the dataclasses of another package (its top-level name)."""
-    _allowed_packages.add(name)
+class OwnTree(ABC):
+    """Base of configs that are no dataclasses, and write and read their own trees."""
+
+    @abstractmethod
+    def to_tree(self) -> dict[str, Any]:
+        """Return the plain tree, with its `_target_`."""
+
+    @classmethod
+    @abstractmethod
+    def from_tree(cls, tree: Any, path: str) -> Self:
+        """Build the config that stands at `path`.
+
+        Raises:
+            ValueError: naming the full path of what is wrong.
+        """
 
 
 def to_tree(value: Any, annotation: Any = None) -> Any:
     """Return the plain tree of a dataclass, mapping, sequence or scalar."""
+    if isinstance(value, OwnTree):
+        return value.to_tree()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         hints = typing.get_type_hints(type(value))
         tree: dict[str, Any] = {}
         if type(value) is not _default_class(annotation):
-            tree[TARGET] = f"{type(value).__module__}.{type(value).__qualname__}"
+            tree[TARGET] = class_paths.public_path(type(value))
         for field in dataclasses.fields(value):
             tree[field.name] = to_tree(getattr(value, field.name), hints[field.name])
         return tree
@@ -75,10 +89,15 @@ def from_tree(annotation: type[Config], tree: Any, path: str = "") -> Config:
         ValueError: with the full path of the field that is unknown, missing, of a wrong type or out of range, and what
             would be valid.
     """
-    return _build(annotation, tree, path)
+    return build_value(annotation, tree, path)
 
 
-def _build(annotation: Any, value: Any, path: str) -> Any:
+def build_value(annotation: Any, value: Any, path: str) -> Any:
+    """Build what an annotation describes from a tree; `Any` takes it as it is.
+
+    Raises:
+        ValueError: as `from_tree`.
+    """
     if annotation is Any:
         return value
     alternatives = _alternatives(annotation)
@@ -86,7 +105,12 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
         return None
     alternatives = [option for option in alternatives if option is not type(None)]
     classes = [option for option in alternatives if isinstance(option, type) and not _is_scalar(option)]
-    if isinstance(value, Mapping) and (TARGET in value or any(dataclasses.is_dataclass(c) for c in classes)):
+    if len(classes) == 1 and issubclass(classes[0], OwnTree):
+        return classes[0].from_tree(value, path)
+    takes_mapping = any(typing.get_origin(option) in _MAPPINGS for option in alternatives)
+    if isinstance(value, Mapping) and (
+        TARGET in value or not takes_mapping and any(dataclasses.is_dataclass(c) for c in classes)
+    ):
         return _build_dataclass(classes, value, path)
     for option in alternatives:
         built = _match(option, value, path)
@@ -96,6 +120,7 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
 
 
 _NO_MATCH = object()
+_MAPPINGS = (collections.abc.Mapping, dict)
 
 
 def _match(option: Any, value: Any, path: str) -> Any:
@@ -106,31 +131,46 @@ def _match(option: Any, value: Any, path: str) -> Any:
         if not isinstance(value, (list, tuple)):
             return _NO_MATCH
         if len(arguments) == 2 and arguments[1] is Ellipsis:
-            return tuple(_build(arguments[0], entry, f"{path}[{i}]") for i, entry in enumerate(value))
+            return tuple(build_value(arguments[0], entry, f"{path}[{i}]") for i, entry in enumerate(value))
         if len(arguments) != len(value):
             return _NO_MATCH
         return tuple(
-            _build(a, entry, f"{path}[{i}]")
+            build_value(a, entry, f"{path}[{i}]")
             for i, (a, entry) in enumerate(zip(arguments, value, strict=True))
         )
-    if origin is collections.abc.Sequence:
+    if origin in (collections.abc.Sequence, list):
         if not isinstance(value, (list, tuple)):
             return _NO_MATCH
-        return tuple(_build(arguments[0], entry, f"{path}[{i}]") for i, entry in enumerate(value))
-    if origin in (collections.abc.Mapping, dict):
+        if arguments[0] == NestedKey:
+            # A tuple is one nested key, so several keys are a list.
+            return [_build_nested_key(entry, f"{path}[{i}]") for i, entry in enumerate(value)]
+        return tuple(build_value(arguments[0], entry, f"{path}[{i}]") for i, entry in enumerate(value))
+    if origin in _MAPPINGS:
         if not isinstance(value, Mapping):
             return _NO_MATCH
         return {
-            _build_key(arguments[0], k, path): _build(arguments[1], entry, f"{path}.{k}" if path else str(k))
+            _build_key(arguments[0], k, path): build_value(
+                arguments[1], entry, f"{path}.{k}" if path else str(k)
+            )
             for k, entry in value.items()
         }
     if option is bool or option is str:
         return value if isinstance(value, option) else _NO_MATCH
+    if option is NestedKey:
+        return _build_nested_key(value, path)
     if option is int:
         return value if isinstance(value, int) and not isinstance(value, bool) else _NO_MATCH
     if option is float:
         return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else _NO_MATCH
     return _NO_MATCH
+
+
+def _build_nested_key(value: Any, path: str) -> NestedKey:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, (list, tuple)) and value and all(isinstance(part, str) for part in value):
+        return tuple(value)
+    raise ValueError(f"{path}={value!r}: expected a key, or a list of the parts of a nested key")
 
 
 def _build_key(annotation: Any, key: object, path: str) -> Any:
@@ -145,7 +185,7 @@ def _build_key(annotation: Any, key: object, path: str) -> Any:
 def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> Any:
     cls: Any
     if TARGET in tree:
-        cls = _resolve_target(tree[TARGET], path)
+        cls = class_paths.find(tree[TARGET], path, kind="dataclass", accepts=dataclasses.is_dataclass)
         bases = [c for c in classes if not getattr(c, "_is_protocol", False)]
         if bases and not issubclass(cls, tuple(bases)):
             kinds = _describe(functools.reduce(operator.or_, bases))
@@ -163,7 +203,7 @@ def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> 
         where = f"{path}.{key}" if path else str(key)
         if key not in fields:
             raise ValueError(f"unknown field {where!r} of {cls.__name__}: {near(str(key), fields)}")
-        given[key] = _build(hints[key], entry, where)
+        given[key] = build_value(hints[key], entry, where)
     missing = [
         name
         for name, field in fields.items()
@@ -181,28 +221,6 @@ def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> 
         raise ValueError(f"{path}.{error}" if path else str(error)) from None
 
 
-def _resolve_target(target: object, path: str) -> type:
-    """Import the dataclass that a `_target_` names, if its package is allowed."""
-    module_name, _, class_name = str(target).rpartition(".")
-    allowed = _allowed_packages | plugins.packages()
-    if module_name.split(".")[0] not in allowed:
-        raise ValueError(
-            f"{path}.{TARGET}={target!r}: only classes of these packages are built: {', '.join(sorted(allowed))}. "
-            "`ksim_rl.envs.allow_package` or an entry point (see `ksim_rl.config.plugins`) adds one"
-        )
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError:
-        raise ValueError(f"{path}.{TARGET}={target!r}: no module {module_name!r}") from None
-    cls = getattr(module, class_name, None)
-    if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
-        names = [n for n, v in vars(module).items() if isinstance(v, type) and dataclasses.is_dataclass(v)]
-        raise ValueError(
-            f"{path}.{TARGET}={target!r}: no dataclass {class_name!r} there: {near(class_name, names)}"
-        )
-    return cls
-
-
 def _alternatives(annotation: Any) -> list[Any]:
     if typing.get_origin(annotation) in (Union, types.UnionType):
         return list(typing.get_args(annotation))
@@ -215,7 +233,7 @@ def _default_class(annotation: Any) -> Any:
 
 
 def _is_scalar(option: Any) -> bool:
-    return option in (bool, int, float, str)
+    return option in (bool, int, float, str, NestedKey)
 
 
 def _describe(annotation: Any) -> str:

@@ -1,29 +1,68 @@
-"""Checks Hydra overrides against a config tree before anything is composed."""
+"""This module checks Hydra overrides against a config tree before anything is composed."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
+import copy
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
+from omegaconf import OmegaConf
 
 from ksim_rl.checks import near
 
 
 def check_overrides(tree: Mapping[str, Any], overrides: Sequence[str]) -> None:
-    """Refuse overrides of fields that the tree does not have.
+    """Refuse overrides that do not parse, or that change a field which the tree does not have.
 
     Raises:
         ValueError: naming the override, and the near names at the level where its path leaves the tree.
     """
+    parsed = []
     for text in overrides:
         try:
-            override = OverridesParser.create().parse_override(text)
+            parsed.append(OverridesParser.create().parse_override(text))
         except HydraException as error:
             raise ValueError(f"override {text!r} does not parse: {str(error).splitlines()[0]}") from None
-        if not override.is_add():
-            check_key(tree, override.key_or_group)
+    check_parsed(tree, parsed)
+
+
+def check_parsed(tree: Mapping[str, Any], overrides: Iterable[Override]) -> None:
+    """Do the same with overrides that are parsed: each sees what the ones before it have added and dropped.
+
+    Raises:
+        ValueError: as `check_overrides`.
+    """
+    tree = copy.deepcopy(dict(tree))
+    for override in overrides:
+        key = override.key_or_group
+        if override.is_add() or override.is_force_add():
+            above = _node(tree, key.split(".")[:-1], make=True)
+            above[key.split(".")[-1]] = None if override.is_sweep_override() else _plain(override)
+            continue
+        check_key(tree, key)
+        if override.is_delete():
+            above = _node(tree, key.split(".")[:-1])
+            above.pop(key.split(".")[-1], None)
+        elif not override.is_sweep_override() and isinstance(value := _plain(override), dict):
+            _node(tree, key.split("."), make=True).update(value)
+
+
+def _plain(override: Override) -> Any:
+    tree: Any = OmegaConf.to_container(OmegaConf.create({"value": override.value()}))
+    return tree["value"]
+
+
+def _node(tree: dict[str, Any], path: Sequence[str], *, make: bool = False) -> dict[str, Any]:
+    """Return the mapping at a path, or an empty one where there is none: made in the tree with `make`."""
+    for name in path:
+        inside = tree.get(name)
+        if not isinstance(inside, dict):
+            inside = {}
+            if make:
+                tree[name] = inside
+        tree = inside
+    return tree
 
 
 def check_key(tree: Mapping[str, Any], key: str) -> None:

@@ -1,30 +1,38 @@
-"""Other packages' tasks, terms and configs, found through the entry points that they declare.
+"""This module finds and imports plug-ins: other packages' tasks, terms, robots, transforms, networks and algorithms.
 
-In the package's pyproject.toml:
+An installed package declares what it has in its pyproject.toml, and is then known to every command:
 
     [project.entry-points."ksim_rl.tasks"]
     my_robots = "my_robots.tasks"      # a module, or a package whose modules are all read
 
     [project.entry-points."ksim_rl.algorithms"]
-    my_robots = "my_robots.learning"   # the same
+    my_robots = "my_robots.learning"
 
     [project.entry-points."ksim_rl.conf"]
     my_robots = "my_robots.conf"       # a package of YAML files, laid out like ksim_rl/conf
 
-Each `Task` or `Algorithm` at the top level of such a module is registered. Declaring any of them also lets configs name
-the package's dataclasses (terms, robots, transforms) as `_target_`: who may be installed may also be built.
+Any other package is a plug-in where the user names it: `--plugin my_package` for one command, the environment variable
+`KSIM_RL_PLUGINS=my_package,other` for all. Its modules are imported at once, each `Task` and
+`Algorithm` at the top level of one is registered, its subpackage `conf`, where there is one, holds YAML files, and
+configs may name its classes as `_target_`.
+What a run folder or a checkpoint says is never a reason to import anything.
 """
 
-from __future__ import annotations
-
 import importlib
+import os
 import pkgutil
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from types import ModuleType
 
-TASKS, ALGORITHMS, CONF = "ksim_rl.tasks", "ksim_rl.algorithms", "ksim_rl.conf"
+TASKS, CONF, ALGORITHMS = "ksim_rl.tasks", "ksim_rl.conf", "ksim_rl.algorithms"
+VARIABLE = "KSIM_RL_PLUGINS"
+
+_named: list[str] = []
+_allowed: set[str] = set()
 
 
 @cache
@@ -33,37 +41,95 @@ def declared(group: str) -> tuple[EntryPoint, ...]:
     return tuple(sorted(entry_points(group=group), key=lambda point: (point.name, point.value)))
 
 
+def allow_package(name: str) -> None:
+    """Let configs build the classes of another package (its top-level name)."""
+    _allowed.add(name)
+
+
+def load(names: Sequence[str]) -> None:
+    """Import the plug-ins that a command or a caller names, with those of `KSIM_RL_PLUGINS`.
+
+    Packages of the working directory are found too, after installed ones. Processes that this one starts load the same
+    plug-ins, as the environment variable takes up the names.
+
+    Raises:
+        ValueError: if one cannot be imported; the message names it.
+    """
+    wanted = [*os.environ.get(VARIABLE, "").split(","), *names]
+    for name in dict.fromkeys(name.strip() for name in wanted if name.strip()):
+        if name in _named:
+            continue
+        if os.getcwd() not in sys.path and "" not in sys.path:
+            sys.path.append(os.getcwd())
+        _import(f"plug-in {name!r}", name, "correct the name, or install the package")
+        _named.append(name)
+    if _named:
+        os.environ[VARIABLE] = ",".join(_named)
+
+
+def named() -> tuple[str, ...]:
+    """Return the plug-ins that were named so far, in that order."""
+    return tuple(_named)
+
+
 def packages() -> frozenset[str]:
-    """Return the top-level packages that declare an entry point of ours; nothing is imported."""
-    return frozenset(
-        point.module.split(".")[0] for group in (TASKS, ALGORITHMS, CONF) for point in declared(group)
-    )
+    """Return the top-level packages whose classes configs may name, beside our own; nothing is imported."""
+    points = (point.module for group in (TASKS, CONF, ALGORITHMS) for point in declared(group))
+    return frozenset(name.split(".")[0] for name in (*points, *_named)) | _allowed
+
+
+def hint(package: str) -> str:
+    """Return what a user who trusts a package does so that configs may name its classes."""
+    return f"If you trust {package!r}, add --plugin {package} (in Python: plugins=[{package!r}])"
+
+
+def check_remembered(names: Sequence[str]) -> None:
+    """Refuse a run whose plug-ins nobody named, allowed or installed here.
+
+    Raises:
+        ValueError: with the flag that names the plug-in.
+    """
+    for name in names:
+        package = str(name).split(".")[0]
+        if package not in packages():
+            raise ValueError(
+                f"this run was made with the plug-in {name!r}, which is not loaded. {hint(str(name))}"
+            )
 
 
 def modules(group: str) -> Iterator[tuple[str, ModuleType]]:
-    """Import the modules that a group of entry points names, with the origin of each for messages.
+    """Import the modules that a group of entry points names, and the plug-ins, with the origin of each for messages.
 
     Raises:
         ValueError: if one cannot be imported; the message names the package.
     """
     for point in declared(group):
         origin = f"entry point {point.name} = {point.value!r} of {_distribution(point)}"
-        try:
-            module = importlib.import_module(point.module)
-            for name in _modules(module):
-                yield origin, importlib.import_module(name)
-        except Exception as error:
-            raise ValueError(
-                f"{origin} cannot be loaded: {type(error).__name__}: {error}; mend or uninstall that package"
-            ) from error
+        for module in _import(origin, point.module, "mend or uninstall that package"):
+            yield origin, module
+    for name in _named:
+        for module in _import(f"plug-in {name!r}", name, "mend that package"):
+            yield f"plug-in {name!r}", module
 
 
-def _modules(module: ModuleType) -> list[str]:
-    inside = getattr(module, "__path__", None)
-    children = (
-        [] if inside is None else [info.name for info in pkgutil.iter_modules(inside, f"{module.__name__}.")]
-    )
-    return [module.__name__, *children]
+def conf_packages() -> Iterator[tuple[str, str]]:
+    """Yield the packages with YAML configs: an origin for messages, and the package."""
+    for point in declared(CONF):
+        yield point.name, point.module
+    for name in _named:
+        if "__path__" in vars(sys.modules[name]) and find_spec(f"{name}.conf") is not None:
+            yield name, f"{name}.conf"
+
+
+def _import(origin: str, name: str, fix: str) -> list[ModuleType]:
+    """Import a module and, if it is a package, those directly in it."""
+    try:
+        module = importlib.import_module(name)
+        inside = vars(module).get("__path__", ())
+        found = (info.name for info in pkgutil.iter_modules(inside) if info.name != "__main__")
+        return [module, *(importlib.import_module(f"{name}.{child}") for child in found)]
+    except Exception as error:
+        raise ValueError(f"{origin} cannot be loaded: {type(error).__name__}: {error}; {fix}") from error
 
 
 def _distribution(point: EntryPoint) -> str:

@@ -1,6 +1,7 @@
 """The env, its terms, its transforms and its tasks."""
 
-from ksim_rl.config.config_tree import allow_package, from_tree, to_tree
+from ksim_rl.config.config_tree import from_tree, to_tree
+from ksim_rl.config.plugins import allow_package
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
@@ -32,6 +33,7 @@ from ksim_rl.scene.state.entity import Entity
 from ksim_rl.scene.terrains import PlaneTerrain, TerrainGrid
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
+from ksim_rl.transforms.transform_cfg import TransformCfg
 
 __all__ = [
     "ActionTerm",
@@ -63,6 +65,7 @@ __all__ = [
     "Task",
     "TerminationTerm",
     "TerrainGrid",
+    "TransformCfg",
     "ViewerCfg",
     "allow_package",
     "build",

@@ -10,6 +10,11 @@ from typing import TYPE_CHECKING, Any
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from torchrl.envs.transforms import Transform
+
+from ksim_rl.transforms.groups.compile_groups import compile_groups
+from ksim_rl.transforms.groups.group_spec import spell
+from ksim_rl.transforms.transform_cfg import TransformCfg
 
 if TYPE_CHECKING:
     from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
@@ -109,6 +114,23 @@ def _tables(env: ManagerBasedRlEnv) -> Iterable[Table]:
 
     rows = [(name, term.reduce, _described(term, ("reduce",))) for name, term in cfg.metrics.items()]
     yield _table("metrics", ("term", "reduced by", "parameters"), rows)
+
+    of_groups = compile_groups(cfg.observations)
+    rows = [("(groups)", _keys(transform), type(transform).__name__) for transform in of_groups]
+    rows += [(name, _keys(each.build()), _call(each)) for name, each in cfg.transforms.items()]
+    yield _table("transforms (actions pass them from last to first)", ("term", "keys", "parameters"), rows)
+
+
+def _keys(transform: Transform) -> str:
+    """Return what a transform reads and, where that is elsewhere, writes."""
+    keys = [[*transform.in_keys, *transform.in_keys_inv], [*transform.out_keys, *transform.out_keys_inv]]
+    reads, writes = (", ".join(map(spell, part)) for part in keys)
+    return reads if reads == writes else f"{reads} -> {writes}"
+
+
+def _call(described: TransformCfg) -> str:
+    parts = (f"{name}={_shown(value)}" for name, value in described.given().items())
+    return f"{described.transform.__name__}({', '.join(parts)})"
 
 
 def _table(title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:

@@ -19,6 +19,7 @@ from ksim_rl.physics import SimCfg
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg
+from ksim_rl.transforms.transform_cfg import TransformCfg
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +45,8 @@ class ManagerBasedRlEnvCfg:
         metrics: values per step that are reduced over the episode.
         is_finite_horizon: False: a time-out is `truncated`, and its value is bootstrapped; True: it is `terminated`.
         scale_rewards_by_dt: True: rewards are per second and are multiplied by the env step's seconds.
+        transforms: what `envs.make` appends, in this order, to the transforms of the groups. What the env emits passes
+            them from the first to the last, and an action from the last to the first.
     """
 
     decimation: int
@@ -62,6 +65,7 @@ class ManagerBasedRlEnvCfg:
     metrics: Mapping[str, MetricTerm] = field(default_factory=dict)
     is_finite_horizon: bool = False
     scale_rewards_by_dt: bool = True
+    transforms: Mapping[str, TransformCfg] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if isinstance(self.decimation, bool) or not isinstance(self.decimation, int) or self.decimation < 1:
@@ -75,6 +79,12 @@ class ManagerBasedRlEnvCfg:
             )
         if not self.actions:
             raise ValueError("actions={}: name at least one action term")
+        for name, transform in self.transforms.items():
+            if not isinstance(transform, TransformCfg):
+                raise ValueError(
+                    f"transforms.{name}={transform!r}: each env builds its own, so give "
+                    "TransformCfg(<class>, <arguments>)"
+                )
         timed = [name for name, term in self.terminations.items() if term.time_out]
         if timed and self.episode_length_s == 0.0:
             raise ValueError(

@@ -24,14 +24,19 @@ from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
 from ksim_rl.envs.task import Task
 from ksim_rl.transforms.groups.compile_groups import compile_groups
+from ksim_rl.transforms.level import follow_level
 
 _CONFIG = "ksim_rl_env"
 # Imported by name when tasks are first asked for: they stand above this room and import it.
 OWN_TASKS = "ksim_rl.tasks"
 
 
-@cache
 def _tasks() -> dict[str, Task]:
+    return _tasks_with(plugins.named())
+
+
+@cache
+def _tasks_with(_named: tuple[str, ...]) -> dict[str, Task]:
     """Import all task modules once, ours and those of other packages, and collect their `Task`s."""
     found: dict[str, tuple[str, Task]] = {}
     for origin, module in (*_own_modules(), *plugins.modules(plugins.TASKS)):
@@ -69,10 +74,14 @@ def task(name: str) -> Task:
     return tasks[name]
 
 
-@cache
 def register_configs() -> None:
     """Store each task's config tree in Hydra's config group `task`."""
-    for name in names():
+    _register(tuple(names()))
+
+
+@cache
+def _register(names: tuple[str, ...]) -> None:
+    for name in names:
         stored_configs.store("task", name, partial(_tree, name))
     ConfigStore.instance().store(name=_CONFIG, node={"defaults": [{"task": "???"}, "_self_"]})
 
@@ -104,9 +113,25 @@ def build(
     device: str | torch.device = "cpu",
     render_mode: str | None = None,
 ) -> MaskedTransformedEnv:
-    """Build the env of a config, with the transforms that its observation groups ask for."""
+    """Build the env of a config, with the transforms that its observation groups ask for and its own after them.
+
+    Raises:
+        ValueError: naming the transform that does not fit the env.
+    """
     base_env = ManagerBasedRlEnv(cfg, device=device, render_mode=render_mode)
-    env = MaskedTransformedEnv(base_env, compile_groups(cfg.observations, level=base_env.view.level))
+    level = base_env.view.level
+    env = MaskedTransformedEnv(base_env, compile_groups(cfg.observations, level=level))
+    for name, described in cfg.transforms.items():
+        transform = described.build()
+        follow_level([transform], level)
+        try:
+            env.append_transform(transform)
+            assert (
+                env.output_spec is not None and env.input_spec is not None
+            )  # made, which shows what does not fit
+        except (KeyError, ValueError, RuntimeError, TypeError) as error:
+            reason = error.args[0] if isinstance(error, KeyError) and error.args else error
+            raise ValueError(f"task.transforms.{name}: {reason}") from error
     seed = base_env.cfg.seed
     assert seed is not None  # an env stores the seed that it drew
     env.seed(seed)

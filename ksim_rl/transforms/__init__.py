@@ -44,6 +44,7 @@ from ksim_rl.transforms.reward_scale import RewardScale
 from ksim_rl.transforms.scale import ObservationScale
 from ksim_rl.transforms.success_tracker import SuccessTracker
 from ksim_rl.transforms.time_aware import TimeAwareObservation
+from ksim_rl.transforms.transform_cfg import TransformCfg
 
 __all__ = [
     "AXIAL",
@@ -79,6 +80,7 @@ __all__ = [
     "RewardScale",
     "SuccessTracker",
     "TimeAwareObservation",
+    "TransformCfg",
     "UniformNoise",
     "compile_groups",
     "follow_level",

@@ -10,7 +10,7 @@ from torchrl.data import Bounded, Composite
 from ksim_rl import checks
 from ksim_rl.device import random
 from ksim_rl.transforms.keyed_transform import KeyedTransform
-from ksim_rl.transforms.row_transform import as_keys
+from ksim_rl.transforms.row_transform import Keys, as_keys
 from ksim_rl.transforms.specs import (
     Device,
     bounded,
@@ -53,7 +53,7 @@ class RandomCommandCurriculum(KeyedTransform):
 
     def __init__(
         self,
-        in_keys: list[NestedKey] | NestedKey = "reward",
+        in_keys: Keys = "reward",
         out_keys: Sequence[NestedKey] = ("command", "command_level"),
         *,
         start: Ranges,

@@ -59,6 +59,11 @@ def test_each_manager_is_a_table_of_its_terms():
         "events": ["0 launch reset Launch(speed=2)", "1 kick interval 1 s Kick()"],
         "curriculum": ["0 level 0.25 LinearLevel(initial_level=0.25, end_step=8)"],
         "metrics": ["0 speed max Speed()"],
+        "transforms (actions pass them from last to first)": [
+            "0 (groups) obs/position -> actor_terms/position ObservationNoise",
+            "1 (groups) actor_terms/position ObservationHistory",
+            "2 (groups) actor_terms/position, obs/target -> actor ObservationGroups",
+        ],
     }
 
 

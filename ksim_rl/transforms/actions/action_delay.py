@@ -30,7 +30,7 @@ class ActionDelay(LaggedTransform):
 
     def __init__(
         self,
-        in_keys_inv: Keys = ("action",),
+        in_keys_inv: Keys = "action",
         out_keys_inv: Keys | None = None,
         *,
         delay: DelayCfg,

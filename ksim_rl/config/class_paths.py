@@ -1,0 +1,93 @@
+"""This module spells classes in configs by public paths, and finds the class of a path, also of one that 0.1 wrote."""
+
+import importlib
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from ksim_rl.checks import near
+from ksim_rl.config import plugins
+
+TARGET = "_target_"
+OWN = "ksim_rl"
+
+MOVED = {
+    "ksim_rl.envs.actuators": "ksim_rl.scene.actuators",
+    "ksim_rl.envs.mdp": "ksim_rl.mdp",
+    "ksim_rl.envs.objects": "ksim_rl.scene.objects",
+    "ksim_rl.envs.robots": "ksim_rl.scene.robots",
+    "ksim_rl.envs.sensors": "ksim_rl.scene.sensors",
+    "ksim_rl.envs.tasks": "ksim_rl.tasks",
+    "ksim_rl.envs.terrains": "ksim_rl.scene.terrains",
+    "ksim_rl.envs.transforms": "ksim_rl.transforms",
+}
+"""Packages of 0.1 and where their classes are now; modules inside them are found by the package's exports."""
+
+
+def public_path(cls: type) -> str:
+    """Return the shortest path that leads to a class, so that files which move inside a room change no config."""
+    parts = cls.__module__.split(".")
+    if parts[0] == OWN:
+        for end in range(2, len(parts)):
+            package = ".".join(parts[:end])
+            if vars(sys.modules[package]).get(cls.__qualname__) is cls:
+                return f"{package}.{cls.__qualname__}"
+    return f"{cls.__module__}.{cls.__qualname__}"
+
+
+def find(
+    target: object,
+    path: str,
+    *,
+    kind: str,
+    accepts: Callable[[Any], bool],
+    besides: frozenset[str] = frozenset(),
+) -> Any:
+    """Import the class that a `_target_` names, if its package is allowed.
+
+    Args:
+        target: the dotted path of a class.
+        path: where it stands in the config, for errors.
+        kind: what is looked for, for errors.
+        accepts: whether a class is of that kind.
+        besides: packages that are allowed here beside ours and those of plug-ins.
+
+    Raises:
+        ValueError: if the package is not allowed, or has no such class, with the near names.
+    """
+    module_name, _, class_name = str(target).rpartition(".")
+    where = f"{path}.{TARGET}={target!r}"
+    package = module_name.split(".")[0]
+    allowed = plugins.packages() | {OWN} | besides
+    if package not in allowed:
+        raise ValueError(
+            f"{where}: only classes of these packages are built: {', '.join(sorted(allowed))}. {plugins.hint(package)}"
+        )
+    names: list[str] = []
+    for candidate in _modules(module_name):
+        try:
+            module = importlib.import_module(candidate)
+        except ModuleNotFoundError as error:
+            if not candidate.startswith(str(error.name)):
+                raise ValueError(
+                    f"{where}: {candidate} needs {error.name!r}, which is not installed"
+                ) from error
+            continue
+        found = vars(module).get(class_name)
+        if isinstance(found, type) and accepts(found):
+            return found
+        names += [name for name, value in vars(module).items() if isinstance(value, type) and accepts(value)]
+    if not names:
+        raise ValueError(f"{where}: no module {module_name!r} with a {kind}")
+    raise ValueError(f"{where}: no {kind} {class_name!r} there: {near(class_name, names)}")
+
+
+def _modules(name: str) -> list[str]:
+    """Return the module of a path and, for ours, where its classes may have moved to: the packages above it."""
+    if name.split(".")[0] != OWN:
+        return [name]
+    moved = next(
+        (name.replace(old, new, 1) for old, new in MOVED.items() if f"{name}.".startswith(f"{old}.")), name
+    )
+    parts = moved.split(".")
+    return list(dict.fromkeys([name, *(".".join(parts[:end]) for end in range(len(parts), 1, -1))]))
