@@ -20,6 +20,8 @@ usage: ksim-rl <command> [arguments]
   envs     list the tasks, or print what one is made of: ksim-rl envs cartpole_swingup
 
 RUN is a run folder (its newest checkpoint) or one of its checkpoints.
+--plugin PACKAGE, with any command and repeatable, imports a package of yours: its tasks, and the terms, robots,
+transforms, networks and algorithms that configs name. KSIM_RL_PLUGINS=PACKAGE,... does so for all commands.
 `ksim-rl <command> --help` tells more. KSIM_RL_TRACEBACK=1 shows the traceback of an error.
 
 exit codes: 0 done (and solved, or its target met, where there is one), 1 not solved, 2 refused: the command or its
@@ -56,16 +58,35 @@ def _dispatch(arguments: list[str]) -> int:
 
         raise unknown_name("command", command, COMMANDS)
     # Imported here, so that usage and mistyped commands answer at once.
+    rest, names = _without_plugins(rest)
     with collector_off():
         from ksim_rl.cli import run_commands
         from ksim_rl.cli.train import train
         from ksim_rl.cli.warmup import warmup
+        from ksim_rl.config import plugins
 
+        plugins.load(names)
     if command == "train":
         return train(rest)
     if command == "warmup":
         return warmup(rest)
     return run_commands.run_command(command, rest)
+
+
+def _without_plugins(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Take `--plugin NAME` and `--plugin=NAME` out of a command's arguments; return those left, and the names."""
+    left, names = [], []
+    following = iter(arguments)
+    for argument in following:
+        flag, equals, name = argument.partition("=")
+        if flag != "--plugin":
+            left.append(argument)
+            continue
+        name = name if equals else next(following, "")
+        if not name or name.startswith("-"):
+            raise ValueError("--plugin: expected the name of a package after it")
+        names.append(name)
+    return left, names
 
 
 @contextmanager

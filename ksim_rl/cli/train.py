@@ -18,6 +18,7 @@ from ksim_rl import conf
 from ksim_rl.cli.command_line import check_command_line
 from ksim_rl.cli.errors import report
 from ksim_rl.cli.report import run_and_report
+from ksim_rl.config import plugins
 from ksim_rl.trainers import RunCfg
 
 
@@ -86,6 +87,7 @@ def _job_of_a_multirun() -> str:
 
 
 def _train_one(config: DictConfig) -> int:
+    plugins.load(())  # those of the environment, where a launcher runs the job in a process of its own
     plain: Any = OmegaConf.to_container(config, resolve=True)
     cfg = RunCfg.from_tree(plain)
     cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))

@@ -14,7 +14,7 @@ from yaml import YAMLError
 from ksim_rl import algorithms, envs
 from ksim_rl.conf import choices, search_path
 from ksim_rl.conf.training import objective_defaults, training_defaults
-from ksim_rl.config import stored_configs
+from ksim_rl.config import plugins, stored_configs
 from ksim_rl.trainers import RunCfg
 
 MODULE, NAME = "ksim_rl.conf", "train"
@@ -40,12 +40,16 @@ def compose_within(overrides: Sequence[str], *, name: str = NAME) -> RunCfg:
     return RunCfg.from_tree({str(key): value for key, value in plain.items()})
 
 
-@cache
 def register() -> None:
     """Let Hydra find other packages' configs, and store the groups' choices, the tasks and their training defaults.
 
     The last go to the groups `task`, `task/training` (what holds for any objective) and `task/objective_training`.
     """
+    _register(plugins.named())
+
+
+@cache
+def _register(_named: tuple[str, ...]) -> None:
     search_path.register()
     envs.register_configs()
     store = partial(stored_configs.store, package="_global_")

@@ -91,3 +91,33 @@ def _modules(name: str) -> list[str]:
     )
     parts = moved.split(".")
     return list(dict.fromkeys([name, *(".".join(parts[:end]) for end in range(len(parts), 1, -1))]))
+
+
+def foreign(tree: Any) -> list[str]:
+    """Return the `_target_`s in a tree that are neither ours nor TorchRL's, each once, in order."""
+    found: dict[str, None] = {}
+    entries = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ()
+    if isinstance(tree, dict) and str(tree.get(TARGET, OWN)).split(".")[0] not in (OWN, "torchrl"):
+        found[str(tree[TARGET])] = None
+    for entry in entries:
+        found.update(dict.fromkeys(foreign(entry)))
+    return list(found)
+
+
+def loading_notes(tree: Any) -> list[str]:
+    """Return one line for each foreign package of a tree whose classes a later command does not find by itself."""
+    notes: dict[str, str] = {}
+    known = plugins.declared_packages() | {name.split(".")[0] for name in plugins.named()}
+    for target in foreign(tree):
+        package = target.split(".")[0]
+        if package == "__main__" or "<locals>" in target:
+            notes[target] = (
+                f"this run names {target}, which no other process can import: `ksim-rl` will not be able to load its "
+                "checkpoints; move the class to a module of a package"
+            )
+        elif package not in known:
+            notes.setdefault(
+                package,
+                f"this run names {target}: to load its checkpoints, give `ksim-rl` --plugin {package}",
+            )
+    return list(notes.values())

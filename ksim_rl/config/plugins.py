@@ -72,10 +72,15 @@ def named() -> tuple[str, ...]:
     return tuple(_named)
 
 
-def packages() -> frozenset[str]:
-    """Return the top-level packages whose classes configs may name, beside our own; nothing is imported."""
+def declared_packages() -> frozenset[str]:
+    """Return the top-level packages that declare an entry point of ours; nothing is imported."""
     points = (point.module for group in (TASKS, CONF, ALGORITHMS) for point in declared(group))
-    return frozenset(name.split(".")[0] for name in (*points, *_named)) | _allowed
+    return frozenset(name.split(".")[0] for name in points)
+
+
+def packages() -> frozenset[str]:
+    """Return the top-level packages whose classes configs may name, beside our own."""
+    return declared_packages() | _allowed | {name.split(".")[0] for name in _named}
 
 
 def hint(package: str) -> str:

@@ -9,6 +9,7 @@ import torch
 
 from ksim_rl.checks import near
 from ksim_rl.collectors import CollectorCfg
+from ksim_rl.config import class_paths, plugins
 from ksim_rl.config.config_tree import from_tree, to_tree
 from ksim_rl.data import DatasetCfg, ReplayCfg, sequence_length
 from ksim_rl.envs import ManagerBasedRlEnvCfg
@@ -30,6 +31,7 @@ from ksim_rl.trainers.trainer_cfg import TrainerCfg
 
 # Seeds of evaluations lie above a run's own, and must fit 64 bits as well.
 MOST_SEED = 2**62
+PLUGINS = "plugins"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,13 +182,20 @@ class RunCfg(TrainingCfg):
         """Build the config from plain data, such as a resolved Hydra config or what an earlier version wrote.
 
         Raises:
-            ValueError: with the full path of the field that is unknown, missing, of a wrong type or out of range.
+            ValueError: with the full path of the field that is unknown, missing, of a wrong type or out of range; or
+                with the plug-in that the run needs and nobody named.
         """
-        return from_tree(cls, up_to_date(tree))
+        plugins.check_remembered(tree.get(PLUGINS) or ())
+        return from_tree(cls, up_to_date({key: value for key, value in tree.items() if key != PLUGINS}))
 
     def to_tree(self) -> dict[str, Any]:
-        """Return the config as plain data, from which `from_tree` builds an equal one."""
-        return to_tree(self, type(self))
+        """Return the config as plain data, from which `from_tree` builds an equal one.
+
+        Beside the fields it names the plug-ins of this process and of the classes in the config.
+        """
+        tree = to_tree(self, type(self))
+        needed = [*plugins.named(), *(target.split(".")[0] for target in class_paths.foreign(tree))]
+        return {**tree, PLUGINS: list(dict.fromkeys(needed))} if needed else tree
 
     def resolved_device(self) -> torch.device:
         """Return the device that "auto" stands for here."""

@@ -10,6 +10,8 @@ from pathlib import Path
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
+from ksim_rl.config.class_paths import loading_notes
+from ksim_rl.config.plugins import load as load_plugins
 from ksim_rl.device.memory import memory_for
 from ksim_rl.trainers import checkpoint, video
 from ksim_rl.trainers.algorithm import make_policy
@@ -52,6 +54,8 @@ def run(
             for the number of envs.
     """
     run_folder.mkdir(parents=True, exist_ok=True)
+    for note in loading_notes(cfg.to_tree()):
+        progress.note(note)
     checkpoint.remove_leftovers(run_folder / "checkpoint")
     # The graphs that the first iterations record take memory as well.
     with memory_for(cfg.num_envs, cfg.resolved_device()):
@@ -74,13 +78,19 @@ def run(
     return outcome
 
 
-def load_policy(path: Path, *, device: str = "auto") -> Policy:
+def load_policy(path: Path, *, device: str = "auto", plugins: Sequence[str] = ()) -> Policy:
     """Rebuild the policy of a checkpoint, or of the newest one in a run folder.
+
+    Args:
+        path: of a run folder or a checkpoint.
+        device: "cpu", "cuda", "cuda:<index>" or "auto".
+        plugins: packages to import first, whose classes the run's config may then name.
 
     Raises:
         CheckpointError: when there is none, or it is damaged.
         ValueError: when its config does not fit this version, or makes other observations.
     """
+    load_plugins(plugins)
     saved = checkpoint.load(checkpoint.latest(path))
     cfg = RunCfg.from_tree({**saved.config, "device": device})
     env = build_env(cfg, num_envs=1, seed=cfg.seed)

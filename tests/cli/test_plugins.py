@@ -1,0 +1,139 @@
+"""A package of the user's: named on the command line, remembered by the run folder, imported only where it is named."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+import yaml
+
+from ksim_rl.trainers import load_policy
+from tests.cli.test_train import SMALL
+
+PACKAGE = {
+    "__init__.py": "",
+    "__main__.py": "raise SystemExit('a plug-in is imported, not run')",
+    "terms.py": """
+from dataclasses import dataclass
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torchrl.envs.transforms import Transform
+from ksim_rl.envs import EnvView, RewardTerm
+
+@dataclass(frozen=True, kw_only=True)
+class Alive(RewardTerm):
+    weight: float = 1.0
+    bonus: float
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        return torch.full((view.num_envs,), self.bonus, device=view.device)
+
+class Negate(Transform):
+    def __init__(self, key: str = "actor") -> None:
+        super().__init__(in_keys=[key], out_keys=[key])
+
+    def _apply_transform(self, obs):
+        return -obs
+
+    def _reset(self, tensordict, tensordict_reset):
+        return self._call(tensordict_reset)
+""",
+    "tasks.py": """
+import dataclasses
+from ksim_rl import envs
+
+def cfg():
+    return envs.task("cartpole_swingup").cfg()
+
+MINE = dataclasses.replace(envs.task("cartpole_swingup"), name="my_swingup", cfg=cfg, solved_at=None)
+""",
+    "conf/__init__.py": "",
+    "conf/experiment/brief.yaml": "# @package _global_\ntrainer:\n  num_iterations: 1\n",
+}
+NODES = (
+    "+task.rewards.alive={_target_: mine_of_test.terms.Alive, bonus: 0.5}",
+    "+task.transforms.negate={_target_: mine_of_test.terms.Negate}",
+)
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """Make a working directory with the package in it, not installed."""
+    folder = tmp_path_factory.mktemp("work")
+    for name, text in PACKAGE.items():
+        path = folder / "mine_of_test" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return folder
+
+
+def ksim_rl(work, *arguments, **environment):
+    # As the console script does it: unlike with -m, the working directory is not on the path.
+    code = "import sys; from ksim_rl.cli.main import main; sys.path.remove(''); main()"
+    command = [sys.executable, "-c", code, *arguments]
+    given = {**os.environ, "PYTHONPATH": os.getcwd(), **environment}
+    return subprocess.run(command, cwd=work, env=given, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def trained(work):
+    arguments = [
+        "task=my_swingup",
+        "+experiment=brief",
+        *NODES,
+        *SMALL,
+        "trainer.video=false",
+        "hydra.run.dir=run",
+    ]
+    done = ksim_rl(work, "train", "--plugin", "mine_of_test", *arguments)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return work / "run"
+
+
+def test_its_classes_task_and_configs_are_used_and_its_name_is_remembered(trained):
+    config = yaml.safe_load((trained / "config.yaml").read_text())
+    assert config["plugins"] == ["mine_of_test"]
+    assert config["task_name"] == "my_swingup"
+    assert config["trainer"]["num_iterations"] == 1
+    assert config["task"]["rewards"]["alive"]["_target_"] == "mine_of_test.terms.Alive"
+    assert list(config["task"]["transforms"]) == ["negate"]
+
+
+@pytest.mark.parametrize("command", ["eval", "resume", "play"])
+def test_a_remembered_plug_in_is_not_imported_until_it_is_named(work, trained, command):
+    done = ksim_rl(work, command, "run")
+    assert done.returncode == 2
+    assert "this run was made with the plug-in 'mine_of_test', which is not loaded" in done.stderr
+    assert "--plugin mine_of_test" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_it_is_named_by_the_flag_or_by_the_users_settings(work, trained):
+    done = ksim_rl(work, "eval", "run", "--episodes", "2", "--plugin=mine_of_test")
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "my_swingup, iteration 1" in done.stdout
+    done = ksim_rl(work, "envs", KSIM_RL_PLUGINS="mine_of_test")
+    assert "my_swingup" in done.stdout
+
+
+def test_a_plug_in_that_does_not_exist_is_refused(work):
+    done = ksim_rl(work, "envs", "--plugin", "mine_of_tset")
+    assert (done.returncode, len(done.stderr.strip().splitlines())) == (2, 1)
+    assert "plug-in 'mine_of_tset' cannot be loaded" in done.stderr
+    assert "--plugin: expected the name" in ksim_rl(work, "envs", "--plugin").stderr
+
+
+def test_python_names_it_for_a_policy(work, trained, monkeypatch):
+    monkeypatch.chdir(work)
+    monkeypatch.syspath_prepend(str(work))
+    monkeypatch.setenv("KSIM_RL_PLUGINS", "")
+    with pytest.raises(ValueError, match="--plugin mine_of_test"):
+        load_policy(trained, device="cpu")
+    from ksim_rl.config import plugins
+
+    monkeypatch.setattr(plugins, "_named", [])
+    policy = load_policy(trained, device="cpu", plugins=["mine_of_test"])
+    assert type(policy.cfg.task.rewards["alive"]).__name__ == "Alive"
+    assert all(torch.isfinite(p).all() for p in policy.actor.parameters())

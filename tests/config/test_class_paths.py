@@ -1,0 +1,51 @@
+"""Paths of classes in configs: public ones now, and those that 0.1 wrote."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ksim_rl import envs
+from ksim_rl.config import class_paths
+from ksim_rl.envs import ManagerBasedRlEnvCfg, from_tree, to_tree
+
+
+def targets(tree):
+    if isinstance(tree, dict):
+        return (
+            {tree["_target_"]}
+            if set(tree) == {"_target_"}
+            else {
+                *([tree["_target_"]] if "_target_" in tree else []),
+                *(t for v in tree.values() for t in targets(v)),
+            }
+        )
+    return {t for v in tree for t in targets(v)} if isinstance(tree, list) else set()
+
+
+def test_configs_name_classes_by_public_paths():
+    tree = to_tree(envs.task("go1_velocity_flat").cfg(), ManagerBasedRlEnvCfg)
+    assert tree["rewards"]["track_linear_velocity"]["_target_"] == "ksim_rl.mdp.TrackLinearVelocity"
+    assert {t.rpartition(".")[0] for t in targets(tree)} <= {
+        "ksim_rl.mdp", "ksim_rl.transforms", "ksim_rl.scene.robots", "ksim_rl.scene.sensors", "ksim_rl.scene.terrains",
+        "ksim_rl.scene.actuators",
+    }  # fmt: skip
+
+
+OLD = (Path(__file__).parent / "targets_of_0_1.txt").read_text().split()
+RUNS = json.loads((Path(__file__).parent / "runs_of_0_1.json").read_text())
+
+
+@pytest.mark.parametrize("target", OLD)
+def test_each_path_that_0_1_wrote_leads_to_its_class(target):
+    found = class_paths.find(target, "x", kind="class", accepts=lambda value: True)
+    assert found.__name__ == target.rpartition(".")[2]
+    assert (
+        class_paths.find(class_paths.public_path(found), "x", kind="class", accepts=lambda value: True)
+        is found
+    )
+
+
+@pytest.mark.parametrize("name", sorted(RUNS))
+def test_a_task_config_that_0_1_wrote_builds_the_same_task(name):
+    assert from_tree(ManagerBasedRlEnvCfg, RUNS[name]) == envs.make_cfg(name)
