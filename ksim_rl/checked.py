@@ -1,0 +1,146 @@
+"""Config dataclasses that inherit `Checked` hold, once built, what the annotations of their fields say.
+
+Bounds stand in the annotation: `stiffness: Positive`, `share: Share = 0.5`, `x: Annotated[float, Within(high=3.0)]`.
+Only what relates several fields to each other needs a `__post_init__`, which calls `super().__post_init__()` first.
+"""
+
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import Annotated, Any, Literal
+
+from ksim_rl.checks import check_choice, check_in_range, check_pair
+
+
+@dataclass(frozen=True)
+class Within:
+    """Bounds of a number, or of each number of a tuple: `[low, high]`, `(low, high]` with `low_open`.
+
+    `ordered` says that a pair is a range, whose first number must not exceed the second.
+    """
+
+    low: float | None = None
+    high: float | None = None
+    low_open: bool = False
+    ordered: bool = False
+
+    def check(self, field: str, value: Any) -> None:
+        """Refuse what is outside, by a ValueError that names the field and the bounds; None passes."""
+        if value is None:
+            return
+        if self.ordered:
+            check_pair(field, value, low=self.low, high=self.high)
+        elif isinstance(value, (list, tuple)):
+            for index, number in enumerate(value):
+                self.check(f"{field}[{index}]", number)
+        else:
+            check_in_range(field, value, low=self.low, high=self.high, low_open=self.low_open)
+
+
+Positive = Annotated[float, Within(low=0.0, low_open=True)]
+NonNegative = Annotated[float, Within(low=0.0)]
+Share = Annotated[float, Within(low=0.0, high=1.0)]
+Count = Annotated[int, Within(low=1)]
+WholeNumber = Annotated[int, Within(low=0)]
+Range = Annotated[tuple[float, float], Within(ordered=True)]
+NonNegativeRange = Annotated[tuple[float, float], Within(low=0.0, ordered=True)]
+
+
+class Checked:
+    """A base of dataclasses whose fields are checked against their annotations when one is built.
+
+    Raises:
+        ValueError: naming the field, the value and what would be valid.
+    """
+
+    def __post_init__(self) -> None:
+        """Check every field; a subclass that relates fields to each other does so after this."""
+        hints = _hints(type(self))
+        for field in fields(typing.cast(Any, self)):
+            check_value(field.name, getattr(self, field.name), hints[field.name])
+
+
+@cache
+def _hints(cls: type) -> dict[str, Any]:
+    return typing.get_type_hints(cls, include_extras=True)
+
+
+def check_value(field: str, value: object, annotation: Any) -> None:
+    """Refuse a value that is not what an annotation says; protocols, callables and `Any` take everything.
+
+    Raises:
+        ValueError: naming the field, the value and what would be valid.
+    """
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if annotation is Any:  # a class since Python 3.11, but none to ask `isinstance` of
+        return
+    if origin is Annotated:
+        bounds = [extra for extra in arguments[1:] if isinstance(extra, Within)]
+        if not (bounds and _is_numeric(arguments[0])):
+            check_value(field, value, arguments[0])
+        elif arguments[0] is int:
+            _check_instance(field, value, int)
+        for bound in bounds:
+            bound.check(field, value)
+    elif origin in (typing.Union, types.UnionType):
+        _check_union(field, value, arguments)
+    elif origin is Literal:
+        check_choice(field, value, arguments)
+    elif origin is tuple or origin is Sequence:
+        _check_sequence(field, value, annotation)
+    elif origin is Mapping or origin is dict:
+        if not isinstance(value, Mapping):
+            raise ValueError(f"{field}={value!r}: expected a mapping")
+        for key, entry in value.items():
+            check_value(f"{field} key {key!r}", key, arguments[0])
+            check_value(f"{field}.{key}", entry, arguments[1])
+    elif annotation is float:
+        check_in_range(field, value)
+    elif isinstance(annotation, type) and not getattr(annotation, "_is_protocol", False):
+        _check_instance(field, value, annotation)
+
+
+def _is_numeric(annotation: Any) -> bool:
+    """Whether bounds alone say all about the values of this annotation."""
+    if annotation in (int, float):
+        return True
+    return typing.get_origin(annotation) is tuple and typing.get_args(annotation) == (float, float)
+
+
+def _check_instance(field: str, value: object, kind: type) -> None:
+    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+        expected = {int: "a whole number", str: "a text", bool: "true or false"}.get(
+            kind, f"a {kind.__name__}"
+        )
+        raise ValueError(f"{field}={value!r}: expected {expected}")
+
+
+def _check_union(field: str, value: object, options: Sequence[Any]) -> None:
+    if value is None and type(None) in options:
+        return
+    errors = []
+    for option in options:
+        if option is type(None):
+            continue
+        try:
+            check_value(field, value, option)
+            return
+        except ValueError as error:
+            errors.append(str(error))
+    raise ValueError("; or ".join(errors))
+
+
+def _check_sequence(field: str, value: object, annotation: Any) -> None:
+    arguments = typing.get_args(annotation)
+    if not isinstance(value, (list, tuple)):
+        raise ValueError(f"{field}={value!r}: expected a list")
+    if typing.get_origin(annotation) is Sequence or arguments[1:] == (...,):
+        kinds: Sequence[Any] = [arguments[0]] * len(value)
+    elif len(value) == len(arguments):
+        kinds = arguments
+    else:
+        raise ValueError(f"{field}={value!r}: expected {len(arguments)} entries")
+    for index, (entry, kind) in enumerate(zip(value, kinds, strict=True)):
+        check_value(f"{field}[{index}]", entry, kind)

@@ -1,0 +1,75 @@
+"""Fields of config dataclasses are checked against their annotations."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import pytest
+
+from ksim_rl.checked import Checked, Count, Positive, Range, Share, Within
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inner(Checked):
+    size: Count = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outer(Checked):
+    gain: Positive = 1.0
+    share: Share | None = None
+    limits: Range = (0.0, 1.0)
+    point: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ends: Annotated[tuple[float, float], Within(low=0.0)] = (1.0, 0.5)
+    names: str | tuple[str, ...] = ".*"
+    mode: Literal["add", "scale"] = "add"
+    flag: bool = False
+    weights: Mapping[str, Positive] | None = None
+    inner: Inner = Inner()
+    anything: Any = None
+
+
+GOOD: list[dict[str, Any]] = [
+    {},
+    {"gain": 2},
+    {"share": 0.0},
+    {"limits": (1.0, 1.0)},
+    {"names": ["a", "b"]},
+    {"weights": {"a": 1.0}},
+    {"anything": object()},
+]
+BAD: list[tuple[dict[str, Any], str]] = [
+    ({"gain": 0.0}, r"gain=0.0: expected a finite number in \(0.0, inf\)"),
+    ({"gain": float("nan")}, r"gain=nan: expected a finite number"),
+    ({"gain": "1"}, r"gain='1': expected a number in \(0.0, inf\)"),
+    ({"share": 1.5}, r"share=1.5: expected a finite number in \[0.0, 1.0\]"),
+    ({"limits": (2.0, 1.0)}, r"limits=\(2.0, 1.0\): low exceeds high"),
+    ({"limits": 3.0}, r"limits=3.0: expected a pair"),
+    ({"point": (0.0, float("inf"), 0.0)}, r"point\[1\]=inf: expected a finite number"),
+    ({"point": (0.0, 0.0)}, r"point=\(0.0, 0.0\): expected 3 entries"),
+    ({"ends": (1.0, -0.5)}, r"ends\[1\]=-0.5: expected a finite number in \[0.0, inf\)"),
+    ({"names": 3}, r"names=3: expected a text; or names=3: expected a list"),
+    ({"names": ("a", 3)}, r"names\[1\]=3: expected a text"),
+    ({"mode": "scal"}, r"mode='scal': did you mean 'scale'\?"),
+    ({"flag": 1}, r"flag=1: expected true or false"),
+    ({"weights": {"a": -1.0}}, r"weights.a=-1.0: expected a finite number in \(0.0, inf\)"),
+    ({"weights": [1.0]}, r"weights=\[1.0\]: expected a mapping"),
+    ({"inner": 3}, r"inner=3: expected a Inner"),
+]
+
+
+@pytest.mark.parametrize("given", GOOD)
+def test_what_annotations_allow_is_taken(given):
+    assert Outer(**given).gain > 0
+
+
+@pytest.mark.parametrize(("given", "message"), BAD)
+def test_what_annotations_do_not_allow_is_refused_by_name(given, message):
+    with pytest.raises(ValueError, match=message):
+        Outer(**given)
+
+
+@pytest.mark.parametrize("size", [0, -1, 1.0, True])
+def test_a_count_is_a_whole_number_of_at_least_one(size):
+    with pytest.raises(ValueError, match="size="):
+        Inner(size=size)
