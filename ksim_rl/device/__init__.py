@@ -1,1 +1,1 @@
-"""The device: streams, captured graphs, keyed random draws, running moments and trees of state."""
+"""This package holds what work on a device shares: streams, graphs, keyed draws, moments and trees of state."""

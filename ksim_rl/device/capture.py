@@ -1,4 +1,4 @@
-"""One graph for torch and Warp work: torch owns the graph, Warp joins its capture.
+"""This module captures work of torch and Warp in one graph, which torch owns and whose capture Warp joins.
 
 Inside the captured body, worlds issue live launches: a finished Warp graph cannot be launched inside a capture.
 """

@@ -1,4 +1,4 @@
-"""Say that Warp compiles kernels, instead of looking like a hang.
+"""A notice tells the user that Warp compiles kernels, which would look like a hang otherwise.
 
 The first use of a model compiles its kernels: 15 to 45 s, once per machine, then cached. Warp's own module-load lines
 are dropped; in their place each compiled module calls one hook with one line of text. The default hook writes the

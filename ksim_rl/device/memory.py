@@ -1,4 +1,4 @@
-"""Says how many envs fit where memory does not suffice for those that were asked for."""
+"""This module explains a failed allocation by the number of envs that fit."""
 
 import re
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Counter-based random numbers: a pure function of (seed, stream, env row, counter).
+"""Random numbers are drawn here as a pure function of (seed, stream, env row, counter).
 
 A generator with hidden state gives other numbers as soon as one more reset happens somewhere. Here each draw is a
 hash of its coordinates, as in Salmon et al., "Parallel random numbers: as easy as 1, 2, 3" (SC 2011): one row's reset

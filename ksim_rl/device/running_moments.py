@@ -1,4 +1,4 @@
-"""Exact running mean and variance, in one process or over all ranks."""
+"""This module keeps an exact running mean and variance, in one process or over all ranks."""
 
 import torch
 import torch.distributed as dist

@@ -1,4 +1,4 @@
-"""Starts Warp once per process."""
+"""This module starts Warp once per process."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""MuJoCo model -> Warp world: batched step, refresh, masked reset, capture, guards."""
+"""This package turns a MuJoCo model into many worlds on the device, and steps, refreshes, resets and watches them."""
 
 from ksim_rl.device import capture
 from ksim_rl.device.capture import Captured

@@ -1,4 +1,4 @@
-"""One camera of the model, drawn for all worlds at once by MuJoCo Warp's ray-casting renderer."""
+"""This module draws one camera of the model for all worlds at once, with MuJoCo Warp's ray-casting renderer."""
 
 from __future__ import annotations
 

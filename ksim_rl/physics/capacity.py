@@ -1,4 +1,4 @@
-"""Room for constraints and contacts: tight, but safe, from a probe of the model with MuJoCo's C engine."""
+"""This module finds how many constraint rows and contacts a world needs, by a probe with MuJoCo's C engine."""
 
 import copy
 import hashlib

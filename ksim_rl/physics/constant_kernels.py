@@ -1,4 +1,4 @@
-"""Warp kernels for the constants that MuJoCo derives at `qpos0`, in the worlds of a mask only.
+"""These Warp kernels recompute the constants that MuJoCo derives at `qpos0`, in the worlds of a mask only.
 
 The joint-space inertia is factored as M = L^T D L over the tree of dofs (Featherstone, "Rigid Body Dynamics
 Algorithms", 2008, section 6.5), and L is inverted row by row. Then J M^-1 J^T = sum_k (J L^-1)_k^2 / D_k for each

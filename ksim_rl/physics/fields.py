@@ -1,9 +1,10 @@
-"""Model fields that differ between worlds, and the constants that follow from them."""
+"""This module knows which model fields may differ between worlds, and which constants follow from them."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import mujoco
 import mujoco_warp as mjw
+import numpy as np
 
 from ksim_rl.checks import unknown_name
 from ksim_rl.physics.upstream import per_world_fields
@@ -89,3 +90,12 @@ def prepare_spec(spec: mujoco.MjSpec, per_world_fields: Iterable[str]) -> None:
     if {"body_ipos", "body_iquat"} & set(per_world_fields):
         for body in spec.bodies:
             body.simple = False
+
+
+def write_fields(mj_model: mujoco.MjModel, fields: Mapping[str, np.ndarray]) -> None:
+    """Write one row of `World.per_world_fields` into a model of the C engine, in place."""
+    for name, value in fields.items():
+        target = mj_model.opt.gravity if name == GRAVITY else getattr(mj_model, name, None)
+        # A few of MuJoCo Warp's fields are its own, or laid out otherwise.
+        if target is not None and target.size == value.size:
+            target[:] = value.reshape(target.shape)

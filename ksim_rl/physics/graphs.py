@@ -1,4 +1,4 @@
-"""A world's own graphs: each kind of launch sequence is recorded once and replayed from then on."""
+"""A world records each kind of launch sequence once as a graph of its own, and replays it from then on."""
 
 from collections.abc import Callable, Hashable
 

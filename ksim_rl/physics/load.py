@@ -1,4 +1,4 @@
-"""From an MJCF file, an XML string, a spec or a menagerie name to a checked model. Errors name file and element."""
+"""This module loads and checks a model from a file, an XML string, a spec or a menagerie name."""
 
 import re
 import warnings

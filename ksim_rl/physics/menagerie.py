@@ -1,4 +1,4 @@
-"""Robots of the MuJoCo Menagerie by name, with or without a network."""
+"""This module finds robots of the MuJoCo Menagerie by name, with or without a network."""
 
 import os
 import re

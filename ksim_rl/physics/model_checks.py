@@ -1,4 +1,4 @@
-"""What a compiled model must satisfy before kernels are compiled for it: finite numbers, features that Warp has."""
+"""A model is refused here before kernels are compiled for it, if a number is not finite or Warp lacks a feature."""
 
 import warnings
 from collections.abc import Iterable, Iterator

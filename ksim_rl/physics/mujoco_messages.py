@@ -1,4 +1,4 @@
-"""Catch MuJoCo's warnings: left alone, they go to the terminal and into a file MUJOCO_LOG.TXT in the present folder."""
+"""This module catches MuJoCo's warnings, which go to the terminal and into a file MUJOCO_LOG.TXT if left alone."""
 
 import warnings
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Contacts and constraints that did not fit are never silent: sticky bits and running maxima, read once per rollout."""
+"""This module reports contacts and constraints that did not fit, from sticky bits and maxima read once per rollout."""
 
 import dataclasses
 import math

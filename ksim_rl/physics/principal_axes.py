@@ -1,4 +1,4 @@
-"""Principal moments and axes of many inertia matrices at once, without a host sync."""
+"""This module diagonalizes many inertia matrices at once, without a host sync."""
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false

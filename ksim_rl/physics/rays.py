@@ -1,4 +1,4 @@
-"""Rays that are cast in all worlds at once."""
+"""This module casts rays in all worlds at once."""
 
 from __future__ import annotations
 

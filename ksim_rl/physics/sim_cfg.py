@@ -1,10 +1,10 @@
-"""Solver and integrator settings, laid over those of a model."""
+"""This module holds the settings of solver and integrator that are laid over those of a model."""
 
 import dataclasses
 
 import mujoco
 
-from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.checks import check_choice, check_count, check_in_range
 from ksim_rl.physics.nan_guard.cfg import NanGuardCfg
 
 INTEGRATORS = {
@@ -79,12 +79,8 @@ class SimCfg:
             if value is not None:
                 check_choice(field, value, choices)
         for field in ("iterations", "ls_iterations", "ccd_iterations", "njmax", "nconmax"):
-            value = getattr(self, field)
-            if value is None:
-                continue
-            if isinstance(value, bool) or not isinstance(value, int):
-                raise ValueError(f"{field}={value!r}: expected a whole number >= 1, or None")
-            check_in_range(field, value, low=1)
+            if getattr(self, field) is not None:
+                check_count(field, getattr(self, field))
         for field in ("deterministic", "one_kernel_solver", "require_graphs"):
             value = getattr(self, field)
             if not isinstance(value, bool):

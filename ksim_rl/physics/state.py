@@ -1,9 +1,11 @@
-"""What the next steps of a world depend on."""
+"""This module names the arrays that the next steps of a world depend on, and restores saved ones."""
 
 import mujoco_warp as mjw
 import warp as wp
 from jaxtyping import Shaped
 from torch import Tensor
+
+from ksim_rl.physics.views import ACCELERATION_STAGE
 
 # Integrated or set by the user; empty arrays are left out.
 STATE = (
@@ -36,13 +38,7 @@ LAST_SUBSTEP = (
     "sensordata",
     "qacc",
     "act_dot",
-    "actuator_force",
-    "qfrc_actuator",
-    "qfrc_constraint",
-    "qfrc_passive",
-    "cacc",
-    "cfrc_int",
-    "cfrc_ext",
+    *ACCELERATION_STAGE,
     "actuator_length",
     "actuator_velocity",
 )

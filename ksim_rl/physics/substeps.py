@@ -1,4 +1,4 @@
-"""The launch sequences of a world: substeps with sensors on the last one, and the refresh of derived quantities."""
+"""This module launches the substeps of a world, sensors on the last one only, and the refresh of derived quantities."""
 
 import dataclasses
 
@@ -46,14 +46,14 @@ class Substeps:
         has_history = np.any(mj_model.sensor_history > 0, axis=-1)
         # A delayed sensor samples at every substep.
         self._always_senses = bool(has_history.any())
-        self._silent_model = warp_model if self._always_senses else upstream.without_sensors(warp_model)
-        self._solver_model: mjw.Model | None = None
+        self._silent_warp_model = warp_model if self._always_senses else upstream.without_sensors(warp_model)
+        self._warp_model_of_solver: mjw.Model | None = None
         if one_kernel_solver:
             # From the warm start even a world without constraints reaches qacc_smooth in one step.
             opt = dataclasses.replace(warp_model.opt, run_qacc_smooth=False)
-            self._solver_model = dataclasses.replace(warp_model, opt=opt)
-            self._solve = newton.solver(self._solver_model, warp_data_E)
-        self._refresh_model = upstream.with_refreshable_sensors(
+            self._warp_model_of_solver = dataclasses.replace(warp_model, opt=opt)
+            self._solve = newton.solver(self._warp_model_of_solver, warp_data_E)
+        self._refresh_warp_model = upstream.with_refreshable_sensors(
             warp_model, skip=has_history | np.isin(sensor_type, COLLISION_SENSORS), sensor_type=sensor_type
         )
         self._needs_transmission = bool(np.isin(sensor_type, TRANSMISSION_SENSORS).any())
@@ -62,18 +62,18 @@ class Substeps:
 
     def advance(self, *, sensors: bool) -> None:
         """Launch one physics step. Sensors never change the state that it reaches."""
-        if self._solver_model is not None:
+        if self._warp_model_of_solver is not None:
             sensors = sensors or self._always_senses
-            newton.step(self._solver_model, self.warp_data_E, self._solve, sensors=sensors)
+            newton.step(self._warp_model_of_solver, self.warp_data_E, self._solve, sensors=sensors)
         else:
-            mjw.step(self.warp_model if sensors else self._silent_model, self.warp_data_E)
+            mjw.step(self.warp_model if sensors else self._silent_warp_model, self.warp_data_E)
 
     def refresh(self) -> None:
         """Launch what recomputes position- and velocity-stage quantities from the present qpos and qvel.
 
         No collision pass: contacts, forces and the sensors that read them stay as the last substep left them.
         """
-        m, d = self._refresh_model, self.warp_data_E
+        m, d = self._refresh_warp_model, self.warp_data_E
         mjw.kinematics(m, d)
         mjw.com_pos(m, d)
         mjw.camlight(m, d)

@@ -1,4 +1,4 @@
-"""Zero-copy torch views of Warp arrays."""
+"""This module makes zero-copy torch views of Warp arrays."""
 
 import dataclasses
 

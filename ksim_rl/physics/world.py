@@ -1,4 +1,4 @@
-"""One model, many worlds: batched physics on MuJoCo Warp with zero-copy torch views."""
+"""A world batch simulates many copies of one model on MuJoCo Warp, and shows their data as zero-copy torch views."""
 
 import copy
 from collections.abc import Callable, Hashable, Sequence
@@ -11,7 +11,7 @@ import warp as wp
 from jaxtyping import Bool, Int, Shaped
 from torch import Tensor
 
-from ksim_rl.checks import check_choice, unknown_name
+from ksim_rl.checks import check_choice, check_count, unknown_name
 from ksim_rl.device.kernel_loading import loaded_together
 from ksim_rl.device.memory import memory_for
 from ksim_rl.device.streams import checked_device, warp_scope
@@ -70,8 +70,7 @@ class World(views.DataViews):
         sim: SimCfg | None = None,
         per_world_fields: Sequence[str] = (),
     ) -> None:
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
-            raise ValueError(f"num_envs={num_envs!r}: expected a whole number >= 1")
+        check_count("num_envs", num_envs)
         if not isinstance(mj_model, mujoco.MjModel):
             raise ValueError(f"mj_model={mj_model!r}: expected a mujoco.MjModel, as load_model returns it")
         if sim is not None and not isinstance(sim, SimCfg):

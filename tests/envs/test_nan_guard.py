@@ -26,5 +26,5 @@ def test_a_failed_env_ends_and_leaves_its_last_substeps(tmp_path):
     assert failure.world == 1 and DECIMATION < failure.substep <= 2 * DECIMATION
     assert failure.states["ctrl"][-1] == np.float32(3e38)
     found = replay.replay(failure)
-    assert replay.dof_name(failure.model, found.first) == "rail"
+    assert replay.dof_name(failure.mj_model, found.first) == "rail"
     env.close()

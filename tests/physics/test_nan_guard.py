@@ -79,7 +79,7 @@ def test_the_replay_names_the_step_and_the_dof(tmp_path, capsys):
     (path,) = world.nan_report().files
     failure = nan_file.read(path)
     found = replay.replay(failure)
-    assert replay.dof_name(failure.model, found.first) == "light"
+    assert replay.dof_name(failure.mj_model, found.first) == "light"
     assert not found.was_broken_before and found.breaks_on_c
     assert found.substeps[-1].warnings == ("bad qacc",) and all(not s.warnings for s in found.substeps[:-1])
     acceleration, dof = found.substeps[-1].acceleration
@@ -99,7 +99,7 @@ def test_a_control_beyond_all_bounds_is_named(tmp_path):
     push(world, row=0, light=1e20)
     failure = nan_file.read(world.nan_report().files[0])
     found = replay.replay(failure)
-    assert replay.dof_name(failure.model, found.first) == "light"
+    assert replay.dof_name(failure.mj_model, found.first) == "light"
     assert found.substeps[-1].warnings == ("bad ctrl",)
     assert "The control of actuator 'light' is 1e+20." in replay.describe(failure, found)
 
@@ -137,7 +137,7 @@ def test_what_a_reset_changes_after_the_failure_is_not_what_is_saved(tmp_path):
     assert failure.fields["dof_damping"][HEAVY] == 7.0
     # With damping 7 N s/m and 1 N the heavy sled decelerates from rest: v = dt F / (m + dt c), implicitly.
     found = replay.replay(failure)
-    assert failure.model.dof_damping[HEAVY] == 7.0 and found.substeps[0].deviation > 1e30
+    assert failure.mj_model.dof_damping[HEAVY] == 7.0 and found.substeps[0].deviation > 1e30
 
 
 def test_a_state_that_was_written_as_nan_is_said_to_be_written(tmp_path):
@@ -148,7 +148,7 @@ def test_a_state_that_was_written_as_nan_is_said_to_be_written(tmp_path):
     failure = nan_file.read(world.nan_report().files[0])
     found = replay.replay(failure)
     assert found.was_broken_before
-    assert replay.dof_name(failure.model, found.first).startswith("ball[")
+    assert replay.dof_name(failure.mj_model, found.first).startswith("ball[")
     assert "First: ball[0], before substep 0 already" in replay.describe(failure, found)
 
 
@@ -218,4 +218,4 @@ def test_the_models_own_file_is_not_pickle(tmp_path):
     data = path.read_bytes()
     header = int.from_bytes(data[:8], "little")
     assert data[8 : 8 + header].strip().startswith(b"{"), "safetensors: a JSON header, then plain numbers"
-    assert isinstance(nan_file.read(path).model, mujoco.MjModel)
+    assert isinstance(nan_file.read(path).mj_model, mujoco.MjModel)

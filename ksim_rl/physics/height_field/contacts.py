@@ -13,12 +13,8 @@ import numpy as np
 import warp as wp
 
 from ksim_rl.physics import upstream
-from ksim_rl.physics.height_field.kernels import (
-    BOX,
-    CAPSULE,
-    SPHERE,
-    height_field_contacts,
-)
+from ksim_rl.physics.height_field.kernels import BOX, CAPSULE, SPHERE, height_field_contacts
+from ksim_rl.physics.launch import launch_by_name
 
 HEIGHT_FIELD = int(mjw.GeomType.HFIELD)
 _SHAPES = (SPHERE, CAPSULE, BOX)
@@ -50,60 +46,9 @@ class _Contacts:
         self._pairs = wp.array(pairs, dtype=wp.vec2i)
         self._pair_ids = wp.array(pair_ids, dtype=wp.vec2i)
 
-    def __call__(self, m: mjw.Model, d: mjw.Data) -> None:
+    def __call__(self, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
         """Append the contacts of all worlds."""
-        wp.launch(
-            height_field_contacts,
-            dim=(d.nworld, len(self._pairs)),
-            inputs=[
-                self._pairs,
-                self._pair_ids,
-                m.geom_type,
-                m.geom_condim,
-                m.geom_dataid,
-                m.geom_priority,
-                m.geom_solmix,
-                m.geom_solref,
-                m.geom_solimp,
-                m.geom_size,
-                m.geom_rbound,
-                m.geom_friction,
-                m.geom_margin,
-                m.geom_gap,
-                m.geom_adhesion,
-                m.hfield_size,
-                m.hfield_nrow,
-                m.hfield_ncol,
-                m.hfield_adr,
-                m.hfield_data,
-                m.pair_dim,
-                m.pair_solref,
-                m.pair_solreffriction,
-                m.pair_solimp,
-                m.pair_margin,
-                m.pair_gap,
-                m.pair_adhesion,
-                m.pair_friction,
-                d.geom_xpos,
-                d.geom_xmat,
-                d.naconmax,
-            ],
-            outputs=[
-                d.contact.dist,
-                d.contact.pos,
-                d.contact.frame,
-                d.contact.includemargin,
-                d.contact.friction,
-                d.contact.solref,
-                d.contact.solreffriction,
-                d.contact.solimp,
-                d.contact.dim,
-                d.contact.geom,
-                d.contact.efc_address,
-                d.contact.worldid,
-                d.contact.type,
-                d.contact.geomcollisionid,
-                d.contact.adhesion,
-                d.nacon,
-            ],
-        )
+        own = {"pairs": self._pairs, "pair_ids": self._pair_ids}
+        contacts = {f"contact_{name}": array for name, array in vars(warp_data_E.contact).items()}
+        dim = (warp_data_E.nworld, len(self._pairs))
+        launch_by_name(height_field_contacts, dim, own, contacts, warp_model, warp_data_E)

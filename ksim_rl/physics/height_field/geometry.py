@@ -1,4 +1,4 @@
-"""The ground of a height field, as Warp functions: how far a point is from it, and where its ridges are.
+"""These Warp functions find how far a point is from the ground of a height field, and where its ridges are.
 
 The ground is what is below the triangles, however deep, and ends at the field's edges. A point above it is closest to
 a point of the triangles; a point below it finds out along the normal of the triangle right above it, so that nothing

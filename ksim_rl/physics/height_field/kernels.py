@@ -1,4 +1,4 @@
-"""Contacts of spheres, capsules and boxes with height fields, as a Warp kernel: see `height_field_geometry`."""
+"""This Warp kernel finds the contacts of spheres, capsules and boxes with height fields."""
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for, and a number that a loop
 # changes has to be made a variable by its type.

@@ -1,8 +1,8 @@
-"""Settings of the NaN guard."""
+"""This module holds the settings of the NaN guard."""
 
 from dataclasses import dataclass
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checks import check_count
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,8 +23,5 @@ class NanGuardCfg:
     def __post_init__(self) -> None:
         if not isinstance(self.folder, str) or not self.folder:
             raise ValueError(f"folder={self.folder!r}: expected the path of a folder")
-        for field in ("history", "max_files"):
-            value = getattr(self, field)
-            if isinstance(value, bool) or not isinstance(value, int):
-                raise ValueError(f"{field}={value!r}: expected a whole number >= 1")
-            check_in_range(field, value, low=1)
+        check_count("history", self.history)
+        check_count("max_files", self.max_files)

@@ -1,4 +1,4 @@
-"""The file of a failed world: its last substeps and its model, as tensors."""
+"""This module writes and reads the file of a failed world, which has its last substeps and its model as tensors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Failure:
     """The last substeps of a world whose state became non-finite in the last of them.
 
     Args:
-        model: the model, before `fields` are written into it.
+        mj_model: the model, before `fields` are written into it.
         world: which of the worlds it was.
         substep: how many substeps the world had done, with the last one, since the guard began to watch it.
         states: state, controls and applied forces before each substep, oldest first, [H, W] each, by MuJoCo's names.
@@ -30,7 +30,7 @@ class Failure:
         fields: model fields of this world that may differ between worlds.
     """
 
-    model: mujoco.MjModel
+    mj_model: mujoco.MjModel
     world: int
     substep: int
     states: Mapping[str, np.ndarray]
@@ -40,7 +40,7 @@ class Failure:
 
 def write(path: Path, failure: Failure) -> None:
     """Write a failure: safetensors, of which nothing is ever executed, completely or not at all."""
-    tensors = {_MODEL: _model_bytes(failure.model)}
+    tensors = {_MODEL: _model_bytes(failure.mj_model)}
     for prefix, arrays in ((_STATE, failure.states), (_REACHED, failure.reached), (_FIELD, failure.fields)):
         tensors |= {f"{prefix}{name}": np.ascontiguousarray(array) for name, array in arrays.items()}
     about = {
@@ -77,7 +77,7 @@ def read(path: Path) -> Failure:
         raise ValueError(f"{path}: damaged, or not a file of the NaN guard: {error}") from None
     if about["mujoco"] != mujoco.__version__:
         raise ValueError(f"{path}: written with MuJoCo {about['mujoco']}; this is {mujoco.__version__}")
-    model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": tensors[_MODEL].tobytes()})
+    mj_model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": tensors[_MODEL].tobytes()})
 
     def under(prefix: str) -> dict[str, np.ndarray]:
         return {
@@ -85,7 +85,7 @@ def read(path: Path) -> Failure:
         }
 
     return Failure(
-        model=model,
+        mj_model=mj_model,
         world=about["world"],
         substep=about["substep"],
         states=under(_STATE),
@@ -94,7 +94,7 @@ def read(path: Path) -> Failure:
     )
 
 
-def _model_bytes(model: mujoco.MjModel) -> np.ndarray:
-    data = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
-    mujoco.mj_saveModel(model, None, data)
+def _model_bytes(mj_model: mujoco.MjModel) -> np.ndarray:
+    data = np.empty(mujoco.mj_sizeModel(mj_model), dtype=np.uint8)
+    mujoco.mj_saveModel(mj_model, None, data)
     return data

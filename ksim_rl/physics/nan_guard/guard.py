@@ -1,4 +1,4 @@
-"""Keeps what led to a non-finite state: the last substeps of each world, on the device, written once per rollout."""
+"""The NaN guard keeps the last substeps of each world on the device, and writes those of failed worlds to files."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ class NanGuard:
         # The newest row stands at count - 1; fewer substeps than places leave the rest unused.
         places = [place % history for place in range(max(0, count - history), count)]
         failure = nan_file.Failure(
-            model=self._mj_model,
+            mj_model=self._mj_model,
             world=world,
             substep=count,
             states={

@@ -1,4 +1,4 @@
-"""The Warp kernels of the NaN guard."""
+"""These Warp kernels keep the last substeps of each world, and find the worlds that failed."""
 
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false

@@ -1,4 +1,4 @@
-"""Replay, on MuJoCo's C engine, of the last substeps of a world that became non-finite.
+"""This command replays the last substeps of a world that became non-finite on MuJoCo's C engine.
 
     python -m ksim_rl.physics.nan_guard.replay FILE
 
@@ -17,7 +17,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from ksim_rl.physics.model_fields import write_fields
+from ksim_rl.physics.fields import write_fields
 from ksim_rl.physics.mujoco_messages import caught_warnings
 from ksim_rl.physics.nan_guard.file import Failure, read
 
@@ -84,15 +84,17 @@ class Replay:
 
 def replay(failure: Failure) -> Replay:
     """Run each kept substep on the C engine."""
-    model = _with_fields(failure)
-    data = mujoco.MjData(model)
+    mj_model = _with_fields(failure)
+    data = mujoco.MjData(mj_model)
     reached_qvel = [*failure.states["qvel"][1:], failure.reached["qvel"]]
     with np.errstate(all="ignore"), caught_warnings():
-        substeps = tuple(_substep(model, data, failure, k, reached) for k, reached in enumerate(reached_qvel))
-    before = _broken_dofs(model, failure.states["qpos"][-1], failure.states["qvel"][-1])
-    after = _broken_dofs(model, failure.reached["qpos"], failure.reached["qvel"])
+        substeps = tuple(
+            _substep(mj_model, data, failure, k, reached) for k, reached in enumerate(reached_qvel)
+        )
+    before = _broken_dofs(mj_model, failure.states["qpos"][-1], failure.states["qvel"][-1])
+    after = _broken_dofs(mj_model, failure.reached["qpos"], failure.reached["qvel"])
     finite = np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()
-    spread = len(after) in (0, model.nv) and not before
+    spread = len(after) in (0, mj_model.nv) and not before
     return Replay(
         substeps=substeps,
         dofs=after,
@@ -102,17 +104,17 @@ def replay(failure: Failure) -> Replay:
     )
 
 
-def dof_name(model: mujoco.MjModel, dof: int) -> str:
+def dof_name(mj_model: mujoco.MjModel, dof: int) -> str:
     """Return the name of a dof: its joint's, with the place in it for joints of several dofs."""
-    joint = int(model.dof_jntid[dof])
-    name = model.joint(joint).name or f"joint {joint}"
-    several = model.jnt_type[joint] in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL))
-    return f"{name}[{dof - int(model.jnt_dofadr[joint])}]" if several else name
+    joint = int(mj_model.dof_jntid[dof])
+    name = mj_model.joint(joint).name or f"joint {joint}"
+    several = mj_model.jnt_type[joint] in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL))
+    return f"{name}[{dof - int(mj_model.jnt_dofadr[joint])}]" if several else name
 
 
 def describe(failure: Failure, result: Replay, *, limit: int = 10) -> str:
     """Return the replay as a table, with the verdict below it."""
-    model = failure.model
+    mj_model = failure.mj_model
     heads = (
         "substep",
         "time s",
@@ -128,17 +130,17 @@ def describe(failure: Failure, result: Replay, *, limit: int = 10) -> str:
     last = len(result.substeps) - 1
     for k, substep in enumerate(result.substeps):
         (speed, fast), (acceleration, pushed) = substep.speed, substep.acceleration
-        numbers = (f"{substep.time:.4f}", _short(substep.energy), _short(speed), dof_name(model, fast))
-        numbers += (_short(acceleration), dof_name(model, pushed), _short(substep.control[0]))
+        numbers = (f"{substep.time:.4f}", _short(substep.energy), _short(speed), dof_name(mj_model, fast))
+        numbers += (_short(acceleration), dof_name(mj_model, pushed), _short(substep.control[0]))
         said = ", ".join(substep.warnings) or "ok"
         rows.append((str(k - last), *numbers, str(substep.contacts), _short(substep.deviation), said))
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
-    names = [dof_name(model, dof) for dof in result.dofs]
+    names = [dof_name(mj_model, dof) for dof in result.dofs]
     shown = ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
     kept = len(result.substeps)
     title = f"world {failure.world}: its last {kept} of {failure.substep} substeps; 0 is the one that broke"
-    first = dof_name(model, result.first)
+    first = dof_name(mj_model, result.first)
     if result.was_broken_before:
         verdict = f"First: {first}, before substep 0 already. An event, a command or a reset wrote it there."
     else:
@@ -146,7 +148,7 @@ def describe(failure: Failure, result: Replay, *, limit: int = 10) -> str:
     lines = [title, *lines, verdict]
     size, actuator = result.substeps[-1].control
     if size > MOST_CONTROL:
-        lines.append(f"The control of actuator {model.actuator(actuator).name!r} is {_short(size)}.")
+        lines.append(f"The control of actuator {mj_model.actuator(actuator).name!r} is {_short(size)}.")
     lines.append(f"The C engine {'breaks in the same' if result.breaks_on_c else 'takes the'} substep.")
     return "\n".join(lines)
 
@@ -169,17 +171,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _with_fields(failure: Failure) -> mujoco.MjModel:
     """Return the model of the one world, which says what it finds instead of starting anew."""
-    model = failure.model
-    write_fields(model, failure.fields)
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-    model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
-    return model
+    mj_model = failure.mj_model
+    write_fields(mj_model, failure.fields)
+    mj_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    mj_model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+    return mj_model
 
 
 def _substep(
-    model: mujoco.MjModel, data: mujoco.MjData, failure: Failure, k: int, reached_qvel: np.ndarray
+    mj_model: mujoco.MjModel, data: mujoco.MjData, failure: Failure, k: int, reached_qvel: np.ndarray
 ) -> Substep:
-    mujoco.mj_resetData(model, data)
+    mujoco.mj_resetData(mj_model, data)
     for name, values in failure.states.items():
         if name == "time":
             data.time = float(values[k, 0])
@@ -189,11 +191,11 @@ def _substep(
     speed, control = _largest(data.qvel), _largest(data.ctrl)
     given = data.ctrl.copy()
     data.ctrl[:] = np.clip(np.nan_to_num(given), -MOST_CONTROL, MOST_CONTROL)
-    mujoco.mj_forward(model, data)
+    mujoco.mj_forward(mj_model, data)
     data.ctrl[:] = given
     energy, contacts, acceleration = float(data.energy.sum()), int(data.ncon), _largest(data.qacc)
     time = float(data.time)
-    mujoco.mj_step(model, data)
+    mujoco.mj_step(mj_model, data)
     return Substep(
         time=time,
         energy=energy,
@@ -215,13 +217,13 @@ def _largest(values: np.ndarray) -> tuple[float, int]:
     return float(size[place]), place
 
 
-def _broken_dofs(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> tuple[int, ...]:
+def _broken_dofs(mj_model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> tuple[int, ...]:
     broken = ~np.isfinite(qvel)
-    for joint in range(model.njnt):
-        start = int(model.jnt_qposadr[joint])
-        end = int(model.jnt_qposadr[joint + 1]) if joint + 1 < model.njnt else model.nq
-        if not np.isfinite(qpos[start:end]).all() and not broken[model.dof_jntid == joint].any():
-            broken[model.dof_jntid == joint] = True
+    for joint in range(mj_model.njnt):
+        start = int(mj_model.jnt_qposadr[joint])
+        end = int(mj_model.jnt_qposadr[joint + 1]) if joint + 1 < mj_model.njnt else mj_model.nq
+        if not np.isfinite(qpos[start:end]).all() and not broken[mj_model.dof_jntid == joint].any():
+            broken[mj_model.dof_jntid == joint] = True
     return tuple(int(dof) for dof in np.flatnonzero(broken))
 
 

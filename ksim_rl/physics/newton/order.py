@@ -1,4 +1,4 @@
-"""The order in which a GPU takes up the worlds of the solver: those that will take longest come first.
+"""A GPU takes up the worlds of the solver in an order that puts those first which will take longest.
 
 A world that takes three times as long as most would otherwise start late and leave the GPU waiting for it alone. How
 long it will take is told by its iterations of the substep before and by its rows.

@@ -10,7 +10,7 @@ import numpy as np
 
 from ksim_rl.checks import near
 from ksim_rl.physics import World
-from ksim_rl.physics.model_fields import write_fields
+from ksim_rl.physics.fields import write_fields
 from ksim_rl.scene.rendering.gl_platform import FIXES, choose_gl_platform
 from ksim_rl.scene.rendering.visualizer import (
     DebugVisualizer,
