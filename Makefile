@@ -1,4 +1,5 @@
-# make train: from a fresh clone to a trained policy. make test: everything that CI checks.
+# make train: from a fresh clone to a trained policy. make test: everything that CI checks. make test-full: the long
+# tests too, and how much of the package they run.
 # ARGS passes overrides on: make train ARGS="task=cartpole_swingup seed=2"
 
 PYTHON ?= python3
@@ -39,7 +40,7 @@ test: setup check
 	$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
 
 test-full: setup check
-	$(BIN)/python -m pytest $(PARALLEL) -m "full or not full" $(ARGS)
+	$(BIN)/python -m pytest $(PARALLEL) -m "full or not full" --cov --cov-report=term $(ARGS)
 
 clean:
-	rm -rf build dist .pytest_cache .ruff_cache .import_linter_cache
+	rm -rf build dist .coverage .pytest_cache .ruff_cache .import_linter_cache

@@ -1,6 +1,7 @@
 """What is installed elsewhere is whole: sdist -> wheel -> another folder -> import."""
 
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -9,6 +10,9 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
+
+import ksim_rl
 
 ROOT = Path(__file__).parent.parent
 
@@ -37,7 +41,15 @@ def test_the_sdist_has_the_package_the_tests_and_what_builds_them(built):
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert sources("ksim_rl") <= names
     assert sources("tests", (".py",)) | sources("docs", (".md", ".png")) <= names
-    assert {"README.md", "LICENSE", "Makefile", "constraints.txt", "pyproject.toml"} <= names
+    assert {
+        "README.md",
+        "CHANGELOG.md",
+        "CONTRIBUTING.md",
+        "LICENSE",
+        "Makefile",
+        "constraints.txt",
+        "pyproject.toml",
+    } <= names
     assert not [name for name in names if name.split("/")[0] in ("envs", "objectives", ".venv", "runs")]
 
 
@@ -83,10 +95,8 @@ def test_an_installed_wheel_imports_from_elsewhere(built, tmp_path):
     command = [sys.executable, "-P", "-c", IMPORT_ALL, str(target)]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert (
-        done.stdout.splitlines()[-1]
-        == tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
-    )
+    assert done.stdout.splitlines()[-1] == ksim_rl.__version__
+    assert built[1].name.startswith(f"ksim_rl-{ksim_rl.__version__}-")
     assert (target / "bin" / "ksim-rl").exists()
 
 
@@ -104,3 +114,20 @@ def test_each_dependency_is_pinned_for_the_tested_environment():
     pinned = {line.split("==")[0].lower() for line in lines if "==" in line}
     assert names <= pinned
     assert not [line for line in lines if "/" in line or "@" in line or "+" in line]
+
+
+def test_the_changelog_begins_with_this_version():
+    versions = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert versions[0] == ksim_rl.__version__ and versions[-1] == "0.1.0"
+
+
+def test_the_workflow_and_the_hooks_run_what_make_runs():
+    """Without these pages' YAML being read by GitHub and pre-commit themselves: their commands are there."""
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
+    commands = [step.get("run", "") for job in jobs.values() for step in job["steps"]]
+    assert ".ci/run" in commands and os.access(ROOT / ".ci" / "run", os.X_OK)
+    (local,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    makefile = (ROOT / "Makefile").read_text()
+    for hook in local["hooks"]:
+        tool = hook["entry"].removeprefix(".venv/bin/").split(" --force")[0]
+        assert tool.split()[0] in makefile, hook
