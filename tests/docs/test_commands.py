@@ -10,7 +10,8 @@ import pytest
 from ksim_rl import conf, envs
 from tests.docs.guide import DOCS, REPOSITORY
 
-PAGES = {page.name: page.read_text() for page in (REPOSITORY / "README.md", *sorted(DOCS.glob("*.md")))}
+_PAGES = (*sorted(REPOSITORY.glob("*.md")), *sorted(DOCS.rglob("*.md")))
+PAGES = {page.relative_to(REPOSITORY).as_posix(): page.read_text() for page in _PAGES}
 ALL = "\n".join(PAGES.values())
 FLAGS = {"--multirun": 0, "--cfg": 1}
 # Tasks that the reader writes.
@@ -45,7 +46,7 @@ def test_the_fields_of_a_command_exist(command: str) -> None:
 
 
 def test_fields_in_the_text_exist() -> None:
-    fields = set(re.findall(r"`'?((?:objective|data|trainer|collector|task\.sim)\.\w+)[=`]", ALL))
+    fields = set(re.findall(r"`'?((?:objective|data|trainer|collector|task\.sim)\.(?!py\b)\w+)[=`]", ALL))
     fields.remove("trainer.loggers")  # of a Trainer
     choices = (
         [],
@@ -80,13 +81,13 @@ def anchors(text: str) -> set[str]:
 
 @pytest.mark.parametrize("name", PAGES)
 def test_links_lead_somewhere(name: str) -> None:
-    folder = REPOSITORY if name == "README.md" else DOCS
+    folder = (REPOSITORY / name).parent
     for link in re.findall(r'\]\(([^)\s]+)\)|<img src="([^"]+)"', PAGES[name]):
         target = "".join(link)
         if target.startswith("https://"):
             continue
         path, _, anchor = target.partition("#")
-        file = (folder / path).resolve() if path else folder / name
+        file = (folder / path).resolve() if path else REPOSITORY / name
         assert file.exists(), target
         if anchor:
             assert anchor in anchors(Path(file).read_text()), target
