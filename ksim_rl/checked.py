@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 from functools import cache
 from typing import Annotated, Any, Literal
 
-from ksim_rl.checks import check_choice, check_in_range, check_pair
+from ksim_rl.checks import check_choice, check_count, check_in_range, check_pair
 
 
 @dataclass(frozen=True)
@@ -80,10 +80,11 @@ def check_value(field: str, value: object, annotation: Any) -> None:
         bounds = [extra for extra in arguments[1:] if isinstance(extra, Within)]
         if not (bounds and _is_numeric(arguments[0])):
             check_value(field, value, arguments[0])
-        elif arguments[0] is int:
-            _check_instance(field, value, int)
         for bound in bounds:
-            bound.check(field, value)
+            if arguments[0] is int and bound.high is None and bound.low is not None:
+                check_count(field, value, low=int(bound.low))
+            else:
+                bound.check(field, value)
     elif origin in (typing.Union, types.UnionType):
         _check_union(field, value, arguments)
     elif origin is Literal:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Checked
 from ksim_rl.physics import load_model
 
 
 @dataclass(frozen=True, kw_only=True)
-class Placement:
+class Placement(Checked):
     """A rigid transform from an entity's own world frame into the scene's.
 
     Attributes:
@@ -25,10 +25,7 @@ class Placement:
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for index, value in enumerate(self.pos):
-            check_in_range(f"pos[{index}]", value)
-        for index, value in enumerate(self.quat):
-            check_in_range(f"quat[{index}]", value, low=-1.0, high=1.0)
+        super().__post_init__()
         if not math.isclose(math.hypot(*self.quat), 1.0, abs_tol=1e-3):
             raise ValueError(f"quat={self.quat!r}: expected a unit quaternion (w, x, y, z)")
 

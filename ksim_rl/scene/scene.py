@@ -8,7 +8,8 @@ from typing import Protocol, runtime_checkable
 
 import mujoco
 
-from ksim_rl.checks import check_in_range, near
+from ksim_rl.checked import Checked, Count, NonNegative, Share
+from ksim_rl.checks import near
 from ksim_rl.physics import load_model, load_spec
 from ksim_rl.scene.actuators import Actuator, set_actuators
 from ksim_rl.scene.placement import Placement
@@ -49,7 +50,7 @@ class MjcfRobot:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneCfg:
+class SceneCfg(Checked):
     """What is in each world.
 
     Attributes:
@@ -69,11 +70,12 @@ class SceneCfg:
     placements: Mapping[str, Placement] = field(default_factory=dict)
     terrain: Terrain | None = None
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
-    num_envs: int = 1
-    spacing: float = 2.0
-    soft_joint_pos_limit_factor: float = 1.0
+    num_envs: Count = 1
+    spacing: NonNegative = 2.0
+    soft_joint_pos_limit_factor: Share = 1.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.robots:
             raise ValueError("robots={}: name at least one robot")
         for name in self.objects:
@@ -82,10 +84,6 @@ class SceneCfg:
         for name in self.placements:
             if name not in self.entities:
                 raise ValueError(f"placements: no robot or object {name!r}: {near(name, self.entities)}")
-        if isinstance(self.num_envs, bool) or not isinstance(self.num_envs, int) or self.num_envs < 1:
-            raise ValueError(f"num_envs={self.num_envs!r}: expected a whole number of at least 1")
-        check_in_range("spacing", self.spacing, low=0.0)
-        check_in_range("soft_joint_pos_limit_factor", self.soft_joint_pos_limit_factor, low=0.0, high=1.0)
 
     @property
     def entities(self) -> Mapping[str, Robot]:

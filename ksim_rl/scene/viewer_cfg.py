@@ -2,12 +2,13 @@
 
 import re
 from dataclasses import dataclass
+from typing import Annotated
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Checked, Count, Positive, WholeNumber, Within
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewerCfg:
+class ViewerCfg(Checked):
     """A camera that follows a body, or looks at a point.
 
     Attributes:
@@ -24,22 +25,17 @@ class ViewerCfg:
 
     body: str | None = None
     lookat: tuple[float, float, float] = (0.0, 0.0, 0.5)
-    distance: float = 3.0
-    elevation: float = -20.0
-    azimuth: float = 120.0
-    width: int = 640
-    height: int = 480
-    env_index: int = 0
-    num_envs: int = 1
+    distance: Positive = 3.0
+    elevation: Annotated[float, Within(low=-90.0, high=90.0)] = -20.0
+    azimuth: Annotated[float, Within(low=-360.0, high=360.0)] = 120.0
+    width: Count = 640
+    height: Count = 480
+    env_index: WholeNumber = 0
+    num_envs: Count = 1
     draw: tuple[str, ...] = (".*",)
 
     def __post_init__(self) -> None:
-        check_in_range("distance", self.distance, low=0.0, low_open=True)
-        check_in_range("elevation", self.elevation, low=-90.0, high=90.0)
-        check_in_range("azimuth", self.azimuth, low=-360.0, high=360.0)
-        for field in ("width", "height", "num_envs"):
-            check_in_range(field, getattr(self, field), low=1)
-        check_in_range("env_index", self.env_index, low=0)
+        super().__post_init__()
         for index, pattern in enumerate(self.draw):
             try:
                 re.compile(pattern)

@@ -192,7 +192,7 @@ def test_a_robot_that_cannot_be_loaded_is_refused():
     ("fields", "message"),
     [
         ({"robots": {}}, "robots={}: name at least one robot"),
-        ({"num_envs": 0}, "num_envs=0: expected a whole number of at least 1"),
+        ({"num_envs": 0}, "num_envs=0: expected a whole number >= 1"),
         ({"num_envs": 2.0}, r"num_envs=2\.0"),
         ({"num_envs": True}, "num_envs=True"),
         ({"spacing": -1.0}, r"spacing=-1\.0"),

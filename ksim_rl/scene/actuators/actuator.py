@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import mujoco
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Checked, NonNegative, Positive
 from ksim_rl.scene.names import Patterns
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ Law = Callable[[JointState, JointTarget], Tensor]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Actuator(ABC):
+class Actuator(Checked, ABC):
     """What drives some joints of a robot, one actuator of the model for each of them.
 
     MuJoCo computes the effort of built-in actuators from `ctrl`, which is their target. Explicit ones are plain motors
@@ -93,16 +93,9 @@ class JointActuator(Actuator):
     """
 
     joints: Patterns
-    effort_limit: float | None = None
-    armature: float | None = None
-    frictionloss: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.effort_limit is not None:
-            check_in_range("effort_limit", self.effort_limit, low=0.0, low_open=True)
-        for name in ("armature", "frictionloss"):
-            if getattr(self, name) is not None:
-                check_in_range(name, getattr(self, name), low=0.0)
+    effort_limit: Positive | None = None
+    armature: NonNegative | None = None
+    frictionloss: NonNegative | None = None
 
     @property
     def driven(self) -> Patterns:

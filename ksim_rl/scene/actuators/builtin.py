@@ -13,7 +13,7 @@ from typing import Literal
 import mujoco
 from torch import Tensor
 
-from ksim_rl.checks import check_choice, check_in_range, check_pair
+from ksim_rl.checked import NonNegative, Positive, Range
 from ksim_rl.scene.actuators.actuator import (
     JointActuator,
     JointState,
@@ -83,13 +83,8 @@ class PositionActuator(BuiltinActuator):
         damping: N m s / rad or N s / m.
     """
 
-    stiffness: float
-    damping: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("stiffness", self.stiffness, low=0.0, low_open=True)
-        check_in_range("damping", self.damping, low=0.0)
+    stiffness: Positive
+    damping: NonNegative = 0.0
 
     @classmethod
     def tuned(
@@ -135,11 +130,7 @@ class VelocityActuator(BuiltinActuator):
         damping: N m s / rad or N s / m.
     """
 
-    damping: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("damping", self.damping, low=0.0, low_open=True)
+    damping: Positive
 
     @property
     def takes(self) -> frozenset[TargetKind]:
@@ -188,23 +179,15 @@ class GeneralActuator(BuiltinActuator):
     dyntype: Literal["none", "integrator", "filter", "filterexact", "muscle"] = "none"
     dynprm: tuple[float, ...] = (1.0,)
     gear: float = 1.0
-    ctrlrange: tuple[float, float] | None = None
-    actrange: tuple[float, float] | None = None
+    ctrlrange: Range | None = None
+    actrange: Range | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, choices in (("gaintype", GAINS), ("biastype", BIASES), ("dyntype", DYNAMICS)):
-            check_choice(name, getattr(self, name), choices)
         for name in ("gainprm", "biasprm", "dynprm"):
             numbers = getattr(self, name)
             if len(numbers) > _NUM_PARAMETERS:
                 raise ValueError(f"{name} has {len(numbers)} numbers: expected at most {_NUM_PARAMETERS}")
-            for index, number in enumerate(numbers):
-                check_in_range(f"{name}[{index}]", number)
-        check_in_range("gear", self.gear)
-        for name in ("ctrlrange", "actrange"):
-            if getattr(self, name) is not None:
-                check_pair(name, getattr(self, name))
 
     @property
     def takes(self) -> frozenset[TargetKind]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Positive
 from ksim_rl.scene.actuators.actuator import JointState, JointTarget, Law
 from ksim_rl.scene.actuators.drive import Drive
 from ksim_rl.scene.actuators.ideal_pd import IdealPDActuator, pd_effort
@@ -26,13 +26,8 @@ class DCMotorActuator(IdealPDActuator):
         velocity_limit: no-load velocity at full voltage, rad/s or m/s.
     """
 
-    saturation_effort: float
-    velocity_limit: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("saturation_effort", self.saturation_effort, low=0.0, low_open=True)
-        check_in_range("velocity_limit", self.velocity_limit, low=0.0, low_open=True)
+    saturation_effort: Positive
+    velocity_limit: Positive
 
     @property
     def params(self) -> Mapping[str, float]:

@@ -7,6 +7,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from ksim_rl.checked import WholeNumber
 from ksim_rl.scene.actuators.actuator import (
     Actuator,
     JointState,
@@ -33,16 +34,11 @@ class DelayedActuator(Actuator):
     """
 
     actuator: Actuator
-    min_lag: int = 0
-    max_lag: int
+    min_lag: WholeNumber = 0
+    max_lag: WholeNumber
 
     def __post_init__(self) -> None:
-        for field in ("min_lag", "max_lag"):
-            value = getattr(self, field)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-                raise ValueError(
-                    f"{field}={value!r}: expected a whole number of physics substeps of at least 0"
-                )
+        super().__post_init__()
         if self.min_lag > self.max_lag:
             raise ValueError(f"min_lag={self.min_lag} exceeds max_lag={self.max_lag}")
 

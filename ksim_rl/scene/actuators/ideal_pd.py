@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import NonNegative
 from ksim_rl.scene.actuators.actuator import (
     ExplicitActuator,
     JointState,
@@ -26,13 +26,8 @@ class IdealPDActuator(ExplicitActuator):
         damping: N m s / rad or N s / m.
     """
 
-    stiffness: float
-    damping: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("stiffness", self.stiffness, low=0.0)
-        check_in_range("damping", self.damping, low=0.0)
+    stiffness: NonNegative
+    damping: NonNegative
 
     @property
     def takes(self) -> frozenset[TargetKind]:

@@ -40,8 +40,6 @@ class MLPActuator(NetActuator):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.activation is not None:
-            check_choice("activation", self.activation, ACTIVATIONS)
         if self.input_lags is not None:
             _check_lags("input_lags", self.input_lags)
 

@@ -31,12 +31,6 @@ class NetActuator(ExplicitActuator):
     velocity_scale: float | None = None
     effort_scale: float | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in _SCALES:
-            if getattr(self, name) is not None:
-                check_in_range(name, getattr(self, name))
-
     @property
     def takes(self) -> frozenset[TargetKind]:
         """A position."""

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import mujoco
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Checked, NonNegative, Positive, Share
 
 
 @dataclass(frozen=True, kw_only=True)
-class Box:
+class Box(Checked):
     """A box with a free joint: body, joint and geom are all called "box". It starts at rest on the plane z = 0.
 
     Attributes:
@@ -18,18 +18,10 @@ class Box:
         rgba: colour and opacity.
     """
 
-    size: tuple[float, float, float] = (0.05, 0.05, 0.05)
-    mass: float = 0.1
-    friction: tuple[float, float, float] = (0.6, 0.005, 0.0001)
-    rgba: tuple[float, float, float, float] = (0.2, 0.5, 0.75, 1.0)
-
-    def __post_init__(self) -> None:
-        for index, edge in enumerate(self.size):
-            check_in_range(f"size[{index}]", edge, low=0.0, low_open=True)
-        check_in_range("mass", self.mass, low=0.0, low_open=True)
-        for field, high in (("friction", None), ("rgba", 1.0)):
-            for index, value in enumerate(getattr(self, field)):
-                check_in_range(f"{field}[{index}]", value, low=0.0, high=high)
+    size: tuple[Positive, Positive, Positive] = (0.05, 0.05, 0.05)
+    mass: Positive = 0.1
+    friction: tuple[NonNegative, NonNegative, NonNegative] = (0.6, 0.005, 0.0001)
+    rgba: tuple[Share, Share, Share, Share] = (0.2, 0.5, 0.75, 1.0)
 
     def spec(self) -> mujoco.MjSpec:
         """Return a new spec of the model."""

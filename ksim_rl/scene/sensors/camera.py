@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import mujoco
 import torch
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range, near
+from ksim_rl.checked import Count, Positive, Within
+from ksim_rl.checks import near
 from ksim_rl.physics.batch_camera import BatchCamera
-from ksim_rl.scene.sensors.sensor import Sensor, SensorTracker
+from ksim_rl.scene.sensors.sensor import GeomGroup, Sensor, SensorTracker
 
 if TYPE_CHECKING:
     from ksim_rl.envs.view import EnvView
@@ -42,27 +43,19 @@ class CameraSensor(Sensor):
     body: str = "world"
     pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
     xyaxes: tuple[float, float, float, float, float, float] = (0.0, -1.0, 0.0, 0.0, 0.0, 1.0)
-    fovy: float = 45.0
-    width: int = 64
-    height: int = 64
+    fovy: Annotated[float, Within(low=0.0, high=180.0, low_open=True)] = 45.0
+    width: Count = 64
+    height: Count = 64
     rgb: bool = True
     depth: bool = False
     segmentation: bool = False
-    max_depth: float = 10.0
-    geom_groups: tuple[int, ...] = (0, 1, 2)
+    max_depth: Positive = 10.0
+    geom_groups: tuple[GeomGroup, ...] = (0, 1, 2)
     textures: bool = True
     shadows: bool = False
 
     def __post_init__(self) -> None:
-        for field in ("width", "height"):
-            value = getattr(self, field)
-            if isinstance(value, bool) or not isinstance(value, int):
-                raise ValueError(f"{field}={value!r}: expected a whole number >= 1")
-            check_in_range(field, value, low=1)
-        check_in_range("fovy", self.fovy, low=0.0, high=180.0, low_open=True)
-        check_in_range("max_depth", self.max_depth, low=0.0, low_open=True)
-        for index, group in enumerate(self.geom_groups):
-            check_in_range(f"geom_groups[{index}]", group, low=0, high=mujoco.mjNGROUP - 1)
+        super().__post_init__()
         if not (self.rgb or self.depth or self.segmentation):
             raise ValueError("rgb=False, depth=False, segmentation=False: draw at least one of them")
 

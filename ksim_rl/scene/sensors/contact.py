@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import mujoco
 
-from ksim_rl.checks import check_choice, near
+from ksim_rl.checks import near
 from ksim_rl.scene.names import match_names
 from ksim_rl.scene.sensors.contact_tracker import ContactTracker
 from ksim_rl.scene.sensors.sensor import Sensor
@@ -56,13 +56,12 @@ class ContactSensor(Sensor):
     every_substep: bool = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         given = [field for field in ("geoms", "bodies", "subtrees") if getattr(self, field)]
         if len(given) != 1:
             raise ValueError(
                 f"geoms={self.geoms!r}, bodies={self.bodies!r}, subtrees={self.subtrees!r}: give exactly one of them"
             )
-        check_choice("against_kind", self.against_kind, _OBJECTS)
-        check_choice("reduce", self.reduce, ("net", "strongest"))
         within_one = self.against_kind == "subtree" and self.against in self.subtrees
         if within_one and self.reduce == "net":
             raise ValueError(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import mujoco
 
-from ksim_rl.checks import check_in_range, near
+from ksim_rl.checks import near
 from ksim_rl.scene.sensors.sensor import Sensor
 
 
@@ -26,10 +26,9 @@ class MountedSensor(Sensor, ABC):
     pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if (self.site is None) == (self.body is None):
             raise ValueError(f"site={self.site!r}, body={self.body!r}: give exactly one of them")
-        for index, value in enumerate(self.pos):
-            check_in_range(f"pos[{index}]", value)
         if self.site is not None and any(self.pos):
             raise ValueError(
                 f"pos={self.pos!r} with site={self.site!r}: a site has its own place; give a body"

@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-import mujoco
 import torch
 from torch import Tensor
 
-from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.checked import Positive
 from ksim_rl.physics.rays import RayBatch
 from ksim_rl.scene.sensors.mount import MountedSensor
 from ksim_rl.scene.sensors.ray_patterns import RayPattern
-from ksim_rl.scene.sensors.sensor import SensorTracker
+from ksim_rl.scene.sensors.sensor import GeomGroup, SensorTracker
 from ksim_rl.scene.small_matrices import product
 
 if TYPE_CHECKING:
@@ -51,16 +50,9 @@ class RayCaster(MountedSensor):
 
     pattern: RayPattern
     alignment: Literal["site", "yaw", "world"] = "site"
-    max_distance: float = 10.0
-    geom_groups: tuple[int, ...] = (0, 1)
+    max_distance: Positive = 10.0
+    geom_groups: tuple[GeomGroup, ...] = (0, 1)
     exclude_body: bool = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_choice("alignment", self.alignment, ("site", "yaw", "world"))
-        check_in_range("max_distance", self.max_distance, low=0.0, low_open=True)
-        for index, group in enumerate(self.geom_groups):
-            check_in_range(f"geom_groups[{index}]", group, low=0, high=mujoco.mjNGROUP - 1)
 
     def track(self, name: str, view: EnvView) -> RayTracker:
         """Return the reader of this sensor in the worlds of `view`."""

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Checked, Count, Positive, Within
 
 
 @dataclass(frozen=True, kw_only=True)
-class RayPattern(ABC):
+class RayPattern(Checked, ABC):
     """A bundle of N rays."""
 
     @abstractmethod
@@ -33,16 +34,13 @@ class GridPattern(RayPattern):
         direction: of the rays; its length does not matter.
     """
 
-    size: tuple[float, float] = (1.6, 1.0)
-    resolution: float = 0.1
+    size: Annotated[tuple[float, float], Within(low=0.0)] = (1.6, 1.0)
+    resolution: Positive = 0.1
     height: float = 0.0
     direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
 
     def __post_init__(self) -> None:
-        check_in_range("resolution", self.resolution, low=0.0, low_open=True)
-        for index, edge in enumerate(self.size):
-            check_in_range(f"size[{index}]", edge, low=0.0)
-        check_in_range("height", self.height)
+        super().__post_init__()
         if not any(self.direction):
             raise ValueError(f"direction={self.direction!r}: expected a vector that is not zero")
 
@@ -62,14 +60,9 @@ class PinholePattern(RayPattern):
         fovy: vertical field of view, degrees; pixels are square.
     """
 
-    width: int = 16
-    height: int = 12
-    fovy: float = 60.0
-
-    def __post_init__(self) -> None:
-        check_in_range("width", self.width, low=1)
-        check_in_range("height", self.height, low=1)
-        check_in_range("fovy", self.fovy, low=0.0, high=179.0, low_open=True)
+    width: Count = 16
+    height: Count = 12
+    fovy: Annotated[float, Within(low=0.0, high=179.0, low_open=True)] = 60.0
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the rays."""
@@ -89,15 +82,13 @@ class RingPattern(RayPattern):
         elevations: degrees above the xy plane, one ring each.
     """
 
-    num_rays: int = 36
-    elevations: tuple[float, ...] = (0.0,)
+    num_rays: Count = 36
+    elevations: tuple[Annotated[float, Within(low=-90.0, high=90.0)], ...] = (0.0,)
 
     def __post_init__(self) -> None:
-        check_in_range("num_rays", self.num_rays, low=1)
+        super().__post_init__()
         if not self.elevations:
             raise ValueError("elevations=(): give at least one ring, such as (0.0,)")
-        for index, angle in enumerate(self.elevations):
-            check_in_range(f"elevations[{index}]", angle, low=-90.0, high=90.0)
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the rays."""

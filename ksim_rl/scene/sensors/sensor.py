@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import mujoco
+
+from ksim_rl.checked import Checked, Within
 
 if TYPE_CHECKING:
     from ksim_rl.envs.view import EnvView
     from ksim_rl.scene.rendering.visualizer import DebugVisualizer
+
+
+GeomGroup = Annotated[int, Within(low=0, high=mujoco.mjNGROUP - 1)]
+"""One of MuJoCo's geom groups."""
 
 
 class SensorTracker:
@@ -24,7 +30,7 @@ class SensorTracker:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sensor(ABC):
+class Sensor(Checked, ABC):
     """A sensor of `scene.sensors`, where its key is its name."""
 
     @abstractmethod

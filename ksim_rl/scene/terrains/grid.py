@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Count, Positive, WholeNumber
+from ksim_rl.checks import check_count, check_in_range
 from ksim_rl.scene.terrains.patch import TIE, Lattice, TerrainPatch
 from ksim_rl.scene.terrains.patched_ground import GEOM_FIELDS, PatchedGround, patch_name
-from ksim_rl.scene.terrains.terrain import Terrain, add_ground, add_look
+from ksim_rl.scene.terrains.terrain import Friction, Terrain, add_ground, add_look
 
 if TYPE_CHECKING:
     from ksim_rl.envs.view import EnvView
@@ -47,30 +48,20 @@ class TerrainGrid(Terrain):
     """
 
     patches: Mapping[str, TerrainPatch]
-    num_levels: int = 10
+    num_levels: Count = 10
     num_columns: int = 10
-    size: float = 8.0
-    max_initial_level: int = 5
+    size: Positive = 8.0
+    max_initial_level: WholeNumber = 5
     spawn_width: float = 1.4
-    seed: int = 0
-    friction: tuple[float, float, float] = (1.0, 0.005, 0.0001)
+    seed: WholeNumber = 0
+    friction: Friction = (1.0, 0.005, 0.0001)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.patches:
             raise ValueError("patches={}: name at least one kind of ground")
-        for field, low in (
-            ("num_levels", 1),
-            ("num_columns", len(self.patches)),
-            ("max_initial_level", 0),
-            ("seed", 0),
-        ):
-            value = getattr(self, field)
-            if isinstance(value, bool) or not isinstance(value, int) or value < low:
-                raise ValueError(f"{field}={value!r}: expected a whole number of at least {low}")
-        check_in_range("size", self.size, low=0.0, low_open=True)
+        check_count("num_columns", self.num_columns, low=len(self.patches))
         check_in_range("spawn_width", self.spawn_width, low=0.0, high=self.size)
-        for index, value in enumerate(self.friction):
-            check_in_range(f"friction[{index}]", value, low=0.0)
 
     @property
     def per_world_fields(self) -> tuple[str, ...]:

@@ -5,15 +5,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ksim_rl.checks import check_in_range, check_pair
-from ksim_rl.scene.terrains.patch import TIE, Lattice, TerrainPatch, between, check_ends
+from ksim_rl.checked import NonNegative, NonNegativeRange, Positive, WholeNumber, Within
+from ksim_rl.checks import check_in_range
+from ksim_rl.scene.terrains.patch import TIE, Cell, Ends, Lattice, TerrainPatch, between
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlatPatch(TerrainPatch):
     """Even ground at every difficulty."""
 
-    cell: float = 1.0
+    cell: Cell = 1.0
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
         """Return zeros, [R, C]."""
@@ -28,12 +29,8 @@ class RoughGround(TerrainPatch):
         amplitude: m, at difficulty 0 and 1.
     """
 
-    amplitude: tuple[float, float] = (0.01, 0.06)
-    cell: float = 0.15
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_ends("amplitude", self.amplitude, low=0.0)
+    amplitude: Ends = (0.01, 0.06)
+    cell: Cell = 0.15
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
         """Return the heights, m, [R, C]."""
@@ -49,13 +46,12 @@ class Waves(TerrainPatch):
         wave_length: m.
     """
 
-    amplitude: tuple[float, float] = (0.02, 0.2)
+    amplitude: Ends = (0.02, 0.2)
     wave_length: float = 2.0
-    cell: float = 0.2
+    cell: Cell = 0.2
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ends("amplitude", self.amplitude, low=0.0)
         check_in_range("wave_length", self.wave_length, low=4 * self.cell)
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
@@ -77,15 +73,10 @@ class PyramidSlope(TerrainPatch):
         inverted: a pit instead of a pyramid.
     """
 
-    gradient: tuple[float, float] = (0.0, 0.5)
-    platform_width: float = 2.0
+    gradient: Ends = (0.0, 0.5)
+    platform_width: Positive = 2.0
     inverted: bool = False
-    cell: float = 0.25
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_ends("gradient", self.gradient, low=0.0)
-        check_in_range("platform_width", self.platform_width, low=0.0, low_open=True)
+    cell: Cell = 0.25
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
         """Return the heights, m, [R, C]."""
@@ -106,17 +97,15 @@ class PyramidStairs(TerrainPatch):
         inverted: a pit instead of a pyramid.
     """
 
-    step_height: tuple[float, float] = (0.02, 0.2)
+    step_height: Ends = (0.02, 0.2)
     step_width: float = 0.3
-    platform_width: float = 2.0
+    platform_width: Positive = 2.0
     inverted: bool = False
-    cell: float = 0.05
+    cell: Cell = 0.05
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ends("step_height", self.step_height, low=0.0)
         check_in_range("step_width", self.step_width, low=2 * self.cell)
-        check_in_range("platform_width", self.platform_width, low=0.0, low_open=True)
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
         """Return the heights, m, [R, C]; as many steps as fit."""
@@ -137,18 +126,10 @@ class DiscreteObstacles(TerrainPatch):
         platform_width: edge of the platform, m.
     """
 
-    height: tuple[float, float] = (0.02, 0.2)
-    width: tuple[float, float] = (0.3, 1.0)
-    num_obstacles: int = 60
-    platform_width: float = 1.5
-    cell: float = 0.1
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_ends("height", self.height, low=0.0)
-        check_pair("width", self.width, low=0.0)
-        check_in_range("num_obstacles", self.num_obstacles, low=0)
-        check_in_range("platform_width", self.platform_width, low=0.0)
+    height: Ends = (0.02, 0.2)
+    width: NonNegativeRange = (0.3, 1.0)
+    num_obstacles: WholeNumber = 60
+    platform_width: NonNegative = 1.5
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
         """Return the heights, m, [R, C]."""
@@ -177,20 +158,17 @@ class SteppingStones(TerrainPatch):
         platform_width: edge of the platform, m.
     """
 
-    stone_width: tuple[float, float] = (0.8, 0.35)
-    gap: tuple[float, float] = (0.1, 0.3)
-    unevenness: tuple[float, float] = (0.0, 0.05)
-    depth: float = 0.5
-    platform_width: float = 1.5
-    cell: float = 0.05
+    stone_width: Ends = (0.8, 0.35)
+    gap: Ends = (0.1, 0.3)
+    unevenness: Ends = (0.0, 0.05)
+    depth: NonNegative = 0.5
+    platform_width: NonNegative = 1.5
+    cell: Cell = 0.05
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ends("stone_width", self.stone_width, low=self.cell)
-        check_ends("gap", self.gap, low=2 * self.cell)
-        check_ends("unevenness", self.unevenness, low=0.0)
-        check_in_range("depth", self.depth, low=0.0)
-        check_in_range("platform_width", self.platform_width, low=0.0)
+        Within(low=self.cell).check("stone_width", self.stone_width)
+        Within(low=2 * self.cell).check("gap", self.gap)
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
         """Return the heights, m, [R, C]."""
@@ -222,18 +200,16 @@ class Gaps(TerrainPatch):
         platform_width: edge of the platform, m.
     """
 
-    width: tuple[float, float] = (0.1, 0.6)
+    width: Ends = (0.1, 0.6)
     spacing: float = 0.8
-    depth: float = 0.5
-    platform_width: float = 1.5
-    cell: float = 0.05
+    depth: NonNegative = 0.5
+    platform_width: Positive = 1.5
+    cell: Cell = 0.05
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ends("width", self.width, low=2 * self.cell)
+        Within(low=2 * self.cell).check("width", self.width)
         check_in_range("spacing", self.spacing, low=self.cell)
-        check_in_range("depth", self.depth, low=0.0)
-        check_in_range("platform_width", self.platform_width, low=0.0, low_open=True)
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
         """Return the heights, m, [R, C]."""

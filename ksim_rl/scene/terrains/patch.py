@@ -5,13 +5,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Checked, Positive, Within
 
 TIE = 1e-6
 """m. Lattice points that lie on an edge of a pattern belong to its inside, whatever the coordinates round to."""
+
+
+Cell = Annotated[float, Within(low=0.01)]
+"""m between the points at which heights are given."""
+Ends = Annotated[tuple[float, float], Within(low=0.0)]
+"""Values at difficulty 0 and 1; either may be the greater one."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +61,7 @@ class Lattice:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TerrainPatch(ABC):
+class TerrainPatch(Checked, ABC):
     """A kind of ground. Pairs are values at difficulty 0 and at difficulty 1, with a straight line between them.
 
     Attributes:
@@ -63,12 +70,8 @@ class TerrainPatch(ABC):
             take the coarsest that shows the shape.
     """
 
-    proportion: float = 1.0
-    cell: float = 0.1
-
-    def __post_init__(self) -> None:
-        check_in_range("proportion", self.proportion, low=0.0, low_open=True)
-        check_in_range("cell", self.cell, low=0.01)
+    proportion: Positive = 1.0
+    cell: Cell = 0.1
 
     @abstractmethod
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
@@ -81,13 +84,3 @@ class TerrainPatch(ABC):
 def between(pair: tuple[float, float], difficulty: float) -> float:
     """Return the value of a pair at a difficulty in [0, 1]."""
     return pair[0] + difficulty * (pair[1] - pair[0])
-
-
-def check_ends(field: str, pair: tuple[float, float], *, low: float, low_open: bool = False) -> None:
-    """Refuse a pair (at difficulty 0, at difficulty 1) with a number below `low`; either may be the greater one.
-
-    Raises:
-        ValueError: naming the field, the value and the valid range.
-    """
-    for index, value in enumerate(pair):
-        check_in_range(f"{field}[{index}]", value, low=low, low_open=low_open)

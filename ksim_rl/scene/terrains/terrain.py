@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Checked, NonNegative
 from ksim_rl.scene.state.ground import Ground
 
 if TYPE_CHECKING:
     from ksim_rl.envs.view import EnvView
 
+Friction = tuple[NonNegative, NonNegative, NonNegative]
 MATERIAL = "terrain"
 BODY = "terrain"
 """Name of the body, and of the geom, that a terrain adds to the world."""
@@ -68,7 +69,7 @@ def add_ground(spec: mujoco.MjSpec, *, friction: Sequence[float], **shape: Any) 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Terrain(ABC):
+class Terrain(Checked, ABC):
     """The ground of a scene: one static body with one geom, both called "terrain"."""
 
     @property
@@ -93,11 +94,7 @@ class PlaneTerrain(Terrain):
         friction: sliding (1), torsional (m) and rolling (m) coefficients, as in MJCF.
     """
 
-    friction: tuple[float, float, float] = (1.0, 0.005, 0.0001)
-
-    def __post_init__(self) -> None:
-        for index, value in enumerate(self.friction):
-            check_in_range(f"friction[{index}]", value, low=0.0)
+    friction: Friction = (1.0, 0.005, 0.0001)
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add the plane to the world body, with a checker pattern and a sky for rendering."""
