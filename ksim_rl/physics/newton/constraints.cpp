@@ -16,22 +16,22 @@ each_row(0, 1, Singly {}, [&](int row, float* jacobian) {
 });
 UNROLL
 for (int block = 0; block < BLOCKS; ++block) {
-    qacc[block] = row_of(problem.warmstart)[dof_of(block)];
+    qacc[block] = row_of(problem.qacc_warmstart)[dof_of(block)];
     qfrc_smooth[block] = row_of(problem.qfrc_smooth)[dof_of(block)];
     if (is_dof(block))
         shared[dof_of(block)] = bounded(qacc[block]);
 }
 sync();
 #pragma unroll 4
-for (int entry = lane; entry < problem.M_row.shape[0]; entry += LANES) {
-    const int row = problem.M_row.data[entry], column = problem.M_col.data[entry];
+for (int entry = lane; entry < problem.M_hinit_i.shape[0]; entry += LANES) {
+    const int row = problem.M_hinit_i.data[entry], column = problem.M_colind.data[entry];
     mass[row * STRIDE + column] = mass[column * STRIDE + row] = row_of(problem.M)[entry];
 }
 each_row(lane, LANES, Singly {}, [&](int row, float* jacobian) {
-    const int begin = row_of(problem.J_rowadr)[row];
-    const int end = begin + row_of(problem.J_rownnz)[row];
-    const float* const values = row_of(problem.J_values);
-    const int* const dofs = row_of(problem.J_colind);
+    const int begin = row_of(problem.efc_J_rowadr)[row];
+    const int end = begin + row_of(problem.efc_J_rownnz)[row];
+    const float* const values = row_of(problem.efc_J);
+    const int* const dofs = row_of(problem.efc_J_colind);
     float product = 0.0f;
 #pragma unroll 4
     for (int entry = begin; entry < end; ++entry) {
@@ -42,7 +42,7 @@ each_row(lane, LANES, Singly {}, [&](int row, float* jacobian) {
     residual[row] = product - row_of(problem.efc_aref)[row];
     efc_D[row] = row_of(problem.efc_D)[row];
     kinds[row] = row < equalities ? EQUALITY : row < equalities + frictions ? FRICTION : ONE_SIDED;
-    bound[row] = row_of(problem.efc_limit)[row];
+    bound[row] = row_of(problem.efc_frictionloss)[row];
     require(efc_D[row] > 0.0f && (kinds[row] != FRICTION || bound[row] >= 0.0f), ROWS_ARE_WHOLE);
     if (ELLIPTIC) {
         const int* const types = row_of(problem.efc_type);

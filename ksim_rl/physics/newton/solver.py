@@ -131,35 +131,18 @@ def solver(
     far_floats = (d.njmax - place.rows_on_chip) * row_stride(m.nv)
     problem = Problem()
     problem.iterations = int(m.opt.iterations)
-    problem.tolerance = m.opt.tolerance
-    problem.ls_tolerance = m.opt.ls_tolerance
-    problem.impratio_invsqrt = m.opt.impratio_invsqrt
-    problem.M_row = m.M_hinit_i
-    problem.M_col = m.M_colind
-    problem.ne = d.ne
-    problem.nf = d.nf
-    problem.nefc = d.nefc
-    problem.M = d.M
-    problem.warmstart = d.qacc_warmstart
-    problem.qfrc_smooth = d.qfrc_smooth
     problem.contact_friction = d.contact.friction
-    problem.efc_type = efc.type
-    problem.efc_id = efc.id
-    problem.J_rownnz = efc.J_rownnz
-    problem.J_rowadr = efc.J_rowadr
-    problem.J_colind = efc.J_colind.reshape((d.nworld, -1))
-    problem.J_values = efc.J.reshape((d.nworld, -1))
-    problem.efc_D = efc.D
-    problem.efc_aref = efc.aref
-    problem.efc_limit = efc.frictionloss
+    problem.efc_J_colind = efc.J_colind.reshape((d.nworld, -1))
+    problem.efc_J = efc.J.reshape((d.nworld, -1))
+    for prefix, owner, names in (
+        ("", m, "M_hinit_i M_colind"),
+        ("", m.opt, "tolerance ls_tolerance impratio_invsqrt"),
+        ("", d, "ne nf nefc M qacc qacc_warmstart qfrc_smooth qfrc_constraint solver_niter overflow"),
+        ("efc_", efc, "type id J_rownnz J_rowadr D aref frictionloss Ma force state"),
+    ):
+        for name in names.split():
+            setattr(problem, prefix + name, getattr(owner, name))
     problem.scratch = wp.empty((d.nworld, far_floats), dtype=float, device=d.qpos.device)
-    problem.qacc = d.qacc
-    problem.efc_Ma = efc.Ma
-    problem.efc_force = efc.force
-    problem.efc_state = efc.state
-    problem.qfrc_constraint = d.qfrc_constraint
-    problem.solver_niter = d.solver_niter
-    problem.overflow = d.overflow
     problem.order = wp.array(list(range(d.nworld)), dtype=int, device=d.qpos.device)
     problem.broken = wp.empty(0, dtype=int, device=d.qpos.device) if broken is None else broken
     dim, block_dim = (d.nworld, lanes), place.worlds_per_block * lanes
