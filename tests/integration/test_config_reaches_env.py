@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ksim_rl import envs
-from ksim_rl.config import config_tree
+from ksim_rl.config import plugins
 from ksim_rl.physics import SimCfg
 from ksim_rl.physics.sim_cfg import CONES, INTEGRATORS, SOLVERS
 from ksim_rl.scene.rendering import rendering
@@ -31,7 +31,7 @@ def rolled_out(env, steps=1, action=0.5):
 @pytest.fixture
 def own_terms(monkeypatch):
     """Let configs build the terms of the tests."""
-    monkeypatch.setattr(config_tree, "_allowed_packages", set(config_tree._allowed_packages))
+    monkeypatch.setattr(plugins, "_allowed", set(plugins._allowed))
     envs.allow_package("tests")
 
 
@@ -275,6 +275,17 @@ def test_metrics():
     env = made(f"+task.metrics.jolt={acceleration}", f"task.episode_length_s={2 * DT}")
     rolled_out(env, 2, action=0.5)
     assert float(env.base_env.episode_log()["metric/jolt"]) == 0.5 * E
+
+
+def test_transforms_delay_the_actions_by_exactly_their_lag():
+    lag = "+task.transforms.lag={_target_: ksim_rl.envs.transforms.ActionDelay, delay: {min_lag: 1, max_lag: 2}}"
+    env = made(lag, "task.transforms.lag.delay.min_lag=2")
+    assert "lag" in env.explain()
+    td, taken = env.reset(), []
+    for step in range(1, 6):
+        td = env.step_and_maybe_reset(td.set("action", torch.full((E, 1), step / 10)))[1]
+        taken.append(env.base_env.view.action_EL.mean())
+    torch.testing.assert_close(torch.stack(taken), torch.tensor([0.0, 0.0, 0.1, 0.2, 0.3]))
 
 
 def test_is_finite_horizon():
