@@ -299,12 +299,15 @@ def tests_in_place(house: House) -> list[str]:
     found = [f"tests/{room} is missing" for room in sorted(rooms - folders)]
     found += [f"tests/{name} is of no room" for name in sorted(folders - rooms - TESTS_OF_ALL_ROOMS)]
     rooms_of: dict[str, set[str]] = {}
+    folders_of: dict[str, set[str]] = {}
     for path in house.texts:
         rooms_of.setdefault(path.stem, set()).add(house.room(path))
+        folders_of.setdefault(path.parent.name, set()).add(house.room(path))
     for path in sorted(tests.rglob("test_*.py")):
         room = path.relative_to(tests).parts[0]
-        homes = rooms_of.get(path.stem.removeprefix("test_"), set())
-        if room in rooms and homes and room not in homes:
+        subject = path.stem.removeprefix("test_")
+        homes = rooms_of.get(subject, set())
+        if room in rooms and homes and room not in homes | folders_of.get(subject, set()):
             found.append(f"{house.name(path)} tests a module of {', '.join(sorted(homes))}")
     return found
 

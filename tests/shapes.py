@@ -14,18 +14,17 @@ import importlib.machinery
 import inspect
 import re
 import sys
-import types
-import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any
 
 import jaxtyping
-import numpy as np
 import torch
-from jaxtyping import AbstractArray, TypeCheckError
+from jaxtyping import TypeCheckError
+
+from tests.annotations import Check, check_of, items_check, names_a_shape
 
 PACKAGE = "ksim_rl"
 ROOT = Path(__file__).parents[1] / PACKAGE
@@ -42,171 +41,17 @@ _DTYPES = {
 }
 _ALIAS = re.compile(rf"^(\w+)(?:: TypeAlias)? = .*\b(?:{'|'.join(sorted(_DTYPES))})\[", re.MULTILINE)
 
-Check = Callable[[Any, dict[str, Any]], str]
-
 
 def shape_aliases(root: Path) -> set[str]:
     """Return the names that the package's modules give to annotations with axes."""
     return {name for path in root.rglob("*.py") for name in _ALIAS.findall(path.read_text())}
 
 
-# ---- what an annotation asks of a value ----
-
-
-def names_a_shape(annotation: object) -> bool:
-    """Say whether axes stand anywhere in `annotation`."""
-    if inspect.isclass(annotation) and issubclass(annotation, AbstractArray):
-        return True
-    parts = annotation if isinstance(annotation, list | tuple) else typing.get_args(annotation)
-    return any(names_a_shape(part) for part in parts)
-
-
-@functools.cache
-def _has_dtype(annotation: type[AbstractArray], dtype: object) -> bool:
-    kind: Any = annotation.dtype
-    if isinstance(dtype, torch.dtype):
-        return isinstance(torch.empty((), dtype=dtype), kind[torch.Tensor, ""])
-    return isinstance(np.empty((), dtype=dtype), kind[np.ndarray, ""])
-
-
-def _axis_error(axis: str, size: int, sizes: dict[str, Any]) -> bool:
-    """Bind one axis in `sizes`, or say that it has another size there."""
-    if axis.startswith("#"):
-        if size == 1:
-            return False
-        axis = axis[1:]
-    if axis == "_" or axis.startswith("?"):  # ?L: another size in each item of a container
-        return False
-    if axis.isidentifier():
-        return sizes.setdefault(axis, size) != size
-    return eval(axis, {}, sizes) != size  # noqa: S307  # a size such as 3 or T+1, from our own source
-
-
-def _array_check(annotation: type[AbstractArray]) -> Check:
-    axes = annotation.dim_str.split()
-    kind = annotation.array_type
-    (several, *more) = [index for index, axis in enumerate(axes) if "*" in axis[:2] or axis == "..."] or [-1]
-    assert not more, annotation
-    count = len(axes)
-    fixed = [(index, int(axis)) for index, axis in enumerate(axes) if axis.isdecimal()]
-    named = [(index, axis) for index, axis in enumerate(axes) if axis.isidentifier() and axis != "_"]
-    plain = several < 0 and len(fixed) + len(named) == count
-
-    def check(value: Any, sizes: dict[str, Any]) -> str:
-        if not isinstance(value, kind):
-            return f"is of type {type(value).__name__}"
-        shape = value.shape
-        if not _has_dtype(annotation, value.dtype):
-            return f"has dtype {value.dtype}"
-        if plain:
-            if len(shape) != count:
-                return f"has shape {tuple(shape)}"
-            for index, size in fixed:
-                if shape[index] != size:
-                    return f"has shape {tuple(shape)}"
-            for index, axis in named:
-                if sizes.setdefault(axis, shape[index]) != shape[index]:
-                    return f"has shape {tuple(shape)}"
-            return ""
-        names = axes
-        if several >= 0:
-            if len(shape) < count - 1:
-                return f"has shape {tuple(shape)}"
-            width = len(shape) - count + 1
-            inner = tuple(shape[several : several + width])
-            if (
-                axes[several][0] == "*"
-                and "?" not in axes[several]
-                and sizes.setdefault(axes[several], inner) != inner
-            ):
-                return f"has shape {tuple(shape)}"
-            names = [*axes[:several], *["_"] * width, *axes[several + 1 :]]
-        if len(shape) != len(names) or any(
-            _axis_error(a, n, sizes) for a, n in zip(names, shape, strict=True)
-        ):
-            return f"has shape {tuple(shape)}"
-        return ""
-
-    return check
-
-
-def _union_check(parts: Iterable[object]) -> Check:
-    checks = [check_of(part) for part in parts]
-
-    def check(value: Any, sizes: dict[str, Any]) -> str:
-        errors = []
-        for alternative in checks:
-            before = dict(sizes)
-            if not (error := alternative(value, sizes)):
-                return ""
-            sizes.clear()
-            sizes.update(before)
-            errors.append(error)
-        return errors[0]
-
-    return check
-
-
-def _kind_check(kind: type) -> Check:
-    return lambda value, sizes: "" if isinstance(value, kind) else f"is of type {type(value).__name__}"
-
-
-def _items_check(kind: type, items: Callable[[Any], Iterable[Any]], item: Check) -> Check:
-    def check(value: Any, sizes: dict[str, Any]) -> str:
-        if not isinstance(value, kind):
-            return f"is of type {type(value).__name__}"
-        for index, part in enumerate(items(value)):
-            if error := item(part, sizes):
-                return f"has an item {index} that {error}"
-        return ""
-
-    return check
-
-
-def _tuple_check(parts: tuple[object, ...]) -> Check:
-    checks = [check_of(part) for part in parts]
-
-    def check(value: Any, sizes: dict[str, Any]) -> str:
-        if not isinstance(value, tuple) or len(value) != len(checks):
-            return f"is no tuple of {len(checks)}"
-        for index, (part, of_part) in enumerate(zip(value, checks, strict=True)):
-            if error := of_part(part, sizes):
-                return f"has an item {index} that {error}"
-        return ""
-
-    return check
-
-
-def check_of(annotation: Any) -> Check:
-    """Return a function of a value and of the axes bound so far, which says in what way the value is not as annotated.
-
-    What has no axes is checked by its class at most: static types are pyright's.
-    """
-    if inspect.isclass(annotation) and issubclass(annotation, AbstractArray):
-        return _array_check(annotation)
-    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
-    if origin is typing.Annotated:
-        return check_of(parts[0])
-    if origin in (typing.Union, types.UnionType):
-        return _union_check(parts)
-    if not inspect.isclass(origin or annotation):
-        return lambda value, sizes: ""
-    kind = origin or annotation
-    if kind is Any or (isinstance(kind, type(typing.Protocol)) and not names_a_shape(annotation)):
-        return lambda value, sizes: ""
-    if names_a_shape(annotation):
-        if kind is tuple:
-            if parts[-1] is Ellipsis:
-                return _items_check(tuple, iter, check_of(parts[0]))
-            return _tuple_check(parts)
-        if issubclass(kind, Mapping):
-            return _items_check(kind, lambda value: value.values(), check_of(parts[1]))
-        if kind is not type and issubclass(kind, Iterable) and hasattr(kind, "__len__"):
-            return _items_check(kind, iter, check_of(parts[0]))
-    return _kind_check(kind)
-
-
 # ---- functions ----
+
+
+def _unchecked(value: Any, sizes: dict[str, Any]) -> str:
+    return ""
 
 
 @dataclass
@@ -239,23 +84,23 @@ class Shaped:
                 check = check_of(annotation)
             except Exception as error:  # listed, and refused by a test
                 self.error = f"{self.name}: {parameter}: {annotation}: {error!r}"
-                continue
+                check = _unchecked
             if parameter == names.varargs:
-                check = _items_check(tuple, iter, check)
+                check = items_check(tuple, iter, check)
             elif parameter == names.varkw:
-                check = _items_check(dict, dict.values, check)
+                check = items_check(dict, dict.values, check)
             if parameter != "return":
                 self.arguments.append((parameter, check))
             elif not inspect.isgeneratorfunction(self.function):
                 self.result = check
 
-    def check_arguments(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the sizes that the arguments bind; raises TypeCheckError where they disagree."""
+    def check_arguments(self, *values: Any) -> dict[str, Any]:
+        """Return the sizes that the arguments with axes bind; raises TypeCheckError where they disagree."""
         if not self.ready:
             self.resolve()
         sizes: dict[str, Any] = {}
-        for parameter, check in self.arguments:
-            if error := check(values[parameter], sizes):
+        for (parameter, check), value in zip(self.arguments, values, strict=False):
+            if error := check(value, sizes):
                 self.fail(parameter, error, sizes)
         return sizes
 
@@ -295,7 +140,7 @@ def _wrapper_code(
         kind_before = kind
     if kind_before is _KINDS.POSITIONAL_ONLY:
         heads.append("/")
-    values = "{" + ", ".join(f"{p!r}: {p}" for p in checked if p != "return") + "}"
+    values = ", ".join(p for p in checked if p != "return")
     tree = ast.parse(
         f"def enclosing({', '.join(_FREE)}):\n"
         f"    def wrapper({', '.join(heads)}):\n"
@@ -366,6 +211,19 @@ PLAIN: list[str] = []
 """The functions whose annotations name no axes."""
 
 
+def _dotted(decorator: ast.expr) -> str:
+    if isinstance(decorator, ast.Call):
+        return _dotted(decorator.func)
+    if isinstance(decorator, ast.Attribute):
+        return f"{_dotted(decorator.value)}.{decorator.attr}"
+    return decorator.id if isinstance(decorator, ast.Name) else ""
+
+
+def is_foreign(decorator: ast.expr) -> bool:
+    """Say whether a decorator hands the function's source to another compiler."""
+    return FOREIGN_COMPILERS.fullmatch(_dotted(decorator)) is not None
+
+
 class _Decorating(ast.NodeTransformer):
     """Adds `checked` below all other decorators of a module's functions, where an annotation names axes."""
 
@@ -393,14 +251,14 @@ class _Decorating(ast.NodeTransformer):
             and isinstance(part.target, ast.Name)
             and self._mentions(part.annotation)
         ]
-        if fields and any("dataclass" in ast.unparse(decorator) for decorator in node.decorator_list):
+        if fields and any("dataclass" in _dotted(decorator) for decorator in node.decorator_list):
             node.decorator_list.insert(0, self._decorator("checked_class", node, fields))
         return node
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.FunctionDef:
         self._inside(node)
         name = ".".join([*self.scope, node.name])
-        if any(FOREIGN_COMPILERS.match(ast.unparse(decorator)) for decorator in node.decorator_list):
+        if any(map(is_foreign, node.decorator_list)):
             FOREIGN.append(name)
             return node
         arguments = node.args

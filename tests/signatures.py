@@ -43,6 +43,9 @@ class Function:
     """Names with annotations; `return` last."""
     is_property: bool = False
     is_class: bool = False
+    is_nested: bool = False
+    """Inside of a function: it exists while that one runs."""
+    decorators: tuple[ast.expr, ...] = ()
 
 
 def parse(text: str) -> ast.Module:
@@ -57,14 +60,16 @@ def _parse(text: str) -> ast.Module:
 
 def functions(path: Path, root: Path) -> Iterator[Function]:
     """Yield all functions of a file, with those inside of others and the fields of classes."""
-    yield from _functions(parse(path.read_text()).body, str(path.relative_to(root)), [], True)
+    yield from _functions(parse(path.read_text()).body, str(path.relative_to(root)), [], True, False)
 
 
-def _functions(body: list[ast.stmt], path: str, scope: list[str], public: bool) -> Iterator[Function]:
+def _functions(
+    body: list[ast.stmt], path: str, scope: list[str], public: bool, nested: bool
+) -> Iterator[Function]:
     for node in body:
         if isinstance(node, ast.If | ast.Try | ast.With):
             inner = [*node.body, *getattr(node, "orelse", ())]
-            yield from _functions(inner, path, scope, public)
+            yield from _functions(inner, path, scope, public, nested)
         elif isinstance(node, ast.ClassDef):
             shown = public and not node.name.startswith("_")
             fields = tuple(
@@ -74,7 +79,7 @@ def _functions(body: list[ast.stmt], path: str, scope: list[str], public: bool) 
             )
             name = ".".join([*scope, node.name])
             yield Function(f"{path}:{node.lineno}", name, shown, fields, is_class=True)
-            yield from _functions(node.body, path, [*scope, node.name], shown)
+            yield from _functions(node.body, path, [*scope, node.name], shown, nested)
         elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             decorators = [ast.unparse(decorator) for decorator in node.decorator_list]
             arguments = node.args
@@ -96,8 +101,10 @@ def _functions(body: list[ast.stmt], path: str, scope: list[str], public: bool) 
                 public and (not node.name.startswith("_") or node.name in _PUBLIC_MAGIC),
                 tuple(parameters),
                 is_property=any(d in ("property", "cached_property", "quantity") for d in decorators),
+                is_nested=nested,
+                decorators=tuple(node.decorator_list),
             )
-            yield from _functions(node.body, path, [*scope, node.name], False)
+            yield from _functions(node.body, path, [*scope, node.name], False, True)
 
 
 def aliases(root: Path) -> set[str]:

@@ -11,13 +11,11 @@ ROOT = Path(__file__).parents[1]
 PENDING = {
     "package_size",
     "file_lengths",
-    "folder_sizes",
     "circles",
     "bare_tensors",
     "suffixes",
     "probes",
     "docstrings",
-    "tests_in_place",
 }
 
 _TENSORS = """\"\"\"This module has tensors.\"\"\"
