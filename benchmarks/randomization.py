@@ -153,7 +153,7 @@ def _reset_events_ms(env: Any, episode_steps: int, device: torch.device, schedul
 
     def reset_events() -> None:
         base_env.event_manager.reset(mask_E)
-        base_env.view.refreshed()
+        base_env.driver.refreshed()
 
     return _warm_ms(reset_events, device, schedule)
 

@@ -27,6 +27,7 @@ from benchmarks.stopwatch import milliseconds
 from ksim_rl import envs
 from ksim_rl.checks import unknown_name
 from ksim_rl.device.streams import checked_device
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.view import EnvView
 from ksim_rl.physics import World, load_model
@@ -122,7 +123,7 @@ def _physics_ms(cfg: ManagerBasedRlEnvCfg, terrain: Terrain, device: torch.devic
         sim=cfg.sim,
         per_world_fields=terrain.per_world_fields,
     )
-    view = EnvView(world, step_dt=cfg.decimation * world.timestep, entities=tuple(scene.entities))
+    view = EnvDriver(world, step_dt=cfg.decimation * world.timestep, entities=tuple(scene.entities)).view
     generator = torch.Generator(device).manual_seed(0)
     _spread(view, terrain.ground(view), generator)
     pose_K = _default_targets(view)

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
+from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import CommandTerm, RewardTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors import SensorTracker
-
-if TYPE_CHECKING:
-    from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
-    from ksim_rl.envs.view import EnvView
-    from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 
 
 class Drawing(Protocol):

@@ -1,52 +1,67 @@
-"""What an env is made of, as tables to read."""
+"""This module writes what an env is made of as tables to read."""
 
 from __future__ import annotations
 
 import dataclasses
 import io
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from torchrl.data import TensorSpec
 from torchrl.envs.transforms import Transform
 
+from ksim_rl.envs.driver import EnvDriver
+from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.term import EventTerm
+from ksim_rl.physics import World
 from ksim_rl.transforms.groups.compile_groups import compile_groups
 from ksim_rl.transforms.groups.group_spec import spell
 from ksim_rl.transforms.transform_cfg import TransformCfg
 
-if TYPE_CHECKING:
-    from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
-    from ksim_rl.physics import World
-
 WIDTH = 120
 
 
-def explain(env: ManagerBasedRlEnv, *, width: int = WIDTH) -> str:
+def explain(
+    cfg: ManagerBasedRlEnvCfg,
+    driver: EnvDriver,
+    *,
+    observations: Mapping[str, TensorSpec],
+    action_sizes: Mapping[str, int],
+    events: Mapping[str, EventTerm],
+    levels: Mapping[str, float],
+    width: int = WIDTH,
+) -> str:
     """Return one table per manager: index, name, shape, weight, mode and parameters of each term.
 
     Parameters that have their defaults are left out.
 
     Args:
-        env: what is explained.
+        cfg: of the env.
+        driver: of the env.
+        observations: the spec of each observation term, [E, ...].
+        action_sizes: how many columns each action term takes.
+        events: the events that the env has, by name.
+        levels: of the curricula.
         width: characters per line.
     """
     output = io.StringIO()
     console = Console(file=output, width=width, highlight=False, markup=False, color_system=None)
-    console.print(_summary(env))
-    for table in _tables(env):
+    console.print(_summary(cfg, driver))
+    for table in _tables(cfg, driver, observations, action_sizes, events, levels):
         console.print(table)
     return "\n".join(line.rstrip() for line in output.getvalue().splitlines()) + "\n"
 
 
-def _summary(env: ManagerBasedRlEnv) -> str:
-    length = f"{env.max_episode_length_s:g} s = {env.max_episode_length} steps"
+def _summary(cfg: ManagerBasedRlEnvCfg, driver: EnvDriver) -> str:
+    length = f"{cfg.episode_length_s:g} s = {driver.max_episode_length} steps"
     return (
-        f"{env.num_envs} envs on {env.device}, "
-        f"{env.step_dt:g} s per step = {env.cfg.decimation} x {env.physics_dt:g} s, "
-        f"episodes of {length if env.max_episode_length else 'any length'}\n"
-        f"constraints are solved by {_solver(env.world)}"
+        f"{driver.num_envs} envs on {driver.device}, "
+        f"{driver.step_dt:g} s per step = {cfg.decimation} x {driver.physics_dt:g} s, "
+        f"episodes of {length if driver.max_episode_length else 'any length'}\n"
+        f"constraints are solved by {_solver(driver.world)}"
     )
 
 
@@ -56,12 +71,18 @@ def _solver(world: World) -> str:
     return f"MuJoCo Warp's own solver, because {world.one_kernel_unavailable}"
 
 
-def _tables(env: ManagerBasedRlEnv) -> Iterable[Table]:
-    cfg = env.cfg
+def _tables(
+    cfg: ManagerBasedRlEnvCfg,
+    driver: EnvDriver,
+    observations: Mapping[str, TensorSpec],
+    action_sizes: Mapping[str, int],
+    events: Mapping[str, EventTerm],
+    levels: Mapping[str, float],
+) -> Iterable[Table]:
     for group, group_cfg in cfg.observations.items():
         rows, shapes = [], []
         for name, term_cfg in group_cfg.terms.items():
-            shape = tuple(env.observation_spec["obs", name].shape[1:])
+            shape = tuple(observations[name].shape[1:])
             if len(shape) == 1:
                 shape = (shape[0] * group_cfg.num_frames(name),)
             shapes.append(shape)
@@ -71,18 +92,17 @@ def _tables(env: ManagerBasedRlEnv) -> Iterable[Table]:
         whole = shapes[0] if len(shapes) == 1 else (sum(shape[0] for shape in shapes),)
         yield _table(f"observations/{group} {whole}", ("term", "shape", "chain", "parameters"), rows)
 
-    sizes = env.action_manager.sizes
-    rows = [(name, f"({sizes[name]},)", _described(term)) for name, term in cfg.actions.items()]
-    yield _table(f"actions ({env.action_manager.size},)", ("term", "shape", "parameters"), rows)
+    rows = [(name, f"({action_sizes[name]},)", _described(term)) for name, term in cfg.actions.items()]
+    yield _table(f"actions ({sum(action_sizes.values())},)", ("term", "shape", "parameters"), rows)
 
     rows = [
-        (name, f"({env.command_manager.values[name].shape[-1]},)", _seconds(term.resampling_time_range_s, "at resets"),
+        (name, f"({driver.readings.commands[name].shape[-1]},)", _seconds(term.resampling_time_range_s, "at resets"),
          _described(term, without=("resampling_time_range_s",)))
         for name, term in cfg.commands.items()
     ]  # fmt: skip
     yield _table("commands", ("term", "shape", "resampled every", "parameters"), rows)
 
-    weights = env.view.reward_weights
+    weights = driver.readings.reward_weights
     rows = [
         (
             name,
@@ -91,7 +111,7 @@ def _tables(env: ManagerBasedRlEnv) -> Iterable[Table]:
         )
         for name, term in cfg.rewards.items()
     ]
-    scaled = f"times {env.step_dt:g} s" if cfg.scale_rewards_by_dt else "per step"
+    scaled = f"times {driver.step_dt:g} s" if cfg.scale_rewards_by_dt else "per step"
     yield _table(f"rewards ({scaled})", ("term", "weight", "parameters"), rows)
 
     ends = "terminated" if cfg.is_finite_horizon else "truncated"
@@ -104,12 +124,11 @@ def _tables(env: ManagerBasedRlEnv) -> Iterable[Table]:
 
     rows = [
         (name, term.mode, _seconds(term.interval_range_s, ""), _described(term, ("mode", "interval_range_s")))
-        for name, term in env.event_manager.terms.items()
+        for name, term in events.items()
     ]
     yield _table("events", ("term", "mode", "every", "parameters"), rows)
 
-    levels = env.curriculum_levels()
-    rows = [(name, f"{float(levels[name]):g}", _described(term)) for name, term in cfg.curriculum.items()]
+    rows = [(name, f"{levels[name]:g}", _described(term)) for name, term in cfg.curriculum.items()]
     yield _table("curriculum", ("term", "level", "parameters"), rows)
 
     rows = [(name, term.reduce, _described(term, ("reduce",))) for name, term in cfg.metrics.items()]

@@ -22,6 +22,7 @@ from ksim_rl.device.streams import checked_device
 from ksim_rl.envs import specs
 from ksim_rl.envs.contract import DifficultyLevels, EpisodeClock, EpisodeSums, Pictures, SimulatedWorld
 from ksim_rl.envs.drawing import Drawing, drawings
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.explain import explain
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.managers import (
@@ -37,7 +38,6 @@ from ksim_rl.envs.managers import (
 )
 from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.envs.reset_to_default import ResetToDefault
-from ksim_rl.envs.view import EnvView
 from ksim_rl.physics import World, load_model, prepare_spec
 from ksim_rl.scene.actuators import JointDrives
 from ksim_rl.scene.rendering.rendering import OffscreenRenderer
@@ -101,7 +101,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             sim=cfg.sim,
             per_world_fields=tuple(dict.fromkeys(fields)),
         )
-        self.view = EnvView(
+        self.driver = EnvDriver(
             self.world,
             step_dt=self.step_dt,
             max_episode_length=self.max_episode_length,
@@ -110,8 +110,9 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         )
         self.world.refresh()
         self._events_cfg: Mapping[str, Any] = events
+        self.view = self.driver.view
         self.load_managers()
-        self.view.freeze()
+        self.driver.freeze()
         self._make_specs()
         self.seed(-1 if cfg.seed is None else cfg.seed)
 
@@ -122,37 +123,32 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
 
         Each term runs once here, so that names that match nothing are errors before the first step.
         """
-        cfg, view = self.cfg, self.view
+        cfg, driver, view = self.cfg, self.driver, self.driver.view
         if cfg.scene.terrain is not None:
-            view.terrain = cfg.scene.terrain.ground(view)
-        view.sensors.update((name, sensor.track(name, view)) for name, sensor in cfg.scene.sensors.items())
+            driver.ground = cfg.scene.terrain.ground(view)
+        driver.add_sensors(cfg.scene.sensors)
         self.joint_drives = JointDrives(
             {
                 view.entity(name).prefix: getattr(robot, "actuators", ())
                 for name, robot in cfg.scene.entities.items()
             },
+            driver,
             view,
         )
-        self.event_manager = EventManager(self._events_cfg, view)
-        view.refreshed()
-        self.command_manager = CommandManager(cfg.commands, view)
-        self.action_manager = ActionManager(cfg.actions, view)
-        self.observation_manager = ObservationManager(cfg.observations, view)
+        self.event_manager = EventManager(self._events_cfg, driver)
+        driver.refreshed()
+        self.command_manager = CommandManager(cfg.commands, driver)
+        self.action_manager = ActionManager(cfg.actions, driver)
+        self.observation_manager = ObservationManager(cfg.observations, driver)
         adapted = frozenset(name for term in cfg.curriculum.values() for name in term.adapted_rewards)
         self.reward_manager = RewardManager(
-            cfg.rewards, view, scale=self.step_dt if cfg.scale_rewards_by_dt else 1.0, adapted=adapted
-        )
-        view.reward_weights = dict(
-            zip(self.reward_manager.names, self.reward_manager.weights_R.unbind(), strict=True)
-        )
-        view.episode_rewards = dict(
-            zip(self.reward_manager.names, self.reward_manager.episode_sums_ER.unbind(-1), strict=True)
+            cfg.rewards, driver, scale=self.step_dt if cfg.scale_rewards_by_dt else 1.0, adapted=adapted
         )
         self.termination_manager = TerminationManager(
-            cfg.terminations, view, is_finite_horizon=cfg.is_finite_horizon
+            cfg.terminations, driver, is_finite_horizon=cfg.is_finite_horizon
         )
-        self.metric_manager = MetricManager(cfg.metrics, view)
-        self.curriculum_manager = CurriculumManager(cfg.curriculum, view)
+        self.metric_manager = MetricManager(cfg.metrics, driver)
+        self.curriculum_manager = CurriculumManager(cfg.curriculum, driver)
         self._log = EpisodeLog(view, self.reward_manager, self.termination_manager, self.metric_manager)
 
     @property
@@ -201,29 +197,29 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
     # -- step and reset ------------------------------------------------------------------------------------------
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        view, world = self.view, self.world
+        driver, world = self.driver, self.world
         action_EL = self._checked_action(tensordict.get("action"))
         # A graph would go on reading what the step before it computed, which no replay computes again.
-        view.forget()
-        view.step_count.add_(1)
+        driver.forget()
+        driver.step_count.add_(1)
         self.event_manager.step()
         finite_E = self.action_manager.apply(action_EL)
 
         world.step(
             self.cfg.decimation,
-            before=view.before_substep,
-            after=view.after_substep,
-            sensors=view.substep_sensors,
+            before=driver.before_substep,
+            after=driver.after_substep,
+            sensors=driver.substep_sensors,
         )
         # Also false for NaN, and in fewer kernels than `torch.isfinite`.
         finite_E = finite_E & ((world.qpos_EL.sum(-1) + world.qvel_EL.sum(-1)).abs() < torch.inf)
         # Clearing failed worlds at once keeps everything that is computed from here on finite.
         world.reset(~finite_E)
         world.refresh()
-        view.refreshed()
+        driver.refreshed()
 
-        view.episode_step_E.add_(1)
-        for tracker in view.sensors.values():
+        driver.episode_step_E.add_(1)
+        for tracker in driver.readings.sensors.values():
             tracker.update()
         terminated_E, truncated_E = self.termination_manager.step(finite_E)
         done_E = terminated_E | truncated_E
@@ -239,24 +235,24 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        view = self.view
+        driver = self.driver
         if tensordict is not None and "_reset" in tensordict.keys():
             mask_E = tensordict.get("_reset").view(self.num_envs)
         else:
             mask_E = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        view.forget()
-        view.reset_count_E.add_(mask_E)
+        driver.forget()
+        driver.reset_count_E.add_(mask_E)
         self.curriculum_manager.reset(mask_E)
         self.world.reset(mask_E)
-        view.buffers.clear(mask_E)
-        view.targets.reset(mask_E)
+        driver.buffers.clear(mask_E)
+        self.view.targets.reset(mask_E)
         self.joint_drives.reset(mask_E)
-        view.episode_step_E.masked_fill_(mask_E, 0)
-        view.changed()
+        driver.episode_step_E.masked_fill_(mask_E, 0)
+        driver.changed()
         self.event_manager.reset(mask_E)
         self.command_manager.resample(mask_E)
         self.world.refresh()
-        view.refreshed()
+        driver.refreshed()
         self.command_manager.refresh(mask_E)
         no_E1 = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         return self._env_state(done=no_E1, terminated=no_E1.clone(), truncated=no_E1.clone())
@@ -284,10 +280,9 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         """Seed all draws and redo the startup events. What curricula have learned stays."""
         seed = secrets.randbelow(2**31) if seed is None else seed
         self.cfg = dataclasses.replace(self.cfg, seed=seed)
-        view = self.view
-        view.seed.fill_(seed)
-        view.step_count.zero_()
-        view.reset_count_E.zero_()
+        self.driver.seed.fill_(seed)
+        self.driver.step_count.zero_()
+        self.driver.reset_count_E.zero_()
         self.event_manager.startup()
 
     def stagger_episodes_(self) -> None:
@@ -297,9 +292,9 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         only. Later episodes have their full length.
         """
         if self.max_episode_length:
-            with self.view.scope("stagger_episodes", self.view.reset_count_E):
+            with self.driver.scope("stagger_episodes", self.driver.reset_count_E):
                 share_E = self.view.uniform(1)[:, 0]
-            self.view.time_out_offset_E.copy_((share_E * self.max_episode_length).long())
+            self.driver.time_out_offset_E.copy_((share_E * self.max_episode_length).long())
 
     # -- what trainers read --------------------------------------------------------------------------------------
 
@@ -374,26 +369,33 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             }
         )
         self.world.refresh()
-        self.view.refreshed()
+        self.driver.refreshed()
         self.cfg = dataclasses.replace(self.cfg, seed=int(self.view.seed))
 
     def _buffers_to_save(self) -> dict[str, Tensor]:
-        view = self.view
+        driver = self.driver
         counters = {
-            "seed": view.seed,
-            "step_count": view.step_count,
-            "reset_count_E": view.reset_count_E,
-            "episode_step_E": view.episode_step_E,
+            "seed": driver.seed,
+            "step_count": driver.step_count,
+            "reset_count_E": driver.reset_count_E,
+            "episode_step_E": driver.episode_step_E,
             "reward_weights_R": self.reward_manager.weights_R,
             "curriculum_levels_C": self.curriculum_manager.levels_C,
             "episode_log_N": self._log.totals_N,
         }
-        shared = {f"shared/{name}": tensor for name, tensor in view.shared_values.by_name().items()}
-        return counters | shared | view.buffers.by_name()
+        shared = {f"shared/{name}": tensor for name, tensor in driver.shared_values.by_name().items()}
+        return counters | shared | driver.buffers.by_name()
 
     def explain(self) -> str:
         """Return what the env is made of: a table per manager with index, name, shape, weight, mode and parameters."""
-        return explain(self)
+        return explain(
+            self.cfg,
+            self.driver,
+            observations=dict(self.observation_spec["obs"].items()) if self.observation_manager.terms else {},
+            action_sizes=self.action_manager.sizes,
+            events=self.event_manager.terms,
+            levels={name: float(level) for name, level in self.curriculum_levels().items()},
+        )
 
     # -- pictures and the end ------------------------------------------------------------------------------------
 
@@ -405,7 +407,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         """Let each part of `setup_manager_visualizers` draw one env: the one that the viewer shows, unless given."""
         shown = self.cfg.viewer.env_index if env_index is None else env_index
         for scope, part in self.setup_manager_visualizers().items():
-            with self.view.scope(scope):
+            with self.driver.scope(scope):
                 part.draw_debug(self.view, visualizer, shown)
 
     def render(self) -> np.ndarray | None:

@@ -53,9 +53,13 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Seed the base env and each transform; return the next seed, as TorchRL does."""
         if seed is not None:
-            for transform in keyed_transforms(self):
-                transform.seed_(seed)
+            self.seed_transforms_(seed)
         return self.base_env.set_seed(seed, static_seed=static_seed)
+
+    def seed_transforms_(self, seed: int) -> None:
+        """Seed the transforms alone, as `set_seed` does: for a base env that has its seed already."""
+        for transform in keyed_transforms(self):
+            transform.seed_(seed)
 
     def state_dict(self, *args: Any, **kwargs: Any) -> OrderedDict[str, Any]:
         """Return a copy of all that a bit-exact continuation needs: base env, transforms, the last root values."""

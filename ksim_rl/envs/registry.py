@@ -134,7 +134,7 @@ def build(
             raise ValueError(f"task.transforms.{name}: {reason}") from error
     seed = base_env.cfg.seed
     assert seed is not None  # an env stores the seed that it drew
-    env.seed(seed)
+    env.seed_transforms_(seed)
     return env
 
 

@@ -11,16 +11,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from ksim_rl.checks import check_choice, check_in_range, check_pair
-
-if TYPE_CHECKING:
-    from ksim_rl.envs.view import EnvView
-    from ksim_rl.scene.rendering.visualizer import DebugVisualizer
+from ksim_rl.envs.view import EnvView
+from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 
 EVENT_MODES = ("startup", "reset", "interval", "step")
 METRIC_REDUCTIONS = ("mean", "last", "max", "sum")

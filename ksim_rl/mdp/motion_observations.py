@@ -13,7 +13,8 @@ from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.registry import build
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.scene.motions.motion import load_motion, motion_start_time
+from ksim_rl.scene.motions.motion import load_motion
+from ksim_rl.scene.state.motion_clock import motion_start_time
 from ksim_rl.scene.terrains import PlaneTerrain
 
 

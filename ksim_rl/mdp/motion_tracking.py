@@ -17,8 +17,8 @@ from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.fields import OfJoints
 from ksim_rl.mdp.rewards.gaussian_reward import GaussianReward
 from ksim_rl.scene import quaternion
-from ksim_rl.scene.motions.motion import motion_bodies, motion_joints, motion_time
 from ksim_rl.scene.names import Patterns
+from ksim_rl.scene.state.motion_clock import motion_bodies, motion_joints, motion_time
 
 # -- observations ------------------------------------------------------------------------------------------------
 

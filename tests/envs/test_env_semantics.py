@@ -177,7 +177,7 @@ def test_reset_events_read_nothing_of_the_episode_that_ended():
     env.reset()
     env.world.qpos_EL.fill_(2.0)
     env.world.refresh()
-    env.view.refreshed()
+    env.driver.refreshed()
     assert env.view.joint_pos_rel_EL[:, 0].tolist() == [2.0] * 3
     env.reset(env_ids=[1])
     assert seen[-1] == [2.0, 0.0, 2.0]

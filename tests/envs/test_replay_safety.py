@@ -19,7 +19,7 @@ STEPS = 16
 
 def spoil_caches(env: ManagerBasedRlEnv) -> None:
     """Make all quantities that were computed so far useless."""
-    for cache in env.view._state._caches:
+    for cache in env.driver._caches:
         for name, value in cache.items():
             # Not in place: a quantity may be a view of the state.
             cache[name] = ~value if value.dtype == torch.bool else torch.full_like(value, 77)

@@ -37,7 +37,7 @@ def test_centres_of_mass_of_subtrees(bench):
 def test_subtree_velocities_must_be_asked_for_during_construction():
     bench = random_bench(FIXED_BASE)
     assert not bench.world.has_subtree_velocities
-    bench.view.freeze()
+    bench.driver.freeze()
     with pytest.raises(RuntimeError, match="let a term of the config read them"):
         assert bench.view.bodies(".*").subtree_com_vel_EN3
 
@@ -60,10 +60,10 @@ def test_efforts_at_the_joints(bench):
 def test_heights_of_sites_are_above_the_ground(bench):
     sites = bench.view.sites(".*")
     close(sites.height_EN, engine(bench, lambda m, d: d.site_xpos[:, 2]))
-    flat, bench.view.terrain = bench.view.terrain, Plateau(E, bench.view.device)
+    flat, bench.driver.ground = bench.view.terrain, Plateau(E, bench.view.device)
     bench.refresh()
     close(sites.height_EN, engine(bench, lambda m, d: d.site_xpos[:, 2] - 0.25))
-    bench.view.terrain = flat
+    bench.driver.ground = flat
     bench.refresh()
 
 

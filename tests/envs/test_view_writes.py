@@ -72,7 +72,7 @@ def test_a_derived_quantity_after_a_write_is_refused_until_the_refresh():
     view.joints().write_pos(everybody_E, torch.zeros(E, 2))
     assert view.joint_pos_EL.eq(0).all(), "the joint state itself is never stale"
     assert torch.equal(view.root_lin_vel_w_EL, bench.world.qvel_EL[:, :3])
-    with view.scope("events/push"):
+    with bench.driver.scope("events/push"):
         for read in (
             lambda: view.bodies("trunk").pos_EN3,
             lambda: view.bodies("trunk").lin_vel_EN3,

@@ -6,7 +6,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from ksim_rl.envs.view import EnvView
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.physics import World, load_model, prepare_spec
 from ksim_rl.scene.sensors import Sensor
 from ksim_rl.scene.state.ground import Ground
@@ -99,8 +99,9 @@ class Bench:
         self.per_world = ("geom_friction", "body_ipos")
         prepare_spec(spec, self.per_world)
         self.world = World(load_model(spec), num_envs=num_envs, per_world_fields=self.per_world)
-        self.view = EnvView(self.world, step_dt=0.02, **view)
-        self.view.sensors.update((name, sensor.track(name, self.view)) for name, sensor in contacts.items())
+        self.driver = EnvDriver(self.world, step_dt=0.02, **view)
+        self.view = self.driver.view
+        self.driver.add_sensors(contacts)
         self.everybody_E = torch.ones(num_envs, dtype=torch.bool)
 
     def place(self, qpos=None, qvel=None) -> None:
@@ -112,14 +113,17 @@ class Bench:
 
     def refresh(self) -> None:
         self.world.refresh()
-        self.view.refreshed()
+        self.driver.refreshed()
 
     def step(self, substeps: int = 10) -> None:
         """Advance by one env step of 20 ms, contact clocks included."""
         self.view.step_count.add_(1)
-        view = self.view
+        driver = self.driver
         self.world.step(
-            substeps, before=view.before_substep, after=view.after_substep, sensors=view.substep_sensors
+            substeps,
+            before=driver.before_substep,
+            after=driver.after_substep,
+            sensors=driver.substep_sensors,
         )
         self.refresh()
         self.view.episode_step_E.add_(1)
@@ -129,15 +133,15 @@ class Bench:
     def command(self, values) -> None:
         """Set the command "twist" [E, 3] or [3]."""
         value = torch.as_tensor(values, dtype=torch.float32)
-        self.view.commands["twist"] = value.expand(self.world.num_envs, 3).clone()
+        self.driver.readings.commands["twist"] = value.expand(self.world.num_envs, 3).clone()
         self.view.command_cache.clear()
 
     def read(self, term, scope: str = "observations/x") -> Tensor:
-        with self.view.scope(scope):
+        with self.driver.scope(scope):
             return term(self.view)
 
     def fire(self, event, mask_E: Tensor | None = None, scope: str = "events/x") -> None:
         """Run an event for some rows (all by default), and refresh."""
-        with self.view.scope(scope):
+        with self.driver.scope(scope):
             event(self.view, self.everybody_E if mask_E is None else mask_E)
         self.refresh()

@@ -9,7 +9,7 @@ import torch
 
 from ksim_rl import mdp
 from ksim_rl.scene.motions import motion_path
-from ksim_rl.scene.motions.motion import motion_start_time
+from ksim_rl.scene.state.motion_clock import motion_start_time
 from tests.tasks.placed import Placed
 
 CLIP = "walker_walk"
@@ -33,11 +33,11 @@ def at(bench, *times, moved=0.0):
     bench.world.qpos_EL.copy_(qpos_EL)
     bench.world.qvel_EL.copy_(qvel_EL)
     bench.world.refresh()
-    bench.view.refreshed()
+    bench.driver.refreshed()
 
 
 def read(bench, term):
-    with bench.view.scope("observations/x"):
+    with bench.driver.scope("observations/x"):
         return term(bench.view)
 
 
@@ -67,7 +67,7 @@ def test_kernels_of_known_errors(bench):
     bench.world.qpos_EL[:, 2] += 0.2
     bench.world.qvel_EL[:, 0] += 0.5
     bench.world.refresh()
-    bench.view.refreshed()
+    bench.driver.refreshed()
     turned = mdp.TrackMotionBodyQuat(file=CLIP, std=0.2, bodies="torso")
     torch.testing.assert_close(bench.reward(turned), torch.full((E,), math.exp(-1.0)), atol=1e-4, rtol=0.0)
     fast = mdp.TrackMotionJointVel(file=CLIP, std=0.5)

@@ -48,7 +48,7 @@ def test_limit_angle_is_checked(angle):
 
 def test_root_height_counts_from_the_ground_below(free_body):
     free_body.place(qpos=[(0, 0, z, 1, 0, 0, 0, 0, 0) for z in (0.1, 0.55, 0.45)])
-    free_body.view.terrain = Plateau(3, free_body.view.device)
+    free_body.driver.ground = Plateau(3, free_body.view.device)
     value = free_body.read(mdp.RootHeightBelow(minimum_height=0.25), "terminations/x")
     assert value.tolist() == [True, False, True]
 
@@ -59,7 +59,7 @@ def test_far_is_horizontal_and_from_where_the_env_starts(free_body):
     )
     term = mdp.FarFromOrigin(distance=4.99)
     assert free_body.read(term, "terminations/x").tolist() == [True, False, True]
-    free_body.view.terrain = Elsewhere(3, free_body.view.device)
+    free_body.driver.ground = Elsewhere(3, free_body.view.device)
     assert free_body.read(term, "terminations/x").tolist() == [False, False, True]
 
 

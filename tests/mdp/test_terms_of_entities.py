@@ -7,7 +7,7 @@ import torch
 
 from ksim_rl import mdp
 from ksim_rl.envs import MjcfRobot, SceneCfg
-from ksim_rl.envs.view import EnvView
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.physics import load_model
 from ksim_rl.scene.scene import build_spec
 from tests.mdp.bench import FREE_BODY, Bench
@@ -24,7 +24,8 @@ def pair():
     bench = Bench(FREE_BODY, 2, {})
     spec = build_spec(SCENE)
     bench.world = type(bench.world)(load_model(spec), num_envs=2)
-    bench.view = EnvView(bench.world, step_dt=0.02, entities=tuple(SCENE.entities))
+    bench.driver = EnvDriver(bench.world, step_dt=0.02, entities=tuple(SCENE.entities))
+    bench.view = bench.driver.view
     bench.place(qpos=(*ONE, *TWO), qvel=(*ONE_VEL, *TWO_VEL))
     return bench
 
@@ -82,7 +83,7 @@ def test_metrics_and_commands_are_of_their_entity(pair):
         error = mdp.AngularVelocityError(command="twist", entity=entity)
         assert pair.read(error, "metrics/x").tolist() == pytest.approx([angular] * 2, abs=1e-5)
     start = mdp.StartPoseCommand(entity="two")
-    with pair.view.scope("commands/start"):
+    with pair.driver.scope("commands/start"):
         start.resample(pair.view, pair.everybody_E)
         assert start(pair.view)[0].tolist() == pytest.approx(list(TWO[:7]), abs=1e-6)
 
@@ -98,7 +99,7 @@ def test_a_heading_command_steers_its_entity(pair):
         rel_heading_envs=1.0,
         entity="two",
     )
-    with pair.view.scope("commands/twist"):
+    with pair.driver.scope("commands/twist"):
         term.resample(pair.view, pair.everybody_E)
         assert term(pair.view)[:, 2].tolist() == pytest.approx([-math.pi / 2] * 2, abs=1e-5)
 

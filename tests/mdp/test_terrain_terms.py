@@ -23,11 +23,11 @@ def stand(bench, place_EN, yaw=0.0):
     bench.place(torch.cat((place_E2, height_E1), dim=-1), torch.zeros(bench.world.num_envs, 3))
     bench.world.qpos_EL[:, 3], bench.world.qpos_EL[:, 6] = math.cos(yaw / 2), math.sin(yaw / 2)
     bench.world.refresh()
-    bench.view.refreshed()
+    bench.driver.refreshed()
 
 
 def read(bench, term):
-    with bench.view.scope("observations/x"):
+    with bench.driver.scope("observations/x"):
         return term(bench.view)
 
 
@@ -35,7 +35,7 @@ def read(bench, term):
 
 
 def adapt(bench, mask_E, count=0):
-    with bench.view.scope("curriculum/x", torch.full_like(bench.view.reset_count_E, count)):
+    with bench.driver.scope("curriculum/x", torch.full_like(bench.view.reset_count_E, count)):
         return TerrainLevels(command="twist")(bench.view, mask_E)
 
 
@@ -48,7 +48,7 @@ def walked(bench, distances, *, levels, steps=100, speed=0.2):
     everybody_E = torch.ones(5, dtype=torch.bool)
     bench.ground.set_levels(everybody_E, torch.tensor(levels))
     bench.view.episode_step_E.copy_(torch.as_tensor(steps).expand(5))
-    bench.view.commands["twist"] = torch.tensor([[0.6 * speed, 0.8 * speed, 0.5]]).expand(5, 3)
+    bench.driver.readings.commands["twist"] = torch.tensor([[0.6 * speed, 0.8 * speed, 0.5]]).expand(5, 3)
     angle_E = torch.arange(5.0)
     distance_E = torch.tensor(distances)
     stand(bench, torch.stack((distance_E * angle_E.cos(), distance_E * angle_E.sin()), dim=-1))
@@ -135,7 +135,7 @@ def test_a_scan_does_not_turn_with_tilt(bench):
     upright = read(bench, HeightScan())
     bench.world.qpos_EL[:, 3], bench.world.qpos_EL[:, 4] = math.cos(0.3), math.sin(0.3)
     bench.world.refresh()
-    bench.view.refreshed()
+    bench.driver.refreshed()
     assert torch.allclose(read(bench, HeightScan()), upright, atol=1e-6)
 
 

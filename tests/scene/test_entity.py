@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ksim_rl.envs import MjcfRobot, SceneCfg
-from ksim_rl.envs.view import EnvView
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.physics import World, load_model
 from ksim_rl.scene.placement import Placement
 from ksim_rl.scene.scene import build_spec
@@ -49,8 +49,8 @@ def scene():
     world.qpos_EL.copy_(torch.tensor(qpos))
     world.qvel_EL.copy_(torch.tensor(rng.normal(0.0, 1.5, (E, model.nv))))
     world.refresh()
-    view = EnvView(world, step_dt=0.02, entities=tuple(SCENE.entities))
-    return SimpleNamespace(world=world, view=view, model=model)
+    driver = EnvDriver(world, step_dt=0.02, entities=tuple(SCENE.entities))
+    return SimpleNamespace(world=world, driver=driver, view=driver.view, model=model)
 
 
 @pytest.mark.parametrize("name", ROOTS)
@@ -131,7 +131,7 @@ def test_writes_change_one_entity_in_the_masked_rows(scene):
         unchanged[mask_E, own] = False
         assert torch.equal(after[unchanged], before[unchanged])
     world.refresh()
-    scene.view.refreshed()
+    scene.driver.refreshed()
     body = cube.root.id
     close(engine(scene, lambda m, d: d.xpos[body])[mask_E], pos[mask_E])
     close(engine(scene, lambda m, d: velocity(m, d, [body], part="linear")[0])[mask_E], lin[mask_E])
@@ -162,7 +162,7 @@ def test_a_derived_pose_after_a_write_is_refused_for_every_entity(scene):
     with pytest.raises(RuntimeError, match="derived"):
         _ = turret.root_lin_vel_w_EL
     scene.world.refresh()
-    view.refreshed()
+    scene.driver.refreshed()
     assert turret.root_lin_vel_w_EL.shape == (E, 3)
 
 

@@ -14,6 +14,7 @@ class Placed:
 
     def __init__(self, name: str, num_envs: int) -> None:
         self.env = envs.make(name, num_envs=num_envs, seed=0).base_env
+        self.driver = self.env.driver
         self.view, self.world, self.model = self.env.view, self.env.world, self.env.world.mj_model
         self.env.reset()
 
@@ -28,8 +29,8 @@ class Placed:
         for name, value in (qvel or {}).items():
             self.world.qvel_EL[:, int(self.model.joint(name).dofadr[0])] = torch.tensor(value)
         self.world.refresh()
-        self.view.refreshed()
+        self.driver.refreshed()
 
     def reward(self, term: RewardTerm) -> Tensor:
-        with self.view.scope("rewards/x"):
+        with self.driver.scope("rewards/x"):
             return term(self.view)

@@ -25,7 +25,7 @@ def hold(bench, **targets):
         ]
     bench.world.step(100)
     bench.world.refresh()
-    bench.view.refreshed()
+    bench.driver.refreshed()
 
 
 def test_the_arm_carries_its_weight_and_points_down(bench):
@@ -60,7 +60,7 @@ def test_the_cube_rests_on_the_table_until_it_is_pushed(bench):
 def test_terms_name_their_entity(bench):
     bench.set({})
     view = bench.view
-    view.commands["target"] = torch.tensor([[0.35, 0.1, 0.03]] * E)
+    bench.driver.readings.commands["target"] = torch.tensor([[0.35, 0.1, 0.03]] * E)
     assert bench.reward(
         mdp.TrackPosition(command="target", body="cube/box", std=0.1)
     ).tolist() == pytest.approx([math.exp(-1.0)] * E, abs=1e-4)

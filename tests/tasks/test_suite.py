@@ -41,7 +41,7 @@ def test_reacher():
     bench = Placed("reacher", 3)
     # Straight along x, the finger is 0.25 m from the hub; targets on it, at its margin, and beyond the tolerated 15 mm.
     bench.set({"shoulder": 0.0, "wrist": 0.0})
-    bench.view.commands["target"] = torch.tensor([[0.25, 0.0], [0.25, 0.115], [0.25, 0.0149]])
+    bench.driver.readings.commands["target"] = torch.tensor([[0.25, 0.0], [0.25, 0.115], [0.25, 0.0149]])
     close(bench.reward(reacher.ReacherReward()), [1.0, 0.1, 1.0])
 
 
@@ -88,7 +88,7 @@ def test_hopper():
     rated = bench.reward(hopper.HopperReward(speed=1.5))
     close(rated[:2], [1.0, 0.5])
     assert rated[2] < 0.9
-    bench.view.action_EL = torch.tensor([[0.0] * 4, [1.0] * 4, [1.0, 1.0, 0.0, 0.0]])
+    bench.driver.readings.action_EL = torch.tensor([[0.0] * 4, [1.0] * 4, [1.0, 1.0, 0.0, 0.0]])
     close(bench.reward(hopper.HopperReward())[:2], [1.0, 0.8])
 
 
@@ -106,7 +106,7 @@ def test_they_stand_on_the_ground_at_the_start(name):
     before = bench.view.joints("root_z").pos_EL.clone()
     bench.world.step(20)
     bench.world.refresh()
-    bench.view.refreshed()
+    bench.driver.refreshed()
     after = bench.view.joints("root_z").pos_EL
     assert lowest > -0.001
     assert (before - after).abs().max() < 0.06, "they neither fall through the ground nor are thrown up"

@@ -82,7 +82,7 @@ def test_get_up_starts_anywhere_and_rewards_standing(fallen):
         height_E > 0.9 * base.cfg.rewards["height"].standing_height
     )
     assert not tall_E.all()  # holding the default pose does not get up from everywhere
-    with view.scope("test"):
+    with base.driver.scope("test"):
         standing_E = base.cfg.rewards["standing"](view)
         stands_E = base.cfg.metrics["stands"](view)
     assert (standing_E >= 0).all() and (standing_E <= 1).all()
@@ -106,8 +106,8 @@ def test_get_up_rates_the_stance_highest(fallen):
     speed_EL[3] = 3.0
     view.joints().write_vel(everyone_E, speed_EL)
     view.world.refresh()
-    view.refreshed()
-    with view.scope("test"):
+    base.driver.refreshed()
+    with base.driver.scope("test"):
         reward = {
             name: term(view)
             for name, term in base.cfg.rewards.items()

@@ -6,20 +6,25 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checks import unknown_name
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.masked_reset import mask_from_env_ids
 from ksim_rl.envs.term import CommandTerm
-from ksim_rl.envs.view import EnvView
 
 
 class CommandManager:
     """Holds one command vector per term, [E, K], and one resampling clock per env and term.
 
     Clocks count down in seconds and run out at the env step that is nearest.
+
+    Attributes:
+        values: the current commands by name, [E, K].
     """
 
-    def __init__(self, terms: Mapping[str, CommandTerm], view: EnvView) -> None:
-        self._view = view
+    def __init__(self, terms: Mapping[str, CommandTerm], driver: EnvDriver) -> None:
+        self._driver, self._view = driver, driver.view
+        view = driver.view
         self._terms = dict(terms)
+        self.values = driver.readings.commands
         self._clocks = {
             name: view.buffers.get(f"commands/{name}.time_left_E")
             for name, term in terms.items()
@@ -27,24 +32,19 @@ class CommandManager:
         }
         nobody_E = torch.zeros(view.num_envs, dtype=torch.bool, device=view.device)
         for name, term in terms.items():
-            with view.scope(f"commands/{name}"):
+            with self._driver.scope(f"commands/{name}"):
                 term.resample(view, nobody_E)
                 value_EK = term(view)
                 if term.ranges:
                     # Columns beyond those of `ranges` are the term's own.
                     columns = term.shared_ranges(view).unbind(-1)
-                    view.command_ranges[name] = dict(zip(term.ranges, columns, strict=False))
+                    driver.readings.command_ranges[name] = dict(zip(term.ranges, columns, strict=False))
             if value_EK.ndim != 2 or value_EK.shape[0] != view.num_envs:
                 raise ValueError(
                     f"command term {name!r} returns shape {tuple(value_EK.shape)}: expected [{view.num_envs}, K], one "
                     "row per env"
                 )
-            view.commands[name] = view.buffers.get(f"commands/{name}.value_EK", value_EK.shape[1])
-
-    @property
-    def values(self) -> dict[str, Tensor]:
-        """The current commands by name, [E, K]."""
-        return self._view.commands
+            self.values[name] = view.buffers.get(f"commands/{name}.value_EK", value_EK.shape[1])
 
     def time_left(self, name: str) -> Tensor:
         """Return the seconds until each env resamples, [E]; infinite for a command that resets alone resample."""
@@ -73,7 +73,7 @@ class CommandManager:
         rows = range(view.num_envs) if env_ids is None else env_ids
         mask_E = mask_from_env_ids(rows, torch.Size([view.num_envs]), view.device)
         value_EK = torch.as_tensor(values, dtype=torch.float32, device=view.device)
-        with view.scope(f"commands/{name}"):
+        with self._driver.scope(f"commands/{name}"):
             self._terms[name].set(view, value_EK, mask_E)
 
     def resample(self, mask_E: Tensor) -> None:
@@ -84,9 +84,9 @@ class CommandManager:
     def refresh(self, mask_E: Tensor) -> None:
         """Recompute the command vectors of the rows of `mask_E` from the current state and targets."""
         for name, term in self._terms.items():
-            with self._view.scope(f"commands/{name}"):
+            with self._driver.scope(f"commands/{name}"):
                 value_EK = term(self._view)
-            held_EK = self._view.commands[name]
+            held_EK = self.values[name]
             held_EK.copy_(torch.where(mask_E[:, None], value_EK, held_EK))
         self._view.command_cache.clear()
 
@@ -103,8 +103,8 @@ class CommandManager:
     def _draw(self, name: str, term: CommandTerm, mask_E: Tensor, moment: str, counter: Tensor) -> None:
         if term.resampling_time_range_s is not None:
             clock_E = self._clocks[name]
-            with self._view.scope(f"commands/{name}/clock/{moment}", counter):
+            with self._driver.scope(f"commands/{name}/clock/{moment}", counter):
                 drawn_E = self._view.uniform(1, *term.resampling_time_range_s)[:, 0]
             clock_E.copy_(torch.where(mask_E, drawn_E, clock_E))
-        with self._view.scope(f"commands/{name}", counter, draws=moment):
+        with self._driver.scope(f"commands/{name}", counter, draws=moment):
             term.resample(self._view, mask_E)

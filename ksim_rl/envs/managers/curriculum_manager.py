@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.term import CurriculumTerm
-from ksim_rl.envs.view import EnvView
 
 
 class CurriculumManager:
@@ -16,22 +16,23 @@ class CurriculumManager:
         ValueError: if two curricula drive `view.level`, or one does not return a single level.
     """
 
-    def __init__(self, terms: Mapping[str, CurriculumTerm], view: EnvView) -> None:
-        self._view = view
+    def __init__(self, terms: Mapping[str, CurriculumTerm], driver: EnvDriver) -> None:
+        self._driver, self._view = driver, driver.view
+        view = driver.view
         self._terms = dict(terms)
         self.names = tuple(terms)
         drivers = {name: term.first_level for name, term in terms.items() if term.first_level is not None}
         if len(drivers) > 1:
             raise ValueError(f"curriculum: {' and '.join(drivers)} all drive the one level: keep one of them")
         for level in drivers.values():
-            view.level.fill_(level)
+            driver.readings.level.fill_(level)
         self.levels_C = torch.zeros(len(self.names), device=view.device)
         self.reset(torch.zeros(view.num_envs, dtype=torch.bool, device=view.device))
 
     def reset(self, mask_E: Tensor) -> None:
         """Adapt to the episodes that just ended in the rows of `mask_E`."""
         for index, (name, term) in enumerate(self._terms.items()):
-            with self._view.scope(f"curriculum/{name}", self._view.reset_count_E):
+            with self._driver.scope(f"curriculum/{name}", self._view.reset_count_E):
                 level = term(self._view, mask_E)
             if level.shape != ():
                 raise ValueError(

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.term import EventTerm
-from ksim_rl.envs.view import EnvView
 
 
 class EventManager:
@@ -16,8 +16,9 @@ class EventManager:
     env step that is nearest, so that an interval of n steps ends at the n-th, whatever the subtractions round to.
     """
 
-    def __init__(self, terms: Mapping[str, EventTerm], view: EnvView) -> None:
-        self._view = view
+    def __init__(self, terms: Mapping[str, EventTerm], driver: EnvDriver) -> None:
+        self._driver, self._view = driver, driver.view
+        view = driver.view
         self.terms = dict(terms)
         self._by_mode: dict[str, list[tuple[str, EventTerm]]] = {}
         for name, term in terms.items():
@@ -31,14 +32,14 @@ class EventManager:
             self._clocks[scope] = view.buffers.get(f"{scope}.time_left_E")
         nobody_E = torch.zeros(view.num_envs, dtype=torch.bool, device=view.device)
         for name, term in terms.items():
-            with view.scope(f"events/{name}"):
+            with self._driver.scope(f"events/{name}"):
                 term(view, nobody_E)
 
     def startup(self) -> None:
         """Run the startup events for all rows; their numbers depend on the seed only."""
         everybody_E = torch.ones(self._view.num_envs, dtype=torch.bool, device=self._view.device)
         for scope, term in self._by_mode.get("startup", []):
-            with self._view.scope(scope, self._view.startup_counter):
+            with self._driver.scope(scope, self._driver.startup_counter):
                 term(self._view, everybody_E)
         self._view.world.set_const(self._fields.get("startup", ()))
 
@@ -46,11 +47,11 @@ class EventManager:
         """Run the reset events for the rows of `mask_E`, and restart their interval clocks."""
         view = self._view
         for scope, term in self._by_mode.get("reset", []):
-            with view.scope(scope, view.reset_count_E):
+            with self._driver.scope(scope, view.reset_count_E):
                 term(view, mask_E)
         view.world.set_const(self._fields.get("reset", ()), mask_E)
         for scope, term in self._by_mode.get("interval", []):
-            with view.scope(f"{scope}/clock", view.reset_count_E):
+            with self._driver.scope(f"{scope}/clock", view.reset_count_E):
                 self._restart(scope, term, mask_E)
 
     def step(self) -> None:
@@ -61,9 +62,9 @@ class EventManager:
             clock_E = self._clocks[scope]
             clock_E.sub_(view.step_dt)
             due_E = clock_E < 0.5 * view.step_dt
-            with view.scope(f"{scope}/interval"):
+            with self._driver.scope(f"{scope}/interval"):
                 self._restart(scope, term, due_E)
-            with view.scope(scope):
+            with self._driver.scope(scope):
                 term(view, due_E)
             if term.per_world_fields:
                 written.append(due_E)
@@ -72,7 +73,7 @@ class EventManager:
         if "step" in self._by_mode:
             everybody_E = torch.ones(view.num_envs, dtype=torch.bool, device=view.device)
             for scope, term in self._by_mode["step"]:
-                with view.scope(scope):
+                with self._driver.scope(scope):
                     term(view, everybody_E)
             view.world.set_const(self._fields["step"], everybody_E)
 

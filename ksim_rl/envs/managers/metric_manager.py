@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.term import MetricTerm
-from ksim_rl.envs.view import EnvView
 
 
 class MetricManager:
@@ -15,8 +15,9 @@ class MetricManager:
     Which of these occur is known at construction, and the others cost nothing in a step.
     """
 
-    def __init__(self, terms: Mapping[str, MetricTerm], view: EnvView) -> None:
-        self._view = view
+    def __init__(self, terms: Mapping[str, MetricTerm], driver: EnvDriver) -> None:
+        self._driver, self._view = driver, driver.view
+        view = driver.view
         self._terms = dict(terms)
         self.names = tuple(terms)
         self._held_EM = view.buffers.get("metrics.held_EM", len(self.names))
@@ -32,7 +33,7 @@ class MetricManager:
         """Take in the values of the current state; rows whose physics failed add nothing."""
         values = []
         for name, term in self._terms.items():
-            with self._view.scope(f"metrics/{name}"):
+            with self._driver.scope(f"metrics/{name}"):
                 value_E = term(self._view)
             if value_E.shape != finite_E.shape:
                 raise ValueError(

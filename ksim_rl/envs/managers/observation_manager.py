@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from ksim_rl.envs.view import EnvView
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg
 
 IMAGE_DTYPES = (torch.float32, torch.int32, torch.uint8)
@@ -14,8 +14,9 @@ IMAGE_DTYPES = (torch.float32, torch.int32, torch.uint8)
 class ObservationManager:
     """Computes the union of the groups' terms; what groups add to them is done by transforms."""
 
-    def __init__(self, groups: Mapping[str, ObservationGroupCfg], view: EnvView) -> None:
-        self._view = view
+    def __init__(self, groups: Mapping[str, ObservationGroupCfg], driver: EnvDriver) -> None:
+        self._driver, self._view = driver, driver.view
+        view = driver.view
         self.terms = {name: cfg.term for group in groups.values() for name, cfg in group.terms.items()}
         for name, reading in self.read().items():
             image = getattr(self.terms[name], "is_image", False)
@@ -39,14 +40,14 @@ class ObservationManager:
         """
         readings, vectors = {}, []
         for name, term in self.terms.items():
-            with self._view.scope(f"observations/{name}"):
+            with self._driver.scope(f"observations/{name}"):
                 readings[name] = term(self._view)
             if readings[name].ndim == 2 and readings[name].dtype == torch.float32:
                 vectors.append(name)
             else:
-                readings[name] = self._view.detached(readings[name])
+                readings[name] = self._driver.detached(readings[name])
         if len(vectors) < 2:
-            return {name: self._view.detached(value) for name, value in readings.items()}
+            return {name: self._driver.detached(value) for name, value in readings.items()}
         # One copy for all of them, which also takes them off the state.
         together_EL = torch.cat([readings[name] for name in vectors], dim=1)
         widths = [readings[name].shape[1] for name in vectors]

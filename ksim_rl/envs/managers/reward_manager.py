@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checks import near
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.term import RewardTerm
-from ksim_rl.envs.view import EnvView
 
 
 class RewardManager:
@@ -18,26 +18,29 @@ class RewardManager:
     """
 
     def __init__(
-        self, terms: Mapping[str, RewardTerm], view: EnvView, *, scale: float, adapted: frozenset[str]
+        self, terms: Mapping[str, RewardTerm], driver: EnvDriver, *, scale: float, adapted: frozenset[str]
     ) -> None:
         unknown = sorted(adapted - terms.keys())
         if unknown:
             raise ValueError(
                 f"a curriculum adapts the unknown reward {unknown[0]!r}: {near(unknown[0], terms)}"
             )
-        self._view = view
+        self._driver, self._view = driver, driver.view
+        view = driver.view
         self._scale = scale
         self._terms = {name: term for name, term in terms.items() if term.weight != 0.0 or name in adapted}
         self.names = tuple(self._terms)
         self.weights_R = torch.tensor([term.weight for term in self._terms.values()], device=view.device)
         self.episode_sums_ER = view.buffers.get("rewards.episode_sums_ER", len(self.names))
+        driver.readings.reward_weights.update(zip(self.names, self.weights_R.unbind(), strict=True))
+        driver.readings.episode_rewards.update(zip(self.names, self.episode_sums_ER.unbind(-1), strict=True))
         self.step(torch.ones(view.num_envs, dtype=torch.bool, device=view.device))
 
     def step(self, finite_E: Tensor) -> Tensor:
         """Return the reward of the current state, float32 [E]; rows whose physics failed get 0."""
         values = []
         for name, term in self._terms.items():
-            with self._view.scope(f"rewards/{name}"):
+            with self._driver.scope(f"rewards/{name}"):
                 values.append(self._checked(name, term(self._view)))
         if not values:
             return torch.zeros(self._view.num_envs, device=self._view.device)

@@ -5,22 +5,23 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.term import TerminationTerm
-from ksim_rl.envs.view import EnvView
 
 
 class TerminationManager:
     """Combines the termination terms with the guard against non-finite physics."""
 
     def __init__(
-        self, terms: Mapping[str, TerminationTerm], view: EnvView, *, is_finite_horizon: bool
+        self, terms: Mapping[str, TerminationTerm], driver: EnvDriver, *, is_finite_horizon: bool
     ) -> None:
-        self._view = view
+        self._driver, self._view = driver, driver.view
+        view = driver.view
         self._terms = dict(terms)
         self._is_finite_horizon = is_finite_horizon
         self.names = (*terms, "non_finite")
         self.flags_EK = torch.zeros(view.num_envs, len(self.names), dtype=torch.bool, device=view.device)
-        view.terminations = dict(zip(self.names, self.flags_EK.unbind(-1), strict=True))
+        driver.readings.terminations.update(zip(self.names, self.flags_EK.unbind(-1), strict=True))
         time_out = [term.time_out for term in terms.values()] + [False]
         self._time_out_K = torch.tensor(time_out, device=view.device)
         self._failure_K = ~self._time_out_K
@@ -33,7 +34,7 @@ class TerminationManager:
         """
         flags = []
         for name, term in self._terms.items():
-            with self._view.scope(f"terminations/{name}"):
+            with self._driver.scope(f"terminations/{name}"):
                 flag_E = term(self._view)
             if flag_E.shape != finite_E.shape or flag_E.dtype != torch.bool:
                 raise ValueError(
@@ -44,8 +45,8 @@ class TerminationManager:
         self.flags_EK.copy_(torch.stack((*flags, ~finite_E), dim=-1))
         timed_out_E = (self.flags_EK & self._time_out_K).any(-1)
         failed_E = (self.flags_EK & self._failure_K).any(-1)
-        self._view.terminated_E.copy_(failed_E)
-        self._view.truncated_E.copy_(timed_out_E)
+        self._driver.readings.terminated_E.copy_(failed_E)
+        self._driver.readings.truncated_E.copy_(timed_out_E)
         if self._is_finite_horizon:
             return failed_E | timed_out_E, torch.zeros_like(timed_out_E)
         return failed_E, timed_out_E

@@ -9,7 +9,7 @@ from torch import Tensor
 from ksim_rl.checks import check_pair
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.scene.motions.motion import motion_shift, motion_start_time
+from ksim_rl.scene.state.motion_clock import motion_shift, motion_start_time
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,6 @@ entry says by name or pattern which joints it drives.
 """
 
 from ksim_rl.scene.actuators.actuator import Actuator
-from ksim_rl.scene.actuators.actuator_params import ActuatorParams
 from ksim_rl.scene.actuators.builtin import (
     GeneralActuator,
     MotorActuator,
@@ -16,10 +15,11 @@ from ksim_rl.scene.actuators.dc_motor import DCMotorActuator
 from ksim_rl.scene.actuators.delayed import DelayedActuator
 from ksim_rl.scene.actuators.ideal_pd import IdealPDActuator
 from ksim_rl.scene.actuators.joint_drives import JointDrives
-from ksim_rl.scene.actuators.joint_targets import JointTargets
 from ksim_rl.scene.actuators.lstm import LSTMActuator
 from ksim_rl.scene.actuators.mlp import MLPActuator
 from ksim_rl.scene.actuators.set_actuators import set_actuators
+from ksim_rl.scene.state.actuator_params import ActuatorParams
+from ksim_rl.scene.state.joint_targets import JointTargets
 
 __all__ = [
     "Actuator",

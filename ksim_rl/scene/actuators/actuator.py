@@ -5,34 +5,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import mujoco
 from torch import Tensor
 
 from ksim_rl.checked import Checked, NonNegative, Positive
+from ksim_rl.scene.actuators.drive import Drive
 from ksim_rl.scene.names import Patterns
-
-if TYPE_CHECKING:
-    from ksim_rl.scene.actuators.drive import Drive
-
-TargetKind = Literal["pos", "vel", "effort"]
-
-
-class JointState(NamedTuple):
-    """Where N joints are before a substep: rad or m, and rad/s or m/s, [E, N]."""
-
-    pos_EN: Tensor
-    vel_EN: Tensor
-
-
-class JointTarget(NamedTuple):
-    """What N joints are asked for: position, velocity, and effort (N m or N) to add, [E, N]."""
-
-    pos_EN: Tensor
-    vel_EN: Tensor
-    effort_EN: Tensor
-
+from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKind
 
 Law = Callable[[JointState, JointTarget], Tensor]
 """The control [E, N] of a law's motors; of explicit ones, the effort itself."""

@@ -14,15 +14,10 @@ import mujoco
 from torch import Tensor
 
 from ksim_rl.checked import NonNegative, Positive, Range
-from ksim_rl.scene.actuators.actuator import (
-    JointActuator,
-    JointState,
-    JointTarget,
-    Law,
-    TargetKind,
-)
+from ksim_rl.scene.actuators.actuator import JointActuator, Law
 from ksim_rl.scene.actuators.drive import Drive
 from ksim_rl.scene.names import Patterns
+from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKind, control_kind
 
 GAINS = {
     "fixed": mujoco.mjtGain.mjGAIN_FIXED,
@@ -42,19 +37,6 @@ DYNAMICS = {
     "muscle": mujoco.mjtDyn.mjDYN_MUSCLE,
 }
 _NUM_PARAMETERS = 10
-
-
-def control_kind(biastype: int, biasprm: Sequence[float], dyntype: int) -> TargetKind:
-    """Return what the control of a MuJoCo actuator is a target for.
-
-    A bias that pulls back in proportion to the position makes a position servo (with an integrator in front of it,
-    one whose control is a velocity), one that is proportional to the velocity alone a velocity servo.
-    """
-    if biastype != mujoco.mjtBias.mjBIAS_AFFINE:
-        return "effort"
-    if biasprm[1] != 0.0:
-        return "vel" if dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR else "pos"
-    return "vel" if biasprm[2] != 0.0 else "effort"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checked import Positive
-from ksim_rl.scene.actuators.actuator import JointState, JointTarget, Law
+from ksim_rl.scene.actuators.actuator import Law
 from ksim_rl.scene.actuators.drive import Drive
 from ksim_rl.scene.actuators.ideal_pd import IdealPDActuator, pd_effort
+from ksim_rl.scene.state.joint_targets import JointState, JointTarget
 
 
 @dataclass(frozen=True, kw_only=True)

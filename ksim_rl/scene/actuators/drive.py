@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from ksim_rl.scene.actuators.actuator import JointState, JointTarget
 from ksim_rl.scene.names import as_index, scalar_joint_ids
-
-if TYPE_CHECKING:
-    from ksim_rl.envs.view import EnvView
+from ksim_rl.scene.state.joint_targets import JointState, JointTarget
+from ksim_rl.scene.state.simulation import Simulation
+from ksim_rl.scene.state.world_view import WorldView
 
 
 class Drive:
@@ -22,11 +20,11 @@ class Drive:
         num_envs, num_joints, device: E, N, and where the buffers live.
     """
 
-    def __init__(self, name: str, view: EnvView, joint_ids: Sequence[int]) -> None:
+    def __init__(self, name: str, simulation: Simulation, view: WorldView, joint_ids: Sequence[int]) -> None:
         model = view.world.mj_model
         scalar = scalar_joint_ids(model)
         self.num_envs, self.num_joints, self.device = view.num_envs, len(joint_ids), view.device
-        self._name, self._view = name, view
+        self._name, self._simulation, self._view = name, simulation, view
         self._joints = as_index(joint_ids, view.device)
         self._qpos = as_index([model.jnt_qposadr[scalar[i]] for i in joint_ids], view.device)
         self._qvel = as_index([model.jnt_dofadr[scalar[i]] for i in joint_ids], view.device)
@@ -54,7 +52,7 @@ class Drive:
     def reset(self, mask_E: Tensor) -> None:
         """Draw anew for the rows of `mask_E`."""
         if self._at_reset:
-            with self._view.scope(self._name, self._view.reset_count_E, draws="reset"):
+            with self._simulation.scope(self._name, self._view.reset_count_E, draws="reset"):
                 for draw in self._at_reset:
                     draw(mask_E)
 

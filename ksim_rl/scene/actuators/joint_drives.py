@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 from torch import Tensor
 
 from ksim_rl.scene.actuators.actuator import Actuator, Law
 from ksim_rl.scene.actuators.drive import Drive
 from ksim_rl.scene.actuators.set_actuators import driven_joints
-
-if TYPE_CHECKING:
-    from ksim_rl.envs.view import EnvView
+from ksim_rl.scene.state.simulation import Simulation
+from ksim_rl.scene.state.world_view import WorldView
 
 
 class JointDrives:
@@ -22,15 +20,18 @@ class JointDrives:
 
     Args:
         actuators: the `actuators` of each robot, by the prefix of its names.
+        simulation: what is driven.
         view: whose targets are read, and whose controls are written.
 
     Raises:
         ValueError: naming the pattern that matches no joint, or the joint that two entries drive or that has no motor.
     """
 
-    def __init__(self, actuators: Mapping[str, Sequence[Actuator]], view: EnvView) -> None:
+    def __init__(
+        self, actuators: Mapping[str, Sequence[Actuator]], simulation: Simulation, view: WorldView
+    ) -> None:
         groups: dict[Hashable, tuple[Actuator, list[int]]] = {}
-        names = view.joints().names if view.num_joints else []
+        names = view.joints().names
         for prefix, entries in actuators.items():
             ids = {name.removeprefix(prefix): i for i, name in enumerate(names) if name.startswith(prefix)}
             for actuator, driven in driven_joints(entries, list(ids)):
@@ -43,11 +44,11 @@ class JointDrives:
                     view.actuator_params.add(name, joints, value)
         self._drives: list[tuple[Drive, Law]] = []
         for number, (actuator, joints) in enumerate(groups.values()):
-            drive = Drive(f"actuators/{number}", view, sorted(joints))
+            drive = Drive(f"actuators/{number}", simulation, view, sorted(joints))
             self._drives.append((drive, actuator.law(drive)))
         if self._drives:
             self._apply()
-            view.before_substep.append(self._apply)
+            simulation.before_substep.append(self._apply)
 
     def reset(self, mask_E: Tensor) -> None:
         """Draw the lags of the rows of `mask_E`, bool [E]."""

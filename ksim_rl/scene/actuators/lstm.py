@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ksim_rl.scene.actuators.actuator import JointState, JointTarget, Law
+from ksim_rl.scene.actuators.actuator import Law
 from ksim_rl.scene.actuators.drive import Drive
 from ksim_rl.scene.actuators.net_actuator import NetActuator
 from ksim_rl.scene.actuators.net_file import NetFile
+from ksim_rl.scene.state.joint_targets import JointState, JointTarget
 
 _NUM_INPUTS = 2
 _PARTS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")

@@ -8,11 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from ksim_rl.checks import check_choice
-from ksim_rl.scene.actuators.actuator import JointState, JointTarget, Law
+from ksim_rl.scene.actuators.actuator import Law
 from ksim_rl.scene.actuators.drive import Drive
 from ksim_rl.scene.actuators.net_actuator import NetActuator
 from ksim_rl.scene.actuators.net_file import NetFile
 from ksim_rl.scene.actuators.substep_ring import SubstepRing
+from ksim_rl.scene.state.joint_targets import JointState, JointTarget
 
 ACTIVATIONS = {
     "elu": nn.ELU,

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from ksim_rl.checks import check_in_range
-from ksim_rl.scene.actuators.actuator import ExplicitActuator, TargetKind
+from ksim_rl.scene.actuators.actuator import ExplicitActuator
 from ksim_rl.scene.actuators.net_file import NetFile, read_net_file
+from ksim_rl.scene.state.joint_targets import TargetKind
 
 _SCALES = ("position_scale", "velocity_scale", "effort_scale")
 

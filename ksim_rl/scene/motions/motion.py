@@ -6,7 +6,6 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -15,10 +14,7 @@ from torch import Tensor
 
 from ksim_rl.checks import near
 from ksim_rl.scene.motions import motion_names, motion_path
-from ksim_rl.scene.names import Index, Patterns, scalar_joint_ids
-
-if TYPE_CHECKING:
-    from ksim_rl.envs.view import EnvView
+from ksim_rl.scene.names import Index, scalar_joint_ids
 
 KEYS = ("fps", "qpos", "qvel")
 _OPTIONAL = ("joint_names",)
@@ -143,46 +139,6 @@ def load_motion(file: str | Path, model: mujoco.MjModel, device: torch.device) -
         body_pos_FN3=on_device(body_pos_FN3),
         body_quat_FN4=on_device(body_quat_FN4),
     )
-
-
-def motion_start_time(view: EnvView, file: str) -> Tensor:
-    """Return the buffer of when in the motion each episode began, s, [E]; `ResetToMotion` writes it."""
-    return view.buffers.get(f"motion/{file}.start_s_E")
-
-
-def motion_time(view: EnvView, file: str) -> Tensor:
-    """Return the present time in a motion that episodes follow from where `ResetToMotion` began them, s, [E]."""
-    return motion_start_time(view, file) + view.episode_time_E
-
-
-def motion_joints(view: EnvView, file: str, joints: Patterns) -> tuple[Tensor, Tensor]:
-    """Return positions and velocities that joints have in the motion now, [E, L] each; computed once per state."""
-    keys = [f"motion/{file}.{part} of {joints}" for part in ("joint_pos", "joint_vel")]
-    if keys[0] not in view.cache:
-        sampled = view.motion(file).sample_joints(motion_time(view, file), view.joints(joints).index)
-        view.cache.update(zip(keys, sampled, strict=True))
-    return view.cache[keys[0]], view.cache[keys[1]]
-
-
-def motion_bodies(view: EnvView, file: str, bodies: Patterns) -> tuple[Tensor, Tensor]:
-    """Return the poses that bodies have in the motion now, world frame, [E, N, 3] and [E, N, 4]; once per state.
-
-    On a terrain they are moved as `motion_shift` says.
-    """
-    keys = [f"motion/{file}.{part} of {bodies}" for part in ("body_pos", "body_quat")]
-    if keys[0] not in view.cache:
-        pos_EN3, quat_EN4 = view.motion(file).sample_bodies(
-            motion_time(view, file), view.bodies(bodies).index
-        )
-        shift_E3 = motion_shift(view)
-        pos_EN3 = pos_EN3 if shift_E3 is None else pos_EN3 + shift_E3[:, None]
-        view.cache.update(zip(keys, (pos_EN3, quat_EN4), strict=True))
-    return view.cache[keys[0]], view.cache[keys[1]]
-
-
-def motion_shift(view: EnvView) -> Tensor | None:
-    """Return how far motions are moved in each env, m, [E, 3]: to its origin, if the robot's root can go there."""
-    return None if view.terrain.is_flat or not view.robot.free_root else view.terrain.origins_E3
 
 
 def _read(path: Path) -> Mapping[str, np.ndarray]:

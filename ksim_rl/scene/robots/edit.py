@@ -11,8 +11,8 @@ import mujoco
 
 from ksim_rl.checks import unknown_name
 from ksim_rl.scene.actuators import Actuator, set_actuators
-from ksim_rl.scene.actuators.builtin import control_kind
 from ksim_rl.scene.names import match_names
+from ksim_rl.scene.state.joint_targets import control_kind
 
 Vector = tuple[float, ...]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import mujoco
 import torch
@@ -12,11 +12,9 @@ from torch import Tensor
 from ksim_rl.checked import Count, Positive, Within
 from ksim_rl.checks import near
 from ksim_rl.physics.batch_camera import BatchCamera
+from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.sensor import GeomGroup, Sensor, SensorTracker
-
-if TYPE_CHECKING:
-    from ksim_rl.envs.view import EnvView
-    from ksim_rl.scene.rendering.visualizer import DebugVisualizer
+from ksim_rl.scene.state.world_view import WorldView
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +77,7 @@ class CameraSensor(Sensor):
             name=name, pos=list(self.pos), xyaxes=list(self.xyaxes), fovy=self.fovy
         )
 
-    def track(self, name: str, view: EnvView) -> CameraTracker:
+    def track(self, name: str, view: WorldView) -> CameraTracker:
         """Return the reader of this sensor in the worlds of `view`."""
         return CameraTracker(name, self, view)
 
@@ -87,7 +85,7 @@ class CameraSensor(Sensor):
 class CameraTracker(SensorTracker):
     """Draws the pictures of one camera, at most once per state, and only if something reads them."""
 
-    def __init__(self, name: str, sensor: CameraSensor, view: EnvView) -> None:
+    def __init__(self, name: str, sensor: CameraSensor, view: WorldView) -> None:
         self._name, self._sensor, self._view = name, sensor, view
         self._camera = BatchCamera(
             view.world,
@@ -117,7 +115,7 @@ class CameraTracker(SensorTracker):
         """Ids of the geoms that are seen, -1 for none, int32 [E, H, W]."""
         return self._read("segmentation")
 
-    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
+    def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw the camera's axes: right in red, up in green, and back in blue."""
         camera = view.world.mj_model.camera(self._sensor.camera or self._name).id
         origin = view.world.view("cam_xpos")[env_index, camera].cpu().numpy()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import mujoco
 
@@ -12,9 +12,7 @@ from ksim_rl.checks import near
 from ksim_rl.scene.names import match_names
 from ksim_rl.scene.sensors.contact_tracker import ContactTracker
 from ksim_rl.scene.sensors.sensor import Sensor
-
-if TYPE_CHECKING:
-    from ksim_rl.envs.view import EnvView
+from ksim_rl.scene.state.world_view import WorldView
 
 _OBJECTS = {
     "geom": mujoco.mjtObj.mjOBJ_GEOM,
@@ -118,7 +116,7 @@ class ContactSensor(Sensor):
                 **other,
             )
 
-    def track(self, name: str, view: EnvView) -> ContactTracker:
+    def track(self, name: str, view: WorldView) -> ContactTracker:
         """Return the reader of this sensor in the worlds of `view`."""
         return ContactTracker(
             name,

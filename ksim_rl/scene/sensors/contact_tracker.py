@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ksim_rl.scene.names import as_index
+from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.sensor import SensorTracker, sensor_columns
 from ksim_rl.scene.small_matrices import product
-
-if TYPE_CHECKING:
-    from ksim_rl.envs.view import EnvView
-    from ksim_rl.scene.rendering.visualizer import DebugVisualizer
+from ksim_rl.scene.state.world_view import WorldView
 
 _RGBA = (1.0, 0.55, 0.1, 1.0)
 
@@ -53,7 +51,7 @@ class ContactTracker(SensorTracker):
     """Reads one contact sensor once per env step, or at every substep, and runs its clocks."""
 
     def __init__(
-        self, name: str, view: EnvView, *, elements: Sequence[str], strongest: bool, every_substep: bool
+        self, name: str, view: WorldView, *, elements: Sequence[str], strongest: bool, every_substep: bool
     ) -> None:
         self._key = f"contact/{name}"
         self._world, self._view, self._strongest = view.world, view, strongest
@@ -81,8 +79,7 @@ class ContactTracker(SensorTracker):
         if every_substep:
             substeps = round(view.step_dt / view.physics_dt)
             self._history_ESN3 = view.buffers.get(f"{self._key}.force_history", substeps, self._count, 3)
-            view.after_substep.append(self._read_substep)
-            view.substep_sensors = "every"
+            self.every_substep = True
 
     def update(self) -> None:
         """Advance the clocks by one env step, unless they ran with the substeps."""
@@ -111,7 +108,7 @@ class ContactTracker(SensorTracker):
             force_history_ESN3=force_EN3[:, None] if history_ESN3 is None else history_ESN3,
         )
 
-    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
+    def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw an arrow for each contact: the force on the element, from the point of contact."""
         state, model = self.state, self._world.mj_model
         # m per newton, as in MuJoCo's own viewer.
@@ -122,7 +119,8 @@ class ContactTracker(SensorTracker):
             if np.linalg.norm(force_3) > 0.0:
                 visualizer.arrow(position_3, position_3 - scale * force_3, rgba=_RGBA, width=0.01)
 
-    def _read_substep(self) -> None:
+    def update_substep(self) -> None:
+        """Advance the clocks by one substep, and keep its forces."""
         assert self._history_ESN3 is not None
         readings = self._readings()
         self._advance(readings, self._view.physics_dt, starts=self._substep == 0)

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import mujoco
 import torch
 from torch import Tensor
 
 from ksim_rl.scene import quaternion
+from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.mount import MountedSensor
 from ksim_rl.scene.sensors.sensor import SensorTracker
-
-if TYPE_CHECKING:
-    from ksim_rl.envs.view import EnvView
-    from ksim_rl.scene.rendering.visualizer import DebugVisualizer
+from ksim_rl.scene.state.world_view import WorldView
 
 _SENSORS = {
     "gyro": mujoco.mjtSensor.mjSENS_GYRO,
@@ -43,7 +40,7 @@ class ImuSensor(MountedSensor):
                 objname=self.mounting_site(name),
             )
 
-    def track(self, name: str, view: EnvView) -> ImuTracker:
+    def track(self, name: str, view: WorldView) -> ImuTracker:
         """Return the reader of this sensor in the worlds of `view`."""
         return ImuTracker(name, view, self.mounting_site(name))
 
@@ -51,7 +48,7 @@ class ImuSensor(MountedSensor):
 class ImuTracker(SensorTracker):
     """What one inertial measurement unit reads, float32, in its own axes."""
 
-    def __init__(self, name: str, view: EnvView, site: str) -> None:
+    def __init__(self, name: str, view: WorldView, site: str) -> None:
         self._name, self._view, self._site = name, view, site
         self._down = torch.tensor([0.0, 0.0, -1.0], device=view.device)
 
@@ -81,7 +78,7 @@ class ImuTracker(SensorTracker):
             cache[key] = quaternion.rotate_inverse(self.quat_EL, self._down.expand(self._view.num_envs, 3))
         return cache[key]
 
-    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
+    def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw the unit's axes at its place."""
         site = view.world.mj_model.site(self._site).id
         origin = view.world.site_xpos_EL[env_index, site].cpu().numpy()

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ksim_rl.checked import Positive
 from ksim_rl.physics.rays import RayBatch
+from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.mount import MountedSensor
 from ksim_rl.scene.sensors.ray_patterns import RayPattern
 from ksim_rl.scene.sensors.sensor import GeomGroup, SensorTracker
 from ksim_rl.scene.small_matrices import product
-
-if TYPE_CHECKING:
-    from ksim_rl.envs.view import EnvView
-    from ksim_rl.scene.rendering.visualizer import DebugVisualizer
+from ksim_rl.scene.state.world_view import WorldView
 
 
 class RayState(NamedTuple):
@@ -54,7 +52,7 @@ class RayCaster(MountedSensor):
     geom_groups: tuple[GeomGroup, ...] = (0, 1)
     exclude_body: bool = True
 
-    def track(self, name: str, view: EnvView) -> RayTracker:
+    def track(self, name: str, view: WorldView) -> RayTracker:
         """Return the reader of this sensor in the worlds of `view`."""
         return RayTracker(name, self, view)
 
@@ -62,7 +60,7 @@ class RayCaster(MountedSensor):
 class RayTracker(SensorTracker):
     """Casts the rays of one sensor, at most once per state, and only if something reads them."""
 
-    def __init__(self, name: str, sensor: RayCaster, view: EnvView) -> None:
+    def __init__(self, name: str, sensor: RayCaster, view: WorldView) -> None:
         self._sensor, self._view, self._key = sensor, view, f"rays/{name}."
         site = view.world.mj_model.site(sensor.mounting_site(name))
         self._site = int(site.id)
@@ -90,7 +88,7 @@ class RayTracker(SensorTracker):
         """Place of the sensor, world frame, m, [E, 3]."""
         return self._view.derived().site_xpos_EL[:, self._site]
 
-    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
+    def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw a ball where each ray hits."""
         state = self.state
         points = state.point_EN3[env_index].cpu().numpy()

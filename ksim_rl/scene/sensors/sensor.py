@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import mujoco
 
 from ksim_rl.checked import Checked, Within
-
-if TYPE_CHECKING:
-    from ksim_rl.envs.view import EnvView
-    from ksim_rl.scene.rendering.visualizer import DebugVisualizer
+from ksim_rl.scene.rendering.visualizer import DebugVisualizer
+from ksim_rl.scene.state.world_view import WorldView
 
 
 GeomGroup = Annotated[int, Within(low=0, high=mujoco.mjNGROUP - 1)]
@@ -20,12 +18,22 @@ GeomGroup = Annotated[int, Within(low=0, high=mujoco.mjNGROUP - 1)]
 
 
 class SensorTracker:
-    """Reads one sensor. What it reads on demand belongs in `view.cache`, so that it is read once per state."""
+    """Reads one sensor. What it reads on demand belongs in `view.cache`, so that it is read once per state.
+
+    Attributes:
+        every_substep: whether `update_substep` runs after each physics substep; the worlds then compute their sensors
+            at each.
+    """
+
+    every_substep: bool = False
 
     def update(self) -> None:
         """Advance by one env step; it runs in each step, after the refresh (nothing by default)."""
 
-    def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
+    def update_substep(self) -> None:
+        """Read what the last physics substep left (nothing by default); quantities of the view are not current."""
+
+    def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw the reading of one env (nothing by default)."""
 
 
@@ -42,7 +50,7 @@ class Sensor(Checked, ABC):
         """
 
     @abstractmethod
-    def track(self, name: str, view: EnvView) -> SensorTracker:
+    def track(self, name: str, view: WorldView) -> SensorTracker:
         """Return the reader of this sensor in the worlds of `view`."""
 
 

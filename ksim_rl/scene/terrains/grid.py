@@ -5,19 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
 from ksim_rl.checked import Count, Positive, WholeNumber
 from ksim_rl.checks import check_count, check_in_range
+from ksim_rl.scene.state.world_view import WorldView
 from ksim_rl.scene.terrains.patch import TIE, Lattice, TerrainPatch
 from ksim_rl.scene.terrains.patched_ground import GEOM_FIELDS, PatchedGround, patch_name
 from ksim_rl.scene.terrains.terrain import Friction, Terrain, add_ground, add_look
-
-if TYPE_CHECKING:
-    from ksim_rl.envs.view import EnvView
 
 BASE = 0.5
 """m of solid ground below the lowest point of a patch."""
@@ -121,7 +118,7 @@ class TerrainGrid(Terrain):
             mass=0,  # as planes have none
         )
 
-    def ground(self, view: EnvView) -> PatchedGround:
+    def ground(self, view: WorldView) -> PatchedGround:
         """Return the ground of the worlds of `view`, each on its first patch."""
         kinds = list(self.patches)
         return PatchedGround(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -11,10 +10,8 @@ import torch
 from torch import Tensor
 
 from ksim_rl.scene.state.ground import Ground
+from ksim_rl.scene.state.world_view import WorldView
 from ksim_rl.scene.terrains.terrain import BODY
-
-if TYPE_CHECKING:
-    from ksim_rl.envs.view import EnvView
 
 GEOM_FIELDS = ("geom_dataid", "geom_size", "geom_aabb", "geom_rbound")
 """The model fields of the terrain's geom that say which height field it is, and the bounds that follow from that."""
@@ -35,7 +32,7 @@ class PatchedGround(Ground):
 
     def __init__(
         self,
-        view: EnvView,
+        view: WorldView,
         *,
         num_levels: int,
         max_initial_level: int,

@@ -5,15 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 
 from ksim_rl.checked import Checked, NonNegative
 from ksim_rl.scene.state.ground import Ground
-
-if TYPE_CHECKING:
-    from ksim_rl.envs.view import EnvView
+from ksim_rl.scene.state.world_view import WorldView
 
 Friction = tuple[NonNegative, NonNegative, NonNegative]
 MATERIAL = "terrain"
@@ -81,7 +79,7 @@ class Terrain(Checked, ABC):
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add body, geom and looks to the scene's spec."""
 
-    def ground(self, view: EnvView) -> Ground:
+    def ground(self, view: WorldView) -> Ground:
         """Return the ground of the worlds of `view` (flat, at z = 0, by default)."""
         return Ground(view.num_envs, view.device)
 

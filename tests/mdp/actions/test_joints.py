@@ -53,7 +53,7 @@ def arms():
 
 
 def run(bench, term, action=ACTION, scope="actions/x"):
-    with bench.view.scope(scope):
+    with bench.driver.scope(scope):
         term(bench.view, action)
     return bench.world.ctrl_EL
 

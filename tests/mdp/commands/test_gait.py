@@ -77,7 +77,7 @@ def test_a_reset_without_events_begins_the_rhythm_anew():
 def test_it_says_which_feet_should_be_in_the_air():
     env, recorder = gait_env(frequency=(1.0, 1.0)), Recorder()
     phases(env, 3)
-    with env.view.scope("commands/gait"):
+    with env.driver.scope("commands/gait"):
         env.cfg.commands["gait"].draw_debug(env.view, recorder, 0)
     assert [(kind, what[-1]) for kind, *what in recorder.drawn] == [("text", "in the air: 1 0 0 1")]
 

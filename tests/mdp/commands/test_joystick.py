@@ -53,7 +53,7 @@ def test_it_says_where_the_stick_is(env):
     env.reset()
     env.command_manager.set("stick", [0.5, -9.0])
     recorder = Recorder()
-    with env.view.scope("commands/stick"):
+    with env.driver.scope("commands/stick"):
         env.cfg.commands["stick"].draw_debug(env.view, recorder, 1)
     assert [(kind, what[-1]) for kind, *what in recorder.drawn] == [("text", "vx +0.50, wz -0.50")]
 

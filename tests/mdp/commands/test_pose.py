@@ -22,14 +22,14 @@ def crowd():
 
 
 def draw(bench, term, mask_E=None, scope="commands/x"):
-    with bench.view.scope(scope):
+    with bench.driver.scope(scope):
         term.resample(bench.view, bench.everybody_E if mask_E is None else mask_E)
         return term(bench.view)
 
 
 def drawn(bench, term, scope="commands/x", env_index=1):
     recorder = Recorder()
-    with bench.view.scope(scope):
+    with bench.driver.scope(scope):
         term.draw_debug(bench.view, recorder, env_index)
     return recorder.drawn
 
@@ -68,7 +68,7 @@ def test_a_cartesian_target_stays_in_the_frame_that_it_was_drawn_in(crowd):
         assert (before_E3[:, 0] == 0.5).all() and (before_E3[:, 1] == 0.0).all()
         is_even(before_E3[:, 2], -1.0, 1.0)
         crowd.place(qpos=TURNED)
-        with crowd.view.scope(f"c/{frame}"):
+        with crowd.driver.scope(f"c/{frame}"):
             assert torch.equal(term(crowd.view), before_E3)
         pos_E3, quat_E4 = target_pose_w(crowd.view, before_E3, frame=frame)
         assert quat_E4 is None
@@ -101,7 +101,9 @@ def test_a_cartesian_orientation_is_that_of_mujocos_euler_angles(free_body):
 
 def test_the_distance_to_a_target_is_that_of_the_named_point(free_body):
     free_body.place(qpos=TURNED)
-    free_body.view.commands["reach"] = torch.tensor([[0.3, 0.0, 0.0], [0.3, 0.4, 0.0], [0.0, 0.0, 0.0]])
+    free_body.driver.readings.commands["reach"] = torch.tensor(
+        [[0.3, 0.0, 0.0], [0.3, 0.4, 0.0], [0.0, 0.0, 0.0]]
+    )
     # The site "imu" is 0.3 m ahead of the trunk's frame.
     imu_E = mdp.OffsetToCommand(command="reach", site="imu").distance(free_body.view)
     torch.testing.assert_close(imu_E, torch.tensor([0.0, 0.4, 0.3]), atol=1e-5, rtol=0)
@@ -115,7 +117,7 @@ def test_the_start_pose_stays_when_the_robot_moves(free_body):
     before_E7 = draw(free_body, term).clone()
     assert before_E7[0].tolist() == pytest.approx(list(TURNED[:7]), abs=1e-6)
     free_body.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0, 0))
-    with free_body.view.scope("commands/x"):
+    with free_body.driver.scope("commands/x"):
         assert torch.equal(term(free_body.view), before_E7)
     only_first = torch.tensor([True, False, False])
     after_E7 = draw(free_body, term, only_first)

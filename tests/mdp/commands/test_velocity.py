@@ -25,7 +25,7 @@ def crowd():
 
 
 def draw(bench, term, mask_E=None, scope="commands/twist"):
-    with bench.view.scope(scope):
+    with bench.driver.scope(scope):
         term.resample(bench.view, bench.everybody_E if mask_E is None else mask_E)
         return term(bench.view)
 
@@ -67,11 +67,11 @@ def test_heading_control_turns_the_short_way_within_the_yaw_range(crowd):
     value = draw(crowd, term, scope="commands/heading")
     torch.testing.assert_close(value[:, 2], torch.full((E,), 0.25), atol=1e-4, rtol=0)
     headed(crowd, -3.0)  # the error is 6 rad, or 6 - 2 pi = -0.283 the other way
-    with crowd.view.scope("commands/heading"):
+    with crowd.driver.scope("commands/heading"):
         value = term(crowd.view)
     torch.testing.assert_close(value[:, 2], torch.full((E,), 0.5 * (6.0 - 2 * math.pi)), atol=1e-4, rtol=0)
     headed(crowd, 0.0)
-    with crowd.view.scope("commands/heading"):
+    with crowd.driver.scope("commands/heading"):
         assert (term(crowd.view)[:, 2] == 0.5).all()
 
 
@@ -115,7 +115,7 @@ def test_debug_drawing_shows_command_and_velocity(free_body):
     free_body.place(qpos=(0, 0, 1, math.cos(half), 0, 0, math.sin(half), 0, 0), qvel=(1, 0, 0, 0, 0, 0, 0, 0))
     term, recorder = command(lin_vel_x=(1.0, 1.0), lin_vel_y=(0.0, 0.0)), Recorder()
     draw(free_body, term)
-    with free_body.view.scope("commands/twist"):
+    with free_body.driver.scope("commands/twist"):
         term.draw_debug(free_body.view, recorder, 1)
     assert recorder.arrows[0] == pytest.approx([0.0, 0.5, 0.0], abs=1e-5)  # ahead, which is world y
     assert recorder.arrows[1] == pytest.approx([0.5, 0.0, 0.0], abs=1e-5)

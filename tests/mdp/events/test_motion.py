@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from ksim_rl import mdp
-from ksim_rl.scene.motions.motion import motion_time
+from ksim_rl.scene.state.motion_clock import motion_time
 from tests.envs.probe_env import DT, puck_env, push
 
 FPS = 1.0 / DT

@@ -202,7 +202,7 @@ def test_two_pushes_of_one_moment_add_up(crowd):
     event = mdp.PushByVelocity(velocity_range={"yaw": (1.0, 1.0)}, interval_range_s=(1.0, 3.0))
     crowd.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0, 0))
     for scope in ("events/first", "events/second"):
-        with crowd.view.scope(scope):
+        with crowd.driver.scope(scope):
             event(crowd.view, crowd.everybody_E)
     torch.testing.assert_close(crowd.world.qvel_EL[:, 5], torch.full((500,), 2.0))
 

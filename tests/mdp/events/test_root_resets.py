@@ -81,7 +81,7 @@ def test_on_a_terrain_the_default_pose_stands_at_the_envs_origin(crowd):
         def origins_E3(self):
             return torch.tensor([5.0, -3.0, 0.5]).expand(E, 3)
 
-    crowd.view.terrain = Hill(E, crowd.view.device)
+    crowd.driver.ground = Hill(E, crowd.view.device)
     crowd.fire(mdp.ResetRootUniform(pose_range={"z": (0.1, 0.1)}))
     torch.testing.assert_close(crowd.world.qpos_EL[:, :3], torch.tensor([6.0, -1.0, 3.6]).expand(E, 3))
 
@@ -105,16 +105,16 @@ def test_the_height_is_above_the_ground(crowd):
     heights_E = crowd.world.qpos_EL[:, 2]
     assert (heights_E[~odd_rows()] == 9.0).all()
     assert heights_E[odd_rows()].min() >= 0.3 - 1e-5 and heights_E[odd_rows()].max() <= 0.4 + 1e-5
-    flat, crowd.view.terrain = crowd.view.terrain, Plateau(E, crowd.view.device)
+    flat, crowd.driver.ground = crowd.view.terrain, Plateau(E, crowd.view.device)
     crowd.fire(mdp.ResetHeight(height_range=(0.3, 0.3)))
-    crowd.view.terrain = flat
+    crowd.driver.ground = flat
     torch.testing.assert_close(crowd.world.qpos_EL[:, 2], torch.full((E,), 0.55))
 
 
 def test_they_may_follow_one_another_in_one_reset(crowd):
-    with crowd.view.scope("events/root"):
+    with crowd.driver.scope("events/root"):
         mdp.ResetRootUniform(pose_range={"roll": (0.3, 0.3)})(crowd.view, crowd.everybody_E)
-    with crowd.view.scope("events/height"):
+    with crowd.driver.scope("events/height"):
         mdp.ResetHeight(height_range=(2.0, 2.0))(crowd.view, crowd.everybody_E)
     crowd.fire(mdp.ResetHeading(heading_range=(1.0, 1.0)))
     torch.testing.assert_close(crowd.world.qpos_EL[:, :3], torch.tensor([1.0, 2.0, 2.0]).expand(E, 3))

@@ -16,8 +16,8 @@ def test_action_acceleration_is_the_second_difference(free_body):
     actions = [0.0, 1.0, 3.0, 3.0]  # after zeros: second differences 0, 1, 1, -2
     last, seen = 0.0, []
     for action in actions:
-        free_body.view.action_EL = torch.full((3, 2), action)
-        free_body.view.last_action_EL = torch.full((3, 2), last)
+        free_body.driver.readings.action_EL = torch.full((3, 2), action)
+        free_body.driver.readings.last_action_EL = torch.full((3, 2), last)
         seen.append(float(free_body.read(mdp.ActionAcceleration(), "metrics/acc")[0]))
         last = action
     assert seen == [0.0, 1.0, 1.0, 2.0]

@@ -56,7 +56,9 @@ def test_an_unknown_termination_is_refused_at_construction():
 def test_a_target_is_reached_within_the_tolerance(free_body):
     free_body.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0, 0))
     # The site "imu" is 0.3 m ahead of the trunk's frame.
-    free_body.view.commands["reach"] = torch.tensor([[0.3, 0.0, 0.0], [0.3, 0.09, 0.0], [0.3, 0.11, 0.0]])
+    free_body.driver.readings.commands["reach"] = torch.tensor(
+        [[0.3, 0.0, 0.0], [0.3, 0.09, 0.0], [0.3, 0.11, 0.0]]
+    )
     term = mdp.TargetReached(command="reach", tolerance=0.1, site="imu")
     assert free_body.read(term, "metrics/x").tolist() == [1.0, 1.0, 0.0]
     free_body.view.commands["reach"] += torch.tensor([0.0, 0.0, 1.0])

@@ -30,7 +30,7 @@ def test_foot_height_follows_the_leg_and_the_ground(free_body):
     free_body.place(qpos=(0, 0, 1, 1, 0, 0, 0, angle, 0))
     term = mdp.FootHeight(sites=("left_foot", "right_foot"))
     close(free_body.read(term), [1.0 - 0.4 * math.cos(angle), 0.6])
-    free_body.view.terrain = Plateau(3, free_body.view.device)
+    free_body.driver.ground = Plateau(3, free_body.view.device)
     free_body.refresh()
     close(free_body.read(term), [0.75 - 0.4 * math.cos(angle), 0.35])
 

@@ -99,7 +99,7 @@ def test_lagging_gravity_answers_a_step_exponentially(free_body):
 
 
 def test_action_and_command_pass_through(free_body):
-    free_body.view.action_EL = torch.arange(6.0).view(3, 2)
+    free_body.driver.readings.action_EL = torch.arange(6.0).view(3, 2)
     free_body.command([0.1, 0.2, 0.3])
     close(free_body.read(mdp.LastAction()), free_body.view.action_EL)
     close(free_body.read(mdp.Command(command="twist")), [0.1, 0.2, 0.3])

@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 import torch
 
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.term import EventTerm
-from ksim_rl.envs.view import EnvView
 from ksim_rl.physics import SimCfg, World, load_model, prepare_spec
 
 RUNNER = """
@@ -82,7 +82,8 @@ class Runners:
             per_world_fields=FIELDS,
             sim=SimCfg(njmax=60, nconmax=20),
         )
-        self.view = EnvView(self.world, step_dt=0.02)
+        self.driver = EnvDriver(self.world, step_dt=0.02)
+        self.view = self.driver.view
         self.everybody_E = torch.ones(num_envs, dtype=torch.bool, device=device)
         self.own = self.world.state_dict()
 
@@ -95,7 +96,7 @@ class Runners:
     def fire(self, event: EventTerm, mask_E: torch.Tensor | None = None, scope: str = "events/x") -> None:
         """Run an event for some rows (all by default), and recompute what follows from it, as the env does."""
         mask_E = self.everybody_E if mask_E is None else mask_E
-        with self.view.scope(scope, self.view.reset_count_E):
+        with self.driver.scope(scope, self.view.reset_count_E):
             event(self.view, mask_E)
         self.world.set_const(event.per_world_fields, mask_E)
 

@@ -169,7 +169,7 @@ def test_pseudo_inertia_is_the_deformed_one(herd):
     event = mdp.RandomizePseudoInertia(
         bodies="trunk", alpha=(-0.5, 0.5), stretch=(-0.4, 0.4), shear=(-0.5, 0.5), shift=(-0.1, 0.1)
     )
-    with herd.view.scope("events/x", herd.view.reset_count_E):
+    with herd.driver.scope("events/x", herd.view.reset_count_E):
         drawn = herd.view.uniform(10).double().numpy()
     herd.fire(event)
     low, high = np.repeat([[-0.5, -0.4, -0.5, -0.1], [0.5, 0.4, 0.5, 0.1]], [1, 3, 3, 3], axis=1)
@@ -210,7 +210,7 @@ def test_default_joint_pos_moves_what_joint_positions_are_relative_to(herd):
     herd.restart()
     herd.fire(mdp.RandomizeDefaultJointPos(joints=".*_hip", ranges=(-0.1, 0.1)), torch.arange(E) >= 10)
     herd.world.qpos_EL[:, 7:] = torch.tensor((0.1, -0.1, 0.05))
-    herd.view.refreshed()
+    herd.driver.refreshed()
     offset = herd.view.joint_pos_rel_EL
     assert offset[:10].abs().max() < 1e-7 and offset[:, 2].abs().max() < 1e-7
     assert offset[10:, :2].abs().max() <= 0.1 + 1e-6 and offset[10:, :2].std() > 0.05

@@ -67,7 +67,7 @@ def test_mass_com_and_inertia_events_of_one_reset_act_together(runners):
     runners.restart()
     fields = []
     for number, name in enumerate(("mass", "inertia", "com")):
-        with runners.view.scope(f"events/{number}", runners.view.reset_count_E):
+        with runners.driver.scope(f"events/{number}", runners.view.reset_count_E):
             EVENTS[name](runners.view, runners.everybody_E)
         fields += EVENTS[name].per_world_fields
     runners.world.set_const(fields, runners.everybody_E)

@@ -6,18 +6,18 @@ from tests.envs.probe_env import puck_env
 
 
 def test_action_rate_is_the_squared_change(free_body):
-    free_body.view.action_EL = torch.tensor([[1.0, 2.0], [0.0, 0.0], [-1.0, 1.0]])
-    free_body.view.last_action_EL = torch.tensor([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
+    free_body.driver.readings.action_EL = torch.tensor([[1.0, 2.0], [0.0, 0.0], [-1.0, 1.0]])
+    free_body.driver.readings.last_action_EL = torch.tensor([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
     assert free_body.read(mdp.ActionRateL2(), "rewards/x").tolist() == [5.0, 0.0, 4.0]
 
 
 def act(bench, term, polynomial, steps):
     """Values of a term while each env's two actions follow `polynomial(k)`, from k = 0 on; before, they are 0."""
-    view, values = bench.view, []
-    view.action_EL = torch.zeros(3, 2)
+    readings, values = bench.driver.readings, []
+    readings.action_EL = torch.zeros(3, 2)
     for k in range(steps):
-        view.last_action_EL = view.action_EL
-        view.action_EL = torch.full((3, 2), float(polynomial(k)))
+        readings.last_action_EL = readings.action_EL
+        readings.action_EL = torch.full((3, 2), float(polynomial(k)))
         values.append(bench.read(term, "rewards/x"))
     return torch.stack(values, dim=-1)
 

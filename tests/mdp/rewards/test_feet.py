@@ -137,11 +137,11 @@ def test_gait_phase_is_the_share_of_feet_in_the_wanted_phase(boxes):
     boxes.step()
     # Box a stands, box b is in the air. Sines ask: swing where positive.
     for sines, share in (((-0.5, 0.5), 1.0), ((0.5, -0.5), 0.0), ((-0.5, -0.5), 0.5), ((0.5, 0.5), 0.5)):
-        boxes.view.commands["gait"] = torch.tensor([[*sines, 9.0, 9.0]]).expand(2, 4)
+        boxes.driver.readings.commands["gait"] = torch.tensor([[*sines, 9.0, 9.0]]).expand(2, 4)
         assert boxes.read(term, "rewards/x").tolist() == [share, share]
     boxes.command([MOVING, IDLE])
     assert boxes.read(term, "rewards/x").tolist() == [0.5, 0.0]
-    boxes.view.commands["gait"] = torch.zeros(2, 6)
+    boxes.driver.readings.commands["gait"] = torch.zeros(2, 6)
     with pytest.raises(ValueError, match="'gait' has 3 feet, sensor='touch' has 2"):
         boxes.read(term, "rewards/x")
 
@@ -149,7 +149,7 @@ def test_gait_phase_is_the_share_of_feet_in_the_wanted_phase(boxes):
 def test_heights_are_above_the_ground_below_the_foot(free_body):
     free_body.place(qpos=(0, 0, 0.75, 1, 0, 0, 0, 0, 0), qvel=(0.5, 0, 0, 0, 0, 0, 0, 0))
     free_body.command(MOVING)
-    free_body.view.terrain = Plateau(3, free_body.view.device)
+    free_body.driver.ground = Plateau(3, free_body.view.device)
     term = mdp.FootClearance(sites=(".*_foot",), target_height=0.3, **GATE)
     # Both feet are at 0.35 m, 0.1 m above the plateau.
     value = free_body.read(term, "rewards/x")

@@ -84,7 +84,7 @@ def test_root_height_is_above_the_ground(free_body):
     term = mdp.RootHeightL2(target_height=0.6)
     free_body.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0, 0))
     torch.testing.assert_close(free_body.read(term, "rewards/x"), torch.full((3,), 0.16), atol=1e-5, rtol=0)
-    free_body.view.terrain = Plateau(3, free_body.view.device)
+    free_body.driver.ground = Plateau(3, free_body.view.device)
     torch.testing.assert_close(
         free_body.read(term, "rewards/x"), torch.full((3,), 0.15**2), atol=1e-5, rtol=0
     )

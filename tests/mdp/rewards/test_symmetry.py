@@ -42,7 +42,7 @@ def test_actions_stand_in_the_order_of_the_action_term(bench):
     order = ("right_knee", "left_hip", "right_hip", "left_knee")
     term = mdp.ActionSymmetryL2(joints=order, **MIRROR)
     # The last column belongs to another action term.
-    bench.view.action_EL = torch.tensor(
+    bench.driver.readings.action_EL = torch.tensor(
         [[0.5, 0.3, -0.3, 0.5, 9.0], [0.5, 0.3, 0.3, 0.5, 9.0], [0.1, 0.0, 0.0, 0.5, 9.0]]
     )
     value = bench.read(term, "rewards/x")

@@ -40,17 +40,19 @@ def check(bench, term, expected):
 
 def test_height_tracking_is_above_the_ground(free_body):
     free_body.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0, 0))
-    free_body.view.commands["height"] = torch.tensor([[1.0], [0.8], [0.65]])
+    free_body.driver.readings.commands["height"] = torch.tensor([[1.0], [0.8], [0.65]])
     term = mdp.TrackRootHeight(command="height", std=0.2)
     check(free_body, term, torch.exp(-torch.tensor([0.0, 1.0, (0.35 / 0.2) ** 2])))
-    free_body.view.terrain = Plateau(3, free_body.view.device)
+    free_body.driver.ground = Plateau(3, free_body.view.device)
     check(free_body, term, torch.exp(-torch.tensor([(0.25 / 0.2) ** 2, (0.05 / 0.2) ** 2, 0.25])))
 
 
 def test_position_tracking_in_both_frames(free_body):
     # At (1, 2, 3), turned to the left. The left foot hangs 0.4 m below the hip, 0.2 m to the left: at (0.8, 2, 2.6).
     free_body.place(qpos=(1, 2, 3, *YAW_90, 0, 0))
-    free_body.view.commands["reach"] = torch.tensor([[0.0, 0.2, -0.4], [0.3, 0.2, -0.4], [0.8, 2.0, 2.6]])
+    free_body.driver.readings.commands["reach"] = torch.tensor(
+        [[0.0, 0.2, -0.4], [0.3, 0.2, -0.4], [0.8, 2.0, 2.6]]
+    )
     own = mdp.TrackPosition(command="reach", std=0.3, site="left_foot")
     assert free_body.read(own, "rewards/x")[:2].tolist() == pytest.approx([1.0, math.exp(-1.0)], abs=1e-5)
     world = mdp.TrackPosition(command="reach", std=0.3, site="left_foot", frame="world")
@@ -66,18 +68,18 @@ def test_orientation_tracking_takes_the_angle(free_body):
     free_body.place(qpos=(0, 0, 1, *YAW_90, 0.5, 0))
     turned, opposite = (math.cos(0.1), 0.0, math.sin(0.1), 0.0), (-math.cos(0.25), 0.0, -math.sin(0.25), 0.0)
     targets = [(1.0, 0.0, 0.0, 0.0), turned, opposite]
-    free_body.view.commands["pose"] = torch.tensor([(9.0, 9.0, 9.0, *quat) for quat in targets])
+    free_body.driver.readings.commands["pose"] = torch.tensor([(9.0, 9.0, 9.0, *quat) for quat in targets])
     own = mdp.TrackOrientation(command="pose", std=0.5, body="left")
     check(free_body, own, torch.exp(-torch.tensor([1.0, 0.36, 0.0])))
     world = mdp.TrackOrientation(command="pose", std=0.5, body="trunk", frame="world")
     assert free_body.read(world, "rewards/x")[0].item() == pytest.approx(math.exp(-(math.pi**2)), abs=1e-5)
-    free_body.view.commands["pose"] = torch.zeros(3, 3)
+    free_body.driver.readings.commands["pose"] = torch.zeros(3, 3)
     with pytest.raises(ValueError, match="'pose' has 3 numbers"):
         free_body.read(own, "rewards/x")
 
 
 def test_joint_tracking_takes_the_mean_error(free_body):
     free_body.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0.3, 0.7))
-    free_body.view.commands["joints"] = torch.tensor([[0.7, 0.3], [0.7, 0.7], [0.3, 0.3]])
+    free_body.driver.readings.commands["joints"] = torch.tensor([[0.7, 0.3], [0.7, 0.7], [0.3, 0.3]])
     term = mdp.TrackJointPosition(command="joints", std=0.2, joints=("right_hip", "left_hip"))
     check(free_body, term, torch.exp(-torch.tensor([0.0, 2.0, 2.0])))

@@ -7,7 +7,8 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from ksim_rl.envs import EnvView, MjcfRobot
+from ksim_rl.envs import MjcfRobot
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.physics import World, load_model
 from ksim_rl.scene.actuators import (
     Actuator,
@@ -114,9 +115,10 @@ class ChainBench:
     def __init__(self, *actuators: Actuator, num_envs: int = 3) -> None:
         spec = MjcfRobot(source=CHAINS, actuators=actuators).spec()
         self.world = World(load_model(spec), num_envs=num_envs)
-        self.view = EnvView(self.world, step_dt=4 * TIMESTEP)
-        self.drives = JointDrives({"": actuators}, self.view)
-        self.view.freeze()
+        self.driver = EnvDriver(self.world, step_dt=4 * TIMESTEP)
+        self.view = self.driver.view
+        self.drives = JointDrives({"": actuators}, self.driver, self.view)
+        self.driver.freeze()
         self.reset(*range(num_envs))
 
     def reset(self, *rows: int) -> None:
@@ -129,7 +131,7 @@ class ChainBench:
 
     def efforts(self, joint: str) -> torch.Tensor:
         """Let the motor models write their controls; return those of one joint, [E]."""
-        for hook in self.view.before_substep:
+        for hook in self.driver.before_substep:
             hook()
         return self.world.ctrl_EL[:, self.world.mj_model.actuator(joint).id].clone()
 

@@ -167,4 +167,4 @@ def test_draws_depend_on_row_and_count_of_resets_only(late):
 def test_a_robot_that_forgot_to_set_its_actuators_is_told(pd):
     entry = IdealPDActuator(joints="neck", stiffness=1.0, damping=0.0)
     with pytest.raises(ValueError, match="'neck' has 0 actuators.*set_actuators"):
-        JointDrives({"": (entry,)}, pd.view)
+        JointDrives({"": (entry,)}, pd.driver, pd.view)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import mujoco
 import torch
 
-from ksim_rl.envs.view import EnvView
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.physics import World, load_model
 from ksim_rl.scene.sensors import Sensor
 
@@ -22,8 +22,9 @@ class SensorBench:
         for name, sensor in sensors.items():
             sensor.add_to(spec, name)
         self.world = World(load_model(spec), num_envs=num_envs, device=device, **world)
-        self.view = EnvView(self.world, step_dt=SUBSTEPS * self.world.timestep)
-        self.view.sensors.update((name, sensor.track(name, self.view)) for name, sensor in sensors.items())
+        self.driver = EnvDriver(self.world, step_dt=SUBSTEPS * self.world.timestep)
+        self.view = self.driver.view
+        self.driver.add_sensors(sensors)
 
     def place(self, qpos=None, qvel=None) -> None:
         """Write states [E, L] or [L], and refresh what derives from them."""
@@ -34,14 +35,17 @@ class SensorBench:
 
     def refresh(self) -> None:
         self.world.refresh()
-        self.view.refreshed()
+        self.driver.refreshed()
 
     def step(self, substeps: int = SUBSTEPS) -> None:
         """Advance by one env step."""
-        view = self.view
+        driver = self.driver
         self.world.step(
-            substeps, before=view.before_substep, after=view.after_substep, sensors=view.substep_sensors
+            substeps,
+            before=driver.before_substep,
+            after=driver.after_substep,
+            sensors=driver.substep_sensors,
         )
         self.refresh()
-        for tracker in view.sensors.values():
+        for tracker in self.view.sensors.values():
             tracker.update()

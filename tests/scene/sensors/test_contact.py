@@ -244,7 +244,7 @@ def test_without_it_the_history_is_the_last_substep_and_the_graph_stays_one():
     env = falling_env(heights=(0.0, 0.0))
     state = contacts(env, 5)[-1]
     assert torch.equal(state.force_history_ESN3, state.force_EN3[:, None])
-    assert env.view.after_substep == [] and env.view.substep_sensors == "last"
+    assert env.driver.after_substep == [] and env.driver.substep_sensors == "last"
 
 
 def test_last_contact_time_and_first_air_mark_the_take_off():

@@ -88,7 +88,7 @@ def test_on_a_spinning_rim_it_reads_the_centripetal_acceleration(bench):
 
 def test_observations_name_the_quantity(bench):
     bench.place(qpos=REST + AXLE, qvel=[0.0] * 6 + [2.0])
-    with bench.view.scope("observations/x"):
+    with bench.driver.scope("observations/x"):
         assert_reads(ImuReading(sensor="rim")(bench.view), 0.0, 0.0, 2.0)
         reading = ImuReading(sensor="body", quantity="projected_gravity")(bench.view)
     assert_reads(reading, 0.0, 0.0, -1.0)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from ksim_rl.envs.view import EnvView
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.mdp import RayDistance, RayHeight
 from ksim_rl.physics import SimCfg, World, load_model
 from ksim_rl.scene.sensors import (
@@ -56,17 +56,18 @@ class Bench:
             sim=SimCfg(njmax=60, nconmax=30),
             per_world_fields=GRID.per_world_fields,
         )
-        self.view = EnvView(self.world, step_dt=0.02)
-        self.view.terrain = GRID.ground(self.view)
-        self.tracker = sensor.track("scan", self.view)
-        self.view.sensors["scan"] = self.tracker
+        self.driver = EnvDriver(self.world, step_dt=0.02)
+        self.view = self.driver.view
+        self.driver.ground = GRID.ground(self.view)
+        self.driver.add_sensors({"scan": sensor})
+        self.tracker = self.view.sensors["scan"]
         quat = torch.nn.functional.normalize(torch.tensor([0.8, 0.1, -0.2, 0.5]), dim=0).tolist()
         self.place(torch.tensor([[0.1 * row, 0.2, 1.0 + 0.1 * row, *quat] for row in range(NUM_ENVS)]))
 
     def place(self, pose_E7) -> None:
         self.world.qpos_EL.copy_(pose_E7)
         self.world.refresh()
-        self.view.refreshed()
+        self.driver.refreshed()
 
     def ray_of_the_c_engine(self, row, start, direction, groups, exclude):
         """Return distance (-1 for none) and normal of one ray, in the world's own model."""
@@ -144,7 +145,7 @@ def test_what_rays_hit_is_chosen_by_group_and_body():
 def test_readings_follow_the_state_and_are_the_readers_own():
     bench = Bench(RayCaster(pattern=GridPattern(size=(0.0, 0.0)), body="robot", alignment="world"))
     bench.place(torch.tensor([-2.5, -2.5, 2.0, 1.0, 0.0, 0.0, 0.0]).expand(NUM_ENVS, 7))
-    with bench.view.scope("observations/x"):
+    with bench.driver.scope("observations/x"):
         before = RayDistance(sensor="scan")(bench.view)
         held = before.clone()
         bench.place(torch.tensor([-2.5, -2.5, 3.0, 1.0, 0.0, 0.0, 0.0]).expand(NUM_ENVS, 7))

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import torch
 
-from ksim_rl.envs.view import EnvView
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.physics import SimCfg, World, load_model
 from ksim_rl.scene.terrains import (
     FlatPatch,
@@ -60,8 +60,9 @@ class GroundBench:
         self.world = World(
             load_model(spec), num_envs=num_envs, sim=ROOM, per_world_fields=grid.per_world_fields
         )
-        self.view = EnvView(self.world, step_dt=0.02, max_episode_length=500)
-        self.view.terrain = self.ground = grid.ground(self.view)
+        self.driver = EnvDriver(self.world, step_dt=0.02, max_episode_length=500)
+        self.view = self.driver.view
+        self.driver.ground = self.ground = grid.ground(self.view)
         self.geom = self.world.mj_model.geom("terrain").id
 
     def mj_model(self, row: int) -> mujoco.MjModel:
@@ -78,7 +79,7 @@ class GroundBench:
         self.world.qpos_EL.copy_(torch.cat((ball_E3, upright, box_E3, upright), dim=-1))
         self.world.qvel_EL.zero_()
         self.world.refresh()
-        self.view.refreshed()
+        self.driver.refreshed()
 
     def mj_data(self, row: int, mj_model: mujoco.MjModel) -> mujoco.MjData:
         """Return the C engine's data at the present state of one world, after its forward pass."""

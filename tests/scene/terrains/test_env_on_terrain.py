@@ -161,7 +161,7 @@ def test_pictures_show_the_patch_that_the_env_stands_on():
         env.view.terrain.set_levels(torch.ones(NUM_ENVS, dtype=torch.bool), torch.full((NUM_ENVS,), 2))
         env.world.qpos_EL[:] = torch.tensor([0.0, 0.0, 9.0, 1.0, 0.0, 0.0, 0.0, 0.0])
         env.world.refresh()
-        env.view.refreshed()
+        env.driver.refreshed()
         env.cfg = dataclasses.replace(env.cfg, commands={})  # no arrows
         pictures[row] = env.render().astype(int)
         env.close()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import mujoco
 import torch
@@ -11,8 +11,6 @@ from torch import Tensor
 
 from ksim_rl.checks import near
 from ksim_rl.physics import World
-from ksim_rl.scene.actuators.actuator import TargetKind
-from ksim_rl.scene.actuators.builtin import control_kind
 from ksim_rl.scene.names import (
     Index,
     NameResolver,
@@ -23,7 +21,38 @@ from ksim_rl.scene.names import (
 )
 from ksim_rl.scene.state.buffers import Buffers
 
+TargetKind = Literal["pos", "vel", "effort"]
+
+
+class JointState(NamedTuple):
+    """Where N joints are before a substep: rad or m, and rad/s or m/s, [E, N]."""
+
+    pos_EN: Tensor
+    vel_EN: Tensor
+
+
+class JointTarget(NamedTuple):
+    """What N joints are asked for: position, velocity, and effort (N m or N) to add, [E, N]."""
+
+    pos_EN: Tensor
+    vel_EN: Tensor
+    effort_EN: Tensor
+
+
 _WORDS = {"pos": "a position", "vel": "a velocity", "effort": "an effort"}
+
+
+def control_kind(biastype: int, biasprm: Sequence[float], dyntype: int) -> TargetKind:
+    """Return what the control of a MuJoCo actuator is a target for.
+
+    A bias that pulls back in proportion to the position makes a position servo (with an integrator in front of it,
+    one whose control is a velocity), one that is proportional to the velocity alone a velocity servo.
+    """
+    if biastype != mujoco.mjtBias.mjBIAS_AFFINE:
+        return "effort"
+    if biasprm[1] != 0.0:
+        return "vel" if dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR else "pos"
+    return "vel" if biasprm[2] != 0.0 else "effort"
 
 
 class _Route(NamedTuple):

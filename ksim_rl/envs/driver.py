@@ -1,0 +1,50 @@
+"""This module is what an env and its managers drive terms with; terms themselves see the driver's view only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from ksim_rl.envs.readings import Readings
+from ksim_rl.envs.view import EnvView
+from ksim_rl.physics import World
+from ksim_rl.scene.sensors import Sensor
+from ksim_rl.scene.state.simulation import Simulation
+
+
+class EnvDriver(Simulation):
+    """A `Simulation` with what sensors and managers read out, and the view of both that terms are called with.
+
+    Attributes:
+        readings: what managers and sensors write.
+        view: what terms read.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        *,
+        step_dt: float,
+        max_episode_length: int = 0,
+        soft_joint_pos_limit_factor: float = 1.0,
+        entities: Sequence[str] = (),
+    ) -> None:
+        super().__init__(world, step_dt=step_dt, max_episode_length=max_episode_length)
+        self.readings = Readings(self)
+        self.view = EnvView(
+            self,
+            self.readings,
+            soft_joint_pos_limit_factor=soft_joint_pos_limit_factor,
+            entities=entities,
+        )
+
+    def add_sensors(self, sensors: Mapping[str, Sensor]) -> None:
+        """Let sensors read the worlds from now on."""
+        for name, sensor in sensors.items():
+            tracker = self.readings.sensors[name] = sensor.track(name, self.view)
+            if tracker.every_substep:
+                self.after_substep.append(tracker.update_substep)
+                self.substep_sensors = "every"
+
+    def freeze(self) -> None:
+        """End construction: no new buffers, and all that lives on is known to `detached`."""
+        super().freeze(self.view.default_qpos_L)
