@@ -7,10 +7,10 @@ import io
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import torch
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
-from torchrl.data import TensorSpec
 from torchrl.envs.transforms import Transform
 
 from ksim_rl.envs.driver import EnvDriver
@@ -28,11 +28,11 @@ def explain(
     cfg: ManagerBasedRlEnvCfg,
     driver: EnvDriver,
     *,
-    observations: Mapping[str, TensorSpec],
+    shapes: Mapping[str, torch.Size],
     action_sizes: Mapping[str, int],
     events: Mapping[str, EventTerm],
     levels: Mapping[str, float],
-    width: int = WIDTH,
+    width: int,
 ) -> str:
     """Return one table per manager: index, name, shape, weight, mode and parameters of each term.
 
@@ -41,7 +41,7 @@ def explain(
     Args:
         cfg: of the env.
         driver: of the env.
-        observations: the spec of each observation term, [E, ...].
+        shapes: of the observation terms, [E, ...] each.
         action_sizes: how many columns each action term takes.
         events: the events that the env has, by name.
         levels: of the curricula.
@@ -50,7 +50,7 @@ def explain(
     output = io.StringIO()
     console = Console(file=output, width=width, highlight=False, markup=False, color_system=None)
     console.print(_summary(cfg, driver))
-    for table in _tables(cfg, driver, observations, action_sizes, events, levels):
+    for table in _tables(cfg, driver, shapes, action_sizes, events, levels):
         console.print(table)
     return "\n".join(line.rstrip() for line in output.getvalue().splitlines()) + "\n"
 
@@ -74,22 +74,22 @@ def _solver(world: World) -> str:
 def _tables(
     cfg: ManagerBasedRlEnvCfg,
     driver: EnvDriver,
-    observations: Mapping[str, TensorSpec],
+    shapes: Mapping[str, torch.Size],
     action_sizes: Mapping[str, int],
     events: Mapping[str, EventTerm],
     levels: Mapping[str, float],
 ) -> Iterable[Table]:
     for group, group_cfg in cfg.observations.items():
-        rows, shapes = [], []
+        rows, widths = [], []
         for name, term_cfg in group_cfg.terms.items():
-            shape = tuple(observations[name].shape[1:])
+            shape = tuple(shapes[name][1:])
             if len(shape) == 1:
                 shape = (shape[0] * group_cfg.num_frames(name),)
-            shapes.append(shape)
+            widths.append(shape)
             chain = _parameters(term_cfg, without=("term",))
             rows.append((name, str(shape), chain, _described(term_cfg.term)))
         # An image stands alone in its group; vectors are concatenated.
-        whole = shapes[0] if len(shapes) == 1 else (sum(shape[0] for shape in shapes),)
+        whole = widths[0] if len(widths) == 1 else (sum(shape[0] for shape in widths),)
         yield _table(f"observations/{group} {whole}", ("term", "shape", "chain", "parameters"), rows)
 
     rows = [(name, f"({action_sizes[name]},)", _described(term)) for name, term in cfg.actions.items()]

@@ -23,7 +23,7 @@ from ksim_rl.envs import specs
 from ksim_rl.envs.contract import DifficultyLevels, EpisodeClock, EpisodeSums, Pictures, SimulatedWorld
 from ksim_rl.envs.drawing import Drawing, drawings
 from ksim_rl.envs.driver import EnvDriver
-from ksim_rl.envs.explain import explain
+from ksim_rl.envs.explain import WIDTH, explain
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.managers import (
     ActionManager,
@@ -386,15 +386,18 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         shared = {f"shared/{name}": tensor for name, tensor in driver.shared_values.by_name().items()}
         return counters | shared | driver.buffers.by_name()
 
-    def explain(self) -> str:
+    def explain(self, *, width: int = WIDTH) -> str:
         """Return what the env is made of: a table per manager with index, name, shape, weight, mode and parameters."""
         return explain(
             self.cfg,
             self.driver,
-            observations=dict(self.observation_spec["obs"].items()) if self.observation_manager.terms else {},
+            shapes={
+                name: self.observation_spec["obs", name].shape for name in self.observation_manager.terms
+            },
             action_sizes=self.action_manager.sizes,
             events=self.event_manager.terms,
             levels={name: float(level) for name, level in self.curriculum_levels().items()},
+            width=width,
         )
 
     # -- pictures and the end ------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ import math
 
 from ksim_rl import mdp
 from ksim_rl.envs import ObservationGroupCfg, ObservationTermCfg
-from ksim_rl.envs.explain import explain
 from ksim_rl.physics import SimCfg
 from ksim_rl.transforms.noise.cfg import UniformNoise
 from tests.envs.probe_env import DT, Kick, Launch, Position, Speed, Target, puck_env
@@ -83,7 +82,7 @@ def test_the_second_line_says_what_solves_the_constraints():
 
 def test_an_empty_manager_says_none_and_lines_stay_within_the_width():
     env = puck_env(limit=None, commands={"reach": reach()})
-    text = explain(env, width=90)
+    text = env.explain(width=90)
     assert max(len(line) for line in text.splitlines()) <= 90
     assert tables(text)["metrics"] == ["- none"]
     env.view.reward_weights["position"].fill_(7.0)

@@ -1,8 +1,14 @@
 """Tasks by name, with Hydra overrides."""
 
+from dataclasses import dataclass, replace
+
 import pytest
+import torch
+from torch import Tensor
 
 from ksim_rl import envs
+from ksim_rl.envs import EnvView
+from ksim_rl.envs.term import EventTerm
 
 
 def test_names_are_sorted_and_hold_the_reference_tasks():
@@ -56,3 +62,30 @@ def test_make_gives_the_env_ready_to_train_on():
     assert root_E["actor"].shape == (4, 5) and root_E["critic"].shape == (4, 5)
     assert env.action_spec.shape == (4, 1) and env.base_env.cfg.seed == 3
     assert env.rollout(7, break_when_any_done=False)["next", "truncated"][:, 4].all()
+
+
+STARTS: list[float] = []
+
+
+@dataclass(frozen=True, kw_only=True)
+class NotesStarts(EventTerm):
+    """Notes what it draws each time that it is asked to write rows."""
+
+    mode: str = "startup"
+
+    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+        if mask_E.any():
+            STARTS.append(view.uniform(1)[0].item())
+
+
+def test_startup_events_run_once_for_each_seed():
+    cfg = envs.make_cfg("cartpole_balance", ["task.scene.num_envs=2", "task.seed=5"])
+    STARTS.clear()
+    env = envs.build(replace(cfg, events={**(cfg.events or {}), "notes": NotesStarts()}))
+    assert len(STARTS) == 1
+    built = {key: value.clone() for key, value in env.state_dict().items()}
+    env.seed(5)
+    assert len(STARTS) == 2 and STARTS[0] == STARTS[1]
+    for key, value in env.state_dict().items():
+        assert torch.equal(value, built[key]), f"{key}: building seeds as seed() does"
+    env.close()
