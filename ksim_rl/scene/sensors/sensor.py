@@ -12,7 +12,6 @@ from ksim_rl.checked import Checked, Within
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.state.world_view import WorldView
 
-
 GeomGroup = Annotated[int, Within(low=0, high=mujoco.mjNGROUP - 1)]
 """One of MuJoCo's geom groups."""
 
