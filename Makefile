@@ -10,7 +10,7 @@ ARGS ?=
 # Whole files go to one worker, since their tests share envs and compiled kernels.
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: setup train check lint types imports test test-full clean
+.PHONY: setup train check lint types imports house test test-full clean
 
 setup: $(STAMP)
 
@@ -35,6 +35,9 @@ types: setup
 
 imports: setup
 	$(BIN)/lint-imports
+
+house: setup
+	$(BIN)/python -m tests.house
 
 test: setup check
 	$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
