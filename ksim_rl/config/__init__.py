@@ -1,1 +1,1 @@
-"""Dataclasses to plain trees and back, the plug-ins of other packages, and the configs that Hydra finds."""
+"""This room turns dataclasses into plain trees and back, loads plug-ins, and stores the configs that Hydra finds."""

@@ -1,4 +1,4 @@
-"""Configs in Hydra's store that cost nothing until Hydra loads them.
+"""This module puts configs into Hydra's store that cost nothing until Hydra loads them.
 
 `ConfigStore.store` makes OmegaConf nodes of whatever it is given, which takes most of a second for all of our tasks.
 And Hydra copies all that it holds whenever it lists a group, which `ksim-rl train --help` does a hundred times; what it

@@ -1,22 +1,17 @@
-"""Transforms for any TorchRL env: noise, delay, history, limits, units, statistics, mirrors, groups."""
+"""This room holds transforms for any TorchRL env: noise, delay, history, limits, units, statistics, mirrors, groups."""
 
-from ksim_rl.transforms.actions.action_clip import ActionClip
-from ksim_rl.transforms.actions.action_delay import ActionDelay
-from ksim_rl.transforms.actions.action_low_pass import ActionLowPass
-from ksim_rl.transforms.actions.action_scale import ActionScale
-from ksim_rl.transforms.clip import ObservationClip
+from ksim_rl.transforms.clip import ActionClip, ObservationClip, RewardClip
 from ksim_rl.transforms.command_curriculum import RandomCommandCurriculum
-from ksim_rl.transforms.delay import ObservationDelay
-from ksim_rl.transforms.delay_cfg import DelayCfg
-from ksim_rl.transforms.episode_tracker import EpisodeTracker
+from ksim_rl.transforms.delay import ActionDelay, ObservationDelay
 from ksim_rl.transforms.groups.compile_groups import compile_groups
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.transforms.groups.group_spec import GroupSpec
 from ksim_rl.transforms.groups.groups import ObservationGroups, group_specs, observation_columns
-from ksim_rl.transforms.history import ObservationHistory
-from ksim_rl.transforms.history_cfg import HistoryCfg
+from ksim_rl.transforms.history import HistoryCfg, ObservationHistory
 from ksim_rl.transforms.keyed_transform import KeyedTransform
+from ksim_rl.transforms.lagged_transform import DelayCfg
 from ksim_rl.transforms.level import FollowsLevel, follow_level
+from ksim_rl.transforms.low_pass import ActionLowPass
 from ksim_rl.transforms.mirror.mirror import Mirror, mirrored
 from ksim_rl.transforms.mirror.mirror_map import (
     AXIAL,
@@ -39,11 +34,9 @@ from ksim_rl.transforms.noise.cfg import (
 )
 from ksim_rl.transforms.noise.observation_noise import ObservationNoise
 from ksim_rl.transforms.normalization import ObservationNormalization
-from ksim_rl.transforms.reward_clip import RewardClip
-from ksim_rl.transforms.reward_scale import RewardScale
-from ksim_rl.transforms.scale import ObservationScale
-from ksim_rl.transforms.success_tracker import SuccessTracker
+from ksim_rl.transforms.scale import ActionScale, ObservationScale, RewardScale
 from ksim_rl.transforms.time_aware import TimeAwareObservation
+from ksim_rl.transforms.trackers import EpisodeTracker, SuccessTracker
 from ksim_rl.transforms.transform_cfg import TransformCfg
 
 __all__ = [

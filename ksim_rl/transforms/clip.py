@@ -1,25 +1,22 @@
-"""Limits on observations."""
+"""Observations, rewards and actions are limited by the transforms of this module."""
 
 from collections.abc import Mapping
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from torchrl.data import Composite
-from torchrl.envs.transforms import Transform
+from jaxtyping import Num
+from tensordict import NestedKey
+from torch import Tensor
+from torchrl.data import TensorSpec, Unbounded
 
 from ksim_rl import checks
-from ksim_rl.transforms.row_transform import Keys, as_keys, checked_out_keys
-from ksim_rl.transforms.specs import (
-    bounded,
-    bounds,
-    floating_spec,
-    set_leaf_spec,
-)
+from ksim_rl.transforms.elementwise import ActionMap, ObservationMap, RewardMap
+from ksim_rl.transforms.row_transform import Keys
+from ksim_rl.transforms.specs import bounded, bounds
 
 Range = tuple[float | None, float | None]
 
 
-class ObservationClip(Transform):
+class ObservationClip(ObservationMap):
     """Clip observations to [low, high]; NaN stays NaN.
 
     Args:
@@ -34,33 +31,81 @@ class ObservationClip(Transform):
     def __init__(
         self, in_keys: Keys, out_keys: Keys | None = None, *, clip: Range | Mapping[NestedKey, Range]
     ) -> None:
-        in_keys = as_keys(in_keys)
-        super().__init__(in_keys, checked_out_keys(in_keys, out_keys))
+        super().__init__(in_keys, out_keys)
         if isinstance(clip, Mapping) and set(clip) != set(self.in_keys):
             raise ValueError(f"clip has the keys {list(clip)}, but in_keys={self.in_keys}: give one per key")
         self.ranges = [clip[key] if isinstance(clip, Mapping) else clip for key in self.in_keys]
         for key, ends in zip(self.in_keys, self.ranges, strict=True):
             check_clip(f"clip of {key!r}", ends)
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+    def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
         """Narrow the bounds."""
-        specs = [floating_spec(observation_spec, key, type(self).__name__) for key in self.in_keys]
-        for out_key, spec, (clip_low, clip_high) in zip(self.out_keys, specs, self.ranges, strict=True):
-            low, high = (end.clamp(clip_low, clip_high) for end in bounds(spec))
-            set_leaf_spec(observation_spec, out_key, bounded(low, high, dtype=spec.dtype, device=spec.device))
-        return observation_spec
+        return _clipped_spec(spec, self.ranges[index])
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        for key, out_key, (low, high) in zip(self.in_keys, self.out_keys, self.ranges, strict=True):
-            next_tensordict.set(out_key, torch.clamp(next_tensordict.get(key), low, high))
-        return next_tensordict
+    def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
+        """Clip."""
+        return torch.clamp(value, *self.ranges[index])
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Do the same to a batch of samples."""
-        return self._call(tensordict)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._call(tensordict_reset)
+class RewardClip(RewardMap):
+    """Clip rewards to [low, high]; NaN stays NaN.
+
+    Args:
+        in_keys: rewards; nested keys as tuples.
+        out_keys: where the clipped ones go. Default: in place.
+        clip: (low, high); None is no limit on that side.
+
+    Example:
+        >>> clip = RewardClip(clip=(0.0, None))
+    """
+
+    def __init__(self, in_keys: Keys = "reward", out_keys: Keys | None = None, *, clip: Range) -> None:
+        super().__init__(in_keys, out_keys)
+        check_clip("clip", clip)
+        self.clip = clip
+
+    def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
+        """Narrow the bounds."""
+        return _clipped_spec(spec, self.clip)
+
+    def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
+        """Clip."""
+        return torch.clamp(value, *self.clip)
+
+
+class ActionClip(ActionMap):
+    """The env receives the action clipped to [low, high]; the policy may ask for any number. NaN stays NaN.
+
+    The tensordict keeps the action that the policy chose.
+
+    Args:
+        in_keys_inv: the actions that the env reads.
+        out_keys_inv: where the policy writes them. Default: the same keys.
+        clip: (low, high); None is no limit on that side.
+
+    Example:
+        >>> clip = ActionClip(clip=(-1.0, 1.0))
+    """
+
+    def __init__(
+        self, in_keys_inv: Keys = "action", out_keys_inv: Keys | None = None, *, clip: Range
+    ) -> None:
+        super().__init__(in_keys_inv, out_keys_inv)
+        check_clip("clip", clip)
+        self.clip = clip
+
+    def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
+        """Remove the bounds."""
+        return Unbounded(spec.shape, dtype=spec.dtype, device=spec.device)
+
+    def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
+        """Clip."""
+        return torch.clamp(value, *self.clip)
+
+
+def _clipped_spec(spec: TensorSpec, ends: Range) -> TensorSpec:
+    low, high = (end.clamp(*ends) for end in bounds(spec))
+    return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
 
 def check_clip(field: str, ends: Range) -> None:

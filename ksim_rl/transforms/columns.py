@@ -1,12 +1,13 @@
-"""Observations side by side, as kernels that take all of them at once want them."""
+"""This module lays observations side by side, so that one kernel takes all of them, and splits them again."""
 
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Shaped
 from torch import Tensor
 
 
-def side_by_side(values: Sequence[Tensor], num_rows: int) -> Tensor:
+def side_by_side(values: Sequence[Shaped[Tensor, "*?leaf"]], num_rows: int) -> Shaped[Tensor, "E L"]:
     """Return values [E, ...] as the columns of one tensor [E, L], without a copy where they are that already.
 
     So what one transform has split, the next one need not join. The result may share memory with the values.
@@ -36,7 +37,9 @@ def _whole(vectors: list[Tensor]) -> Tensor | None:
     return owner.view(-1, width)
 
 
-def split(joined_EL: Tensor, likes: Sequence[Tensor]) -> list[Tensor]:
+def split(
+    joined_EL: Shaped[Tensor, "E L"], likes: Sequence[Shaped[Tensor, "*?leaf"]]
+) -> list[Shaped[Tensor, "*?leaf"]]:
     """Return views of the columns in the shapes of these values, which `side_by_side` has joined."""
     if len(likes) == 1:
         return [joined_EL if joined_EL.shape == likes[0].shape else joined_EL.reshape(likes[0].shape)]

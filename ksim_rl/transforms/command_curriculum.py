@@ -1,8 +1,9 @@
-"""Random commands that get harder for envs that follow them."""
+"""Random commands that get harder for envs that follow them come from the transform of this module."""
 
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Num
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite
@@ -96,7 +97,7 @@ class RandomCommandCurriculum(KeyedTransform):
         ends = [[[pair[side] for pair in ranges] for side in (0, 1)] for ranges in (start, end)]
         self.register_buffer("ends_22L", torch.tensor(ends, dtype=torch.float32), persistent=False)
 
-    def set_level_(self, level: float | Tensor) -> None:
+    def set_level_(self, level: float | Num[Tensor, "*rows"]) -> None:
         """Set the level of all envs, or of each, [E]; commands follow at their next draw.
 
         Raises:

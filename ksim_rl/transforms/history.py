@@ -1,5 +1,6 @@
-"""The last frames of an observation."""
+"""Observations show their last frames by the transform of this module."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -7,9 +8,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
+from ksim_rl import checks
 from ksim_rl.transforms import ring
 from ksim_rl.transforms.columns import side_by_side
-from ksim_rl.transforms.history_cfg import HistoryCfg
 from ksim_rl.transforms.row_transform import (
     Keys,
     RowTransform,
@@ -23,6 +24,27 @@ from ksim_rl.transforms.specs import (
     leaf_spec,
     set_leaf_spec,
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class HistoryCfg:
+    """The last `length` frames, oldest first.
+
+    Args:
+        length: number of frames.
+        stride: env steps from one frame to the next.
+        flat: True puts frame after frame into one vector; False stacks them along a dim of their own.
+    """
+
+    length: int
+    stride: int = 1
+    flat: bool = True
+
+    def __post_init__(self) -> None:
+        for field in ("length", "stride"):
+            checks.check_count(field, getattr(self, field))
+        if not isinstance(self.flat, bool):
+            raise ValueError(f"flat={self.flat!r}: expected True or False")
 
 
 class ObservationHistory(RowTransform):

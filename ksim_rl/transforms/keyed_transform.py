@@ -1,4 +1,4 @@
-"""Transforms that draw random numbers, each a function of (seed, stream, env row, counter)."""
+"""This module holds the base of transforms that draw: each number is a function of (seed, stream, env row, counter)."""
 
 from collections.abc import Sequence
 from typing import ClassVar, Self

@@ -1,9 +1,10 @@
-"""Transforms whose strength follows a difficulty in [0, 1]."""
+"""This module lets the strength of transforms follow a difficulty in [0, 1]."""
 
 from collections.abc import Iterable
 from typing import Self
 
 import torch
+from jaxtyping import Float32, Shaped
 from torch import Tensor
 from torchrl.envs.transforms import Transform
 
@@ -16,7 +17,7 @@ class FollowsLevel(Transform):
     def _register_level(self, *, is_used: bool) -> None:
         self.register_buffer("level", torch.ones(()), persistent=is_used)
 
-    def follow_level_(self, level: Tensor | float) -> Self:
+    def follow_level_(self, level: Shaped[Tensor, "*any"] | float) -> Self:
         """Follow a level: a number is copied; a tensor is read anew at every step, wherever it is changed in place.
 
         Raises:
@@ -35,7 +36,7 @@ class FollowsLevel(Transform):
         return self
 
 
-def follow_level(transforms: Iterable[Transform], level: Tensor | float) -> None:
+def follow_level(transforms: Iterable[Transform], level: Float32[Tensor, ""] | float) -> None:
     """Let all transforms that can follow the level do so."""
     for transform in transforms:
         for module in transform.modules():

@@ -1,4 +1,4 @@
-"""Normalization of observations by what has been observed so far."""
+"""Observations are normalized by what has been observed so far by the transform of this module."""
 
 from typing import Self
 

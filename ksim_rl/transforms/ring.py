@@ -1,4 +1,4 @@
-"""The last values of a signal, in a ring of slots per env, as one kernel that is also a torch operator.
+"""This module keeps the last values of a signal in a ring of slots per env: one kernel, also a torch operator.
 
 A step writes one value per env and reads the values of some steps ago; a reset writes the value that the masked rows
 begin with, and no lag reaches back beyond it. Where the ring of an env stands is its age, the steps since its reset,
@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import torch
 import warp as wp
+from jaxtyping import Bool, Int32, Int64, Shaped
 from torch import Tensor
 
 from ksim_rl.device.quick_launch import QuickLaunch, address
@@ -157,16 +158,16 @@ _NO_LAGS = Lags(None, None, None, 0, 0, 0)
 
 
 def push(
-    ring_EM: Tensor,
-    age_E: Tensor,
-    value_E: Tensor,
+    ring_EM: Shaped[Tensor, " E M *leaf"],
+    age_E: Int64[Tensor, " E"],
+    value_E: Shaped[Tensor, " E *leaf"],
     *,
-    lag_E: Tensor | None = None,
+    lag_E: Int64[Tensor, " E"] | None = None,
     num_frames: int = 1,
     stride: int = 0,
-    parts: Tensor | None = None,
+    parts: Int32[Tensor, " C"] | None = None,
     counts: bool = True,
-) -> Tensor:
+) -> Shaped[Tensor, "E L"]:
     """Go on by one step: write its values, and return those of some steps ago.
 
     Args:
@@ -187,15 +188,15 @@ def push(
 
 
 def begin(
-    ring_EM: Tensor,
-    age_E: Tensor,
-    value_E: Tensor,
-    mask_E: Tensor,
+    ring_EM: Shaped[Tensor, " E M *leaf"],
+    age_E: Int64[Tensor, " E"],
+    value_E: Shaped[Tensor, " E *leaf"],
+    mask_E: Bool[Tensor, " E"],
     *,
     num_frames: int = 1,
-    parts: Tensor | None = None,
+    parts: Int32[Tensor, " C"] | None = None,
     lags: Lags | None = None,
-) -> Tensor:
+) -> Shaped[Tensor, "E L"]:
     """Let the masked rows begin with these values, and return each row's value `num_frames` times; see `push`.
 
     With `lags`, these rows also draw new ones.

@@ -1,9 +1,10 @@
-"""What transforms with state per env share: rows of a reset, buffers sized by the env, a copy that is a copy."""
+"""This module holds the base of transforms with buffers per env, which the env sizes and resets row by row."""
 
 from collections.abc import Sequence
 from typing import Any, Self
 
 import torch
+from jaxtyping import Shaped
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
@@ -122,3 +123,20 @@ def checked_out_keys(in_keys: list[NestedKey], out_keys: Keys | None) -> list[Ne
     if len(set(out)) != len(out):
         raise ValueError(f"out_keys={out} repeats a key: each needs its own place")
     return out
+
+
+def checked_action(
+    tensordict: TensorDictBase, key: NestedKey, leaf: Sequence[int], dtype: torch.dtype
+) -> Shaped[Tensor, "*leaf"]:
+    """Return the action, refused before it reaches a buffer: the env sees only what comes out of that.
+
+    Raises:
+        ValueError: with both shapes and dtypes.
+    """
+    action = tensordict.get(key)
+    expected = (*tensordict.batch_size, *leaf)
+    if tuple(action.shape) != expected or action.dtype != dtype:
+        raise ValueError(
+            f"action {key!r} has shape {tuple(action.shape)} and dtype {action.dtype}: expected {expected} and {dtype}"
+        )
+    return action

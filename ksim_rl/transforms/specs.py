@@ -1,14 +1,16 @@
-"""Reading and writing of leaf specs and their bounds."""
+"""This module reads and writes leaf specs and their bounds."""
 
 from typing import Any
 
 import torch
+from jaxtyping import Num
 from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
 from ksim_rl import checks
 
+Ends = tuple[Num[Tensor, "*leaf"], Num[Tensor, "*leaf"]]
 Device = torch.device | str | int | None
 
 
@@ -57,7 +59,7 @@ def drop_leaf_spec(observation_spec: Composite, key: NestedKey) -> None:
             drop_leaf_spec(observation_spec, above)
 
 
-def bounds(spec: TensorSpec) -> tuple[Tensor, Tensor]:
+def bounds(spec: TensorSpec) -> tuple[Num[Tensor, "*leaf"], Num[Tensor, "*leaf"]]:
     """Return (low, high) in the spec's shape; infinite where the spec has none."""
     if isinstance(spec, Bounded):
         space: Any = spec.space
@@ -66,19 +68,21 @@ def bounds(spec: TensorSpec) -> tuple[Tensor, Tensor]:
     return -high, high
 
 
-def bounded(low: Tensor, high: Tensor, *, dtype: torch.dtype, device: Device) -> TensorSpec:
+def bounded(
+    low: Num[Tensor, "*leaf"], high: Num[Tensor, "*leaf"], *, dtype: torch.dtype, device: Device
+) -> TensorSpec:
     """Return a `Bounded` spec, or `Unbounded` where no element has a bound."""
     if bool(torch.isinf(low).all()) and bool(torch.isinf(high).all()):
         return Unbounded(shape=low.shape, dtype=dtype, device=device)
     return Bounded(low=low.to(dtype), high=high.to(dtype), shape=low.shape, dtype=dtype, device=device)
 
 
-def add_bounds(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def add_bounds(a: Ends, b: Ends) -> Ends:
     """Return the range of x + y for x in a, y in b."""
     return a[0] + b[0], a[1] + b[1]
 
 
-def multiply_bounds(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def multiply_bounds(a: Ends, b: Ends) -> Ends:
     """Return the range of x * y for x in a, y in b; 0 times infinity is 0, as no finite x exceeds it."""
     corners = torch.stack(
         [torch.nan_to_num(x * y, nan=0.0, posinf=torch.inf, neginf=-torch.inf) for x in a for y in b]

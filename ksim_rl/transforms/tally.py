@@ -1,7 +1,8 @@
-"""What trackers count per env, as kernels that are also torch operators: one launch counts and copies."""
+"""This module counts for trackers, per env, by kernels that are also torch operators: one launch counts and copies."""
 
 import torch
 import warp as wp
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from ksim_rl.device.quick_launch import QuickLaunch, address
@@ -80,7 +81,9 @@ _quick_count_down = QuickLaunch(_count_down_kernel, _CountDown)
 _quick_tally = QuickLaunch(_tally_kernel, _Tally)
 
 
-def count_down(left_E: Tensor, mask_E: Tensor | None, horizon: float, divisor: float) -> Tensor:
+def count_down(
+    left_E: Float32[Tensor, " E"], mask_E: Bool[Tensor, " E"] | None, horizon: float, divisor: float
+) -> Float32[Tensor, " E"]:
     """Take one env step off what is left, down to 0, or, given the rows that reset, let those begin with the horizon.
 
     Args:
@@ -95,8 +98,11 @@ def count_down(left_E: Tensor, mask_E: Tensor | None, horizon: float, divisor: f
 
 
 def tally(
-    step_E: Tensor, total_E: Tensor, reward_E: Tensor | None, mask_E: Tensor | None
-) -> tuple[Tensor, Tensor]:
+    step_E: Int64[Tensor, " E"],
+    total_E: Float32[Tensor, " E *leaf"],
+    reward_E: Float32[Tensor, "*rows"] | None,
+    mask_E: Bool[Tensor, " E"] | None,
+) -> tuple[Int64[Tensor, " E"], Float32[Tensor, " E *leaf"]]:
     """Count one env step and add its reward, or, given the rows that reset, let those begin at 0.
 
     Args:

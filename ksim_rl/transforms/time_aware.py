@@ -1,4 +1,4 @@
-"""The clock that a policy of finite episodes needs to see."""
+"""A policy of finite episodes sees the time that is left by the transform of this module."""
 
 import torch
 from tensordict import NestedKey, TensorDictBase

@@ -16,7 +16,7 @@ def test_every_transform_is_in_a_table_and_has_an_example():
     assert {name for name, _ in listed} == exported_transforms()
     assert len(listed) == len(exported_transforms())
     assert all(anchor == name.lower() and f"### {name}\n" in PAGE for name, anchor in listed)
-    assert EXAMPLES.keys() - {"chain", "level"} == exported_transforms()
+    assert EXAMPLES.keys() - {"chain", "config", "level"} == exported_transforms()
     assert PAGE.count("```python") == len(EXAMPLES)
 
 

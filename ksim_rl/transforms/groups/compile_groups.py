@@ -1,8 +1,9 @@
-"""Observation groups as transforms: the same ones that a user composes by hand."""
+"""This module compiles observation groups into transforms, the same ones that a user composes by hand."""
 
 import dataclasses
 from collections.abc import Mapping
 
+from jaxtyping import Float32
 from tensordict import NestedKey
 from torch import Tensor
 from torchrl.envs.transforms import RenameTransform, Transform
@@ -11,15 +12,14 @@ from ksim_rl.transforms.clip import ObservationClip
 from ksim_rl.transforms.delay import ObservationDelay
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg, history_cfg
 from ksim_rl.transforms.groups.groups import ObservationGroups
-from ksim_rl.transforms.history import ObservationHistory
-from ksim_rl.transforms.history_cfg import HistoryCfg
+from ksim_rl.transforms.history import HistoryCfg, ObservationHistory
 from ksim_rl.transforms.level import follow_level
 from ksim_rl.transforms.noise.observation_noise import ObservationNoise
 from ksim_rl.transforms.scale import ObservationScale
 
 
 def compile_groups(
-    groups: Mapping[str, ObservationGroupCfg], *, level: Tensor | None = None
+    groups: Mapping[str, ObservationGroupCfg], *, level: Float32[Tensor, ""] | None = None
 ) -> list[Transform]:
     """Return the transforms that write each group's vector, or image, under the group's name.
 

@@ -1,14 +1,15 @@
-"""What an observation group is made of, as parameters; `compile_groups` turns it into transforms."""
+"""Observation groups are described by the configs of this module, which `compile_groups` turns into transforms."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from jaxtyping import Num
 from torch import Tensor
 
 from ksim_rl.transforms.clip import check_clip
-from ksim_rl.transforms.delay_cfg import DelayCfg
-from ksim_rl.transforms.history_cfg import HistoryCfg
+from ksim_rl.transforms.history import HistoryCfg
+from ksim_rl.transforms.lagged_transform import DelayCfg
 from ksim_rl.transforms.noise.cfg import NoiseCfg, PerDim
 from ksim_rl.transforms.scale import check_scale
 
@@ -16,7 +17,7 @@ from ksim_rl.transforms.scale import check_scale
 class Reading(Protocol):
     """Anything that reads an observation from the env's view: float32 [E, L]."""
 
-    def __call__(self, view: Any) -> Tensor:
+    def __call__(self, view: Any) -> Num[Tensor, " E *L"]:
         """Return the clean reading of the current state."""
         ...
 

@@ -1,4 +1,4 @@
-"""Which columns of a group vector belong to which term."""
+"""This module maps the terms of a group to their columns in its vector."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,4 +1,4 @@
-"""Concatenation of observations into the vectors that networks read."""
+"""Observations are concatenated into the vectors that networks read by the transform of this module."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

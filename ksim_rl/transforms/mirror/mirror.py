@@ -1,4 +1,4 @@
-"""Episodes and samples seen in a mirror."""
+"""This module shows episodes and samples in a left-right mirror."""
 
 from collections.abc import Mapping
 

@@ -1,10 +1,11 @@
-"""Left-right mirror images of vectors, as permutations with signs."""
+"""This module describes left-right mirror images of vectors as permutations with signs."""
 
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float32, Int64, Num
 from torch import Tensor
 
 from ksim_rl import checks
@@ -45,11 +46,11 @@ class MirrorMap:
         """Number of columns."""
         return len(self.source)
 
-    def __call__(self, vector: Tensor) -> Tensor:
+    def __call__(self, vector: Num[Tensor, "*batch L"]) -> Num[Tensor, "*batch L"]:
         """Return the mirror image of vectors [..., L]."""
         return image(vector, *self.tensors(vector.device))
 
-    def tensors(self, device: Device) -> tuple[Tensor | None, Tensor]:
+    def tensors(self, device: Device) -> tuple[Int64[Tensor, " L"] | None, Float32[Tensor, " L"]]:
         """Return source (int64; None if no column moves) and signs (float32), [L]."""
         return _tensors(self, device)
 
@@ -58,7 +59,9 @@ class MirrorMap:
         return concatenate([self] * times)
 
 
-def image(vector: Tensor, source_L: Tensor | None, signs_L: Tensor) -> Tensor:
+def image(
+    vector: Num[Tensor, "*batch L"], source_L: Int64[Tensor, " L"] | None, signs_L: Float32[Tensor, " L"]
+) -> Num[Tensor, "*batch L"]:
     """Return the mirror image of vectors [..., L]; a `source_L` of None leaves the columns in place."""
     columns = vector if source_L is None else vector.index_select(-1, source_L)
     return columns * signs_L.to(vector.dtype)

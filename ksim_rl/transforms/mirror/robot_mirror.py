@@ -1,4 +1,4 @@
-"""The left-right symmetry of a robot, found in its names and joint axes."""
+"""This module finds the left-right symmetry of a robot in its names and joint axes."""
 
 import itertools
 import re
@@ -72,7 +72,7 @@ def mirror_by_name(names: Sequence[str], each: MirrorMap | None = None) -> Mirro
     )
 
 
-def mirror_joints(model: mujoco.MjModel, joints: Sequence[str] | None = None) -> MirrorMap:
+def mirror_joints(mj_model: mujoco.MjModel, joints: Sequence[str] | None = None) -> MirrorMap:
     """Return the map of a vector with one number per joint: position, velocity, effort, target, action.
 
     The mirror is the plane y = 0 of the world, with the robot at `qpos0`. A hinge's sign is 1 if its counterpart
@@ -80,17 +80,17 @@ def mirror_joints(model: mujoco.MjModel, joints: Sequence[str] | None = None) ->
     a pose that is its own mirror image.
 
     Args:
-        model: the robot's model.
-        joints: hinges and slides, in the order of the columns; None for all of the model.
+        model: the robot's mj_model.
+        joints: hinges and slides, in the order of the columns; None for all of the mj_model.
 
     Raises:
         ValueError: if a joint has no counterpart, or the two are not mirror images of each other.
     """
-    data = mujoco.MjData(model)
-    data.qpos[:] = model.qpos0
-    mujoco.mj_kinematics(model, data)
+    data = mujoco.MjData(mj_model)
+    data.qpos[:] = mj_model.qpos0
+    mujoco.mj_kinematics(mj_model, data)
     scalar = (_HINGE, int(mujoco.mjtJoint.mjJNT_SLIDE))
-    valid = {model.joint(i).name: i for i in range(model.njnt) if model.jnt_type[i] in scalar}
+    valid = {mj_model.joint(i).name: i for i in range(mj_model.njnt) if mj_model.jnt_type[i] in scalar}
     names = list(valid) if joints is None else list(joints)
     for name in names:
         if name not in valid:
@@ -99,25 +99,25 @@ def mirror_joints(model: mujoco.MjModel, joints: Sequence[str] | None = None) ->
     for name in names:
         other = mirror_name(name, names)
         source.append(names.index(other))
-        signs.append(_sign(model, data, valid[name], valid[other]))
+        signs.append(_sign(mj_model, data, valid[name], valid[other]))
     return MirrorMap(source=tuple(source), signs=tuple(signs))
 
 
-def _sign(model: mujoco.MjModel, data: mujoco.MjData, joint: int, other: int) -> float:
+def _sign(mj_model: mujoco.MjModel, data: mujoco.MjData, joint: int, other: int) -> float:
     reflection = np.array([1.0, -1.0, 1.0])
     apart = np.abs(data.xanchor[joint] * reflection - data.xanchor[other]).max()
     # A rotation axis is a pseudovector: its mirror image turns the other way as well.
-    handed = -1.0 if model.jnt_type[joint] == _HINGE else 1.0
+    handed = -1.0 if mj_model.jnt_type[joint] == _HINGE else 1.0
     agreement = float(handed * reflection * data.xaxis[joint] @ data.xaxis[other])
-    extent = max(float(model.stat.extent), _TOLERANCE)
+    extent = max(float(mj_model.stat.extent), _TOLERANCE)
     if (
-        model.jnt_type[joint] != model.jnt_type[other]
+        mj_model.jnt_type[joint] != mj_model.jnt_type[other]
         or abs(abs(agreement) - 1) > _TOLERANCE
         or apart > 0.02 * extent
     ):
         raise ValueError(
-            f"joints {model.joint(joint).name!r} and {model.joint(other).name!r} are no mirror images of each other in "
-            f"the plane y = 0: axes {data.xaxis[joint]} and {data.xaxis[other]}, anchors {apart:.3g} m apart"
+            f"joints {mj_model.joint(joint).name!r} and {mj_model.joint(other).name!r} are no mirror images of each "
+            f"other in the plane y = 0: axes {data.xaxis[joint]} and {data.xaxis[other]}, anchors {apart:.3g} m apart"
         )
     return 1.0 if agreement > 0 else -1.0
 

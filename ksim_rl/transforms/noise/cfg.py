@@ -1,4 +1,4 @@
-"""Noise distributions, as parameters of `ObservationNoise` and of an observation group's terms."""
+"""Noise is described by the configs of this module, for `ObservationNoise` and the terms of observation groups."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence

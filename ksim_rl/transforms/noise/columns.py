@@ -1,8 +1,9 @@
-"""The noise of several observations side by side, so that one draw serves all of them."""
+"""This module lays the parameters of several observations' noise side by side, so that one draw serves all of them."""
 
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float, Float32
 from tensordict import NestedKey
 from torch import Tensor, nn
 
@@ -55,7 +56,7 @@ class NoiseColumns(nn.Module):
         """Whether any column has it."""
         return bool(self.features & feature)
 
-    def neutral_bias(self) -> Tensor:
+    def neutral_bias(self) -> Float32[Tensor, " L"]:
         """Return the bias that changes nothing, [L]."""
         return (self.flags_L & noise_kernel.BIAS_MULTIPLY != 0).to(torch.float32)
 
@@ -94,7 +95,9 @@ def _is_gaussian(cfg: NoiseCfg | None) -> bool:
     return cfg is not None and cfg.draw is Draw.GAUSSIAN
 
 
-def widen(cfg: NoiseCfg, key: NestedKey, low: Tensor, high: Tensor, batch_dims: int) -> tuple[Tensor, Tensor]:
+def widen(
+    cfg: NoiseCfg, key: NestedKey, low: Float[Tensor, "*leaf"], high: Float[Tensor, "*leaf"], batch_dims: int
+) -> tuple[Float[Tensor, "*leaf"], Float[Tensor, "*leaf"]]:
     """Return the bounds of the noisy observation; they hold the clean one too, as noise can be off or weaker."""
     shape = low.shape[batch_dims:]
     rows = [

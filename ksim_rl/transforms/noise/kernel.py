@@ -1,4 +1,4 @@
-"""Noise on all observations of a transform as one kernel, which is also a torch operator.
+"""This module adds noise to all observations of a transform by one kernel, which is also a torch operator.
 
 Each column's draws are those of `ksim_rl.device.random` at (seed, stream, counter, row, column).
 """
@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import torch
 import warp as wp
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from ksim_rl.device.quick_launch import QuickLaunch, address
@@ -170,14 +171,26 @@ class NoiseState(NamedTuple):
     last_EL: Tensor | None = None
 
 
-def add_noise(clean_EL: Tensor, state: NoiseState, features: int, *, stream: int, counter: Tensor) -> Tensor:
+def add_noise(
+    clean_EL: Float32[Tensor, "*leaf"],
+    state: NoiseState,
+    features: int,
+    *,
+    stream: int,
+    counter: Int64[Tensor, ""],
+) -> Float32[Tensor, "*leaf"]:
     """Return the noisy readings of samples, which belong to no episode: no bias, drift or dropout."""
     return _run(clean_EL, *state, features & (HAS_GAUSSIAN | HAS_RESOLUTION), _PLAIN, None, stream, counter)
 
 
 def step_noise(
-    clean_EL: Tensor, state: NoiseState, features: int, *, stream: int, counter_E: Tensor
-) -> Tensor:
+    clean_EL: Float32[Tensor, "*leaf"],
+    state: NoiseState,
+    features: int,
+    *,
+    stream: int,
+    counter_E: Int64[Tensor, " E"],
+) -> Float32[Tensor, "*leaf"]:
     """Go on by one env step, which adds 1 to the counter of each row, and return the noisy readings.
 
     Args:
@@ -191,8 +204,14 @@ def step_noise(
 
 
 def reset_noise(
-    clean_EL: Tensor, state: NoiseState, features: int, mask_E: Tensor, *, stream: int, counter_E: Tensor
-) -> Tensor:
+    clean_EL: Float32[Tensor, "*leaf"],
+    state: NoiseState,
+    features: int,
+    mask_E: Bool[Tensor, " E"],
+    *,
+    stream: int,
+    counter_E: Int64[Tensor, " E"],
+) -> Float32[Tensor, "*leaf"]:
     """Begin the episodes of the masked rows, and count them; return their noisy readings and the others' clean ones."""
     return _run(clean_EL, *state, features, _RESET, mask_E, stream, counter_E)
 

@@ -1,4 +1,4 @@
-"""Sensor noise."""
+"""Sensor noise is added by the transform of this module."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Self, cast

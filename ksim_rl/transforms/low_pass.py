@@ -1,4 +1,4 @@
-"""Smoothing of actions."""
+"""Actions are smoothed by the transform of this module."""
 
 import torch
 from tensordict import TensorDictBase
@@ -6,11 +6,11 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from ksim_rl import checks
-from ksim_rl.transforms.actions.action_keys import checked_action
 from ksim_rl.transforms.row_transform import (
     Keys,
     RowTransform,
     as_keys,
+    checked_action,
     checked_out_keys,
 )
 from ksim_rl.transforms.specs import drop_leaf_spec, leaf_spec, set_leaf_spec
