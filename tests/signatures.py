@@ -158,7 +158,8 @@ def has_axes(annotation: ast.expr) -> bool:
 def suffix_agrees(name: str, axes: str) -> bool:
     """Say whether a name ends as its axes want: `qpos_EL` for "E L", `mean_E3` for "E 3", none for scalars.
 
-    A timestamp may follow. TorchRL's trailing one need not be spelled: "E T 1" may end in `_ET`.
+    A timestamp may follow. TorchRL's trailing one need not be spelled: "E T 1" may end in `_ET`. A leaf of known size may
+    be called L: a position is `pos_EL` or `pos_E3`.
     """
     found = _SUFFIX.search(_TIMESTAMP.sub("", name))
     suffix = found.group(1) if found else ""
@@ -167,6 +168,8 @@ def suffix_agrees(name: str, axes: str) -> bool:
         return True
     wanted = "".join(parts).upper()
     allowed = {wanted, wanted[:-1]} if len(parts) > 1 and parts[-1] == "1" else {wanted}
+    if parts and parts[-1].isdecimal():
+        allowed.add("".join(parts[:-1]).upper() + "L")
     return suffix in allowed
 
 
