@@ -40,12 +40,12 @@ TASK = (
     f"{TERM}.base_lin_vel.noise.bias={{_target_: ksim_rl.transforms.noise.cfg.GaussianNoise, std: 0.1}}",
     f"{TERM}.base_ang_vel.delay={{min_lag: 0, max_lag: 3, resample_every: 5}}",
     f"{TERM}.projected_gravity.history=3",
-    "+task.events.mass={_target_: ksim_rl.mdp.randomization.bodies.RandomizeBodyMass, mode: reset, bodies: [trunk], "
+    "+task.events.mass={_target_: ksim_rl.mdp.RandomizeBodyMass, mode: reset, bodies: [trunk], "
     "ranges: [0.8, 1.2], operation: scale}",
-    "+task.curriculum.level={_target_: ksim_rl.mdp.curricula.level.LinearLevel, end_step: 100}",
-    "+task.curriculum.weight={_target_: ksim_rl.mdp.curricula.scale.RewardWeightByLevel, "
+    "+task.curriculum.level={_target_: ksim_rl.mdp.LinearLevel, end_step: 100}",
+    "+task.curriculum.weight={_target_: ksim_rl.mdp.RewardWeightByLevel, "
     "reward: track_linear_velocity, start: 1.0, end: 2.0}",
-    "+task.curriculum.speed={_target_: ksim_rl.mdp.curricula.scale.CommandRangesByLevel, command: twist, "
+    "+task.curriculum.speed={_target_: ksim_rl.mdp.CommandRangesByLevel, command: twist, "
     "start: {lin_vel_x: [-0.5, 0.5]}, end: {lin_vel_x: [-1.0, 1.0]}}",
     "modules.actor.hidden_dims=[16]",
     "modules.critic.hidden_dims=[16]",

@@ -81,7 +81,6 @@ from ksim_rl.mdp.observations.joints import (
     JointPosRel,
     JointVel,
 )
-from ksim_rl.mdp.observations.rays import RayDistance, RayHeight
 from ksim_rl.mdp.observations.root import (
     Command,
     LastAction,
@@ -93,7 +92,7 @@ from ksim_rl.mdp.observations.root import (
     RootRotation6d,
     SensorReading,
 )
-from ksim_rl.mdp.observations.sensors import CameraImage, ImuReading
+from ksim_rl.mdp.observations.sensors import CameraImage, ImuReading, RayDistance, RayHeight
 from ksim_rl.mdp.observations.time import Clock, EpisodeTime, RemainingTime
 from ksim_rl.mdp.randomization.actuators import RandomizeActuatorGains, RandomizeEffortLimit
 from ksim_rl.mdp.randomization.bodies import RandomizeBodyCom, RandomizeBodyInertia, RandomizeBodyMass

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ksim_rl.checks import near
@@ -30,7 +30,7 @@ def array_constant(values: np.ndarray, device: torch.device) -> Float[Tensor, "*
     return constant(values.ravel().tolist(), device).view(values.shape)
 
 
-def index_constant(ids: Sequence[int], device: torch.device) -> Index:
+def index_constant(ids: Sequence[int], device: torch.device) -> Int[Tensor, " N"] | slice:
     """Return `ids` as an index on the device, a slice if they are contiguous; the same for the same ids, for ever."""
     return _index_constant(tuple(ids), device)
 

@@ -5,7 +5,9 @@ from typing import Literal
 
 from ksim_rl.checks import check_choice, check_in_range
 from ksim_rl.envs.term import Term
+from ksim_rl.envs.view import EnvView
 from ksim_rl.scene.names import Patterns
+from ksim_rl.scene.sensors import ContactState
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,3 +62,30 @@ class OfContacts(Term):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_in_range("threshold", self.threshold, low=0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfFeet(Term):
+    """A term of how feet move and what they touch.
+
+    Attributes:
+        sensor: a contact sensor of `scene.sensors` with one geom or body per foot, in the order of `sites`.
+        sites: names or patterns of the feet.
+    """
+
+    sensor: str
+    sites: Patterns
+
+    def contact(self, view: EnvView) -> ContactState:
+        """Return the state of the contact sensor.
+
+        Raises:
+            ValueError: if it has another number of elements than feet: one alone would count for every foot.
+        """
+        contact, num_feet = view.contact(self.sensor), len(view.sites(self.sites))
+        if contact.found_EN.shape[-1] != num_feet:
+            raise ValueError(
+                f"sensor={self.sensor!r} has {contact.found_EN.shape[-1]} elements, and sites={self.sites!r} are "
+                f"{num_feet} feet: give the sensor one geom or body per foot, in the order of the sites"
+            )
+        return contact

@@ -1,4 +1,4 @@
-"""Cartpole: balance and swing up, with the figures of dm_control's suite.
+"""A pole on a cart is balanced or swung up, with the figures of dm_control's suite.
 
 Tassa et al., "DeepMind Control Suite" (2018): a 1 kg cart on a 3.6 m rail carries a 0.1 kg pole of 1 m; the force is
 at most 10 N; control runs at 100 Hz for 10 s. The reward is a product of four factors in [0, 1], so that a return lies
@@ -9,15 +9,16 @@ import math
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ksim_rl import mdp
 from ksim_rl.checks import check_in_range
 from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import EventTerm, ObservationTerm, RewardTerm, TerminationTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp import JointEffortAction, JointVel, TimeOut
 from ksim_rl.mdp.rewards.tolerance import tolerance
 from ksim_rl.scene.robots.control_models import Cartpole
 from ksim_rl.scene.scene import SceneCfg
@@ -30,11 +31,9 @@ from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, Observation
 class CartpolePosition(ObservationTerm):
     """Position of the cart, m, and cosine and sine of the pole's angle from upright, [E, 3]; position stage."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading, [E, 3]."""
-        cart_E = view.joints("slider").pos_EL
-        angle_E = view.joints("hinge").pos_EL
-        return torch.cat((cart_E, torch.cos(angle_E), torch.sin(angle_E)), dim=-1)
+    def __call__(self, view: EnvView) -> Float[Tensor, "E 3"]:
+        cart_E1, angle_E1 = view.joints("slider").pos_EL, view.joints("hinge").pos_EL
+        return torch.cat((cart_E1, torch.cos(angle_E1), torch.sin(angle_E1)), dim=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +43,7 @@ class CartpoleReward(RewardTerm):
     A factor that rates x against a margin m is 0.1^((x/m)^2): 1 at 0 and 0.1 at the margin (see `tolerance`).
     """
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         cart_E = view.joints("slider").pos_EL[:, 0]
         angle_E = view.joints("hinge").pos_EL[:, 0]
         velocity_E = view.joints("hinge").vel_EL[:, 0]
@@ -63,13 +61,10 @@ class PoleFallen(TerminationTerm):
     limit: float
 
     def __post_init__(self) -> None:
-        """Refuse angles that do not exist."""
         check_in_range("limit", self.limit, low=0.0, high=math.pi, low_open=True)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return which poles have fallen, bool [E]."""
-        angle_E = view.joints("hinge").pos_EL[:, 0]
-        return torch.cos(angle_E) < math.cos(self.limit)
+    def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
+        return torch.cos(view.joints("hinge").pos_EL[:, 0]) < math.cos(self.limit)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,13 +84,11 @@ class ResetCartpole(EventTerm):
     velocity_std: float = 0.01
 
     def __post_init__(self) -> None:
-        """Refuse negative spreads."""
         super().__post_init__()
         for name in ("cart_range", "angle_range", "velocity_std"):
             check_in_range(name, getattr(self, name), low=0.0)
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        """Write the state of the rows of `mask_E`."""
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         spread_EL = view.uniform(2, -1.0, 1.0)
         cart_E1 = spread_EL[:, :1] * self.cart_range
         angle_E1 = self.angle + spread_EL[:, 1:] * self.angle_range
@@ -107,16 +100,16 @@ class ResetCartpole(EventTerm):
 def _cfg(reset: ResetCartpole, **terminations: TerminationTerm) -> ManagerBasedRlEnvCfg:
     terms = {
         "position": ObservationTermCfg(term=CartpolePosition()),
-        "velocity": ObservationTermCfg(term=JointVel(joints=("slider", "hinge"))),
+        "velocity": ObservationTermCfg(term=mdp.JointVel(joints=("slider", "hinge"))),
     }
     return ManagerBasedRlEnvCfg(
         decimation=1,
         scene=SceneCfg(robots={"cartpole": Cartpole()}, num_envs=1024),
         observations={"actor": ObservationGroupCfg(terms=terms), "critic": ObservationGroupCfg(terms=terms)},
-        actions={"force": JointEffortAction(joints="slider")},
+        actions={"force": mdp.JointEffortAction(joints="slider")},
         events={"reset": reset},
         rewards={"balance": CartpoleReward()},
-        terminations={"time_out": TimeOut(time_out=True), **terminations},
+        terminations={"time_out": mdp.TimeOut(time_out=True), **terminations},
         episode_length_s=10.0,
         scale_rewards_by_dt=False,
         viewer=ViewerCfg(body="cart", distance=4.0, elevation=-10.0, azimuth=90.0),

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
@@ -19,8 +20,7 @@ RUN_SPEED = 8.0
 class CheetahReward(RewardTerm):
     """Forward speed over `RUN_SPEED`, clipped to [0, 1]; velocity stage."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         speed_E = planar.forward_speed(view)
         return tolerance(speed_E, low=RUN_SPEED, margin=RUN_SPEED, value_at_margin=0.0, shape="linear")
 

@@ -1,4 +1,4 @@
-"""What the get-up tasks share: a legged robot that was dropped in any pose rises and then stands still.
+"""A legged robot that was dropped in any pose rises and then stands still; robots of our own, nothing to download.
 
 An episode starts with the robot in the air, turned and bent at random; within half a second it lies on the ground.
 The reward has no stages: height and uprightness lead up from any pose, and what a good stance adds on top is worth
@@ -11,15 +11,18 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl import mdp
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import MetricTerm, RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.quantities import root_height
 from ksim_rl.scene.robots.legged_robot import LeggedRobot
+from ksim_rl.scene.robots.own_robots import Humanoid, Quadruped
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.terrains import PlaneTerrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
@@ -32,8 +35,7 @@ from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, Observation
 class Uprightness(RewardTerm):
     """(1 + cos tilt) / 2 of the root, [E]: 1 upright, 0 upside down; position stage."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return uprightness(view)
 
 
@@ -51,8 +53,7 @@ class RisenHeight(RewardTerm):
         super().__post_init__()
         check_in_range("standing_height", self.standing_height, low=0.0, low_open=True)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return risen(view, self.standing_height)
 
 
@@ -75,8 +76,7 @@ class Standing(RewardTerm):
         for field in ("standing_height", "pose_std", "speed_std"):
             check_in_range(field, getattr(self, field), low=0.0, low_open=True)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the unweighted reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         up_E = (uprightness(view) * risen(view, self.standing_height)).square()
         stray_E = view.joint_pos_rel_EL.square().mean(-1) / self.pose_std**2
         motion_E = view.joint_vel_EL.square().mean(-1) / self.speed_std**2
@@ -93,19 +93,18 @@ class Stands(MetricTerm):
     standing_height: float
     reduce: Literal["mean", "last", "max", "sum"] = "last"
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the value of the current state, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         is_high_E = root_height(view) > 0.85 * self.standing_height
         is_upright_E = -view.projected_gravity_EL[:, 2] > math.cos(0.35)
         return (is_high_E & is_upright_E).to(torch.float32)
 
 
-def uprightness(view: EnvView) -> Tensor:
+def uprightness(view: EnvView) -> Float[Tensor, " E"]:
     """Return (1 + cos tilt) / 2 of the root, [E]; position stage."""
     return 0.5 * (1.0 - view.projected_gravity_EL[:, 2])
 
 
-def risen(view: EnvView, standing_height: float) -> Tensor:
+def risen(view: EnvView, standing_height: float) -> Float[Tensor, " E"]:
     """Return the root's height as a fraction of the standing one, within [0, 1], [E]; position stage."""
     return (root_height(view) / standing_height).clamp(0.0, 1.0)
 
@@ -194,3 +193,43 @@ def _observations(robot: LeggedRobot) -> dict[str, ObservationGroupCfg]:
 def training(*, num_iterations: int) -> TrainingCfg:
     """Return the training settings: 24 steps of 4096 envs per update."""
     return velocity.training(num_iterations=num_iterations, entropy_coeff=0.005)
+
+
+def quadruped_get_up() -> ManagerBasedRlEnvCfg:
+    """Return the config of our own quadruped."""
+    robot = Quadruped()
+    return get_up_cfg(
+        robot,
+        standing_height=0.29,
+        drop_height=(0.12, 0.2),
+        bend=0.6,
+        action_scale={".*_roll": 0.4, ".*_(hip|knee)": 0.6},
+        viewer=ViewerCfg(body=robot.root_body, distance=1.6, elevation=-15.0, azimuth=120.0),
+    )
+
+
+def humanoid_get_up() -> ManagerBasedRlEnvCfg:
+    """Return the config of our own humanoid."""
+    robot = Humanoid()
+    return get_up_cfg(
+        robot,
+        standing_height=0.48,
+        drop_height=(0.05, 0.15),
+        bend=0.6,
+        action_scale={".*": 0.7},
+        viewer=ViewerCfg(body=robot.root_body, distance=2.2, elevation=-12.0, azimuth=130.0),
+    )
+
+
+QUADRUPED = Task(
+    name="quadruped_get_up",
+    description="our quadruped gets up from any pose",
+    cfg=quadruped_get_up,
+    training=training(num_iterations=1_000),
+)
+HUMANOID = Task(
+    name="humanoid_get_up",
+    description="our humanoid gets up from any pose",
+    cfg=humanoid_get_up,
+    training=training(num_iterations=3_000),
+)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
@@ -32,13 +33,11 @@ class HopperReward(RewardTerm):
     speed: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse negative speeds."""
         super().__post_init__()
         check_in_range("speed", self.speed, low=0.0)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reward, [E]."""
-        foot_E = view.bodies("foot").pos_EN3[:, 0, 2]
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        foot_E = view.body("foot").pos_EL[:, 2]
         tall_E = tolerance(planar.height(view) - foot_E, low=STAND_HEIGHT, margin=STAND_HEIGHT / 2)
         stand_E = tall_E * planar.upright(view)
         if self.speed == 0.0:

@@ -1,4 +1,4 @@
-"""A torque that cannot lift a pendulum swings it up; after the pendulum of dm_control's suite (Tassa et al., 2018).
+"""A pendulum is swung up by a torque that cannot lift it, as in dm_control's suite (Tassa et al., 2018).
 
 Their reward is 1 within 8 degrees of upright and 0 elsewhere; ours rates the way there too.
 """
@@ -7,8 +7,10 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
+from ksim_rl import mdp
 from ksim_rl.algorithms import fast_td3
 from ksim_rl.algorithms.fast_td3 import FastTD3Cfg
 from ksim_rl.data import DatasetCfg, ReplayCfg
@@ -16,12 +18,6 @@ from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import ObservationTerm, RewardTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp import (
-    JointEffortAction,
-    JointVel,
-    ResetJoints,
-    TimeOut,
-)
 from ksim_rl.mdp.rewards.tolerance import tolerance
 from ksim_rl.scene.robots.control_models import Pendulum
 from ksim_rl.scene.scene import SceneCfg
@@ -37,8 +33,7 @@ UPRIGHT = math.cos(math.radians(8.0))
 class PendulumAngle(ObservationTerm):
     """Cosine and sine of the angle from upright, [E, 2]; position stage."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading, [E, 2]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E 2"]:
         return torch.cat((torch.cos(view.joint_pos_EL), torch.sin(view.joint_pos_EL)), dim=-1)
 
 
@@ -50,8 +45,7 @@ class PendulumReward(RewardTerm):
     turning round and round gives less than half of what swinging does.
     """
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         cosine_E, speed_E = torch.cos(view.joint_pos_EL[:, 0]), view.joint_vel_EL[:, 0]
         up_E = tolerance(cosine_E, low=UPRIGHT, margin=1.0 + UPRIGHT, value_at_margin=0.0, shape="linear")
         return up_E * (1.0 + 4.0 * tolerance(speed_E, low=0.0, high=0.0, margin=5.0)) / 5.0
@@ -61,16 +55,16 @@ def pendulum_swingup() -> ManagerBasedRlEnvCfg:
     """Return the config of swinging the pendulum up, from any angle, and holding it there."""
     terms = {
         "angle": ObservationTermCfg(term=PendulumAngle()),
-        "velocity": ObservationTermCfg(term=JointVel()),
+        "velocity": ObservationTermCfg(term=mdp.JointVel()),
     }
     return ManagerBasedRlEnvCfg(
         decimation=2,
         scene=SceneCfg(robots={"pendulum": Pendulum()}, num_envs=1024),
         observations={"actor": ObservationGroupCfg(terms=terms), "critic": ObservationGroupCfg(terms=terms)},
-        actions={"torque": JointEffortAction()},
-        events={"reset": ResetJoints(position_range=(-math.pi, math.pi))},
+        actions={"torque": mdp.JointEffortAction()},
+        events={"reset": mdp.ResetJoints(position_range=(-math.pi, math.pi))},
         rewards={"swing_up": PendulumReward()},
-        terminations={"time_out": TimeOut(time_out=True)},
+        terminations={"time_out": mdp.TimeOut(time_out=True)},
         episode_length_s=20.0,
         scale_rewards_by_dt=False,
         viewer=ViewerCfg(lookat=(0.0, 0.0, 0.8), distance=2.5, elevation=-10.0, azimuth=90.0),

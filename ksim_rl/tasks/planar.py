@@ -1,4 +1,4 @@
-"""What the planar runners share: a robot in the xz plane, on the ground, rated by posture and forward speed.
+"""The planar runners share this module: a robot in the xz plane, on the ground, is rated by posture and forward speed.
 
 The tasks are those of dm_control's suite (Tassa et al., "DeepMind Control Suite", 2018) on robots of our own:
 rewards in [0, 1], 1000 steps per episode, no early end. Unlike there, episodes start standing; who falls has to get up.
@@ -7,6 +7,7 @@ rewards in [0, 1], 1000 steps per episode, no early end. Unlike there, episodes 
 from dataclasses import dataclass
 from typing import Any
 
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl import mdp
@@ -27,22 +28,22 @@ STEPS_PER_EPISODE = 1000
 SIM = SimCfg(iterations=10, ls_iterations=20)
 
 
-def height(view: EnvView) -> Tensor:
+def height(view: EnvView) -> Float[Tensor, " E"]:
     """Return the torso's height, m, [E]; position stage."""
     return view.joints("root_z").pos_EL[:, 0]
 
 
-def upright(view: EnvView) -> Tensor:
+def upright(view: EnvView) -> Float[Tensor, " E"]:
     """Return 1 where the torso is upright, 0 where it is upside down, linear in the cosine between, [E]."""
     return (1.0 - view.projected_gravity_EL[:, 2]) / 2.0
 
 
-def forward_speed(view: EnvView) -> Tensor:
+def forward_speed(view: EnvView) -> Float[Tensor, " E"]:
     """Return the velocity of the centre of mass along x, m/s, [E]; velocity stage."""
     return view.sensor("com_velocity")[:, 0]
 
 
-def small_effort(view: EnvView) -> Tensor:
+def small_effort(view: EnvView) -> Float[Tensor, " E"]:
     """Return 1 without any action, 0 where each is at or beyond its limit, [E]."""
     return (1.0 - view.action_EL.clamp(-1.0, 1.0).square()).mean(-1)
 
@@ -51,8 +52,7 @@ def small_effort(view: EnvView) -> Tensor:
 class ForwardSpeed(MetricTerm):
     """Velocity of the centre of mass along x, m/s, [E]; velocity stage."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the value, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return forward_speed(view)
 
 

@@ -6,20 +6,16 @@ Their reward is 1 inside the target and 0 elsewhere; ours rates the way there to
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ksim_rl import mdp
 from ksim_rl.checks import check_pair
 from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import CommandTerm, ObservationTerm, RewardTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp import (
-    JointEffortAction,
-    JointVel,
-    ResetJoints,
-    TimeOut,
-)
 from ksim_rl.mdp.rewards.tolerance import tolerance
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.robots.control_models import Reacher
@@ -45,8 +41,7 @@ class ReacherTarget(CommandTerm):
         super().__post_init__()
         check_pair("radius", self.radius, low=0.0)
 
-    def resample(self, view: EnvView, mask_E: Tensor) -> None:
-        """Draw targets for the rows of `mask_E`."""
+    def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         share_E, angle_E = view.uniform(2).unbind(-1)
         inner, outer = self.radius
         radius_E = torch.sqrt(inner**2 + share_E * (outer**2 - inner**2))
@@ -55,8 +50,7 @@ class ReacherTarget(CommandTerm):
         held_E2 = self._held(view)
         held_E2.copy_(torch.where(mask_E[:, None], drawn_E2, held_E2))
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the target, float32 [E, 2]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E 2"]:
         return self._held(view).clone()
 
     def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
@@ -64,7 +58,7 @@ class ReacherTarget(CommandTerm):
         x, y = self._held(view)[env_index].tolist()
         visualizer.sphere((x, y, Reacher.plane_height), radius=TARGET_RADIUS, rgba=(0.2, 0.6, 0.2, 0.8))
 
-    def _held(self, view: EnvView) -> Tensor:
+    def _held(self, view: EnvView) -> Float[Tensor, "E 2"]:
         return view.buffer("target_E2", 2)
 
 
@@ -72,8 +66,7 @@ class ReacherTarget(CommandTerm):
 class ReacherPose(ObservationTerm):
     """Cosine and sine of the shoulder's angle, and the wrist's angle, rad, [E, 3]; position stage."""
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading, [E, 3]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E 3"]:
         shoulder_E1, wrist_E1 = view.joint_pos_EL.split(1, dim=-1)
         return torch.cat((torch.cos(shoulder_E1), torch.sin(shoulder_E1), wrist_E1), dim=-1)
 
@@ -88,8 +81,7 @@ class FingerToTarget(ObservationTerm):
 
     command: str = "target"
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reading, [E, 2]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, "E 2"]:
         return _offset(view, self.command)
 
 
@@ -99,36 +91,35 @@ class ReacherReward(RewardTerm):
 
     command: str = "target"
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         distance_E = torch.linalg.vector_norm(_offset(view, self.command), dim=-1)
         return tolerance(distance_E, high=TARGET_RADIUS, margin=0.1)
 
 
-def _offset(view: EnvView, command: str) -> Tensor:
+def _offset(view: EnvView, command: str) -> Float[Tensor, "E 2"]:
     """Return target minus finger, x and y in the world frame, m, [E, 2]."""
-    return view.command(command) - view.sites("finger").pos_EN3[:, 0, :2]
+    return view.command(command) - view.site("finger").pos_EL[:, :2]
 
 
 def reacher() -> ManagerBasedRlEnvCfg:
     """Return the config of reaching one target per episode."""
     terms = {
         "pose": ObservationTermCfg(term=ReacherPose()),
-        "velocity": ObservationTermCfg(term=JointVel()),
+        "velocity": ObservationTermCfg(term=mdp.JointVel()),
         "to_target": ObservationTermCfg(term=FingerToTarget()),
     }
     return ManagerBasedRlEnvCfg(
         decimation=2,
         scene=SceneCfg(robots={"reacher": Reacher()}, num_envs=1024),
         observations={"actor": ObservationGroupCfg(terms=terms), "critic": ObservationGroupCfg(terms=terms)},
-        actions={"torque": JointEffortAction(joints=("shoulder", "wrist"))},
+        actions={"torque": mdp.JointEffortAction(joints=("shoulder", "wrist"))},
         events={
-            "shoulder": ResetJoints(joints="shoulder", position_range=(-torch.pi, torch.pi)),
-            "wrist": ResetJoints(joints="wrist", position_range=(-2.7, 2.7)),
+            "shoulder": mdp.ResetJoints(joints="shoulder", position_range=(-torch.pi, torch.pi)),
+            "wrist": mdp.ResetJoints(joints="wrist", position_range=(-2.7, 2.7)),
         },
         commands={"target": ReacherTarget(resampling_time_range_s=(20.0, 20.0))},
         rewards={"reach": ReacherReward()},
-        terminations={"time_out": TimeOut(time_out=True)},
+        terminations={"time_out": mdp.TimeOut(time_out=True)},
         episode_length_s=20.0,
         scale_rewards_by_dt=False,
         viewer=ViewerCfg(lookat=(0.0, 0.0, 0.0), distance=0.8, elevation=-60.0, azimuth=90.0),

@@ -1,4 +1,4 @@
-"""What all velocity tasks share: a legged robot follows a planar velocity command.
+"""All velocity tasks share this module: a legged robot follows a planar velocity command.
 
 A task's module holds the figures of its robot and puts the parts together. Weights, noise and pushes are those of
 mjlab 1.6.0's velocity tasks, so that both can be compared on the same work, and so are the training settings but for
@@ -286,7 +286,7 @@ def velocity_cfg(
 def training(*, num_iterations: int, entropy_coeff: float = 0.01) -> TrainingCfg:
     """Return the training settings: 24 steps of 4096 envs per update.
 
-    They are the peer's but for two: with a discount of 0.98 (it has 0.99) and an output layer of ordinary scale Go1
+    They are mjlab's but for two: with a discount of 0.98 (it has 0.99) and an output layer of ordinary scale Go1
     tracks both velocities better after 30 M env states (linear 1.64, angular 1.35, against 1.48 and 1.07).
     """
     return TrainingCfg(

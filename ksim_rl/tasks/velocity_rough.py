@@ -1,10 +1,11 @@
-"""What velocity tasks on rough ground share: the flat task, a terrain in levels, and a scan of it."""
+"""Velocity tasks on rough ground are the flat task with a terrain in levels and a scan of it."""
 
 import dataclasses
 from collections.abc import Mapping
 
 from ksim_rl import mdp
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.task import Task
 from ksim_rl.scene.terrains import (
     DiscreteObstacles,
     FlatPatch,
@@ -15,7 +16,7 @@ from ksim_rl.scene.terrains import (
     TerrainPatch,
     Waves,
 )
-from ksim_rl.tasks import velocity
+from ksim_rl.tasks import g1_velocity_flat, go1_velocity_flat, velocity
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 
 PATCHES: Mapping[str, TerrainPatch] = {
@@ -65,3 +66,29 @@ def on_rough_ground(
 
 def _with(group: ObservationGroupCfg, scan: ObservationTermCfg) -> ObservationGroupCfg:
     return dataclasses.replace(group, terms={**group.terms, "height_scan": scan})
+
+
+def go1_velocity_rough() -> ManagerBasedRlEnvCfg:
+    """Return the config of Unitree Go1."""
+    flat, robot = go1_velocity_flat.go1_velocity_flat(), go1_velocity_flat.ROBOT
+    return on_rough_ground(flat, root_height=robot.init_pos[2], njmax=120, nconmax=40)
+
+
+def g1_velocity_rough() -> ManagerBasedRlEnvCfg:
+    """Return the config of Unitree G1."""
+    flat, robot = g1_velocity_flat.g1_velocity_flat(), g1_velocity_flat.ROBOT
+    return on_rough_ground(flat, root_height=robot.init_pos[2], njmax=250, nconmax=80)
+
+
+GO1 = Task(
+    name="go1_velocity_rough",
+    description="Unitree Go1 follows a velocity command over stairs, slopes and rough ground",
+    cfg=go1_velocity_rough,
+    training=velocity.training(num_iterations=10_000),
+)
+G1 = Task(
+    name="g1_velocity_rough",
+    description="Unitree G1 follows a velocity command over stairs, slopes and rough ground",
+    cfg=g1_velocity_rough,
+    training=velocity.training(num_iterations=30_000),
+)

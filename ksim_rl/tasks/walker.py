@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import check_in_range
@@ -31,12 +32,10 @@ class WalkerReward(RewardTerm):
     speed: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse negative speeds."""
         super().__post_init__()
         check_in_range("speed", self.speed, low=0.0)
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         tall_E = tolerance(planar.height(view), low=STAND_HEIGHT, margin=STAND_HEIGHT / 2)
         stand_E = (3.0 * tall_E + planar.upright(view)) / 4.0
         if self.speed == 0.0:

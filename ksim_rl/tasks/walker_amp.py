@@ -7,6 +7,7 @@ Unlike in `walker_track`, the policy never sees the motion, nor where in it it s
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl import mdp
@@ -38,8 +39,7 @@ class WalkAt(RewardTerm):
 
     speed: float
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the reward, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         low, high = self.speed - 0.1, self.speed + 0.1
         return tolerance(planar.forward_speed(view), low=low, high=high, margin=self.speed)
 
@@ -56,8 +56,7 @@ class PoseDistance(MetricTerm):
     file: str
     joints: Patterns
 
-    def __call__(self, view: EnvView) -> Tensor:
-        """Return the value, [E]."""
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         joints = view.joints(self.joints)
         poses_FL, own_EL = view.motion(self.file).joint_pos_FL[:, joints.index], joints.pos_EL
         return torch.cdist(own_EL, poses_FL).amin(-1) / own_EL.shape[-1] ** 0.5

@@ -112,11 +112,6 @@ class EpisodeLengthLevel(SteppedLevel):
     raise_above: float = 0.8
 
     def score(self, view: EnvView) -> Float[Tensor, " E"]:
-        """Return the shares, [E].
-
-        Raises:
-            ValueError: if episodes have no longest length.
-        """
         if view.max_episode_length == 0:
             raise ValueError(
                 "EpisodeLengthLevel with episode_length_s=0: episodes have no longest length; set one"
@@ -147,11 +142,6 @@ class SaturationLevel(SteppedLevel):
     reward: str
 
     def score(self, view: EnvView) -> Float[Tensor, " E"]:
-        """Return the episodes' rewards, [E].
-
-        Raises:
-            ValueError: if there is no such reward.
-        """
         if self.reward not in view.episode_rewards:
             raise unknown_name("reward", self.reward, view.episode_rewards)
         sum_E = view.episode_rewards[self.reward]

@@ -25,7 +25,7 @@ class Power(OfJoints, MetricTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class CostOfTransport(OfJoints, OfEntity, MetricTerm):
-    """Energy / (weight * distance) since the start of the episode, no unit, [E].
+    """Energy / (weight * distance) since the start of the episode, no unit; it needs gravity.
 
     Energy is the integral of `Power`; distance is the length of the root's path over the ground; the weight is that of
     the nominal model (m g of the root body with all that hangs on it).
@@ -42,11 +42,6 @@ class CostOfTransport(OfJoints, OfEntity, MetricTerm):
         check_in_range("min_distance", self.min_distance, low=0.0, low_open=True)
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        """Return the value up to the current state, [E].
-
-        Raises:
-            ValueError: if nothing weighs anything.
-        """
         robot, model = view.entity(self.entity), view.world.mj_model
         weight = float(model.body_subtreemass[robot.root.id] * np.linalg.norm(model.opt.gravity))
         if weight == 0.0:

@@ -13,24 +13,17 @@ from torch import Tensor
 
 from ksim_rl.envs.term import MetricTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.quantities import contact_force, foot_contact
+from ksim_rl.mdp.fields import OfFeet
+from ksim_rl.mdp.quantities import contact_force
 from ksim_rl.scene.names import Patterns
 
 
 @dataclass(frozen=True, kw_only=True)
-class FootSlipSpeed(MetricTerm):
-    """Mean over the feet in contact of their horizontal speed, world frame, m/s, [E]; 0 while none touches.
-
-    Attributes:
-        sensor: contact sensor, one element per foot, in the order of `sites`.
-        sites: the feet.
-    """
-
-    sensor: str
-    sites: Patterns
+class FootSlipSpeed(OfFeet, MetricTerm):
+    """Mean over the feet in contact of their horizontal speed, world frame, m/s; 0 while none touches."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        found_EF = foot_contact(view, self.sensor, self.sites).found_EN
+        found_EF = self.contact(view).found_EN
         speed_EF = torch.linalg.vector_norm(view.sites(self.sites).lin_vel_EN3[..., :2], dim=-1)
         return (speed_EF * found_EF).sum(-1) / found_EF.sum(-1).clamp(min=1.0)
 

@@ -32,11 +32,6 @@ class Success(MetricTerm):
             raise ValueError("terminations=(): name at least one, such as ('time_out',)")
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        """Return the value of this step, [E].
-
-        Raises:
-            ValueError: if the env has no such termination.
-        """
         for name in self.terminations:
             if name not in view.terminations:
                 raise unknown_name("termination", name, view.terminations)

@@ -18,8 +18,6 @@ from ksim_rl.mdp.observations.framed_observation import FramedObservation
 from ksim_rl.mdp.quantities import contact_force
 from ksim_rl.scene.names import Patterns
 
-# -- any contact sensor ------------------------------------------------------------------------------------------
-
 
 @dataclass(frozen=True, kw_only=True)
 class Contact(OfContacts, ObservationTerm):
@@ -44,9 +42,6 @@ class ContactForce(FramedObservation):
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return self.vectors(view, view.contact(self.sensor).force_EN3)
-
-
-# -- feet --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,8 +12,6 @@ from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.fields import InFrame, OfEntity
 
-# -- root --------------------------------------------------------------------------------------------------------
-
 
 @dataclass(frozen=True, kw_only=True)
 class RootPos(OfEntity, ObservationTerm):
@@ -88,9 +86,6 @@ class ProjectedGravity(OfEntity, ObservationTerm):
         filtered_E3.lerp_(gravity_E3, gain_E[:, None])
         steps_E.copy_(now_E)
         return torch.nn.functional.normalize(filtered_E3, dim=-1)
-
-
-# -- sensors, action, command ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)

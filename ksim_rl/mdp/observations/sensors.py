@@ -1,4 +1,4 @@
-"""These observations read inertial measurement units and cameras."""
+"""Each of these observations has the readings of an inertial measurement unit, a camera or a ray caster."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from ksim_rl.checks import check_choice
+from ksim_rl.checks import check_choice, check_in_range, check_pair
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 
@@ -55,3 +55,38 @@ class CameraImage(ObservationTerm):
     def __call__(self, view: EnvView) -> Shaped[Tensor, " E *image"]:
         camera = view.camera(self.sensor)
         return camera.rgb_EHW3 if self.output == "rgb" else getattr(camera, f"{self.output}_EHW")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RayDistance(ObservationTerm):
+    """Distances to what the rays hit, m, the sensor's `max_distance` where they hit nothing, [E, N]; position stage."""
+
+    sensor: str
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.rays(self.sensor).state.distance_EN
+
+
+@dataclass(frozen=True, kw_only=True)
+class RayHeight(ObservationTerm):
+    """How far the ends of the rays are below the sensor, minus `offset`, clipped, m, [E, N]; position stage.
+
+    With a `GridPattern` that starts well above the robot it is a height scan that sees everything, not only terrain.
+
+    Attributes:
+        offset: m.
+        clip: readings are clipped to this range, m.
+    """
+
+    sensor: str
+    offset: float = 0.0
+    clip: tuple[float, float] = (-1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        check_in_range("offset", self.offset)
+        check_pair("clip", self.clip)
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        tracker = view.rays(self.sensor)
+        below_EN = tracker.origin_E3[:, 2:] - tracker.state.point_EN3[..., 2] - self.offset
+        return below_EN.clamp(*self.clip)

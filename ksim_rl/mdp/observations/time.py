@@ -26,11 +26,6 @@ class RemainingTime(ObservationTerm):
     """Time until the episode times out (`TimeOut`), s, [E, 1]. Needs `episode_length_s`."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
-        """Return the reading.
-
-        Raises:
-            ValueError: if episodes have no length.
-        """
         if view.max_episode_length == 0:
             raise ValueError(
                 "RemainingTime with episode_length_s=0: episodes never time out; set episode_length_s"

@@ -15,6 +15,7 @@ from ksim_rl.mdp.randomization.randomize import (
     Operation,
     Pair,
     Randomize,
+    RandomizeNumber,
     write_entries,
 )
 from ksim_rl.scene.names import Patterns, scalar_joint_ids
@@ -119,21 +120,12 @@ class RandomizeActuatorGains(RandomizeActuator):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeEffortLimit(RandomizeActuator):
+class RandomizeEffortLimit(RandomizeActuator, RandomizeNumber):
     """Largest effort of the actuators of joints, N m or N: one draw for both directions.
 
     It changes what holds the effort: the actuator's force range, the joint's, both, or an explicit actuator's
     `effort_limit`, which stays at 0 or above.
-
-    Attributes:
-        ranges: what to draw from.
     """
-
-    ranges: Pair
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_range("ranges", self.ranges)
 
     @property
     def per_world_fields(self) -> tuple[str, ...]:

@@ -16,8 +16,8 @@ from ksim_rl.mdp.fields import OfJoints
 from ksim_rl.mdp.randomization.randomize import (
     Operation,
     Pair,
-    Randomize,
     RandomizeModelField,
+    RandomizeNumber,
 )
 from ksim_rl.scene.names import Patterns, scalar_joint_ids
 
@@ -110,21 +110,14 @@ class RandomizeJointZero(RandomizeJointField):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeDefaultJointPos(OfJoints, Randomize):
+class RandomizeDefaultJointPos(OfJoints, RandomizeNumber):
     """The default pose, rad or m: what resets, position actions and relative joint positions start from.
 
-    In mode "reset" let it run before the event that resets the joints.
-
-    Attributes:
-        ranges: what to draw from; the model's own value is that of its first keyframe or, without one, `qpos0`.
+    The model's own value is that of its first keyframe or, without one, `qpos0`. In mode "reset" let it run before the
+    event that resets the joints.
     """
 
-    ranges: Pair
     operation: Operation = "add"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_range("ranges", self.ranges)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         joints = view.joints(self.joints).index
@@ -139,21 +132,15 @@ class RandomizeDefaultJointPos(OfJoints, Randomize):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeEncoderBias(OfJoints, Randomize):
+class RandomizeEncoderBias(OfJoints, RandomizeNumber):
     """Offset between a joint's position and what its encoder reads, rad or m.
 
     Observations show it where they ask for it (`JointPosRel(biased=True)`); nothing else feels it.
-
-    Attributes:
-        ranges: what to draw from.
     """
-
-    ranges: Pair
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choice("operation", self.operation, ("abs",))
-        self.check_range("ranges", self.ranges)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         joints = view.joints(self.joints).index

@@ -13,7 +13,8 @@ from torch import Tensor
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.commands.speed import RewardWhileCommanded
-from ksim_rl.mdp.quantities import contact_force, foot_contact
+from ksim_rl.mdp.fields import OfFeet
+from ksim_rl.mdp.quantities import contact_force
 from ksim_rl.scene.names import Patterns
 
 
@@ -37,19 +38,15 @@ class FootClearance(RewardWhileCommanded):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FootSwingHeight(RewardWhileCommanded):
+class FootSwingHeight(OfFeet, RewardWhileCommanded):
     """active * sum_f landed_f * (peak_f / target_height - 1)^2, [E]; `peak` is the swing's greatest height.
 
     The peak starts at 0 after each landing and each reset.
 
     Attributes:
-        sensor: contact sensor, one geom per foot, in the order of `sites`.
-        sites: the feet; heights are above the ground right below them.
-        target_height: m.
+        target_height: m, above the ground right below a foot.
     """
 
-    sensor: str
-    sites: Patterns
     target_height: float
 
     def __post_init__(self) -> None:
@@ -57,7 +54,7 @@ class FootSwingHeight(RewardWhileCommanded):
         check_in_range("target_height", self.target_height, low=0.0, low_open=True)
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        contact = foot_contact(view, self.sensor, self.sites)
+        contact = self.contact(view)
         height_EF = view.sites(self.sites).height_EN
         held_EF = view.buffer("peak_EF", height_EF.shape[-1])
         peak_EF = torch.where(contact.found_EN > 0, held_EF, torch.maximum(held_EF, height_EF))
@@ -67,19 +64,12 @@ class FootSwingHeight(RewardWhileCommanded):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FootSlip(RewardWhileCommanded):
-    """active * sum_f contact_f * |v_xy,f|^2, (m/s)^2, [E]; velocities of the sites in the world frame.
-
-    Attributes:
-        sensor: contact sensor, one geom per foot, in the order of `sites`.
-    """
-
-    sensor: str
-    sites: Patterns
+class FootSlip(OfFeet, RewardWhileCommanded):
+    """active * sum_f contact_f * |v_xy,f|^2, (m/s)^2; velocities of the sites in the world frame."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         speed2_EF = view.sites(self.sites).lin_vel_EN3[..., :2].square().sum(-1)
-        cost_E = (speed2_EF * foot_contact(view, self.sensor, self.sites).found_EN).sum(-1)
+        cost_E = (speed2_EF * self.contact(view).found_EN).sum(-1)
         return self.while_commanded(view, cost_E)
 
 
@@ -125,11 +115,6 @@ class GaitPhase(RewardWhileCommanded):
     sensor: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        """Return the unweighted reward, [E].
-
-        Raises:
-            ValueError: if the gait has another number of feet than the sensor.
-        """
         touches_EF, phase_EL = view.contact(self.sensor).found_EN > 0, view.command(self.gait)
         feet = touches_EF.shape[-1]
         if phase_EL.shape[-1] != 2 * feet:

@@ -45,9 +45,6 @@ class JointLimitReward(OfJoints, RewardTerm):
         return (value_EL.abs() - free_L).clamp(min=0.0).sum(-1)
 
 
-# -- position ----------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
 class JointPosLimits(OfJoints, RewardTerm):
     """Sum over joints of how far each is beyond its soft limits, rad or m, [E]; position stage.
@@ -78,9 +75,6 @@ class JointDeviationL2(OfJoints, RewardTerm):
         return view.joints(self.joints).pos_rel_EL.square().sum(-1)
 
 
-# -- velocity and acceleration -----------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
 class JointVelL2(OfJoints, RewardTerm):
     """Sum of squared joint velocities, (rad/s)^2 or (m/s)^2, [E]; velocity stage."""
@@ -103,9 +97,6 @@ class JointAccL2(OfJoints, RewardTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return view.joints(self.joints).acc_EL.square().sum(-1)
-
-
-# -- effort ------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -75,11 +75,6 @@ class ActionSymmetryL2(Symmetry):
     joints: Patterns
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        """Return the unweighted reward, [E].
-
-        Raises:
-            ValueError: if a joint of a pair is not among `joints`.
-        """
         names = view.joints(self.joints).names
         columns = []
         for side in self._pairs(view):

@@ -12,8 +12,6 @@ from ksim_rl.mdp.quantities import root_height
 from ksim_rl.mdp.rewards.gaussian_reward import GaussianReward
 from ksim_rl.scene import quaternion
 
-# -- velocity ----------------------------------------------------------------------------------------------------
-
 
 @dataclass(frozen=True, kw_only=True)
 class TrackLinearVelocity(OfEntity, GaussianReward):
@@ -37,9 +35,6 @@ class TrackAngularVelocity(OfEntity, GaussianReward):
         vel_E3 = view.entity(self.entity).root_ang_vel_b_EL
         error_E = view.command(self.command)[:, 2] - vel_E3[:, 2]
         return self.rate(error_E.square() + vel_E3[:, :2].square().sum(-1))
-
-
-# -- height, pose, joints ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +65,7 @@ class TrackOrientation(InFrame, GaussianReward):
     """exp(-a^2 / std^2), `a` the angle between a body and the commanded orientation, rad; position stage.
 
     Attributes:
-        command: position and quaternion, such as `CartesianCommand` or `StartPoseCommand`, in `frame`.
+        command: position and quaternion [E, 7], such as `CartesianCommand` or `StartPoseCommand`, in `frame`.
         body: what should have that orientation.
     """
 
@@ -78,11 +73,6 @@ class TrackOrientation(InFrame, GaussianReward):
     body: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        """Return the unweighted reward.
-
-        Raises:
-            ValueError: if the command has no orientation.
-        """
         command_EK = view.command(self.command)
         _, target_E4 = target_pose_w(view, command_EK, frame=self.frame, entity=self.entity)
         if target_E4 is None:
