@@ -119,3 +119,15 @@ def test_get_up_rates_the_stance_highest(fallen):
     assert reward["standing"][0] > 0.99 and reward["standing"][1] < 0.1 and reward["standing"][2] == 0.0
     assert reward["standing"][3] < 0.2  # it shakes
     assert stands_E[:4].tolist() == [1.0, 0.0, 0.0, 1.0]
+
+
+def test_actions_of_the_delayed_quadruped_arrive_up_to_two_steps_late():
+    env = envs.make("quadruped_velocity_delayed", num_envs=64, seed=3, overrides=CALM)
+    td, lags = env.reset(), []
+    for step in range(6):
+        action = torch.full(env.action_spec.shape, 0.01 * step)
+        td = env.step(td.set("action", action))["next"].exclude("reward")
+        lags.append((step - 100.0 * env.base_env.view.action_EL[:, 0]).round())
+    assert set(lags[-1].tolist()) == {0.0, 1.0, 2.0}
+    assert torch.equal(lags[-1], lags[-2]), "a lag stays for the episode"
+    env.close()
