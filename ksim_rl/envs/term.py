@@ -16,20 +16,14 @@ from typing import ClassVar, Literal
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from ksim_rl.checks import check_choice, check_in_range, check_pair
+from ksim_rl.checked import Checked, NonNegativeRange
 from ksim_rl.envs.view import EnvView
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 
-EVENT_MODES = ("startup", "reset", "interval", "step")
-METRIC_REDUCTIONS = ("mean", "last", "max", "sum")
-
 
 @dataclass(frozen=True, kw_only=True)
-class Term(ABC):  # noqa: B024
-    """What all kinds of term are, so that fields can be shared across kinds (`ksim_rl.mdp.fields`)."""
-
-    def __post_init__(self) -> None:  # noqa: B027
-        """Check the fields; each class checks its own after its bases have checked theirs."""
+class Term(Checked, ABC):
+    """The base of all kinds of term; kinds may share fields (see `ksim_rl.mdp.fields`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,10 +50,6 @@ class RewardTerm(Term):
 
     weight: float = 1.0
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("weight", self.weight)
-
     @abstractmethod
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         """Return the unweighted reward of the current state, float32 [E]."""
@@ -85,10 +75,6 @@ class MetricTerm(Term):
 
     reduce: Literal["mean", "last", "max", "sum"] = "mean"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_choice("reduce", self.reduce, METRIC_REDUCTIONS)
-
     @abstractmethod
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         """Return the value of the current state, float32 [E]."""
@@ -103,18 +89,15 @@ class EventTerm(Term):
     """
 
     mode: Literal["startup", "reset", "interval", "step"] = "reset"
-    interval_range_s: tuple[float, float] | None = None
+    interval_range_s: NonNegativeRange | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_choice("mode", self.mode, EVENT_MODES)
         if (self.mode == "interval") != (self.interval_range_s is not None):
             raise ValueError(
                 f"interval_range_s={self.interval_range_s!r} with mode={self.mode!r}: give a pair of seconds with "
                 "mode='interval', and None with any other"
             )
-        if self.interval_range_s is not None:
-            check_pair("interval_range_s", self.interval_range_s, low=0.0)
 
     @property
     def per_world_fields(self) -> tuple[str, ...]:
@@ -130,12 +113,7 @@ class EventTerm(Term):
 class CommandTerm(Term):
     """A generator of commands with a per-env clock that resamples; None as its range draws at resets only."""
 
-    resampling_time_range_s: tuple[float, float] | None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.resampling_time_range_s is not None:
-            check_pair("resampling_time_range_s", self.resampling_time_range_s, low=0.0)
+    resampling_time_range_s: NonNegativeRange | None
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:

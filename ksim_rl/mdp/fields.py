@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.checked import NonNegative
 from ksim_rl.envs.term import Term
 from ksim_rl.envs.view import EnvView
 from ksim_rl.scene.names import Patterns
@@ -31,10 +31,6 @@ class InFrame(OfEntity):
 
     frame: Literal["root", "world"] = "root"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_choice("frame", self.frame, ("root", "world"))
-
 
 @dataclass(frozen=True, kw_only=True)
 class OfJoints(Term):
@@ -57,11 +53,7 @@ class OfContacts(Term):
     """
 
     sensor: str
-    threshold: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("threshold", self.threshold, low=0.0)
+    threshold: NonNegative
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Positive
 from ksim_rl.envs.term import ObservationTerm, TerminationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.fields import OfJoints
@@ -32,11 +32,7 @@ class MotionPhase(ObservationTerm):
     """
 
     file: str
-    cycle_s: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.cycle_s is not None:
-            check_in_range("cycle_s", self.cycle_s, low=0.0, low_open=True)
+    cycle_s: Positive | None = None
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         cycle_s = self.cycle_s or view.motion(self.file).duration_s
@@ -54,9 +50,6 @@ class MotionJoints(OfJoints, ObservationTerm):
 
     file: str
     ahead_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_in_range("ahead_s", self.ahead_s)
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         if self.ahead_s == 0.0:
@@ -141,10 +134,7 @@ class FarFromMotion(TerminationTerm):
 
     file: str
     bodies: Patterns
-    distance: float
-
-    def __post_init__(self) -> None:
-        check_in_range("distance", self.distance, low=0.0, low_open=True)
+    distance: Positive
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         offset_EN3 = _body_offset(view, self.file, self.bodies)

@@ -2,12 +2,13 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import NonNegative, Positive, Within
 from ksim_rl.envs.term import TerminationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.fields import OfContacts, OfEntity, OfJoints
@@ -32,10 +33,7 @@ class BadOrientation(OfEntity, TerminationTerm):
         limit_angle: rad, in (0, pi).
     """
 
-    limit_angle: float
-
-    def __post_init__(self) -> None:
-        check_in_range("limit_angle", self.limit_angle, low=0.0, high=math.pi, low_open=True)
+    limit_angle: Annotated[float, Within(low=0.0, high=math.pi, low_open=True)]
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         # The cosine falls as the angle grows, so comparing cosines needs no acos, which is ill-conditioned at 0.
@@ -52,9 +50,6 @@ class RootHeightBelow(OfEntity, TerminationTerm):
 
     minimum_height: float
 
-    def __post_init__(self) -> None:
-        check_in_range("minimum_height", self.minimum_height)
-
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         return root_height(view, self.entity) < self.minimum_height
 
@@ -67,10 +62,7 @@ class FarFromOrigin(OfEntity, TerminationTerm):
         distance: m from the env's origin on the terrain; on a plane, from the world's.
     """
 
-    distance: float
-
-    def __post_init__(self) -> None:
-        check_in_range("distance", self.distance, low=0.0, low_open=True)
+    distance: Positive
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         return distance_from_origin(view, self.entity) > self.distance
@@ -87,10 +79,7 @@ class OutsideTerrain(OfEntity, TerminationTerm):
     """
 
     time_out: bool = True
-    margin: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_in_range("margin", self.margin, low=0.0)
+    margin: NonNegative = 0.5
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         reach_E = view.entity(self.entity).root_pos_EL[:, :2].abs().amax(-1)
@@ -106,15 +95,13 @@ class RootVelocityAbove(OfEntity, TerminationTerm):
         angular: rad/s; None sets no limit.
     """
 
-    linear: float | None = None
-    angular: float | None = None
+    linear: Positive | None = None
+    angular: Positive | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.linear is None and self.angular is None:
             raise ValueError("linear=None, angular=None: give at least one limit")
-        for name in ("linear", "angular"):
-            if getattr(self, name) is not None:
-                check_in_range(name, getattr(self, name), low=0.0, low_open=True)
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         root = view.entity(self.entity)
@@ -134,10 +121,7 @@ class JointVelocityAbove(OfJoints, TerminationTerm):
         limit: rad/s or m/s.
     """
 
-    limit: float
-
-    def __post_init__(self) -> None:
-        check_in_range("limit", self.limit, low=0.0, low_open=True)
+    limit: Positive
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         return (view.joints(self.joints).vel_EL.abs() > self.limit).any(-1)
@@ -151,10 +135,7 @@ class JointLimitViolated(OfJoints, TerminationTerm):
         margin: rad or m.
     """
 
-    margin: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_in_range("margin", self.margin, low=0.0)
+    margin: NonNegative = 0.0
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         joints = view.joints(self.joints)
@@ -167,7 +148,7 @@ class JointLimitViolated(OfJoints, TerminationTerm):
 class IllegalContact(OfContacts, TerminationTerm):
     """Something touches that should not: its sensor sees more than `threshold`; acceleration stage."""
 
-    threshold: float = 0.0
+    threshold: NonNegative = 0.0
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         return (contact_force(view, self.sensor) > self.threshold).any(-1)

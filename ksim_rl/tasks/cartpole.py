@@ -7,13 +7,14 @@ in [0, 1000].
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl import mdp
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import NonNegative, Within
 from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
@@ -58,10 +59,7 @@ class CartpoleReward(RewardTerm):
 class PoleFallen(TerminationTerm):
     """The pole is further than `limit` rad from upright."""
 
-    limit: float
-
-    def __post_init__(self) -> None:
-        check_in_range("limit", self.limit, low=0.0, high=math.pi, low_open=True)
+    limit: Annotated[float, Within(low=0.0, high=math.pi, low_open=True)]
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         return torch.cos(view.joints("hinge").pos_EL[:, 0]) < math.cos(self.limit)
@@ -78,15 +76,10 @@ class ResetCartpole(EventTerm):
         velocity_std: m/s and rad/s; both velocities start normally distributed.
     """
 
-    cart_range: float
+    cart_range: NonNegative
     angle: float
-    angle_range: float
-    velocity_std: float = 0.01
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("cart_range", "angle_range", "velocity_std"):
-            check_in_range(name, getattr(self, name), low=0.0)
+    angle_range: NonNegative
+    velocity_std: NonNegative = 0.01
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         spread_EL = view.uniform(2, -1.0, 1.0)

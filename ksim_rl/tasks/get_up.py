@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl import mdp
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Positive
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import MetricTerm, RewardTerm
@@ -47,11 +47,7 @@ class RisenHeight(RewardTerm):
         standing_height: m.
     """
 
-    standing_height: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("standing_height", self.standing_height, low=0.0, low_open=True)
+    standing_height: Positive
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return risen(view, self.standing_height)
@@ -67,14 +63,9 @@ class Standing(RewardTerm):
         speed_std: rad/s; position and velocity stage.
     """
 
-    standing_height: float
-    pose_std: float = 0.5
-    speed_std: float = 2.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for field in ("standing_height", "pose_std", "speed_std"):
-            check_in_range(field, getattr(self, field), low=0.0, low_open=True)
+    standing_height: Positive
+    pose_std: Positive = 0.5
+    speed_std: Positive = 2.0
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         up_E = (uprightness(view) * risen(view, self.standing_height)).square()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import NonNegative
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import RewardTerm
@@ -30,11 +30,7 @@ class HopperReward(RewardTerm):
         speed: m/s, from which on the robot is fast enough; 0 only asks it to stand.
     """
 
-    speed: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("speed", self.speed, low=0.0)
+    speed: NonNegative = 0.0
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         foot_E = view.body("foot").pos_EL[:, 2]

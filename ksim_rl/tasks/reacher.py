@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl import mdp
-from ksim_rl.checks import check_pair
+from ksim_rl.checked import NonNegativeRange
 from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
@@ -35,11 +35,7 @@ class ReacherTarget(CommandTerm):
         radius: m, inner and outer radius of the ring.
     """
 
-    radius: tuple[float, float] = (0.06, 0.22)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_pair("radius", self.radius, low=0.0)
+    radius: NonNegativeRange = (0.06, 0.22)
 
     def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         share_E, angle_E = view.uniform(2).unbind(-1)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range, check_pair
+from ksim_rl.checked import Positive, Range
 from ksim_rl.envs.term import ActionTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant, values_by_name
@@ -21,7 +21,9 @@ PerJoint = float | Mapping[str, float]
 class JointAction(ActionTerm):
     """An action with one column per joint, in the order of `joints`; the actuators may stand in any order.
 
-    A raw action is clipped, squashed, scaled, filtered and shifted, in this order; each is left out by default.
+    A raw action is clipped, squashed, scaled, filtered and shifted, in this order; each is left out by default. These
+    belong to this term and may differ by joint; latency, and what treats the whole action alike in any env, are
+    transforms of the task (`ActionDelay`, `ActionClip`, `ActionScale`, `ActionLowPass`).
 
     Attributes:
         joints: names or patterns.
@@ -37,17 +39,9 @@ class JointAction(ActionTerm):
     joints: Patterns
     scale: PerJoint = 1.0
     offset: PerJoint = 0.0
-    clip: tuple[float, float] | None = None
+    clip: Range | None = None
     tanh: bool = False
-    cutoff_hz: float | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("scale", "offset"):
-            check_per_joint(name, getattr(self, name))
-        if self.clip is not None:
-            check_pair("clip", self.clip)
-        if self.cutoff_hz is not None:
-            check_in_range("cutoff_hz", self.cutoff_hz, low=0.0, low_open=True)
+    cutoff_hz: Positive | None = None
 
     def size(self, view: EnvView) -> int:
         return len(view.joints(self.joints))
@@ -71,17 +65,6 @@ class JointAction(ActionTerm):
             return action_EK
         filtered_EK = view.buffer(f"filtered_{field}_EK", action_EK.shape[1])
         return filtered_EK.lerp_(action_EK, 1.0 - math.exp(-2.0 * math.pi * self.cutoff_hz * view.step_dt))
-
-
-def check_per_joint(field: str, value: PerJoint) -> None:
-    """Refuse numbers that are not finite.
-
-    Raises:
-        ValueError: naming the field and the pattern.
-    """
-    table = value if isinstance(value, Mapping) else {None: value}
-    for pattern, number in table.items():
-        check_in_range(field if pattern is None else f"{field}[{pattern!r}]", number)
 
 
 def per_joint(view: EnvView, field: str, value: PerJoint, joints: Patterns) -> float | Float[Tensor, " K"]:

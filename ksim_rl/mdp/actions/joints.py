@@ -6,10 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import ActionTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.actions.joint_action import JointAction, PerJoint, check_per_joint
+from ksim_rl.mdp.actions.joint_action import JointAction, PerJoint
 from ksim_rl.scene.names import Patterns
 
 
@@ -68,10 +67,6 @@ class JointPositionVelocityAction(JointPositionAction):
 
     velocity_scale: PerJoint = 1.0
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_per_joint("velocity_scale", self.velocity_scale)
-
     def size(self, view: EnvView) -> int:
         return 2 * super().size(view)
 
@@ -96,9 +91,6 @@ class ActuatorAction(ActionTerm):
 
     actuators: Patterns
     scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_in_range("scale", self.scale)
 
     def size(self, view: EnvView) -> int:
         ids = view.resolver.ids("actuator", self.actuators)

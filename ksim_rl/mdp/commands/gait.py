@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range, check_pair
+from ksim_rl.checked import NonNegativeRange
 from ksim_rl.envs.term import CommandTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
@@ -27,17 +27,14 @@ class SinusoidalGaitCommand(CommandTerm):
         offsets: one per foot, in cycles: (0.0, 0.5) is a biped's walk, (0.0, 0.5, 0.5, 0.0) a trot.
     """
 
-    frequency: tuple[float, float]
+    frequency: NonNegativeRange
     offsets: tuple[float, ...]
-    resampling_time_range_s: tuple[float, float] | None = None
+    resampling_time_range_s: NonNegativeRange | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_pair("frequency", self.frequency, low=0.0)
         if not self.offsets:
             raise ValueError("offsets=(): give one per foot, such as (0.0, 0.5)")
-        for index, offset in enumerate(self.offsets):
-            check_in_range(f"offsets[{index}]", offset)
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:

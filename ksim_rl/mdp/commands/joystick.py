@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ksim_rl.checked import NonNegativeRange
 from ksim_rl.checks import check_pair
 from ksim_rl.envs.term import CommandTerm
 from ksim_rl.envs.view import EnvView
@@ -26,7 +27,7 @@ class JoystickCommand(CommandTerm):
     """
 
     axes: Mapping[str, tuple[float, float]]
-    resampling_time_range_s: tuple[float, float] | None = None
+    resampling_time_range_s: NonNegativeRange | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

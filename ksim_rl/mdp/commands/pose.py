@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ksim_rl.checks import check_pair
+from ksim_rl.checked import NonNegativeRange, Range
 from ksim_rl.envs.term import CommandTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp import se3_ranges
@@ -52,11 +52,7 @@ class BaseHeightCommand(OfEntity, HeldCommand):
         height: m.
     """
 
-    height: tuple[float, float]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_pair("height", self.height)
+    height: Range
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
@@ -85,11 +81,7 @@ class JointPositionCommand(HeldCommand):
     """
 
     joints: Patterns
-    offset: tuple[float, float]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_pair("offset", self.offset)
+    offset: Range
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
@@ -165,7 +157,7 @@ class StartPoseCommand(OfEntity, CommandTerm):
     With a resampling range, the pose at the last resampling. For tasks that stay in place, or return to it.
     """
 
-    resampling_time_range_s: tuple[float, float] | None = None
+    resampling_time_range_s: NonNegativeRange | None = None
 
     def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Mark the rows of `mask_E`: their pose is read once it is up to date."""

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import NonNegative
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 
@@ -20,11 +20,7 @@ class RewardWhileCommanded(RewardTerm):
     """
 
     command: str
-    command_threshold: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("command_threshold", self.command_threshold, low=0.0)
+    command_threshold: NonNegative
 
     def while_commanded(self, view: EnvView, value_E: Float[Tensor, " E"]) -> Float[Tensor, " E"]:
         """Return the value where the command asks to move, else 0."""

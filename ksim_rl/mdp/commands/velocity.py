@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range, check_pair
+from ksim_rl.checked import NonNegative, Range, Share
 from ksim_rl.envs.term import CommandTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
@@ -17,7 +17,6 @@ from ksim_rl.mdp.fields import OfEntity
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer, Rgba
 
-Range = tuple[float, float]
 _COMMANDED: Rgba = (0.2, 0.6, 0.2, 0.8)
 _REACHED: Rgba = (0.2, 0.3, 0.8, 0.8)
 
@@ -46,20 +45,11 @@ class UniformVelocityCommand(OfEntity, CommandTerm):
     lin_vel_y: Range
     ang_vel_z: Range
     heading: Range = (-math.pi, math.pi)
-    heading_stiffness: float = 0.5
-    rel_standing_envs: float = 0.0
-    rel_heading_envs: float = 0.0
-    rel_forward_envs: float = 0.0
-    forward_min_speed: float = 0.3
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for field in ("lin_vel_x", "lin_vel_y", "ang_vel_z", "heading"):
-            check_pair(field, getattr(self, field))
-        for field in ("rel_standing_envs", "rel_heading_envs", "rel_forward_envs"):
-            check_in_range(field, getattr(self, field), low=0.0, high=1.0)
-        check_in_range("heading_stiffness", self.heading_stiffness, low=0.0)
-        check_in_range("forward_min_speed", self.forward_min_speed, low=0.0)
+    heading_stiffness: NonNegative = 0.5
+    rel_standing_envs: Share = 0.0
+    rel_heading_envs: Share = 0.0
+    rel_forward_envs: Share = 0.0
+    forward_min_speed: NonNegative = 0.3
 
     @property
     def ranges(self) -> Mapping[str, Range]:

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ksim_rl.checked import Count, Share, WholeNumber
 from ksim_rl.checks import check_in_range, unknown_name
 from ksim_rl.envs.term import CurriculumTerm
 from ksim_rl.envs.view import EnvView
@@ -25,10 +26,7 @@ class LevelCurriculum(CurriculumTerm):
         initial_level: of an env that has just been built.
     """
 
-    initial_level: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_in_range("initial_level", self.initial_level, low=0.0, high=1.0)
+    initial_level: Share = 0.0
 
     @property
     def first_level(self) -> float:
@@ -43,12 +41,11 @@ class LinearLevel(LevelCurriculum):
         begin_step, end_step: env steps since the env was seeded.
     """
 
-    begin_step: int = 0
+    begin_step: WholeNumber = 0
     end_step: int
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_in_range("begin_step", self.begin_step, low=0)
         check_in_range("end_step", self.end_step, low=self.begin_step, low_open=True)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
@@ -72,17 +69,13 @@ class SteppedLevel(LevelCurriculum):
 
     raise_above: float
     lower_below: float | None = None
-    num_levels: int = 10
-    min_episodes: int | None = None
+    num_levels: Count = 10
+    min_episodes: Count | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_in_range("raise_above", self.raise_above)
         if self.lower_below is not None:
             check_in_range("lower_below", self.lower_below, high=self.raise_above)
-        check_in_range("num_levels", self.num_levels, low=1)
-        if self.min_episodes is not None:
-            check_in_range("min_episodes", self.min_episodes, low=1)
 
     @abstractmethod
     def score(self, view: EnvView) -> Float[Tensor, " E"]:

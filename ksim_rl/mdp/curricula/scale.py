@@ -77,11 +77,6 @@ class RewardWeightByLevel(RewardWeight):
     start: float
     end: float
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("start", self.start)
-        check_in_range("end", self.end)
-
     def weight(self, view: EnvView, held: Float[Tensor, ""]) -> Float[Tensor, ""]:
         return self.start + (self.end - self.start) * view.level
 
@@ -102,6 +97,7 @@ class CommandRangesByStage(CurriculumTerm):
     stages: Mapping[int, Ranges]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_steps(self.stages)
         for step, ranges in self.stages.items():
             _check_ranges(f"stages.{step}", ranges)
@@ -137,6 +133,7 @@ class CommandRangesByLevel(CurriculumTerm):
     end: Ranges
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_ranges("start", self.start)
         _check_ranges("end", self.end)
         if self.start.keys() != self.end.keys():

@@ -1,12 +1,13 @@
 """The curriculum of a terrain grid moves each env through its levels by how far its robot walks."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import NonNegative, Within
 from ksim_rl.envs.term import CurriculumTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.fields import OfEntity
@@ -29,12 +30,8 @@ class TerrainLevels(OfEntity, CurriculumTerm):
     """
 
     command: str
-    up_distance: float = 0.8
-    down_share: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_in_range("up_distance", self.up_distance, low=0.0, high=1.0, low_open=True)
-        check_in_range("down_share", self.down_share, low=0.0)
+    up_distance: Annotated[float, Within(low=0.0, high=1.0, low_open=True)] = 0.8
+    down_share: NonNegative = 0.5
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         """Move the rows of `mask_E` that have had an episode, and return the mean level of all envs, float32 []."""

@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ksim_rl.checks import check_choice, check_in_range, check_pair
+from ksim_rl.checked import Range
+from ksim_rl.checks import check_in_range, check_pair
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
@@ -47,7 +48,6 @@ class ResetJoints(JointReset):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_choice("distribution", self.distribution, ("uniform", "gaussian"))
         for name in ("position_range", "velocity_range"):
             if self.distribution == "uniform":
                 check_pair(name, getattr(self, name))
@@ -78,13 +78,8 @@ class ResetJointsByScale(JointReset):
         velocity_range: rad/s or m/s, uniform.
     """
 
-    position_scale: tuple[float, float]
-    velocity_range: tuple[float, float] = (0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_pair("position_scale", self.position_scale)
-        check_pair("velocity_range", self.velocity_range)
+    position_scale: Range
+    velocity_range: Range = (0.0, 0.0)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         default_EL = view.joints(self.joints).default_pos_EL

@@ -1,12 +1,13 @@
 """This event lets episodes begin somewhere in a reference motion."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from ksim_rl.checks import check_pair
+from ksim_rl.checked import Within
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.scene.state.motion_clock import motion_shift, motion_start_time
@@ -24,11 +25,7 @@ class ResetToMotion(EventTerm):
     """
 
     file: str
-    start_range: tuple[float, float] = (0.0, 1.0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_pair("start_range", self.start_range, low=0.0, high=1.0)
+    start_range: Annotated[tuple[float, float], Within(low=0.0, high=1.0, ordered=True)] = (0.0, 1.0)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         motion, start_E = view.motion(self.file), motion_start_time(view, self.file)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from ksim_rl.checks import check_pair
+from ksim_rl.checked import NonNegativeRange
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp import se3_ranges
@@ -51,13 +51,12 @@ class PushByForce(EventTerm):
 
     body: str
     wrench_range: Mapping[str, tuple[float, float]]
-    duration_s: tuple[float, float]
+    duration_s: NonNegativeRange
     mode: Literal["startup", "reset", "interval", "step"] = "interval"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         se3_ranges.check_ranges("wrench_range", self.wrench_range)
-        check_pair("duration_s", self.duration_s, low=0.0)
         if self.mode != "interval":
             raise ValueError(f"mode={self.mode!r}: expected 'interval', which also says when a push ends")
 
@@ -83,12 +82,8 @@ class Jump(OfFreeRoot, EventTerm):
         height_range: h, m, in free flight.
     """
 
-    height_range: tuple[float, float]
+    height_range: NonNegativeRange
     mode: Literal["startup", "reset", "interval", "step"] = "interval"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_pair("height_range", self.height_range, low=0.0)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         body = self.root_of(view)

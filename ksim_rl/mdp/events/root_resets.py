@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from ksim_rl.checks import check_pair
+from ksim_rl.checked import Range
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp import se3_ranges
@@ -59,11 +59,7 @@ class ResetHeading(OfFreeRoot, EventTerm):
         heading_range: rad.
     """
 
-    heading_range: tuple[float, float] = (-math.pi, math.pi)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_pair("heading_range", self.heading_range)
+    heading_range: Range = (-math.pi, math.pi)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         body = self.root_of(view)
@@ -83,11 +79,7 @@ class ResetHeight(OfFreeRoot, EventTerm):
         height_range: m.
     """
 
-    height_range: tuple[float, float]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_pair("height_range", self.height_range)
+    height_range: Range
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         body = self.root_of(view)

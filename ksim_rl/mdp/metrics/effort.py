@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Positive
 from ksim_rl.envs.term import MetricTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.fields import OfEntity, OfJoints
@@ -34,12 +34,8 @@ class CostOfTransport(OfJoints, OfEntity, MetricTerm):
         min_distance: m; a path that is still shorter counts as this long, so that standing still gives a finite value.
     """
 
-    min_distance: float = 0.1
+    min_distance: Positive = 0.1
     reduce: Literal["mean", "last", "max", "sum"] = "last"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("min_distance", self.min_distance, low=0.0, low_open=True)
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         robot, model = view.entity(self.entity), view.world.mj_model

@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range, unknown_name
+from ksim_rl.checked import Positive
+from ksim_rl.checks import unknown_name
 from ksim_rl.envs.term import MetricTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.commands.target_pose import OfTarget
@@ -17,7 +18,7 @@ from ksim_rl.mdp.commands.target_pose import OfTarget
 class Success(MetricTerm):
     """1 where the episode ends by one of the named terminations and by no other, else 0, [E].
 
-    With the time-out it is the share of episodes that survived.
+    With the time-out it is the share of episodes that survived. Envs that are not made of terms have `SuccessTracker`.
 
     Attributes:
         terminations: names in the env's `terminations`.
@@ -54,12 +55,8 @@ class TargetReached(OfTarget, MetricTerm):
         tolerance: m.
     """
 
-    tolerance: float
+    tolerance: Positive
     reduce: Literal["mean", "last", "max", "sum"] = "last"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("tolerance", self.tolerance, low=0.0, low_open=True)
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return (self.distance(view) <= self.tolerance).to(torch.float32)

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ksim_rl.checked import NonNegative
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.fields import OfContacts
@@ -23,7 +24,7 @@ from ksim_rl.scene.names import Patterns
 class Contact(OfContacts, ObservationTerm):
     """1 where the net contact force exceeds a threshold, else 0, [E, N]; acceleration stage."""
 
-    threshold: float = 0.0
+    threshold: NonNegative = 0.0
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E N"]:
         return (contact_force(view, self.sensor) > self.threshold).to(torch.float32)

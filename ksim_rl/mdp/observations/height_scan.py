@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range, check_pair
+from ksim_rl.checked import Positive, Range, Within
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
@@ -31,17 +32,10 @@ class HeightScan(OfEntity, ObservationTerm):
         clip: readings are clipped to this range, m.
     """
 
-    size: tuple[float, float] = (1.6, 1.0)
-    resolution: float = 0.1
+    size: Annotated[tuple[float, float], Within(low=0.0)] = (1.6, 1.0)
+    resolution: Positive = 0.1
     offset: float = 0.5
-    clip: tuple[float, float] = (-1.0, 1.0)
-
-    def __post_init__(self) -> None:
-        check_in_range("resolution", self.resolution, low=0.0, low_open=True)
-        for index, edge in enumerate(self.size):
-            check_in_range(f"size[{index}]", edge, low=0.0)
-        check_in_range("offset", self.offset)
-        check_pair("clip", self.clip)
+    clip: Range = (-1.0, 1.0)
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         body = view.entity(self.entity)

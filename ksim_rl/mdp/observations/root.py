@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import NonNegative
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.fields import InFrame, OfEntity
@@ -69,10 +69,7 @@ class ProjectedGravity(OfEntity, ObservationTerm):
             filter with the new orientation.
     """
 
-    time_constant: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_in_range("time_constant", self.time_constant, low=0.0)
+    time_constant: NonNegative = 0.0
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         gravity_E3 = view.entity(self.entity).projected_gravity_EL

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from ksim_rl.checks import check_choice, check_in_range, check_pair
+from ksim_rl.checked import Range
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 
@@ -27,9 +27,6 @@ class ImuReading(ObservationTerm):
     sensor: str
     quantity: Literal["ang_vel", "lin_acc", "quat", "projected_gravity"] = "ang_vel"
 
-    def __post_init__(self) -> None:
-        check_choice("quantity", self.quantity, IMU_QUANTITIES)
-
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return getattr(view.imu(self.sensor), f"{self.quantity}_EL")
 
@@ -48,9 +45,6 @@ class CameraImage(ObservationTerm):
 
     sensor: str
     output: Literal["rgb", "depth", "segmentation"] = "rgb"
-
-    def __post_init__(self) -> None:
-        check_choice("output", self.output, CAMERA_OUTPUTS)
 
     def __call__(self, view: EnvView) -> Shaped[Tensor, " E *image"]:
         camera = view.camera(self.sensor)
@@ -80,11 +74,7 @@ class RayHeight(ObservationTerm):
 
     sensor: str
     offset: float = 0.0
-    clip: tuple[float, float] = (-1.0, 1.0)
-
-    def __post_init__(self) -> None:
-        check_in_range("offset", self.offset)
-        check_pair("clip", self.clip)
+    clip: Range = (-1.0, 1.0)
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         tracker = view.rays(self.sensor)

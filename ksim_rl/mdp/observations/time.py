@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Positive
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
@@ -23,7 +23,10 @@ class EpisodeTime(ObservationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class RemainingTime(ObservationTerm):
-    """Time until the episode times out (`TimeOut`), s, [E, 1]. Needs `episode_length_s`."""
+    """Time until the episode times out (`TimeOut`), s, [E, 1]. Needs `episode_length_s`.
+
+    Envs that are not made of terms have `TimeAwareObservation`, which counts steps itself.
+    """
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         if view.max_episode_length == 0:
@@ -43,15 +46,13 @@ class Clock(ObservationTerm):
         phases: P offsets in cycles, one per foot, say; (0.0, 0.5) are in antiphase.
     """
 
-    frequency: float
+    frequency: Positive
     phases: tuple[float, ...] = (0.0,)
 
     def __post_init__(self) -> None:
-        check_in_range("frequency", self.frequency, low=0.0, low_open=True)
+        super().__post_init__()
         if not self.phases:
             raise ValueError("phases=(): give at least one, such as (0.0,)")
-        for index, phase in enumerate(self.phases):
-            check_in_range(f"phases[{index}]", phase)
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         offsets_P = constant([2.0 * math.pi * phase for phase in self.phases], view.device)

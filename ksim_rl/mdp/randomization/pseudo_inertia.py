@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from ksim_rl.checks import check_choice
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant
 from ksim_rl.mdp.randomization.bodies import second_moments
@@ -47,8 +46,6 @@ class RandomizePseudoInertia(Randomize):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_choice("operation", self.operation, ("add",))
-        check_choice("distribution", self.distribution, ("uniform", "gaussian"))
         for name in ("alpha", "stretch", "shear", "shift"):
             self.check_range(name, getattr(self, name))
 

@@ -24,8 +24,6 @@ Pair = tuple[float, float]
 Mode = Literal["startup", "reset", "interval", "step"]
 Operation = Literal["abs", "add", "scale"]
 Distribution = Literal["uniform", "log_uniform", "gaussian"]
-OPERATIONS = ("abs", "add", "scale")
-DISTRIBUTIONS = ("uniform", "log_uniform", "gaussian")
 # Where a gaussian draw is cut, in standard deviations, so that its reach can be checked.
 CUT = 3.0
 
@@ -45,11 +43,6 @@ class Randomize(EventTerm):
     distribution: Distribution = "uniform"
     shared: bool = False
     mode: Mode = "startup"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_choice("operation", self.operation, OPERATIONS)
-        check_choice("distribution", self.distribution, DISTRIBUTIONS)
 
     def check_range(self, name: str, pair: object) -> None:
         """Refuse a range that the distribution cannot draw from.

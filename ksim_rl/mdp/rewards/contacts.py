@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ksim_rl.checked import NonNegative
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.fields import OfContacts
@@ -24,7 +25,7 @@ class ContactForceAbove(OfContacts, RewardTerm):
 class UndesiredContacts(OfContacts, RewardTerm):
     """Number of the sensor's elements whose net contact force exceeds a threshold."""
 
-    threshold: float = 1.0
+    threshold: NonNegative = 1.0
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return (contact_force(view, self.sensor) > self.threshold).to(torch.float32).sum(-1)
@@ -39,7 +40,7 @@ class SelfCollision(OfContacts, RewardTerm):
     seen.
     """
 
-    threshold: float = 10.0
+    threshold: NonNegative = 10.0
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         force_ESN = torch.linalg.vector_norm(view.contact(self.sensor).force_history_ESN3, dim=-1)

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ksim_rl.checked import Positive
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.commands.speed import RewardWhileCommanded
@@ -47,11 +48,7 @@ class FootSwingHeight(OfFeet, RewardWhileCommanded):
         target_height: m, above the ground right below a foot.
     """
 
-    target_height: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("target_height", self.target_height, low=0.0, low_open=True)
+    target_height: Positive
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         contact = self.contact(view)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Positive
 from ksim_rl.envs.term import RewardTerm
 
 
@@ -18,11 +18,7 @@ class GaussianReward(RewardTerm):
         std: in the unit of the error.
     """
 
-    std: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("std", self.std, low=0.0, low_open=True)
+    std: Positive
 
     def rate(self, squared_error_E: Float[Tensor, " E"]) -> Float[Tensor, " E"]:
         """Return the reward of a squared error."""

@@ -6,12 +6,13 @@ Positions and velocities are of the current state; accelerations, efforts and fo
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Positive, Within
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant, values_by_name
@@ -29,14 +30,8 @@ class JointLimitReward(OfJoints, RewardTerm):
         soft_factor: fraction of the limit that is free of penalty.
     """
 
-    limits: Mapping[str, float]
-    soft_factor: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for pattern, limit in self.limits.items():
-            check_in_range(f"limits[{pattern!r}]", limit, low=0.0, low_open=True)
-        check_in_range("soft_factor", self.soft_factor, low=0.0, high=1.0, low_open=True)
+    limits: Mapping[str, Positive]
+    soft_factor: Annotated[float, Within(low=0.0, high=1.0, low_open=True)] = 1.0
 
     def overshoot(self, view: EnvView, value_EL: Float[Tensor, "E L"]) -> Float[Tensor, " E"]:
         """Return the sum for the values of the joints."""

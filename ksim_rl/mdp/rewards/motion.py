@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import NonNegative
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.commands.speed import is_commanded
@@ -77,11 +77,7 @@ class MotionlessAtRest(OfJoints, RewardTerm):
     """
 
     command: str
-    command_threshold: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("command_threshold", self.command_threshold, low=0.0)
+    command_threshold: NonNegative
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         motion_E = view.joints(self.joints).vel_EL.square().sum(-1)

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ksim_rl.checked import Positive
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
@@ -61,10 +62,6 @@ class RootHeightL2(OfEntity, RewardTerm):
 
     target_height: float
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_in_range("target_height", self.target_height)
-
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return (root_height(view, self.entity) - self.target_height).square()
 
@@ -82,17 +79,14 @@ class Pose(OfJoints, RewardTerm):
     """
 
     command: str
-    std_standing: Mapping[str, float]
-    std_walking: Mapping[str, float]
-    std_running: Mapping[str, float]
+    std_standing: Mapping[str, Positive]
+    std_walking: Mapping[str, Positive]
+    std_running: Mapping[str, Positive]
     walking_threshold: float
     running_threshold: float
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for field in ("std_standing", "std_walking", "std_running"):
-            for pattern, std in getattr(self, field).items():
-                check_in_range(f"{field}[{pattern!r}]", std, low=0.0, low_open=True)
         check_in_range("running_threshold", self.running_threshold, low=self.walking_threshold)
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:

@@ -176,7 +176,7 @@ def test_scale_must_name_each_joint(arms):
     ("fields", "message"),
     [
         ({"scale": math.nan}, "scale"),
-        ({"offset": {"elbow": math.inf}}, r"offset\['elbow'\]"),
+        ({"offset": {"elbow": math.inf}}, r"offset\.elbow=inf"),
         ({"clip": (1.0, -1.0)}, "clip"),
         ({"cutoff_hz": 0.0}, "cutoff_hz"),
     ],

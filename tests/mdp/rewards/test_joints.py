@@ -69,7 +69,7 @@ def test_energy_is_the_power_of_all_joints(wheels):
 
 @pytest.mark.parametrize("term", [mdp.JointVelLimits, mdp.JointEffortLimits])
 def test_limits_must_be_positive_and_complete(free_body, term):
-    with pytest.raises(ValueError, match=r"limits\['\.\*'\]=0"):
+    with pytest.raises(ValueError, match=r"limits\.\.\*=0"):
         term(limits={".*": 0.0})
     with pytest.raises(ValueError, match="soft_factor=1.5"):
         term(limits={".*": 1.0}, soft_factor=1.5)
