@@ -158,8 +158,8 @@ def has_axes(annotation: ast.expr) -> bool:
 def suffix_agrees(name: str, axes: str) -> bool:
     """Say whether a name ends as its axes want: `qpos_EL` for "E L", `mean_E3` for "E 3", none for scalars.
 
-    A timestamp may follow. TorchRL's trailing one need not be spelled: "E T 1" may end in `_ET`. A leaf of known size may
-    be called L: a position is `pos_EL` or `pos_E3`.
+    A timestamp may follow. TorchRL's trailing one need not be spelled: "E T 1" may end in `_ET`. A leaf of known size
+    may be called L: a position is `pos_EL` or `pos_E3`.
     """
     found = _SUFFIX.search(_TIMESTAMP.sub("", name))
     suffix = found.group(1) if found else ""
