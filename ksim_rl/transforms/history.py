@@ -162,7 +162,7 @@ class ObservationHistory(RowTransform):
         value_E = value if value.ndim == ring_EM.ndim - 1 else value.reshape(-1, *ring_EM.shape[2:])
         length = self.length
         if mask_E is not None:
-            return ring.begin(ring_EM, age_E, value_E, mask_E, num_frames=length, parts=parts)
+            return ring.begin(ring_EM, age_E, value_E, mask_E, num_frames=length, parts_C=parts)
         return ring.push(
-            ring_EM, age_E, value_E, num_frames=length, stride=self.stride, parts=parts, counts=counts
+            ring_EM, age_E, value_E, num_frames=length, stride=self.stride, parts_C=parts, counts=counts
         )

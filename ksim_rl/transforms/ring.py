@@ -165,7 +165,7 @@ def push(
     lag_E: Int64[Tensor, " E"] | None = None,
     num_frames: int = 1,
     stride: int = 0,
-    parts: Int32[Tensor, " C"] | None = None,
+    parts_C: Int32[Tensor, " C"] | None = None,
     counts: bool = True,
 ) -> Shaped[Tensor, "E L"]:
     """Go on by one step: write its values, and return those of some steps ago.
@@ -177,14 +177,14 @@ def push(
         lag_E: of the newest frame, int64; None for 0. All lags have to be below M.
         num_frames: N, of each env; the newest is the last.
         stride: steps from one frame to the next.
-        parts: int32 sizes in bytes of what a value consists of; what is returned has all frames of the first part,
+        parts_C: int32 sizes in bytes of what a value consists of; what is returned has all frames of the first part,
             then all of the second one, and so on. None for one part.
         counts: whether the age goes on; of several rings with one age only the last one may do that.
 
     Returns:
         [E, N * L] for L elements per env. A lag that reaches back beyond the reset gives the value of that.
     """
-    return _run(ring_EM, age_E, value_E, lag_E, None, num_frames, stride, parts, counts, *_NO_LAGS[1:])
+    return _run(ring_EM, age_E, value_E, lag_E, None, num_frames, stride, parts_C, counts, *_NO_LAGS[1:])
 
 
 def begin(
@@ -194,7 +194,7 @@ def begin(
     mask_E: Bool[Tensor, " E"],
     *,
     num_frames: int = 1,
-    parts: Int32[Tensor, " C"] | None = None,
+    parts_C: Int32[Tensor, " C"] | None = None,
     lags: Lags | None = None,
 ) -> Shaped[Tensor, "E L"]:
     """Let the masked rows begin with these values, and return each row's value `num_frames` times; see `push`.
@@ -202,7 +202,7 @@ def begin(
     With `lags`, these rows also draw new ones.
     """
     drawn = _NO_LAGS if lags is None else lags
-    return _run(ring_EM, age_E, value_E, drawn[0], mask_E, num_frames, 0, parts, True, *drawn[1:])
+    return _run(ring_EM, age_E, value_E, drawn[0], mask_E, num_frames, 0, parts_C, True, *drawn[1:])
 
 
 def _run(*arguments: object) -> Tensor:

@@ -102,10 +102,12 @@ def test_rings_of_several_parts_give_all_frames_of_one_part_after_another(sizes)
     age_E = torch.zeros(rows, dtype=torch.int64, device="cuda")
     parts = torch.tensor([4 * size for size in sizes], dtype=torch.int32, device="cuda")
     mask_E = torch.arange(rows, device="cuda") % 3 == 0
-    ring.begin(ring_EM, age_E, pushed_TEL[0], torch.ones_like(mask_E), num_frames=length, parts=parts)
+    ring.begin(ring_EM, age_E, pushed_TEL[0], torch.ones_like(mask_E), num_frames=length, parts_C=parts)
     first_E = torch.zeros_like(age_E)
     for step in range(1, 12):
-        found_EL = ring.push(ring_EM, age_E, pushed_TEL[step], num_frames=length, stride=stride, parts=parts)
+        found_EL = ring.push(
+            ring_EM, age_E, pushed_TEL[step], num_frames=length, stride=stride, parts_C=parts
+        )
         start = 0
         for part_EL in pushed_TEL.split(sizes, dim=2):
             for frame in range(length):
@@ -117,7 +119,7 @@ def test_rings_of_several_parts_give_all_frames_of_one_part_after_another(sizes)
                 assert torch.equal(found_EL[:, start:stop], expected_EL), (step, frame)
                 start = stop
         if step == 6:
-            ring.begin(ring_EM, age_E, pushed_TEL[6], mask_E, num_frames=length, parts=parts)
+            ring.begin(ring_EM, age_E, pushed_TEL[6], mask_E, num_frames=length, parts_C=parts)
             first_E = torch.where(mask_E, 6, first_E)
 
 
