@@ -19,8 +19,8 @@ from benchmarks import command_line, report
 
 _CHILD = """
 import sys
-from ksim_rl.cli.main import collector_off
-with collector_off():
+from ksim_rl.cli.main import gc_disabled
+with gc_disabled():
     from ksim_rl import conf
     from ksim_rl.trainers import build
 trainer = build(conf.compose(sys.argv[1:]))

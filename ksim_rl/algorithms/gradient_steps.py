@@ -1,14 +1,17 @@
-"""What the updates share: their dataset, its epochs of gradient steps, and what these measured."""
+"""The updates share what is here: their dataset, its epochs of gradient steps, and what these measured."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Num
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
 from ksim_rl.data import DatasetBuffer, DatasetCfg, SequenceSampler
+from ksim_rl.device.capture import Captured
 from ksim_rl.modules import burnt_in
 from ksim_rl.objectives import NonFiniteStepsError, StepGuard, ppo_step
 
@@ -42,7 +45,7 @@ def epoch_of_steps(
     cfg: Any,
     guard: StepGuard,
     memories: Sequence[TensorDictModuleBase],
-) -> list[dict[str, Tensor]]:
+) -> list[dict[str, Num[Tensor, ""]]]:
     """Make a gradient step on each minibatch of one epoch; return what each measured, as `ppo_step` names it.
 
     Beside it stands `skipped_in_a_row`, the guard's count after the step.
@@ -56,7 +59,7 @@ def epoch_of_steps(
     return steps
 
 
-def in_columns(steps: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+def in_columns(steps: Sequence[Mapping[str, Num[Tensor, ""]]]) -> dict[str, Num[Tensor, " steps"]]:
     """Return what steps measured, each quantity as a tensor [steps]."""
     return {name: torch.stack([step[name] for step in steps]) for name in steps[0]}
 
@@ -72,7 +75,7 @@ class StepMeans(dict[str, Tensor]):
         super().__init__()
         self._names = names
 
-    def take_(self, steps: Mapping[str, Tensor]) -> None:
+    def take_(self, steps: Mapping[str, Num[Tensor, " steps"]]) -> None:
         """Take the means of `steps`, each [steps], over those that were made."""
         made = steps["skipped"] == 0.0
         count = made.sum().clamp_min(1)
@@ -83,13 +86,53 @@ class StepMeans(dict[str, Tensor]):
                 self.setdefault(logged, torch.zeros_like(total)).copy_(total / count)
 
 
-def check_skipped_steps(metrics: Mapping[str, float], limit: int) -> None:
-    """Stop a run that skips its gradient steps; `metrics` are those of an update, on the host.
+class RolloutUpdate:
+    """What the updates have in common: each is one piece of work on a rollout, without a host sync.
 
-    Raises:
-        NonFiniteStepsError: if `limit` or more in a row were skipped.
+    On CUDA the first updates run eagerly and the next is captured. So each rollout must be the same memory, which is
+    what `RolloutCollector` gives.
+
+    Args:
+        max_skipped_steps: so many gradient steps in a row that are not finite end the run.
+        device: where all of it lives.
+
+    Attributes:
+        guard: counts gradient steps that were skipped.
     """
-    # Not the guard, which knows only of those since the last step that was made.
-    in_a_row = int(metrics["update/skipped_in_a_row"])
-    if in_a_row >= limit:
-        raise NonFiniteStepsError.of(in_a_row, limit=limit, skipped=int(metrics["update/skipped_steps"]))
+
+    def __init__(self, *, max_skipped_steps: int, device: torch.device | str) -> None:
+        self.device = torch.device(device)
+        self.guard = StepGuard(device=self.device)
+        self._max_skipped_steps = max_skipped_steps
+        self._rollout_ET: TensorDictBase | None = None
+        self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
+        self._run = Captured(self._update, device=self.device)
+
+    def __call__(self, rollout_ET: TensorDictBase) -> None:
+        """Learn from a rollout `["E","T"]` of the dataset's size."""
+        self._rollout_ET = rollout_ET
+        self._run()
+
+    def check(self, metrics: Mapping[str, float]) -> None:
+        """Stop a run that skips its gradient steps; `metrics` are those of `metrics()`, on the host.
+
+        Raises:
+            NonFiniteStepsError: if `max_skipped_steps` or more in a row were skipped.
+        """
+        # Not the guard, which knows only of those since the last step that was made.
+        in_a_row, limit = int(metrics["update/skipped_in_a_row"]), self._max_skipped_steps
+        if in_a_row >= limit:
+            raise NonFiniteStepsError.of(in_a_row, limit=limit, skipped=int(metrics["update/skipped_steps"]))
+
+    @property
+    def rollout_ET(self) -> TensorDictBase:
+        """The rollout that the update is about."""
+        assert self._rollout_ET is not None
+        return self._rollout_ET
+
+    def _skipped(self) -> dict[str, Tensor]:
+        """Return the metrics of the gradient steps that were not made."""
+        return {"update/skipped_steps": self.guard.skipped, "update/skipped_in_a_row": self._longest_skip}
+
+    def _update(self) -> None:
+        raise NotImplementedError

@@ -1,4 +1,4 @@
-"""The state of an optimizer with one group of parameters, as a checkpoint holds it."""
+"""This module turns the state of an optimizer with one group of parameters into what a checkpoint holds, and back."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,1 +1,1 @@
-"""The command `ksim-rl`."""
+"""This room is the command `ksim-rl`."""

@@ -1,4 +1,4 @@
-"""Checks a `ksim-rl train` command line as a whole, before anything is built or written."""
+"""This module checks a `ksim-rl train` command line as a whole, before anything is built or written."""
 
 import itertools
 from collections.abc import Iterator, Sequence

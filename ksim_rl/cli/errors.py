@@ -1,4 +1,4 @@
-"""What an error tells the user, and the exit code that it stands for."""
+"""This module turns an error into one line for the user and an exit code."""
 
 import os
 import sys

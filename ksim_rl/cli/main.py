@@ -1,4 +1,4 @@
-"""`ksim-rl <command>`: finds the command, and turns errors of users into one line."""
+"""`ksim-rl <command>` starts here: the command is found, and errors of users become one line."""
 
 import gc
 import sys
@@ -59,7 +59,7 @@ def _dispatch(arguments: list[str]) -> int:
         raise unknown_name("command", command, COMMANDS)
     # Imported here, so that usage and mistyped commands answer at once.
     rest, names = _without_plugins(rest)
-    with collector_off():
+    with gc_disabled():
         from ksim_rl.cli import run_commands
         from ksim_rl.cli.train import train
         from ksim_rl.cli.warmup import warmup
@@ -90,7 +90,7 @@ def _without_plugins(arguments: list[str]) -> tuple[list[str], list[str]]:
 
 
 @contextmanager
-def collector_off() -> Iterator[None]:
+def gc_disabled() -> Iterator[None]:
     """Import without the garbage collector, which would look through all modules again and again, and at exit too."""
     if "torch" in sys.modules:  # called by a program whose objects are not ours to freeze
         yield

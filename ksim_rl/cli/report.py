@@ -1,4 +1,4 @@
-"""What a command says about a run."""
+"""This module trains for a command, and prints how the run went."""
 
 import os
 from pathlib import Path

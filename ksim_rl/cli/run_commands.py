@@ -1,4 +1,4 @@
-"""The commands that take no Hydra overrides: resume, eval, play, envs."""
+"""This module holds the commands that take no Hydra overrides: resume, eval, play, envs."""
 
 import argparse
 import dataclasses
@@ -12,9 +12,9 @@ from ksim_rl import envs
 from ksim_rl.checks import check_in_range
 from ksim_rl.cli.report import run_and_report, shown, verdict
 from ksim_rl.device.compile_notice import compile_notice
+from ksim_rl.envs.contract import part
 from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, load_policy, record_video
 from ksim_rl.trainers.build import build_evaluator, solved_at
-from ksim_rl.transforms.innermost import innermost
 
 VIDEO_SUFFIXES = (".mp4", ".gif")
 
@@ -100,7 +100,9 @@ def _envs(arguments: list[str]) -> int:
         with compile_notice(RunProgress(1).status):
             device = "cuda" if torch.cuda.is_available() else "cpu"
             env = envs.make(options.task, num_envs=1, device=device)
-        print(innermost(env).explain(), end="")
+        ours = part(env, envs.ManagerBasedRlEnv)
+        assert ours is not None
+        print(ours.explain(), end="")
         return 0
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("task", "robot", "episode", "observations", "solved at", "description"):

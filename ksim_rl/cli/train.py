@@ -1,4 +1,4 @@
-"""`ksim-rl train`: Hydra composes the config, the trainers do the rest."""
+"""`ksim-rl train` lets Hydra compose the config, and trains with it."""
 
 import argparse
 import dataclasses

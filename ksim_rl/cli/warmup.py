@@ -1,4 +1,4 @@
-"""`ksim-rl warmup`: compiles what a run needs ahead of time, and says how long that took."""
+"""`ksim-rl warmup` compiles what a run needs ahead of time, and prints how long that took."""
 
 import dataclasses
 import time

@@ -16,6 +16,7 @@ from ksim_rl.conf import choices, search_path
 from ksim_rl.conf.training import objective_defaults, training_defaults
 from ksim_rl.config import plugins, stored_configs
 from ksim_rl.trainers import RunCfg
+from ksim_rl.trainers.run_cfg import without_env_size
 
 MODULE, NAME = "ksim_rl.conf", "train"
 RUN_AGAIN, RUN_CONFIG = "run_again", "config.yaml"
@@ -65,10 +66,8 @@ def _register(_named: tuple[str, ...]) -> None:
 def register_run(folder: Path) -> bool:
     """Store the config that a run left in its folder as the primary config `RUN_AGAIN`; False if there is none.
 
-    Its number of envs and its seed follow overrides, as they do in a config that is composed.
-
     Raises:
-        ValueError: if its file is not YAML.
+        ValueError: if its file is not YAML, or its env has another seed than the run.
     """
     path = folder / RUN_CONFIG
     try:
@@ -80,8 +79,6 @@ def register_run(folder: Path) -> bool:
     task = tree["task"]
     if not isinstance(task, dict) or not isinstance(task.get("scene"), dict):
         raise ValueError(f"{path}: task={task!r}: expected the config of an env, as a run writes it")
-    task["scene"]["num_envs"] = "${num_envs}"
-    if task.get("seed") == tree.get("seed"):
-        task["seed"] = "${seed}"
-    ConfigStore.instance().store(name=RUN_AGAIN, node={"defaults": ["launch", "_self_"], **tree})
+    plain = without_env_size({str(key): value for key, value in tree.items()})
+    ConfigStore.instance().store(name=RUN_AGAIN, node={"defaults": ["launch", "_self_"], **plain})
     return True

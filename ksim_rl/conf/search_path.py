@@ -1,4 +1,4 @@
-"""Lets Hydra find the YAML configs of other packages (see `ksim_rl.config.plugins`)."""
+"""This module lets Hydra find the YAML configs of other packages (see `ksim_rl.config.plugins`)."""
 
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.plugins import Plugins

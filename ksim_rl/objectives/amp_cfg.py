@@ -1,8 +1,8 @@
-"""The settings of PPO with an adversarial motion prior."""
+"""This module holds the settings of PPO with an adversarial motion prior."""
 
 from dataclasses import dataclass
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checks import check_count, check_in_range
 from ksim_rl.objectives.ppo_cfg import PPOCfg
 
 
@@ -71,6 +71,4 @@ class AMPCfg(PPOCfg):
             # A rollout whose episodes all end at once takes two places per env state, and must not overwrite itself.
             ("replay_rollouts", 3),
         ):
-            value = getattr(self, field)
-            if isinstance(value, bool) or not isinstance(value, int) or value < low:
-                raise ValueError(f"{field}={value!r}: expected a whole number >= {low}")
+            check_count(field, getattr(self, field), low=low)

@@ -1,15 +1,15 @@
-"""The settings of off-policy learning: SAC and TD3, and their recipes for many envs, FastSAC and FastTD3."""
+"""This module holds the settings of off-policy learning with SAC and TD3."""
 
 from dataclasses import dataclass
 
-from ksim_rl.checks import check_choice, check_in_range
-from ksim_rl.objectives.algorithm_cfg import AlgorithmCfg
+from ksim_rl.checks import check_choice, check_count, check_in_range
+from ksim_rl.objectives.algorithm_cfg import GradientCfg
 
 VALUE_REDUCTIONS = ("min", "mean")
 
 
 @dataclass(frozen=True, kw_only=True)
-class OffPolicyCfg(AlgorithmCfg):
+class OffPolicyCfg(GradientCfg):
     """What all off-policy objectives share.
 
     Attributes:
@@ -19,10 +19,7 @@ class OffPolicyCfg(AlgorithmCfg):
             Fujimoto et al., arXiv 1802.09477); "mean" lets each network learn from its own target and climbs the mean.
         policy_delay: gradient steps of the critics for each of the actor.
         critic_learning_rate, actor_learning_rate: of AdamW.
-        betas, adam_eps, weight_decay: of AdamW.
-        max_grad_norm: bound on the norm of the gradient; None does not clip.
         autocast: run the networks in bfloat16, with float32 weights.
-        max_skipped_steps: so many gradient steps in a row that are not finite end the run.
     """
 
     gamma: float = 0.99
@@ -31,29 +28,16 @@ class OffPolicyCfg(AlgorithmCfg):
     policy_delay: int = 1
     critic_learning_rate: float = 3e-4
     actor_learning_rate: float = 3e-4
-    betas: tuple[float, float] = (0.9, 0.999)
-    adam_eps: float = 1e-8
-    weight_decay: float = 0.0
-    max_grad_norm: float | None = None
     autocast: bool = False
-    max_skipped_steps: int = 100
 
     def __post_init__(self) -> None:
         """Refuse values out of range, naming the field."""
-        object.__setattr__(self, "betas", tuple(self.betas))
-        for field in ("policy_delay", "max_skipped_steps"):
-            value = getattr(self, field)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{field}={value!r}: expected a whole number >= 1")
+        super().__post_init__()
+        check_count("policy_delay", self.policy_delay)
         check_in_range("gamma", self.gamma, low=0.0, high=1.0)
         check_in_range("tau", self.tau, low=0.0, high=1.0, low_open=True)
-        for field in ("critic_learning_rate", "actor_learning_rate", "adam_eps"):
+        for field in ("critic_learning_rate", "actor_learning_rate"):
             check_in_range(field, getattr(self, field), low=0.0, low_open=True)
-        check_in_range("weight_decay", self.weight_decay, low=0.0)
-        if self.max_grad_norm is not None:
-            check_in_range("max_grad_norm", self.max_grad_norm, low=0.0, low_open=True)
-        if len(self.betas) != 2 or not all(0.0 <= beta < 1.0 for beta in self.betas):
-            raise ValueError(f"betas={self.betas!r}: expected two numbers in [0, 1)")
         check_choice("value_reduction", self.value_reduction, VALUE_REDUCTIONS)
 
 

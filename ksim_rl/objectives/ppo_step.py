@@ -13,8 +13,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from ksim_rl.objectives.adaptive_learning_rate import adapt_learning_rate_
+from ksim_rl.objectives.algorithm_cfg import OnPolicyCfg
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
-from ksim_rl.objectives.distillation_cfg import DistillationCfg
 from ksim_rl.objectives.gae import GAE
 from ksim_rl.objectives.ppo_cfg import PPOCfg
 from ksim_rl.objectives.rollout_estimator import RolloutEstimator
@@ -85,7 +85,7 @@ def make_symmetric(
     return with_mirror_loss(loss, actor, mirror, coeff=cfg.symmetry_coeff)
 
 
-def make_optimizer(cfg: PPOCfg | DistillationCfg, *modules: nn.Module) -> torch.optim.Adam:
+def make_optimizer(cfg: OnPolicyCfg, *modules: nn.Module) -> torch.optim.Adam:
     """Build one fused Adam over the parameters of `modules`, each once, with the learning rate on the device.
 
     `optimizer.param_groups[0]["lr"]` is a float32 tensor [] that changes in place. On CUDA the optimizer is
@@ -119,7 +119,7 @@ def ppo_step(
     optimizer: torch.optim.Optimizer,
     minibatch_B: TensorDictBase,
     *,
-    cfg: PPOCfg | DistillationCfg,
+    cfg: OnPolicyCfg,
     guard: StepGuard | None = None,
 ) -> dict[str, Tensor]:
     """Make one gradient step on a minibatch. Makes no host sync and can be captured in a CUDA graph.

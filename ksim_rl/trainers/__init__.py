@@ -1,4 +1,4 @@
-"""The training loop, and what surrounds it: evaluation, checkpoints, logs, progress, pictures."""
+"""This room holds the training loop and what surrounds it: evaluation, checkpoints, logs, progress, pictures."""
 
 import importlib
 from typing import Any
@@ -7,7 +7,7 @@ from ksim_rl.trainers.algorithm import Algorithm, Update
 from ksim_rl.trainers.build import build
 from ksim_rl.trainers.checkpoint import Checkpoint, CheckpointError
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
-from ksim_rl.trainers.hook import Hook
+from ksim_rl.trainers.hooks import Hook
 from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg, TrainingCfg
 from ksim_rl.trainers.run_folder import Policy, load_policy, record_video, run

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Num
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -56,7 +56,7 @@ class Update(Protocol):
     def __call__(self, rollout_ET: TensorDictBase) -> None:
         """Learn from a rollout `["E","T"]`, without a host sync; on CUDA it is the same memory at each call."""
 
-    def metrics(self) -> dict[str, Float[Tensor, ""]]:
+    def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return what the last update measured, each a tensor [] on the device, `update/skipped_steps` among them."""
         ...
 

@@ -1,4 +1,4 @@
-"""From a config to the objects of a run."""
+"""This module builds the objects of a run from its config."""
 
 import dataclasses
 import os
@@ -13,15 +13,15 @@ from torchrl.envs import EnvBase, TransformedEnv
 from ksim_rl import envs
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.device import state_tree
+from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.modules import RecurrentStatePrimer, recurrent_transforms, state_spec
 from ksim_rl.trainers.algorithm import make_update
 from ksim_rl.trainers.checkpoint import Checkpoint
 from ksim_rl.trainers.evaluation import Evaluator
-from ksim_rl.trainers.hook import Hook
+from ksim_rl.trainers.hooks import Hook
 from ksim_rl.trainers.loggers import check_installed, make_loggers
 from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg
 from ksim_rl.trainers.trainer import Trainer
-from ksim_rl.transforms.innermost import innermost
 
 # Evaluations see other initial states than training does.
 EVALUATION_SEED_OFFSET = 1_000_003
@@ -56,7 +56,7 @@ def build(
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
     torch.set_num_threads(cfg.trainer.num_threads or _num_threads(cfg.resolved_device()))
 
-    env = build_env(cfg, num_envs=cfg.num_envs, seed=cfg.task.seed if cfg.task.seed is not None else cfg.seed)
+    env = build_env(cfg, num_envs=cfg.num_envs, seed=cfg.seed)
     update = make_update(cfg, env, resumed=resume_from.state["update"] if resume_from else None)
     collector = RolloutCollector(
         env,
@@ -133,7 +133,8 @@ def build_evaluator(
     cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, curriculum={}))
     env = build_env(cfg, num_envs=episodes or cfg.trainer.eval_episodes, seed=seed)
     env.eval()
-    max_steps = innermost(env).max_episode_length or UNLIMITED_EPISODE_STEPS
+    clock = part(env, EpisodeClock)
+    max_steps = (clock and clock.max_episode_length) or UNLIMITED_EPISODE_STEPS
     return Evaluator(env, actor, max_steps=max_steps, seed=seed)
 
 

@@ -1,4 +1,4 @@
-"""Formats of checkpoints: what each version changed, and how an older one becomes a present one."""
+"""Each format of checkpoints is described here, with the way from an older one to the present one."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

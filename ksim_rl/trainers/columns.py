@@ -1,4 +1,4 @@
-"""Whether a checkpoint's networks read what this run's env shows."""
+"""This module checks that a checkpoint's networks read what this run's env shows."""
 
 from collections.abc import Mapping, Sequence
 

@@ -1,4 +1,4 @@
-"""Learning curves of a run as one picture."""
+"""This module draws the learning curves of a run as one picture."""
 
 from pathlib import Path
 

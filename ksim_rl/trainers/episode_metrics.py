@@ -1,30 +1,29 @@
-"""What the env says about episodes, as metrics."""
+"""This module turns what an env says about episodes into metrics."""
 
 from collections.abc import Mapping
 
+from jaxtyping import Num
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.transforms.innermost import innermost
+from ksim_rl.envs.contract import DifficultyLevels, EpisodeSums, part
 
 
-def read_episode_sums(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Tensor]:
+def read_episode_sums(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Num[Tensor, ""]]:
     """Return what happened in this rollout, each a tensor [] on the device, and start the env's sums anew.
 
-    Any env gives the mean reward per step; one with an `episode_log` also its sums over the episodes that ended, and
-    one with `curriculum_levels` and `command_levels` those.
+    Any env gives the mean reward per step; one with `EpisodeSums` also its sums over the episodes that ended, and one
+    with `DifficultyLevels` those.
     """
     sums = {"rollout/reward": rollout_ET.get(("next", "reward")).mean()}
-    base_env = innermost(env)
-    if hasattr(base_env, "episode_log"):
+    if (episodes := part(env, EpisodeSums)) is not None:
         # Copies, because the sums are cleared before they are read on the host.
-        sums |= {f"sum/{name}": total.clone() for name, total in base_env.episode_log().items()}
-        base_env.episode_log_reset_()
-    if hasattr(base_env, "curriculum_levels"):
-        sums |= {f"curriculum/{name}": level for name, level in base_env.curriculum_levels().items()}
-    if hasattr(base_env, "command_levels"):
-        sums |= {f"command/{name}": level for name, level in base_env.command_levels().items()}
+        sums |= {f"sum/{name}": total.clone() for name, total in episodes.episode_log().items()}
+        episodes.episode_log_reset_()
+    if (levels := part(env, DifficultyLevels)) is not None:
+        sums |= {f"curriculum/{name}": level for name, level in levels.curriculum_levels().items()}
+        sums |= {f"command/{name}": level for name, level in levels.command_levels().items()}
     return sums
 
 

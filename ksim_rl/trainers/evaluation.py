@@ -1,4 +1,4 @@
-"""How good a policy is: its deterministic actions in envs of their own, one whole episode in each."""
+"""An evaluation judges a policy by its deterministic actions in envs of their own, one whole episode in each."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass

@@ -1,13 +1,13 @@
-"""What the physics lost or could not compute: counted on the device, explained on the host."""
+"""This module counts on the device what the physics lost or could not compute, and explains it on the host."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
+from jaxtyping import Int64
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.transforms.innermost import innermost
+from ksim_rl.envs.contract import SimulatedWorld, part
 
 _OVERFLOW, _NAN = "overflow/", "nan/worlds"
 
@@ -27,20 +27,22 @@ class PhysicsReport:
     saved: tuple[str, ...] = ()
 
 
-def read_physics(env: EnvBase) -> dict[str, Tensor]:
+def read_physics(env: EnvBase) -> dict[str, Int64[Tensor, ""]]:
     """Return the counts of this rollout, each a tensor [] on the device, and start anew; none without a world."""
-    world = _world(env)
-    if world is None:
+    simulated = part(env, SimulatedWorld)
+    if simulated is None:
         return {}
+    world = simulated.world
     counts = {f"{_OVERFLOW}{index}": count for index, count in enumerate(world.overflow_counts().unbind())}
     return counts | {_NAN: world.nan_count()}
 
 
 def explain_physics(env: EnvBase, counts: Mapping[str, float]) -> PhysicsReport:
     """Say what the counts mean, which other metrics may stand beside; reads the device only if a world failed."""
-    world = _world(env)
-    if world is None:
+    simulated = part(env, SimulatedWorld)
+    if simulated is None:
         return PhysicsReport(metrics={})
+    world = simulated.world
     numbers = [int(value) for name, value in counts.items() if name.startswith(_OVERFLOW)]
     overflow = world.explain_overflow(numbers)
     return PhysicsReport(
@@ -53,8 +55,3 @@ def explain_physics(env: EnvBase, counts: Mapping[str, float]) -> PhysicsReport:
 def without_counts(metrics: Mapping[str, float]) -> dict[str, float]:
     """Leave out what only `explain_physics` reads."""
     return {name: value for name, value in metrics.items() if not name.startswith((_OVERFLOW, _NAN))}
-
-
-def _world(env: EnvBase) -> Any:
-    world = getattr(innermost(env), "world", None)
-    return world if hasattr(world, "overflow_counts") else None

@@ -1,4 +1,4 @@
-"""Progress of a run: one live panel on a terminal, plain lines in a pipe."""
+"""The progress of a run is one live panel on a terminal, and plain lines in a pipe."""
 
 import sys
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from rich.table import Table
 SHOWN = (
     ("env_states", "env states", "{:,.0f}"),
     ("throughput/env_states_per_s", "env states/s", "{:,.0f}"),
-    ("episode/return", "reward", "{:.3g}"),
+    ("episode/return", "return", "{:.3g}"),
     ("episode/length", "episode length", "{:.4g}"),
     ("loss/policy", "policy loss", "{:.2g}"),
     ("loss/value", "value loss", "{:.2g}"),
@@ -37,7 +37,7 @@ class _OwnConsole(Console):
 
 
 class RunProgress:
-    """Shows iteration, speed, reward, episode length, losses and the time left.
+    """Shows iteration, speed, return, episode length, losses and the time left.
 
     Use as a context manager around the run. `note` prints a line that stays; `status` shows what is going on while
     nothing else moves (kernel compilation).

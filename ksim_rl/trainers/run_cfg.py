@@ -1,13 +1,13 @@
-"""The whole configuration of a training run: one dataclass tree whose groups mirror the rooms."""
+"""A training run is configured by one dataclass tree whose groups mirror the rooms."""
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 
-from ksim_rl.checks import near
+from ksim_rl.checks import check_count, near
 from ksim_rl.collectors import CollectorCfg
 from ksim_rl.config import class_paths, plugins
 from ksim_rl.config.config_tree import from_tree, to_tree
@@ -114,7 +114,7 @@ class RunCfg(TrainingCfg):
 
     Attributes:
         task_name: the registered task that `task` began as; names the run and its threshold.
-        task: the env.
+        task: the env; its number of envs and its seed are set to the run's.
         device: "cpu", "cuda", "cuda:<index>", or "auto" for CUDA where there is a GPU.
         checkpoint: a run folder or a checkpoint whose networks and normalizers this run starts from; None starts
             anew.
@@ -129,21 +129,16 @@ class RunCfg(TrainingCfg):
 
     def __post_init__(self) -> None:
         """Refuse values that no run can have, before any model is compiled."""
-        for name, low in (("num_envs", 1), ("seed", 0)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < low:
-                raise ValueError(f"{name}={value!r}: expected a whole number >= {low}")
+        check_count("num_envs", self.num_envs)
+        check_count("seed", self.seed, low=0)
         if self.seed > MOST_SEED:
             raise ValueError(f"seed={self.seed}: expected at most {MOST_SEED}")
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):
             raise ValueError(f"device={self.device!r}: expected 'auto', 'cpu', 'cuda' or 'cuda:<index>'")
         if self.device.startswith("cuda") and not torch.cuda.is_available():
             raise ValueError(f"device={self.device!r}: torch finds no CUDA device here; use device=cpu")
-        if self.task.scene.num_envs != self.num_envs:
-            raise ValueError(
-                f"task.scene.num_envs={self.task.scene.num_envs} differs from num_envs={self.num_envs}: "
-                "set num_envs, which sets both"
-            )
+        scene = replace(self.task.scene, num_envs=self.num_envs)
+        object.__setattr__(self, "task", replace(self.task, scene=scene, seed=self.seed))
         groups = {key for key in self.modules.observation_keys() if isinstance(key, str)}
         groups |= set(self.objective.observation_groups)
         missing = sorted(groups - set(self.task.observations))
@@ -167,7 +162,7 @@ class RunCfg(TrainingCfg):
         if not self.objective.learns_on_sequences or not isinstance(self.data, DatasetCfg):
             raise ValueError(
                 f"modules.recurrent_actor or recurrent_critic is set, and {type(self.objective).__name__} learns on "
-                "single env states: set both to null, or use objective=ppo, amp or distillation"
+                "single env states: set both to null, or choose an objective that learns on sequences"
             )
         self.objective.check_memory()
         sequence_length(
@@ -186,14 +181,15 @@ class RunCfg(TrainingCfg):
                 with the plug-in that the run needs and nobody named.
         """
         plugins.check_remembered(tree.get(PLUGINS) or ())
-        return from_tree(cls, up_to_date({key: value for key, value in tree.items() if key != PLUGINS}))
+        tree = up_to_date({key: value for key, value in tree.items() if key != PLUGINS})
+        return from_tree(cls, without_env_size(tree))
 
     def to_tree(self) -> dict[str, Any]:
         """Return the config as plain data, from which `from_tree` builds an equal one.
 
         Beside the fields it names the plug-ins of this process and of the classes in the config.
         """
-        tree = to_tree(self, type(self))
+        tree = without_env_size(to_tree(self, type(self)))
         needed = [*plugins.named(), *(target.split(".")[0] for target in class_paths.foreign(tree))]
         return {**tree, PLUGINS: list(dict.fromkeys(needed))} if needed else tree
 
@@ -202,3 +198,23 @@ class RunCfg(TrainingCfg):
         if self.device == "auto":
             return torch.device("cuda" if torch.cuda.is_available() else "cpu")
         return torch.device(self.device)
+
+
+def without_env_size(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tree of a run without the env's own number of envs and seed, which are the run's.
+
+    Raises:
+        ValueError: if one of them is another than the run's.
+    """
+    task = tree.get("task")
+    if not isinstance(task, Mapping) or not isinstance(task.get("scene"), Mapping):
+        return dict(tree)
+    scene = dict(task["scene"])
+    task = {**task, "scene": scene}
+    for where, name, below in (("task.scene.num_envs", "num_envs", scene), ("task.seed", "seed", task)):
+        value = below.pop(name, None)
+        if value is not None and value != tree.get(name):
+            raise ValueError(
+                f"{where}={value!r} differs from {name}={tree.get(name)!r}: set {name}, which is the env's as well"
+            )
+    return {**tree, "task": task}

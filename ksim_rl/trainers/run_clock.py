@@ -1,4 +1,4 @@
-"""Wall time of a run: in all, per iteration, and what is left."""
+"""A run's clock measures wall time: in all, per iteration, and what is left."""
 
 import time
 from collections import deque

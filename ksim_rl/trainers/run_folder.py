@@ -1,4 +1,4 @@
-"""A whole run in a folder: config, training, evaluation, learning curves, video."""
+"""A whole run lies in a folder: config, training, evaluation, learning curves, video."""
 
 import json
 import warnings
@@ -13,17 +13,17 @@ from tensordict.nn import TensorDictModuleBase
 from ksim_rl.config.class_paths import loading_notes
 from ksim_rl.config.plugins import load as load_plugins
 from ksim_rl.device.memory import memory_for
+from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.trainers import checkpoint, video
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build, build_env, load_actor
 from ksim_rl.trainers.columns import check_columns
 from ksim_rl.trainers.evaluation import Evaluation
-from ksim_rl.trainers.hook import Hook
+from ksim_rl.trainers.hooks import Hook
 from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_cfg import RunCfg
 from ksim_rl.trainers.trainer import Outcome, Trainer
 from ksim_rl.transforms import observation_columns
-from ksim_rl.transforms.innermost import innermost
 
 CONFIG, EVALUATION, CURVES, VIDEO = "config.yaml", "evaluation.json", "curves.png", "video.mp4"
 
@@ -125,7 +125,9 @@ def record_video(
     """Record the policy in one env; where that is impossible, say why and how to mend it, and return None."""
     env = build_env(cfg, num_envs=1, seed=seed, render_mode="rgb_array")
     env.eval()
-    step_dt = innermost(env).step_dt
+    clock = part(env, EpisodeClock)
+    assert clock is not None  # the env of a config is ours
+    step_dt = clock.step_dt
     steps = max(1, round((seconds or cfg.trainer.video_s) / step_dt))
     try:
         with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""The training loop."""
+"""The training loop collects and learns in turn, and reports, evaluates and saves beside that."""
 
 import signal
 from collections.abc import Callable, Mapping, Sequence
@@ -10,14 +10,13 @@ from tensordict import TensorDictBase
 
 from ksim_rl.checks import near
 from ksim_rl.collectors import RolloutCollector
+from ksim_rl.envs.contract import EpisodeClock, missing_parts, part
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.algorithm import Update
-from ksim_rl.trainers.checkpoint_hook import CheckpointHook
 from ksim_rl.trainers.columns import check_columns
 from ksim_rl.trainers.episode_metrics import episode_means, read_episode_sums
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
-from ksim_rl.trainers.evaluation_hook import EvaluationHook
-from ksim_rl.trainers.hook import Hook
+from ksim_rl.trainers.hooks import CheckpointHook, EvaluationHook, Hook
 from ksim_rl.trainers.interrupt import InterruptRequest
 from ksim_rl.trainers.loggers import MetricLogger
 from ksim_rl.trainers.metrics import PendingMetrics, start_copy
@@ -27,7 +26,6 @@ from ksim_rl.trainers.run_clock import RunClock
 from ksim_rl.trainers.run_state import load_random_state, random_state
 from ksim_rl.trainers.trainer_cfg import TrainerCfg
 from ksim_rl.transforms import observation_columns
-from ksim_rl.transforms.innermost import innermost
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +114,8 @@ class Trainer:
         """
         self.progress = progress or self.progress
         with self.interrupt, self.progress:
+            for text in missing_parts(self.collector.env):
+                self.progress.note(text)
             try:
                 while not self._is_over():
                     self.iterate()
@@ -175,13 +175,14 @@ class Trainer:
 
     def _report_iteration(self, iteration: int, read: dict[str, float]) -> None:
         env, seconds = self.collector.env, self.clock.lap()
+        clock = part(env, EpisodeClock)
         physics = explain_physics(env, read)
         for text in physics.saved:
             self.progress.note(f"NaN guard: {text}")
         self._warn(physics.lost, read, iteration)
         self.update.check(read)
         self.metrics = episode_means(
-            without_counts(read), max_episode_length_s=getattr(innermost(env), "max_episode_length_s", 0.0)
+            without_counts(read), max_episode_length_s=0.0 if clock is None else clock.max_episode_length_s
         )
         self.metrics |= physics.metrics | {
             "iteration": iteration,

@@ -1,9 +1,9 @@
-"""How long a run is, and what happens beside learning."""
+"""This module configures how long a run is, and what happens beside learning."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.checks import check_choice, check_count, check_in_range
 
 MATMUL_PRECISIONS = ("highest", "high", "medium")
 MOST_THREADS = 1024
@@ -58,9 +58,7 @@ class TrainerCfg:
             ("keep_checkpoints", 1),
             ("log_interval", 1),
         ):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < low:
-                raise ValueError(f"{name}={value!r}: expected a whole number >= {low}")
+            check_count(name, getattr(self, name), low=low)
         for name, value in (self.stop_at or {}).items():
             check_in_range(f"stop_at.{name}", value)
         if self.num_threads is not None:

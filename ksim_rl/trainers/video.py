@@ -1,4 +1,4 @@
-"""A video of a policy: the frames that `env.render()` gives while it acts."""
+"""A video of a policy consists of the pictures that its env renders while it acts."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +9,8 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ksim_rl.envs.contract import Pictures, part
 
 # Why rendering failed in this process, once it did. MuJoCo aborts the process when it tries a second time without a
 # working OpenGL platform.
@@ -25,7 +27,7 @@ def record(
     """Let the policy act, deterministically, and write what a camera sees.
 
     Args:
-        env: has a `render()` that returns uint8 [H, W, 3].
+        env: has the part `Pictures`.
         policy: writes the action.
         path: an `.mp4` file; without a video encoder a `.gif` beside it is written instead.
         steps: env steps to show.
@@ -83,7 +85,8 @@ def _frames(
 
 
 def _picture(env: EnvBase) -> np.ndarray:
-    frame = env.render()  # type: ignore[operator]
+    pictures = part(env, Pictures)
+    frame = None if pictures is None else pictures.render()
     if frame is None:
         raise VideoUnavailableError("the env has no render mode: build it with render_mode='rgb_array'")
     return frame

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ksim_rl.algorithms.gradient_steps import StepMeans, check_skipped_steps
+from ksim_rl.algorithms.gradient_steps import RolloutUpdate, StepMeans
 from ksim_rl.objectives import NonFiniteStepsError
 from tests.trainers.target_env import make_trainer
 
@@ -20,9 +20,9 @@ def test_means_are_over_the_steps_that_were_made():
 
 def test_the_limit_counts_all_steps_in_a_row():
     metrics = {"update/skipped_in_a_row": 4.0, "update/skipped_steps": 9.0}
-    check_skipped_steps(metrics, 5)
+    RolloutUpdate(max_skipped_steps=5, device="cpu").check(metrics)
     with pytest.raises(NonFiniteStepsError, match="4 gradient steps in a row.*limit 4, 9 since the start"):
-        check_skipped_steps(metrics, 4)
+        RolloutUpdate(max_skipped_steps=4, device="cpu").check(metrics)
 
 
 def test_a_run_ends_even_if_steps_are_made_after_those_in_a_row():

@@ -52,8 +52,8 @@ def test_overrides_lie_over_a_run_that_is_made_again(first, tmp_path):
     changes = ("seed=4", "num_envs=8", "objective.gamma=0.9")
     assert run("--config-dir", str(first), *changes, f"hydra.run.dir={tmp_path}") == 0
     config = checkpoint.load(checkpoint.latest(tmp_path)).config
-    assert (config["seed"], config["task"]["seed"]) == (4, 4)
-    assert (config["num_envs"], config["task"]["scene"]["num_envs"]) == (8, 8)
+    assert (config["seed"], config["num_envs"]) == (4, 8)
+    assert "seed" not in config["task"] and "num_envs" not in config["task"]["scene"]
     assert config["objective"]["gamma"] == 0.9
     assert rows(tmp_path) != rows(first)
 

@@ -66,7 +66,7 @@ def test_captured_without_syncs_and_learning_what_it_sees(name, options):
         with no_syncs(on=iteration > 3):
             update(rollout)
         assert not all(torch.equal(a, b) for a, b in zip(before, update.loss.parameters(), strict=True))
-    assert update._store_and_learn.ready
+    assert update._run.ready
     metrics = update.metrics()
     assert int(metrics["update/non_finite_env_states"]) == 6 and int(metrics["update/skipped_steps"]) == 0
     # Each replay wrote to the ring where the last one ended.

@@ -8,6 +8,7 @@ from ksim_rl.collectors import RolloutCollector
 from ksim_rl.data import DatasetCfg
 from ksim_rl.device import random
 from ksim_rl.envs import MaskedTransformedEnv
+from ksim_rl.envs.contract import EpisodeClock, EpisodeSums
 from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
 from ksim_rl.objectives import PPOCfg
@@ -106,10 +107,14 @@ class TargetEnv(MaskedReset):
             value.copy_(state_dict[name])
 
 
-def make_env(num_envs=16, *, seed=0, noise=0.0, **options):
+EpisodeClock.register(TargetEnv)
+EpisodeSums.register(TargetEnv)
+
+
+def make_env(num_envs=16, *, seed=0, noise=0.0, kind=TargetEnv, **options):
     """Return the env with sensor noise on what the actor sees."""
     transform = ObservationNoise(["actor"], noise=GaussianNoise(std=noise))
-    env = MaskedTransformedEnv(TargetEnv(num_envs, **options), transform)
+    env = MaskedTransformedEnv(kind(num_envs, **options), transform)
     env.set_seed(seed)
     return env
 

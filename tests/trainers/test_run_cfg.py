@@ -63,13 +63,36 @@ def test_a_wrong_value_is_refused_by_its_path(cfg, path, value, message):
 
 def test_a_dataset_that_the_envs_cannot_share_is_refused_with_working_numbers(cfg):
     with pytest.raises(ValueError, match=r"num_minibatches=4 = 256 .* num_envs=48.* num_envs=32 or 64"):
-        scene = dataclasses.replace(cfg.task.scene, num_envs=48)
-        dataclasses.replace(cfg, num_envs=48, task=dataclasses.replace(cfg.task, scene=scene))
+        dataclasses.replace(cfg, num_envs=48)
 
 
-def test_the_env_has_as_many_envs_as_the_run(cfg):
-    with pytest.raises(ValueError, match="task.scene.num_envs=64 differs from num_envs=32: set num_envs"):
-        dataclasses.replace(cfg, num_envs=32)
+def test_number_of_envs_and_seed_stand_in_one_place(cfg):
+    other = dataclasses.replace(cfg, num_envs=32, seed=7)
+    assert (other.task.scene.num_envs, other.task.seed) == (32, 7)
+    tree = other.to_tree()
+    assert "num_envs" not in tree["task"]["scene"] and "seed" not in tree["task"]
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("task.scene.num_envs=7", "task.scene.num_envs=7 differs from num_envs=512: set num_envs"),
+        ("task.seed=7", "task.seed=7 differs from seed=1: set seed"),
+    ],
+)
+def test_the_envs_own_are_refused_where_they_differ(override, message):
+    with pytest.raises(ValueError, match=message):
+        conf.compose(["task=cartpole_balance", override])
+
+
+def test_the_config_of_a_run_of_0_1_loads(cfg):
+    tree = cfg.to_tree()
+    del tree["objective"]["_target_"]
+    tree["task"]["scene"]["num_envs"], tree["task"]["seed"] = 64, 1
+    assert RunCfg.from_tree(tree) == cfg
+    tree["task"]["seed"] = 5
+    with pytest.raises(ValueError, match="task.seed=5 differs from seed=1"):
+        RunCfg.from_tree(tree)
 
 
 def test_the_networks_groups_must_be_there(cfg):

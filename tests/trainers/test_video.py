@@ -6,9 +6,10 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
+from ksim_rl.envs.contract import Pictures
 from ksim_rl.trainers import video
 from ksim_rl.trainers.video import VideoUnavailableError, record
-from tests.trainers.target_env import make_env
+from tests.trainers.target_env import TargetEnv, make_env
 
 
 @pytest.fixture(autouse=True)
@@ -16,10 +17,13 @@ def _nothing_failed_yet(monkeypatch):
     monkeypatch.setattr(video, "_failed", [])
 
 
+Pictures.register(TargetEnv)
+
+
 def filmed(render):
     env = make_env(1)
     env.base_env.__dict__["render"] = render
-    env.__dict__["render"] = render
+
     return env
 
 

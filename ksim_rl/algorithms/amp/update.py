@@ -1,28 +1,27 @@
-"""PPO with an adversarial motion prior: style reward, discriminator, then PPO; one CUDA graph on CUDA."""
+"""AMP scores a rollout's style, lets PPO learn from it, and teaches the discriminator; one CUDA graph on CUDA."""
 
 import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
 import torch
+from jaxtyping import Float32, Num
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.algorithms.gradient_steps import StepMeans, check_skipped_steps, in_columns
+from ksim_rl.algorithms.gradient_steps import RolloutUpdate, StepMeans, in_columns
 from ksim_rl.algorithms.optimizer_state import load_optimizer_state, optimizer_state
 from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.algorithms.ppo.wiring import make_ppo_update
 from ksim_rl.data import ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
-from ksim_rl.device.capture import Captured
 from ksim_rl.mdp.motion_observations import observe_motion
 from ksim_rl.modules import Discriminator
 from ksim_rl.objectives import (
     AMPCfg,
-    StepGuard,
     descend,
     discriminator_loss,
     make_optimizer,
@@ -57,12 +56,11 @@ def make_amp_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> "AMPUp
     )
 
 
-class AMPUpdate:
+class AMPUpdate(RolloutUpdate):
     """Rewards a rollout's transitions for looking like the reference motions, and improves the policy with that.
 
     In turn: the discriminator scores the rollout, PPO learns from it with both rewards, and the discriminator learns
-    from the motions and the policy's last rollouts. Nothing makes a host sync. Each rollout must be the same memory,
-    which is what `RolloutCollector` gives.
+    from the motions and the policy's last rollouts. See `RolloutUpdate`.
 
     Args:
         cfg: of the objective.
@@ -75,8 +73,11 @@ class AMPUpdate:
         replay: the policy's transitions of the last rollouts.
     """
 
-    def __init__(self, cfg: AMPCfg, *, ppo: PPOUpdate, reference_N2L: Tensor, num_envs: int) -> None:
-        self.cfg, self.ppo, self.device = cfg, ppo, ppo.device
+    def __init__(
+        self, cfg: AMPCfg, *, ppo: PPOUpdate, reference_N2L: Float32[Tensor, "N 2 L"], num_envs: int
+    ) -> None:
+        super().__init__(max_skipped_steps=cfg.max_skipped_steps, device=ppo.device)
+        self.cfg, self.ppo = cfg, ppo
         if not bool(reference_N2L.isfinite().all()):
             raise ValueError(
                 f"motions={cfg.motions!r}: group {cfg.style_group!r} is not finite in their states"
@@ -108,12 +109,8 @@ class AMPUpdate:
             observations=[cfg.style_group],
             device=self.device,
         )
-        self.guard = StepGuard(device=self.device)
-        self._rollout_ET: TensorDictBase | None = None
         self._means = StepMeans(LOGGED)
         self._style = torch.zeros((), device=self.device)
-        self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
-        self._run = Captured(self._update, device=self.device)
 
     @property
     def actor(self) -> ProbabilisticTensorDictSequential:
@@ -140,12 +137,7 @@ class AMPUpdate:
         """Where the features before and after a step lie."""
         return self.cfg.style_group, unravel_key(("next", self.cfg.style_group))
 
-    def __call__(self, rollout_ET: TensorDictBase) -> None:
-        """Update discriminator and policy with a rollout `["E","T"]` of the dataset's size."""
-        self._rollout_ET = rollout_ET
-        self._run()
-
-    def metrics(self) -> dict[str, Tensor]:
+    def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return what the last update measured, each a tensor [] on the device.
 
         `style/reward` is the mean style reward of the rollout, in [0, 1]; the rest of `style/` are means over the
@@ -163,19 +155,9 @@ class AMPUpdate:
             }
         )
 
-    def check(self, metrics: Mapping[str, float]) -> None:
-        """Stop a run that skips its gradient steps; `metrics` are those of `metrics()`, on the host.
-
-        Raises:
-            NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped, of PPO or the discriminator.
-        """
-        check_skipped_steps(metrics, self.cfg.max_skipped_steps)
-
     def _update(self) -> None:
-        rollout_ET = self._rollout_ET
-        assert rollout_ET is not None
-        self.ppo(self._rewarded(rollout_ET))
-        self._learn_style(rollout_ET)
+        self.ppo(self._rewarded(self.rollout_ET))
+        self._learn_style(self.rollout_ET)
 
     @torch.no_grad()
     def _rewarded(self, rollout_ET: TensorDictBase) -> TensorDictBase:

@@ -1,4 +1,4 @@
-"""The policy of another run, as a teacher: its weights, and all that is needed to build it once more."""
+"""A teacher is the policy of another run: its weights, and all that is needed to build it once more."""
 
 import json
 from collections.abc import Mapping

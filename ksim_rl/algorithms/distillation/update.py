@@ -1,19 +1,19 @@
-"""One iteration of distillation: labels, dataset, gradient steps, observation statistics; one CUDA graph on CUDA."""
+"""An iteration of distillation labels a rollout and makes gradient steps on it; it is one CUDA graph on CUDA."""
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from jaxtyping import Num
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl.algorithms.distillation.teacher import Teacher, load_teacher, restored_teacher
 from ksim_rl.algorithms.gradient_steps import (
+    RolloutUpdate,
     StepMeans,
-    check_skipped_steps,
     epoch_of_steps,
     in_columns,
     make_dataset,
@@ -22,12 +22,10 @@ from ksim_rl.algorithms.optimizer_state import load_optimizer_state, optimizer_s
 from ksim_rl.algorithms.ppo.wiring import make_ppo_policy
 from ksim_rl.data import DatasetCfg
 from ksim_rl.device import state_tree
-from ksim_rl.device.capture import Captured
 from ksim_rl.modules import MixedPolicy, memories, update_normalizers
 from ksim_rl.objectives import (
     DistillationCfg,
     DistillationLoss,
-    StepGuard,
     distribution_keys,
     make_optimizer,
     observation_keys,
@@ -59,11 +57,8 @@ def make_distillation_update(
     )
 
 
-class DistillationUpdate:
-    """Lets a student learn, from one rollout at a time, what its teacher would do there; without a host sync.
-
-    On CUDA the first updates run eagerly and the next is captured. So each rollout must be the same memory, which is
-    what `RolloutCollector` gives.
+class DistillationUpdate(RolloutUpdate):
+    """Lets a student learn, from one rollout at a time, what its teacher would do there; see `RolloutUpdate`.
 
     Args:
         cfg: of the objective.
@@ -87,15 +82,14 @@ class DistillationUpdate:
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
+        super().__init__(max_skipped_steps=cfg.max_skipped_steps, device=device)
         self.cfg, self.actor, self.teacher = cfg, actor, teacher
-        self.device = torch.device(device)
         self.loss = DistillationLoss(actor, teacher.policy, loss=cfg.loss)
         self.optimizer = make_optimizer(cfg, actor)
         self._memories = memories(actor)
         self.dataset = make_dataset(
             data, keys=self.loss.dataset_keys, memories=self._memories, seed=seed, device=self.device
         )
-        self.guard = StepGuard(device=self.device)
         self.teacher_share = torch.tensor(cfg.teacher_share, device=self.device)
         helps = cfg.teacher_share > 0.0
         self._behavior: TensorDictModuleBase = actor
@@ -108,11 +102,8 @@ class DistillationUpdate:
                 teacher_keys=self._teacher_keys if helps else (),
                 explores=cfg.loss == "kl",
             )
-        self._rollout_ET: TensorDictBase | None = None
         self._means = StepMeans(LOGGED)
         self._action_error = torch.zeros((), device=self.device)
-        self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
-        self._run = Captured(self._update, device=self.device)
 
     @property
     def behavior(self) -> TensorDictModuleBase:
@@ -130,41 +121,29 @@ class DistillationUpdate:
         read = [*observation_keys(self.actor), *self._teacher_keys, *distribution_keys(self.actor)]
         return list(dict.fromkeys([*read, ("next", "reward")]))
 
-    def __call__(self, rollout_ET: TensorDictBase) -> None:
-        """Update the student with a rollout `["E","T"]` of the dataset's size."""
-        self._rollout_ET = rollout_ET
-        self._run()
-
-    def metrics(self) -> dict[str, Tensor]:
+    def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return what the last update measured, each a tensor [] on the device; means are over the steps made.
 
         `update/action_error` is how far the student was from the teacher in the rollout, before it learned from it: the
         root mean square over actions, in their unit.
         """
-        return self._means | {
-            "update/action_error": self._action_error,
-            "update/teacher_share": self.teacher_share,
-            "update/learning_rate": self.optimizer.param_groups[0]["lr"],
-            "update/skipped_steps": self.guard.skipped,
-            "update/skipped_in_a_row": self._longest_skip,
-            "update/non_finite_env_states": self.dataset.non_finite_count,
-        }
-
-    def check(self, metrics: Mapping[str, float]) -> None:
-        """Stop a run that skips its gradient steps; `metrics` are those of `metrics()`, on the host.
-
-        Raises:
-            NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped.
-        """
-        check_skipped_steps(metrics, self.cfg.max_skipped_steps)
+        return (
+            self._means
+            | self._skipped()
+            | {
+                "update/action_error": self._action_error,
+                "update/teacher_share": self.teacher_share,
+                "update/learning_rate": self.optimizer.param_groups[0]["lr"],
+                "update/non_finite_env_states": self.dataset.non_finite_count,
+            }
+        )
 
     @property
     def _teacher_keys(self) -> list[Any]:
         return observation_keys_of(self.teacher.policy)
 
     def _update(self) -> None:
-        assert self._rollout_ET is not None
-        labelled_ET = self.loss.label(self._rollout_ET)
+        labelled_ET = self.loss.label(self.rollout_ET)
         self._action_error.copy_(self.loss.action_error(labelled_ET))
         self.dataset.extend(labelled_ET)
         made: list[dict[str, Tensor]] = []
@@ -182,7 +161,7 @@ class DistillationUpdate:
         self._longest_skip.copy_(steps["skipped_in_a_row"].max())
         self.teacher_share.mul_(self.cfg.teacher_share_decay)
         # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
-        update_normalizers(self._rollout_ET, self.actor)
+        update_normalizers(self.rollout_ET, self.actor)
 
     def state_dict(self) -> state_tree.State:
         """Return student, teacher, optimizer, sampler and counters."""

@@ -1,21 +1,22 @@
-"""One iteration of off-policy learning: env states into the replay, then gradient steps; one CUDA graph on CUDA."""
+"""An off-policy iteration puts a rollout into the replay and makes gradient steps; it is one CUDA graph on CUDA."""
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
+from jaxtyping import Num
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from ksim_rl.algorithms.gradient_steps import check_skipped_steps
+from ksim_rl.algorithms.gradient_steps import RolloutUpdate
 from ksim_rl.algorithms.optimizer_state import load_optimizer_state, optimizer_state
 from ksim_rl.data import ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
 from ksim_rl.modules import ExploringPolicy, update_normalizers
-from ksim_rl.objectives import OffPolicyCfg, OffPolicyLoss, SACCfg, SACLoss, StepGuard, descend, make_adamw
+from ksim_rl.objectives import OffPolicyCfg, OffPolicyLoss, SACCfg, SACLoss, descend, make_adamw
 
 # Names of the logged means, by the names that the losses give them.
 OF_CRITIC_STEPS = {
@@ -28,13 +29,12 @@ OF_ACTOR_STEPS = {"loss_actor": "loss/policy", "actor_grad_norm": "update/actor_
 OF_TEMPERATURE = {"entropy": "loss/entropy", "alpha": "update/alpha"}
 
 
-class OffPolicyUpdate:
+class OffPolicyUpdate(RolloutUpdate):
     """Adds a rollout to the replay and improves actor and critics with minibatches of it, without a host sync.
 
     Until each env has made `learning_starts` steps, rollouts have random actions and there are no gradient steps. From
     then on an update is `num_minibatches` gradient steps of the critics, each followed by one of the target networks,
-    and by one of the actor (and the temperature) every `policy_delay`. Each rollout must be the same memory, which is
-    what `RolloutCollector` gives.
+    and by one of the actor (and the temperature) every `policy_delay`. See `RolloutUpdate`.
 
     Args:
         cfg: of the objective.
@@ -63,8 +63,8 @@ class OffPolicyUpdate:
                 f"data.num_minibatches={data.num_minibatches} is no multiple of objective.policy_delay="
                 f"{cfg.policy_delay}: each iteration makes the same gradient steps"
             )
+        super().__init__(max_skipped_steps=cfg.max_skipped_steps, device=device)
         self.cfg, self.loss, self.data, self.num_envs = cfg, loss, data, num_envs
-        self.device = torch.device(device)
         self.actor: TensorDictModuleBase = loss.actor_network
         self.critic = loss.critic_network
         self.behavior = behavior
@@ -83,15 +83,11 @@ class OffPolicyUpdate:
         if isinstance(cfg, SACCfg) and isinstance(loss, SACLoss) and loss.log_alpha.requires_grad:
             rate = cfg.alpha_learning_rate
             self.optimizers["alpha"] = make_adamw(cfg, [loss.log_alpha], learning_rate=rate, weight_decay=0.0)
-        self.guard = StepGuard(device=self.device)
         self.steps_made = 0
-        self._rollout_ET: TensorDictBase | None = None
         logged = OF_CRITIC_STEPS | OF_ACTOR_STEPS | (OF_TEMPERATURE if isinstance(loss, SACLoss) else {})
         self._sums = {name: self._zero() for name in logged.values()}
         self._counts = {name: self._zero() for name in ("critic", "actor")}
-        self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
         self._store_only = Captured(self._store, device=self.device)
-        self._store_and_learn = Captured(self._learn, device=self.device)
 
     @property
     def num_env_states(self) -> int:
@@ -109,39 +105,32 @@ class OffPolicyUpdate:
         self._rollout_ET = rollout_ET
         self.steps_made += self.data.num_steps
         learns = self.steps_made >= self.data.learning_starts
-        (self._store_and_learn if learns else self._store_only)()
+        (self._run if learns else self._store_only)()
         self.behavior.random.fill_(not learns)
 
-    def metrics(self) -> dict[str, Tensor]:
+    def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
         means = {
             name: total / self._counts["critic" if name in OF_CRITIC_STEPS.values() else "actor"].clamp_min(1)
             for name, total in self._sums.items()
         }
-        return means | {
-            "replay/env_states": self.replay.num_stored,
-            "update/skipped_steps": self.guard.skipped,
-            "update/skipped_in_a_row": self._longest_skip,
-            "update/non_finite_env_states": self.replay.non_finite_count,
-        }
-
-    def check(self, metrics: Mapping[str, float]) -> None:
-        """Stop a run that skips its gradient steps; `metrics` are those of `metrics()`, on the host.
-
-        Raises:
-            NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped.
-        """
-        check_skipped_steps(metrics, self.cfg.max_skipped_steps)
+        return (
+            means
+            | self._skipped()
+            | {
+                "replay/env_states": self.replay.num_stored,
+                "update/non_finite_env_states": self.replay.non_finite_count,
+            }
+        )
 
     def _store(self) -> None:
-        rollout_ET = self._rollout_ET
-        assert rollout_ET is not None
+        rollout_ET = self.rollout_ET
         self.replay.extend(rollout_ET)
         # Unlike on policy, gradient steps need not see the statistics that the actions were drawn with.
         update_normalizers(rollout_ET, self.actor, self.critic)
         self.behavior.end_episodes_(rollout_ET.get(("next", "done")).squeeze(-1).any(1))
 
-    def _learn(self) -> None:
+    def _update(self) -> None:
         self._store()
         for tensor in (*self._sums.values(), *self._counts.values(), self._longest_skip):
             tensor.zero_()

@@ -1,10 +1,11 @@
-"""Whether the gradient steps of a PPO run can be fused kernels, and these for it."""
+"""This module says whether the gradient steps of a PPO run can be fused kernels, and builds these for it."""
 
 import importlib.util
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
+from jaxtyping import Float
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor, nn
@@ -81,12 +82,12 @@ def _layers(network: nn.Sequential) -> list[nn.Linear]:
     return [layer for layer in network if isinstance(layer, nn.Linear)]
 
 
-def observer(module: Any) -> Callable[[TensorDictBase], Tensor]:
+def observer(module: Any) -> Callable[[TensorDictBase], Float[Tensor, "B L"]]:
     """Return what gives the input of the first layer of a network from `make_actor` or `make_critic`."""
     network: PolicyNetwork | ValueNetwork = module.module
     keys = list(module.in_keys)
 
-    def observe(env_states: TensorDictBase) -> Tensor:
+    def observe(env_states: TensorDictBase) -> Float[Tensor, "*batch L"]:
         obs = side_by_side([env_states.get(key) for key in keys])
         return obs if network.normalizer is None else network.normalizer(obs)
 

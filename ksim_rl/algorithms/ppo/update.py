@@ -1,17 +1,18 @@
-"""One RL update: advantages, dataset, gradient steps, observation statistics; one CUDA graph where there is CUDA."""
+"""A PPO update estimates advantages, makes gradient steps and updates statistics; it is one CUDA graph on CUDA."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import torch
+from jaxtyping import Num
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import unravel_key
 from torch import Tensor
 
 from ksim_rl.algorithms.gradient_steps import (
+    RolloutUpdate,
     StepMeans,
-    check_skipped_steps,
     epoch_of_steps,
     in_columns,
     make_dataset,
@@ -20,11 +21,9 @@ from ksim_rl.algorithms.optimizer_state import load_optimizer_state, optimizer_s
 from ksim_rl.algorithms.ppo.fused import make_fused_ppo
 from ksim_rl.data import DatasetCfg
 from ksim_rl.device import state_tree
-from ksim_rl.device.capture import Captured
 from ksim_rl.modules import CarriedState, memories, update_normalizers
 from ksim_rl.objectives import (
     PPOCfg,
-    StepGuard,
     distribution_keys,
     in_precision,
     make_advantage,
@@ -49,11 +48,8 @@ LOGGED = {
 }
 
 
-class PPOUpdate:
-    """Improves actor and critic with one rollout, without a host sync.
-
-    On CUDA the first updates run eagerly and the next is captured. So each rollout must be the same memory, which is
-    what `RolloutCollector` gives.
+class PPOUpdate(RolloutUpdate):
+    """Improves actor and critic with one rollout at a time; see `RolloutUpdate`.
 
     Args:
         cfg: of the objective.
@@ -79,9 +75,9 @@ class PPOUpdate:
         device: torch.device | str = "cpu",
         mirror: Mapping[Any, MirrorMap] | None = None,
     ) -> None:
+        super().__init__(max_skipped_steps=cfg.max_skipped_steps, device=device)
         self.cfg = cfg = with_precision_of(cfg, device)
         self.actor, self.critic = actor, critic
-        self.device = torch.device(device)
         self.advantage = make_advantage(cfg, actor, critic)
         self.loss = make_loss(cfg, actor, critic)
         losses = make_symmetric(cfg, self.loss, mirror, device=self.device)
@@ -93,7 +89,6 @@ class PPOUpdate:
         self.dataset = make_dataset(
             data, keys=self.loss.dataset_keys, memories=self._memories, seed=seed, device=self.device
         )
-        self.guard = StepGuard(device=self.device)
         self.fused = make_fused_ppo(
             cfg,
             actor=actor,
@@ -104,12 +99,9 @@ class PPOUpdate:
             device=self.device,
         )
         self._is_fused = torch.tensor(float(not isinstance(self.fused, str)), device=self.device)
-        self._rollout_ET: TensorDictBase | None = None
         self._means = StepMeans(LOGGED)
         self._std = torch.zeros((), device=self.device)
         self._scale_keys = [key for key in distribution_keys(actor) if key == "scale" or key[-1] == "scale"]
-        self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
-        self._run = Captured(self._update, device=self.device)
 
     @property
     def behavior(self) -> ProbabilisticTensorDictSequential:
@@ -130,37 +122,22 @@ class PPOUpdate:
         following = [unravel_key(("next", key)) for key in (*valued, "reward", "done", "terminated")]
         return list(dict.fromkeys([*observation_keys(actor), *valued, *written, *following]))
 
-    def __call__(self, rollout_ET: TensorDictBase) -> None:
-        """Update the networks with a rollout `["E","T"]` of the dataset's size."""
-        self._rollout_ET = rollout_ET
-        self._run()
-
-    def metrics(self) -> dict[str, Tensor]:
+    def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
         std = {"policy/std": self._std} if self._scale_keys else {}
         return (
             self._means
             | std
+            | self._skipped()
             | {
                 "update/learning_rate": self.optimizer.param_groups[0]["lr"],
                 "update/fused": self._is_fused,
-                "update/skipped_steps": self.guard.skipped,
-                "update/skipped_in_a_row": self._longest_skip,
                 "update/non_finite_env_states": self.dataset.non_finite_count,
             }
         )
 
-    def check(self, metrics: Mapping[str, float]) -> None:
-        """Stop a run that skips its gradient steps; `metrics` are those of `metrics()`, on the host.
-
-        Raises:
-            NonFiniteStepsError: if `cfg.max_skipped_steps` or more in a row were skipped.
-        """
-        check_skipped_steps(metrics, self.cfg.max_skipped_steps)
-
     def _update(self) -> None:
-        assert self._rollout_ET is not None
-        rollout_ET = self._rollout_ET
+        rollout_ET = self.rollout_ET
         if isinstance(self.fused, str):
             steps = self._torch_steps(rollout_ET)
         else:

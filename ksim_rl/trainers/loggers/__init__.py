@@ -1,4 +1,4 @@
-"""Where metrics go. Any TorchRL logger fits: all that is called is `log_metrics` and `close`."""
+"""Metrics go to loggers. Any of TorchRL's fits: all that is called is `log_metrics` and `close`."""
 
 from ksim_rl.trainers.loggers.csv_table import CsvTable
 from ksim_rl.trainers.loggers.logger_cfg import LoggerCfg, check_installed, make_loggers

@@ -1,4 +1,4 @@
-"""Which loggers a run has."""
+"""This module opens the loggers that a run's config asks for."""
 
 import importlib.util
 from collections.abc import Iterator, Mapping

@@ -1,4 +1,4 @@
-"""What the trainer asks of a logger."""
+"""The trainer asks no more of a logger than this protocol has."""
 
 from typing import Any, Protocol
 

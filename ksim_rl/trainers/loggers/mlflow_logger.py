@@ -1,4 +1,4 @@
-"""Runs in MLflow, through TorchRL's `MLFlowLogger`."""
+"""This module writes runs to MLflow, through TorchRL's `MLFlowLogger`."""
 
 import os
 from collections.abc import Iterator, Mapping

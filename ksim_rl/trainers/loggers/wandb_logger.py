@@ -1,4 +1,4 @@
-"""Runs on Weights & Biases, through TorchRL's `WandbLogger`."""
+"""This module writes runs to Weights & Biases, through TorchRL's `WandbLogger`."""
 
 import uuid
 from collections.abc import Mapping

@@ -1,0 +1,120 @@
+"""Algorithms are found by name and by the class of their settings, and other packages bring their own."""
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from ksim_rl import algorithms
+from ksim_rl.algorithms import registry
+from ksim_rl.objectives import AlgorithmCfg, AMPCfg, PPOCfg, SACCfg
+from ksim_rl.trainers.run_cfg import RunCfg
+from tests.algorithms import plugin
+
+SMALL = (
+    "task=cartpole_balance",
+    "num_envs=8",
+    "data.num_env_states_per_minibatch=64",
+    "data.num_minibatches=2",
+    "modules.actor.hidden_dims=[16]",
+    "trainer.num_iterations=2",
+    "trainer.eval_episodes=2",
+    "trainer.video=false",
+    "task.episode_length_s=0.3",
+    "logger=none",
+    "device=cpu",
+)
+ENTRY_POINTS = """
+[ksim_rl.algorithms]
+mine = my_learning
+
+[ksim_rl.conf]
+mine = my_learning.conf
+"""
+
+
+def test_ours_are_there_by_name():
+    ours = ["amp", "distillation", "fast_sac", "fast_td3", "ppo", "sac", "td3"]
+    assert [name for name in algorithms.names() if name != "mine"] == ours
+    assert algorithms.algorithm("amp").cfg is AMPCfg
+    with pytest.raises(ValueError, match="fast_sca.*did you mean 'fast_sac'"):
+        algorithms.algorithm("fast_sca")
+
+
+def test_a_subclass_inherits_the_algorithm_of_its_nearest_base():
+    @dataclass(frozen=True, kw_only=True)
+    class Gentle(AMPCfg):
+        entropy_coeff: float = 0.001
+
+    assert registry.serving(Gentle).name == "amp" and registry.serving(PPOCfg).name == "ppo"
+    assert registry.serving(SACCfg).name == "sac"
+    with pytest.raises(ValueError, match="objective is a AlgorithmCfg, which no algorithm serves"):
+        registry.serving(AlgorithmCfg)
+
+
+def test_two_of_one_name_are_refused():
+    registry.register(algorithms.algorithm("ppo"))
+    other = algorithms.Algorithm(
+        name="ppo",
+        cfg=plugin.MineCfg,
+        update=plugin.MineUpdate,
+        policy=plugin.make_ppo_policy,
+        data=plugin.DATA,
+    )
+    with pytest.raises(ValueError, match="two algorithms are called 'ppo'.*rename one"):
+        registry.register(other)
+
+
+def test_trainers_name_no_algorithm():
+    names = [name for name in algorithms.names() if name != "mine"]
+    for path in Path(sys.modules[RunCfg.__module__].__file__).parent.rglob("*.py"):
+        words = path.read_text().replace("_", " ").lower().split()
+        assert not [name for name in names if name in words], path
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """Install the package, as a wheel would, where only a subprocess sees it."""
+    site = tmp_path_factory.mktemp("site")
+    package, info = site / "my_learning", site / "my_learning-1.0.dist-info"
+    (package / "conf" / "objective").mkdir(parents=True)
+    info.mkdir()
+    source = Path(plugin.__file__).read_text()
+    assert source.count("\n") <= 60
+    (package / "__init__.py").write_text(source)
+    (package / "conf" / "__init__.py").write_text("")
+    (package / "conf" / "objective" / "slow.yaml").write_text("defaults: [mine]\nlearning_rate: 1.0e-5\n")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my_learning\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(ENTRY_POINTS)
+    return site
+
+
+def ksim_rl(site, *arguments):
+    paths = os.pathsep.join([str(site), str(Path(__file__).parents[2])])
+    return subprocess.run(
+        [sys.executable, "-m", "ksim_rl.cli.main", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": paths},
+    )
+
+
+def test_an_algorithm_from_another_package_trains_and_is_evaluated(site, tmp_path):
+    done = ksim_rl(site, "train", "objective=mine", *SMALL, f"hydra.run.dir={tmp_path / 'run'}")
+    assert done.returncode in (0, 1), done.stderr
+    assert "2 iterations" in done.stdout
+    resumed = ksim_rl(site, "resume", str(tmp_path / "run"), "--num-iterations", "3")
+    assert resumed.returncode in (0, 1) and "3 iterations" in resumed.stdout, resumed.stderr
+    judged = ksim_rl(site, "eval", str(tmp_path / "run"), "--episodes", "2")
+    assert "cartpole_balance, iteration 3: evaluation over 2 episodes" in judged.stdout, judged.stderr
+
+
+def test_its_settings_are_overridden_and_varied_like_ours(site):
+    shown = ksim_rl(site, "train", "objective=slow", *SMALL, "--cfg", "job", "--package", "objective")
+    assert "_target_: my_learning.MineCfg" in shown.stdout and "learning_rate: 1.0e-05" in shown.stdout
+    wrong = ksim_rl(site, "train", "objective=mine", "objective.learning_rat=1", *SMALL)
+    assert wrong.returncode == 2 and "did you mean 'learning_rate'" in wrong.stderr
