@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
@@ -18,6 +17,7 @@ from ksim_rl import conf
 from ksim_rl.cli.command_line import check_command_line
 from ksim_rl.cli.errors import report
 from ksim_rl.cli.report import run_and_report
+from ksim_rl.cli.upstream import parse_flags
 from ksim_rl.config import plugins
 from ksim_rl.trainers import RunCfg
 
@@ -31,7 +31,7 @@ def train(arguments: list[str]) -> int:
         ValueError: for a group, name, field or value that is wrong; nothing was built or written then.
     """
     conf.register()
-    flags = get_args_parser().parse_args(arguments)
+    flags = parse_flags(arguments)
     name, own_config = _primary_config(flags)
     if not (flags.help or flags.hydra_help or flags.shell_completion or own_config):
         builds = flags.cfg is None and flags.info is None

@@ -67,7 +67,7 @@ def default_tree(cls: type, annotation: Any = None) -> dict[str, Any]:
     """Return the plain tree of a dataclass's defaults, with Hydra's "???" for fields that have none."""
     hints, tree = typing.get_type_hints(cls), {}
     if annotation is not None and cls is not _default_class(annotation):
-        tree[TARGET] = f"{cls.__module__}.{cls.__qualname__}"
+        tree[TARGET] = class_paths.public_path(cls)
     for field in dataclasses.fields(cls):
         default = field.default
         if field.default_factory is not dataclasses.MISSING:

@@ -75,18 +75,24 @@ def test_trainers_name_no_algorithm():
         assert not [name for name in names if name in words], path
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """Install the package, as a wheel would, where only a subprocess sees it."""
-    site = tmp_path_factory.mktemp("site")
-    package, info = site / "my_learning", site / "my_learning-1.0.dist-info"
+def write_package(site):
+    """Write the package, in which one file is all of the algorithm."""
+    package = site / "my_learning"
     (package / "conf" / "objective").mkdir(parents=True)
-    info.mkdir()
     source = Path(plugin.__file__).read_text()
     assert source.count("\n") <= 60
     (package / "__init__.py").write_text(source)
     (package / "conf" / "__init__.py").write_text("")
     (package / "conf" / "objective" / "slow.yaml").write_text("defaults: [mine]\nlearning_rate: 1.0e-5\n")
+    return site
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """Install the package, as a wheel would, where only a subprocess sees it."""
+    site = write_package(tmp_path_factory.mktemp("site"))
+    info = site / "my_learning-1.0.dist-info"
+    info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my_learning\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(ENTRY_POINTS)
     return site
@@ -113,8 +119,11 @@ def test_an_algorithm_from_another_package_trains_and_is_evaluated(site, tmp_pat
     assert "cartpole_balance, iteration 3: evaluation over 2 episodes" in judged.stdout, judged.stderr
 
 
-def test_its_settings_are_overridden_and_varied_like_ours(site):
-    shown = ksim_rl(site, "train", "objective=slow", *SMALL, "--cfg", "job", "--package", "objective")
+def test_a_plugin_is_named_and_its_settings_are_varied_like_ours(tmp_path):
+    site, named = write_package(tmp_path), ("--plugin", "my_learning")
+    shown = ksim_rl(site, "train", *named, "objective=slow", *SMALL, "--cfg", "job", "--package", "objective")
     assert "_target_: my_learning.MineCfg" in shown.stdout and "learning_rate: 1.0e-05" in shown.stdout
-    wrong = ksim_rl(site, "train", "objective=mine", "objective.learning_rat=1", *SMALL)
+    wrong = ksim_rl(site, "train", *named, "objective=mine", "objective.learning_rat=1", *SMALL)
     assert wrong.returncode == 2 and "did you mean 'learning_rate'" in wrong.stderr
+    unknown = ksim_rl(site, "train", "objective=mine", *SMALL)
+    assert unknown.returncode == 2 and "unknown objective 'mine'" in unknown.stderr

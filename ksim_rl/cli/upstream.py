@@ -1,0 +1,17 @@
+"""This module holds what the command line uses of Hydra beyond its documented interface, checked with Hydra 1.3.7.
+
+`tests/cli/test_upstream.py` names the part that a new version moved.
+"""
+
+import argparse
+from collections.abc import Sequence
+
+from hydra._internal.utils import get_args_parser
+
+
+def parse_flags(arguments: Sequence[str]) -> argparse.Namespace:
+    """Read Hydra's own flags from a command line.
+
+    Hydra does so only when the job starts, which is too late to check overrides before anything is written.
+    """
+    return get_args_parser().parse_args(list(arguments))
