@@ -1,22 +1,52 @@
-"""This module sends Warp's work to a device, in order with torch's current stream.
+"""This module starts Warp, and sends its work to a device, in order with torch's current stream.
 
 On CUDA, Warp launches on the very stream that torch uses, so neither waits for the other. The wrappers of streams are
 kept for ever: a temporary one that dies unregisters the CUDA stream ("unknown stream"). On CPU, two threads that
 launch Warp work at once abort the process, so one process-wide lock lets them in one at a time.
 """
 
+import os
+import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 
 import torch
 import warp as wp
 
-from ksim_rl.device.warp_start import start_warp
+from ksim_rl.device.upstream import ABSENT_DRIVER
 
 CPU_LOCK = threading.RLock()
 
 _warp_streams: dict[tuple[int, int], tuple[torch.cuda.Stream, wp.Stream]] = {}
+
+
+@cache
+def start_warp() -> None:
+    """Start Warp, without its complaint about an absent NVIDIA driver where torch finds no GPU either.
+
+    A run on the CPU is no fault, and who asks for CUDA there is refused by name. The complaint is written by native
+    code, so it can be told from other messages only on the file descriptor.
+    """
+    if torch.cuda.is_available():
+        wp.init()
+        return
+    sys.stderr.flush()
+    stderr = os.dup(2)
+    try:
+        with tempfile.TemporaryFile() as caught:
+            os.dup2(caught.fileno(), 2)
+            try:
+                wp.init()
+            finally:
+                os.dup2(stderr, 2)
+            caught.seek(0)
+            lines = caught.read().decode(errors="replace").splitlines(keepends=True)
+    finally:
+        os.close(stderr)
+    sys.stderr.writelines(line for line in lines if ABSENT_DRIVER not in line)
 
 
 def checked_device(device: str | torch.device) -> torch.device:

@@ -5,8 +5,7 @@ from ksim_rl.device.capture import Captured
 from ksim_rl.device.compile_notice import compile_notice
 from ksim_rl.physics.fields import prepare_spec
 from ksim_rl.physics.load import load_model, load_spec
-from ksim_rl.physics.nan_guard.cfg import NanGuardCfg
-from ksim_rl.physics.nan_guard.guard import NanReport
+from ksim_rl.physics.nan_guard.guard import NanGuardCfg, NanReport
 from ksim_rl.physics.overflow import OverflowReport
 from ksim_rl.physics.sim_cfg import SimCfg
 from ksim_rl.physics.world import World

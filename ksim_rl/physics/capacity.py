@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from ksim_rl.physics.mujoco_messages import caught_warnings
+from ksim_rl.physics.load import caught_warnings
 from ksim_rl.physics.sim_cfg import SimCfg
 
 # On what the probe saw: half as much again for rows and contacts; less for candidate pairs, which all worlds share.

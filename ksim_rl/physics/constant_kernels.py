@@ -11,11 +11,44 @@ Jacobian row, with no further solve. One matrix [nv, nv] per world holds D on it
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
 
 import mujoco
+import mujoco_warp as mjw
 import warp as wp
+
+from ksim_rl.physics.structs import struct_with
 
 FREE = wp.constant(int(mujoco.mjtJoint.mjJNT_FREE))
 BALL = wp.constant(int(mujoco.mjtJoint.mjJNT_BALL))
 MINVAL = wp.constant(float(mujoco.mjMINVAL))
+
+
+@struct_with(
+    (
+        "",
+        mjw.Model,
+        "nbody nv qpos0 body_parentid body_jntnum body_jntadr body_subtreenum body_pos body_quat body_mass "
+        "body_inertia body_ipos body_iquat body_invweight0 jnt_type jnt_qposadr jnt_dofadr jnt_pos jnt_axis "
+        "dof_bodyid dof_parentid dof_armature dof_invweight0 actuator_armature actuator_gear actuator_acc0 "
+        "cam_bodyid cam_targetbodyid cam_pos cam_quat cam_pos0 cam_poscom0 cam_mat0 light_bodyid "
+        "light_targetbodyid light_pos light_dir light_pos0 light_poscom0 light_dir0",
+    )
+)
+class Constants:
+    """What the kernels read of a model and write into it, and their own memory; `axis` and `anchor` are per dof."""
+
+    mask: wp.array[bool]
+    num_actuators: int
+    dof_rotates: wp.array[float]
+    group_start: wp.array[int]
+    group_size: wp.array[int]
+    last_dof: wp.array[int]
+    actuator_dof: wp.array[int]
+    xpos: wp.array2d[wp.vec3]
+    xquat: wp.array2d[wp.quat]
+    anchor: wp.array2d[wp.vec3]
+    axis: wp.array2d[wp.vec3]
+    xipos: wp.array2d[wp.vec3]
+    inertia: wp.array2d[wp.mat33]
+    factor: wp.array3d[float]
 
 
 @wp.func
@@ -52,241 +85,186 @@ def _point_velocity(rotates: float, axis: wp.vec3, anchor: wp.vec3, point: wp.ve
 
 
 @wp.kernel(enable_backward=False)
-def frames(
-    mask: wp.array[bool],
-    nbody: int,
-    qpos0: wp.array2d[float],
-    body_parentid: wp.array[int],
-    body_jntnum: wp.array[int],
-    body_jntadr: wp.array[int],
-    body_pos: wp.array2d[wp.vec3],
-    body_quat: wp.array2d[wp.quat],
-    jnt_type: wp.array[int],
-    jnt_qposadr: wp.array[int],
-    jnt_dofadr: wp.array[int],
-    jnt_pos: wp.array2d[wp.vec3],
-    jnt_axis: wp.array2d[wp.vec3],
-    xpos: wp.array2d[wp.vec3],
-    xquat: wp.array2d[wp.quat],
-    anchor: wp.array2d[wp.vec3],
-    axis: wp.array2d[wp.vec3],
-):
+def frames(c: Constants):
     """Body frames, and each dof's axis and anchor, at `qpos0`: there, hinges and slides do not move anything."""
     world = wp.tid()
-    if not mask[world]:
+    if not c.mask[world]:
         return
-    xpos[world, 0] = wp.vec3(0.0, 0.0, 0.0)
-    xquat[world, 0] = wp.quat(1.0, 0.0, 0.0, 0.0)
-    for body in range(1, nbody):
-        parent = body_parentid[body]
-        turn = xquat[world, parent]
-        pos = xpos[world, parent] + _rotate(turn, body_pos[world % body_pos.shape[0], body])
-        quat = _multiply(turn, body_quat[world % body_quat.shape[0], body])
-        for joint in range(body_jntadr[body], body_jntadr[body] + body_jntnum[body]):
-            kind = jnt_type[joint]
-            dof = jnt_dofadr[joint]
-            q = jnt_qposadr[joint]
-            row = world % qpos0.shape[0]
-            pivot = jnt_pos[world % jnt_pos.shape[0], joint]
+    c.xpos[world, 0] = wp.vec3(0.0, 0.0, 0.0)
+    c.xquat[world, 0] = wp.quat(1.0, 0.0, 0.0, 0.0)
+    for body in range(1, c.nbody):
+        parent = c.body_parentid[body]
+        turn = c.xquat[world, parent]
+        pos = c.xpos[world, parent] + _rotate(turn, c.body_pos[world % c.body_pos.shape[0], body])
+        quat = _multiply(turn, c.body_quat[world % c.body_quat.shape[0], body])
+        for joint in range(c.body_jntadr[body], c.body_jntadr[body] + c.body_jntnum[body]):
+            kind = c.jnt_type[joint]
+            dof = c.jnt_dofadr[joint]
+            q = c.jnt_qposadr[joint]
+            row = world % c.qpos0.shape[0]
+            pivot = c.jnt_pos[world % c.jnt_pos.shape[0], joint]
             if kind == FREE:
-                pos = wp.vec3(qpos0[row, q], qpos0[row, q + 1], qpos0[row, q + 2])
+                pos = wp.vec3(c.qpos0[row, q], c.qpos0[row, q + 1], c.qpos0[row, q + 2])
                 quat = wp.normalize(
-                    wp.quat(qpos0[row, q + 3], qpos0[row, q + 4], qpos0[row, q + 5], qpos0[row, q + 6])
+                    wp.quat(
+                        c.qpos0[row, q + 3], c.qpos0[row, q + 4], c.qpos0[row, q + 5], c.qpos0[row, q + 6]
+                    )
                 )
                 for i in range(3):
                     unit = wp.vec3(0.0, 0.0, 0.0)
                     unit[i] = 1.0
-                    axis[world, dof + i] = unit
-                    anchor[world, dof + i] = pos
-                    axis[world, dof + 3 + i] = _rotate(quat, unit)
-                    anchor[world, dof + 3 + i] = pos
+                    c.axis[world, dof + i] = unit
+                    c.anchor[world, dof + i] = pos
+                    c.axis[world, dof + 3 + i] = _rotate(quat, unit)
+                    c.anchor[world, dof + 3 + i] = pos
             elif kind == BALL:
                 place = pos + _rotate(quat, pivot)
-                turned = wp.quat(qpos0[row, q], qpos0[row, q + 1], qpos0[row, q + 2], qpos0[row, q + 3])
+                turned = wp.quat(
+                    c.qpos0[row, q], c.qpos0[row, q + 1], c.qpos0[row, q + 2], c.qpos0[row, q + 3]
+                )
                 quat = _multiply(quat, wp.normalize(turned))
                 pos = place - _rotate(quat, pivot)
                 for i in range(3):
                     unit = wp.vec3(0.0, 0.0, 0.0)
                     unit[i] = 1.0
-                    axis[world, dof + i] = _rotate(quat, unit)
-                    anchor[world, dof + i] = place
+                    c.axis[world, dof + i] = _rotate(quat, unit)
+                    c.anchor[world, dof + i] = place
             else:
-                anchor[world, dof] = pos + _rotate(quat, pivot)
-                axis[world, dof] = _rotate(quat, jnt_axis[world % jnt_axis.shape[0], joint])
-        xpos[world, body] = pos
-        xquat[world, body] = wp.normalize(quat)
+                c.anchor[world, dof] = pos + _rotate(quat, pivot)
+                c.axis[world, dof] = _rotate(quat, c.jnt_axis[world % c.jnt_axis.shape[0], joint])
+        c.xpos[world, body] = pos
+        c.xquat[world, body] = wp.normalize(quat)
 
 
 @wp.kernel(enable_backward=False)
-def inertias(
-    mask: wp.array[bool],
-    body_inertia: wp.array2d[wp.vec3],
-    body_ipos: wp.array2d[wp.vec3],
-    body_iquat: wp.array2d[wp.quat],
-    xpos: wp.array2d[wp.vec3],
-    xquat: wp.array2d[wp.quat],
-    xipos: wp.array2d[wp.vec3],
-    inertia: wp.array2d[wp.mat33],
-):
+def inertias(c: Constants):
     """Each body's centre of mass, and its inertia about that, in the world frame."""
     world, body = wp.tid()
-    if not mask[world]:
+    if not c.mask[world]:
         return
-    frame = world % xpos.shape[0]
-    turn = xquat[frame, body]
-    xipos[world, body] = xpos[frame, body] + _rotate(turn, body_ipos[world % body_ipos.shape[0], body])
-    axes = _matrix(_multiply(turn, body_iquat[world % body_iquat.shape[0], body]))
-    moments = body_inertia[world % body_inertia.shape[0], body]
-    inertia[world, body] = axes @ wp.diag(moments) @ wp.transpose(axes)
+    frame = world % c.xpos.shape[0]
+    turn = c.xquat[frame, body]
+    c.xipos[world, body] = c.xpos[frame, body] + _rotate(
+        turn, c.body_ipos[world % c.body_ipos.shape[0], body]
+    )
+    axes = _matrix(_multiply(turn, c.body_iquat[world % c.body_iquat.shape[0], body]))
+    moments = c.body_inertia[world % c.body_inertia.shape[0], body]
+    c.inertia[world, body] = axes @ wp.diag(moments) @ wp.transpose(axes)
 
 
 @wp.kernel(enable_backward=False)
-def mass_matrix(
-    mask: wp.array[bool],
-    num_actuators: int,
-    dof_bodyid: wp.array[int],
-    dof_parentid: wp.array[int],
-    dof_rotates: wp.array[float],
-    body_subtreenum: wp.array[int],
-    body_mass: wp.array2d[float],
-    dof_armature: wp.array2d[float],
-    actuator_dof: wp.array[int],
-    actuator_armature: wp.array2d[float],
-    actuator_gear: wp.array2d[wp.spatial_vector],
-    anchor: wp.array2d[wp.vec3],
-    axis: wp.array2d[wp.vec3],
-    xipos: wp.array2d[wp.vec3],
-    inertia: wp.array2d[wp.mat33],
-    factor: wp.array3d[float],
-):
+def mass_matrix(c: Constants):
     """Row `dof` of M: what the momentum of its subtree, moved at unit speed, is along the dofs of its chain."""
     world, dof = wp.tid()
-    if not mask[world]:
+    if not c.mask[world]:
         return
-    frame = world % axis.shape[0]
-    first = dof_bodyid[dof]
-    point = xipos[world, first]
-    rotates = dof_rotates[dof]
-    turning = rotates * axis[frame, dof]
+    frame = world % c.axis.shape[0]
+    first = c.dof_bodyid[dof]
+    point = c.xipos[world, first]
+    rotates = c.dof_rotates[dof]
+    turning = rotates * c.axis[frame, dof]
     momentum = wp.vec3(0.0, 0.0, 0.0)
     spin = wp.vec3(0.0, 0.0, 0.0)
-    for body in range(first, first + body_subtreenum[first]):
-        com = xipos[world, body]
-        velocity = _point_velocity(rotates, axis[frame, dof], anchor[frame, dof], com)
-        part = body_mass[world % body_mass.shape[0], body] * velocity
+    for body in range(first, first + c.body_subtreenum[first]):
+        com = c.xipos[world, body]
+        velocity = _point_velocity(rotates, c.axis[frame, dof], c.anchor[frame, dof], com)
+        part = c.body_mass[world % c.body_mass.shape[0], body] * velocity
         momentum += part
-        spin += inertia[world, body] @ turning + wp.cross(com - point, part)
-    armature = float(dof_armature[world % dof_armature.shape[0], dof])
-    for i in range(num_actuators):
-        if actuator_dof[i] == dof:
-            gear = actuator_gear[world % actuator_gear.shape[0], i][0]
-            armature += actuator_armature[world % actuator_armature.shape[0], i] * gear * gear
+        spin += c.inertia[world, body] @ turning + wp.cross(com - point, part)
+    armature = float(c.dof_armature[world % c.dof_armature.shape[0], dof])
+    for i in range(c.num_actuators):
+        if c.actuator_dof[i] == dof:
+            gear = c.actuator_gear[world % c.actuator_gear.shape[0], i][0]
+            armature += c.actuator_armature[world % c.actuator_armature.shape[0], i] * gear * gear
     other = dof
     while other >= 0:
-        along = dof_rotates[other]
-        velocity = _point_velocity(along, axis[frame, other], anchor[frame, other], point)
-        factor[world, dof, other] = (
-            wp.dot(momentum, velocity) + along * wp.dot(spin, axis[frame, other]) + armature
+        along = c.dof_rotates[other]
+        velocity = _point_velocity(along, c.axis[frame, other], c.anchor[frame, other], point)
+        c.factor[world, dof, other] = (
+            wp.dot(momentum, velocity) + along * wp.dot(spin, c.axis[frame, other]) + armature
         )
         armature = 0.0
-        other = dof_parentid[other]
+        other = c.dof_parentid[other]
 
 
 @wp.kernel(enable_backward=False)
-def factorize(mask: wp.array[bool], nv: int, dof_parentid: wp.array[int], factor: wp.array3d[float]):
+def factorize(c: Constants):
     """M = L^T D L, in place, from the leaves to the root."""
     world = wp.tid()
-    if not mask[world]:
+    if not c.mask[world]:
         return
-    for step in range(nv):
-        k = nv - 1 - step
-        inverse = 1.0 / factor[world, k, k]
-        i = dof_parentid[k]
+    for step in range(c.nv):
+        k = c.nv - 1 - step
+        inverse = 1.0 / c.factor[world, k, k]
+        i = c.dof_parentid[k]
         while i >= 0:
-            ratio = factor[world, k, i] * inverse
+            ratio = c.factor[world, k, i] * inverse
             j = i
             while j >= 0:
-                factor[world, i, j] = factor[world, i, j] - ratio * factor[world, k, j]
-                j = dof_parentid[j]
-            factor[world, k, i] = ratio
-            i = dof_parentid[i]
+                c.factor[world, i, j] = c.factor[world, i, j] - ratio * c.factor[world, k, j]
+                j = c.dof_parentid[j]
+            c.factor[world, k, i] = ratio
+            i = c.dof_parentid[i]
 
 
 @wp.kernel(enable_backward=False)
-def invert(mask: wp.array[bool], dof_parentid: wp.array[int], factor: wp.array3d[float]):
+def invert(c: Constants):
     """Row `dof` of X = L^-1, from X L = 1; X[dof, k] is kept at [k, dof]."""
     world, dof = wp.tid()
-    if not mask[world]:
+    if not c.mask[world]:
         return
-    k = dof_parentid[dof]
+    k = c.dof_parentid[dof]
     while k >= 0:
-        total = float(factor[world, dof, k])
-        j = dof_parentid[dof]
+        total = float(c.factor[world, dof, k])
+        j = c.dof_parentid[dof]
         while j > k:
-            total += factor[world, j, dof] * factor[world, j, k]
-            j = dof_parentid[j]
-        factor[world, k, dof] = -total
-        k = dof_parentid[k]
+            total += c.factor[world, j, dof] * c.factor[world, j, k]
+            j = c.dof_parentid[j]
+        c.factor[world, k, dof] = -total
+        k = c.dof_parentid[k]
 
 
 @wp.kernel(enable_backward=False)
-def dof_invweights(
-    mask: wp.array[bool],
-    dof_parentid: wp.array[int],
-    group_start: wp.array[int],
-    group_size: wp.array[int],
-    factor: wp.array3d[float],
-    dof_invweight0: wp.array2d[float],
-):
+def dof_invweights(c: Constants):
     """Diagonal of M^-1, averaged over the translations and over the rotations of one joint."""
     world, dof = wp.tid()
-    if not mask[world]:
+    if not c.mask[world]:
         return
     total = float(0.0)  # noqa: UP018 (Warp: a variable that changes in a loop)
-    for member in range(group_start[dof], group_start[dof] + group_size[dof]):
-        total += 1.0 / factor[world, member, member]
-        k = dof_parentid[member]
+    for member in range(c.group_start[dof], c.group_start[dof] + c.group_size[dof]):
+        total += 1.0 / c.factor[world, member, member]
+        k = c.dof_parentid[member]
         while k >= 0:
-            total += factor[world, k, member] * factor[world, k, member] / factor[world, k, k]
-            k = dof_parentid[k]
-    dof_invweight0[world % dof_invweight0.shape[0], dof] = total / float(group_size[dof])
+            total += c.factor[world, k, member] * c.factor[world, k, member] / c.factor[world, k, k]
+            k = c.dof_parentid[k]
+    c.dof_invweight0[world % c.dof_invweight0.shape[0], dof] = total / float(c.group_size[dof])
 
 
 @wp.kernel(enable_backward=False)
-def body_invweights(
-    mask: wp.array[bool],
-    dof_parentid: wp.array[int],
-    dof_rotates: wp.array[float],
-    last_dof: wp.array[int],
-    anchor: wp.array2d[wp.vec3],
-    axis: wp.array2d[wp.vec3],
-    xipos: wp.array2d[wp.vec3],
-    factor: wp.array3d[float],
-    body_invweight0: wp.array2d[wp.vec2],
-):
+def body_invweights(c: Constants):
     """Mean diagonal of J M^-1 J^T at each centre of mass: translation, rotation."""
     world, body = wp.tid()
-    if not mask[world]:
+    if not c.mask[world]:
         return
-    frame = world % axis.shape[0]
-    point = xipos[world, body]
+    frame = world % c.axis.shape[0]
+    point = c.xipos[world, body]
     moved = float(0.0)  # noqa: UP018
     turned = float(0.0)  # noqa: UP018
-    k = last_dof[body]
+    k = c.last_dof[body]
     while k >= 0:
         linear = wp.vec3(0.0, 0.0, 0.0)
         angular = wp.vec3(0.0, 0.0, 0.0)
-        i = last_dof[body]
+        i = c.last_dof[body]
         while i >= k:
             share = float(1.0)  # noqa: UP018
             if i > k:
-                share = factor[world, k, i]
-            linear += share * _point_velocity(dof_rotates[i], axis[frame, i], anchor[frame, i], point)
-            angular += share * dof_rotates[i] * axis[frame, i]
-            i = dof_parentid[i]
-        moved += wp.dot(linear, linear) / factor[world, k, k]
-        turned += wp.dot(angular, angular) / factor[world, k, k]
-        k = dof_parentid[k]
+                share = c.factor[world, k, i]
+            linear += share * _point_velocity(c.dof_rotates[i], c.axis[frame, i], c.anchor[frame, i], point)
+            angular += share * c.dof_rotates[i] * c.axis[frame, i]
+            i = c.dof_parentid[i]
+        moved += wp.dot(linear, linear) / c.factor[world, k, k]
+        turned += wp.dot(angular, angular) / c.factor[world, k, k]
+        k = c.dof_parentid[k]
     translation = moved / 3.0
     rotation = turned / 3.0
     # A body that can only slide, or only turn, takes the other figure, as in mujoco_warp.set_const.
@@ -294,127 +272,87 @@ def body_invweights(
         translation = rotation
     elif rotation < MINVAL:
         rotation = translation
-    body_invweight0[world % body_invweight0.shape[0], body] = wp.vec2(translation, rotation)
+    c.body_invweight0[world % c.body_invweight0.shape[0], body] = wp.vec2(translation, rotation)
 
 
 @wp.kernel(enable_backward=False)
-def actuator_accelerations(
-    mask: wp.array[bool],
-    nv: int,
-    dof_parentid: wp.array[int],
-    actuator_dof: wp.array[int],
-    actuator_gear: wp.array2d[wp.spatial_vector],
-    factor: wp.array3d[float],
-    actuator_acc0: wp.array2d[float],
-):
+def actuator_accelerations(c: Constants):
     """Norm of the acceleration from unit force: of column `actuator_dof` of M^-1, times the gear."""
     world, actuator = wp.tid()
-    if not mask[world]:
+    if not c.mask[world]:
         return
-    dof = actuator_dof[actuator]
+    dof = c.actuator_dof[actuator]
     total = float(0.0)  # noqa: UP018
-    for other in range(nv):
+    for other in range(c.nv):
         entry = float(0.0)  # noqa: UP018
         k = dof
         while k >= 0:
             left = float(1.0)  # noqa: UP018
             right = float(0.0)  # noqa: UP018
             if k < dof:
-                left = factor[world, k, dof]
+                left = c.factor[world, k, dof]
             if k == other:
                 right = 1.0
             elif k < other:
-                right = factor[world, k, other]
-            entry += left * right / factor[world, k, k]
-            k = dof_parentid[k]
+                right = c.factor[world, k, other]
+            entry += left * right / c.factor[world, k, k]
+            k = c.dof_parentid[k]
         total += entry * entry
-    gear = actuator_gear[world % actuator_gear.shape[0], actuator][0]
-    actuator_acc0[world % actuator_acc0.shape[0], actuator] = wp.abs(gear) * wp.sqrt(total)
+    gear = c.actuator_gear[world % c.actuator_gear.shape[0], actuator][0]
+    c.actuator_acc0[world % c.actuator_acc0.shape[0], actuator] = wp.abs(gear) * wp.sqrt(total)
 
 
 @wp.func
-def _subtree_com(
-    world: int,
-    body: int,
-    body_subtreenum: wp.array[int],
-    body_mass: wp.array2d[float],
-    xipos: wp.array2d[wp.vec3],
-) -> wp.vec3:
+def _subtree_com(world: int, body: int, c: Constants) -> wp.vec3:
     moment = wp.vec3(0.0, 0.0, 0.0)
     total = float(0.0)  # noqa: UP018
-    for other in range(body, body + body_subtreenum[body]):
-        mass = body_mass[world % body_mass.shape[0], other]
-        moment += mass * xipos[world, other]
+    for other in range(body, body + c.body_subtreenum[body]):
+        mass = c.body_mass[world % c.body_mass.shape[0], other]
+        moment += mass * c.xipos[world, other]
         total += mass
     if total < MINVAL:
-        return xipos[world, body]
+        return c.xipos[world, body]
     return moment / total
 
 
+@wp.func
+def _references(world: int, body: int, target: int, pos: wp.vec3, c: Constants):
+    """Return a place on a body from that body and from the centre of mass that it tracks, world axes, m."""
+    frame = world % c.xpos.shape[0]
+    tracked = wp.where(target < 0, body, target)
+    offset = _rotate(c.xquat[frame, body], pos)
+    return offset, c.xpos[frame, body] + offset - _subtree_com(world, tracked, c)
+
+
 @wp.kernel(enable_backward=False)
-def camera_references(
-    mask: wp.array[bool],
-    cam_bodyid: wp.array[int],
-    cam_targetbodyid: wp.array[int],
-    cam_pos: wp.array2d[wp.vec3],
-    cam_quat: wp.array2d[wp.quat],
-    body_subtreenum: wp.array[int],
-    body_mass: wp.array2d[float],
-    xpos: wp.array2d[wp.vec3],
-    xquat: wp.array2d[wp.quat],
-    xipos: wp.array2d[wp.vec3],
-    cam_pos0: wp.array2d[wp.vec3],
-    cam_poscom0: wp.array2d[wp.vec3],
-    cam_mat0: wp.array2d[wp.mat33],
-):
+def camera_references(c: Constants):
     """Where cameras are at `qpos0`: from their body, and from the centre of mass that they track."""
     world, camera = wp.tid()
-    if not mask[world]:
+    if not c.mask[world]:
         return
-    frame = world % xpos.shape[0]
-    body = cam_bodyid[camera]
-    tracked = cam_targetbodyid[camera]
-    if tracked < 0:
-        tracked = body
-    turn = xquat[frame, body]
-    offset = _rotate(turn, cam_pos[world % cam_pos.shape[0], camera])
-    com = _subtree_com(world, tracked, body_subtreenum, body_mass, xipos)
-    cam_pos0[world % cam_pos0.shape[0], camera] = offset
-    cam_poscom0[world % cam_poscom0.shape[0], camera] = xpos[frame, body] + offset - com
-    cam_mat0[world % cam_mat0.shape[0], camera] = _matrix(
-        _multiply(turn, cam_quat[world % cam_quat.shape[0], camera])
+    body = c.cam_bodyid[camera]
+    pos = c.cam_pos[world % c.cam_pos.shape[0], camera]
+    offset, from_com = _references(world, body, c.cam_targetbodyid[camera], pos, c)
+    turn = c.xquat[world % c.xpos.shape[0], body]
+    c.cam_pos0[world % c.cam_pos0.shape[0], camera] = offset
+    c.cam_poscom0[world % c.cam_poscom0.shape[0], camera] = from_com
+    c.cam_mat0[world % c.cam_mat0.shape[0], camera] = _matrix(
+        _multiply(turn, c.cam_quat[world % c.cam_quat.shape[0], camera])
     )
 
 
 @wp.kernel(enable_backward=False)
-def light_references(
-    mask: wp.array[bool],
-    light_bodyid: wp.array[int],
-    light_targetbodyid: wp.array[int],
-    light_pos: wp.array2d[wp.vec3],
-    light_dir: wp.array2d[wp.vec3],
-    body_subtreenum: wp.array[int],
-    body_mass: wp.array2d[float],
-    xpos: wp.array2d[wp.vec3],
-    xquat: wp.array2d[wp.quat],
-    xipos: wp.array2d[wp.vec3],
-    light_pos0: wp.array2d[wp.vec3],
-    light_poscom0: wp.array2d[wp.vec3],
-    light_dir0: wp.array2d[wp.vec3],
-):
+def light_references(c: Constants):
     """Where lights are at `qpos0`: from their body, and from the centre of mass that they track."""
     world, light = wp.tid()
-    if not mask[world]:
+    if not c.mask[world]:
         return
-    frame = world % xpos.shape[0]
-    body = light_bodyid[light]
-    tracked = light_targetbodyid[light]
-    if tracked < 0:
-        tracked = body
-    turn = xquat[frame, body]
-    offset = _rotate(turn, light_pos[world % light_pos.shape[0], light])
-    com = _subtree_com(world, tracked, body_subtreenum, body_mass, xipos)
-    light_pos0[world % light_pos0.shape[0], light] = offset
-    light_poscom0[world % light_poscom0.shape[0], light] = xpos[frame, body] + offset - com
-    direction = _rotate(turn, light_dir[world % light_dir.shape[0], light])
-    light_dir0[world % light_dir0.shape[0], light] = wp.normalize(direction)
+    body = c.light_bodyid[light]
+    pos = c.light_pos[world % c.light_pos.shape[0], light]
+    offset, from_com = _references(world, body, c.light_targetbodyid[light], pos, c)
+    direction = _rotate(
+        c.xquat[world % c.xpos.shape[0], body], c.light_dir[world % c.light_dir.shape[0], light]
+    )
+    c.light_pos0[world % c.light_pos0.shape[0], light] = offset
+    c.light_poscom0[world % c.light_poscom0.shape[0], light] = from_com
+    c.light_dir0[world % c.light_dir0.shape[0], light] = wp.normalize(direction)

@@ -1,20 +1,23 @@
 """This module loads and checks a model from a file, an XML string, a spec or a menagerie name."""
 
+import os
 import re
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import mujoco
 import warp as wp
 
-from ksim_rl.device.warp_start import start_warp
-from ksim_rl.physics import menagerie
+from ksim_rl.checks import near
+from ksim_rl.device.streams import start_warp
 from ksim_rl.physics.model_checks import check_finite, warp_model_of
-from ksim_rl.physics.mujoco_messages import caught_warnings
 
 SUFFIXES = (".xml", ".mjcf", ".urdf")
 Source = str | Path | mujoco.MjSpec
 
+_MENAGERIE_NAME = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)?")
 _ELEMENT = re.compile(r"Element '(?P<tag>[^']*)', line (?P<line>\d+)")
 _NAMED_ELEMENT = re.compile(r"Element name '(?P<name>[^']*)', id (?P<id>-?\d+)(, line (?P<line>\d+))?")
 _FILE_IN_MESSAGE = re.compile(r"file '(?P<file>[^']+)'")
@@ -93,8 +96,8 @@ def _read(source: str | Path) -> tuple[Path | None, str, str]:
             )
         if source.lstrip().startswith("<"):
             return None, source, "XML string"
-        if menagerie.looks_like_name(source) and not Path(source).exists():
-            source = menagerie.model_path(source)
+        if _MENAGERIE_NAME.fullmatch(source) and not Path(source).exists():
+            source = model_path(source)
     path = Path(source)
     if path.is_dir() or not path.exists():
         raise ValueError(f"model file {str(path)!r}: {'is a folder' if path.is_dir() else 'no such file'}")
@@ -154,3 +157,73 @@ def _refuse_serious(message: str, mj_model: mujoco.MjModel, label: str, text: st
 def _pass_on(caught: list[str], label: str) -> None:
     for text in dict.fromkeys(caught):
         warnings.warn(f"{label}: {text}", UserWarning, stacklevel=3)
+
+
+@contextmanager
+def caught_warnings() -> Iterator[list[str]]:
+    """Collect MuJoCo's warnings, which else go to the terminal and into a file MUJOCO_LOG.TXT."""
+    caught: list[str] = []
+
+    def keep(text: bytes | str) -> None:
+        caught.append((text.decode(errors="replace") if isinstance(text, bytes) else text).strip())
+
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(keep)
+    try:
+        with warnings.catch_warnings(record=True) as from_bindings:
+            warnings.simplefilter("always")
+            yield caught
+        for warning in from_bindings:
+            keep(str(warning.message))
+    finally:
+        mujoco.set_mju_user_warning(previous)
+
+
+def model_path(name: str) -> Path:
+    """Return the file of a robot: "unitree_go1" (its scene), or "unitree_go1/go1" (one of its entry points).
+
+    Looks under the folder that the environment variable MENAGERIE_ROOT names, else in the cache of the package
+    `mujoco-menagerie`, which downloads a robot on first use.
+
+    Raises:
+        ValueError: in one line, what is missing and how to get it with and without a network.
+    """
+    robot, _, entry = name.partition("/")
+    root = os.environ.get("MENAGERIE_ROOT")
+    if root:
+        return _in_folder(Path(root), robot, entry)
+    return _from_package(robot, entry)
+
+
+def _in_folder(root: Path, robot: str, entry: str) -> Path:
+    if not (root / robot).is_dir():
+        found = [path.name for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
+        raise ValueError(
+            f"menagerie model {robot!r} is not under MENAGERIE_ROOT={root}: {near(robot, found)}; copy its "
+            "folder there, or unset MENAGERIE_ROOT to download it with the package mujoco-menagerie"
+        )
+    stem = entry or "scene"
+    path = root / robot / f"{stem}.xml"
+    if not path.is_file():
+        found = [path.stem for path in (root / robot).glob("*.xml")]
+        raise ValueError(f"menagerie model {robot!r} has no entry point {stem!r}: {near(stem, found)}")
+    return path
+
+
+def _from_package(robot: str, entry: str) -> Path:
+    try:
+        import mujoco_menagerie
+    except ImportError:
+        raise ValueError(
+            f"menagerie model {robot!r} is not here: with a network, `pip install mujoco-menagerie` (it downloads the "
+            "model on first use); without one, copy the folder and set MENAGERIE_ROOT to its parent"
+        ) from None
+    try:
+        return mujoco_menagerie.get(robot).xml(entry or None)
+    except LookupError as error:
+        raise ValueError(f"menagerie: {error}") from None
+    except (mujoco_menagerie.MenagerieError, OSError) as error:
+        raise ValueError(
+            f"menagerie model {robot!r} could not be downloaded ({error}): with a network, try again; without one, "
+            "copy its folder from github.com/google-deepmind/mujoco_menagerie and set MENAGERIE_ROOT to its parent"
+        ) from None

@@ -13,7 +13,7 @@ import warp as wp
 
 from ksim_rl.physics import constant_kernels as kernels
 from ksim_rl.physics.fields import FIXED, INERT0, KIN0, const_groups
-from ksim_rl.physics.launch import launch_by_name
+from ksim_rl.physics.structs import filled
 from ksim_rl.physics.upstream import set_fixed_constants
 
 KINEMATIC = frozenset(("qpos0", "body_pos", "body_quat", "jnt_pos", "jnt_axis"))
@@ -41,9 +41,8 @@ class MaskedConstants:
         starts, sizes = _joint_groups(mj_model)
         # Frames at qpos0 are shared unless a field that moves them differs between worlds.
         num_frames = num_envs if self._moves else 1
-        # By the names of the kernels' parameters.
-        self._own = {
-            "mask": mask,
+        own = {
+            "mask": wp.full(num_frames, True, dtype=bool),
             "num_actuators": mj_model.nu if has_armature else 0,
             "dof_rotates": wp.array(_rotates(mj_model), dtype=float),
             "group_start": wp.array(starts, dtype=int),
@@ -58,8 +57,9 @@ class MaskedConstants:
             "inertia": wp.zeros((num_envs, nbody), dtype=wp.mat33),
             "factor": wp.zeros((num_envs, nv, nv), dtype=float),
         }
-        everywhere = {"mask": wp.full(num_frames, True, dtype=bool)}
-        launch_by_name(kernels.frames, num_frames, everywhere, self._own, warp_model)
+        self._constants = filled(kernels.Constants, own, warp_model)
+        wp.launch(kernels.frames, dim=num_frames, inputs=[self._constants])
+        self._constants.mask = mask
 
     def covers(self, fields: Iterable[str]) -> bool:
         """Return whether the constants that follow from `fields` can be recomputed here.
@@ -92,10 +92,10 @@ class MaskedConstants:
             self._launch(kernels.invert, m.nv)
             self._launch(kernels.dof_invweights, m.nv)
             self._launch(kernels.body_invweights, m.nbody)
-            self._launch(kernels.actuator_accelerations, self._own["actuator_dof"].shape[0])
+            self._launch(kernels.actuator_accelerations, self._constants.actuator_dof.shape[0])
 
     def _launch(self, kernel: wp.Kernel, *width: int) -> None:
-        launch_by_name(kernel, (self._num_envs, *width), self._own, self._warp_model)
+        wp.launch(kernel, dim=(self._num_envs, *width), inputs=[self._constants])
 
 
 def _drives_scalar_joints(mj_model: mujoco.MjModel) -> bool:

@@ -7,26 +7,8 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 
-OBJECT_TYPES = {
-    "body": mujoco.mjtObj.mjOBJ_BODY,
-    "jnt": mujoco.mjtObj.mjOBJ_JOINT,
-    "geom": mujoco.mjtObj.mjOBJ_GEOM,
-    "site": mujoco.mjtObj.mjOBJ_SITE,
-    "cam": mujoco.mjtObj.mjOBJ_CAMERA,
-    "light": mujoco.mjtObj.mjOBJ_LIGHT,
-    "mesh": mujoco.mjtObj.mjOBJ_MESH,
-    "hfield": mujoco.mjtObj.mjOBJ_HFIELD,
-    "mat": mujoco.mjtObj.mjOBJ_MATERIAL,
-    "pair": mujoco.mjtObj.mjOBJ_PAIR,
-    "eq": mujoco.mjtObj.mjOBJ_EQUALITY,
-    "tendon": mujoco.mjtObj.mjOBJ_TENDON,
-    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
-    "sensor": mujoco.mjtObj.mjOBJ_SENSOR,
-    "numeric": mujoco.mjtObj.mjOBJ_NUMERIC,
-    "flex": mujoco.mjtObj.mjOBJ_FLEX,
-    "key": mujoco.mjtObj.mjOBJ_KEY,
-}
-ELEMENT_WORDS = {"jnt": "joint", "cam": "camera", "mat": "material", "eq": "equality", "key": "keyframe"}
+# Where a field's prefix is not the name of MuJoCo's type of object.
+TYPES_OF_PREFIXES = {"jnt": "joint", "cam": "camera", "mat": "material", "eq": "equality"}
 # The largest number that the float32 of the GPU holds.
 LARGEST = float(np.finfo(np.float32).max)
 DERIVED = ("invweight0", "acc0", "aabb", "rbound", "length0", "subtreemass", "mat0", "pos0", "poscom0")
@@ -115,14 +97,15 @@ def _element_of(mj_model: mujoco.MjModel, field: str, flat_index: int, shape: tu
         prefix, row = "jnt", int(mj_model.dof_jntid[row])
     elif field in ("qpos0", "qpos_spring"):
         prefix, row = "jnt", int(np.searchsorted(mj_model.jnt_qposadr, row, side="right")) - 1
-    if prefix not in OBJECT_TYPES:
-        return f"row {row}"
     return _element(mj_model, prefix, row)
 
 
 def _element(mj_model: mujoco.MjModel, prefix: str, row: int) -> str:
-    name = mujoco.mj_id2name(mj_model, int(OBJECT_TYPES[prefix]), row)
-    word = ELEMENT_WORDS.get(prefix, prefix)
+    word = TYPES_OF_PREFIXES.get(prefix, prefix)
+    kind = mujoco.mju_str2Type(word)
+    if not kind:
+        return f"row {row}"
+    name = mujoco.mj_id2name(mj_model, kind, row)
     return f"{word} {name!r}" if name else f"{word} number {row} (unnamed)"
 
 

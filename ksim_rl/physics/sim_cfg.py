@@ -1,11 +1,12 @@
 """This module holds the settings of solver and integrator that are laid over those of a model."""
 
 import dataclasses
+from typing import Literal
 
 import mujoco
 
-from ksim_rl.checks import check_choice, check_count, check_in_range
-from ksim_rl.physics.nan_guard.cfg import NanGuardCfg
+from ksim_rl.checked import Checked, Count, Positive
+from ksim_rl.physics.nan_guard.guard import NanGuardCfg
 
 INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
@@ -19,7 +20,7 @@ CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCon
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SimCfg:
+class SimCfg(Checked):
     """Simulation settings. `None` keeps the model's own value.
 
     Args:
@@ -53,40 +54,21 @@ class SimCfg:
         ValueError: naming the field, the value and what is valid.
     """
 
-    timestep: float | None = None
-    integrator: str | None = None
-    solver: str | None = None
-    cone: str | None = None
-    impratio: float | None = None
-    tolerance: float | None = None
-    iterations: int | None = None
-    ls_iterations: int | None = None
-    ccd_iterations: int | None = None
-    njmax: int | None = None
-    nconmax: int | None = None
+    timestep: Positive | None = None
+    integrator: Literal["euler", "rk4", "implicit", "implicitfast", "discrete"] | None = None
+    solver: Literal["cg", "newton"] | None = None
+    cone: Literal["pyramidal", "elliptic"] | None = None
+    impratio: Positive | None = None
+    tolerance: Positive | None = None
+    iterations: Count | None = None
+    ls_iterations: Count | None = None
+    ccd_iterations: Count | None = None
+    njmax: Count | None = None
+    nconmax: Count | None = None
     deterministic: bool = False
     one_kernel_solver: bool = True
     require_graphs: bool = False
     nan_guard: NanGuardCfg | None = None
-
-    def __post_init__(self) -> None:
-        for field in ("timestep", "impratio", "tolerance"):
-            value = getattr(self, field)
-            if value is not None:
-                check_in_range(field, value, low=0.0, low_open=True)
-        for field, choices in (("integrator", INTEGRATORS), ("solver", SOLVERS), ("cone", CONES)):
-            value = getattr(self, field)
-            if value is not None:
-                check_choice(field, value, choices)
-        for field in ("iterations", "ls_iterations", "ccd_iterations", "njmax", "nconmax"):
-            if getattr(self, field) is not None:
-                check_count(field, getattr(self, field))
-        for field in ("deterministic", "one_kernel_solver", "require_graphs"):
-            value = getattr(self, field)
-            if not isinstance(value, bool):
-                raise ValueError(f"{field}={value!r}: expected True or False")
-        if self.nan_guard is not None and not isinstance(self.nan_guard, NanGuardCfg):
-            raise ValueError(f"nan_guard={self.nan_guard!r}: expected a NanGuardCfg(folder=...), or None")
 
     def apply_to(self, target: mujoco.MjSpec | mujoco.MjModel) -> None:
         """Write the settings that are not `None` into the options of a spec or a model, in place."""

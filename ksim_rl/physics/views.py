@@ -1,4 +1,4 @@
-"""This module makes zero-copy torch views of Warp arrays."""
+"""This module makes zero-copy torch views of Warp arrays, and names those that the next steps of a world depend on."""
 
 import dataclasses
 
@@ -19,6 +19,49 @@ ACCELERATION_STAGE = (
     "cfrc_int",
     "cfrc_ext",
 )
+
+
+# Integrated or set by the user; empty arrays are left out.
+STATE = (
+    "time",
+    "qpos",
+    "qvel",
+    "act",
+    "history",
+    "plastic",
+    "qacc_warmstart",
+    "ctrl",
+    "qfrc_applied",
+    "xfrc_applied",
+    "eq_active",
+    "mocap_pos",
+    "mocap_quat",
+    "userdata",
+    "tree_asleep",
+    "tree_awake",
+    "body_awake",
+    "body_awake_ind",
+    "dof_awake_ind",
+    "ntree_awake",
+    "nbody_awake",
+    "nv_awake",
+    "overflow",
+)
+# Results of the last substep that `refresh` does not recompute, but terms may read before the next one.
+LAST_SUBSTEP = (
+    "sensordata",
+    "qacc",
+    "act_dot",
+    *ACCELERATION_STAGE,
+    "actuator_length",
+    "actuator_velocity",
+)
+
+
+def state_tensors(warp_data_E: mjw.Data) -> dict[str, Shaped[Tensor, "*?leaf"]]:
+    """Return views of the arrays that make up the state of a world."""
+    tensors = {name: wp.to_torch(getattr(warp_data_E, name)) for name in (*STATE, *LAST_SUBSTEP)}
+    return {name: tensor for name, tensor in tensors.items() if tensor.numel()}
 
 
 def float_rows(warp_data_E: mjw.Data, names: tuple[str, ...]) -> list[wp.array]:

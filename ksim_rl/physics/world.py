@@ -14,8 +14,9 @@ from torch import Tensor
 from ksim_rl.checks import check_choice, check_count, unknown_name
 from ksim_rl.device.kernel_loading import loaded_together
 from ksim_rl.device.memory import memory_for
+from ksim_rl.device.state_tree import copy_into
 from ksim_rl.device.streams import checked_device, warp_scope
-from ksim_rl.physics import capacity, kernels, state, upstream, views
+from ksim_rl.physics import capacity, kernels, upstream, views
 from ksim_rl.physics.fields import (
     FIXED,
     GRAVITY,
@@ -305,7 +306,8 @@ class World(views.DataViews):
         Raises:
             ValueError: if a tensor is missing, unknown, or of another shape (other model or `num_envs`).
         """
-        state.load(self._state_tensors(), state_dict)
+        what = "state of a world (of the same model, num_envs and per_world_fields)"
+        copy_into(self._state_tensors(), state_dict, what=what)
         self.refresh()
 
     def bytes_per_world(self) -> int:
@@ -368,7 +370,7 @@ class World(views.DataViews):
         self._reset_mask_E.copy_(mask_E)
 
     def _state_tensors(self) -> dict[str, Tensor]:
-        tensors = state.data_tensors(self.warp_data_E)
+        tensors = views.state_tensors(self.warp_data_E)
         tensors |= {f"field/{name}": tensor for name, tensor in self._fields.items()}
         tensors |= {
             "overflow/sticky": self._overflow.sticky_E,

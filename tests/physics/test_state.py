@@ -46,10 +46,10 @@ def test_another_state_is_refused_before_anything_changes():
     world = World(cartpole(), num_envs=2)
     world.qpos_EL.fill_(0.25)
     saved = World(cartpole(), num_envs=3).state_dict()
-    with pytest.raises(ValueError, match=r"'qpos' is .*\(3, 2\).*\(2, 2\)"):
+    with pytest.raises(ValueError, match=r"'qpos' is .*\[3, 2\].*\[2, 2\]"):
         world.load_state_dict({**world.state_dict(), "qpos": saved["qpos"]})
     incomplete = world.state_dict()
     incomplete.pop("qvel")
-    with pytest.raises(ValueError, match=r"missing \['qvel'\]"):
+    with pytest.raises(ValueError, match="has no 'qvel'"):
         world.load_state_dict(incomplete)
     assert (world.qpos_EL == 0.25).all()

@@ -1,6 +1,7 @@
 """The NaN guard keeps the last substeps of each world on the device, and writes those of failed worlds to files."""
 
-from __future__ import annotations
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportAssignmentType=false, reportCallIssue=false
 
 import os
 from collections.abc import Mapping
@@ -15,9 +16,8 @@ import warp as wp
 from jaxtyping import Int, Shaped
 from torch import Tensor
 
+from ksim_rl.checked import Checked, Count
 from ksim_rl.physics.nan_guard import file as nan_file
-from ksim_rl.physics.nan_guard import kernels as nan_kernels
-from ksim_rl.physics.nan_guard.cfg import NanGuardCfg
 from ksim_rl.physics.views import float_rows
 
 # What a substep depends on; empty arrays are left out.
@@ -34,6 +34,27 @@ BEFORE = (
     "qacc_warmstart",
 )
 _WATCHED, _FAILED, _KEPT = 0, 1, 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class NanGuardCfg(Checked):
+    """Keep the last substeps of each world, and save those of a world whose state became non-finite.
+
+    Args:
+        folder: where the files go; it is created with the world.
+        history: substeps that are kept, on the device: 4 bytes for each number of a world's state, controls and
+            applied forces (Go1: 0.7 kB per world and substep).
+        max_files: most files that one world batch writes; further failures are only counted.
+    """
+
+    folder: str
+    history: Count = 20
+    max_files: Count = 4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.folder:
+            raise ValueError(f"folder={self.folder!r}: expected the path of a folder")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +75,45 @@ class NanReport:
     def ok(self) -> bool:
         """Whether all worlds stayed finite."""
         return not self.worlds
+
+
+@wp.kernel(enable_backward=False)
+def keep_rows(
+    rows: wp.array2d[float],
+    failed: wp.array[int],
+    count: wp.array[int],
+    ring: wp.array3d[float],
+):
+    """Write each world's row into the next place of its ring, unless the world has failed."""
+    world, i = wp.tid()
+    if failed[world] == 0:
+        ring[world, count[world] % ring.shape[1], i] = rows[world, i]
+
+
+@wp.kernel(enable_backward=False)
+def mark_failed(
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    failed: wp.array[int],
+    count: wp.array[int],
+    reached_qpos: wp.array2d[float],
+    reached_qvel: wp.array2d[float],
+):
+    """Count the substep; where the sum of the state is not finite, keep the state and stop the world's ring."""
+    world = wp.tid()
+    if failed[world] == 0:
+        count[world] = count[world] + 1
+        total = float(0.0)  # noqa: UP018 (Warp: a variable that changes in a loop)
+        for i in range(qpos.shape[1]):
+            total += qpos[world, i]
+        for i in range(qvel.shape[1]):
+            total += qvel[world, i]
+        if not wp.isfinite(total):
+            failed[world] = 1
+            for i in range(qpos.shape[1]):
+                reached_qpos[world, i] = qpos[world, i]
+            for i in range(qvel.shape[1]):
+                reached_qvel[world, i] = qvel[world, i]
 
 
 class NanGuard:
@@ -88,7 +148,7 @@ class NanGuard:
         """Launch the copies of the state that the substep starts from."""
         for rows, ring in zip(self._rows, self._rings, strict=True):
             wp.launch(
-                nan_kernels.keep_rows,
+                keep_rows,
                 dim=rows.shape,
                 inputs=[rows, self._failed, self._count],
                 outputs=[ring],
@@ -98,7 +158,7 @@ class NanGuard:
         """Launch the search for worlds that failed in this substep."""
         d = self._warp_data_E
         wp.launch(
-            nan_kernels.mark_failed,
+            mark_failed,
             dim=d.nworld,
             inputs=[d.qpos, d.qvel, self._failed, self._count],
             outputs=[self._reached["qpos"], self._reached["qvel"]],

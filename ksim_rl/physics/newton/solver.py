@@ -12,10 +12,11 @@ from ksim_rl.physics.newton.kernel import (
     Problem,
     floats_per_world,
     newton_kernel,
+    put_longest_first,
     row_stride,
 )
-from ksim_rl.physics.newton.order import put_longest_first
 from ksim_rl.physics.sim_cfg import SimCfg
+from ksim_rl.physics.structs import filled
 
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
@@ -129,22 +130,17 @@ def solver(
         checked=broken is not None,
     )
     far_floats = (d.njmax - place.rows_on_chip) * row_stride(m.nv)
-    problem = Problem()
-    problem.iterations = int(m.opt.iterations)
-    problem.contact_friction = d.contact.friction
-    problem.efc_J_colind = efc.J_colind.reshape((d.nworld, -1))
-    problem.efc_J = efc.J.reshape((d.nworld, -1))
-    for prefix, owner, names in (
-        ("", m, "M_hinit_i M_colind"),
-        ("", m.opt, "tolerance ls_tolerance impratio_invsqrt"),
-        ("", d, "ne nf nefc M qacc qacc_warmstart qfrc_smooth qfrc_constraint solver_niter overflow"),
-        ("efc_", efc, "type id J_rownnz J_rowadr D aref frictionloss Ma force state"),
-    ):
-        for name in names.split():
-            setattr(problem, prefix + name, getattr(owner, name))
-    problem.scratch = wp.empty((d.nworld, far_floats), dtype=float, device=d.qpos.device)
-    problem.order = wp.array(list(range(d.nworld)), dtype=int, device=d.qpos.device)
-    problem.broken = wp.empty(0, dtype=int, device=d.qpos.device) if broken is None else broken
+    device = d.qpos.device
+    own = {
+        "efc_J_colind": efc.J_colind.reshape((d.nworld, -1)),
+        "efc_J": efc.J.reshape((d.nworld, -1)),
+        "contact_friction": d.contact.friction,
+        "scratch": wp.empty((d.nworld, far_floats), dtype=float, device=device),
+        "order": wp.array(list(range(d.nworld)), dtype=int, device=device),
+        "broken": wp.empty(0, dtype=int, device=device) if broken is None else broken,
+    }
+    rows = {f"efc_{name}": array for name, array in vars(efc).items()}
+    problem = filled(Problem, own, rows, m, m.opt, d)
     dim, block_dim = (d.nworld, lanes), place.worlds_per_block * lanes
 
     def launch() -> None:

@@ -8,7 +8,7 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
-from ksim_rl.physics.mujoco_messages import caught_warnings
+from ksim_rl.physics.load import caught_warnings
 
 Vector = Sequence[float] | np.ndarray
 Rgba = tuple[float, float, float, float]
