@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from ksim_rl.device.compile_notice import compile_notice
+from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.trainers import Checkpoint, Evaluation, Outcome, RunCfg, RunProgress, run
 from ksim_rl.trainers.build import solved_at
 

@@ -11,7 +11,7 @@ from rich.table import Table
 from ksim_rl import envs
 from ksim_rl.checks import check_in_range
 from ksim_rl.cli.report import run_and_report, shown, verdict
-from ksim_rl.device.compile_notice import compile_notice
+from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.envs.contract import part
 from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, load_policy, record_video
 from ksim_rl.trainers.build import build_evaluator, solved_at

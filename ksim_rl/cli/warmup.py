@@ -7,7 +7,7 @@ import warp as wp
 
 from ksim_rl import conf
 from ksim_rl.cli.command_line import check_command_line
-from ksim_rl.device.compile_notice import compile_notice
+from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.trainers import RunProgress, build
 
 USAGE = """usage: ksim-rl warmup [overrides of ksim-rl train]

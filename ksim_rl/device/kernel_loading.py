@@ -1,8 +1,18 @@
-"""This module loads the kernels of many launches at once: one after another, a new model takes half a minute."""
+"""Kernels are compiled side by side here, and a notice says so, as it would look like a hang otherwise.
+
+The first use of a model compiles its kernels: 15 to 45 s, once per machine, then cached. Warp's own module-load lines
+are dropped; in their place each compiled module calls one hook with one line of text. The default hook writes the
+first line of a burst to stderr; a program with its own display sets another:
+
+    with compile_notice(lambda text: status.update(text)):
+        world.step(1)
+"""
 
 import os
+import sys
+import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -12,16 +22,80 @@ import warp as wp
 from ksim_rl.device import upstream
 from ksim_rl.device.streams import warp_device
 
+CompileHook = Callable[[str], None]
 # A process with more compilers than this waits for its disk.
 MOST_WORKERS = 16
+# Compilations further apart than this belong to another model.
+BURST_GAP_S = 60.0
+
+
+class CompileLogger:
+    """A Warp logger that drops information lines and turns compilations into calls of a hook."""
+
+    def __init__(self, hook: CompileHook) -> None:
+        self.hook = hook
+        self.count = 0
+        self.seconds = 0.0
+        self.last_time = -BURST_GAP_S
+
+    def debug(self, message: str) -> None:
+        """Drop Warp's debug lines."""
+
+    def info(self, message: str) -> None:
+        """Drop Warp's information lines, and report those that tell of a compiled module."""
+        match = upstream.COMPILED_LINE.match(message)
+        if match is None:
+            return
+        now = time.monotonic()
+        if now - self.last_time > BURST_GAP_S:
+            self.count, self.seconds = 0, 0.0
+        self.last_time = now
+        self.count += 1
+        self.seconds += float(match["ms"]) / 1000.0
+        self.hook(
+            f"compiling Warp kernels (first use of this model, cached in {wp.config.kernel_cache_dir}): "
+            f"{self.count} modules, {self.seconds:.0f} s"
+        )
+
+    def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:
+        """Write Warp's warnings to stderr."""
+        sys.stderr.write(f"Warp warning: {message}\n")
+
+    def error(self, message: str) -> None:
+        """Write Warp's errors to stderr."""
+        sys.stderr.write(f"Warp error: {message}\n")
+
+
+def say_first(text: str) -> None:
+    """Write the first line of a burst of compilations to stderr; the default hook."""
+    if _logger.count == 1:
+        sys.stderr.write(text.rsplit(":", 1)[0] + " ...\n")
+
+
+_logger = CompileLogger(say_first)
+
+
+if upstream.has_default_logger():  # one that the program set itself stays
+    wp.set_logger(_logger)
+
+
+@contextmanager
+def compile_notice(hook: CompileHook) -> Iterator[None]:
+    """Call `hook` with one line of text after each kernel module that Warp compiles in this block, counted from 1."""
+    saved, _logger.hook = _logger.hook, hook
+    _logger.last_time = -BURST_GAP_S
+    try:
+        yield
+    finally:
+        _logger.hook = saved
 
 
 @contextmanager
 def loaded_together(device: torch.device) -> Iterator[None]:
     """Run none of the launches that this thread issues in this block, but load their kernels, side by side, at its end.
 
-    Loops of Warp (`wp.capture_while`) go through their body once. Kernels that take their types from a launch are left
-    to that launch.
+    One after another, a new model takes half a minute. Loops of Warp (`wp.capture_while`) go through their body once.
+    Kernels that take their types from a launch are left to that launch.
     """
     modules: dict[int | None, dict[wp.Module, None]] = defaultdict(dict)
 

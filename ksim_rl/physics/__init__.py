@@ -2,7 +2,7 @@
 
 from ksim_rl.device import capture
 from ksim_rl.device.capture import Captured
-from ksim_rl.device.compile_notice import compile_notice
+from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.physics.fields import prepare_spec
 from ksim_rl.physics.load import load_model, load_spec
 from ksim_rl.physics.nan_guard.guard import NanGuardCfg, NanReport

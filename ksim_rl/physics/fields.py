@@ -13,40 +13,18 @@ FIXED, KIN0, INERT0 = (int(mjw.SetConstGroup[name]) for name in ("FIXED", "KIN0"
 ALL = FIXED | KIN0 | INERT0
 
 # What MuJoCo's mj_setConst derives from a field (see mujoco_warp.set_const). `actuator_gear` scales the moments.
-GROUPS_OF_FIELD = {
-    "qpos0": KIN0 | INERT0,
-    "body_mass": ALL,
-    "body_inertia": INERT0,
-    "body_ipos": KIN0 | INERT0,
-    "body_iquat": INERT0,
-    "body_pos": KIN0 | INERT0,
-    "body_quat": KIN0 | INERT0,
-    "jnt_pos": KIN0 | INERT0,
-    "jnt_axis": KIN0 | INERT0,
-    "dof_armature": INERT0,
-    "tendon_armature": INERT0,
-    "actuator_armature": INERT0,
-    "actuator_gear": INERT0,
-    "geom_size": FIXED,
-    "eq_data": KIN0,
-    "cam_pos": KIN0,
-    "cam_quat": KIN0,
-    "light_pos": KIN0,
-    "light_dir": KIN0,
+_FIELDS_OF_GROUPS = {
+    ALL: "body_mass",
+    FIXED: "geom_size",
+    KIN0: "eq_data cam_pos cam_quat light_pos light_dir",
+    KIN0 | INERT0: "qpos0 body_ipos body_pos body_quat jnt_pos jnt_axis",
+    INERT0: "body_inertia body_iquat dof_armature tendon_armature actuator_armature actuator_gear",
 }
+GROUPS_OF_FIELD = {name: groups for groups, names in _FIELDS_OF_GROUPS.items() for name in names.split()}
 DERIVED_FIELDS = {
-    FIXED: ("body_subtreemass", "geom_aabb", "geom_rbound"),
-    KIN0: (
-        "tendon_length0",
-        "eq_data",
-        "cam_pos0",
-        "cam_poscom0",
-        "cam_mat0",
-        "light_pos0",
-        "light_poscom0",
-        "light_dir0",
-    ),
-    INERT0: ("dof_invweight0", "body_invweight0", "tendon_invweight0", "actuator_acc0"),
+    FIXED: "body_subtreemass geom_aabb geom_rbound",
+    KIN0: "tendon_length0 eq_data cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0 light_dir0",
+    INERT0: "dof_invweight0 body_invweight0 tendon_invweight0 actuator_acc0",
 }
 # Not a field of the model but of its options, which put_model cannot expand.
 GRAVITY = "gravity"
@@ -62,7 +40,7 @@ def const_groups(fields: Iterable[str]) -> int:
 
 def derived_fields(groups: int) -> tuple[str, ...]:
     """Return the names of the constants of these `SetConstGroup` bits."""
-    return tuple(name for group, names in DERIVED_FIELDS.items() if groups & group for name in names)
+    return tuple(name for group, names in DERIVED_FIELDS.items() if groups & group for name in names.split())
 
 
 def fields_to_expand(fields: Sequence[str]) -> tuple[str, ...]:

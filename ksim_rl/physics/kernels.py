@@ -58,34 +58,18 @@ def record_overflow(
 
 
 @wp.kernel(enable_backward=False)
-def tendon_velocity(
-    rownnz: wp.array[int],
-    rowadr: wp.array[int],
-    colind: wp.array[int],
-    jacobian: wp.array2d[float],
-    qvel: wp.array2d[float],
-    velocity: wp.array2d[float],
-):
-    """Multiply the sparse tendon Jacobian, whose pattern all worlds share, by qvel."""
-    world, row = wp.tid()
-    total = float(0.0)  # noqa: UP018 (Warp: a variable that changes in a loop)
-    for i in range(rowadr[row], rowadr[row] + rownnz[row]):
-        total += jacobian[world, i] * qvel[world, colind[i]]
-    velocity[world, row] = total
-
-
-@wp.kernel(enable_backward=False)
-def actuator_velocity(
+def sparse_velocity(
     rownnz: wp.array2d[int],
     rowadr: wp.array2d[int],
     colind: wp.array2d[int],
-    moment: wp.array2d[float],
+    matrix: wp.array2d[float],
     qvel: wp.array2d[float],
     velocity: wp.array2d[float],
 ):
-    """Multiply each world's sparse actuator moments by qvel."""
+    """Multiply each world's sparse matrix by qvel; its pattern is the world's own, or shared by all."""
     world, row = wp.tid()
+    pattern = world % rownnz.shape[0]
     total = float(0.0)  # noqa: UP018 (Warp: a variable that changes in a loop)
-    for i in range(rowadr[world, row], rowadr[world, row] + rownnz[world, row]):
-        total += moment[world, i] * qvel[world, colind[world, i]]
+    for i in range(rowadr[pattern, row], rowadr[pattern, row] + rownnz[pattern, row]):
+        total += matrix[world, i] * qvel[world, colind[pattern, i]]
     velocity[world, row] = total

@@ -1,6 +1,7 @@
 """This module launches the substeps of a world, sensors on the last one only, and the refresh of derived quantities."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import mujoco
 import mujoco_warp as mjw
@@ -81,22 +82,19 @@ class Substeps:
         mjw.tendon(m, d)
         mjw.com_vel(m, d)
         if self._needs_tendon_velocity:
-            wp.launch(
-                kernels.tendon_velocity,
-                dim=(d.nworld, m.ntendon),
-                inputs=[m.ten_J_rownnz, m.ten_J_rowadr, m.ten_J_colind, d.ten_J, d.qvel],
-                outputs=[d.ten_velocity],
-            )
+            pattern = (m.ten_J_rownnz, m.ten_J_rowadr, m.ten_J_colind)
+            shared = [array.reshape((1, -1)) for array in pattern]
+            self._launch_product(shared, d.ten_J, d.ten_velocity)
         if self._needs_transmission:
             mjw.transmission(m, d)
-            wp.launch(
-                kernels.actuator_velocity,
-                dim=(d.nworld, m.nactuator),
-                inputs=[d.moment_rownnz, d.moment_rowadr, d.moment_colind, d.actuator_moment, d.qvel],
-                outputs=[d.actuator_velocity],
-            )
+            pattern = (d.moment_rownnz, d.moment_rowadr, d.moment_colind)
+            self._launch_product(pattern, d.actuator_moment, d.actuator_velocity)
         # A model with sensors of them computes them with these.
         if self.refreshes_subtree_velocities and not m.sensor_subtree_vel:
             mjw.subtree_vel(m, d)
         mjw.sensor_pos(m, d)
         mjw.sensor_vel(m, d)
+
+    def _launch_product(self, pattern: Sequence[wp.array], matrix: wp.array, velocity: wp.array) -> None:
+        inputs = [*pattern, matrix, self.warp_data_E.qvel]
+        wp.launch(kernels.sparse_velocity, dim=velocity.shape, inputs=inputs, outputs=[velocity])

@@ -6,8 +6,6 @@ Each row starts the C engine from the state that MuJoCo Warp had before that sub
 forces and model fields, and takes one step in double precision.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

@@ -16,6 +16,7 @@ search and tests of convergence: mujoco_warp/_src/solver.py.
 
 import enum
 import functools
+from dataclasses import dataclass
 from importlib.resources import files
 
 import mujoco
@@ -91,20 +92,28 @@ def _column(nv: int) -> int:
     return _padded(nv + 1 + (CUDA_LANES if nv >= CUDA_LANES else 0))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Placement:
+    """How the worlds lie on a CUDA device; the CPU, which has no chip to fill, heeds `rows_on_chip` alone.
+
+    Args:
+        rows_on_chip: rows that the shared memory of a world holds; those beyond are in device memory.
+        worlds_per_block: worlds that share a block.
+        min_blocks: blocks that a multiprocessor is to hold at once, which bounds the registers; 0 does not.
+        longest_first: whether the worlds that will take longest start first.
+    """
+
+    rows_on_chip: int
+    worlds_per_block: int = 1
+    min_blocks: int = 0
+    longest_first: bool = True
+
+
 @functools.cache
 def newton_kernel(
-    *,
-    nv: int,
-    njmax: int,
-    elliptic: bool,
-    ls_iterations: int,
-    lanes: int,
-    rows_on_chip: int,
-    worlds_per_block: int,
-    min_blocks: int,
-    checked: bool = False,
+    nv: int, njmax: int, elliptic: bool, ls_iterations: int, lanes: int, place: Placement, checked: bool
 ) -> wp.Kernel:
-    """Return the kernel of a `Problem` with `nv` degrees of freedom; launch it over (worlds, lanes).
+    """Return the kernel of a `Problem`; launch it over (worlds, lanes).
 
     Args:
         nv: number of degrees of freedom.
@@ -112,9 +121,7 @@ def newton_kernel(
         elliptic: whether friction cones are elliptic.
         ls_iterations: most trials of a line search.
         lanes: 32 on CUDA, 1 on the CPU.
-        rows_on_chip: rows that the shared memory of a world holds; those beyond are in the scratch.
-        worlds_per_block: worlds that share a block.
-        min_blocks: blocks that a multiprocessor is to hold at once, which bounds the registers; 0 does not.
+        place: where the worlds lie; rows that find no room on the chip are in the scratch.
         checked: a debug build, which writes each world's broken `Invariant`s.
     """
     states, rows = mujoco.mjtConstraintState, mujoco.mjtConstraint
@@ -124,10 +131,10 @@ def newton_kernel(
         "PADDED_ROWS": _padded(njmax),
         "STRIDE": row_stride(nv),
         "COLUMN": _column(nv),
-        "ROWS_ON_CHIP": rows_on_chip,
+        "ROWS_ON_CHIP": place.rows_on_chip,
         "LANES": lanes,
-        "WORLDS_PER_BLOCK": worlds_per_block,
-        "FLOATS": floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=rows_on_chip),
+        "WORLDS_PER_BLOCK": place.worlds_per_block,
+        "FLOATS": floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=place.rows_on_chip),
         "MOST_TRIALS": ls_iterations,
         "ELLIPTIC": elliptic,
         "ELLIPTIC_CONTACT": rows.mjCNSTR_CONTACT_ELLIPTIC,
@@ -148,8 +155,8 @@ def newton_kernel(
     @wp.func_native(snippet)
     def solve_world(world: int, lane: int, problem: Problem) -> None: ...
 
-    block = worlds_per_block * lanes
-    bounds = {"launch_bounds": (block, min_blocks)} if min_blocks else {}
+    block = place.worlds_per_block * lanes
+    bounds = {"launch_bounds": (block, place.min_blocks)} if place.min_blocks else {}
 
     @wp.kernel(
         module="unique",

@@ -1,6 +1,5 @@
 """This module chooses the constraint solver of a world, and launches the one that is a single kernel."""
 
-import dataclasses
 from collections.abc import Callable
 
 import mujoco
@@ -9,6 +8,7 @@ import warp as wp
 
 from ksim_rl.physics.newton.kernel import (
     CUDA_LANES,
+    Placement,
     Problem,
     floats_per_world,
     newton_kernel,
@@ -32,23 +32,6 @@ INTEGRATORS = (
     mujoco.mjtIntegrator.mjINT_IMPLICIT,
     mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 )
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Placement:
-    """How the worlds lie on a CUDA device; the CPU, which has no chip to fill, heeds `rows_on_chip` alone.
-
-    Args:
-        rows_on_chip: rows that the shared memory of a world holds; those beyond are in device memory.
-        worlds_per_block: worlds that share a block.
-        min_blocks: blocks that a multiprocessor is to hold at once, which bounds the registers; 0 does not.
-        longest_first: whether the worlds that will take longest start first.
-    """
-
-    rows_on_chip: int
-    worlds_per_block: int = 1
-    min_blocks: int = 0
-    longest_first: bool = True
 
 
 def unsuited(mj_model: mujoco.MjModel, *, njmax: int) -> str | None:
@@ -118,17 +101,8 @@ def solver(
             if on_cuda
             else Placement(rows_on_chip=d.njmax)
         )
-    kernel = newton_kernel(
-        nv=m.nv,
-        njmax=d.njmax,
-        elliptic=elliptic,
-        ls_iterations=int(m.opt.ls_iterations),
-        lanes=lanes,
-        rows_on_chip=place.rows_on_chip,
-        worlds_per_block=place.worlds_per_block,
-        min_blocks=place.min_blocks,
-        checked=broken is not None,
-    )
+    ls_iterations, checked = int(m.opt.ls_iterations), broken is not None
+    kernel = newton_kernel(m.nv, d.njmax, elliptic, ls_iterations, lanes, place, checked)
     far_floats = (d.njmax - place.rows_on_chip) * row_stride(m.nv)
     device = d.qpos.device
     own = {
