@@ -43,28 +43,18 @@ def wants_live_launches(device: torch.device) -> bool:
     return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
 
 
-def graphs_unavailable(device: torch.device) -> str | None:
-    """Return why graphs cannot be used on `device`, or None where they can."""
-    if device.type == "cpu":
-        return None
-    warp_dev = warp_device(device)
-    if not wp.is_mempool_enabled(warp_dev):
-        return (
-            f"Warp's memory pool is off on {device}, and graphs cannot allocate without it; unset "
-            "WARP_ENABLE_MEMPOOLS_AT_INIT, or use a driver that supports memory pools"
-        )
-    return None
-
-
 def refuse_or_warn(device: torch.device, *, require_graphs: bool) -> bool:
-    """Return whether graphs can be used; say it loudly, or refuse, where they cannot.
+    """Return whether graphs can be used on `device`; say it loudly, or refuse, where they cannot.
 
     Raises:
         RuntimeError: with `require_graphs`, naming the reason.
     """
-    reason = graphs_unavailable(device)
-    if reason is None:
+    if device.type == "cpu" or wp.is_mempool_enabled(warp_device(device)):
         return True
+    reason = (
+        f"Warp's memory pool is off on {device}, and graphs cannot allocate without it; unset "
+        "WARP_ENABLE_MEMPOOLS_AT_INIT, or use a driver that supports memory pools"
+    )
     if require_graphs:
         raise RuntimeError(f"require_graphs=True, but {reason}")
     warnings.warn(f"RUNNING WITHOUT GRAPHS, about 13 times slower: {reason}", RuntimeWarning, stacklevel=3)

@@ -8,16 +8,6 @@ import mujoco
 from ksim_rl.checked import Checked, Count, Positive
 from ksim_rl.physics.nan_guard.guard import NanGuardCfg
 
-INTEGRATORS = {
-    "euler": mujoco.mjtIntegrator.mjINT_EULER,
-    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
-    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
-    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-    "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
-}
-SOLVERS = {"cg": mujoco.mjtSolver.mjSOL_CG, "newton": mujoco.mjtSolver.mjSOL_NEWTON}
-CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SimCfg(Checked):
@@ -77,7 +67,11 @@ class SimCfg(Checked):
             value = getattr(self, field)
             if value is not None:
                 setattr(option, field, value)
-        for field, values in (("integrator", INTEGRATORS), ("solver", SOLVERS), ("cone", CONES)):
+        for field, kind, prefix in (
+            ("integrator", mujoco.mjtIntegrator, "mjINT"),
+            ("solver", mujoco.mjtSolver, "mjSOL"),
+            ("cone", mujoco.mjtCone, "mjCONE"),
+        ):
             value = getattr(self, field)
             if value is not None:
-                setattr(option, field, int(values[value]))
+                setattr(option, field, int(kind.__members__[f"{prefix}_{value.upper()}"]))

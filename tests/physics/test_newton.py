@@ -234,7 +234,7 @@ def test_models_out_of_range_take_the_solver_of_mujoco_warp():
         many = load_model(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
         assert f"{count} degrees of freedom" in str(newton.unsuited(many, njmax=8))
     sim = SimCfg(njmax=64, nconmax=16)
-    with pytest.raises(ValueError, match="one_kernel_solver='auto': expected True or False"):
+    with pytest.raises(ValueError, match="one_kernel_solver='auto': expected true or false"):
         SimCfg(one_kernel_solver="auto")  # pyright: ignore[reportArgumentType]
     world = World(model, num_envs=1, sim=sim)
     assert world.has_one_kernel_solver and world.one_kernel_unavailable is None

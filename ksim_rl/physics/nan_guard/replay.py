@@ -17,7 +17,7 @@ import numpy as np
 
 from ksim_rl.physics.fields import write_fields
 from ksim_rl.physics.load import caught_warnings
-from ksim_rl.physics.nan_guard.file import Failure, read
+from ksim_rl.physics.nan_guard.guard import Failure, read
 
 # The C engine sets all controls to zero if one exceeds 1e10 or is not finite.
 MOST_CONTROL = 1e9

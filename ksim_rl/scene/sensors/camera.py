@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ksim_rl.checked import Count, Positive, Within
 from ksim_rl.checks import near
-from ksim_rl.physics.batch_camera import BatchCamera
+from ksim_rl.physics.ray_casting import BatchCamera
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.sensor import GeomGroup, Sensor, SensorTracker
 from ksim_rl.scene.state.world_view import WorldView

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ksim_rl.checked import Positive
-from ksim_rl.physics.rays import RayBatch
+from ksim_rl.physics.ray_casting import RayBatch
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.mount import MountedSensor
 from ksim_rl.scene.sensors.ray_patterns import RayPattern

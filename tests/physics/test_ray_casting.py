@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ksim_rl.physics import World, load_model
-from ksim_rl.physics.batch_camera import BatchCamera
+from ksim_rl.physics.ray_casting import BatchCamera
 
 CAMERA_HEIGHT = 2.0
 FIELDS = """
