@@ -11,7 +11,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from ksim_rl import mdp
 from ksim_rl.algorithms import fast_sac, fast_td3
@@ -53,7 +53,7 @@ class PoseStd:
     running: Mapping[str, float]
 
 
-def sim(*, cone: str = "pyramidal", impratio: float = 1.0) -> SimCfg:
+def sim(*, cone: Literal["pyramidal", "elliptic"] = "pyramidal", impratio: float = 1.0) -> SimCfg:
     """Return the physics settings: 200 Hz, few solver iterations."""
     return SimCfg(
         timestep=0.005,
