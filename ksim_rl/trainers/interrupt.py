@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM become a request here: the loop ends after the current iteration, with everything saved."""
+"""SIGINT and SIGTERM are turned into a request: the loop ends after the current iteration, with everything saved."""
 
 import signal
 import threading

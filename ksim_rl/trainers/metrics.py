@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 import torch
-from jaxtyping import Float64, Num
+from jaxtyping import Float64, Shaped
 from torch import Tensor
 
 
@@ -22,7 +22,7 @@ class PendingMetrics:
         return dict(zip(self._names, self._values_M.tolist(), strict=True))
 
 
-def start_copy(metrics: Mapping[str, Num[Tensor, ""]], *, device: torch.device) -> PendingMetrics:
+def start_copy(metrics: Mapping[str, Shaped[Tensor, ""]], *, device: torch.device) -> PendingMetrics:
     """Begin to copy 0-dim tensors to the host, as one vector.
 
     On CUDA the copy goes to pinned memory and does not wait for the device: work that is queued after it may start
