@@ -7,7 +7,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 
-def random_state(device: torch.device) -> dict[str, UInt8[Tensor, " L"]]:
+def random_state(device: torch.device) -> dict[str, UInt8[Tensor, "?L"]]:
     """Return the state of the default generators of the host and of `device`."""
     state = {"cpu": torch.get_rng_state()}
     if device.type == "cuda":
@@ -15,7 +15,7 @@ def random_state(device: torch.device) -> dict[str, UInt8[Tensor, " L"]]:
     return state
 
 
-def load_random_state(state: Mapping[str, UInt8[Tensor, " L"]], device: torch.device) -> None:
+def load_random_state(state: Mapping[str, UInt8[Tensor, "?L"]], device: torch.device) -> None:
     """Continue the default generators; a run that moves to another kind of device keeps that one's present state."""
     torch.set_rng_state(state["cpu"])
     if device.type == "cuda" and "cuda" in state:

@@ -91,7 +91,7 @@ def test_captured_updates_equal_eager_ones():
                 update(rollout)
             else:
                 update._rollout_ET = rollout
-                update._learn()
+                update._update()
             results.append(update.metrics())
         torch.testing.assert_close(results[0]["loss/value"], results[1]["loss/value"], rtol=1e-3, atol=1e-4)
     for one, other in zip(captured.loss.parameters(), eager.loss.parameters(), strict=True):
