@@ -177,7 +177,13 @@ def checked(function: FunctionType, *parameters: str) -> FunctionType:
     free = dict(
         zip(
             _FREE,
-            (torch.compiler.is_compiling, function, shaped.check_arguments, shaped.check_result),
+            (
+                torch.compiler.is_compiling,
+                function,
+                # Functions, since Dynamo cannot wrap the bound methods in the closure of an `__init__`.
+                lambda values: shaped.check_arguments(values),
+                lambda value, sizes: shaped.check_result(value, sizes),
+            ),
             strict=True,
         )
     )

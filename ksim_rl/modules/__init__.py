@@ -1,4 +1,4 @@
-"""Networks: the actor, the critic and the parts that they are made of, each a TorchRL or torch module."""
+"""This room has the networks: actor, critic and the parts that they are made of, each a TorchRL or torch module."""
 
 from ksim_rl.modules.actor import PolicyNetwork, make_actor
 from ksim_rl.modules.actor_cfg import ActorCfg

@@ -1,4 +1,4 @@
-"""Which last layer a policy needs for an env's actions."""
+"""This module chooses the last layer that a policy needs for an env's actions."""
 
 import math
 from collections.abc import Callable
@@ -12,9 +12,8 @@ from torchrl.data import Composite, TensorSpec
 
 from ksim_rl.modules.action_range import action_range
 from ksim_rl.modules.actor_cfg import ActorCfg
-from ksim_rl.modules.bounded_gaussian_head import TanhGaussianHead, TruncatedGaussianHead
 from ksim_rl.modules.categorical_head import CategoricalHead
-from ksim_rl.modules.gaussian_head import GaussianHead
+from ksim_rl.modules.gaussian_head import GaussianHead, TanhGaussianHead, TruncatedGaussianHead
 from ksim_rl.modules.mixed_head import MixedHead
 
 DISCRETE = (specs.Categorical, specs.OneHot)
@@ -116,19 +115,19 @@ def _continuous(
     }
     if cfg.distribution == "gaussian":
         return GaussianHead(feature_dim, leaf.shape[-1], **options)
-    low, high = _range(cfg, key, leaf)
-    return BOUNDED_HEADS[cfg.distribution](feature_dim, low=low, high=high, **options)
+    low_L, high_L = _range(cfg, key, leaf)
+    return BOUNDED_HEADS[cfg.distribution](feature_dim, low_L=low_L, high_L=high_L, **options)
 
 
 def _range(cfg: ActorCfg, key: NestedKey, leaf: TensorSpec) -> tuple[Tensor, Tensor]:
     """Return the bounds of an action [L]."""
-    low, high = action_range(leaf, math.inf if cfg.action_bound is None else cfg.action_bound)
-    if not bool((low.isfinite() & high.isfinite()).all()):
+    low_L, high_L = action_range(leaf, math.inf if cfg.action_bound is None else cfg.action_bound)
+    if not bool((low_L.isfinite() & high_L.isfinite()).all()):
         raise ValueError(
             f"distribution={cfg.distribution!r} needs bounds, but the action {key!r} has no finite ones in the env's "
             "spec: set action_bound, e.g. 1.0, or take 'gaussian'"
         )
-    return low, high
+    return low_L, high_L
 
 
 def _describe(leaves: dict[NestedKey, Any]) -> str:

@@ -1,14 +1,15 @@
-"""Which actions a bounded policy can take."""
+"""This module finds the box of actions that a bounded policy can take."""
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torchrl.data import TensorSpec
 
 
 def action_range(
     spec: TensorSpec, bound: float, *, device: torch.device | str | None = None
-) -> tuple[Tensor, Tensor]:
-    """Return the lowest and highest action, each [action_dim].
+) -> tuple[Float[Tensor, " L"], Float[Tensor, " L"]]:
+    """Return the lowest and highest action.
 
     Off-policy methods need bounded actions: their critics are asked about whatever the policy proposes, and there is no
     trust region that keeps it near what was tried. Where the spec is bounded these are its bounds; elsewhere (joint

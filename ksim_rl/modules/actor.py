@@ -1,6 +1,7 @@
-"""The stochastic policy: observation normalization, an MLP and a distribution of the action."""
+"""This module builds the stochastic policy: normalization, an MLP and a distribution of the action."""
 
 import torch
+from jaxtyping import Float
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -12,32 +13,26 @@ from ksim_rl.modules.action_head import make_head
 from ksim_rl.modules.actor_cfg import ActorCfg
 from ksim_rl.modules.mixed_head import PARAMETERS, MixedHead
 from ksim_rl.modules.mlp import trunk
-from ksim_rl.modules.observation_keys import side_by_side
-from ksim_rl.modules.observation_normalizer import ObservationNormalizer
+from ksim_rl.modules.network import ObservingNetwork
 
 
-class PolicyNetwork(nn.Module):
+class PolicyNetwork(ObservingNetwork):
     """Maps observations [..., L_i] to the parameters of the action's distribution.
 
     Attributes:
-        normalizer: an `ObservationNormalizer`, or None.
         head: the last layer, which also knows the distribution.
     """
 
     def __init__(
         self, cfg: ActorCfg, *, obs_dim: int, head: nn.Module, device: torch.device | str | None = None
     ) -> None:
-        super().__init__()
-        self.normalizer = ObservationNormalizer(obs_dim, device=device) if cfg.obs_normalization else None
+        super().__init__(cfg, obs_dim=obs_dim, device=device)
         self.trunk = trunk(obs_dim, cfg.hidden_dims, activation=cfg.activation, device=device)
         self.head = head
 
-    def forward(self, *observations: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, *observations: Float[Tensor, "*batch ?L"]) -> tuple[Float[Tensor, "*batch ?N"], ...]:
         """Return the parameters, such as `(loc, scale)`, for observations that stand side by side."""
-        obs = side_by_side(observations)
-        if self.normalizer is not None:
-            obs = self.normalizer(obs)
-        return self.head(self.trunk(obs))
+        return self.head(self.trunk(self.observe(*observations)))
 
 
 def make_actor(

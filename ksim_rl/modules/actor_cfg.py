@@ -1,24 +1,19 @@
-"""The settings of a policy network."""
+"""This module has the settings of a policy network."""
 
 from dataclasses import dataclass
 
 from ksim_rl.checks import check_choice, check_in_range
-from ksim_rl.modules.mlp import check_network
-from ksim_rl.modules.observation_keys import ObservationKey, checked_keys
+from ksim_rl.modules.network import OnPolicyNetworkCfg
 
 STD_TYPES = ("scalar", "log")
 DISTRIBUTIONS = ("gaussian", "tanh_gaussian", "truncated_gaussian", "categorical")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ActorCfg:
+class ActorCfg(OnPolicyNetworkCfg):
     """The policy network.
 
     Attributes:
-        in_keys: the observation groups that it reads, side by side; a list names a nested key.
-        hidden_dims: widths of the hidden layers.
-        activation: one of `ksim_rl.modules.ACTIVATIONS`.
-        obs_normalization: normalize observations by running statistics inside the network.
         distribution: of continuous actions: "gaussian", or within bounds "tanh_gaussian" or "truncated_gaussian".
             "categorical" where all actions are discrete; beside continuous ones, discrete ones always are.
         action_bound: the bounded distributions lie in [-action_bound, action_bound] where the env's action spec has no
@@ -31,10 +26,6 @@ class ActorCfg:
             default pose of a robot), or the center of the range, in every state.
     """
 
-    in_keys: tuple[ObservationKey, ...] = ("actor",)
-    hidden_dims: tuple[int, ...] = (512, 256, 128)
-    activation: str = "elu"
-    obs_normalization: bool = True
     distribution: str = "gaussian"
     action_bound: float | None = None
     init_std: float = 1.0
@@ -44,9 +35,7 @@ class ActorCfg:
 
     def __post_init__(self) -> None:
         """Refuse values out of range, naming the field."""
-        object.__setattr__(self, "in_keys", checked_keys(self.in_keys))
-        object.__setattr__(self, "hidden_dims", tuple(self.hidden_dims))
-        check_network(self.hidden_dims, self.activation)
+        super().__post_init__()
         check_choice("distribution", self.distribution, DISTRIBUTIONS)
         if self.action_bound is not None:
             check_in_range("action_bound", self.action_bound, low=0.0, low_open=True)

@@ -1,92 +1,73 @@
-"""Policies whose actions lie in a box: the deterministic one of TD3 and the squashed gaussian of SAC."""
+"""This module builds policies whose actions lie in a box: TD3's deterministic one and SAC's squashed gaussian."""
 
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float, Float32
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor
 
 from ksim_rl.checks import check_in_range
 from ksim_rl.modules.action_range import action_range
-from ksim_rl.modules.mlp import check_network, mlp
-from ksim_rl.modules.observation_normalizer import ObservationNormalizer
+from ksim_rl.modules.mlp import mlp
+from ksim_rl.modules.network import ObservingNetwork, OffPolicyNetworkCfg
 from ksim_rl.modules.tanh_gaussian import TanhGaussian
 
 
 @dataclass(frozen=True, kw_only=True)
-class DeterministicActorCfg:
-    """The policy of TD3: one action for each observation.
+class BoundedActorCfg(OffPolicyNetworkCfg):
+    """The fields of policies whose actions lie in a box.
 
     Attributes:
-        hidden_dims: widths of the hidden layers.
-        activation: one of `ksim_rl.modules.ACTIVATIONS`.
-        layer_norm: normalize before each activation.
-        obs_normalization: normalize observations by running statistics inside the network.
-        output_gain: scale of the last layer's weights; small, so that the first policy acts around the middle.
         action_bound: actions lie in [-action_bound, action_bound] where the env's action spec has no bounds.
     """
 
-    hidden_dims: tuple[int, ...] = (512, 256, 128)
-    activation: str = "relu"
-    layer_norm: bool = False
-    obs_normalization: bool = True
     output_gain: float = 0.01
     action_bound: float = 1.0
 
     def __post_init__(self) -> None:
         """Refuse values out of range, naming the field."""
-        object.__setattr__(self, "hidden_dims", tuple(self.hidden_dims))
-        check_network(self.hidden_dims, self.activation)
-        check_in_range("output_gain", self.output_gain, low=0.0)
+        super().__post_init__()
         check_in_range("action_bound", self.action_bound, low=0.0, low_open=True)
 
 
 @dataclass(frozen=True, kw_only=True)
-class SquashedActorCfg:
+class DeterministicActorCfg(BoundedActorCfg):
+    """The policy of TD3: one action for each observation."""
+
+    hidden_dims: tuple[int, ...] = (512, 256, 128)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SquashedActorCfg(BoundedActorCfg):
     """The policy of SAC: a gaussian squashed by tanh, whose standard deviation depends on the observation.
 
     Attributes:
-        hidden_dims: widths of the hidden layers.
-        activation: one of `ksim_rl.modules.ACTIVATIONS`.
-        layer_norm: normalize before each activation.
-        obs_normalization: normalize observations by running statistics inside the network.
-        output_gain: scale of the last layer's weights.
         log_std_min, log_std_max: bounds of the log of the standard deviation, before squashing.
-        action_bound: actions lie in [-action_bound, action_bound] where the env's action spec has no bounds.
     """
 
-    hidden_dims: tuple[int, ...] = (256, 256)
-    activation: str = "relu"
-    layer_norm: bool = False
-    obs_normalization: bool = True
-    output_gain: float = 0.01
     log_std_min: float = -5.0
     log_std_max: float = 2.0
-    action_bound: float = 1.0
 
     def __post_init__(self) -> None:
         """Refuse values out of range, naming the field."""
-        object.__setattr__(self, "hidden_dims", tuple(self.hidden_dims))
-        check_network(self.hidden_dims, self.activation)
-        check_in_range("output_gain", self.output_gain, low=0.0)
+        super().__post_init__()
         check_in_range("log_std_min", self.log_std_min)
         check_in_range("log_std_max", self.log_std_max)
         if self.log_std_min >= self.log_std_max:
             raise ValueError(
                 f"log_std_min={self.log_std_min!r} is not below log_std_max={self.log_std_max!r}"
             )
-        check_in_range("action_bound", self.action_bound, low=0.0, low_open=True)
 
 
-class BoundedActor(nn.Module):
+class BoundedActor(ObservingNetwork):
     """Normalization, hidden layers, and a last layer: [..., L] to [..., output_dim].
 
     Attributes:
-        normalizer: an `ObservationNormalizer`, or None.
         low, high: of the actions, [action_dim].
     """
 
@@ -95,16 +76,15 @@ class BoundedActor(nn.Module):
 
     def __init__(
         self,
-        cfg: DeterministicActorCfg | SquashedActorCfg,
+        cfg: BoundedActorCfg,
         *,
         obs_dim: int,
         output_dim: int,
         action_spec: TensorSpec,
         device: torch.device | str | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(cfg, obs_dim=obs_dim, device=device)
         self.cfg = cfg
-        self.normalizer = ObservationNormalizer(obs_dim, device=device) if cfg.obs_normalization else None
         low, high = action_range(action_spec, cfg.action_bound, device=device)
         self.register_buffer("low", low)
         self.register_buffer("high", high)
@@ -118,18 +98,16 @@ class BoundedActor(nn.Module):
             device=device,
         )
 
-    def output(self, obs: Tensor) -> Tensor:
-        """Return what the last layer says, float32 [..., output_dim]."""
-        if self.normalizer is not None:
-            obs = self.normalizer(obs)
+    def output(self, obs: Float[Tensor, "*batch L"]) -> Float32[Tensor, "*batch output_dim"]:
+        """Return what the last layer says."""
         # Half precision would round the squashed action, and its density.
-        return self.layers(obs).float()
+        return self.layers(self.observe(obs)).float()
 
 
 class DeterministicPolicy(BoundedActor):
     """Maps an observation [..., L] to the action [..., action_dim]."""
 
-    def forward(self, obs: Tensor) -> Tensor:
+    def forward(self, obs: Float[Tensor, "*batch L"]) -> Float32[Tensor, "*batch action_dim"]:
         """Return the action, in [low, high]."""
         center, half_range = (self.high + self.low) / 2, (self.high - self.low) / 2
         return center + half_range * self.output(obs).tanh()
@@ -140,7 +118,9 @@ class SquashedPolicy(BoundedActor):
 
     cfg: SquashedActorCfg
 
-    def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, obs: Float[Tensor, "*batch L"]
+    ) -> tuple[Float32[Tensor, "*batch action_dim"], Float32[Tensor, "*batch action_dim"]]:
         """Return `(loc, scale)`."""
         loc, raw = self.output(obs).chunk(2, dim=-1)
         # A tanh instead of a clamp: the gradient never vanishes wholly at a bound.

@@ -1,4 +1,4 @@
-"""Discrete choices, one or several at once, free of host syncs."""
+"""This module has the distribution of discrete choices, one or several at once, free of host syncs."""
 
 from collections.abc import Iterable, Sequence
 from functools import reduce
@@ -6,6 +6,7 @@ from operator import add
 from typing import Any
 
 import torch
+from jaxtyping import Float, Shaped
 from torch import Tensor
 from torch.distributions import Distribution, constraints, register_kl
 from torch.nn import functional
@@ -31,11 +32,10 @@ class Categorical(Distribution):
 
     def __init__(
         self,
-        logits: Tensor,
+        logits: Float[Tensor, "*batch N"],
         sizes: Sequence[int] | None = None,
         one_hot: bool = False,
         dtype: torch.dtype | None = None,
-        validate_args: bool | None = None,
     ) -> None:
         if sizes is not None and sum(sizes) != logits.shape[-1]:
             raise ValueError(f"sizes={tuple(sizes)}: they must sum to the {logits.shape[-1]} logits")
@@ -61,17 +61,17 @@ class Categorical(Distribution):
         return constraints.independent(constraints.integer_interval(0, max(self.sizes) - 1), 1)
 
     @property
-    def probs(self) -> Tensor:
-        """The probabilities [..., N]; those of each choice sum to 1."""
+    def probs(self) -> Float[Tensor, "*batch N"]:
+        """The probabilities; those of each choice sum to 1."""
         return torch.cat([log_probs.exp() for log_probs in self._log_probs], -1)
 
     @property
-    def mode(self) -> Tensor:
+    def mode(self) -> Shaped[Tensor, "*value"]:
         """The most likely option of each choice."""
         return self._as_value([log_probs.argmax(-1) for log_probs in self._log_probs])
 
     @property
-    def deterministic_sample(self) -> Tensor:
+    def deterministic_sample(self) -> Shaped[Tensor, "*value"]:
         """What TorchRL takes under `ExplorationType.DETERMINISTIC`: the mode."""
         return self.mode
 
@@ -80,7 +80,7 @@ class Categorical(Distribution):
         logits = self.logits.expand(torch.Size(batch_shape) + self.logits.shape[-1:])
         return Categorical(logits, self.sizes, self.one_hot, self.dtype)
 
-    def sample(self, sample_shape: Any = ()) -> Tensor:
+    def sample(self, sample_shape: Any = ()) -> Shaped[Tensor, "*value"]:
         """Draw the options, sample_shape + batch shape + event shape."""
         chosen = []
         with torch.no_grad():
@@ -90,15 +90,15 @@ class Categorical(Distribution):
                 chosen.append((log_probs - waiting.log()).argmax(-1))
         return self._as_value(chosen)
 
-    def log_prob(self, value: Tensor) -> Tensor:
-        """Return the log probability of `value`, summed over the choices, shape [...]."""
+    def log_prob(self, value: Shaped[Tensor, "*value"]) -> Float[Tensor, "*shape"]:
+        """Return the log probability of `value`, summed over the choices."""
         return _sum(
             log_probs.expand(*index.shape, -1).gather(-1, index.unsqueeze(-1)).squeeze(-1)
             for log_probs, index in zip(self._log_probs, self._as_indices(value), strict=True)
         )
 
-    def entropy(self) -> Tensor:
-        """Return the entropy in nats, summed over the choices, shape [...]."""
+    def entropy(self) -> Float[Tensor, "*batch"]:
+        """Return the entropy in nats, summed over the choices."""
         return _sum(-(log_probs.exp() * log_probs).sum(-1) for log_probs in self._log_probs)
 
     def _as_value(self, indices: Sequence[Tensor]) -> Tensor:

@@ -1,8 +1,9 @@
-"""The last layer of a policy that chooses."""
+"""This module has the last layer of a policy that chooses."""
 
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from ksim_rl.modules.categorical import Categorical
@@ -36,10 +37,10 @@ class CategoricalHead(nn.Module):
         self.logits = linear(feature_dim, num_options, gain=output_gain, device=device)
         self.sizes, self.one_hot, self.dtype = sizes, one_hot, dtype
 
-    def forward(self, features: Tensor) -> tuple[Tensor]:
+    def forward(self, features: Float[Tensor, "*batch L"]) -> tuple[Float[Tensor, "*batch N"]]:
         """Return `(logits,)`."""
         return (self.logits(features),)
 
-    def distribution(self, logits: Tensor) -> Categorical:
+    def distribution(self, logits: Float[Tensor, "*batch N"]) -> Categorical:
         """Return the distribution of the choices."""
         return Categorical(logits, self.sizes, self.one_hot, self.dtype)

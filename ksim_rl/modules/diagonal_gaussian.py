@@ -1,59 +1,54 @@
-"""The gaussian with a diagonal covariance, free of host syncs."""
+"""This module has the gaussian with a diagonal covariance, free of host syncs."""
 
 import math
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import Distribution, constraints, register_kl
+from torch.distributions import constraints, register_kl
+
+from ksim_rl.modules.vector_distribution import VectorDistribution
 
 _HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
 
 
-class DiagonalGaussian(Distribution):
+class DiagonalGaussian(VectorDistribution):
     """Normal distribution of a vector with independent components, one event per batch element.
 
     It equals `Independent(Normal(loc, scale), 1)`, whose `sample` (through `torch.normal`) and argument
-    checks read tensor values on the host. This one never does, so it can be captured in a CUDA graph and
-    compiled. Samples come from torch's default generator of the device.
+    checks read tensor values on the host.
 
     Args:
         loc: mean, shape [..., L].
         scale: standard deviation, positive, broadcastable with `loc`.
     """
 
-    arg_constraints = {"loc": constraints.real_vector, "scale": constraints.positive}  # type: ignore[assignment]
     support = constraints.real_vector  # type: ignore[assignment]
-    has_rsample = True
-
-    def __init__(self, loc: Tensor, scale: Tensor, validate_args: bool | None = None) -> None:
-        self.loc, self.scale = torch.broadcast_tensors(loc, scale)
-        # Argument checks compare all values and read the answer on the host.
-        super().__init__(self.loc.shape[:-1], self.loc.shape[-1:], validate_args=False)
 
     @property
-    def mean(self) -> Tensor:
-        """The mean, shape [..., L]."""
+    def mean(self) -> Float[Tensor, "*batch L"]:
+        """The mean."""
         return self.loc
 
     @property
-    def mode(self) -> Tensor:
-        """The most likely value, which is the mean, shape [..., L]."""
+    def mode(self) -> Float[Tensor, "*batch L"]:
+        """The most likely value, which is the mean."""
         return self.loc
 
     @property
-    def deterministic_sample(self) -> Tensor:
-        """What TorchRL takes under `ExplorationType.DETERMINISTIC`: the mean, shape [..., L]."""
+    def deterministic_sample(self) -> Float[Tensor, "*batch L"]:
+        """What TorchRL takes under `ExplorationType.DETERMINISTIC`: the mean."""
         return self.loc
 
     @property
-    def stddev(self) -> Tensor:
-        """The standard deviation, shape [..., L]."""
+    def stddev(self) -> Float[Tensor, "*batch L"]:
+        """The standard deviation."""
         return self.scale
 
     @property
-    def variance(self) -> Tensor:
-        """The variance, shape [..., L]."""
+    def variance(self) -> Float[Tensor, "*batch L"]:
+        """The variance."""
         return self.scale.square()
 
     def expand(self, batch_shape: Any, _instance: Any = None) -> "DiagonalGaussian":
@@ -61,24 +56,19 @@ class DiagonalGaussian(Distribution):
         shape = torch.Size(batch_shape) + self.event_shape
         return DiagonalGaussian(self.loc.expand(shape), self.scale.expand(shape))
 
-    def rsample(self, sample_shape: Any = ()) -> Tensor:
+    def rsample(self, sample_shape: Any = ()) -> Float[Tensor, "*shape L"]:
         """Draw [*sample_shape, ..., L] by reparametrization: gradients reach `loc` and `scale`."""
         shape = torch.Size(sample_shape) + self.loc.shape
         noise = torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device)
         return self.loc + self.scale * noise
 
-    def sample(self, sample_shape: Any = ()) -> Tensor:
-        """Draw [*sample_shape, ..., L] without gradients."""
-        with torch.no_grad():
-            return self.rsample(sample_shape)
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        """Return the log density of `value` [..., L], shape [...]."""
+    def log_prob(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*shape"]:
+        """Return the log density of `value` in nats."""
         error = (value - self.loc) / self.scale
         return (-0.5 * error.square() - self.scale.log() - _HALF_LOG_2_PI).sum(-1)
 
-    def entropy(self) -> Tensor:
-        """Return the differential entropy in nats, shape [...]."""
+    def entropy(self) -> Float[Tensor, "*batch"]:
+        """Return the differential entropy in nats."""
         return (self.scale.log() + (0.5 + _HALF_LOG_2_PI)).sum(-1)
 
 

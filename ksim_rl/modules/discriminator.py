@@ -1,8 +1,9 @@
-"""The network that tells the transitions of a motion from those of a policy."""
+"""This module has the network that tells the transitions of a motion from those of a policy."""
 
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from ksim_rl.modules.mlp import mlp
@@ -30,20 +31,20 @@ class Discriminator(nn.Module):
         self.layers = mlp(2 * dim, hidden_dims, 1, activation=activation, device=device)
 
     @property
-    def logit_weight(self) -> Tensor:
+    def logit_weight(self) -> Float[Tensor, "1 L"]:
         """The weights of the last layer."""
         last = self.layers[-1]
         assert isinstance(last, nn.Linear)
         return last.weight
 
-    def normalized(self, transition: Tensor) -> Tensor:
-        """Return what the layers read, [..., 2 L], of transitions [..., 2, L]."""
+    def normalized(self, transition: Float[Tensor, "*batch 2 L"]) -> Float[Tensor, "*batch 2*L"]:
+        """Return what the layers read of transitions."""
         return self.normalizer(transition).flatten(-2)
 
-    def judge(self, normalized: Tensor) -> Tensor:
-        """Return the scores [...] of normalized transitions [..., 2 L]."""
+    def judge(self, normalized: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch"]:
+        """Return the scores of normalized transitions."""
         return self.layers(normalized).squeeze(-1)
 
-    def forward(self, transition: Tensor) -> Tensor:
-        """Return the scores [...] of transitions [..., 2, L]."""
+    def forward(self, transition: Float[Tensor, "*batch 2 L"]) -> Float[Tensor, "*batch"]:
+        """Return the scores of transitions."""
         return self.judge(self.normalized(transition))

@@ -1,9 +1,10 @@
-"""Several networks of one shape, evaluated at once."""
+"""This module evaluates several networks of one shape at once."""
 
 import math
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -32,9 +33,9 @@ class EnsembleLinear(nn.Module):
         self.weight = nn.Parameter(weight.transpose(1, 2).contiguous().to(device))
         self.bias = nn.Parameter(torch.zeros(num_networks, 1, output_dim, device=device))
 
-    def forward(self, features: Tensor) -> Tensor:
-        """Return [N, B, output_dim] for [N, B, input_dim]."""
-        return torch.baddbmm(self.bias, features, self.weight)
+    def forward(self, features_NBL: Float[Tensor, "N B L"]) -> Float[Tensor, "N B M"]:
+        """Return what each layer gives for its own input."""
+        return torch.baddbmm(self.bias, features_NBL, self.weight)
 
 
 class EnsembleLayerNorm(nn.Module):
@@ -46,12 +47,13 @@ class EnsembleLayerNorm(nn.Module):
         self.weight = nn.Parameter(torch.ones(num_networks, 1, dim, device=device))
         self.bias = nn.Parameter(torch.zeros(num_networks, 1, dim, device=device))
 
-    def forward(self, features: Tensor) -> Tensor:
-        """Normalize [N, B, dim]."""
+    def forward(self, features_NBL: Float[Tensor, "N B L"]) -> Float[Tensor, "N B L"]:
+        """Normalize the last dim, and apply each network's own scale and offset."""
         # Autocast would go on in float32 up to the next product, which moves twice the memory.
-        with torch.autocast(features.device.type, enabled=False):
-            normalized = functional.layer_norm(features, (self.dim,))
-            return torch.addcmul(self.bias.to(features.dtype), normalized, self.weight.to(features.dtype))
+        with torch.autocast(features_NBL.device.type, enabled=False):
+            normalized_NBL = functional.layer_norm(features_NBL, (self.dim,))
+            weight, bias = (parameter.to(features_NBL.dtype) for parameter in (self.weight, self.bias))
+            return torch.addcmul(bias, normalized_NBL, weight)
 
 
 def ensemble_mlp(

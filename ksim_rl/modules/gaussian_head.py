@@ -1,14 +1,18 @@
-"""The last layer of a gaussian policy: mean and standard deviation of the action."""
+"""This module has the last layers of gaussian policies, with and without bounds of the action."""
 
 import math
+from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.distributions import Distribution
 from torch.nn import functional
 
 from ksim_rl.modules.diagonal_gaussian import DiagonalGaussian
 from ksim_rl.modules.mlp import linear
+from ksim_rl.modules.tanh_gaussian import TanhGaussian
+from ksim_rl.modules.truncated_gaussian import TruncatedGaussian
 
 MIN_STD = 1e-3
 
@@ -52,7 +56,9 @@ class GaussianHead(nn.Module):
             start = math.log(init_std) if std_type == "log" else init_std
             self.std = nn.Parameter(torch.full((action_dim,), start, device=device))
 
-    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, features: Float[Tensor, "*batch L"]
+    ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
         """Return `(loc, scale)`; `scale` is at least `MIN_STD`."""
         loc = self.loc(features)
         if self.std_layer is None:
@@ -66,6 +72,50 @@ class GaussianHead(nn.Module):
         bounded = scale + (scale.clamp_min(MIN_STD) - scale).detach()
         return loc, bounded.expand_as(loc)
 
-    def distribution(self, loc: Tensor, scale: Tensor) -> Distribution:
+    def distribution(self, loc: Float[Tensor, "*batch L"], scale: Float[Tensor, "*batch L"]) -> Distribution:
         """Return the distribution of the action."""
         return DiagonalGaussian(loc, scale)
+
+
+class TanhGaussianHead(GaussianHead):
+    """Maps features [..., L] to `loc` and `scale` of a `TanhGaussian`, before the tanh.
+
+    Args:
+        low_L, high_L: bounds of the action.
+        **options: of `GaussianHead`.
+    """
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(
+        self, feature_dim: int, *, low_L: Float[Tensor, " L"], high_L: Float[Tensor, " L"], **options: Any
+    ) -> None:
+        super().__init__(feature_dim, len(low_L), **options)
+        device = options.get("device")
+        # They are the env's, so they are no part of a checkpoint.
+        self.register_buffer("low", low_L.to(device, copy=True), persistent=False)
+        self.register_buffer("high", high_L.to(device, copy=True), persistent=False)
+
+    def distribution(self, loc: Float[Tensor, "*batch L"], scale: Float[Tensor, "*batch L"]) -> Distribution:
+        """Return the distribution of the action."""
+        return TanhGaussian(loc, scale, self.low, self.high)
+
+
+class TruncatedGaussianHead(TanhGaussianHead):
+    """Maps features [..., L] to `loc` and `scale` of a `TruncatedGaussian`, in units of the action.
+
+    `loc` stays within the bounds, by a tanh, so that no quantity of the distribution loses precision.
+    """
+
+    def forward(
+        self, features: Float[Tensor, "*batch L"]
+    ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
+        """Return `(loc, scale)`."""
+        loc, scale = super().forward(features)
+        center, half_range = (self.high + self.low) / 2, (self.high - self.low) / 2
+        return center + half_range * torch.tanh(loc), half_range * scale
+
+    def distribution(self, loc: Float[Tensor, "*batch L"], scale: Float[Tensor, "*batch L"]) -> Distribution:
+        """Return the distribution of the action."""
+        return TruncatedGaussian(loc, scale, self.low, self.high)

@@ -1,8 +1,9 @@
-"""The last layers of a policy with several actions, such as joint targets and a choice of gait."""
+"""This module has the last layers of a policy with several actions, such as joint targets and a choice of gait."""
 
 from collections.abc import Mapping
 from typing import Any
 
+from jaxtyping import Float
 from tensordict import TensorDictBase
 from tensordict.nn import CompositeDistribution
 from tensordict.utils import NestedKey
@@ -32,7 +33,7 @@ class MixedHead(nn.Module):
             for name in head.parameter_names  # type: ignore[union-attr]
         ]
 
-    def forward(self, features: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, features: Float[Tensor, "*batch L"]) -> tuple[Float[Tensor, "*batch ?N"], ...]:
         """Return the parameters in the order of `parameter_keys`."""
         return tuple(parameter for head in self.heads for parameter in head(features))
 

@@ -1,9 +1,10 @@
-"""The policy that collects while a student learns from a teacher."""
+"""This module has the policy that collects while a student learns from a teacher: either acts, by chance."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -32,7 +33,7 @@ class MixedPolicy(TensorDictModuleBase):
         student: TensorDictModuleBase,
         teacher: TensorDictModuleBase | None = None,
         *,
-        share: Tensor,
+        share: Float[Tensor, ""],
         teacher_keys: Sequence[Any] = (),
         explores: bool = True,
     ) -> None:
@@ -53,6 +54,6 @@ class MixedPolicy(TensorDictModuleBase):
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             shown = self.teacher(seen).get("action")
         action = acted.get("action")
-        helped = torch.rand(acted.batch_size, device=action.device) < self.share
-        helped = helped.reshape(*acted.batch_size, *[1] * (action.ndim - acted.batch_dims))
+        helped_E = torch.rand(acted.batch_size, device=action.device) < self.share
+        helped = helped_E.reshape(*acted.batch_size, *[1] * (action.ndim - acted.batch_dims))
         return acted.set("action", torch.where(helped, shown, action))

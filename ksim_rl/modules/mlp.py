@@ -1,4 +1,4 @@
-"""The multi-layer perceptron that actors and critics are made of."""
+"""This module builds the multi-layer perceptron that actors and critics are made of."""
 
 import math
 from collections.abc import Sequence

@@ -1,8 +1,9 @@
-"""What a network reads: one or several leaves of an EnvState, side by side."""
+"""This module says what a network reads: one or several leaves of an EnvState, side by side."""
 
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torchrl.data import Composite
 
@@ -43,6 +44,6 @@ def observation_dim(spec: Composite, keys: Sequence[ObservationKey]) -> int:
     return sum(spec[key].shape[-1] for key in keys)
 
 
-def side_by_side(observations: Sequence[Tensor]) -> Tensor:
-    """Join observations [..., L_i] along their last dim."""
+def side_by_side(observations: Sequence[Float[Tensor, "*batch ?L"]]) -> Float[Tensor, "*batch L"]:
+    """Join observations along their last dim."""
     return observations[0] if len(observations) == 1 else torch.cat(tuple(observations), -1)

@@ -1,6 +1,7 @@
-"""Observation normalization by the mean and variance of all observations so far."""
+"""This module normalizes observations by the mean and variance of all observations so far."""
 
 import torch
+from jaxtyping import Bool, Float
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -37,8 +38,8 @@ class ObservationNormalizer(RunningMoments):
         super().__init__(dim, until=until, device=device)
         self.eps = eps
 
-    def forward(self, obs: Tensor) -> Tensor:
-        """Normalize `obs` [..., L]."""
+    def forward(self, obs: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch L"]:
+        """Normalize observations."""
         return (obs - self.mean) * torch.rsqrt(self.var + self.eps)
 
     def extra_repr(self) -> str:
@@ -46,7 +47,9 @@ class ObservationNormalizer(RunningMoments):
         return f"dim={self.dim}, eps={self.eps}, until={self.until}"
 
 
-def update_normalizers(tensordict: TensorDictBase, *networks: nn.Module, valid: Tensor | None = None) -> None:
+def update_normalizers(
+    tensordict: TensorDictBase, *networks: nn.Module, valid: Bool[Tensor, "*batch"] | None = None
+) -> None:
     """Update each normalizer inside `networks` with the observations that its network reads.
 
     Call it once per dataset: a normalizer that two networks share, or that is listed twice, is updated once.
@@ -54,7 +57,7 @@ def update_normalizers(tensordict: TensorDictBase, *networks: nn.Module, valid: 
     Args:
         tensordict: the env states, e.g. a rollout `["E","T"]`.
         networks: actors, critics; any other `nn.Module` is searched for networks that own a `normalizer`.
-        valid: bool, one element per env state; those marked False are left out.
+        valid: env states marked False are left out.
     """
     seen: set[int] = set()
     for network in networks:

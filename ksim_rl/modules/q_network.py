@@ -1,39 +1,29 @@
-"""The action value functions of off-policy learning: numbers or distributions, several at once."""
+"""This module builds the action value functions of off-policy learning: numbers or distributions, several at once."""
 
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import Tensor
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checks import check_count, check_in_range
 from ksim_rl.modules.ensemble import ensemble_mlp
-from ksim_rl.modules.mlp import check_network
-from ksim_rl.modules.observation_normalizer import ObservationNormalizer
+from ksim_rl.modules.network import ObservingNetwork, OffPolicyNetworkCfg
 
 
 @dataclass(frozen=True, kw_only=True)
-class QNetworkCfg:
+class QNetworkCfg(OffPolicyNetworkCfg):
     """The action value networks.
 
     Attributes:
-        hidden_dims: widths of the hidden layers.
-        activation: one of `ksim_rl.modules.ACTIVATIONS`.
-        layer_norm: normalize before each activation.
-        obs_normalization: normalize observations by running statistics inside the network.
-        output_gain: scale of the last layer's weights.
         num_networks: N, networks that differ in their first weights only; two for clipped double Q-learning.
         num_atoms: A, probabilities on A values spread evenly over [v_min, v_max] (Bellemare et al., arXiv 1707.06887);
             1 predicts the value itself.
         v_min, v_max: the values that returns can have; of no effect with `num_atoms=1`.
     """
 
-    hidden_dims: tuple[int, ...] = (256, 256)
-    activation: str = "relu"
-    layer_norm: bool = False
-    obs_normalization: bool = True
-    output_gain: float = 1.0
     num_networks: int = 2
     num_atoms: int = 1
     v_min: float = -10.0
@@ -41,24 +31,19 @@ class QNetworkCfg:
 
     def __post_init__(self) -> None:
         """Refuse values out of range, naming the field."""
-        object.__setattr__(self, "hidden_dims", tuple(self.hidden_dims))
-        check_network(self.hidden_dims, self.activation)
-        check_in_range("output_gain", self.output_gain, low=0.0)
-        for field in ("num_networks", "num_atoms"):
-            value = getattr(self, field)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{field}={value!r}: expected a whole number >= 1")
+        super().__post_init__()
+        check_count("num_networks", self.num_networks)
+        check_count("num_atoms", self.num_atoms)
         check_in_range("v_min", self.v_min)
         check_in_range("v_max", self.v_max)
         if self.v_min >= self.v_max:
             raise ValueError(f"v_min={self.v_min!r} is not below v_max={self.v_max!r}")
 
 
-class QNetwork(nn.Module):
+class QNetwork(ObservingNetwork):
     """Maps observation [..., L] and action [..., action_dim] to what N networks predict.
 
     Attributes:
-        normalizer: an `ObservationNormalizer`, or None.
         support: the values of the A atoms [A], or None where the value itself is predicted.
     """
 
@@ -67,9 +52,8 @@ class QNetwork(nn.Module):
     def __init__(
         self, cfg: QNetworkCfg, *, obs_dim: int, action_dim: int, device: torch.device | str | None = None
     ) -> None:
-        super().__init__()
+        super().__init__(cfg, obs_dim=obs_dim, device=device)
         self.cfg = cfg
-        self.normalizer = ObservationNormalizer(obs_dim, device=device) if cfg.obs_normalization else None
         support = torch.linspace(cfg.v_min, cfg.v_max, cfg.num_atoms, device=device)
         # It follows from the config, so that it is no part of a checkpoint.
         self.register_buffer("support", support if cfg.num_atoms > 1 else None, persistent=False)
@@ -84,11 +68,11 @@ class QNetwork(nn.Module):
             device=device,
         )
 
-    def forward(self, obs: Tensor, action: Tensor) -> Tensor:
+    def forward(
+        self, obs: Float[Tensor, "*batch L"], action: Float[Tensor, "*batch action_dim"]
+    ) -> Float[Tensor, "*batch N"] | Float[Tensor, "*batch N A"]:
         """Return action values [..., N], or with atoms the logits of their probabilities [..., N, A]."""
-        if self.normalizer is not None:
-            obs = self.normalizer(obs)
-        features = torch.cat((obs, action), dim=-1)
+        features = torch.cat((self.observe(obs), action), dim=-1)
         batch = features.shape[:-1]
         features_NBL = features.reshape(1, -1, features.shape[-1]).expand(self.cfg.num_networks, -1, -1)
         out = self.layers(features_NBL).transpose(0, 1).unflatten(0, batch)

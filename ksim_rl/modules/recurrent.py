@@ -1,10 +1,11 @@
-"""Memory for any network: a TensorDict module that turns observations into features of the episode so far."""
+"""This module gives any network a memory: it turns observations into features of the episode so far."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import torch
+from jaxtyping import Bool, Float
 from tensordict import TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
@@ -84,40 +85,43 @@ class RecurrentNetwork(nn.Module):
                 self.register_parameter(f"{name}_l{layer}", nn.Parameter(value.to(device)))
 
     def forward(
-        self, obs_TB: Tensor, state_BN: tuple[Tensor, ...], reset_TB1: Tensor | None = None
-    ) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """Return the features [T, B, H], and the states after each step, each [T, B, N, H].
+        self,
+        obs_TBL: Float[Tensor, "T B L"],
+        state_BNH: tuple[Float[Tensor, "B N H"], ...],
+        reset_TB1: Bool[Tensor, "T B 1"] | None = None,
+    ) -> tuple[Float[Tensor, "T B H"], tuple[Float[Tensor, "T B N H"], ...]]:
+        """Return the features, and the states after each step.
 
         Args:
-            obs_TB: [T, B, L].
-            state_BN: before the first step: h (and c), each [B, N, H].
-            reset_TB1: bool [T, B, 1]: whether an episode begins at the step, from a state of zeros.
+            obs_TBL: the observations.
+            state_BNH: before the first step: h (and c).
+            reset_TB1: whether an episode begins at the step, from a state of zeros.
         """
-        features_TB = obs_TB if self.normalizer is None else self.normalizer(obs_TB)
+        features_TBH = obs_TBL if self.normalizer is None else self.normalizer(obs_TBL)
         states_N: list[tuple[Tensor, ...]] = []
         for layer in range(self.cfg.num_layers):
-            state_B = tuple(part_BN[:, layer] for part_BN in state_BN)
-            states_N.append(self._layer(layer, features_TB, state_B, reset_TB1))
-            features_TB = states_N[-1][0]
+            state_BH = tuple(part_BNH[:, layer] for part_BNH in state_BNH)
+            states_N.append(self._layer(layer, features_TBH, state_BH, reset_TB1))
+            features_TBH = states_N[-1][0]
         if len(states_N) == 1:
-            return features_TB, tuple(part_TB.unsqueeze(-2) for part_TB in states_N[0])
-        return features_TB, tuple(torch.stack(parts_N, -2) for parts_N in zip(*states_N, strict=True))
+            return features_TBH, tuple(part_TB.unsqueeze(-2) for part_TB in states_N[0])
+        return features_TBH, tuple(torch.stack(parts_N, -2) for parts_N in zip(*states_N, strict=True))
 
     def _layer(
-        self, layer: int, features_TB: Tensor, state_B: tuple[Tensor, ...], reset_TB1: Tensor | None
+        self, layer: int, features_TBH: Tensor, state_BH: tuple[Tensor, ...], reset_TB1: Tensor | None
     ) -> tuple[Tensor, ...]:
         weight_ih, weight_hh, bias_ih, bias_hh = (
             self.get_parameter(f"{name}_l{layer}")
             for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
         )
         lstm = self.cfg.kind == "lstm"
-        gates_TB = functional.linear(features_TB, weight_ih, bias_ih + bias_hh if lstm else bias_ih)
+        gates_TBG = functional.linear(features_TBH, weight_ih, bias_ih + bias_hh if lstm else bias_ih)
         # Under autocast only the projection is rounded: errors of a state add up over the steps.
-        with torch.autocast(gates_TB.device.type, enabled=False):
-            gates_TB = gates_TB.to(weight_hh.dtype)
+        with torch.autocast(gates_TBG.device.type, enabled=False):
+            gates_TBG = gates_TBG.to(weight_hh.dtype)
             if lstm:
-                return lstm_layer(gates_TB, weight_hh, state_B, reset_TB1)
-            return gru_layer(gates_TB, weight_hh, bias_hh, state_B, reset_TB1)
+                return lstm_layer(gates_TBG, weight_hh, state_BH, reset_TB1)
+            return gru_layer(gates_TBG, weight_hh, bias_hh, state_BH, reset_TB1)
 
 
 class RecurrentModule(TensorDictModule):
@@ -202,10 +206,10 @@ class RecurrentModule(TensorDictModule):
                 f"recurrent mode {self.name!r} reads sequences [B, T] with {RESET_KEY!r}, which TorchRL's InitTracker "
                 "writes"
             )
-        features_TB, states_TB = self.module(
+        features_TBH, states_TB = self.module(
             obs.transpose(0, 1), tuple(part[:, 0] for part in state), reset.transpose(0, 1)
         )
-        return tuple(part.transpose(0, 1) for part in (features_TB, *states_TB))
+        return tuple(part.transpose(0, 1) for part in (features_TBH, *states_TB))
 
     def make_tensordict_primer(self) -> RecurrentStatePrimer:
         """Return the transform with which an env carries the state; TorchRL's `get_primers_from_module` asks for it."""

@@ -1,4 +1,4 @@
-"""LSTM and GRU layers over a sequence whose state starts anew where an episode does.
+"""This module has LSTM and GRU layers over a sequence whose state starts anew where an episode does.
 
 cuDNN's kernels cannot zero the state of single rows between two steps, and splitting sequences at the resets makes
 sizes that depend on data. Here the input projections of all steps come in as one product; each step is one recurrent
@@ -9,188 +9,199 @@ over all steps. No size depends on data and nothing is read on the host, so it c
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-_aten = torch.ops.aten
+from ksim_rl.modules import upstream
 
 
 def lstm_layer(
-    gates_TB: Tensor, weight_hh: Tensor, state_B: tuple[Tensor, ...], reset_TB1: Tensor | None
-) -> tuple[Tensor, ...]:
+    gates_TBG: Float[Tensor, "T B G"],
+    weight_hh_GH: Float[Tensor, "G H"],
+    state_BH: tuple[Float[Tensor, "B H"], ...],
+    reset_TB1: Bool[Tensor, "T B 1"] | None,
+) -> tuple[Float[Tensor, "T B H"], ...]:
     """Run one LSTM layer (Hochreiter & Schmidhuber 1997, with forget gates; the formulas of `torch.nn.LSTM`).
 
     Args:
-        gates_TB: W_ih x + b_ih + b_hh of each step, [T, B, 4H]: input, forget, cell, output.
-        weight_hh: [4H, H].
-        state_B: h and c before the first step, each [B, H].
-        reset_TB1: bool [T, B, 1]: whether the state is zeroed before the step; None never does.
+        gates_TBG: W_ih x + b_ih + b_hh of each step, G = 4 H: input, forget, cell, output.
+        weight_hh_GH: W_hh.
+        state_BH: h and c before the first step.
+        reset_TB1: whether the state is zeroed before the step; None never does.
 
     Returns:
-        h and c after each step, each [T, B, H].
+        h and c after each step.
     """
-    return _LSTM.apply(gates_TB, weight_hh, *state_B, reset_TB1)  # type: ignore[no-any-return]
+    return _LSTM.apply(gates_TBG, weight_hh_GH, *state_BH, reset_TB1)  # type: ignore[no-any-return]
 
 
 def gru_layer(
-    gates_TB: Tensor,
-    weight_hh: Tensor,
-    bias_hh: Tensor,
-    state_B: tuple[Tensor, ...],
-    reset_TB1: Tensor | None,
-) -> tuple[Tensor, ...]:
+    gates_TBG: Float[Tensor, "T B G"],
+    weight_hh_GH: Float[Tensor, "G H"],
+    bias_hh_G: Float[Tensor, " G"],
+    state_BH: tuple[Float[Tensor, "B H"], ...],
+    reset_TB1: Bool[Tensor, "T B 1"] | None,
+) -> tuple[Float[Tensor, "T B H"], ...]:
     """Run one GRU layer (Cho et al., arXiv 1406.1078, in the variant of `torch.nn.GRU`).
 
     Args:
-        gates_TB: W_ih x + b_ih of each step, [T, B, 3H]: reset, update, new.
-        weight_hh, bias_hh: [3H, H] and [3H].
-        state_B: h before the first step, [B, H], as a tuple of one.
-        reset_TB1: bool [T, B, 1]: whether the state is zeroed before the step; None never does.
+        gates_TBG: W_ih x + b_ih of each step, G = 3 H: reset, update, new.
+        weight_hh_GH, bias_hh_G: W_hh and b_hh.
+        state_BH: h before the first step, as a tuple of one.
+        reset_TB1: whether the state is zeroed before the step; None never does.
 
     Returns:
-        h after each step, [T, B, H], as a tuple of one.
+        h after each step, as a tuple of one.
     """
-    return (_GRU.apply(gates_TB, weight_hh, bias_hh, *state_B, reset_TB1),)
+    return (_GRU.apply(gates_TBG, weight_hh_GH, bias_hh_G, *state_BH, reset_TB1),)
 
 
 class _LSTM(Function):
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, gates_TB: Tensor, weight_hh: Tensor, h_B: Tensor, c_B: Tensor, reset_TB1: Tensor | None
+        ctx: Any,
+        gates_TBG: Tensor,
+        weight_hh_GH: Tensor,
+        h_BH: Tensor,
+        c_BH: Tensor,
+        reset_TB1: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        h0_B, c0_B = h_B, c_B
+        h0_BH, c0_BH = h_BH, c_BH
         steps: list[tuple[Tensor, Tensor, Tensor]] = []
-        for t, gates_B in enumerate(gates_TB.unbind(0)):
-            h_B, c_B = (_kept(state_B, reset_TB1, t) for state_B in (h_B, c_B))
-            h_B, c_B, activations_B = _lstm_step(gates_B, h_B @ weight_hh.t(), c_B)
-            steps.append((h_B, c_B, activations_B))
-        h_TB, c_TB, activations_TB = (torch.stack(column) for column in zip(*steps, strict=True))
-        ctx.save_for_backward(weight_hh, h0_B, c0_B, h_TB, c_TB, activations_TB, reset_TB1)
+        for t, gates_BG in enumerate(gates_TBG.unbind(0)):
+            h_BH, c_BH = (_kept(state_BH, reset_TB1, t) for state_BH in (h_BH, c_BH))
+            h_BH, c_BH, activations_BG = _lstm_step(gates_BG, h_BH @ weight_hh_GH.t(), c_BH)
+            steps.append((h_BH, c_BH, activations_BG))
+        h_TBH, c_TBH, activations_TBG = (torch.stack(column) for column in zip(*steps, strict=True))
+        ctx.save_for_backward(weight_hh_GH, h0_BH, c0_BH, h_TBH, c_TBH, activations_TBG, reset_TB1)
         ctx.set_materialize_grads(False)
-        return h_TB, c_TB
+        return h_TBH, c_TBH
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        grad_h_TB, grad_c_TB = grads
-        weight_hh, h0_B, c0_B, h_TB, c_TB, activations_TB, reset_TB1 = ctx.saved_tensors
-        c_before_TB = _before(c0_B, c_TB, reset_TB1)
-        dh_B, dc_B = torch.zeros_like(h0_B), torch.zeros_like(c0_B)
-        dgates_TB = torch.empty_like(activations_TB)
-        for t in reversed(range(h_TB.shape[0])):
-            dh_B = dh_B if grad_h_TB is None else dh_B + grad_h_TB[t]
-            dc_B = dc_B if grad_c_TB is None else dc_B + grad_c_TB[t]
-            dgates_B, dc_B = _lstm_step_backward(dh_B, dc_B, c_before_TB[t], c_TB[t], activations_TB[t])
-            dgates_TB[t] = dgates_B
-            dh_B, dc_B = (_kept(d_B, reset_TB1, t) for d_B in (dgates_B @ weight_hh, dc_B))
-        h_before_TB = _before(h0_B, h_TB, reset_TB1)
-        return dgates_TB, _outer(dgates_TB, h_before_TB), dh_B, dc_B, None
+        grad_h_TBH, grad_c_TBH = grads
+        weight_hh_GH, h0_BH, c0_BH, h_TBH, c_TBH, activations_TBG, reset_TB1 = ctx.saved_tensors
+        c_before_TBH = _before(c0_BH, c_TBH, reset_TB1)
+        dh_BH, dc_BH = torch.zeros_like(h0_BH), torch.zeros_like(c0_BH)
+        dgates_TBG = torch.empty_like(activations_TBG)
+        for t in reversed(range(h_TBH.shape[0])):
+            dh_BH = dh_BH if grad_h_TBH is None else dh_BH + grad_h_TBH[t]
+            dc_BH = dc_BH if grad_c_TBH is None else dc_BH + grad_c_TBH[t]
+            dgates_BG, dc_BH = _lstm_step_backward(
+                dh_BH, dc_BH, c_before_TBH[t], c_TBH[t], activations_TBG[t]
+            )
+            dgates_TBG[t] = dgates_BG
+            dh_BH, dc_BH = (_kept(d_BH, reset_TB1, t) for d_BH in (dgates_BG @ weight_hh_GH, dc_BH))
+        h_before_TBH = _before(h0_BH, h_TBH, reset_TB1)
+        return dgates_TBG, _outer(dgates_TBG, h_before_TBH), dh_BH, dc_BH, None
 
 
 class _GRU(Function):
     @staticmethod
     def forward(  # type: ignore[override]
         ctx: Any,
-        gates_TB: Tensor,
-        weight_hh: Tensor,
-        bias_hh: Tensor,
-        h_B: Tensor,
+        gates_TBG: Tensor,
+        weight_hh_GH: Tensor,
+        bias_hh_G: Tensor,
+        h_BH: Tensor,
         reset_TB1: Tensor | None,
     ) -> Tensor:
-        h0_B = h_B
+        h0_BH = h_BH
         steps: list[tuple[Tensor, Tensor]] = []
-        for t, gates_B in enumerate(gates_TB.unbind(0)):
-            h_B = _kept(h_B, reset_TB1, t)
-            h_B, workspace_B = _gru_step(gates_B, torch.addmm(bias_hh, h_B, weight_hh.t()), h_B)
-            steps.append((h_B, workspace_B))
-        h_TB, workspace_TB = (torch.stack(column) for column in zip(*steps, strict=True))
-        ctx.save_for_backward(weight_hh, h0_B, h_TB, workspace_TB, reset_TB1)
-        return h_TB
+        for t, gates_BG in enumerate(gates_TBG.unbind(0)):
+            h_BH = _kept(h_BH, reset_TB1, t)
+            h_BH, workspace_BG = _gru_step(gates_BG, torch.addmm(bias_hh_G, h_BH, weight_hh_GH.t()), h_BH)
+            steps.append((h_BH, workspace_BG))
+        h_TBH, workspace_TBG = (torch.stack(column) for column in zip(*steps, strict=True))
+        ctx.save_for_backward(weight_hh_GH, h0_BH, h_TBH, workspace_TBG, reset_TB1)
+        return h_TBH
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        (grad_h_TB,) = grads
-        weight_hh, h0_B, h_TB, workspace_TB, reset_TB1 = ctx.saved_tensors
-        dh_B = torch.zeros_like(h0_B)
+        (grad_h_TBH,) = grads
+        weight_hh_GH, h0_BH, h_TBH, workspace_TBG, reset_TB1 = ctx.saved_tensors
+        dh_BH = torch.zeros_like(h0_BH)
         dinput: list[Tensor] = []
         drecurrent: list[Tensor] = []
-        for t in reversed(range(h_TB.shape[0])):
-            dinput_B, drecurrent_B, dh_B = _gru_step_backward(dh_B + grad_h_TB[t], workspace_TB[t])
-            dinput.append(dinput_B)
-            drecurrent.append(drecurrent_B)
-            dh_B = _kept(torch.addmm(dh_B, drecurrent_B, weight_hh), reset_TB1, t)
-        dinput_TB, drecurrent_TB = torch.stack(dinput[::-1]), torch.stack(drecurrent[::-1])
-        dweight_hh = _outer(drecurrent_TB, _before(h0_B, h_TB, reset_TB1))
-        return dinput_TB, dweight_hh, drecurrent_TB.sum((0, 1)), dh_B, None
+        for t in reversed(range(h_TBH.shape[0])):
+            dinput_BG, drecurrent_BG, dh_BH = _gru_step_backward(dh_BH + grad_h_TBH[t], workspace_TBG[t])
+            dinput.append(dinput_BG)
+            drecurrent.append(drecurrent_BG)
+            dh_BH = _kept(torch.addmm(dh_BH, drecurrent_BG, weight_hh_GH), reset_TB1, t)
+        dinput_TBG, drecurrent_TBG = torch.stack(dinput[::-1]), torch.stack(drecurrent[::-1])
+        dweight_hh_GH = _outer(drecurrent_TBG, _before(h0_BH, h_TBH, reset_TB1))
+        return dinput_TBG, dweight_hh_GH, drecurrent_TBG.sum((0, 1)), dh_BH, None
 
 
-def _kept(state_B: Tensor, reset_TB1: Tensor | None, t: int) -> Tensor:
+def _kept(state_BH: Tensor, reset_TB1: Tensor | None, t: int) -> Tensor:
     # A fill instead of a product: an old state that is NaN must not survive the reset.
-    return state_B if reset_TB1 is None else state_B.masked_fill(reset_TB1[t], 0.0)
+    return state_BH if reset_TB1 is None else state_BH.masked_fill(reset_TB1[t], 0.0)
 
 
-def _before(first_B: Tensor, after_TB: Tensor, reset_TB1: Tensor | None) -> Tensor:
+def _before(first_BH: Tensor, after_TBH: Tensor, reset_TB1: Tensor | None) -> Tensor:
     """Return the state that each step began with, from those that the steps ended with."""
-    before_TB = torch.cat([first_B.unsqueeze(0), after_TB[:-1]])
-    return before_TB if reset_TB1 is None else before_TB.masked_fill(reset_TB1, 0.0)
+    before_TBH = torch.cat([first_BH.unsqueeze(0), after_TBH[:-1]])
+    return before_TBH if reset_TB1 is None else before_TBH.masked_fill(reset_TB1, 0.0)
 
 
-def _outer(left_TB: Tensor, right_TB: Tensor) -> Tensor:
-    return left_TB.flatten(0, 1).t() @ right_TB.flatten(0, 1)
+def _outer(left_TBH: Tensor, right_TBH: Tensor) -> Tensor:
+    return left_TBH.flatten(0, 1).t() @ right_TBH.flatten(0, 1)
 
 
 # On CUDA these are the fused kernels behind torch.nn.LSTMCell and torch.nn.GRUCell; they have none for the CPU.
 
 
-def _lstm_step(gates_B: Tensor, recurrent_B: Tensor, c_B: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _lstm_step(gates_BG: Tensor, recurrent_BG: Tensor, c_BH: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return h and c after the step, and the activated gates."""
-    if gates_B.is_cuda:
-        return _aten._thnn_fused_lstm_cell(gates_B, recurrent_B, c_B)
-    i_B, f_B, g_B, o_B = (gates_B + recurrent_B).chunk(4, -1)
-    i_B, f_B, g_B, o_B = i_B.sigmoid(), f_B.sigmoid(), g_B.tanh(), o_B.sigmoid()
-    c_B = f_B * c_B + i_B * g_B
-    return o_B * c_B.tanh(), c_B, torch.cat([i_B, f_B, g_B, o_B], -1)
+    if gates_BG.is_cuda:
+        return upstream.fused_lstm_cell(gates_BG, recurrent_BG, c_BH)
+    i_BH, f_BH, g_BH, o_BH = (gates_BG + recurrent_BG).chunk(4, -1)
+    i_BH, f_BH, g_BH, o_BH = i_BH.sigmoid(), f_BH.sigmoid(), g_BH.tanh(), o_BH.sigmoid()
+    c_BH = f_BH * c_BH + i_BH * g_BH
+    return o_BH * c_BH.tanh(), c_BH, torch.cat([i_BH, f_BH, g_BH, o_BH], -1)
 
 
 def _lstm_step_backward(
-    dh_B: Tensor, dc_B: Tensor, c_before_B: Tensor, c_B: Tensor, activations_B: Tensor
+    dh_BH: Tensor, dc_BH: Tensor, c_before_BH: Tensor, c_BH: Tensor, activations_BG: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the gradients of the gates before activation, and of c before the step."""
-    if dh_B.is_cuda:
-        dgates_B, dc_B, _ = _aten._thnn_fused_lstm_cell_backward_impl(
-            dh_B, dc_B, c_before_B, c_B, activations_B, False
+    if dh_BH.is_cuda:
+        dgates_BG, dc_BH, _ = upstream.fused_lstm_cell_backward(
+            dh_BH, dc_BH, c_before_BH, c_BH, activations_BG, False
         )
-        return dgates_B, dc_B
-    i_B, f_B, g_B, o_B = activations_B.chunk(4, -1)
-    tanh_c_B = c_B.tanh()
-    dc_B = dc_B + dh_B * o_B * (1.0 - tanh_c_B.square())
+        return dgates_BG, dc_BH
+    i_BH, f_BH, g_BH, o_BH = activations_BG.chunk(4, -1)
+    tanh_c_BH = c_BH.tanh()
+    dc_BH = dc_BH + dh_BH * o_BH * (1.0 - tanh_c_BH.square())
     dgates = [
-        dc_B * g_B * i_B * (1.0 - i_B),
-        dc_B * c_before_B * f_B * (1.0 - f_B),
-        dc_B * i_B * (1.0 - g_B.square()),
-        dh_B * tanh_c_B * o_B * (1.0 - o_B),
+        dc_BH * g_BH * i_BH * (1.0 - i_BH),
+        dc_BH * c_before_BH * f_BH * (1.0 - f_BH),
+        dc_BH * i_BH * (1.0 - g_BH.square()),
+        dh_BH * tanh_c_BH * o_BH * (1.0 - o_BH),
     ]
-    return torch.cat(dgates, -1), dc_B * f_B
+    return torch.cat(dgates, -1), dc_BH * f_BH
 
 
-def _gru_step(gates_B: Tensor, recurrent_B: Tensor, h_B: Tensor) -> tuple[Tensor, Tensor]:
+def _gru_step(gates_BG: Tensor, recurrent_BG: Tensor, h_BH: Tensor) -> tuple[Tensor, Tensor]:
     """Return h after the step, and what the backward step needs."""
-    if gates_B.is_cuda:
-        return _aten._thnn_fused_gru_cell(gates_B, recurrent_B, h_B)
-    (rx_B, zx_B, nx_B), (rh_B, zh_B, nh_B) = gates_B.chunk(3, -1), recurrent_B.chunk(3, -1)
-    r_B, z_B = (rx_B + rh_B).sigmoid(), (zx_B + zh_B).sigmoid()
-    n_B = (nx_B + r_B * nh_B).tanh()
-    return n_B + z_B * (h_B - n_B), torch.cat([r_B, z_B, n_B, h_B, nh_B], -1)
+    if gates_BG.is_cuda:
+        return upstream.fused_gru_cell(gates_BG, recurrent_BG, h_BH)
+    (rx_BH, zx_BH, nx_BH), (rh_BH, zh_BH, nh_BH) = gates_BG.chunk(3, -1), recurrent_BG.chunk(3, -1)
+    r_BH, z_BH = (rx_BH + rh_BH).sigmoid(), (zx_BH + zh_BH).sigmoid()
+    n_BH = (nx_BH + r_BH * nh_BH).tanh()
+    return n_BH + z_BH * (h_BH - n_BH), torch.cat([r_BH, z_BH, n_BH, h_BH, nh_BH], -1)
 
 
-def _gru_step_backward(dh_B: Tensor, workspace_B: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _gru_step_backward(dh_BH: Tensor, workspace_BG: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the gradients of the input gates, the recurrent gates, and h itself."""
-    if dh_B.is_cuda:
-        return _aten._thnn_fused_gru_cell_backward(dh_B, workspace_B, False)[:3]
-    r_B, z_B, n_B, h_B, nh_B = workspace_B.chunk(5, -1)
-    dn_B = dh_B * (1.0 - z_B) * (1.0 - n_B.square())
-    dz_B = dh_B * (h_B - n_B) * z_B * (1.0 - z_B)
-    dr_B = dn_B * nh_B * r_B * (1.0 - r_B)
-    return torch.cat([dr_B, dz_B, dn_B], -1), torch.cat([dr_B, dz_B, dn_B * r_B], -1), dh_B * z_B
+    if dh_BH.is_cuda:
+        return upstream.fused_gru_cell_backward(dh_BH, workspace_BG, False)[:3]
+    r_BH, z_BH, n_BH, h_BH, nh_BH = workspace_BG.chunk(5, -1)
+    dn_BH = dh_BH * (1.0 - z_BH) * (1.0 - n_BH.square())
+    dz_BH = dh_BH * (h_BH - n_BH) * z_BH * (1.0 - z_BH)
+    dr_BH = dn_BH * nh_BH * r_BH * (1.0 - r_BH)
+    return torch.cat([dr_BH, dz_BH, dn_BH], -1), torch.cat([dr_BH, dz_BH, dn_BH * r_BH], -1), dh_BH * z_BH

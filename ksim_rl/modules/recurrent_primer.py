@@ -1,4 +1,4 @@
-"""The transforms with which an env carries the state of a recurrent network."""
+"""This module has the transforms with which an env carries the state of a recurrent network."""
 
 from typing import Any
 

@@ -1,9 +1,10 @@
-"""The states of recurrent networks between rollouts, and before training sequences."""
+"""This module keeps the states of recurrent networks between rollouts, and renews them before training sequences."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
@@ -61,11 +62,13 @@ class CarriedState:
             rollout_ET.set(key, before_ET.masked_fill_(rollout_ET.get(RESET_KEY).unsqueeze(-1), 0.0))
             state_E.copy_(after_ET[:, -1])
 
-    def state_dict(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Float[Tensor, "E N H"]]:
         """Return the states by flat key."""
         return {".".join(key): state_E for key, state_E in self._state_E.items()}
 
-    def load_state_dict(self, state: Mapping[str, Tensor], *, device: torch.device | str = "cpu") -> None:
+    def load_state_dict(
+        self, state: Mapping[str, Float[Tensor, "E N H"]], *, device: torch.device | str = "cpu"
+    ) -> None:
         """Continue where `state_dict` was taken; tensors keep their addresses.
 
         Raises:

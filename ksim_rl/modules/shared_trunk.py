@@ -1,63 +1,43 @@
-"""Layers that actor and critic share."""
+"""This module builds layers that actor and critic share."""
 
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from tensordict.nn import TensorDictModule
-from torch import Tensor, nn
+from torch import Tensor
 
-from ksim_rl.modules.mlp import check_network, trunk
-from ksim_rl.modules.observation_keys import ObservationKey, checked_keys, side_by_side
-from ksim_rl.modules.observation_normalizer import ObservationNormalizer
+from ksim_rl.modules.mlp import trunk
+from ksim_rl.modules.network import ObservingNetwork, OnPolicyNetworkCfg
 
 FEATURES = "features"
 
 
 @dataclass(frozen=True, kw_only=True)
-class SharedTrunkCfg:
-    """Layers below actor and critic, which read what they write: the key "features".
+class SharedTrunkCfg(OnPolicyNetworkCfg):
+    """Layers below actor and critic, which read what they write: the key "features"."""
 
-    Attributes:
-        in_keys: the observation groups that it reads, side by side; a list names a nested key.
-        hidden_dims: widths of the layers.
-        activation: one of `ksim_rl.modules.ACTIVATIONS`.
-        obs_normalization: normalize observations by running statistics inside the network.
-    """
-
-    in_keys: tuple[ObservationKey, ...] = ("actor",)
     hidden_dims: tuple[int, ...] = (512, 256)
-    activation: str = "elu"
-    obs_normalization: bool = True
 
     def __post_init__(self) -> None:
         """Refuse values out of range, naming the field."""
-        object.__setattr__(self, "in_keys", checked_keys(self.in_keys))
-        object.__setattr__(self, "hidden_dims", tuple(self.hidden_dims))
-        check_network(self.hidden_dims, self.activation)
+        super().__post_init__()
         if not self.hidden_dims:
             raise ValueError("hidden_dims=(): expected at least one width")
 
 
-class TrunkNetwork(nn.Module):
-    """Maps observations [..., L_i] to features [..., L], L the last width.
-
-    Attributes:
-        normalizer: an `ObservationNormalizer`, or None.
-    """
+class TrunkNetwork(ObservingNetwork):
+    """Maps observations [..., L_i] to features [..., L], L the last width."""
 
     def __init__(
         self, cfg: SharedTrunkCfg, *, obs_dim: int, device: torch.device | str | None = None
     ) -> None:
-        super().__init__()
-        self.normalizer = ObservationNormalizer(obs_dim, device=device) if cfg.obs_normalization else None
+        super().__init__(cfg, obs_dim=obs_dim, device=device)
         self.layers = trunk(obs_dim, cfg.hidden_dims, activation=cfg.activation, device=device)
 
-    def forward(self, *observations: Tensor) -> Tensor:
+    def forward(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch L"]:
         """Return the features for observations that stand side by side."""
-        obs = side_by_side(observations)
-        if self.normalizer is not None:
-            obs = self.normalizer(obs)
-        return self.layers(obs)
+        return self.layers(self.observe(*observations))
 
 
 def make_shared_trunk(

@@ -1,19 +1,22 @@
-"""The gaussian restricted to bounds, exact far out in its tails and free of host syncs."""
+"""This module has the gaussian restricted to bounds, exact far out in its tails and free of host syncs."""
 
 import math
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import Distribution, constraints, register_kl
+from torch.distributions import register_kl
 from torch.special import log_ndtr, ndtri
+
+from ksim_rl.modules.vector_distribution import BoundedDistribution
 
 _HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
 # Below it exp() underflows in float32, and the inverse of the distribution function is found in another way.
 _LOG_TINY = -80.0
 
 
-class TruncatedGaussian(Distribution):
+class TruncatedGaussian(BoundedDistribution):
     """A `DiagonalGaussian` given that each component lies in [low, high].
 
     Every quantity is computed for the mirror image whose interval lies left of `loc`, from logarithms of the
@@ -21,28 +24,20 @@ class TruncatedGaussian(Distribution):
     density is then good to 0.03 nats at 40 standard deviations. Entropy, moments and divergence are exact (Johnson,
     Kotz and Balakrishnan, "Continuous univariate distributions", vol. 1, 1994, ch. 13.10.1).
 
-    Nothing reads tensor values on the host, so it can be captured in a CUDA graph and compiled. Samples come from
-    torch's default generator of the device.
-
     Args:
         loc: mean before the restriction, also its mode where that lies inside, shape [..., L].
         scale: standard deviation before the restriction, positive, broadcastable with `loc`.
         low, high: the bounds, both numbers or both tensors [L]; low < high.
     """
 
-    arg_constraints = {"loc": constraints.real_vector, "scale": constraints.positive}  # type: ignore[assignment]
-    has_rsample = True
-
     def __init__(
         self,
-        loc: Tensor,
-        scale: Tensor,
-        low: Tensor | float = -1.0,
-        high: Tensor | float = 1.0,
-        validate_args: bool | None = None,
+        loc: Float[Tensor, "#*batch #L"],
+        scale: Float[Tensor, "#*batch #L"],
+        low: Float[Tensor, "#L"] | float = -1.0,
+        high: Float[Tensor, "#L"] | float = 1.0,
     ) -> None:
-        self.loc, self.scale = torch.broadcast_tensors(loc, scale)
-        self.low, self.high = low, high
+        super().__init__(loc, scale, low, high)
         left, right = (low - self.loc) / self.scale, (high - self.loc) / self.scale
         mirrored = left + right > 0.0
         self._sign = torch.where(mirrored, -1.0, 1.0).to(self.loc.dtype)
@@ -50,43 +45,31 @@ class TruncatedGaussian(Distribution):
         self._a, self._b = torch.where(mirrored, -right, left), torch.where(mirrored, -left, right)
         self._log_cdf_a, self._log_cdf_b = log_ndtr(self._a), log_ndtr(self._b)
         self._log_mass = self._log_cdf_b + (-torch.expm1(self._log_cdf_a - self._log_cdf_b)).log()
-        # Argument checks compare all values and read the answer on the host.
-        super().__init__(self.loc.shape[:-1], self.loc.shape[-1:], validate_args=False)
 
     @property
-    def support(self) -> constraints.Constraint:  # type: ignore[override]
-        """The box [low, high]."""
-        return constraints.independent(constraints.interval(self.low, self.high), 1)
-
-    @property
-    def mode(self) -> Tensor:
-        """The most likely value: `loc`, or the bound next to it, shape [..., L]."""
+    def mode(self) -> Float[Tensor, "*batch L"]:
+        """The most likely value: `loc`, or the bound next to it."""
         return self._clamp(self.loc)
 
     @property
-    def deterministic_sample(self) -> Tensor:
-        """What TorchRL takes under `ExplorationType.DETERMINISTIC`: the mode, shape [..., L]."""
+    def deterministic_sample(self) -> Float[Tensor, "*batch L"]:
+        """What TorchRL takes under `ExplorationType.DETERMINISTIC`: the mode."""
         return self.mode
 
     @property
-    def mean(self) -> Tensor:
-        """The mean, shape [..., L]."""
+    def mean(self) -> Float[Tensor, "*batch L"]:
+        """The mean."""
         density_a, density_b = self._bound_densities()
         return self.loc + self._sign * self.scale * (density_a - density_b)
 
     @property
-    def variance(self) -> Tensor:
-        """The variance, shape [..., L]."""
+    def variance(self) -> Float[Tensor, "*batch L"]:
+        """The variance."""
         density_a, density_b = self._bound_densities()
         second = 1.0 + self._a * density_a - self._b * density_b
         return self.scale.square() * (second - (density_a - density_b).square())
 
-    def expand(self, batch_shape: Any, _instance: Any = None) -> "TruncatedGaussian":
-        """Return the distribution with a larger batch shape."""
-        shape = torch.Size(batch_shape) + self.event_shape
-        return TruncatedGaussian(self.loc.expand(shape), self.scale.expand(shape), self.low, self.high)
-
-    def rsample(self, sample_shape: Any = ()) -> Tensor:
+    def rsample(self, sample_shape: Any = ()) -> Float[Tensor, "*shape L"]:
         """Draw [*sample_shape, ..., L]; gradients reach `loc` and `scale`.
 
         They are those of the value at a fixed probability (Figurnov et al., arXiv 1805.08498), in closed form.
@@ -106,20 +89,15 @@ class TruncatedGaussian(Distribution):
             by_scale = self._sign * (z - a * weight_a - b * weight_b)
         return value + (self.loc - self.loc.detach()) * by_loc + (self.scale - self.scale.detach()) * by_scale
 
-    def sample(self, sample_shape: Any = ()) -> Tensor:
-        """Draw [*sample_shape, ..., L] without gradients."""
-        with torch.no_grad():
-            return self.rsample(sample_shape)
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        """Return the log density of `value` [..., L], shape [...]; minus infinity outside of the bounds."""
+    def log_prob(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*shape"]:
+        """Return the log density of `value` in nats; minus infinity outside of the bounds."""
         error = (value - self.loc) / self.scale
         log_density = -0.5 * error.square() - self.scale.log() - _HALF_LOG_2_PI - self._log_mass
         inside = (value >= self.low) & (value <= self.high)
         return torch.where(inside, log_density, -torch.inf).sum(-1)
 
-    def entropy(self) -> Tensor:
-        """Return the differential entropy in nats, shape [...]."""
+    def entropy(self) -> Float[Tensor, "*batch"]:
+        """Return the differential entropy in nats."""
         density_a, density_b = self._bound_densities()
         spread = 1.0 + self._a * density_a - self._b * density_b
         return (self.scale.log() + _HALF_LOG_2_PI + self._log_mass + 0.5 * spread).sum(-1)
@@ -131,9 +109,6 @@ class TruncatedGaussian(Distribution):
         )
         density_a, density_b = (log_density.exp() for log_density in log_densities)
         return density_a, density_b
-
-    def _clamp(self, value: Tensor) -> Tensor:
-        return value.clamp(self.low, self.high)  # type: ignore[arg-type]
 
 
 def _inverse_log_ndtr(log_cdf: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Objectives: what is estimated from a rollout, and the losses and gradient steps that improve the policy."""
+"""This room estimates advantages from a rollout, and has the losses and gradient steps that improve the policy."""
 
 from ksim_rl.objectives.adaptive_learning_rate import adapt_learning_rate_
 from ksim_rl.objectives.algorithm_cfg import AlgorithmCfg
@@ -10,16 +10,14 @@ from ksim_rl.objectives.distillation_loss import DistillationLoss, observation_k
 from ksim_rl.objectives.distributional import cross_entropy, mean_of, project_distribution
 from ksim_rl.objectives.gae import GAE
 from ksim_rl.objectives.gaussian_kl import kl_divergence
+from ksim_rl.objectives.gradient_step import descend, load_optimizer_state_, make_adamw, make_optimizer
 from ksim_rl.objectives.off_policy_cfg import OffPolicyCfg, SACCfg, TD3Cfg
 from ksim_rl.objectives.off_policy_loss import OffPolicyLoss
-from ksim_rl.objectives.off_policy_step import descend, make_adamw
 from ksim_rl.objectives.policy_kl import distribution_keys, observation_keys
 from ksim_rl.objectives.ppo_cfg import PPOCfg
 from ksim_rl.objectives.ppo_step import (
-    load_optimizer_state_,
     make_advantage,
     make_loss,
-    make_optimizer,
     make_symmetric,
     ppo_step,
 )

@@ -1,27 +1,28 @@
-"""The learning rate that follows the divergence of the policy."""
+"""This module adapts the learning rate to how far the policy moves."""
 
 import torch
+from jaxtyping import Float, Float32
 from torch import Tensor
 
 
 @torch.no_grad()
 def adapt_learning_rate_(
-    lr: Tensor,
-    kl: Tensor,
+    lr: Float32[Tensor, ""],
+    kl: Float[Tensor, ""],
     *,
     desired_kl: float,
     factor: float = 1.5,
     lr_min: float = 1e-5,
     lr_max: float = 1e-2,
-) -> Tensor:
+) -> Float32[Tensor, ""]:
     """Divide `lr` by `factor` if `kl` exceeds twice the desired one, multiply it if below half, in place.
 
     The rule of rsl_rl, on the device: no host sync, so it can be captured in a CUDA graph. A divergence of
     exactly zero (the policy has not moved yet), or one that is NaN, changes nothing.
 
     Args:
-        lr: float32 [], the learning rate of the optimizer.
-        kl: [], mean divergence in nats between the policy that collected the data and the present one.
+        lr: the learning rate of the optimizer.
+        kl: mean divergence in nats between the policy that collected the data and the present one.
         desired_kl: target, in nats.
         factor: step of the change, > 1.
         lr_min, lr_max: bounds.

@@ -1,4 +1,4 @@
-"""The clipped surrogate loss of PPO, free of host syncs."""
+"""This module has the clipped surrogate loss of PPO, free of host syncs."""
 
 from typing import Any
 
@@ -16,6 +16,7 @@ from torch.distributions import Distribution
 from torchrl import objectives
 from torchrl.modules.distributions.utils import has_analytic_entropy, sample_and_log_prob
 
+from ksim_rl.objectives.masked import standardized
 from ksim_rl.objectives.policy_kl import (
     distribution_keys,
     estimated_kl,
@@ -104,44 +105,44 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         tensordict = tensordict.clone(False)
         # Read before the actor runs, which writes its own distribution under the same keys.
         dist_old = stored_distribution(self.actor_network, tensordict)
-        advantage = self._advantage(tensordict)
-        log_weight, dist, kl_approx, log_is_weight = self._log_weight(
-            tensordict, adv_shape=advantage.shape[:-1]
+        adv_B = self._advantage(tensordict)
+        log_weight_B, dist, kl_approx_B, log_is_weight_B = self._log_weight(
+            tensordict, adv_shape=adv_B.shape[:-1]
         )
-        if advantage.shape != log_weight.shape:
+        if adv_B.shape != log_weight_B.shape:
             raise ValueError(
-                f"the advantage has shape {tuple(advantage.shape)}, the log-probability ratio "
-                f"{tuple(log_weight.shape)}: both must be batch shape + (1,)"
+                f"the advantage has shape {tuple(adv_B.shape)}, the log-probability ratio "
+                f"{tuple(log_weight_B.shape)}: both must be batch shape + (1,)"
             )
         # The clipping acts on the ratio to the proximal policy; the gain is weighted by that to the
         # collecting one.
-        log_behavior_weight = log_weight if log_is_weight is None else log_weight + log_is_weight
-        log_clipped = log_weight.clamp(*self._clip_bounds)
-        clipped = log_clipped != log_weight
-        if log_is_weight is not None:
-            log_clipped = log_clipped + log_is_weight
-        gain = torch.minimum(log_behavior_weight.exp() * advantage, log_clipped.exp() * advantage)
+        log_behavior_weight_B = log_weight_B if log_is_weight_B is None else log_weight_B + log_is_weight_B
+        log_clipped_B = log_weight_B.clamp(*self._clip_bounds)
+        clipped_B = log_clipped_B != log_weight_B
+        if log_is_weight_B is not None:
+            log_clipped_B = log_clipped_B + log_is_weight_B
+        gain_B = torch.minimum(log_behavior_weight_B.exp() * adv_B, log_clipped_B.exp() * adv_B)
 
-        losses = {"loss_objective": -gain}
-        logged = {"clip_fraction": clipped.to(gain.dtype), "kl_approx": kl_approx}
-        logged["kl"] = _kl(dist_old, dist, log_behavior_weight)
+        losses = {"loss_objective": -gain_B}
+        logged = {"clip_fraction": clipped_B.to(gain_B.dtype), "kl_approx": kl_approx_B}
+        logged["kl"] = _kl(dist_old, dist, log_behavior_weight_B)
         out = TensorDict({})
         if self.entropy_bonus:
-            entropy = self._get_entropy(dist, adv_shape=advantage.shape[:-1])
-            losses["loss_entropy"] = self._weighted_loss_entropy(entropy)
-            if is_tensor_collection(entropy):
-                out.set("composite_entropy", entropy.detach())
-                entropy = entropy.sum(dim="feature", reduce=True)  # type: ignore[call-overload]
-            logged["entropy"] = entropy
+            entropy_B = self._get_entropy(dist, adv_shape=adv_B.shape[:-1])
+            losses["loss_entropy"] = self._weighted_loss_entropy(entropy_B)
+            if is_tensor_collection(entropy_B):
+                out.set("composite_entropy", entropy_B.detach())
+                entropy_B = entropy_B.sum(dim="feature", reduce=True)  # type: ignore[call-overload]
+            logged["entropy"] = entropy_B
         if self._has_critic:
-            loss_critic, value_clip_fraction, explained_variance = self.loss_critic(tensordict)
-            losses["loss_critic"] = loss_critic.view_as(advantage)
+            loss_critic_B, value_clip_fraction, explained_variance = self.loss_critic(tensordict)
+            losses["loss_critic"] = loss_critic_B.view_as(adv_B)
             if value_clip_fraction is not None:
                 out.set("value_clip_fraction", value_clip_fraction)
             if explained_variance is not None:
                 out.set("explained_variance", explained_variance.squeeze(-1))
         if self.log_ratio_statistics:
-            out.update(_ratio_statistics(log_behavior_weight.detach()))
+            out.update(_ratio_statistics(log_behavior_weight_B.detach()))
         if self.reduction != "mean":
             for name, loss in losses.items():
                 out.set(name, self._reduce_loss(loss, tensordict).squeeze(-1))
@@ -169,16 +170,16 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         )
 
     def _advantage(self, tensordict: TensorDictBase) -> Tensor:
-        advantage = tensordict.get(self.tensor_keys.advantage, None)
-        estimate = advantage is None
+        adv_B = tensordict.get(self.tensor_keys.advantage, None)
+        estimate = adv_B is None
         if estimate:
             self.value_estimator(
                 tensordict,
                 params=self._cached_critic_network_params_detached,
                 target_params=self.target_critic_network_params,
             )
-            advantage = tensordict.get(self.tensor_keys.advantage)
-        return self._maybe_normalize_advantage(advantage, tensordict, update_norm=estimate)
+            adv_B = tensordict.get(self.tensor_keys.advantage)
+        return self._maybe_normalize_advantage(adv_B, tensordict, update_norm=estimate)
 
     def _means(self, columns: dict[str, Tensor], tensordict: TensorDictBase) -> dict[str, Tensor]:
         """Return the means over all env states that take part; one reduction for all columns."""
@@ -192,22 +193,19 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
             means = table.flatten(1).sum(1) / mask.sum().clamp_min(1)
         return dict(zip(columns, means.unbind(0), strict=True))
 
-    def _mask(self, tensordict: TensorDictBase, quantity: Tensor) -> Tensor | None:
+    def _mask(self, tensordict: TensorDictBase, column_B: Tensor) -> Tensor | None:
         masks = [tensordict.get(key, None) for key in self._loss_mask_keys()]
-        masks = [self._expand_loss_mask(mask, quantity) for mask in masks if mask is not None]
+        masks = [self._expand_loss_mask(mask, column_B) for mask in masks if mask is not None]
         if len(masks) < 2:
             return masks[0] if masks else None
         return torch.stack(masks).all(0)
 
     def _standardize_advantage(self, advantage: Tensor, tensordict: TensorDictBase) -> Tensor:
-        mask = self._mask(tensordict, advantage)
-        if mask is None or self.normalize_advantage_exclude_dims:
+        mask_B = self._mask(tensordict, advantage)
+        if mask_B is None or self.normalize_advantage_exclude_dims:
             return super()._standardize_advantage(advantage, tensordict)
-        zero = torch.zeros_like(advantage)
-        count = mask.sum()
-        error = advantage - torch.where(mask, advantage, zero).sum() / count.clamp_min(1)
-        variance = torch.where(mask, error, zero).square().sum() / (count - 1).clamp_min(1)
-        return error / variance.sqrt().clamp_min(torch.finfo(torch.float32).resolution)
+        # The bound is that of TorchRL.
+        return standardized(advantage, mask_B, lowest_std=torch.finfo(torch.float32).resolution)
 
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor | TensorDictBase:
         # TorchRL falls back on samples where the entropy is not finite, and asks the host for it.
@@ -225,10 +223,10 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         return -log_prob.mean(0)
 
 
-def _kl(old: Distribution | None, new: Distribution, log_ratio: Tensor) -> Tensor:
+def _kl(old: Distribution | None, new: Distribution, log_ratio_B: Tensor) -> Tensor:
     with torch.no_grad():
         exact = None if old is None else policy_kl(old, new)
-        return estimated_kl(log_ratio) if exact is None else exact.unsqueeze(-1)
+        return estimated_kl(log_ratio_B) if exact is None else exact.unsqueeze(-1)
 
 
 def _entropy_key(key: NestedKey) -> NestedKey:

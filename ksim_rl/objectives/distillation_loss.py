@@ -1,8 +1,9 @@
-"""How far a student is from what its teacher does."""
+"""This module has the loss that moves a student towards what its teacher does."""
 
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import CompositeDistribution, ProbabilisticTensorDictSequential, TensorDictModuleBase
 from tensordict.utils import NestedKey
@@ -13,6 +14,7 @@ from torchrl.modules import set_recurrent_mode
 
 from ksim_rl.checks import check_choice
 from ksim_rl.objectives.distillation_cfg import LOSSES
+from ksim_rl.objectives.masked import mask_of, masked_mean
 from ksim_rl.objectives.policy_kl import (
     distribution_keys,
     observation_keys,
@@ -22,7 +24,6 @@ from ksim_rl.objectives.policy_kl import (
 
 TEACHER = "teacher"
 """Under this key a dataset holds what the teacher would do: its action and, for "kl", its distribution."""
-_MASK: NestedKey = ("collector", "mask")
 
 
 class DistillationLoss(nn.Module):
@@ -79,8 +80,8 @@ class DistillationLoss(nn.Module):
         return rollout_ET.copy().set(TEACHER, judged_ET.select(*self.label_keys))
 
     @torch.no_grad()
-    def action_error(self, labelled: TensorDictBase) -> Tensor:
-        """Return the root mean square of a - a* by the policy that collected the data, [], in units of the action."""
+    def action_error(self, labelled: TensorDictBase) -> Float[Tensor, ""]:
+        """Return the root mean square of a - a* by the policy that collected the data, in units of the action."""
         behaved = stored_distribution(self.actor_network, labelled)
         if behaved is None or self._has_choices:
             return torch.zeros((), device=labelled.device)
@@ -101,19 +102,18 @@ class DistillationLoss(nn.Module):
             loss_B = _action_error(student, labels_B).square().mean(-1)
         else:
             (teacher,) = self._teacher
-            divergence = policy_kl(teacher.build_dist_from_params(labels_B), student)
-            if divergence is None:
+            divergence_B = policy_kl(teacher.build_dist_from_params(labels_B), student)
+            if divergence_B is None:
                 raise ValueError(
                     "loss='kl': teacher and student have distributions of different kinds; use loss='mse'"
                 )
-            loss_B = divergence
+            loss_B = divergence_B
         with torch.no_grad():
-            moved = None if before is None else policy_kl(before, student)
-        mask_B1 = minibatch_B.get(_MASK, None)
-        mask_B = torch.ones_like(loss_B, dtype=torch.bool) if mask_B1 is None else mask_B1.squeeze(-1)
-        out = {"loss_distillation": _mean(loss_B, mask_B)}
-        out["kl"] = torch.zeros_like(out["loss_distillation"]) if moved is None else _mean(moved, mask_B)
-        return TensorDict({"loss_distillation": out["loss_distillation"], "kl": out["kl"].detach()})
+            moved_B = None if before is None else policy_kl(before, student)
+        mask_B = mask_of(minibatch_B, loss_B)
+        mean = masked_mean(loss_B, mask_B)
+        kl = torch.zeros_like(mean) if moved_B is None else masked_mean(moved_B, mask_B)
+        return TensorDict({"loss_distillation": mean, "kl": kl.detach()})
 
 
 def observation_keys_of(policy: Any) -> list[NestedKey]:
@@ -137,7 +137,3 @@ def _action_error(dist: Distribution, labels: TensorDictBase) -> Tensor:
     if not isinstance(dist, CompositeDistribution):
         return _action_of(dist) - labels.get("action")
     return torch.cat([_action_of(part) - labels.get(key) for key, part in dist.dists.items()], -1)
-
-
-def _mean(values: Tensor, mask: Tensor) -> Tensor:
-    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp_min(1)

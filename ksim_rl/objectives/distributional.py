@@ -1,26 +1,29 @@
-"""Distributions of returns on evenly spaced atoms (C51; Bellemare et al., arXiv 1707.06887)."""
+"""This module computes with returns distributed over even atoms (C51; Bellemare et al., arXiv 1707.06887)."""
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
-def project_distribution(probs: Tensor, reward: Tensor, discount: Tensor, support: Tensor) -> Tensor:
+def project_distribution(
+    probs: Float[Tensor, "*batch A"],
+    reward: Float[Tensor, "#*batch 1"],
+    discount: Float[Tensor, "#*batch 1"],
+    support_A: Float[Tensor, " A"],
+) -> Float[Tensor, "*batch A"]:
     """Return the distribution of `reward + discount * z` on the atoms, for `z` distributed as `probs`.
 
     The mass of each moved atom goes to the two atoms that it falls between, in proportion to how near they are; beyond
     the ends it goes to the last atom (algorithm 1 of the paper).
 
     Args:
-        probs: [..., A], probabilities of the atoms.
-        reward, discount: broadcastable with [..., 1].
-        support: [A], values of the atoms, evenly spaced, rising.
-
-    Returns:
-        Probabilities [..., A].
+        probs: probabilities of the atoms.
+        reward, discount: of the step.
+        support_A: values of the atoms, evenly spaced, rising.
     """
-    low, high, count = support[0], support[-1], support.shape[0]
+    low, high, count = support_A[0], support_A[-1], support_A.shape[0]
     spacing = (high - low) / (count - 1)
-    position = ((reward + discount * support).clamp(low, high) - low) / spacing
+    position = ((reward + discount * support_A).clamp(low, high) - low) / spacing
     # The last atom itself counts as the upper neighbour of the one before, so that no index runs over the end.
     lower = position.floor().clamp(0, count - 2)
     upper_share = position - lower
@@ -31,12 +34,14 @@ def project_distribution(probs: Tensor, reward: Tensor, discount: Tensor, suppor
     return projected
 
 
-def mean_of(probs: Tensor, support: Tensor) -> Tensor:
-    """Return the means [...] of distributions [..., A]."""
+def mean_of(probs: Float[Tensor, "*batch A"], support_A: Float[Tensor, " A"]) -> Float[Tensor, "*batch"]:
+    """Return the means of distributions."""
     # No product of matrices: autocast would round it to bfloat16.
-    return (probs * support).sum(-1)
+    return (probs * support_A).sum(-1)
 
 
-def cross_entropy(logits: Tensor, probs: Tensor) -> Tensor:
-    """Return -sum(probs * log softmax(logits)), in nats, [...], for both [..., A]."""
+def cross_entropy(
+    logits: Float[Tensor, "*batch A"], probs: Float[Tensor, "*batch A"]
+) -> Float[Tensor, "*batch"]:
+    """Return -sum(probs * log softmax(logits)), in nats."""
     return -(probs * logits.log_softmax(-1)).sum(-1)

@@ -1,9 +1,10 @@
-"""What the losses of off-policy learning share: critics, their targets, and means over a minibatch."""
+"""This module has what the losses of off-policy learning share: critics, their targets, and means over a minibatch."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
@@ -15,12 +16,14 @@ from ksim_rl.objectives.distributional import cross_entropy, mean_of, project_di
 from ksim_rl.objectives.off_policy_cfg import VALUE_REDUCTIONS
 from ksim_rl.objectives.target_network import follow_, make_target
 
+Scalar = Float[Tensor, ""]
+
 
 class OffPolicyLoss(LossModule):
     """The part of `SACLoss` and `TD3Loss` that is the same: how N critics learn, and what their values say.
 
     The critics are one TensorDict module that reads observations and "action", and writes
-    "state_action_value" [B, N], or "state_action_logits" [B, N, A] if there is a `support`: logits of the return's
+    "state_action_value" [B, N], or "state_action_logits" [B, N, A] if there is a `support_A`: logits of the return's
     distribution on its A atoms.
 
     Losses are sums over the N networks and means over the env states of a minibatch; those whose
@@ -30,7 +33,7 @@ class OffPolicyLoss(LossModule):
     Args:
         actor_network: reads observations, writes "action".
         critic_network: as above.
-        support: [A], the values of the atoms; None if the critics predict values.
+        support_A: the values of the atoms; None if the critics predict values.
         gamma: discount per step; of n steps where the data says "steps_to_next_obs".
         value_reduction: "min" or "mean"; see `OffPolicyCfg`.
     """
@@ -56,7 +59,7 @@ class OffPolicyLoss(LossModule):
         actor_network: TensorDictModuleBase,
         critic_network: TensorDictModule,
         *,
-        support: Tensor | None = None,
+        support_A: Float[Tensor, " A"] | None = None,
         gamma: float = 0.99,
         value_reduction: str = "min",
     ) -> None:
@@ -66,7 +69,7 @@ class OffPolicyLoss(LossModule):
         self.actor_network, self.critic_network = actor_network, critic_network
         # Under a name that `parameters()` leaves out.
         self._target_critic = make_target(critic_network)
-        self.support, self.gamma, self.value_reduction = support, gamma, value_reduction
+        self.support_A, self.gamma, self.value_reduction = support_A, gamma, value_reduction
         self.reduction = "mean"
 
     @property
@@ -88,11 +91,11 @@ class OffPolicyLoss(LossModule):
         following = [*observed, keys.reward, keys.terminated]
         return [*observed, keys.action, *(_next(key) for key in following)]
 
-    def critic_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def critic_loss(self, tensordict: TensorDictBase) -> tuple[Scalar, dict[str, Scalar]]:
         """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
         raise NotImplementedError
 
-    def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
         """Return the losses of all else, each with gradients for its own network alone, and what is logged."""
         raise NotImplementedError
 
@@ -123,7 +126,7 @@ class OffPolicyLoss(LossModule):
     def _value(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         """Return the value of an action [B], which the actor climbs."""
         predicted = self._predict(self.critic_network, tensordict, action)
-        values_BN = predicted if self.support is None else mean_of(predicted.softmax(-1), self.support)
+        values_BN = predicted if self.support_A is None else mean_of(predicted.softmax(-1), self.support_A)
         return values_BN.amin(-1) if self.value_reduction == "min" else values_BN.mean(-1)
 
     def _critic_loss(
@@ -141,7 +144,7 @@ class OffPolicyLoss(LossModule):
                 reward_B1 = reward_B1 + discount_B1 * next_bonus_B[:, None]
             next_predicted = self._predict(self._target_critic, following, next_action)
         predicted = self._predict(self.critic_network, tensordict, tensordict.get(keys.action))
-        if self.support is None:
+        if self.support_A is None:
             with torch.no_grad():
                 target_BN = reward_B1 + discount_B1 * next_predicted
                 if self.value_reduction == "min":
@@ -152,12 +155,12 @@ class OffPolicyLoss(LossModule):
         else:
             with torch.no_grad():
                 target_BNA = project_distribution(
-                    next_predicted.softmax(-1), reward_B1[:, None], discount_B1[:, None], self.support
+                    next_predicted.softmax(-1), reward_B1[:, None], discount_B1[:, None], self.support_A
                 )
                 if self.value_reduction == "min":
-                    lowest_B11 = mean_of(target_BNA, self.support).argmin(-1)[:, None, None]
+                    lowest_B11 = mean_of(target_BNA, self.support_A).argmin(-1)[:, None, None]
                     target_BNA = target_BNA.take_along_dim(lowest_B11, dim=1).expand_as(predicted)
-                values_BN = mean_of(predicted.softmax(-1), self.support)
+                values_BN = mean_of(predicted.softmax(-1), self.support_A)
             loss_BN = cross_entropy(predicted, target_BNA)
             loss_B = loss_BN.sum(-1)
             # As in Rainbow (Hessel et al., arXiv 1710.02298), what is minimized is the priority.

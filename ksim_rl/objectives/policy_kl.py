@@ -1,10 +1,11 @@
-"""How far a policy moved, whatever its distribution: exact where there is a closed form."""
+"""This module computes how far a policy moved, whatever its distribution: exactly where there is a closed form."""
 
 from functools import reduce
 from operator import add
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from tensordict import TensorDictBase
 from tensordict.nn import CompositeDistribution
 from tensordict.utils import NestedKey
@@ -42,7 +43,7 @@ def stored_distribution(actor: Any, tensordict: TensorDictBase) -> Distribution 
     return actor.build_dist_from_params(tensordict)
 
 
-def policy_kl(old: Distribution, new: Distribution) -> Tensor | None:
+def policy_kl(old: Distribution, new: Distribution) -> Float[Tensor, "*batch"] | None:
     """Return KL(old || new) in nats with the batch shape of the two, or None where no closed form is known.
 
     The parts of a `CompositeDistribution` are independent: theirs add up.
@@ -63,7 +64,7 @@ def policy_kl(old: Distribution, new: Distribution) -> Tensor | None:
     return distributions.kl_divergence(old, new) if has_analytic_kl(old, new) else None
 
 
-def estimated_kl(log_ratio: Tensor) -> Tensor:
+def estimated_kl(log_ratio: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """Return an unbiased estimate of KL(old || new) that is never negative, from actions of the old policy.
 
     It is r - 1 - log r with r = new / old (Schulman, "Approximating KL divergence", 2020).

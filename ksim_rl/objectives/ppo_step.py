@@ -1,24 +1,25 @@
-"""One gradient step of PPO, and the parts that it needs, built from one config."""
+"""This module makes one gradient step of PPO, and builds what it needs from one config."""
 
-import copy
 from collections.abc import Mapping
 from functools import reduce
 from operator import add
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import Tensor
 
 from ksim_rl.objectives.adaptive_learning_rate import adapt_learning_rate_
 from ksim_rl.objectives.algorithm_cfg import OnPolicyCfg
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.gae import GAE
+from ksim_rl.objectives.gradient_step import descend
 from ksim_rl.objectives.ppo_cfg import PPOCfg
 from ksim_rl.objectives.rollout_estimator import RolloutEstimator
-from ksim_rl.objectives.step_guard import StepGuard, clip_and_guard
+from ksim_rl.objectives.step_guard import StepGuard
 from ksim_rl.objectives.symmetry import Loss, SymmetricAugmentation, with_augmentation, with_mirror_loss
 from ksim_rl.objectives.td_lambda import TDLambda
 from ksim_rl.objectives.vtrace import VTrace
@@ -85,35 +86,6 @@ def make_symmetric(
     return with_mirror_loss(loss, actor, mirror, coeff=cfg.symmetry_coeff)
 
 
-def make_optimizer(cfg: OnPolicyCfg, *modules: nn.Module) -> torch.optim.Adam:
-    """Build one fused Adam over the parameters of `modules`, each once, with the learning rate on the device.
-
-    `optimizer.param_groups[0]["lr"]` is a float32 tensor [] that changes in place. On CUDA the optimizer is
-    capturable.
-    """
-    parameters = list(dict.fromkeys(parameter for module in modules for parameter in module.parameters()))
-    device = parameters[0].device
-    return torch.optim.Adam(
-        parameters,
-        lr=torch.tensor(cfg.learning_rate, dtype=torch.float32, device=device),
-        betas=cfg.betas,
-        eps=cfg.adam_eps,
-        weight_decay=cfg.weight_decay,
-        fused=True,
-        capturable=device.type == "cuda",
-    )
-
-
-def load_optimizer_state_(optimizer: torch.optim.Optimizer, state_dict: dict[str, Any]) -> None:
-    """Load a state dict; the learning rate stays a tensor on the parameters' device, at its address."""
-    learning_rates = [group["lr"] for group in optimizer.param_groups]
-    # torch takes over the tensors of the state dict themselves, and steps would change them in place.
-    optimizer.load_state_dict(copy.deepcopy(state_dict))
-    for group, learning_rate in zip(optimizer.param_groups, learning_rates, strict=True):
-        if isinstance(learning_rate, Tensor):
-            group["lr"] = learning_rate.copy_(torch.as_tensor(group["lr"]))
-
-
 def ppo_step(
     loss: Loss,
     optimizer: torch.optim.Optimizer,
@@ -121,7 +93,7 @@ def ppo_step(
     *,
     cfg: OnPolicyCfg,
     guard: StepGuard | None = None,
-) -> dict[str, Tensor]:
+) -> dict[str, Float[Tensor, ""]]:
     """Make one gradient step on a minibatch. Makes no host sync and can be captured in a CUDA graph.
 
     With the adaptive schedule the learning rate is changed before the step, as in rsl_rl. A step whose loss
@@ -136,7 +108,7 @@ def ppo_step(
 
     Returns:
         What the loss returns, detached, and `loss`, `grad_norm` (before clipping), `learning_rate` (of this
-        step), `skipped` (0 or 1), each a tensor [].
+        step), `skipped` (0 or 1).
     """
     losses = loss(minibatch_B)
     total = reduce(add, [value for name, value in losses.items() if name.startswith("loss_")])
@@ -149,13 +121,7 @@ def ppo_step(
             lr_min=cfg.learning_rate_min,
             lr_max=cfg.learning_rate_max,
         )
-    optimizer.zero_grad(set_to_none=True)
-    total.backward()
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    grad_norm, found_inf = clip_and_guard(parameters, cfg.max_grad_norm, loss=total.detach())
-    # Fused optimizers read these two, which torch's GradScaler sets as well, and skip the step on the device.
-    optimizer.grad_scale, optimizer.found_inf = None, found_inf  # type: ignore[attr-defined]
-    optimizer.step()
+    grad_norm, found_inf = descend(total, optimizer, max_grad_norm=cfg.max_grad_norm)
     if guard is not None:
         guard.count_(found_inf)
     return {

@@ -1,4 +1,4 @@
-"""In how many bits a loss multiplies matrices."""
+"""This module sets in how many bits a loss multiplies matrices."""
 
 import dataclasses
 

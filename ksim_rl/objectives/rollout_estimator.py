@@ -1,4 +1,4 @@
-"""What the estimators of advantages share: the state values of a rollout, and a recursion backwards in time."""
+"""This module has what the estimators of advantages share: state values of a rollout, and a recursion back in time."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -7,34 +7,40 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Float
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives.value import ValueEstimatorBase
 
+from ksim_rl.objectives.masked import standardized
+
 
 @dataclass(frozen=True, kw_only=True)
 class Signals:
-    """What an advantage is made of, all of one shape [*batch, 1]; flags are bool.
+    """What an advantage is made of, all of one shape; ET stands for whatever the batch dims are.
 
     Attributes:
-        state_value, next_value: V before and after the step; the latter of the true next observation.
-        reward, done, terminated: of the step.
+        value_ET_t, value_ET_t_plus_1: V before and after the step; the latter of the true next observation.
+        reward_ET, done_ET, terminated_ET: of the step.
         time_dim: the batch dim that is time, >= 0.
     """
 
-    state_value: Tensor
-    next_value: Tensor
-    reward: Tensor
-    done: Tensor
-    terminated: Tensor
+    value_ET_t: Float[Tensor, "*batch 1"]
+    value_ET_t_plus_1: Float[Tensor, "*batch 1"]
+    reward_ET: Float[Tensor, "*batch 1"]
+    done_ET: Bool[Tensor, "*batch 1"]
+    terminated_ET: Bool[Tensor, "*batch 1"]
     time_dim: int
 
-    def discounted(self, value: Tensor, gamma: Tensor) -> Tensor:
+    def bootstrap(
+        self, value_ET_t_plus_1: Float[Tensor, "*batch 1"], gamma: Float[Tensor, ""]
+    ) -> Float[Tensor, "*batch 1"]:
         """Return gamma * value, and zero after a termination, whatever the value there."""
         # A where instead of a product, because zero times NaN is NaN.
-        return torch.where(self.terminated, torch.zeros_like(value), gamma * value)
+        zero_ET = torch.zeros_like(value_ET_t_plus_1)
+        return torch.where(self.terminated_ET, zero_ET, gamma * value_ET_t_plus_1)
 
 
 class RolloutEstimator(ValueEstimatorBase):
@@ -51,11 +57,45 @@ class RolloutEstimator(ValueEstimatorBase):
 
     A recurrent critic needs batch dims [E, T]: it runs through the rollout from the state of the first step, and the
     value after a step is that of the true next observation and the state after the step.
+
+    Args:
+        gamma: discount per step, in [0, 1].
+        critic: any TensorDict module that writes `state_value` [..., 1]; None reads the values from the data.
+            `value_network` is TorchRL's name for it.
+        normalize_advantage: shift and scale the finite advantages to mean 0 and standard deviation 1 over all
+            env states.
+        time_dim: the batch dim that is time, whatever the names say; -1 is the last batch dim.
+        flatten: give the critic all env states in one batch dim; False keeps the batch dims, e.g. for a
+            recurrent one.
+        device: of gamma and lmbda; None takes that of the critic.
+        **options: of TorchRL's estimator.
     """
 
-    flatten: bool
-    normalize_advantage: bool
     time_dim: int | None
+
+    def __init__(
+        self,
+        *,
+        gamma: float,
+        critic: TensorDictModule | None = None,
+        normalize_advantage: bool = False,
+        time_dim: int = -1,
+        flatten: bool = True,
+        device: torch.device | str | None = None,
+        value_network: TensorDictModule | None = None,
+        **options: Any,
+    ) -> None:
+        critic = value_network if critic is None else critic
+        if device is None and critic is not None:
+            device = next((parameter.device for parameter in critic.parameters()), None)
+        super().__init__(
+            gamma=gamma,  # type: ignore[call-arg]
+            value_network=critic,  # type: ignore[arg-type]
+            time_dim=time_dim,  # type: ignore[call-arg]
+            device=None if device is None else torch.device(device),
+            **options,
+        )
+        self.flatten, self.normalize_advantage = flatten, normalize_advantage
 
     @abstractmethod
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
@@ -84,12 +124,13 @@ class RolloutEstimator(ValueEstimatorBase):
             ValueError: if a value, the reward or a flag is missing, or their shapes differ.
         """
         signals = self._signals(tensordict, params, target_params, self._resolved(time_dim, tensordict))
-        advantage, value_target, finite = self._estimate(signals, tensordict)
+        adv_ET, target_ET, finite_ET = self._estimate(signals, tensordict)
         if self.normalize_advantage:
-            advantage = standardized(advantage, finite)
-        nan = torch.full_like(advantage, torch.nan)
-        tensordict.set(self.tensor_keys.advantage, torch.where(finite, advantage, nan))
-        tensordict.set(self.tensor_keys.value_target, value_target)
+            # The bound is that of TorchRL.
+            adv_ET = standardized(adv_ET, finite_ET, lowest_std=1e-4)
+        nan_ET = torch.full_like(adv_ET, torch.nan)
+        tensordict.set(self.tensor_keys.advantage, torch.where(finite_ET, adv_ET, nan_ET))
+        tensordict.set(self.tensor_keys.value_target, target_ET)
         return tensordict
 
     def _resolved(self, time_dim: int | None, tensordict: TensorDictBase) -> int:
@@ -130,15 +171,8 @@ class RolloutEstimator(ValueEstimatorBase):
                 f"('next', {keys.reward!r}) {shapes[2]}, ('next', {keys.done!r}) {shapes[3]}, "
                 f"('next', {keys.terminated!r}) {shapes[4]}"
             )
-        state_value, next_value, reward, done, terminated = read
-        return Signals(
-            state_value=state_value,
-            next_value=next_value,
-            reward=reward,
-            done=done,
-            terminated=terminated,
-            time_dim=time_dim,
-        )
+        names = ("value_ET_t", "value_ET_t_plus_1", "reward_ET", "done_ET", "terminated_ET")
+        return Signals(**dict(zip(names, read, strict=True)), time_dim=time_dim)
 
     def _state_values(
         self, tensordict: TensorDictBase, params: TensorDictBase | None, time_dim: int
@@ -186,7 +220,7 @@ class RolloutEstimator(ValueEstimatorBase):
         target_params: TensorDictBase | None = None,
         time_dim: int | None = None,
         **kwargs: Any,
-    ) -> Tensor:
+    ) -> Float[Tensor, "*batch 1"]:
         """Return the value target [..., 1] without writing into `tensordict`."""
         copy = tensordict.copy()
         self(copy, params=params, target_params=target_params, time_dim=time_dim)
@@ -204,32 +238,18 @@ def steps_of(network: TensorDictModuleBase) -> AbstractContextManager[Any]:
     return set_recurrent_mode(False) if carries_state(network) else nullcontext()
 
 
-def device_of(critic: TensorDictModule | None, device: torch.device | str | None) -> torch.device | None:
-    """Return the device of an estimator's constants: `device`, or that of the critic."""
-    if device is None and critic is not None:
-        return next((parameter.device for parameter in critic.parameters()), None)
-    return None if device is None else torch.device(device)
-
-
 def discounted_sum(
-    term: Tensor, discount: Tensor, *, time_dim: int, following: Tensor | None = None
-) -> Tensor:
-    """Return x with x_t = term_t + discount_t x_{t+1}, all [..., T, ...]; x_T is `following`, or zero."""
-    terms, discounts = (leaf.movedim(time_dim, 0).unbind(0) for leaf in (term, discount))
-    total = torch.zeros_like(terms[0]) if following is None else following
+    term_ET: Float[Tensor, "*batch 1"],
+    discount_ET: Float[Tensor, "*batch 1"],
+    *,
+    time_dim: int,
+    last_E: Float[Tensor, "*batch_without_time 1"] | None = None,
+) -> Float[Tensor, "*batch 1"]:
+    """Return x with x_t = term_t + discount_t x_{t+1}; x after the last step is `last_E`, or zero."""
+    terms, discounts = (leaf.movedim(time_dim, 0).unbind(0) for leaf in (term_ET, discount_ET))
+    total = torch.zeros_like(terms[0]) if last_E is None else last_E
     totals = []
     for term_t, discount_t in zip(reversed(terms), reversed(discounts), strict=True):
         total = torch.addcmul(term_t, discount_t, total)
         totals.append(total)
     return torch.stack(totals[::-1]).movedim(0, time_dim)
-
-
-def standardized(advantage: Tensor, finite: Tensor) -> Tensor:
-    """Shift and scale to mean 0 and standard deviation 1 over the elements that `finite` marks."""
-    count = finite.sum()
-    zero = torch.zeros_like(advantage)
-    mean = torch.where(finite, advantage, zero).sum() / count.clamp_min(1)
-    error = advantage - mean
-    variance = torch.where(finite, error, zero).square().sum() / (count - 1).clamp_min(1)
-    # The bound is TorchRL's: advantages that are all alike stay near zero.
-    return error / variance.sqrt().clamp_min(1e-4)

@@ -1,20 +1,21 @@
-"""The loss of soft actor-critic, free of host syncs."""
+"""This module has the loss of soft actor-critic, free of host syncs."""
 
 import math
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
-from torch import Tensor, nn
+from torch import nn
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from ksim_rl.checks import check_in_range
-from ksim_rl.objectives.off_policy_loss import OffPolicyLoss
+from ksim_rl.objectives.off_policy_loss import OffPolicyLoss, Scalar
 from ksim_rl.objectives.target_network import frozen
 
 
 class SACLoss(OffPolicyLoss):
-    """Soft actor-critic with a learned temperature (Haarnoja et al., arXiv 1812.05905), and FastSAC with a `support`.
+    """Soft actor-critic with a learned temperature (Haarnoja et al., arXiv 1812.05905), and FastSAC with a `support_A`.
 
     With values for critics and `value_reduction="min"` it has the losses and gradients of TorchRL's `SACLoss` with
     `loss_function="l2"`. All critics are evaluated in one batched product instead of a `vmap`, and may predict
@@ -26,7 +27,7 @@ class SACLoss(OffPolicyLoss):
 
     Args:
         actor_network: probabilistic.
-        critic_network, support, gamma, value_reduction: see `OffPolicyLoss`.
+        critic_network, **options: see `OffPolicyLoss`.
         alpha_init: temperature at the start.
         learn_alpha: whether the temperature learns.
         target_entropy: that the temperature aims at, in nats.
@@ -40,13 +41,9 @@ class SACLoss(OffPolicyLoss):
         target_entropy: float,
         alpha_init: float = 1.0,
         learn_alpha: bool = True,
-        support: Tensor | None = None,
-        gamma: float = 0.99,
-        value_reduction: str = "min",
+        **options: Any,
     ) -> None:
-        super().__init__(
-            actor_network, critic_network, support=support, gamma=gamma, value_reduction=value_reduction
-        )
+        super().__init__(actor_network, critic_network, **options)
         check_in_range("alpha_init", alpha_init, low=0.0, low_open=True)
         check_in_range("target_entropy", target_entropy)
         self.target_entropy = target_entropy
@@ -55,11 +52,11 @@ class SACLoss(OffPolicyLoss):
         self.log_alpha = nn.Parameter(log_alpha, requires_grad=learn_alpha)
 
     @property
-    def alpha(self) -> Tensor:
-        """The temperature, [], without gradients."""
+    def alpha(self) -> Scalar:
+        """The temperature, without gradients."""
         return self.log_alpha.detach().exp()
 
-    def critic_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def critic_loss(self, tensordict: TensorDictBase) -> tuple[Scalar, dict[str, Scalar]]:
         """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
         with torch.no_grad():
             following = tensordict.get("next").select(*self.actor_network.in_keys)
@@ -67,7 +64,7 @@ class SACLoss(OffPolicyLoss):
             bonus_B = -self.alpha * log_prob_B
         return self._critic_loss(tensordict, next_action, bonus_B)
 
-    def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
         """Return the losses of actor and temperature, each with gradients for it alone, and what is logged."""
         observed = tensordict.select(*self.actor_network.in_keys)
         action, log_prob_B = rsample_and_log_prob(self.actor_network.get_dist(observed))

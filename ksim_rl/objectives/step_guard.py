@@ -1,8 +1,9 @@
-"""No optimizer step on a gradient that is not finite."""
+"""This module keeps gradients that are not finite from the optimizer."""
 
 from collections.abc import Iterable
 
 import torch
+from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
 
@@ -36,8 +37,8 @@ class StepGuard(nn.Module):
         self.register_buffer("skipped_in_a_row", torch.zeros((), dtype=torch.int64, device=device))
 
     @torch.no_grad()
-    def count_(self, found_inf: Tensor) -> None:
-        """Count one gradient step; `found_inf` [] is 1 if it was skipped, else 0. Makes no host sync."""
+    def count_(self, found_inf: Float32[Tensor, ""]) -> None:
+        """Count one gradient step; `found_inf` is 1 if it was skipped, else 0. Makes no host sync."""
         skipped = found_inf.to(torch.int64)
         self.skipped.add_(skipped)
         self.skipped_in_a_row.add_(skipped).mul_(skipped)
@@ -55,10 +56,12 @@ class StepGuard(nn.Module):
 
 @torch.no_grad()
 def clip_and_guard(
-    parameters: Iterable[Tensor], max_grad_norm: float | None, *, loss: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Scale the gradients down to a total norm of at most `max_grad_norm`, in place, and tell if they are
-    finite.
+    parameters: Iterable[nn.Parameter],
+    max_grad_norm: float | None,
+    *,
+    loss: Float[Tensor, ""] | None = None,
+) -> tuple[Float32[Tensor, ""], Float32[Tensor, ""]]:
+    """Scale the gradients down to a total norm of at most `max_grad_norm`, in place, and tell if they are finite.
 
     As `torch.nn.utils.clip_grad_norm_`, without host syncs.
 
@@ -68,7 +71,7 @@ def clip_and_guard(
         loss: also tested for being finite.
 
     Returns:
-        The norm before clipping, float32 [], and `found_inf`, float32 []: 1 if the norm or the loss is not
+        The norm before clipping, and `found_inf`: 1 if the norm or the loss is not
         finite, else 0. Set it as `optimizer.found_inf` of a fused optimizer, which then leaves parameters,
         moments and step count as they are.
     """

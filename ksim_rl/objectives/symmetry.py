@@ -1,8 +1,9 @@
-"""Policies of robots that are their own mirror image: mirrored samples, or a loss on what differs in the mirror."""
+"""This module learns from mirror images: for robots that are their own, by mirrored samples or by a loss."""
 
 from collections.abc import Callable, Mapping
 
 import torch
+from jaxtyping import Float
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from tensordict.utils import NestedKey
@@ -10,11 +11,10 @@ from torch import Tensor
 
 from ksim_rl import dims
 from ksim_rl.objectives.gaussian_kl import gaussian_parameters
+from ksim_rl.objectives.masked import mask_of, masked_mean
 from ksim_rl.transforms.mirror.mirror_map import MirrorMap, image
 
 Loss = Callable[[TensorDictBase], TensorDictBase]
-
-_MASK_KEY = ("collector", "mask")
 
 
 class SymmetricAugmentation:
@@ -43,8 +43,8 @@ class SymmetricAugmentation:
         self._images["loc"] = (source_L, signs_L)
         self._images["scale"] = (source_L, torch.ones_like(signs_L))
 
-    def image_of(self, key: NestedKey, leaf_BL: Tensor) -> Tensor:
-        """Return the mirror image of vectors [B, L] of a kind that has a map."""
+    def image_of(self, key: NestedKey, leaf_BL: Float[Tensor, "B L"]) -> Float[Tensor, "B L"]:
+        """Return the mirror image of vectors of a kind that has a map."""
         return image(leaf_BL, *self._images[key])
 
     def image(self, minibatch_B: TensorDictBase) -> TensorDictBase:
@@ -70,7 +70,7 @@ class SymmetricAugmentation:
 
 def mirror_loss(
     actor: ProbabilisticTensorDictSequential, minibatch_B: TensorDictBase, mirror: SymmetricAugmentation
-) -> Tensor:
+) -> Float[Tensor, ""]:
     """Return the mean squared difference between pi(mirror(s)) and mirror(pi(s)) (Yu et al., arXiv 1801.08093).
 
     The mean is over env states and actions, pi the mean of the policy's gaussian; the gradient flows through both.
@@ -78,11 +78,11 @@ def mirror_loss(
 
     Args:
         actor: its distribution is a gaussian, or made of one.
-        minibatch_B: what the actor reads, [B, L] each.
+        minibatch_B: what the actor reads.
         mirror: for all that the actor reads, and the action.
 
     Returns:
-        [], in squared units of the action.
+        In squared units of the action.
 
     Raises:
         ValueError: if the distribution has no mean of that kind.
@@ -95,11 +95,7 @@ def mirror_loss(
     loc_BL, loc_of_image_BL = parameters[0].chunk(2)
     image_of_loc_BL = mirror.image_of("action", loc_BL)
     error_B = (loc_of_image_BL - image_of_loc_BL).square().mean(-1)
-    mask = minibatch_B.get(_MASK_KEY, None)
-    if mask is None:
-        return error_B.mean()
-    mask_B = mask.reshape(error_B.shape)
-    return torch.where(mask_B, error_B, torch.zeros_like(error_B)).sum() / mask_B.sum().clamp_min(1)
+    return masked_mean(error_B, mask_of(minibatch_B, error_B))
 
 
 def with_mirror_loss(

@@ -1,4 +1,4 @@
-"""Target networks: copies that follow slowly."""
+"""This module makes target networks: copies that follow slowly."""
 
 import copy
 from collections.abc import Iterator

@@ -1,12 +1,13 @@
-"""Lambda returns as value targets, without host syncs."""
+"""This module estimates lambda returns as value targets, without host syncs."""
+
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import value
 
-from ksim_rl.objectives.rollout_estimator import RolloutEstimator, Signals, device_of, discounted_sum
+from ksim_rl.objectives.rollout_estimator import RolloutEstimator, Signals, discounted_sum
 
 
 class TDLambda(RolloutEstimator, value.TDLambdaEstimator):
@@ -19,45 +20,26 @@ class TDLambda(RolloutEstimator, value.TDLambdaEstimator):
     the two values differ, such as with the values of a target critic under "next".
 
     Args:
-        gamma, lmbda, critic, normalize_advantage, time_dim, flatten, device: as those of `GAE`.
+        lmbda: weight of longer returns, in [0, 1].
+        **options: of `RolloutEstimator`, gamma and critic among them.
     """
 
-    def __init__(
-        self,
-        *,
-        gamma: float,
-        lmbda: float,
-        critic: TensorDictModule | None = None,
-        normalize_advantage: bool = False,
-        time_dim: int = -1,
-        flatten: bool = True,
-        device: torch.device | str | None = None,
-        value_network: TensorDictModule | None = None,
-    ) -> None:
-        critic = value_network if critic is None else critic
-        super().__init__(
-            gamma=gamma,
-            lmbda=lmbda,
-            value_network=critic,  # type: ignore[arg-type]
-            vectorized=False,
-            time_dim=time_dim,
-            device=device_of(critic, device),
-        )
-        self.flatten, self.normalize_advantage = flatten, normalize_advantage
+    def __init__(self, *, lmbda: float, **options: Any) -> None:
+        super().__init__(lmbda=lmbda, vectorized=False, **options)
 
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-        bootstrap = signals.discounted(signals.next_value, self.gamma)
-        finite = (signals.reward + bootstrap - signals.state_value).isfinite()
-        goes_on = finite & ~signals.done
-        weight = torch.where(signals.done, torch.ones_like(bootstrap), 1.0 - self.lmbda)
+        bootstrap_ET = signals.bootstrap(signals.value_ET_t_plus_1, self.gamma)
+        finite_ET = (signals.reward_ET + bootstrap_ET - signals.value_ET_t).isfinite()
+        goes_on_ET = finite_ET & ~signals.done_ET
+        weight_ET = torch.where(signals.done_ET, torch.ones_like(bootstrap_ET), 1.0 - self.lmbda)
         # Before a step that is not finite, the return is the value there.
-        cut = signals.state_value.nan_to_num(0.0, 0.0, 0.0)
-        last = -1 % signals.reward.shape[signals.time_dim]
-        following = torch.where(goes_on, signals.next_value, 0.0).select(signals.time_dim, last)
-        value_target = discounted_sum(
-            torch.where(finite, signals.reward + weight * bootstrap, cut),
-            goes_on * (self.gamma * self.lmbda),
+        cut_ET = signals.value_ET_t.nan_to_num(0.0, 0.0, 0.0)
+        last = -1 % signals.reward_ET.shape[signals.time_dim]
+        following_ET = torch.where(goes_on_ET, signals.value_ET_t_plus_1, 0.0)
+        target_ET = discounted_sum(
+            torch.where(finite_ET, signals.reward_ET + weight_ET * bootstrap_ET, cut_ET),
+            goes_on_ET * (self.gamma * self.lmbda),
             time_dim=signals.time_dim,
-            following=following,
+            last_E=following_ET.select(signals.time_dim, last),
         )
-        return value_target - signals.state_value, value_target, finite
+        return target_ET - signals.value_ET_t, target_ET, finite_ET

@@ -1,24 +1,19 @@
-"""V-trace value targets and advantages, without host syncs."""
+"""This module estimates V-trace value targets and advantages, without host syncs."""
+
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import (
     CompositeDistribution,
     ProbabilisticTensorDictSequential,
-    TensorDictModule,
     set_composite_lp_aggregate,
 )
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import value
 
-from ksim_rl.objectives.rollout_estimator import (
-    RolloutEstimator,
-    Signals,
-    device_of,
-    discounted_sum,
-    steps_of,
-)
+from ksim_rl.objectives.rollout_estimator import RolloutEstimator, Signals, discounted_sum, steps_of
 
 
 class VTrace(RolloutEstimator, value.VTrace):
@@ -34,12 +29,11 @@ class VTrace(RolloutEstimator, value.VTrace):
     has nothing to do with the data.)
 
     Args:
-        gamma: discount per step, in [0, 1].
         actor: the present policy; what it reads, `action` and `action_log_prob` are in the data.
         lmbda: weight of longer returns, in [0, 1]; TorchRL's has 1.
-        rho_thresh: bound of the ratio that decides whose value is learned, the present policy's at infinity.
-        c_thresh: bound of the ratio that decides how far later steps count.
-        critic, normalize_advantage, time_dim, flatten, device: as those of `GAE`.
+        normalize_advantage, **options: of `RolloutEstimator`, gamma and critic among them; and of TorchRL's `VTrace`:
+            `rho_thresh`, the bound of the ratio that decides whose value is learned (the present policy's at infinity),
+            and `c_thresh`, of the one that decides how far later steps count.
     """
 
     lmbda: Tensor
@@ -49,37 +43,24 @@ class VTrace(RolloutEstimator, value.VTrace):
     def __init__(
         self,
         *,
-        gamma: float,
         actor: ProbabilisticTensorDictSequential | None = None,
-        critic: TensorDictModule | None = None,
         lmbda: float = 1.0,
-        rho_thresh: float = 1.0,
-        c_thresh: float = 1.0,
         normalize_advantage: bool = False,
-        time_dim: int = -1,
-        flatten: bool = True,
-        device: torch.device | str | None = None,
         actor_network: ProbabilisticTensorDictSequential | None = None,
-        value_network: TensorDictModule | None = None,
+        **options: Any,
     ) -> None:
         actor = actor_network if actor is None else actor
-        critic = value_network if critic is None else critic
         if actor is None:
             raise ValueError(
                 "actor=None: V-trace needs the present policy, whose log-probabilities it compares"
             )
         super().__init__(
-            gamma=gamma,
             actor_network=actor,
-            value_network=critic,  # type: ignore[arg-type]
-            rho_thresh=rho_thresh,
-            c_thresh=c_thresh,
+            normalize_advantage=normalize_advantage,
             average_adv=normalize_advantage,
-            time_dim=time_dim,
-            device=device_of(critic, device),
+            **options,
         )
-        self.register_buffer("lmbda", torch.tensor(lmbda, device=device_of(critic, device)))
-        self.flatten, self.normalize_advantage = flatten, normalize_advantage
+        self.register_buffer("lmbda", torch.tensor(lmbda, device=self.gamma.device))
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -97,23 +78,24 @@ class VTrace(RolloutEstimator, value.VTrace):
         return list(dict.fromkeys([*read, *(("next", key) for key in [*observed, *flags])]))
 
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-        time_dim, next_value = signals.time_dim, signals.next_value
-        ratio = self._ratio(tensordict, signals)
-        rho, c = ratio.clamp_max(self.rho_thresh), self.lmbda * ratio.clamp_max(self.c_thresh)
-        delta = rho * (signals.reward + signals.discounted(next_value, self.gamma) - signals.state_value)
-        finite = delta.isfinite()
-        correction = discounted_sum(
-            torch.where(finite, delta, torch.zeros_like(delta)),
-            torch.where(finite & ~signals.done, self.gamma * c, torch.zeros_like(c)),
+        time_dim, value_ET_t_plus_1 = signals.time_dim, signals.value_ET_t_plus_1
+        ratio_ET = self._ratio(tensordict, signals)
+        rho_ET, c_ET = ratio_ET.clamp_max(self.rho_thresh), self.lmbda * ratio_ET.clamp_max(self.c_thresh)
+        bootstrap_ET = signals.bootstrap(value_ET_t_plus_1, self.gamma)
+        delta_ET = rho_ET * (signals.reward_ET + bootstrap_ET - signals.value_ET_t)
+        finite_ET = delta_ET.isfinite()
+        correction_ET = discounted_sum(
+            torch.where(finite_ET, delta_ET, torch.zeros_like(delta_ET)),
+            torch.where(finite_ET & ~signals.done_ET, self.gamma * c_ET, torch.zeros_like(c_ET)),
             time_dim=time_dim,
         )
-        value_target = signals.state_value + correction
-        following = _shifted(value_target, next_value, time_dim)
+        target_ET = signals.value_ET_t + correction_ET
         # Past the end of an episode, of the rollout, or a step that is not finite there is the value only.
-        known = ~signals.done & _shifted(finite, torch.zeros_like(finite), time_dim)
-        following = torch.where(known, following, next_value)
-        advantage = rho * (signals.reward + signals.discounted(following, self.gamma) - signals.state_value)
-        return advantage, value_target, finite
+        known_ET = ~signals.done_ET & _shifted(finite_ET, torch.zeros_like(finite_ET), time_dim)
+        target_ET_t_plus_1 = _shifted(target_ET, value_ET_t_plus_1, time_dim)
+        target_ET_t_plus_1 = torch.where(known_ET, target_ET_t_plus_1, value_ET_t_plus_1)
+        bootstrap_ET = signals.bootstrap(target_ET_t_plus_1, self.gamma)
+        return rho_ET * (signals.reward_ET + bootstrap_ET - signals.value_ET_t), target_ET, finite_ET
 
     def _ratio(self, tensordict: TensorDictBase, signals: Signals) -> Tensor:
         actor, keys = self.actor_network, [*self.actor_network.in_keys, *self.actor_network.dist_sample_keys]
@@ -126,7 +108,7 @@ class VTrace(RolloutEstimator, value.VTrace):
                 f"{None if old_log_prob is None else tuple(old_log_prob.shape)} for {tuple(log_prob.shape)}; "
                 f"the policy reads {actor.in_keys}"
             )
-        return (log_prob.view_as(signals.reward) - old_log_prob.view_as(signals.reward)).exp()
+        return (log_prob.view_as(signals.reward_ET) - old_log_prob.view_as(signals.reward_ET)).exp()
 
     def _log_prob(self, rows: TensorDictBase) -> Tensor:
         dist = self.actor_network.get_dist(rows)

@@ -56,7 +56,7 @@ def make_update(name, env, *, device="cpu", objective=None, obs_dim=1, support=(
     )
     low, high = torch.full((2, 1), 2.0, device=device) * torch.tensor([[-1.0], [1.0]], device=device)
     shared = {
-        "support": critic.module.support,
+        "support_A": critic.module.support,
         "gamma": cfg.gamma,
         "value_reduction": cfg.value_reduction,
     }
@@ -71,10 +71,10 @@ def make_update(name, env, *, device="cpu", objective=None, obs_dim=1, support=(
             **shared,
         )
     else:
-        loss = TD3Loss(actor, critic, low=low, high=high, target_noise=cfg.target_noise, **shared)
+        loss = TD3Loss(actor, critic, low_L=low, high_L=high, target_noise=cfg.target_noise, **shared)
         noise = {"noise_min": cfg.exploration_noise_min, "noise_max": cfg.exploration_noise_max}
     num_envs = env.batch_size[0]
-    behavior = ExploringPolicy(actor, low=low, high=high, num_envs=num_envs, **noise)
+    behavior = ExploringPolicy(actor, low_L=low, high_L=high, num_envs=num_envs, **noise)
     return OffPolicyUpdate(
         cfg,
         loss=loss,

@@ -29,8 +29,8 @@ def test_finds_the_best_actions_and_their_values(name, ends):
     with torch.no_grad():
         obs = torch.linspace(-1.0, 1.0, 9)[:, None]
         prediction = update.critic.module(obs, obs)
-        if update.loss.support is not None:
-            prediction = prediction.softmax(-1) @ update.loss.support
+        if update.loss.support_A is not None:
+            prediction = prediction.softmax(-1) @ update.loss.support_A
     assert (prediction - best).abs().max() < 0.1 * best + 0.05, prediction
 
 

@@ -116,8 +116,8 @@ def test_plain_layers_learn_off_policy():
     )
     update = OffPolicyUpdate(
         cfg,
-        loss=TD3Loss(actor, critic, low=low, high=high, gamma=0.0),
-        behavior=ExploringPolicy(actor, low=low, high=high, num_envs=16, noise_min=0.05, noise_max=0.3),
+        loss=TD3Loss(actor, critic, low_L=low, high_L=high, gamma=0.0),
+        behavior=ExploringPolicy(actor, low_L=low, high_L=high, num_envs=16, noise_min=0.05, noise_max=0.3),
         data=ReplayCfg(
             num_env_states_per_minibatch=128, num_minibatches=8, num_steps=4, capacity=200, learning_starts=8
         ),

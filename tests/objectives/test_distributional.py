@@ -75,10 +75,10 @@ def test_distributional_td3_loss_is_its_definition(value_reduction):
     loss = TD3Loss(
         _Actor(),
         critic,
-        low=-bound,
-        high=bound,
+        low_L=-bound,
+        high_L=bound,
         target_noise=0.0,
-        support=critic.module.support,
+        support_A=critic.module.support,
         gamma=0.9,
         value_reduction=value_reduction,
     )

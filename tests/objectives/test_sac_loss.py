@@ -162,9 +162,9 @@ def test_each_loss_reaches_its_own_network_alone():
 @pytest.mark.parametrize("value_reduction", ["min", "mean"])
 def test_no_host_sync(num_atoms, value_reduction):
     actor, critic = networks(num_atoms)
-    options = {"support": critic.module.support, "value_reduction": value_reduction}
+    options = {"support_A": critic.module.support, "value_reduction": value_reduction}
     sac = SACLoss(actor, critic, target_entropy=-3.0, **options)
-    td3 = TD3Loss(actor, critic, low=-torch.ones(ACTION), high=torch.ones(ACTION), **options)
+    td3 = TD3Loss(actor, critic, low_L=-torch.ones(ACTION), high_L=torch.ones(ACTION), **options)
     for loss in (sac, td3):
         data = minibatch()
         loss(data)

@@ -30,7 +30,7 @@ def test_losses_and_gradients_are_those_of_torchrl(num_networks, extra):
     # TorchRL's noise is in units of the action, ours of half its range.
     bound = torch.full((ACTION,), 0.8)
     noise = {"target_noise": 0.5, "target_noise_clip": 0.6}
-    ours = TD3Loss(actor, critic, gamma=0.95, low=-bound, high=bound, **noise)
+    ours = TD3Loss(actor, critic, gamma=0.95, low_L=-bound, high_L=bound, **noise)
     stock = objectives.TD3Loss(
         actor,
         for_torchrl(critic),

@@ -74,7 +74,7 @@ def fused_networks(
     if activations != {nn.ELU}:
         return f"the activations are {sorted(kind.__name__ for kind in activations)}, and not all ELU"
     return FusedNetworks(
-        actor=layers[0], critic=layers[1], std=head.std, log_std=head.std_type == "log", min_std=MIN_STD
+        actor=layers[0], critic=layers[1], std_A=head.std, log_std=head.std_type == "log", min_std=MIN_STD
     )
 
 

@@ -32,12 +32,12 @@ def make_sac_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> OffPol
         target_entropy=entropy,
         alpha_init=objective.alpha_init,
         learn_alpha=objective.alpha_learning_rate > 0.0,
-        support=critic.module.support,  # type: ignore[arg-type]
+        support_A=critic.module.support,  # type: ignore[arg-type]
         gamma=objective.gamma,
         value_reduction=objective.value_reduction,
     )
     return make_off_policy_update(
-        cfg, loss, ExploringPolicy(actor, low=low, high=high, num_envs=cfg.num_envs)
+        cfg, loss, ExploringPolicy(actor, low_L=low, high_L=high, num_envs=cfg.num_envs)
     )
 
 

@@ -27,18 +27,18 @@ def make_td3_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> OffPol
     loss = TD3Loss(
         actor,
         critic,
-        low=low,
-        high=high,
+        low_L=low,
+        high_L=high,
         target_noise=objective.target_noise,
         target_noise_clip=objective.target_noise_clip,
-        support=critic.module.support,  # type: ignore[arg-type]
+        support_A=critic.module.support,  # type: ignore[arg-type]
         gamma=objective.gamma,
         value_reduction=objective.value_reduction,
     )
     behavior = ExploringPolicy(
         actor,
-        low=low,
-        high=high,
+        low_L=low,
+        high_L=high,
         num_envs=cfg.num_envs,
         noise_min=objective.exploration_noise_min,
         noise_max=objective.exploration_noise_max,

@@ -1,4 +1,4 @@
-"""Generalized advantage estimation as one Triton kernel."""
+"""This module estimates generalized advantages in one Triton kernel."""
 
 import triton
 import triton.language as tl

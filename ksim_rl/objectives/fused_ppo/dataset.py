@@ -1,8 +1,9 @@
-"""What the gradient steps of an update read of a rollout, laid out for the kernels."""
+"""This module lays out for the kernels what the gradient steps of an update read of a rollout."""
 
 from collections.abc import Callable
 
 import torch
+from jaxtyping import Float, Int64
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -10,12 +11,13 @@ from ksim_rl.objectives.fused_ppo.advantage_kernel import estimate_advantages
 from ksim_rl.objectives.fused_ppo.launch import launch, parts
 from ksim_rl.objectives.fused_ppo.layout import FusedLayout
 from ksim_rl.objectives.fused_ppo.loss_kernels import LOG_PROB, MASK
+from ksim_rl.objectives.masked import standardized
 from ksim_rl.objectives.ppo_cfg import PPOCfg
-from ksim_rl.objectives.rollout_estimator import standardized
 
 # Envs per program.
 ENVS = 32
-Observe = Callable[[TensorDictBase], Tensor]
+Observe = Callable[[TensorDictBase], Float[Tensor, "*batch L"]]
+Evaluate = Callable[[Float[Tensor, "D L"], Float[Tensor, " D"]], None]
 
 
 class FusedDataset:
@@ -56,16 +58,16 @@ class FusedDataset:
         self._signals = torch.zeros(4, size, device=device)
 
     @torch.no_grad()
-    def read(self, rollout_ET: TensorDictBase, *, evaluate: Callable[[Tensor, Tensor], None]) -> Tensor:
+    def read(self, rollout_ET: TensorDictBase, *, evaluate: Evaluate) -> Int64[Tensor, ""]:
         """Take over a rollout `["E","T"]`, whose advantages are estimated here.
 
         An env state with an element that is not finite takes no part, as in `DatasetStorage`.
 
         Args:
-            evaluate: writes the values of observations [D, L] of the critic into a tensor [D].
+            evaluate: writes the values of observations of the critic into its second argument.
 
         Returns:
-            How many env states take no part, int64 [].
+            How many env states take no part.
         """
         following = rollout_ET.get("next")
         for obs_DL, observe, dim in zip(self.obs, self._observe, self.layout.obs_dims, strict=True):
@@ -92,7 +94,7 @@ class FusedDataset:
         )
         if self.cfg.normalize_advantage == "dataset":
             estimated_D = advantages_D.isfinite()
-            normal_D = standardized(advantages_D, estimated_D)
+            normal_D = standardized(advantages_D, estimated_D, lowest_std=1e-4)
             advantages_D = torch.where(estimated_D, normal_D, torch.nan)
         return self._record(rollout_ET, torch.stack([advantages_D, values_D, targets_D], 1))
 

@@ -1,4 +1,4 @@
-"""All gradient steps of a PPO update in four Triton kernels each, for the networks that most runs have.
+"""This module makes all gradient steps of a PPO update in four Triton kernels each, for most runs' networks.
 
 It computes what `GAE`, `ClipPPOLoss` and `ppo_step` compute for an actor and a critic of `FusedNetworks`, from the same
 config, in the same order of env states, and on the state of the same optimizer: a run can change from one to the other
@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float, Int64
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -59,7 +60,7 @@ class FusedPPO:
         self.tuning = tuning = tuning or Tuning.of(layout)
         self.batch = num_env_states_per_minibatch
         num_steps = cfg.num_epochs * num_minibatches
-        device, dtype = networks.std.device, getattr(torch, cfg.precision)
+        device, dtype = networks.std_A.device, getattr(torch, cfg.precision)
         self.parameters = FusedParameters(
             networks, layout, optimizer=optimizer, dtype=dtype, num_steps=num_steps
         )
@@ -89,17 +90,17 @@ class FusedPPO:
         self._summary = zeros(num_steps, power_of_two(len(SUMMARY)))
 
     def __call__(
-        self, rollout_ET: TensorDictBase, orders: Sequence[Tensor]
-    ) -> tuple[dict[str, Tensor], Tensor]:
+        self, rollout_ET: TensorDictBase, orders: Sequence[Int64[Tensor, " D"]]
+    ) -> tuple[dict[str, Float[Tensor, " steps"]], Int64[Tensor, ""]]:
         """Make all gradient steps of an update.
 
         Args:
             rollout_ET: `["E","T"]`; its memory may be time-major, as that of a collector.
-            orders: of each epoch, the env states in the order of the minibatches, int64 [D], counted env by env.
+            orders: of each epoch, the env states in the order of the minibatches, counted env by env.
 
         Returns:
-            What each gradient step measured, by the names of `SUMMARY`, each [steps]; and how many env states took no
-            part because an element was not finite, int64 [].
+            What each gradient step measured, by the names of `SUMMARY`; and how many env states took no part because an
+            element was not finite.
         """
         num_envs, length = rollout_ET.batch_size
         self.parameters.load()
@@ -126,7 +127,7 @@ class FusedPPO:
             self.dataset.records,
             index_B,
             self.parameters.weights,
-            self.parameters.biases,
+            self.parameters.biases_2N,
             self._inputs,
             self._slopes,
             self._block_partials,
@@ -143,7 +144,7 @@ class FusedPPO:
             RECORD=self.dataset.records.shape[1],
             INPUTS=layout.input_columns,
             GRADIENTS=layout.gradient_columns,
-            A=layout.action_dim,
+            ACTIONS=layout.action_dim,
             LOG_STD=self.networks.log_std,
             MIN_STD=self.networks.min_std,
             CLIP_VALUE=clip_value > 0.0,
@@ -179,7 +180,7 @@ class FusedPPO:
             self._block_partials,
             self._gradients,
             self._squares,
-            self.parameters.biases,
+            self.parameters.biases_2N,
             group["lr"],
             self._summary[step],
             cfg.entropy_coeff,
@@ -192,8 +193,8 @@ class FusedPPO:
             NUM_WEIGHTS=layout.num_weights,
             NUM_BIASES=layout.num_biases,
             NUM_STATISTICS=NUM_STATISTICS,
-            A=layout.action_dim,
-            O=layout.out_width,
+            ACTIONS=layout.action_dim,
+            OUT=layout.out_width,
             LOG_STD=self.networks.log_std,
             MIN_STD=self.networks.min_std,
             ADAPTIVE=cfg.schedule == "adaptive",
@@ -235,7 +236,7 @@ class FusedPPO:
             (parts(len(values_D), self.tuning.block),),
             obs_DL,
             self.parameters.weights[1],
-            self.parameters.biases[1],
+            self.parameters.biases_2N[1],
             values_D,
             len(values_D),
             num_warps=self.tuning.warps,
@@ -246,7 +247,8 @@ class FusedPPO:
     def _sizes(self) -> dict[str, int]:
         layout, tuning = self.layout, self.tuning
         first, second, third = layout.hidden
-        widths = {"L": layout.obs_width, "H1": first, "H2": second, "H3": third, "O": layout.out_width}
+        widths = {"H1": first, "H2": second, "H3": third}
+        widths |= {"OBS": layout.obs_width, "OUT": layout.out_width}
         return widths | {"BLOCK": tuning.block, "CHUNK": tuning.chunk, "STAGES": tuning.stages}
 
 

@@ -1,4 +1,4 @@
-"""How a Triton kernel is started."""
+"""This module starts Triton kernels."""
 
 from typing import Any
 

@@ -1,9 +1,10 @@
-"""Where each parameter of a fused actor and critic is, in the two forms that the kernels need."""
+"""This module says where each parameter of a fused actor and critic is, in the two forms that the kernels need."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float, Int32
 from torch import Tensor, nn
 
 # The smallest dim that a tensor core multiplies.
@@ -16,23 +17,23 @@ class FusedNetworks:
 
     Attributes:
         actor, critic: their linear layers, the first to the last; an ELU follows each but the last.
-        std: the parameter of the standard deviations, [A].
+        std_A: the parameter of the standard deviations.
         log_std: whether that is their logarithm.
         min_std: bound of the standard deviations from below, which the gradient passes.
     """
 
     actor: Sequence[nn.Linear]
     critic: Sequence[nn.Linear]
-    std: Tensor
+    std_A: Float[Tensor, " A"]
     log_std: bool
     min_std: float
 
     @property
-    def parameters(self) -> list[Tensor]:
+    def parameters(self) -> list[Float[Tensor, "*?shape"]]:
         """All parameters, in the order of the flat form: of each layer weight and bias, of the actor then the std."""
         actor = [parameter for layer in self.actor for parameter in (layer.weight, layer.bias)]
         critic = [parameter for layer in self.critic for parameter in (layer.weight, layer.bias)]
-        return [*actor, self.std, *critic]
+        return [*actor, self.std_A, *critic]
 
 
 class FusedLayout:
@@ -63,14 +64,16 @@ class FusedLayout:
         self.input_columns = sum(widths[:-1])
         self.gradient_columns = sum(widths[1:])
 
-    def flat_views(self, flat_N: Tensor, networks: FusedNetworks) -> list[Tensor]:
+    def flat_views(
+        self, flat_N: Float[Tensor, " N"], networks: FusedNetworks
+    ) -> list[Float[Tensor, "*?shape"]]:
         """Return the views of a flat tensor that correspond to `networks.parameters`."""
         sizes = [parameter.numel() for parameter in networks.parameters]
         pieces = zip(flat_N.split(sizes), networks.parameters, strict=True)
         return [piece.view(parameter.shape) for piece, parameter in pieces]
 
-    def padded_index(self, networks: FusedNetworks) -> Tensor:
-        """Return for each element of the flat form its place in the padded one, int32 [N] on the CPU."""
+    def padded_index(self, networks: FusedNetworks) -> Int32[Tensor, " N"]:
+        """Return for each element of the flat form its place in the padded one, on the CPU."""
         places = torch.arange(2 * self.num_padded, dtype=torch.int32).view(2, self.num_padded)
         index: list[Tensor] = []
         for row, layers in zip(places, (networks.actor, networks.critic), strict=True):
@@ -84,8 +87,8 @@ class FusedLayout:
                 index.append(row[bias_at : bias_at + self.action_dim])
         return torch.cat([places.reshape(-1) for places in index])
 
-    def weight_tiles(self, tile: int) -> Tensor:
-        """Return what each program of the weight gradient's kernel computes, int32 [tiles, 8] on the CPU.
+    def weight_tiles(self, tile: int) -> Int32[Tensor, "tiles 8"]:
+        """Return what each program of the weight gradient's kernel computes, on the CPU.
 
         Columns: network, first column among the layer inputs, first among the gradients, first place in the padded
         form, width of the layer's input, and how many columns of inputs and of gradients the tile has.

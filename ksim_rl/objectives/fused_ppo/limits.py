@@ -1,4 +1,4 @@
-"""What the fused kernels cannot do."""
+"""This module says what the fused kernels cannot do."""
 
 from typing import Protocol
 

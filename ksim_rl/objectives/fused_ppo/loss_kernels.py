@@ -1,10 +1,10 @@
-"""The clipped losses of PPO and their gradients in closed form, as Triton functions.
+"""This module has the clipped losses of PPO and their gradients in closed form, as Triton functions.
 
 They are those of `ClipPPOLoss`, for a diagonal gaussian whose standard deviations do not depend on the state; the
-gradients are of the sum over the env states, not of the mean.
+gradients are of the sum over the env states, not of the mean. `docs/fused_ppo.md` derives them.
 
-What is known of an env state is one record: `O` columns each of the action, of the old mean and of the old standard
-deviation, then `LOG_PROB`, `ADVANTAGE`, `VALUE`, `TARGET` and `MASK`, counted from column 3 O.
+What is known of an env state is one record: `OUT` columns each of the action, of the old mean and of the old standard
+deviation, then `LOG_PROB`, `ADVANTAGE`, `VALUE`, `TARGET` and `MASK`, counted from column 3 OUT.
 """
 
 import triton
@@ -29,25 +29,25 @@ def policy_gradient(
     log_ratio_low,
     log_ratio_high,
     entropy_coeff,
-    A: tl.constexpr,
-    O: tl.constexpr,  # noqa: E741
+    ACTIONS: tl.constexpr,
+    OUT: tl.constexpr,
     LOG_STD: tl.constexpr,
     MIN_STD: tl.constexpr,
 ):
-    """Return the gradient of the policy loss and the entropy loss at `loc` [rows, O].
+    """Return the gradient of the policy loss and the entropy loss at `loc` [rows, OUT].
 
-    Writes that at the parameter of the std to `d_std_at` [O], and to `statistics` the sums of mask, policy loss,
+    Writes that at the parameter of the std to `d_std_at` [OUT], and to `statistics` the sums of mask, policy loss,
     divergence and clipped ratios.
     """
-    o = tl.arange(0, O)[None, :]
-    action_dims = o < A
+    output = tl.arange(0, OUT)[None, :]
+    action_dims = output < ACTIONS
     keep = valid[:, None]
-    action = tl.load(record[:, None] + o, mask=keep, other=0.0)
-    loc_old = tl.load(record[:, None] + (O + o), mask=keep, other=0.0)
-    scale_old = tl.load(record[:, None] + (2 * O + o), mask=keep, other=1.0)
-    log_prob_old = tl.load(record + (3 * O + LOG_PROB), mask=valid, other=0.0)
-    advantage = tl.load(record + (3 * O + ADVANTAGE), mask=valid, other=0.0)
-    mask = tl.load(record + (3 * O + MASK), mask=valid, other=0.0)
+    action = tl.load(record[:, None] + output, mask=keep, other=0.0)
+    loc_old = tl.load(record[:, None] + (OUT + output), mask=keep, other=0.0)
+    scale_old = tl.load(record[:, None] + (2 * OUT + output), mask=keep, other=1.0)
+    log_prob_old = tl.load(record + (3 * OUT + LOG_PROB), mask=valid, other=0.0)
+    advantage = tl.load(record + (3 * OUT + ADVANTAGE), mask=valid, other=0.0)
+    mask = tl.load(record + (3 * OUT + MASK), mask=valid, other=0.0)
 
     std = tl.exp(raw_std) if LOG_STD else raw_std
     bounded = tl.maximum(std, MIN_STD)[None, :]
@@ -66,7 +66,7 @@ def policy_gradient(
     d_std = (slope[:, None] * (error * error - 1.0) - entropy_coeff * mask[:, None]) * inverse
     if LOG_STD:
         d_std = d_std * std[None, :]
-    tl.store(d_std_at + tl.arange(0, O), tl.sum(tl.where(action_dims, d_std, 0.0), 0))
+    tl.store(d_std_at + tl.arange(0, OUT), tl.sum(tl.where(action_dims, d_std, 0.0), 0))
 
     log_std_ratio = tl.log(scale_old) - log_scale
     drift = (loc_old - loc) * inverse
@@ -86,22 +86,22 @@ def value_gradient(
     statistics,
     clip_value,
     critic_coeff,
-    O: tl.constexpr,  # noqa: E741
+    OUT: tl.constexpr,
     CLIP_VALUE: tl.constexpr,
 ):
-    """Return the gradient of the value loss at `out` [rows, O], whose first column is the value.
+    """Return the gradient of the value loss at `out` [rows, OUT], whose first column is the value.
 
     Writes to `statistics` the sums of mask, value loss (without `critic_coeff`), target, its square, error, its square.
     """
-    o = tl.arange(0, O)[None, :]
-    value = tl.sum(tl.where(o == 0, out, 0.0), 1)
-    target = tl.load(record + (3 * O + TARGET), mask=valid, other=0.0)
-    mask = tl.load(record + (3 * O + MASK), mask=valid, other=0.0)
+    output = tl.arange(0, OUT)[None, :]
+    value = tl.sum(tl.where(output == 0, out, 0.0), 1)
+    target = tl.load(record + (3 * OUT + TARGET), mask=valid, other=0.0)
+    mask = tl.load(record + (3 * OUT + MASK), mask=valid, other=0.0)
     error = value - target
     loss = error * error
     slope = 2.0 * error
     if CLIP_VALUE:
-        value_old = tl.load(record + (3 * O + VALUE), mask=valid, other=0.0)
+        value_old = tl.load(record + (3 * OUT + VALUE), mask=valid, other=0.0)
         change = value - value_old
         held = tl.minimum(tl.maximum(change, -clip_value), clip_value)
         held_error = value_old + held - target
@@ -115,4 +115,4 @@ def value_gradient(
     tl.store(statistics + 3, tl.sum(target * target * mask))
     tl.store(statistics + 4, tl.sum(error * mask))
     tl.store(statistics + 5, tl.sum(error * error * mask))
-    return tl.where(o == 0, slope[:, None], 0.0)
+    return tl.where(output == 0, slope[:, None], 0.0)

@@ -1,6 +1,7 @@
-"""The parameters and moments that the kernels work on, copied from modules and optimizer and back."""
+"""This module copies parameters and moments from modules and optimizer into the form of the kernels, and back."""
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.objectives.fused_ppo.layout import FusedLayout, FusedNetworks
@@ -53,7 +54,7 @@ class FusedParameters:
         self._num_weights = layout.num_weights
 
     @property
-    def biases(self) -> Tensor:
+    def biases_2N(self) -> Float[Tensor, "2 N"]:
         """The biases of both networks in float32; rows are as far apart as those of `exact`."""
         return self.exact[:, self._num_weights :]
 

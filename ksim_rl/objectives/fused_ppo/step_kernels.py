@@ -1,4 +1,4 @@
-"""Triton kernels between the gradients of a minibatch and the next one: sums, statistics, learning rate, Adam.
+"""This module has the Triton kernels between a minibatch and the next: sums, statistics, learning rate, Adam.
 
 What a gradient step measures is one row of `SUMMARY` columns.
 """
@@ -94,8 +94,8 @@ def sum_gradients(
     NUM_WEIGHTS: tl.constexpr,
     NUM_BIASES: tl.constexpr,
     NUM_STATISTICS: tl.constexpr,
-    A: tl.constexpr,
-    O: tl.constexpr,  # noqa: E741
+    ACTIONS: tl.constexpr,
+    OUT: tl.constexpr,
     LOG_STD: tl.constexpr,
     MIN_STD: tl.constexpr,
     ADAPTIVE: tl.constexpr,
@@ -155,10 +155,12 @@ def sum_gradients(
         target_variance = _column(value, 3, NUM_STATISTICS) - target * target
         error = _column(value, 4, NUM_STATISTICS)
         error_variance = _column(value, 5, NUM_STATISTICS) - error * error
-        o = tl.arange(0, O)
-        raw = tl.load(biases + (NUM_BIASES - O + o), mask=o < A, other=0.0 if LOG_STD else 1.0)
+        output = tl.arange(0, OUT)
+        raw = tl.load(
+            biases + (NUM_BIASES - OUT + output), mask=output < ACTIONS, other=0.0 if LOG_STD else 1.0
+        )
         std = tl.maximum(tl.exp(raw) if LOG_STD else raw, MIN_STD)
-        entropy = tl.sum(tl.where(o < A, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0))
+        entropy = tl.sum(tl.where(output < ACTIONS, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0))
         rate = tl.load(learning_rate)
         if ADAPTIVE:
             # As `adapt_learning_rate_`; comparisons with NaN are False.
@@ -220,16 +222,16 @@ def adam_step(
     """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = at < SIZE
-    q = tl.arange(0, SQUARES)
-    norm = tl.sqrt(tl.sum(tl.load(squares + q, mask=q < NUM_SQUARES, other=0.0)))
+    square_at = tl.arange(0, SQUARES)
+    norm = tl.sqrt(tl.sum(tl.load(squares + square_at, mask=square_at < NUM_SQUARES, other=0.0)))
     loss = tl.load(summary + LOSS)
     rate = tl.load(summary + LEARNING_RATE)
     step = tl.load(steps)
     made = (norm < float("inf")) & (tl.abs(loss) < float("inf"))
-    # In float64: 1 - beta^t loses most digits of float32 in the first steps.
-    t = step.to(tl.float64) + 1.0
-    correction1 = (1.0 - tl.exp(t * log_beta1)).to(tl.float32)
-    correction2 = (1.0 - tl.exp(t * log_beta2)).to(tl.float32)
+    # In float64: 1 - beta^steps_made loses most digits of float32 in the first steps.
+    steps_made = step.to(tl.float64) + 1.0
+    correction1 = (1.0 - tl.exp(steps_made * log_beta1)).to(tl.float32)
+    correction2 = (1.0 - tl.exp(steps_made * log_beta2)).to(tl.float32)
 
     place = tl.load(places + at, mask=inside, other=0)
     parameter = tl.load(parameters + at, mask=inside, other=0.0)

@@ -1,4 +1,4 @@
-"""Sizes of the kernels' blocks; they change the speed and the order of sums, nothing else."""
+"""This module has the sizes of the kernels' blocks; they change the speed and the order of sums, nothing else."""
 
 import math
 from dataclasses import dataclass

@@ -1,0 +1,36 @@
+"""This module takes means over the env states that take part: those whose mask is True."""
+
+import torch
+from jaxtyping import Bool, Float
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+# Where TorchRL's losses look for rows to leave out (`LossModule.loss_mask_key`), stock ones included.
+MASK_KEY: NestedKey = ("collector", "mask")
+
+
+def mask_of(env_states: TensorDictBase, like_B: Float[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
+    """Return the mask of env states in the shape of `like_B`; all take part where there is none."""
+    mask = env_states.get(MASK_KEY, None)
+    return torch.ones_like(like_B, dtype=torch.bool) if mask is None else mask.reshape(like_B.shape)
+
+
+def masked_mean(values: Float[Tensor, "*batch"], mask: Bool[Tensor, "*batch"]) -> Float[Tensor, ""]:
+    """Return the mean of the values that `mask` marks; 0 where it marks none."""
+    # A where instead of a product: what is left out may be anything, and zero times infinity is NaN.
+    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp_min(1)
+
+
+def standardized(
+    values: Float[Tensor, "*batch"], mask: Bool[Tensor, "*batch"], *, lowest_std: float
+) -> Float[Tensor, "*batch"]:
+    """Shift and scale values to mean 0 and standard deviation 1 over those that `mask` marks.
+
+    Args:
+        lowest_std: values that are all alike stay near zero, as they are divided by this at least.
+    """
+    zero, count = torch.zeros_like(values), mask.sum()
+    error = values - torch.where(mask, values, zero).sum() / count.clamp_min(1)
+    variance = torch.where(mask, error, zero).square().sum() / (count - 1).clamp_min(1)
+    return error / variance.sqrt().clamp_min(lowest_std)

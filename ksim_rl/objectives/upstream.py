@@ -1,0 +1,44 @@
+"""This module lists what `objectives` uses of TorchRL and torch beyond their documented interfaces.
+
+These are methods that losses inherit and override, so that they cannot be hidden behind functions.
+`tests/objectives/test_upstream.py` names the one that a new version moved. Checked with TorchRL 0.14.1 and torch 2.10
+to 2.13.
+"""
+
+from torchrl import objectives
+from torchrl.objectives.common import LossModule
+
+# Methods by their class, each with its arguments and the reason.
+INHERITED: dict[type, dict[str, tuple[str, str]]] = {
+    LossModule: {
+        "_loss_mask_keys": ("self", "which masks the user chose; there is no public reader"),
+        "_expand_loss_mask": ("mask loss", "gives a mask the shape of a loss"),
+        "_forward_value_estimator_keys": ("self kwargs", "abstract: each loss has to define it"),
+    },
+    objectives.ClipPPOLoss: {
+        "_log_weight": (
+            "self tensordict adv_shape",
+            "the log ratios, for all distributions and proximal policies",
+        ),
+        "_maybe_normalize_advantage": (
+            "self advantage tensordict update_norm",
+            "the options of normalization",
+        ),
+        "_standardize_advantage": ("self advantage tensordict", "overridden: masked rows have no part in it"),
+        "_critic_loss_inputs": (
+            "self target_return state_value old_state_value",
+            "overridden: sequences [B, T]",
+        ),
+        "_get_entropy": (
+            "self dist adv_shape",
+            "overridden: the stock one asks the host whether it is finite",
+        ),
+        "_weighted_loss_entropy": ("self entropy", "the entropy coefficients of several actions"),
+        "_reduce_loss": ("self loss tensordict mask reduction weights", "reductions other than the mean"),
+        "_clear_weakrefs": ("self tds", "frees functional parameters as the stock forward does"),
+    },
+}
+# Properties of TorchRL's `ClipPPOLoss` that its forward reads as well.
+READ = ("_clip_bounds", "_cached_critic_network_params_detached")
+# torch's kernels over lists of tensors, which its own optimizers are made of: one launch for all leaves of a dtype.
+FOREACH = ("_foreach_copy_", "_foreach_lerp_", "_foreach_mul_")
