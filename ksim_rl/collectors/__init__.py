@@ -1,4 +1,4 @@
-"""Collectors: from an env and a policy to rollouts `["E","T"]`."""
+"""This room collects rollouts `["E","T"]` with a policy in an env."""
 
 from ksim_rl.collectors.collector_cfg import CollectorCfg
 from ksim_rl.collectors.rollout_collector import RolloutCollector

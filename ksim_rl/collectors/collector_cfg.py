@@ -1,4 +1,4 @@
-"""How rollouts are collected."""
+"""This module has the options of how rollouts are collected."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Collects rollouts of fixed length from all envs, as one CUDA graph where there is CUDA."""
+"""This module collects rollouts of fixed length from all envs, as one CUDA graph where there is CUDA."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Shaped
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -15,8 +16,8 @@ from ksim_rl import dims
 from ksim_rl.checks import check_count
 from ksim_rl.collectors.collector_cfg import CollectorCfg
 from ksim_rl.device.capture import Captured
+from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.envs.masked_reset import MaskedReset
-from ksim_rl.transforms.innermost import innermost
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -54,10 +55,11 @@ class RolloutCollector:
         check_count("rollout_length", rollout_length)
         if len(env.batch_size) != 1:
             raise ValueError(f"env.batch_size={tuple(env.batch_size)}: expected one dim, [E]")
-        self._cfg = cfg = cfg or CollectorCfg()
-        if cfg.stagger_episodes and not hasattr(innermost(env), "stagger_episodes_"):
+        cfg = cfg or CollectorCfg()
+        self._clock = part(env, EpisodeClock) if cfg.stagger_episodes else None
+        if cfg.stagger_episodes and self._clock is None:
             raise ValueError(
-                f"stagger_episodes=True, but {type(innermost(env)).__name__} has no stagger_episodes_: set it to False"
+                f"stagger_episodes=True, but {type(env).__name__} has no EpisodeClock: set it to False"
             )
         self.env, self.policy, self.rollout_length = env, policy, rollout_length
         self._keys = None if keys is None else list(keys)
@@ -98,10 +100,10 @@ class RolloutCollector:
             self._root = root_E.clone()
         else:
             self._root.update_(root_E)
-        if self._cfg.stagger_episodes:
-            innermost(self.env).stagger_episodes_()
+        if self._clock is not None:
+            self._clock.stagger_episodes_()
 
-    def state_dict(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Shaped[Tensor, " E *?leaf"]]:
         """Return the EnvState from which the next rollout starts, by flat key."""
         if self._root is None:
             return {}

@@ -1,4 +1,4 @@
-"""Datasets, replays and samplers: TorchRL replay buffers for the env states that an RL update learns from."""
+"""This room has TorchRL replay buffers for the env states that an RL update learns from."""
 
 from ksim_rl.data.dataset_buffer import DatasetBuffer
 from ksim_rl.data.dataset_cfg import DatasetCfg, rollout_length

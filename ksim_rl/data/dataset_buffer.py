@@ -1,12 +1,10 @@
-"""The dataset of one RL update.
-
-A TorchRL replay buffer that is filled, used for some epochs, and filled again.
-"""
+"""This module has the dataset of one RL update: it is filled, used for some epochs, and filled again."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Int64
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -57,12 +55,12 @@ class DatasetBuffer(ReplayBuffer):
         self._keys = None if keys is None else list(keys)
 
     @property
-    def non_finite_count(self) -> Tensor:
-        """Rows removed so far because an element was not finite, int64 [] on the device."""
+    def non_finite_count(self) -> Int64[Tensor, ""]:
+        """Rows removed so far because an element was not finite, on the device."""
         return self._dataset.non_finite_count
 
-    def extend(self, data: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
-        """Replace the dataset by `data` and return the indices written, [D].
+    def extend(self, data: TensorDictBase, *, update_priority: bool | None = None) -> Int64[Tensor, " D"]:
+        """Replace the dataset by `data` and return the indices written.
 
         Args:
             data: a rollout `["E","T"]` or any TensorDict of D env states; env-major order.
@@ -109,8 +107,8 @@ class DatasetBuffer(ReplayBuffer):
         data = _labelled(data, info)
         yield from data.split(data.batch_size[0] // self.cfg.num_minibatches)
 
-    def epoch_order(self) -> Tensor:
-        """Begin an epoch, and return its whole order instead of its minibatches: int64 [D], on the device.
+    def epoch_order(self) -> Int64[Tensor, " D"]:
+        """Begin an epoch, and return its whole order instead of its minibatches, on the device.
 
         Raises:
             TypeError: with a sampler that is no `EpochSampler`.

@@ -1,4 +1,4 @@
-"""The arithmetic of the words: dataset, minibatch, rollout."""
+"""This module has the sizes of dataset, minibatch and rollout, and the arithmetic between them."""
 
 import math
 from dataclasses import dataclass

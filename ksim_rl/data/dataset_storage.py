@@ -1,9 +1,10 @@
-"""Static storage of one dataset, which no non-finite number enters."""
+"""This module stores one dataset in place, and lets no non-finite number in."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Int64
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data.replay_buffers.storages import TensorStorage
@@ -122,8 +123,8 @@ class DatasetWriter(StatelessWriter):
             "a dataset is written as a whole: use extend() with all its env states instead of add()"
         )
 
-    def extend(self, data: Sequence | TensorDictBase) -> Tensor:
-        """Replace the content and return the indices written, which are all, [D]."""
+    def extend(self, data: Sequence | TensorDictBase) -> Int64[Tensor, " D"]:
+        """Replace the content and return the indices written, which are all."""
         if not isinstance(data, TensorDictBase):
             raise ValueError(f"extend() got {type(data).__name__}: expected a TensorDict, e.g. a rollout")
         self._storage.write(data)

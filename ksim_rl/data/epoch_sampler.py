@@ -1,10 +1,11 @@
-"""Sampling without replacement, whose order is a function of (seed, epoch) and stays on the device."""
+"""This module samples without replacement, in an order of (seed, epoch) that stays on the device."""
 
 import json
 from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Int64
 from torch import Tensor
 from torchrl.data.replay_buffers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
@@ -47,7 +48,7 @@ class EpochSampler(Sampler):
         if self._epoch is not None:
             self._epoch.zero_()
 
-    def extend(self, index: Tensor) -> None:
+    def extend(self, index: Any) -> None:
         """Start a new epoch, because the data is new."""
         self.restart()
 
@@ -75,8 +76,8 @@ class EpochSampler(Sampler):
             index = torch.unravel_index(index, storage.shape)
         return index, {}
 
-    def epoch_order(self, size: int, *, device: torch.device) -> Tensor:
-        """Begin an epoch and return its order of `range(size)`, int64 [size], as `sample` would give it in parts."""
+    def epoch_order(self, size: int, *, device: torch.device) -> Int64[Tensor, " D"]:
+        """Begin an epoch and return its order of `range(size)`, as `sample` would give it in parts."""
         self.restart()
         return self._next_part(size, size, device)
 
@@ -153,14 +154,11 @@ class EpochSampler(Sampler):
         self._order_D = None
 
 
-def permutation(seed: int, epoch: Tensor, size: int) -> Tensor:
+def permutation(seed: int, epoch: Int64[Tensor, ""], size: int) -> Int64[Tensor, " D"]:
     """Return a random permutation of `range(size)` that depends on `seed` and `epoch` only.
 
     Args:
-        epoch: int64 []; its device is that of the result.
-
-    Returns:
-        int64 [size].
+        epoch: its device is that of the result.
     """
     seed_tensor = torch.full((), seed, dtype=torch.int64, device=epoch.device)
     keys = random.row_keys(seed_tensor, _STREAM, epoch, size)

@@ -1,8 +1,9 @@
-"""Prioritized sampling on the device."""
+"""This module draws by priorities, on the device."""
 
 from typing import Any
 
 import torch
+from jaxtyping import Shaped
 from torch import Tensor
 from torchrl.data.replay_buffers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
@@ -59,7 +60,12 @@ class PrioritySampler(Sampler):
 
     @torch.no_grad()
     def update_priority(
-        self, index: Any, priority: float | Tensor, *, storage: Storage | None = None, **_: Any
+        self,
+        index: Any,
+        priority: float | Shaped[Tensor, "#*batch"],
+        *,
+        storage: Storage | None = None,
+        **_: Any,
     ) -> None:
         """Set priorities [B] or [] of entries [B]; of an index that occurs twice the highest counts.
 

@@ -1,4 +1,4 @@
-"""The sizes of off-policy data: how much is collected, kept, and drawn for gradient steps."""
+"""This module has the sizes of off-policy data: how much is collected, kept, and drawn for gradient steps."""
 
 from dataclasses import dataclass
 

@@ -1,9 +1,10 @@
-"""The replay of off-policy learning: the last env states of each env."""
+"""This module has the replay of off-policy learning: it holds the last env states of each env."""
 
 from collections.abc import Iterator
 from typing import Any
 
 import torch
+from jaxtyping import Int64
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -60,13 +61,13 @@ class ReplayRing(ReplayBuffer):
         self.cfg = cfg
 
     @property
-    def non_finite_count(self) -> Tensor:
-        """Env states refused so far because an element was not finite, int64 [] on the device."""
+    def non_finite_count(self) -> Int64[Tensor, ""]:
+        """Env states refused so far because an element was not finite, on the device."""
         return self._ring.non_finite_count
 
     @property
-    def num_stored(self) -> Tensor:
-        """Env states that are stored, int64 [] on the device."""
+    def num_stored(self) -> Int64[Tensor, ""]:
+        """Env states that are stored, on the device."""
         return self._ring.available.sum()
 
     def minibatches(self, count: int) -> Iterator[TensorDictBase]:

@@ -1,4 +1,4 @@
-"""Uniform sampling of a replay, on the device."""
+"""This module samples a replay uniformly, on the device."""
 
 from typing import Any
 

@@ -1,8 +1,9 @@
-"""A ring of the last env states of each env, which stores each observation once."""
+"""This module keeps the last env states of each env in a ring, which stores each observation once."""
 
 from typing import Any
 
 import torch
+from jaxtyping import Int64
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -71,17 +72,17 @@ class ReplayStorage(Storage):
         self._env_E = torch.arange(num_envs, device=self.device)
 
     @property
-    def max_age(self) -> Tensor:
-        """How many places behind its newest observation the oldest env state of any env lies, int64 []."""
+    def max_age(self) -> Int64[Tensor, ""]:
+        """How many places behind its newest observation the oldest env state of any env lies."""
         return self.filled_E.amax()
 
-    def index(self, env: Tensor, age: Tensor) -> Tensor:
+    def index(self, env: Int64[Tensor, "*batch"], age: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
         """Return the index of the env state that lies `age` >= 1 places behind the newest observation of `env`."""
         return (self.head_E[env] - age) % self.places * self.num_envs + env
 
     @torch.no_grad()
-    def write(self, rollout_ET: TensorDictBase) -> Tensor:
-        """Add a rollout `["E","T"]` and return the indices of its env states, [E * T].
+    def write(self, rollout_ET: TensorDictBase) -> Int64[Tensor, " N"]:
+        """Add a rollout `["E","T"]` and return the indices of its N = E * T env states.
 
         Raises:
             ValueError: if it has another number of envs, lacks a leaf, or is too long for the ring.
@@ -278,8 +279,8 @@ class ReplayWriter(StatelessWriter):
         """Refuse: a replay is written by rollouts."""
         raise ValueError("a replay is written by rollouts: use extend() with one of batch_size [E, T]")
 
-    def extend(self, data: Any) -> Tensor:
-        """Add a rollout `["E","T"]` and return the indices of its env states, [E * T]."""
+    def extend(self, data: Any) -> Int64[Tensor, " N"]:
+        """Add a rollout `["E","T"]` and return the indices of its N = E * T env states."""
         if not isinstance(data, TensorDictBase):
             raise ValueError(f"extend() got {type(data).__name__}: expected a rollout of batch_size [E, T]")
         return self._storage.write(data)

@@ -1,4 +1,4 @@
-"""Sampling of contiguous sequences by env, for recurrent networks."""
+"""This module samples contiguous sequences of an env, for recurrent networks."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""A writer whose storage knows all that there is to know."""
+"""This module has a writer without a state of its own: its storage knows all that there is to know."""
 
 from typing import Any
 
