@@ -181,7 +181,7 @@ def checked(function: FunctionType, *parameters: str) -> FunctionType:
                 torch.compiler.is_compiling,
                 function,
                 # Functions, since Dynamo cannot wrap the bound methods in the closure of an `__init__`.
-                lambda values: shaped.check_arguments(values),
+                lambda *values: shaped.check_arguments(*values),
                 lambda value, sizes: shaped.check_result(value, sizes),
             ),
             strict=True,

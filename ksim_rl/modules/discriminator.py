@@ -37,7 +37,7 @@ class Discriminator(nn.Module):
         assert isinstance(last, nn.Linear)
         return last.weight
 
-    def normalized(self, transition: Float[Tensor, "*batch 2 L"]) -> Float[Tensor, "*batch 2*L"]:
+    def normalized(self, transition: Float[Tensor, "*batch 2 L"]) -> Float[Tensor, "*batch L+L"]:
         """Return what the layers read of transitions."""
         return self.normalizer(transition).flatten(-2)
 
