@@ -1,18 +1,18 @@
-"""This module captures work of torch and Warp in one graph, which torch owns and whose capture Warp joins.
+"""Work of torch and Warp is captured here in one graph, which torch owns, and work of Warp alone in graphs of its own.
 
-Inside the captured body, worlds issue live launches: a finished Warp graph cannot be launched inside a capture.
+Inside the body that is captured for torch, worlds issue live launches: a finished Warp graph cannot be launched there.
 """
 
 import gc
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 import torch
 import warp as wp
 
-from ksim_rl.device.streams import checked_device, warp_device, warp_stream
+from ksim_rl.device.streams import checked_device, warp_device, warp_scope, warp_stream
 
 
 class _Phase(threading.local):
@@ -31,19 +31,14 @@ def is_capturing() -> bool:
     return _phase.capturing > 0
 
 
-def is_warming_up() -> bool:
-    """Whether a `Captured` of this thread runs its body eagerly right now, before it records its graph."""
-    return _phase.warming_up > 0
-
-
-def wants_live_launches(device: torch.device) -> bool:
+def _wants_live_launches(device: torch.device) -> bool:
     """Whether no graph may be recorded here: an outer one is recorded, or warms up to be."""
     if _phase.live > 0:
         return True
     return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
 
 
-def refuse_or_warn(device: torch.device, *, require_graphs: bool) -> bool:
+def _refuse_or_warn(device: torch.device, *, require_graphs: bool) -> bool:
     """Return whether graphs can be used on `device`; say it loudly, or refuse, where they cannot.
 
     Raises:
@@ -126,7 +121,7 @@ class Captured:
         self._calls = 0
         self._graph: torch.cuda.CUDAGraph | None = None
         self._warp_graph: wp.Graph | None = None
-        self._eager_for_ever = self.device.type == "cpu" or not refuse_or_warn(
+        self._eager_for_ever = self.device.type == "cpu" or not _refuse_or_warn(
             self.device, require_graphs=require_graphs
         )
         # Kept as long as the graph: its temporaries belong to this stream.
@@ -141,7 +136,7 @@ class Captured:
         """Run the body: eagerly at first, then as one graph."""
         if self._graph is not None:
             self._graph.replay()
-        elif self._stream is None or wants_live_launches(self.device):
+        elif self._stream is None or _wants_live_launches(self.device):
             # Inside another capture, the body is simply a part of that graph.
             self.body()
         elif self._calls < self.warmup:
@@ -191,3 +186,68 @@ class Captured:
                     "branching on a tensor, boolean indexing), nor allocate a size that depends on data"
                 ) from error
         return graph, warp_graph
+
+
+class WarpGraphs:
+    """Warp graphs by key, for sequences of Warp launches on arrays that keep their addresses.
+
+    On CPU the first run records the graph and replays it. On CUDA the first run is eager, so that all kernels are
+    loaded, and the second one records. Inside an outer capture nothing is recorded here: launches go into that graph.
+    The warm-up of an outer capture replays the graphs that exist, and records none: they would not be used again.
+    """
+
+    def __init__(self, device: torch.device, *, require_graphs: bool = False) -> None:
+        self.device = device
+        self._available = _refuse_or_warn(device, require_graphs=require_graphs)
+        self._graphs: dict[Hashable, wp.Graph] = {}
+        self._warm: set[Hashable] = set()
+        self._joined: list[wp.Graph | None] = []
+        # The default stream cannot record, so graphs are recorded on a stream of our own and launched on any.
+        self._stream = wp.Stream(warp_device(device)) if device.type == "cuda" else None
+
+    def run(self, key: Hashable, launches: Callable[[], None]) -> None:
+        """Run `launches`, in order with torch's current stream. `key` names what it does."""
+        with warp_scope(self.device):
+            replays = _phase.warming_up and key in self._graphs
+            if not self._available or (_wants_live_launches(self.device) and not replays):
+                self._launch_live(launches)
+                return
+            if key not in self._graphs:
+                if self._stream is not None and key not in self._warm:
+                    self._warm.add(key)
+                    launches()
+                    return
+                self._graphs[key] = self._record(launches)
+            stream = None if self._stream is None else warp_stream(torch.cuda.current_stream(self.device))
+            wp.capture_launch(self._graphs[key], stream=stream)
+
+    def clear(self) -> None:
+        """Forget all graphs, and free what they hold."""
+        self._graphs.clear()
+        self._warm.clear()
+        self._joined.clear()
+
+    def _launch_live(self, launches: Callable[[], None]) -> None:
+        if self._stream is None or is_capturing() or not torch.cuda.is_current_stream_capturing():
+            launches()
+            return
+        # A capture that torch began by itself: Warp must join it, or its loops would sync with the host.
+        stream = warp_stream(torch.cuda.current_stream(self.device))
+        with wp.ScopedCapture(stream=stream, external=True) as joined:
+            launches()
+        # It keeps the kernels loaded that torch's graph launches.
+        self._joined.append(joined.graph)
+
+    def _record(self, launches: Callable[[], None]) -> wp.Graph:
+        if self._stream is None:
+            with wp.ScopedCapture(device="cpu") as recorded:
+                launches()
+        else:
+            with (
+                no_collection(),
+                wp.ScopedStream(self._stream, sync_enter=False, sync_exit=False),
+                wp.ScopedCapture(stream=self._stream) as recorded,
+            ):
+                launches()
+        assert recorded.graph is not None
+        return recorded.graph

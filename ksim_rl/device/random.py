@@ -108,11 +108,7 @@ def stream_id(name: str) -> int:
 def row_keys(seed: Int64[Tensor, ""], stream: int, counter: Int[Tensor, "*rows"], num_rows: int) -> RowKeys:
     """Name the coordinates of one draw for each env row.
 
-    Args:
-        seed: of the run.
-        stream: the id of what is drawn (see `stream_id`); two streams never share numbers.
-        counter: of shape [] (all rows at the same count) or [E].
-        num_rows: E.
+    Two streams (see `stream_id`) never share numbers. The counter has shape [] (all rows at the same count) or [E].
     """
     return RowKeys(seed, stream, counter, num_rows)
 

@@ -52,11 +52,7 @@ class RunningMoments(nn.Module):
     def update(self, values: Float[Tensor, "*batch L"], valid: Bool[Tensor, "*rows"] | None = None) -> None:
         """Count every row of `values` once, and publish.
 
-        Rows with a non-finite element, and rows that `valid` marks False, are left out.
-
-        Args:
-            values: [..., L].
-            valid: bool, [...] or [..., 1].
+        Rows with a non-finite element, and rows that `valid` ([...] or [..., 1]) marks False, are left out.
 
         Raises:
             ValueError: if the last dim is not L, or `valid` does not have one element per row.

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from ksim_rl.physics.load import caught_warnings
+from ksim_rl.physics.load import caught_warnings, model_bytes
 from ksim_rl.physics.sim_cfg import SimCfg
 
 # On what the probe saw: half as much again for rows and contacts; less for candidate pairs, which all worlds share.
@@ -48,9 +48,7 @@ def _with_dry_friction(mj_model: mujoco.MjModel) -> mujoco.MjModel:
 
 def probe(mj_model: mujoco.MjModel) -> tuple[int, int]:
     """Return how many constraint rows and contacts a world of this model needs, with margin. Cached per model."""
-    buffer = np.empty(mujoco.mj_sizeModel(mj_model), dtype=np.uint8)
-    mujoco.mj_saveModel(mj_model, None, buffer)
-    key = hashlib.sha256(buffer.tobytes()).digest()
+    key = hashlib.sha256(model_bytes(mj_model).tobytes()).digest()
     if key not in _cache:
         with caught_warnings():
             rows, contacts, pairs = _most(mj_model)

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import warp as wp
 
 from ksim_rl.checks import near
@@ -227,3 +228,10 @@ def _from_package(robot: str, entry: str) -> Path:
             f"menagerie model {robot!r} could not be downloaded ({error}): with a network, try again; without one, "
             "copy its folder from github.com/google-deepmind/mujoco_menagerie and set MENAGERIE_ROOT to its parent"
         ) from None
+
+
+def model_bytes(mj_model: mujoco.MjModel) -> np.ndarray:
+    """Return a model in MuJoCo's binary format, uint8."""
+    data = np.empty(mujoco.mj_sizeModel(mj_model), dtype=np.uint8)
+    mujoco.mj_saveModel(mj_model, None, data)
+    return data

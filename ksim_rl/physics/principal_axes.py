@@ -4,7 +4,6 @@
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
 
-import torch
 import warp as wp
 from jaxtyping import Float32
 from torch import Tensor
@@ -45,28 +44,6 @@ def _jacobi(matrices: wp.array[wp.mat33], moments: wp.array[wp.vec3], quats: wp.
     quats[i] = wp.vec4(quat[3], quat[0], quat[1], quat[2])
 
 
-@torch.library.custom_op("ksim_rl::principal_axes", mutates_args=())
-def _principal_axes(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    moments, quats = matrices.new_empty(matrices.shape[0], 3), matrices.new_empty(matrices.shape[0], 4)
-    with warp_scope(matrices.device):
-        wp.launch(
-            _jacobi,
-            dim=matrices.shape[0],
-            inputs=[wp.from_torch(matrices.contiguous(), dtype=wp.mat33, return_ctype=True)],
-            outputs=[
-                wp.from_torch(moments, dtype=wp.vec3, return_ctype=True),
-                wp.from_torch(quats, dtype=wp.vec4, return_ctype=True),
-            ],
-            device=str(matrices.device),
-        )
-    return moments, quats
-
-
-@_principal_axes.register_fake
-def _(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    return matrices.new_empty(matrices.shape[0], 3), matrices.new_empty(matrices.shape[0], 4)
-
-
 def principal_axes(
     inertia_33: Float32[Tensor, "*batch 3 3"],
 ) -> tuple[Float32[Tensor, "*batch 3"], Float32[Tensor, "*batch 4"]]:
@@ -76,6 +53,11 @@ def principal_axes(
         The principal moments, and the orientation of their axes, a unit quaternion (w, x, y, z). A diagonal matrix
         keeps its order and its axes.
     """
-    moments, quats = _principal_axes(inertia_33.reshape(-1, 3, 3))
+    matrices = inertia_33.reshape(-1, 3, 3).contiguous()
+    moments, quats = matrices.new_empty(matrices.shape[0], 3), matrices.new_empty(matrices.shape[0], 4)
+    arrays = ((matrices, wp.mat33), (moments, wp.vec3), (quats, wp.vec4))
+    with warp_scope(matrices.device):
+        inputs = [wp.from_torch(tensor, dtype=dtype, return_ctype=True) for tensor, dtype in arrays]
+        wp.launch(_jacobi, dim=matrices.shape[0], inputs=inputs, device=str(matrices.device))
     batch = inertia_33.shape[:-2]
     return moments.view(*batch, 3), quats.view(*batch, 4)

@@ -18,19 +18,13 @@ COLLISION_SENSORS = (
     mujoco.mjtSensor.mjSENS_GEOMFROMTO,
 )
 TRANSMISSION_SENSORS = (mujoco.mjtSensor.mjSENS_ACTUATORPOS, mujoco.mjtSensor.mjSENS_ACTUATORVEL)
-TENDON_VELOCITY_SENSORS = (mujoco.mjtSensor.mjSENS_TENDONVEL,)
 
 
 class Substeps:
     """Shallow variants of one Warp model, so that a stage is left out without touching the model itself.
 
-    The variants share all arrays with `warp_model`. Build them once its arrays are in their final place.
-
-    Args:
-        mj_model: the model.
-        warp_model: the same on the device.
-        warp_data_E: the worlds.
-        one_kernel_solver: solve with `newton`, which must suit the model, instead of MuJoCo Warp's own solver.
+    The variants share all arrays with `warp_model`. Build them once its arrays are in their final place. With
+    `one_kernel_solver`, `newton` solves, which must suit the model, instead of MuJoCo Warp's own solver.
     """
 
     def __init__(
@@ -41,8 +35,7 @@ class Substeps:
         *,
         one_kernel_solver: bool = False,
     ) -> None:
-        self.warp_model = warp_model
-        self.warp_data_E = warp_data_E
+        self.warp_model, self.warp_data_E = warp_model, warp_data_E
         sensor_type = mj_model.sensor_type
         has_history = np.any(mj_model.sensor_history > 0, axis=-1)
         # A delayed sensor samples at every substep.
@@ -58,7 +51,7 @@ class Substeps:
             warp_model, skip=has_history | np.isin(sensor_type, COLLISION_SENSORS), sensor_type=sensor_type
         )
         self._needs_transmission = bool(np.isin(sensor_type, TRANSMISSION_SENSORS).any())
-        self._needs_tendon_velocity = bool(np.isin(sensor_type, TENDON_VELOCITY_SENSORS).any())
+        self._needs_tendon_velocity = bool((sensor_type == mujoco.mjtSensor.mjSENS_TENDONVEL).any())
         self.refreshes_subtree_velocities = bool(warp_model.sensor_subtree_vel)
 
     def advance(self, *, sensors: bool) -> None:

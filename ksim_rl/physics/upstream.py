@@ -71,7 +71,6 @@ def with_refreshable_sensors(
     so the lists that `put_model` makes of them, one for each kernel, are replaced.
 
     Args:
-        warp_model: the model.
         skip: bool [nsensor], further sensors to leave out.
         sensor_type: int [nsensor].
     """
@@ -102,7 +101,6 @@ def drop_pairs(warp_model: mjw.Model, dropped: np.ndarray) -> None:
     """Let MuJoCo Warp make no contacts of some geom pairs, in place: it has no setting for a pair.
 
     Args:
-        warp_model: the model.
         dropped: bool [N], in the order of `geom_pairs`.
     """
     pairs, pair_ids = geom_pairs(warp_model)

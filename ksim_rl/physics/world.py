@@ -12,19 +12,13 @@ from jaxtyping import Bool, Int, Shaped
 from torch import Tensor
 
 from ksim_rl.checks import check_choice, check_count, unknown_name
+from ksim_rl.device.capture import WarpGraphs
 from ksim_rl.device.kernel_loading import loaded_together
 from ksim_rl.device.memory import memory_for
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.device.streams import checked_device, warp_scope
 from ksim_rl.physics import capacity, kernels, upstream, views
-from ksim_rl.physics.fields import (
-    FIXED,
-    GRAVITY,
-    const_groups,
-    derived_fields,
-    fields_to_expand,
-)
-from ksim_rl.physics.graphs import WarpGraphs
+from ksim_rl.physics.fields import FIXED, GRAVITY, const_groups, derived_fields, fields_to_expand
 from ksim_rl.physics.height_field.contacts import take_over_height_fields
 from ksim_rl.physics.masked_constants import MaskedConstants
 from ksim_rl.physics.model_checks import check_not_simple, warp_model_of
@@ -106,12 +100,8 @@ class World(views.DataViews):
             self._overflow = OverflowRecord(self.warp_data_E)
             self._reset_mask = wp.zeros(num_envs, dtype=bool)
             self._zeroed_at_reset = views.float_rows(self.warp_data_E, views.ACCELERATION_STAGE)
-            self._substeps = Substeps(
-                self.mj_model,
-                self.warp_model,
-                self.warp_data_E,
-                one_kernel_solver=self.has_one_kernel_solver,
-            )
+            models = self.mj_model, self.warp_model, self.warp_data_E
+            self._substeps = Substeps(*models, one_kernel_solver=self.has_one_kernel_solver)
             self._masked_constants = self._prepare_constants(expanded)
         self._reset_mask_E = wp.to_torch(self._reset_mask)
         self._fields = {name: wp.to_torch(getattr(self.warp_model, name)) for name in expanded}
@@ -252,11 +242,8 @@ class World(views.DataViews):
     def launch(self, key: Hashable, launches: Callable[[], None]) -> None:
         """Run Warp launches of the caller's own, such as a camera's, in order with the world's.
 
-        They are recorded once and replayed from then on, so they must use arrays that keep their addresses.
-
-        Args:
-            key: names what they do; it is recorded once.
-            launches: issues them.
+        They are recorded once for each `key`, which names what they do, and replayed from then on, so they must use
+        arrays that keep their addresses.
         """
         self._graphs.run(("of others", key), launches)
 
@@ -384,13 +371,12 @@ class World(views.DataViews):
             self._launch_substep(sensors=sensors == "every" or substep == n - 1)
 
     def _launch_substep(self, *, sensors: bool) -> None:
-        guard = self._nan_guard
-        if guard is not None:
-            guard.before_substep()
+        if self._nan_guard is not None:
+            self._nan_guard.before_substep()
         self._substeps.advance(sensors=sensors)
         self._overflow.record()
-        if guard is not None:
-            guard.after_substep()
+        if self._nan_guard is not None:
+            self._nan_guard.after_substep()
 
     def _launch_reset(self) -> None:
         mjw.reset_data(self.warp_model, self.warp_data_E, reset=self._reset_mask)

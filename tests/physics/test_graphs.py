@@ -4,8 +4,7 @@ import pytest
 import torch
 import warp as wp
 
-from ksim_rl.device.capture import live_launches
-from ksim_rl.physics.graphs import WarpGraphs
+from ksim_rl.device.capture import WarpGraphs, live_launches
 from tests.physics.models import standing_quadrupeds
 
 CPU = torch.device("cpu")

@@ -20,6 +20,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from ksim_rl.checked import Checked, Count
+from ksim_rl.physics.load import model_bytes
 from ksim_rl.physics.views import float_rows
 
 # What a substep depends on; empty arrays are left out.
@@ -242,7 +243,7 @@ class Failure:
 
 def write(path: Path, failure: Failure) -> None:
     """Write a failure: safetensors, of which nothing is ever executed, completely or not at all."""
-    tensors = {_MODEL: _model_bytes(failure.mj_model)}
+    tensors = {_MODEL: model_bytes(failure.mj_model)}
     for prefix, arrays in ((_STATE, failure.states), (_REACHED, failure.reached), (_FIELD, failure.fields)):
         tensors |= {f"{prefix}{name}": np.ascontiguousarray(array) for name, array in arrays.items()}
     about = {
@@ -294,9 +295,3 @@ def read(path: Path) -> Failure:
         reached=under(_REACHED),
         fields=under(_FIELD),
     )
-
-
-def _model_bytes(mj_model: mujoco.MjModel) -> np.ndarray:
-    data = np.empty(mujoco.mj_sizeModel(mj_model), dtype=np.uint8)
-    mujoco.mj_saveModel(mj_model, None, data)
-    return data

@@ -113,16 +113,10 @@ class Placement:
 def newton_kernel(
     nv: int, njmax: int, elliptic: bool, ls_iterations: int, lanes: int, place: Placement, checked: bool
 ) -> wp.Kernel:
-    """Return the kernel of a `Problem`; launch it over (worlds, lanes).
+    """Return the kernel of a `Problem` with `nv` degrees of freedom; launch it over (worlds, lanes).
 
-    Args:
-        nv: number of degrees of freedom.
-        njmax: most rows of a world.
-        elliptic: whether friction cones are elliptic.
-        ls_iterations: most trials of a line search.
-        lanes: 32 on CUDA, 1 on the CPU.
-        place: where the worlds lie; rows that find no room on the chip are in the scratch.
-        checked: a debug build, which writes each world's broken `Invariant`s.
+    There are 32 lanes on CUDA and 1 on the CPU. Rows that find no room on the chip are in the scratch. A `checked`
+    (debug) build writes each world's broken `Invariant`s.
     """
     states, rows = mujoco.mjtConstraintState, mujoco.mjtConstraint
     constants = {

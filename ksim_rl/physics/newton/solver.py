@@ -86,8 +86,7 @@ def solver(
     """Return what launches the solver: accelerations and forces from the constraint rows, which must be sparse.
 
     Args:
-        warp_model: a model that is not `unsuited`.
-        warp_data_E: the worlds, with their arrays in their final place.
+        warp_model, warp_data_E: a model that is not `unsuited`, and its worlds, with arrays in their final place.
         place: how they lie on a CUDA device; None is what was measured to be best.
         broken: int32 [E], makes a debug build, which adds to each world's number the `Invariant`s that do not hold.
     """
@@ -95,12 +94,9 @@ def solver(
     elliptic = bool(m.opt.cone == mjw.ConeType.ELLIPTIC)
     on_cuda = d.qpos.device.is_cuda
     lanes = CUDA_LANES if on_cuda else 1
-    if place is None:
-        place = (
-            placement(nv=m.nv, njmax=d.njmax, elliptic=elliptic)
-            if on_cuda
-            else Placement(rows_on_chip=d.njmax)
-        )
+    if place is None and on_cuda:
+        place = placement(nv=m.nv, njmax=d.njmax, elliptic=elliptic)
+    place = place or Placement(rows_on_chip=d.njmax)
     ls_iterations, checked = int(m.opt.ls_iterations), broken is not None
     kernel = newton_kernel(m.nv, d.njmax, elliptic, ls_iterations, lanes, place, checked)
     far_floats = (d.njmax - place.rows_on_chip) * row_stride(m.nv)
@@ -125,20 +121,11 @@ def solver(
     return launch
 
 
-def step(
-    warp_model: mjw.Model,
-    warp_data_E: mjw.Data,
-    solve: Callable[[], None],
-    *,
-    sensors: bool,
-) -> None:
+def step(warp_model: mjw.Model, warp_data_E: mjw.Data, solve: Callable[[], None], *, sensors: bool) -> None:
     """Launch a physics step: that of MuJoCo Warp, with this solver.
 
-    Args:
-        warp_model: with `opt.run_qacc_smooth` off, since the solver does not need that acceleration.
-        warp_data_E: the worlds.
-        solve: their `solver`.
-        sensors: whether to compute them; they never change the state that is reached.
+    The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
+    not, never change the state that is reached.
     """
     m, d = warp_model, warp_data_E
     mjw.fwd_position(m, d, factorize=False)
