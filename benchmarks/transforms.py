@@ -56,7 +56,7 @@ from ksim_rl.device.streams import checked_device
 from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
 from ksim_rl.transforms import DelayCfg, GaussianNoise, UniformNoise
-from ksim_rl.transforms.groups.compile_groups import compile_groups
+from ksim_rl.transforms.groups.group_cfg import compile_groups
 
 NAMES = list(TERMS)
 HISTORY, MAX_LAG = 10, 3

@@ -14,7 +14,7 @@ from yaml import YAMLError
 from ksim_rl import algorithms, envs
 from ksim_rl.conf import choices, search_path
 from ksim_rl.conf.training import objective_defaults, training_defaults
-from ksim_rl.config import plugins, stored_configs
+from ksim_rl.config import plugins, upstream
 from ksim_rl.trainers import RunCfg
 from ksim_rl.trainers.run_cfg import without_env_size
 
@@ -53,14 +53,14 @@ def register() -> None:
 def _register(_named: tuple[str, ...]) -> None:
     search_path.register()
     envs.register_configs()
-    store = partial(stored_configs.store, package="_global_")
+    store = partial(upstream.store_config, package="_global_")
     choices.store_choices()
     for name in envs.names():
         store("task/training", name, partial(training_defaults, name))
         for objective in algorithms.names():
             make = partial(objective_defaults, name, objective)
             store("task/objective_training", f"{name}_{objective}", make)
-    stored_configs.quicken()
+    upstream.quicken()
 
 
 def register_run(folder: Path) -> bool:

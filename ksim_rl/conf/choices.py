@@ -9,7 +9,7 @@ from hydra.core.config_store import ConfigStore
 from ksim_rl import algorithms
 from ksim_rl.algorithms.off_policy import FEW_ENVS, MANY_ENVS
 from ksim_rl.algorithms.ppo import DATA
-from ksim_rl.config import stored_configs
+from ksim_rl.config import upstream
 from ksim_rl.config.config_tree import default_tree, to_tree
 from ksim_rl.modules import ActorCfg, CriticCfg, RecurrentCfg, SharedTrunkCfg
 from ksim_rl.trainers import Algorithm, ModulesCfg, RunCfg
@@ -50,18 +50,18 @@ def store_choices() -> None:
     """Store what each group offers, in `objective` the algorithms, and `run`, the fields of no group."""
     alone = ("task_name", "num_envs", "seed", "device", "checkpoint")
     ConfigStore.instance().store(name="run", node={name: DEFAULTS[name] for name in alone})
-    stored_configs.store("collector", "rollout", lambda: DEFAULTS["collector"])
-    stored_configs.store("trainer", "on_policy", lambda: DEFAULTS["trainer"])
+    upstream.store_config("collector", "rollout", lambda: DEFAULTS["collector"])
+    upstream.store_config("trainer", "on_policy", lambda: DEFAULTS["trainer"])
     choices = {group: dict(own) for group, own in CHOICES.items()}
     for name in algorithms.names():
         algorithm = algorithms.algorithm(name)
         chosen = {group: _name_of(group, algorithm) for group in ("data", "modules")}
         for group, choice in chosen.items():
             choices[group].setdefault(choice, getattr(algorithm, group))
-        stored_configs.store("objective", name, partial(_objective, algorithm, chosen))
+        upstream.store_config("objective", name, partial(_objective, algorithm, chosen))
     for group, own in choices.items():
         for name, cfg in own.items():
-            stored_configs.store(group, name, _maker(group, cfg))
+            upstream.store_config(group, name, _maker(group, cfg))
 
 
 def _maker(group: str, cfg: Any) -> Callable[[], dict[str, Any]]:

@@ -2,7 +2,7 @@
 
 import importlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from ksim_rl.checks import near
@@ -93,15 +93,12 @@ def _modules(name: str) -> list[str]:
     return list(dict.fromkeys([name, *(".".join(parts[:end]) for end in range(len(parts), 1, -1))]))
 
 
-def foreign(tree: Any) -> list[str]:
-    """Return the `_target_`s in a tree that are neither ours nor TorchRL's, each once, in order."""
-    found: dict[str, None] = {}
-    entries = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ()
+def foreign(tree: Any) -> Iterator[str]:
+    """Yield the `_target_`s in a tree that are neither ours nor TorchRL's."""
     if isinstance(tree, dict) and str(tree.get(TARGET, OWN)).split(".")[0] not in (OWN, "torchrl"):
-        found[str(tree[TARGET])] = None
-    for entry in entries:
-        found.update(dict.fromkeys(foreign(entry)))
-    return list(found)
+        yield str(tree[TARGET])
+    for entry in tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ():
+        yield from foreign(entry)
 
 
 def loading_notes(tree: Any) -> list[str]:

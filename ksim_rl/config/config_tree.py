@@ -127,42 +127,37 @@ def _match(option: Any, value: Any, path: str) -> Any:
     origin, arguments = typing.get_origin(option), typing.get_args(option)
     if origin is Literal:
         return value if value in arguments else _NO_MATCH
-    if origin is tuple:
+    if origin in (tuple, collections.abc.Sequence, list):
         if not isinstance(value, (list, tuple)):
             return _NO_MATCH
-        if len(arguments) == 2 and arguments[1] is Ellipsis:
-            return tuple(build_value(arguments[0], entry, f"{path}[{i}]") for i, entry in enumerate(value))
-        if len(arguments) != len(value):
-            return _NO_MATCH
-        return tuple(
-            build_value(a, entry, f"{path}[{i}]")
-            for i, (a, entry) in enumerate(zip(arguments, value, strict=True))
-        )
-    if origin in (collections.abc.Sequence, list):
-        if not isinstance(value, (list, tuple)):
-            return _NO_MATCH
-        if arguments[0] == NestedKey:
+        if arguments[0] == NestedKey and origin is not tuple:
             # A tuple is one nested key, so several keys are a list.
             return [_build_nested_key(entry, f"{path}[{i}]") for i, entry in enumerate(value)]
-        return tuple(build_value(arguments[0], entry, f"{path}[{i}]") for i, entry in enumerate(value))
+        kinds = arguments
+        if origin is not tuple or arguments[1:] == (...,):
+            kinds = arguments[:1] * len(value)
+        if len(kinds) != len(value):
+            return _NO_MATCH
+        entries = enumerate(zip(kinds, value, strict=True))
+        return tuple(build_value(kind, entry, f"{path}[{i}]") for i, (kind, entry) in entries)
     if origin in _MAPPINGS:
         if not isinstance(value, Mapping):
             return _NO_MATCH
         return {
-            _build_key(arguments[0], k, path): build_value(
-                arguments[1], entry, f"{path}.{k}" if path else str(k)
-            )
+            _build_key(arguments[0], k, path): build_value(arguments[1], entry, _join(path, k))
             for k, entry in value.items()
         }
-    if option is bool or option is str:
-        return value if isinstance(value, option) else _NO_MATCH
     if option is NestedKey:
         return _build_nested_key(value, path)
-    if option is int:
-        return value if isinstance(value, int) and not isinstance(value, bool) else _NO_MATCH
+    if option not in (bool, str, int, float) or isinstance(value, bool) and option is not bool:
+        return _NO_MATCH
     if option is float:
-        return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else _NO_MATCH
-    return _NO_MATCH
+        return float(value) if isinstance(value, (int, float)) else _NO_MATCH
+    return value if isinstance(value, option) else _NO_MATCH
+
+
+def _join(path: str, name: object) -> str:
+    return f"{path}.{name}" if path else str(name)
 
 
 def _build_nested_key(value: Any, path: str) -> NestedKey:
@@ -191,7 +186,7 @@ def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> 
             kinds = _describe(functools.reduce(operator.or_, bases))
             raise ValueError(f"{path}.{TARGET}={tree[TARGET]!r}: expected a kind of {kinds}")
     else:
-        cls = _default_class(functools.reduce(operator.or_, classes))
+        cls = next(option for option in classes if dataclasses.is_dataclass(option))
         if getattr(cls, "__abstractmethods__", None):
             raise ValueError(f"{path}: needs {TARGET}, the class of this {cls.__name__}")
     hints = typing.get_type_hints(cls)
@@ -200,25 +195,17 @@ def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> 
     for key, entry in tree.items():
         if key == TARGET:
             continue
-        where = f"{path}.{key}" if path else str(key)
+        where = _join(path, key)
         if key not in fields:
             raise ValueError(f"unknown field {where!r} of {cls.__name__}: {near(str(key), fields)}")
         given[key] = build_value(hints[key], entry, where)
-    missing = [
-        name
-        for name, field in fields.items()
-        if name not in given
-        and field.default is dataclasses.MISSING
-        and field.default_factory is dataclasses.MISSING
-    ]
-    if missing:
-        raise ValueError(
-            f"{path}: {cls.__name__} needs the field {missing[0]!r}: {_describe(hints[missing[0]])}"
-        )
+    for name, field in fields.items():
+        if name not in given and field.default is field.default_factory is dataclasses.MISSING:
+            raise ValueError(f"{path}: {cls.__name__} needs the field {name!r}: {_describe(hints[name])}")
     try:
         return cls(**given)
     except ValueError as error:
-        raise ValueError(f"{path}.{error}" if path else str(error)) from None
+        raise ValueError(_join(path, error)) from None
 
 
 def _alternatives(annotation: Any) -> list[Any]:

@@ -72,17 +72,11 @@ def check_key(tree: Mapping[str, Any], key: str) -> None:
     for depth, part in enumerate(parts):
         if isinstance(level, Mapping) and part in level:
             level = level[part]
-        elif (
-            isinstance(level, Sequence)
-            and not isinstance(level, str)
-            and part.isdigit()
-            and int(part) < len(level)
-        ):
+        elif isinstance(level, list | tuple) and part.isdigit() and int(part) < len(level):
             level = level[int(part)]
         else:
             above = ".".join(parts[:depth])
-            choices = (
-                [str(name) for name in level if name != "_target_"] if isinstance(level, Mapping) else []
-            )
+            names = level if isinstance(level, Mapping) else ()
+            choices = [str(name) for name in names if name != "_target_"]
             where = f"{above} has no field {part!r}" if above else f"no field {part!r}"
             raise ValueError(f"unknown field {key!r}: {where}: {near(part, choices)}")

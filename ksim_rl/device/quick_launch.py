@@ -7,6 +7,8 @@ issue it again; then only the bytes of its arguments are written, in one go.
 import ctypes
 import struct
 import threading
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 import warp as wp
@@ -70,6 +72,28 @@ class QuickLaunch:
         self._packer = struct.Struct("@" + "".join(_CODES[field[1]] for field in packed._fields_))
         self._recorded[device, dim] = launch, packed
         return launch, packed
+
+
+def as_operator(
+    name: str, launch: Callable[..., Any], fake: Callable[..., Any], *, mutates: Sequence[str] = ()
+) -> Callable[..., Any]:
+    """Return `launch` as a function that is a torch operator where code is traced.
+
+    Eager code goes past torch's dispatcher, which takes longer than the launch.
+
+    Args:
+        name: of the operator.
+        launch: takes what the operator does, annotated.
+        fake: returns an empty result for its arguments.
+        mutates: names of the arguments that it changes.
+    """
+    operator = torch.library.custom_op(f"ksim_rl::{name}", launch, mutates_args=mutates)
+    operator.register_fake(fake)
+
+    def run(*arguments: object) -> Any:
+        return (operator if torch.compiler.is_compiling() else launch)(*arguments)
+
+    return run
 
 
 def _current_stream(device: torch.device) -> wp.Stream:

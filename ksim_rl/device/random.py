@@ -20,7 +20,7 @@ import warp as wp
 from jaxtyping import Float32, Int, Int64
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import QuickLaunch
+from ksim_rl.device.quick_launch import QuickLaunch, as_operator
 
 DRAWS = r"""
     const unsigned golden = 0x9E3779B9u;
@@ -226,9 +226,7 @@ def _draw(
     start: int = 0,
     span: int = 1,
 ) -> Tensor:
-    # Eager code goes past torch's dispatcher, which takes longer than the launch.
-    run = _draw_operator if torch.compiler.is_compiling() else _draw_now
-    return run(*keys, n, kind, low, high, start, span)
+    return _drawn(*keys, n, kind, low, high, start, span)
 
 
 def _draw_now(
@@ -259,11 +257,10 @@ def _draw_now(
     return out_EL
 
 
-_draw_operator = torch.library.custom_op("ksim_rl::draw", _draw_now, mutates_args=())
-
-
-@_draw_operator.register_fake
-def _(
+def _draw_empty(
     seed: Tensor, stream: int, counter: Tensor, num_rows: int, n: int, kind: int, *options: float
 ) -> Tensor:
     return seed.new_empty((num_rows, n), dtype=torch.int64 if kind == _INTEGER else torch.float32)
+
+
+_drawn = as_operator("draw", _draw_now, _draw_empty)

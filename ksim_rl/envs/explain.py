@@ -17,8 +17,8 @@ from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.physics import World
-from ksim_rl.transforms.groups.compile_groups import compile_groups
-from ksim_rl.transforms.groups.group_spec import spell
+from ksim_rl.transforms.groups.group_cfg import compile_groups
+from ksim_rl.transforms.groups.groups import spell
 from ksim_rl.transforms.transform_cfg import TransformCfg
 
 WIDTH = 120

@@ -12,7 +12,7 @@ from torchrl.envs.transforms import Compose, Transform
 
 from ksim_rl import dims
 from ksim_rl.envs.masked_reset import MaskedReset
-from ksim_rl.transforms.keyed_transform import KeyedTransform
+from ksim_rl.transforms.row_transform import KeyedTransform
 
 _BASE, _TRANSFORM, _ROOT = "base_env.", "transform.", "last_root."
 

@@ -16,15 +16,15 @@ from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
 from ksim_rl.checks import unknown_name
-from ksim_rl.config import plugins, stored_configs
+from ksim_rl.config import plugins, upstream
 from ksim_rl.config.config_tree import from_tree, to_tree
 from ksim_rl.config.overrides import check_overrides
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
 from ksim_rl.envs.task import Task
-from ksim_rl.transforms.groups.compile_groups import compile_groups
-from ksim_rl.transforms.level import follow_level
+from ksim_rl.transforms.groups.group_cfg import compile_groups
+from ksim_rl.transforms.row_transform import follow_level
 
 _CONFIG = "ksim_rl_env"
 # Imported by name when tasks are first asked for: they stand above this room and import it.
@@ -82,7 +82,7 @@ def register_configs() -> None:
 @cache
 def _register(names: tuple[str, ...]) -> None:
     for name in names:
-        stored_configs.store("task", name, partial(_tree, name))
+        upstream.store_config("task", name, partial(_tree, name))
     ConfigStore.instance().store(name=_CONFIG, node={"defaults": [{"task": "???"}, "_self_"]})
 
 
@@ -122,7 +122,7 @@ def build(
     level = base_env.view.level
     env = MaskedTransformedEnv(base_env, compile_groups(cfg.observations, level=level))
     for name, described in cfg.transforms.items():
-        transform = described.build()
+        transform = described.build(name)
         follow_level([transform], level)
         try:
             env.append_transform(transform)

@@ -29,7 +29,7 @@ from ksim_rl.transforms import (
     mirror_group,
     mirror_joints,
 )
-from ksim_rl.transforms.mirror.mirror_map import concatenate, unchanged
+from ksim_rl.transforms.mirror.mirror import concatenate, unchanged
 
 _SENSORS = {
     **dict.fromkeys(("GYRO", "TORQUE", "FRAMEANGVEL", "FRAMEANGACC", "BALLANGVEL", "SUBTREEANGMOM"), AXIAL),

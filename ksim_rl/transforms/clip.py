@@ -1,6 +1,6 @@
 """Observations, rewards and actions are limited by the transforms of this module."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Num
@@ -10,13 +10,28 @@ from torchrl.data import TensorSpec, Unbounded
 
 from ksim_rl import checks
 from ksim_rl.transforms.elementwise import ActionMap, ObservationMap, RewardMap
-from ksim_rl.transforms.row_transform import Keys
+from ksim_rl.transforms.row_transform import Keys, one_per_key
 from ksim_rl.transforms.specs import bounded, bounds
 
 Range = tuple[float | None, float | None]
 
 
-class ObservationClip(ObservationMap):
+class _Clip:
+    """The limits of each key, and what they do to values and specs."""
+
+    ranges: Sequence[Range]
+
+    def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
+        """Narrow the bounds."""
+        low, high = (end.clamp(*self.ranges[index]) for end in bounds(spec))
+        return bounded(low, high, dtype=spec.dtype, device=spec.device)
+
+    def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
+        """Clip."""
+        return torch.clamp(value, *self.ranges[index])
+
+
+class ObservationClip(_Clip, ObservationMap):
     """Clip observations to [low, high]; NaN stays NaN.
 
     Args:
@@ -32,22 +47,12 @@ class ObservationClip(ObservationMap):
         self, in_keys: Keys, out_keys: Keys | None = None, *, clip: Range | Mapping[NestedKey, Range]
     ) -> None:
         super().__init__(in_keys, out_keys)
-        if isinstance(clip, Mapping) and set(clip) != set(self.in_keys):
-            raise ValueError(f"clip has the keys {list(clip)}, but in_keys={self.in_keys}: give one per key")
-        self.ranges = [clip[key] if isinstance(clip, Mapping) else clip for key in self.in_keys]
+        self.ranges = one_per_key("clip", clip, self.in_keys)
         for key, ends in zip(self.in_keys, self.ranges, strict=True):
             check_clip(f"clip of {key!r}", ends)
 
-    def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
-        """Narrow the bounds."""
-        return _clipped_spec(spec, self.ranges[index])
 
-    def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
-        """Clip."""
-        return torch.clamp(value, *self.ranges[index])
-
-
-class RewardClip(RewardMap):
+class RewardClip(_Clip, RewardMap):
     """Clip rewards to [low, high]; NaN stays NaN.
 
     Args:
@@ -62,18 +67,10 @@ class RewardClip(RewardMap):
     def __init__(self, in_keys: Keys = "reward", out_keys: Keys | None = None, *, clip: Range) -> None:
         super().__init__(in_keys, out_keys)
         check_clip("clip", clip)
-        self.clip = clip
-
-    def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
-        """Narrow the bounds."""
-        return _clipped_spec(spec, self.clip)
-
-    def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
-        """Clip."""
-        return torch.clamp(value, *self.clip)
+        self.ranges = [clip] * len(self.in_keys)
 
 
-class ActionClip(ActionMap):
+class ActionClip(_Clip, ActionMap):
     """The env receives the action clipped to [low, high]; the policy may ask for any number. NaN stays NaN.
 
     The tensordict keeps the action that the policy chose.
@@ -92,20 +89,11 @@ class ActionClip(ActionMap):
     ) -> None:
         super().__init__(in_keys_inv, out_keys_inv)
         check_clip("clip", clip)
-        self.clip = clip
+        self.ranges = [clip] * len(self.in_keys_inv)
 
     def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
         """Remove the bounds."""
         return Unbounded(spec.shape, dtype=spec.dtype, device=spec.device)
-
-    def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
-        """Clip."""
-        return torch.clamp(value, *self.clip)
-
-
-def _clipped_spec(spec: TensorSpec, ends: Range) -> TensorSpec:
-    low, high = (end.clamp(*ends) for end in bounds(spec))
-    return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
 
 def check_clip(field: str, ends: Range) -> None:

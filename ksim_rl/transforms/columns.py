@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
+from ksim_rl.transforms import upstream
+
 
 def side_by_side(values: Sequence[Shaped[Tensor, "*?leaf"]], num_rows: int) -> Shaped[Tensor, "E L"]:
     """Return values [E, ...] as the columns of one tensor [E, L], without a copy where they are that already.
@@ -23,12 +25,12 @@ def side_by_side(values: Sequence[Shaped[Tensor, "*?leaf"]], num_rows: int) -> S
 
 def _whole(vectors: list[Tensor]) -> Tensor | None:
     """Return the tensor whose columns, all of them and in this order, the vectors are; None if there is none."""
-    owner = vectors[0]._base
+    owner = upstream.base_of(vectors[0])
     if owner is None:
         return None
     width, offset = vectors[0].stride(0), 0
     for vector in vectors:
-        placed = vector._base is owner and vector.storage_offset() == offset
+        placed = upstream.base_of(vector) is owner and vector.storage_offset() == offset
         if not placed or vector.dtype != owner.dtype or vector.stride() != (width, 1):
             return None
         offset += vector.shape[1]

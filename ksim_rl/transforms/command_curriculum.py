@@ -10,14 +10,8 @@ from torchrl.data import Bounded, Composite
 
 from ksim_rl import checks
 from ksim_rl.device import random
-from ksim_rl.transforms.keyed_transform import KeyedTransform
-from ksim_rl.transforms.row_transform import Keys, as_keys
-from ksim_rl.transforms.specs import (
-    Device,
-    bounded,
-    leaf_spec,
-    set_leaf_spec,
-)
+from ksim_rl.transforms.row_transform import KeyedTransform, Keys, as_keys
+from ksim_rl.transforms.specs import bounded, leaf_spec, set_leaf_spec
 
 Ranges = Sequence[tuple[float, float]]
 
@@ -124,21 +118,15 @@ class RandomCommandCurriculum(KeyedTransform):
         set_leaf_spec(observations, self.out_keys[0], bounded(*ends, dtype=torch.float32, device=device))
         level = Bounded(0.0, 1.0, torch.Size([*batch, 1]), dtype=torch.float32, device=device)
         set_leaf_spec(observations, self.out_keys[1], level)
-        self._size(batch.numel(), device)
+        self._size_rows(observations)
+        if self._buffers["level_E"] is None:
+            self._buffers["level_E"] = torch.full((self.num_rows,), float(self.initial_level), device=device)
+        self._size_buffer("score_E", torch.float32)
+        self._size_buffer("age_E", torch.int64)
+        self._size_buffer("command_EL", torch.float32, self.ends_22L.shape[-1:])
         return output_spec
 
-    def _size(self, num_rows: int, device: Device) -> None:
-        self._size_rows(num_rows, device)
-        if self._buffers["level_E"] is None:
-            self._buffers["level_E"] = torch.full((num_rows,), float(self.initial_level), device=device)
-        self._size_buffer("score_E", (num_rows,), torch.float32, device)
-        self._size_buffer("age_E", (num_rows,), torch.int64, device)
-        self._size_buffer("command_EL", (num_rows, self.ends_22L.shape[-1]), torch.float32, device)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if self._buffers["level_E"] is None or not self.num_rows:
-            self._size(tensordict_reset.numel(), tensordict_reset.device)
-        mask_E = self._reset_rows(tensordict, tensordict_reset)
+    def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
         self._move_levels(mask_E)
         self.score_E.masked_fill_(mask_E, 0.0)
         self.age_E.masked_fill_(mask_E, 0)
@@ -156,6 +144,7 @@ class RandomCommandCurriculum(KeyedTransform):
         self.level_E.copy_(level_E.clamp(0.0, 1.0))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._sized()
         self.step_count.add_(1)
         self.age_E.add_(1)
         for key in self.in_keys:

@@ -1,14 +1,161 @@
 """Observations and actions arrive some env steps late by the transforms of this module."""
 
+from dataclasses import dataclass
+from typing import Any
+
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
-from ksim_rl.transforms.columns import side_by_side, split
-from ksim_rl.transforms.lagged_transform import DelayCfg, LaggedTransform
-from ksim_rl.transforms.row_transform import Keys, as_keys, checked_action, checked_out_keys
-from ksim_rl.transforms.specs import Device, leaf_spec, set_leaf_spec
+from ksim_rl.checked import Checked, Share, WholeNumber
+from ksim_rl.device import random
+from ksim_rl.transforms import ring
+from ksim_rl.transforms.history import RingTransform
+from ksim_rl.transforms.row_transform import (
+    FollowsLevel,
+    KeyedTransform,
+    Keys,
+    RowTransform,
+    as_keys,
+    checked_action,
+    checked_out_keys,
+)
+from ksim_rl.transforms.specs import replace_leaves
+
+
+@dataclass(frozen=True, kw_only=True)
+class DelayCfg(Checked):
+    """A lag in env steps, drawn uniformly from {min_lag, ..., max_lag}.
+
+    Args:
+        min_lag, max_lag: env steps, both included.
+        per_env: True draws a lag per env when that env resets. False draws one lag for all envs; it changes when all
+            envs reset at once, not when some do.
+        resample_every: env steps after which a new lag is drawn within an episode; 0 keeps it. Counted per env since
+            its reset, or since all envs last reset together.
+        hold_probability: chance that such a draw leaves the lag as it is.
+        by_level: whether the transform's level (see `FollowsLevel`) sets the reach: lags are drawn from
+            {min_lag, ..., min_lag + round(level * (max_lag - min_lag))}.
+    """
+
+    min_lag: WholeNumber = 0
+    max_lag: WholeNumber
+    per_env: bool = True
+    resample_every: WholeNumber = 0
+    hold_probability: Share = 0.0
+    by_level: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.min_lag > self.max_lag:
+            raise ValueError(f"min_lag={self.min_lag} exceeds max_lag={self.max_lag}")
+        if self.hold_probability and not self.resample_every:
+            raise ValueError(
+                f"hold_probability={self.hold_probability} without resample_every: there is no draw to hold"
+            )
+
+
+class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
+    """Holds the last `max_lag + 1` values per key in ring buffers, and a lag per env.
+
+    Args:
+        delay: how lags are drawn.
+        num_signals: number of ring buffers.
+        **others: see `KeyedTransform`.
+    """
+
+    purposes = ("step/lag", "step/hold", "reset/lag")
+
+    lag_E: Tensor
+    shared_count: Tensor
+    shared_age: Tensor
+
+    def __init__(
+        self, delay: DelayCfg, num_signals: int, *, seed: int = 0, stream: str | None = None, **keys: Keys
+    ) -> None:
+        rings = [f"ring_{index}" for index in range(num_signals)]
+        super().__init__(**keys, row_buffers=["lag_E", "age_E", *rings], seed=seed, stream=stream)
+        self.delay = delay
+        self.num_slots = delay.max_lag + 1
+        # Unlike the count of steps that keys the draws, no seed turns the ages back: they show where the rings stand.
+        for name in ("shared_count", "shared_age"):
+            self.register_buffer(name, torch.zeros((), dtype=torch.int64))
+        self._register_level(is_used=delay.by_level)
+
+    def seed_(self, seed: int) -> "LaggedTransform":
+        """Set the seed and start the counters of draws anew, in place."""
+        self.shared_count.zero_()
+        return super().seed_(seed)
+
+    def _size_rows(self, specs: Composite) -> None:
+        super()._size_rows(specs)
+        self._size_buffer("lag_E", torch.int64)
+        if self._is_fixed:
+            self.lag_E.fill_(self.delay.min_lag)
+
+    @property
+    def _is_fixed(self) -> bool:
+        """Whether there is one lag only, and nothing to draw."""
+        return self.delay.min_lag == self.delay.max_lag
+
+    def _advance(self) -> None:
+        """Draw new lags for the env step to come, where they are due."""
+        delay = self.delay
+        if not delay.resample_every or self._is_fixed:
+            return
+        self.step_count.add_(1)
+        # A shared lag is drawn once: a single row broadcasts over all.
+        num_rows, age = (self.num_rows, self.age_E + 1) if delay.per_env else (1, self.shared_age.add_(1))
+        due = age % delay.resample_every == 0
+        if delay.hold_probability:
+            chance = random.uniform(self._step_keys("step/hold", num_rows), 1)[:, 0]
+            due = due & (chance >= delay.hold_probability)
+        self.lag_E.copy_(torch.where(due, self._draw(self._step_keys("step/lag", num_rows)), self.lag_E))
+
+    def _rows_that_reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
+        """Return which rows reset, bool [E], with what the rings do not do as these rows begin."""
+        if self._draws_in_ring:
+            return RowTransform._rows_that_reset(self, tensordict, tensordict_reset)
+        mask_E = super()._rows_that_reset(tensordict, tensordict_reset)
+        if self._is_fixed:
+            return mask_E
+        if self.delay.per_env:
+            lag_E = self._draw(self._reset_keys("reset/lag"))
+            self.lag_E.copy_(torch.where(mask_E, lag_E, self.lag_E))
+            return mask_E
+        together = mask_E.all()
+        self.shared_count.add_(together)
+        self.shared_age.mul_(~together)
+        keys = random.row_keys(self.seed_value, self._stream_ids["reset/lag"], self.shared_count, 1)
+        self.lag_E.copy_(torch.where(together, self._draw(keys), self.lag_E))
+        return mask_E
+
+    @property
+    def _draws_in_ring(self) -> bool:
+        """Whether the launch that lets rows begin draws their lags too."""
+        return self.delay.per_env and not self.delay.by_level and not self._is_fixed
+
+    def _draw(self, keys: random.RowKeys) -> Tensor:
+        """Draw lags, int64 [E] or [1]."""
+        delay = self.delay
+        if not delay.by_level:
+            return random.integers(keys, 1, delay.min_lag, delay.max_lag)[:, 0]
+        reach = (self.level * (delay.max_lag - delay.min_lag)).round().long()
+        return random.integers(keys, 1, delay.min_lag, delay.min_lag + reach)[:, 0]
+
+    def _through(self, index: int, value: Tensor, mask_E: Tensor | None) -> Tensor:
+        buffers: dict[str, Any] = self._buffers
+        ring_EM, age_E, lag_E = buffers[f"ring_{index}"], buffers["age_E"], buffers["lag_E"]
+        value_E = value if value.ndim == ring_EM.ndim - 1 else value.reshape(-1, *ring_EM.shape[2:])
+        if mask_E is None:
+            counts = index == self._num_rings - 1
+            return ring.push(ring_EM, age_E, value_E, lag_E=lag_E, counts=counts)
+        lags = None
+        if index == 0 and self._draws_in_ring:
+            state = lag_E, buffers["seed_value"], buffers["reset_count_E"], self._stream_ids["reset/lag"]
+            lags = ring.Lags(*state, self.delay.min_lag, self.delay.max_lag)
+        return ring.begin(ring_EM, age_E, value_E, mask_E, lags=lags)
 
 
 class ObservationDelay(LaggedTransform):
@@ -40,63 +187,20 @@ class ObservationDelay(LaggedTransform):
         in_keys = as_keys(in_keys)
         out_keys = checked_out_keys(in_keys, out_keys)
         super().__init__(delay, len(in_keys), in_keys=in_keys, out_keys=out_keys, seed=seed, stream=stream)
-        self._is_joined = False
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Give the delayed observations the specs of the prompt ones."""
-        specs = [leaf_spec(observation_spec, key, type(self).__name__) for key in self.in_keys]
-        for out_key, spec in zip(self.out_keys, specs, strict=True):
-            set_leaf_spec(observation_spec, out_key, spec.clone())
-        batch_dims = observation_spec.ndim
-        self._size_signals(
-            observation_spec.shape.numel(),
-            [spec.shape[batch_dims:] for spec in specs],
-            [spec.dtype for spec in specs],
-            observation_spec.device,
-        )
+        leaves = replace_leaves(observation_spec, self.in_keys, self.out_keys, type(self).__name__)
+        self._size_rings(observation_spec, leaves)
         return observation_spec
 
-    def _size_signals(
-        self, num_rows: int, shapes: list[torch.Size], dtypes: list[torch.dtype], device: Device
-    ) -> None:
-        """Make one ring for all observations where they are of one dtype, and one for each otherwise."""
-        self._is_joined = len(shapes) > 1 and len(set(dtypes)) == 1
-        if self._is_joined:
-            shapes, dtypes = [torch.Size([sum(shape.numel() for shape in shapes)])], dtypes[:1]
-        self._size_lags(num_rows, shapes, dtypes, device)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        values = self._read(tensordict_reset)
-        mask_E = self._rows_that_reset(tensordict, tensordict_reset)
-        return self._pass(tensordict_reset, values, mask_E)
+    def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
+        return self._pass(tensordict_reset, [tensordict_reset.get(key) for key in self.in_keys], mask_E)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(next_tensordict)
+        self._sized()
         self._advance()
-        return self._pass(next_tensordict, values, None)
-
-    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """Return the prompt observations, and make what the specs have not made yet."""
-        values = [tensordict.get(key) for key in self.in_keys]
-        if not self.num_rings:
-            shapes = [value.shape[tensordict.ndim :] for value in values]
-            dtypes = [value.dtype for value in values]
-            self._size_signals(tensordict.numel(), shapes, dtypes, tensordict.device)
-        return values
-
-    def _pass(
-        self, tensordict: TensorDictBase, values: list[Tensor], mask_E: Tensor | None
-    ) -> TensorDictBase:
-        """Send the values through the rings, and write what comes out; a mask says which rows begin with them."""
-        found = values
-        if self._is_joined:
-            found = [side_by_side(values, self.num_rows)]
-        found = [self._through(index, value, mask_E) for index, value in enumerate(found)]
-        if self._is_joined:
-            found = split(found[0], values)
-        for out_key, value in zip(self.out_keys, found):  # noqa: B905 (strict takes time in every step)
-            tensordict.set(out_key, value)
-        return tensordict
+        return self._pass(next_tensordict, [next_tensordict.get(key) for key in self.in_keys], None)
 
 
 class ActionDelay(LaggedTransform):
@@ -133,40 +237,25 @@ class ActionDelay(LaggedTransform):
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
         """Move the specs to where the policy writes."""
-        specs = [leaf_spec(action_spec, key, type(self).__name__) for key in self.in_keys_inv]
-        for key, out_key, spec in zip(self.in_keys_inv, self.out_keys_inv, specs, strict=True):
-            if key != out_key:
-                del action_spec[key]
-                set_leaf_spec(action_spec, out_key, spec.clone())
-        batch_dims = action_spec.ndim
-        self._size_lags(
-            action_spec.shape.numel(),
-            [spec.shape[batch_dims:] for spec in specs],
-            [spec.dtype for spec in specs],
-            action_spec.device,
-        )
+        owner = type(self).__name__
+        leaves = replace_leaves(action_spec, self.in_keys_inv, self.out_keys_inv, owner, moves=True)
+        self._size_rings(action_spec, leaves, joins=False)
         return action_spec
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if not self._sized:
-            # The action's shape is in the specs only, and they size the buffers.
-            assert self.container is not None and self.container.input_spec is not None
-        mask_E = self._rows_that_reset(tensordict, tensordict_reset)
+    def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
         for index in range(len(self.in_keys_inv)):
-            ring_EM: torch.Tensor = getattr(self, f"ring_{index}")
+            ring_EM: Tensor = getattr(self, f"ring_{index}")
             self._through(index, torch.full_like(ring_EM[:, 0], self.initial), mask_E)
         return tensordict_reset
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if not self._sized:
-            raise RuntimeError("ActionDelay has state per env: use it in an env, not on a batch of samples")
-        actions = [self._checked(index, tensordict, key) for index, key in enumerate(self.out_keys_inv)]
+        rings = [self._sized()[f"ring_{index}"] for index in range(len(self.in_keys_inv))]
+        # Refused before the lags move.
+        actions = [
+            checked_action(tensordict, key, ring_EM.shape[2:], ring_EM.dtype)
+            for key, ring_EM in zip(self.out_keys_inv, rings, strict=True)
+        ]
         self._advance()
         for index, (key, action) in enumerate(zip(self.in_keys_inv, actions, strict=True)):
-            tensordict.set(key, self._through(index, action, None))
+            tensordict.set(key, self._through(index, action, None).view(action.shape))
         return tensordict
-
-    def _checked(self, index: int, tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
-        """Return the action, refused here since the env sees it only after the buffer."""
-        ring_EM: torch.Tensor = getattr(self, f"ring_{index}")
-        return checked_action(tensordict, key, ring_EM.shape[2:], ring_EM.dtype)

@@ -2,35 +2,36 @@
 
 from abc import abstractmethod
 
-from jaxtyping import Num, Shaped
+from jaxtyping import Num
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs.transforms import Transform
 
 from ksim_rl.transforms.row_transform import Keys, as_keys, checked_out_keys
-from ksim_rl.transforms.specs import drop_leaf_spec, floating_spec, leaf_spec, set_leaf_spec
+from ksim_rl.transforms.specs import replace_leaves
 
 
-class _Outward(Transform):
+class _Map(Transform):
+    @abstractmethod
+    def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
+        """Return the spec of what becomes of the leaf of the in key with this index (for actions: was before)."""
+
+    @abstractmethod
+    def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
+        """Return what becomes of a value of that leaf."""
+
+
+class _Outward(_Map):
     """Base for what the env emits: floating-point leaves, replaced on batches of samples as in an env."""
 
     def __init__(self, in_keys: Keys, out_keys: Keys | None) -> None:
         keys = as_keys(in_keys)
         super().__init__(keys, checked_out_keys(keys, out_keys))
 
-    @abstractmethod
-    def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
-        """Return the spec of what becomes of the leaf of the in key with this index."""
-
-    @abstractmethod
-    def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
-        """Return what becomes of a value of that leaf."""
-
     def _new_specs(self, specs: Composite) -> Composite:
-        found = [floating_spec(specs, key, type(self).__name__) for key in self.in_keys]
-        for index, (out_key, spec) in enumerate(zip(self.out_keys, found, strict=True)):
-            set_leaf_spec(specs, out_key, self.new_spec(index, spec))
+        owner = type(self).__name__
+        replace_leaves(specs, self.in_keys, self.out_keys, owner, self.new_spec, is_floating=True)
         return specs
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -62,31 +63,17 @@ class RewardMap(_Outward):
         return self._new_specs(reward_spec)
 
 
-class ActionMap(Transform):
+class ActionMap(_Map):
     """Base of those that replace the action on its way to the env; the tensordict keeps what the policy chose."""
 
     def __init__(self, in_keys_inv: Keys, out_keys_inv: Keys | None) -> None:
         keys = as_keys(in_keys_inv)
         super().__init__(in_keys_inv=keys, out_keys_inv=checked_out_keys(keys, out_keys_inv))
 
-    @abstractmethod
-    def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
-        """Return the spec of what the policy writes, from that of the action which the env reads."""
-
-    @abstractmethod
-    def new_value(self, index: int, value: Shaped[Tensor, "*leaf"]) -> Shaped[Tensor, "*leaf"]:
-        """Return what the env reads, from what the policy wrote."""
-
     def transform_action_spec(self, action_spec: Composite) -> Composite:
         """Replace the specs, and move them to where the policy writes."""
-        specs = [leaf_spec(action_spec, key, type(self).__name__) for key in self.in_keys_inv]
-        for index, (key, out_key, spec) in enumerate(
-            zip(self.in_keys_inv, self.out_keys_inv, specs, strict=True)
-        ):
-            replaced = self.new_spec(index, spec)
-            if key != out_key:
-                drop_leaf_spec(action_spec, key)
-            set_leaf_spec(action_spec, out_key, replaced)
+        owner = type(self).__name__
+        replace_leaves(action_spec, self.in_keys_inv, self.out_keys_inv, owner, self.new_spec, moves=True)
         return action_spec
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -1,5 +1,6 @@
-"""Observations show their last frames by the transform of this module."""
+"""This module holds the base of transforms that remember the last values of signals, and histories of observations."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,26 +9,69 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
-from ksim_rl import checks
+from ksim_rl.checked import Checked, Count
 from ksim_rl.transforms import ring
 from ksim_rl.transforms.columns import side_by_side
-from ksim_rl.transforms.row_transform import (
-    Keys,
-    RowTransform,
-    as_keys,
-    checked_out_keys,
-)
-from ksim_rl.transforms.specs import (
-    Device,
-    bounded,
-    bounds,
-    leaf_spec,
-    set_leaf_spec,
-)
+from ksim_rl.transforms.row_transform import Keys, RowTransform, as_keys, checked_out_keys
+from ksim_rl.transforms.specs import bounded, bounds, replace_leaves
+
+
+class RingTransform(RowTransform):
+    """Base of transforms that pass signals through rings of slots, see `ring`.
+
+    Attributes:
+        num_slots: values that a ring holds per env.
+        num_frames: values that come out of it at each step.
+    """
+
+    num_slots = 1
+    num_frames = 1
+    _is_joined = False
+    _num_rings = 0
+
+    age_E: Tensor
+
+    def _size_rings(self, specs: Composite, leaves: Sequence[TensorSpec], *, joins: bool = True) -> None:
+        """Make one ring [E, M, ...] per signal, or with `joins` one for all signals where they are of one dtype."""
+        self._size_rows(specs)
+        self._size_buffer("age_E", torch.int64)
+        shapes, dtypes = [leaf.shape[specs.ndim :] for leaf in leaves], [leaf.dtype for leaf in leaves]
+        self._is_joined = joins and len(shapes) > 1 and len(set(dtypes)) == 1
+        if self._is_joined:
+            sizes = [shape.numel() for shape in shapes]
+            if self.num_frames > 1:
+                part_bytes = torch.tensor([size * dtypes[0].itemsize for size in sizes], dtype=torch.int32)
+                self._buffers["part_bytes"] = part_bytes.to(self._row_device)
+            shapes, dtypes = [torch.Size([sum(sizes)])], dtypes[:1]
+        self._num_rings = len(shapes)
+        for index, (shape, dtype) in enumerate(zip(shapes, dtypes, strict=True)):
+            self._size_buffer(f"ring_{index}", dtype, (self.num_slots, *shape))
+
+    def _pass(
+        self, tensordict: TensorDictBase, values: list[Tensor], mask_E: Tensor | None
+    ) -> TensorDictBase:
+        """Send the values through the rings, and write what comes out; a mask says which rows begin with them."""
+        if self._is_joined:
+            joined_EL = self._through(0, side_by_side(values, self.num_rows), mask_E)
+            sizes = [self.num_frames * value.numel() // self.num_rows for value in values]
+            found = joined_EL.split(sizes, dim=1)
+        else:
+            found = [self._through(index, value, mask_E) for index, value in enumerate(values)]
+        for out_key, value, found_EL in zip(self.out_keys, values, found):  # noqa: B905 (strict takes time in every step)
+            tensordict.set(out_key, self._shaped(found_EL, value, tensordict.batch_size))
+        return tensordict
+
+    def _through(self, index: int, value: Tensor, mask_E: Tensor | None) -> Tensor:
+        """Write this step's value [E, ...] and return what is due, [E, N * L]; masked rows begin with it."""
+        raise NotImplementedError
+
+    def _shaped(self, found_EL: Tensor, value: Tensor, batch_size: torch.Size) -> Tensor:
+        """Return what comes out in the shape that the env emits."""
+        return found_EL if found_EL.shape == value.shape else found_EL.reshape(value.shape)
 
 
 @dataclass(frozen=True, kw_only=True)
-class HistoryCfg:
+class HistoryCfg(Checked):
     """The last `length` frames, oldest first.
 
     Args:
@@ -36,18 +80,12 @@ class HistoryCfg:
         flat: True puts frame after frame into one vector; False stacks them along a dim of their own.
     """
 
-    length: int
-    stride: int = 1
+    length: Count
+    stride: Count = 1
     flat: bool = True
 
-    def __post_init__(self) -> None:
-        for field in ("length", "stride"):
-            checks.check_count(field, getattr(self, field))
-        if not isinstance(self.flat, bool):
-            raise ValueError(f"flat={self.flat!r}: expected True or False")
 
-
-class ObservationHistory(RowTransform):
+class ObservationHistory(RingTransform):
     """The last N frames, oldest first; frames from before a reset are the reset observation.
 
     Args:
@@ -61,108 +99,59 @@ class ObservationHistory(RowTransform):
         >>> history = ObservationHistory(["joint_pos"], ["joint_pos_history"], length=10)
     """
 
-    age_E: Tensor
-
     def __init__(
-        self,
-        in_keys: Keys,
-        out_keys: Keys | None = None,
-        *,
-        length: int,
-        stride: int = 1,
-        flat: bool = True,
+        self, in_keys: Keys, out_keys: Keys | None = None, *, length: int, stride: int = 1, flat: bool = True
     ) -> None:
         HistoryCfg(length=length, stride=stride, flat=flat)
         in_keys = as_keys(in_keys)
         rings = [f"ring_{index}" for index in range(len(in_keys))]
         super().__init__(in_keys, checked_out_keys(in_keys, out_keys), row_buffers=["age_E", *rings])
-        self.length, self.stride, self.flat = length, stride, flat
+        self.num_frames = self.length = length
+        self.stride, self.flat = stride, flat
         self.num_slots = (length - 1) * stride + 1
-        self._is_joined = False
         # What all frames of an observation take in memory, where several are in one ring.
         self.register_buffer("part_bytes", None, persistent=False)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Repeat the specs N times."""
-        batch_dims = observation_spec.ndim
-        specs = [leaf_spec(observation_spec, key, type(self).__name__) for key in self.in_keys]
-        for out_key, spec in zip(self.out_keys, specs, strict=True):
-            set_leaf_spec(observation_spec, out_key, self._repeated(spec, batch_dims))
-        self._size_rings(
-            observation_spec.shape.numel(),
-            [spec.shape[batch_dims:] for spec in specs],
-            [spec.dtype for spec in specs],
-            observation_spec.device,
+        leaves = replace_leaves(
+            observation_spec,
+            self.in_keys,
+            self.out_keys,
+            type(self).__name__,
+            lambda _index, spec: self._repeated(spec, observation_spec.ndim),
         )
+        self._size_rings(observation_spec, leaves)
         return observation_spec
 
     def _repeated(self, spec: TensorSpec, batch_dims: int) -> TensorSpec:
         batch, leaf = spec.shape[:batch_dims], spec.shape[batch_dims:]
-        stacked = spec.unsqueeze(batch_dims).expand(*batch, self.length, *leaf)
+        stacked = spec.unsqueeze(batch_dims).expand(*batch, self.num_frames, *leaf)
         if not self.flat:
             return stacked.clone()
-        shape = torch.Size([*batch, self.length * leaf.numel()])
+        shape = torch.Size([*batch, self.num_frames * leaf.numel()])
         if not isinstance(spec, Bounded) or not spec.dtype.is_floating_point:
             return Unbounded(shape, dtype=spec.dtype, device=spec.device)
         low, high = (end.reshape(shape) for end in bounds(stacked))
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
-    def _size_rings(
-        self, num_rows: int, shapes: list[torch.Size], dtypes: list[torch.dtype], device: Device
-    ) -> None:
-        """Make one ring for all observations where they are of one dtype, and one for each otherwise."""
-        self._size_rows(num_rows, device)
-        self._size_buffer("age_E", (num_rows,), torch.int64, device)
-        self._is_joined = len(shapes) > 1 and len(set(dtypes)) == 1
-        if self._is_joined:
-            sizes = [shape.numel() for shape in shapes]
-            part_bytes = [size * dtypes[0].itemsize for size in sizes]
-            self._buffers["part_bytes"] = torch.tensor(part_bytes, dtype=torch.int32).to(device)
-            shapes, dtypes = [torch.Size([sum(sizes)])], dtypes[:1]
-        for index, (shape, dtype) in enumerate(zip(shapes, dtypes, strict=True)):
-            self._size_buffer(f"ring_{index}", (num_rows, self.num_slots, *shape), dtype, device)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        values = [tensordict_reset.get(key) for key in self.in_keys]
-        if self._buffers["ring_0"] is None or not self.num_rows:
-            shapes = [value.shape[tensordict_reset.ndim :] for value in values]
-            dtypes = [value.dtype for value in values]
-            self._size_rings(tensordict_reset.numel(), shapes, dtypes, tensordict_reset.device)
-        return self._pass(tensordict_reset, values, self._reset_rows(tensordict, tensordict_reset))
+    def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
+        return self._pass(tensordict_reset, [tensordict_reset.get(key) for key in self.in_keys], mask_E)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._sized()
         return self._pass(next_tensordict, [next_tensordict.get(key) for key in self.in_keys], None)
 
-    def _pass(
-        self, tensordict: TensorDictBase, values: list[Tensor], mask_E: Tensor | None
-    ) -> TensorDictBase:
-        """Send the values through the rings, and write what comes out; a mask says which rows begin with them."""
-        if self._is_joined:
-            joined_EL = self._frames(0, side_by_side(values, self.num_rows), mask_E, counts=True)
-            sizes = [self.length * value.numel() // self.num_rows for value in values]
-            found = joined_EL.split(sizes, dim=1)
-        else:
-            last = len(values) - 1
-            found = [
-                self._frames(index, value, mask_E, counts=index == last) for index, value in enumerate(values)
-            ]
-        batch_size = tensordict.batch_size
-        for out_key, value, frames_EL in zip(self.out_keys, values, found):  # noqa: B905 (takes time in every step)
-            if not self.flat:
-                frames_EL = frames_EL.reshape(*batch_size, self.length, *value.shape[len(batch_size) :])
-            elif len(batch_size) != 1:
-                frames_EL = frames_EL.reshape(*batch_size, -1)
-            tensordict.set(out_key, frames_EL)
-        return tensordict
-
-    def _frames(self, index: int, value: Tensor, mask_E: Tensor | None, *, counts: bool) -> Tensor:
-        """Return the frames of a ring, [E, N * L]."""
+    def _through(self, index: int, value: Tensor, mask_E: Tensor | None) -> Tensor:
         buffers: dict[str, Any] = self._buffers
         ring_EM, age_E, parts = buffers[f"ring_{index}"], buffers["age_E"], buffers["part_bytes"]
         value_E = value if value.ndim == ring_EM.ndim - 1 else value.reshape(-1, *ring_EM.shape[2:])
-        length = self.length
         if mask_E is not None:
-            return ring.begin(ring_EM, age_E, value_E, mask_E, num_frames=length, parts_C=parts)
-        return ring.push(
-            ring_EM, age_E, value_E, num_frames=length, stride=self.stride, parts_C=parts, counts=counts
-        )
+            return ring.begin(ring_EM, age_E, value_E, mask_E, num_frames=self.num_frames, parts_C=parts)
+        layout = {"num_frames": self.num_frames, "stride": self.stride, "parts_C": parts}
+        return ring.push(ring_EM, age_E, value_E, counts=index == self._num_rings - 1, **layout)
+
+    def _shaped(self, found_EL: Tensor, value: Tensor, batch_size: torch.Size) -> Tensor:
+        if not self.flat:
+            return found_EL.reshape(*batch_size, self.num_frames, *value.shape[len(batch_size) :])
+        return found_EL if len(batch_size) == 1 else found_EL.reshape(*batch_size, -1)

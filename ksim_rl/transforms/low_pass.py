@@ -13,7 +13,7 @@ from ksim_rl.transforms.row_transform import (
     checked_action,
     checked_out_keys,
 )
-from ksim_rl.transforms.specs import drop_leaf_spec, leaf_spec, set_leaf_spec
+from ksim_rl.transforms.specs import replace_leaves
 
 
 class ActionLowPass(RowTransform):
@@ -55,29 +55,19 @@ class ActionLowPass(RowTransform):
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
         """Move the specs to where the policy writes."""
-        specs = [leaf_spec(action_spec, key, type(self).__name__) for key in self.in_keys_inv]
-        self._size_rows(action_spec.shape.numel(), action_spec.device)
-        self._size_buffer("fresh_E", (self.num_rows,), torch.bool, action_spec.device)
-        for index, (key, out_key, spec) in enumerate(
-            zip(self.in_keys_inv, self.out_keys_inv, specs, strict=True)
-        ):
-            if key != out_key:
-                drop_leaf_spec(action_spec, key)
-                set_leaf_spec(action_spec, out_key, spec.clone())
-            shape = (self.num_rows, *spec.shape[action_spec.ndim :])
-            self._size_buffer(f"filtered_{index}", shape, spec.dtype, action_spec.device)
+        owner = type(self).__name__
+        leaves = replace_leaves(action_spec, self.in_keys_inv, self.out_keys_inv, owner, moves=True)
+        self._size_rows(action_spec)
+        self._size_buffer("fresh_E", torch.bool)
+        self._size_leaves("filtered", action_spec, leaves)
         return action_spec
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if self._buffers["fresh_E"] is None:
-            # The action's shape is in the specs only, and they size the buffers.
-            assert self.container is not None and self.container.input_spec is not None
-        self.fresh_E.logical_or_(self._reset_rows(tensordict, tensordict_reset))
+    def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
+        self.fresh_E.logical_or_(mask_E)
         return tensordict_reset
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self._buffers["fresh_E"] is None:
-            raise RuntimeError("ActionLowPass has state per env: use it in an env, not on a batch of samples")
+        self._sized()
         for index, (key, out_key) in enumerate(zip(self.in_keys_inv, self.out_keys_inv, strict=True)):
             filtered_E: Tensor = getattr(self, f"filtered_{index}")
             action = checked_action(tensordict, out_key, filtered_E.shape[1:], filtered_E.dtype)

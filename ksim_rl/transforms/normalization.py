@@ -9,13 +9,9 @@ from torchrl.data import Composite, Unbounded
 
 from ksim_rl import checks
 from ksim_rl.device.running_moments import RunningMoments, has_ranks
-from ksim_rl.transforms.row_transform import (
-    Keys,
-    RowTransform,
-    as_keys,
-    checked_out_keys,
-)
-from ksim_rl.transforms.specs import Device, floating_spec, set_leaf_spec
+from ksim_rl.transforms import upstream
+from ksim_rl.transforms.row_transform import Keys, RowTransform, as_keys, checked_out_keys
+from ksim_rl.transforms.specs import Device, replace_leaves
 
 
 class ObservationNormalization(RowTransform):
@@ -72,8 +68,7 @@ class ObservationNormalization(RowTransform):
     def train(self, mode: bool = True) -> Self:
         """Follow the mode of the env: statistics are those of training."""
         super().train(mode)
-        # TorchRL calls eval() on each transform that it attaches: that is no wish for evaluation.
-        if self._in_env():
+        if upstream.is_in_env(self):
             self._collective = self._wanted and mode
             self.updating.fill_(self._collective)
         return self
@@ -86,14 +81,17 @@ class ObservationNormalization(RowTransform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Remove the bounds."""
-        batch_dims = observation_spec.ndim
-        specs = [floating_spec(observation_spec, key, type(self).__name__) for key in self.in_keys]
-        for out_key, spec in zip(self.out_keys, specs, strict=True):
-            set_leaf_spec(
-                observation_spec, out_key, Unbounded(spec.shape, dtype=spec.dtype, device=spec.device)
-            )
-        self._size_rows(observation_spec.shape.numel(), observation_spec.device)
-        self._size_moments([spec.shape[batch_dims:].numel() for spec in specs], observation_spec.device)
+        leaves = replace_leaves(
+            observation_spec,
+            self.in_keys,
+            self.out_keys,
+            type(self).__name__,
+            lambda _index, spec: Unbounded(spec.shape, dtype=spec.dtype, device=spec.device),
+            is_floating=True,
+        )
+        self._size_rows(observation_spec)
+        sizes = [leaf.shape[observation_spec.ndim :].numel() for leaf in leaves]
+        self._size_moments(sizes, observation_spec.device)
         return observation_spec
 
     def _size_moments(self, sizes: list[int], device: Device) -> None:
@@ -103,12 +101,7 @@ class ObservationNormalization(RowTransform):
     def _each_moments(self) -> list[RunningMoments]:
         return list(self.moments)  # pyright: ignore[reportReturnType]
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if not self.num_rows:
-            self._size_rows(tensordict_reset.numel(), tensordict_reset.device)
-            leaves = [tensordict_reset.get(key).shape[tensordict_reset.ndim :] for key in self.in_keys]
-            self._size_moments([leaf.numel() for leaf in leaves], tensordict_reset.device)
-        mask_E = self._reset_rows(tensordict, tensordict_reset)
+    def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
         for values_EL, moments in self._flat(tensordict_reset, self.num_rows):
             moments.count_rows(values_EL, mask_E & self.updating)
             # Ranks reset at different times, so they cannot merge here.
@@ -117,6 +110,7 @@ class ObservationNormalization(RowTransform):
         return self._normalize(tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._sized()
         for values_EL, moments in self._flat(next_tensordict, self.num_rows):
             moments.count_rows(values_EL, self.updating.expand(self.num_rows))
             if self._collective or not has_ranks():

@@ -13,7 +13,7 @@ import warp as wp
 from jaxtyping import Bool, Int32, Int64, Shaped
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import QuickLaunch, address
+from ksim_rl.device.quick_launch import QuickLaunch, address, as_operator
 from ksim_rl.device.random import DRAWS
 
 
@@ -205,13 +205,6 @@ def begin(
     return _run(ring_EM, age_E, value_E, drawn[0], mask_E, num_frames, 0, parts_C, True, *drawn[1:])
 
 
-def _run(*arguments: object) -> Tensor:
-    # Eager code goes past torch's dispatcher, which takes longer than the launch.
-    if torch.compiler.is_compiling():
-        return _ring(*arguments)  # pyright: ignore[reportArgumentType]
-    return _launch(*arguments)  # pyright: ignore[reportArgumentType]
-
-
 def _launch(
     ring_EM: Tensor,
     age_E: Tensor,
@@ -254,19 +247,16 @@ def _has_whole_rows(value_E: Tensor) -> bool:
     return value_E.ndim == 1 or value_E.ndim == 2 and value_E.stride(1) == 1 or value_E.is_contiguous()
 
 
-_ring = torch.library.custom_op(
-    "ksim_rl::ring", _launch, mutates_args=("ring_EM", "age_E", "lag_E", "draw_count_E")
-)
-
-
-@_ring.register_fake
-def _(
+def _empty(
     ring_EM: Tensor,
     age_E: Tensor,
     value_E: Tensor,
-    lag_E: Tensor | None,
-    mask_E: Tensor | None,
+    lag_E: object,
+    mask_E: object,
     num_frames: int,
-    *others: object,
+    *_: object,
 ) -> Tensor:
     return value_E.new_empty((ring_EM.shape[0], num_frames * ring_EM.shape[2:].numel()))
+
+
+_run = as_operator("ring", _launch, _empty, mutates=("ring_EM", "age_E", "lag_E", "draw_count_E"))

@@ -10,9 +10,8 @@ from torchrl.data import TensorSpec
 
 from ksim_rl import checks
 from ksim_rl.transforms.elementwise import ActionMap, ObservationMap, RewardMap
-from ksim_rl.transforms.level import FollowsLevel
 from ksim_rl.transforms.noise.cfg import PerDim
-from ksim_rl.transforms.row_transform import Keys
+from ksim_rl.transforms.row_transform import FollowsLevel, Keys, one_per_key
 from ksim_rl.transforms.specs import add_bounds, bounded, bounds, multiply_bounds
 
 
@@ -32,12 +31,9 @@ class ObservationScale(ObservationMap):
         self, in_keys: Keys, out_keys: Keys | None = None, *, scale: PerDim | Mapping[NestedKey, PerDim]
     ) -> None:
         super().__init__(in_keys, out_keys)
-        if isinstance(scale, Mapping) and set(scale) != set(self.in_keys):
-            raise ValueError(
-                f"scale has the keys {list(scale)}, but in_keys={self.in_keys}: give one per key"
-            )
-        for index, key in enumerate(self.in_keys):
-            factor = scale[key] if isinstance(scale, Mapping) else scale
+        for index, (key, factor) in enumerate(
+            zip(self.in_keys, one_per_key("scale", scale, self.in_keys), strict=True)
+        ):
             check_scale(f"scale of {key!r}", factor)
             held = torch.tensor(factor, dtype=torch.float32)
             self.register_buffer(f"factor_{index}", held, persistent=False)

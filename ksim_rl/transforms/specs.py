@@ -1,5 +1,6 @@
 """This module reads and writes leaf specs and their bounds."""
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -59,6 +60,35 @@ def drop_leaf_spec(observation_spec: Composite, key: NestedKey) -> None:
             drop_leaf_spec(observation_spec, above)
 
 
+def replace_leaves(
+    specs: Composite,
+    in_keys: Sequence[NestedKey],
+    out_keys: Sequence[NestedKey],
+    owner: str,
+    new_spec: Callable[[int, TensorSpec], TensorSpec] = lambda _index, spec: spec.clone(),
+    *,
+    moves: bool = False,
+    is_floating: bool = False,
+) -> list[TensorSpec]:
+    """Set the spec of each out key from that of its in key, and return those of the in keys as they were.
+
+    Args:
+        specs: changed in place.
+        owner: who asks, for errors.
+        new_spec: of the index of the key and its spec.
+        moves: whether in keys that are no out keys go.
+        is_floating: whether other dtypes are refused.
+    """
+    found = [(floating_spec if is_floating else leaf_spec)(specs, key, owner) for key in in_keys]
+    replaced = [new_spec(index, spec) for index, spec in enumerate(found)]
+    for key, out_key in zip(in_keys, out_keys, strict=True):
+        if moves and key != out_key:
+            drop_leaf_spec(specs, key)
+    for out_key, spec in zip(out_keys, replaced, strict=True):
+        set_leaf_spec(specs, out_key, spec)
+    return found
+
+
 def bounds(spec: TensorSpec) -> tuple[Num[Tensor, "*leaf"], Num[Tensor, "*leaf"]]:
     """Return (low, high) in the spec's shape; infinite where the spec has none."""
     if isinstance(spec, Bounded):
@@ -88,11 +118,6 @@ def multiply_bounds(a: Ends, b: Ends) -> Ends:
         [torch.nan_to_num(x * y, nan=0.0, posinf=torch.inf, neginf=-torch.inf) for x in a for y in b]
     )
     return corners.amin(0), corners.amax(0)
-
-
-def flat_size(spec: TensorSpec, batch_dims: int) -> int:
-    """Return the number of elements per env."""
-    return spec.shape[batch_dims:].numel()
 
 
 def _spell(key: NestedKey) -> str:

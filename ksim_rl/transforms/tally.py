@@ -5,7 +5,7 @@ import warp as wp
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import QuickLaunch, address
+from ksim_rl.device.quick_launch import QuickLaunch, address, as_operator
 
 
 @wp.struct
@@ -86,15 +86,9 @@ def count_down(
 ) -> Float32[Tensor, " E"]:
     """Take one env step off what is left, down to 0, or, given the rows that reset, let those begin with the horizon.
 
-    Args:
-        left_E: env steps, float32, changed in place.
-        mask_E: bool; None for a step.
-
-    Returns:
-        What is left over the divisor, float32 [E].
+    `left_E`, in env steps, is changed in place; what is returned is that over the divisor. `mask_E` is None for a step.
     """
-    run = _count_down_operator if torch.compiler.is_compiling() else _count_down_now
-    return run(left_E, mask_E, horizon, divisor)
+    return _run_count_down(left_E, mask_E, horizon, divisor)
 
 
 def tally(
@@ -105,17 +99,10 @@ def tally(
 ) -> tuple[Int64[Tensor, " E"], Float32[Tensor, " E *leaf"]]:
     """Count one env step and add its reward, or, given the rows that reset, let those begin at 0.
 
-    Args:
-        step_E: steps since the reset, int64, changed in place.
-        total_E: sums of rewards since the reset, float32, one per env, changed in place.
-        reward_E: in the shape and dtype of the sums; None for a reset.
-        mask_E: bool; None for a step.
-
-    Returns:
-        Copies of the new steps and sums, in their shapes.
+    `step_E` and `total_E` are changed in place, one number per env; copies of both are returned. `reward_E` is None
+    for a reset, and `mask_E` for a step.
     """
-    run = _tally_operator if torch.compiler.is_compiling() else _tally_now
-    return run(step_E, total_E, reward_E, mask_E)
+    return _run_tally(step_E, total_E, reward_E, mask_E)
 
 
 def _count_down_now(left_E: Tensor, mask_E: Tensor | None, horizon: float, divisor: float) -> Tensor:
@@ -135,17 +122,8 @@ def _tally_now(
     step_out_E, total_out_E = torch.empty_like(step_E), torch.empty_like(total_E)
     device, num_rows = step_E.device, step_E.numel()
     dim, rows = _share(device, num_rows)
-    _quick_tally(
-        device,
-        dim,
-        rows,
-        address(mask_E),
-        address(reward_E),
-        total_E.data_ptr(),
-        step_E.data_ptr(),
-        total_out_E.data_ptr(),
-        step_out_E.data_ptr(),
-    )
+    read = address(mask_E), address(reward_E), total_E.data_ptr(), step_E.data_ptr()
+    _quick_tally(device, dim, rows, *read, total_out_E.data_ptr(), step_out_E.data_ptr())
     return step_out_E, total_out_E
 
 
@@ -154,19 +132,12 @@ def _share(device: torch.device, num_rows: int) -> tuple[tuple[int], int]:
     return ((1,), num_rows) if device.type == "cpu" else ((num_rows,), 1)
 
 
-_count_down_operator = torch.library.custom_op(
-    "ksim_rl::count_down", _count_down_now, mutates_args=("left_E",)
+_run_count_down = as_operator(
+    "count_down", _count_down_now, lambda left_E, *_: torch.empty_like(left_E), mutates=("left_E",)
 )
-_tally_operator = torch.library.custom_op("ksim_rl::tally", _tally_now, mutates_args=("step_E", "total_E"))
-
-
-@_count_down_operator.register_fake
-def _(left_E: Tensor, mask_E: Tensor | None, horizon: float, divisor: float) -> Tensor:
-    return torch.empty_like(left_E)
-
-
-@_tally_operator.register_fake
-def _(
-    step_E: Tensor, total_E: Tensor, reward_E: Tensor | None, mask_E: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(step_E), torch.empty_like(total_E)
+_run_tally = as_operator(
+    "tally",
+    _tally_now,
+    lambda step_E, total_E, *_: (torch.empty_like(step_E), torch.empty_like(total_E)),
+    mutates=("step_E", "total_E"),
+)

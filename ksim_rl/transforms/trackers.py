@@ -1,19 +1,42 @@
-"""The transforms of this module keep account of each episode: its return, its length, whether it succeeded."""
+"""The transforms of this module keep account of each episode: return, length, success, and the time that is left."""
 
+from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Composite, TensorSpec, Unbounded
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from ksim_rl import checks
+from ksim_rl.transforms import upstream
+from ksim_rl.transforms.innermost import EpisodeLimit, innermost
 from ksim_rl.transforms.row_transform import Keys, RowTransform, as_keys, checked_out_keys
-from ksim_rl.transforms.specs import Device, leaf_spec, set_leaf_spec
-from ksim_rl.transforms.tally import tally
+from ksim_rl.transforms.specs import leaf_spec, set_leaf_spec
+from ksim_rl.transforms.tally import count_down, tally
 
 
-class EpisodeTracker(RowTransform):
+class _Tracker(RowTransform):
+    """What is kept of each episode, from 0 at its reset; copies go out, as the kept ones change in place."""
+
+    @abstractmethod
+    def _kept(self) -> list[Tensor]:
+        """Return what is kept, [E, ...], in the order of the out keys."""
+
+    def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
+        for kept_E in self._kept():
+            kept_E.masked_fill_(mask_E.reshape(-1, *[1] * (kept_E.ndim - 1)), 0)
+        return self._write(tensordict_reset)
+
+    def _write(self, tensordict: TensorDictBase, copies: Sequence[Tensor] | None = None) -> TensorDictBase:
+        batch = tensordict.batch_size
+        for key, copy in zip(self.out_keys, copies or [kept_E.clone() for kept_E in self._kept()]):  # noqa: B905 (the length may have no key)
+            tensordict.set(key, copy if len(batch) == 1 else copy.reshape(*batch, *copy.shape[1:]))
+        return tensordict
+
+
+class EpisodeTracker(_Tracker):
     """The sum of rewards and the number of steps since the reset; where `done` is True, those of the whole episode.
 
     Both are part of `next`, and 0 at a reset. Nothing is read by the host: take the rows that are done after a rollout,
@@ -58,50 +81,37 @@ class EpisodeTracker(RowTransform):
         """Add the returns, shaped as the rewards, and the lengths to the observations."""
         output_spec = output_spec.clone()
         rewards, observations = output_spec["full_reward_spec"], output_spec["full_observation_spec"]
-        specs = [leaf_spec(rewards, key, type(self).__name__) for key in self.in_keys]
-        self._size(
-            observations.shape, [spec.shape for spec in specs], [s.dtype for s in specs], output_spec.device
-        )
-        for key, spec in zip(self.out_keys, specs, strict=False):
+        leaves = [leaf_spec(rewards, key, type(self).__name__) for key in self.in_keys]
+        for key, spec in zip(self.out_keys, leaves, strict=False):
             set_leaf_spec(observations, key, Unbounded(spec.shape, dtype=spec.dtype, device=spec.device))
         if self.length_key is not None:
             shape = torch.Size([*observations.shape, 1])
             spec = Unbounded(shape, dtype=torch.int64, device=observations.device)
             set_leaf_spec(observations, self.length_key, spec)
+        self._size_rows(observations)
+        self._size_buffer("step_E", torch.int64)
+        self._size_leaves("return", observations, leaves)
+        # One float32 reward per env is what nearly every env has: it is counted in one launch.
+        one = [spec.dtype for spec in leaves] == [torch.float32]
+        self._is_usual = one and self.return_0.numel() == self.num_rows
         return output_spec
 
-    def _size(
-        self, batch: torch.Size, shapes: list[torch.Size], dtypes: list[torch.dtype], device: Device
-    ) -> None:
-        self._size_rows(batch.numel(), device)
-        self._size_buffer("step_E", (self.num_rows,), torch.int64, device)
-        for index, (shape, dtype) in enumerate(zip(shapes, dtypes, strict=True)):
-            leaf = (self.num_rows, *shape[len(batch) :])
-            self._size_buffer(f"return_{index}", leaf, dtype, device)
-        # One float32 reward per env is what nearly every env has: it is counted in one launch.
-        self._is_usual = dtypes == [torch.float32] and self.return_0.numel() == self.num_rows
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if self._buffers["step_E"] is None or not self.num_rows:
-            # The shapes of rewards are in the specs only.
-            assert self.container is not None and self.container.output_spec is not None
-        mask_E = self._reset_rows(tensordict, tensordict_reset)
-        if self._is_usual:
-            return self._tally(tensordict_reset, None, mask_E)
-        self.step_E.masked_fill_(mask_E, 0)
-        totals = self._totals()
-        for total_E in totals:
-            total_E.masked_fill_(mask_E.reshape(-1, *[1] * (total_E.ndim - 1)), 0)
-        return self._write(tensordict_reset, self.step_E.clone(), [total_E.clone() for total_E in totals])
+    def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
+        return (
+            self._tally(tensordict_reset, None, mask_E)
+            if self._is_usual
+            else super()._begin(tensordict_reset, mask_E)
+        )
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._sized()
         if self._is_usual:
             return self._tally(next_tensordict, next_tensordict.get(self.in_keys[0]), None)
-        self.step_E.add_(1)
-        totals = self._totals()
+        *totals, step_E1 = self._kept()
+        step_E1.add_(1)
         for key, total_E in zip(self.in_keys, totals, strict=True):
             total_E.add_(next_tensordict.get(key).reshape(total_E.shape))
-        return self._write(next_tensordict, self.step_E.clone(), [total_E.clone() for total_E in totals])
+        return self._write(next_tensordict)
 
     def _tally(
         self, tensordict: TensorDictBase, reward: Tensor | None, mask_E: Tensor | None
@@ -109,23 +119,14 @@ class EpisodeTracker(RowTransform):
         # The dict of buffers answers much faster than the module.
         buffers: dict[str, Any] = self._buffers
         step_E, total_E = tally(buffers["step_E"], buffers["return_0"], reward, mask_E)
-        return self._write(tensordict, step_E, [total_E])
+        return self._write(tensordict, (total_E, step_E.unsqueeze(1)))
 
-    def _totals(self) -> list[Tensor]:
-        return [getattr(self, f"return_{index}") for index in range(len(self.in_keys))]
-
-    def _write(self, tensordict: TensorDictBase, step_E: Tensor, totals: list[Tensor]) -> TensorDictBase:
-        batch = tensordict.batch_size
-        for key, total_E in zip(self.out_keys, totals):  # noqa: B905 (the last key is that of the length)
-            tensordict.set(key, total_E if len(batch) == 1 else total_E.reshape(*batch, *total_E.shape[1:]))
-        if self.length_key is not None:
-            tensordict.set(
-                self.length_key, step_E.unsqueeze(1) if len(batch) == 1 else step_E.reshape(*batch, 1)
-            )
-        return tensordict
+    def _kept(self) -> list[Tensor]:
+        totals = [getattr(self, f"return_{index}") for index in range(len(self.in_keys))]
+        return [*totals, self.step_E.unsqueeze(1)]
 
 
-class SuccessTracker(RowTransform):
+class SuccessTracker(_Tracker):
     """Whether an episode has succeeded, bool; where `done` is True, that of the whole episode.
 
     Args:
@@ -157,49 +158,94 @@ class SuccessTracker(RowTransform):
         """Add the outcomes to the observations."""
         output_spec = output_spec.clone()
         observations = output_spec["full_observation_spec"]
-        specs = [self._spec_of(output_spec, key) for key in self.in_keys]
-        batch_dims = observations.ndim
-        self._size_rows(observations.shape.numel(), observations.device)
-        for index, (out_key, spec) in enumerate(zip(self.out_keys, specs, strict=True)):
-            leaf = spec.shape[batch_dims:]
-            self._size_buffer(f"success_{index}", (self.num_rows, *leaf), torch.bool, observations.device)
+        everything = output_spec["full_done_spec"].clone()
+        for part in ("full_reward_spec", "full_observation_spec"):
+            everything.update(output_spec[part].clone())
+        leaves = [leaf_spec(everything, key, type(self).__name__) for key in self.in_keys]
+        for out_key, spec in zip(self.out_keys, leaves, strict=True):
             size = spec.shape[-1] if len(spec.shape) else 1
             outcome = Binary(size, shape=spec.shape, dtype=torch.bool, device=observations.device)
             set_leaf_spec(observations, out_key, outcome)
+        self._size_rows(observations)
+        self._size_leaves("success", observations, leaves, torch.bool)
         return output_spec
 
-    def _spec_of(self, output_spec: Composite, key: NestedKey) -> TensorSpec:
-        parts = [
-            output_spec[part] for part in ("full_observation_spec", "full_reward_spec", "full_done_spec")
-        ]
-        for part in parts:
-            if key in part.keys(True, True):
-                return part[key]
-        everything = parts[0].clone()
-        for part in parts[1:]:
-            everything.update(part.clone())
-        return leaf_spec(everything, key, type(self).__name__)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if self._buffers["success_0"] is None or not self.num_rows:
-            # The shapes of rewards are in the specs only.
-            assert self.container is not None and self.container.output_spec is not None
-        mask_E = self._reset_rows(tensordict, tensordict_reset)
-        for index in range(len(self.in_keys)):
-            success_E: Tensor = getattr(self, f"success_{index}")
-            success_E.masked_fill_(mask_E.reshape(-1, *[1] * (success_E.ndim - 1)), False)
-        return self._write(tensordict_reset)
-
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        for index, key in enumerate(self.in_keys):
-            success_E: Tensor = getattr(self, f"success_{index}")
+        self._sized()
+        for key, success_E in zip(self.in_keys, self._kept(), strict=True):
             now_E = (next_tensordict.get(key) > self.threshold).reshape(success_E.shape)
             success_E.copy_(success_E | now_E if self.reduce == "any" else now_E)
         return self._write(next_tensordict)
 
-    def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Give out copies: the kept ones change in place."""
-        for index, out_key in enumerate(self.out_keys):
-            success_E: Tensor = getattr(self, f"success_{index}")
-            tensordict.set(out_key, success_E.clone().reshape(*tensordict.batch_size, *success_E.shape[1:]))
-        return tensordict
+    def _kept(self) -> list[Tensor]:
+        return [getattr(self, f"success_{index}") for index in range(len(self.in_keys))]
+
+
+class TimeAwareObservation(RowTransform):
+    """The time that is left of an episode, float32 [E, 1]: without it the value of a state is ambiguous.
+
+    Counted in env steps from the reset that this transform saw; 0 from the horizon on. See Pardo et al., "Time Limits
+    in Reinforcement Learning" (2018).
+
+    Args:
+        out_keys: the one key to write.
+        horizon: env steps of an episode. None takes `max_episode_length` of the env, or Gymnasium's
+            `spec.max_episode_steps`.
+        normalize: True gives the share that is left, from 1 to 0; False gives env steps.
+
+    Example:
+        >>> clock = TimeAwareObservation(horizon=500)
+    """
+
+    left_E: Tensor
+
+    def __init__(
+        self,
+        out_keys: list[NestedKey] | NestedKey = "remaining_time",
+        *,
+        horizon: int | None = None,
+        normalize: bool = True,
+    ) -> None:
+        keys = as_keys(out_keys)
+        if len(keys) != 1:
+            raise ValueError(f"out_keys={keys}: expected one key")
+        if horizon is not None and (isinstance(horizon, bool) or not isinstance(horizon, int) or horizon < 1):
+            raise ValueError(f"horizon={horizon!r}: expected a whole number of env steps of at least 1")
+        super().__init__([], keys, row_buffers=["left_E"])
+        self.horizon, self.normalize = horizon, normalize
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the clock, between 0 and 1, or 0 and the horizon."""
+        high = 1.0 if self.normalize else float(self._horizon())
+        shape = torch.Size([*observation_spec.shape, 1])
+        spec = Bounded(0.0, high, shape, device=observation_spec.device, dtype=torch.float32)
+        set_leaf_spec(observation_spec, self.out_keys[0], spec)
+        self._size_rows(observation_spec)
+        self._size_buffer("left_E", torch.float32)
+        return observation_spec
+
+    def _horizon(self) -> int:
+        """Return the number of env steps of an episode, and remember it."""
+        if self.horizon is None:
+            if self.container is None:
+                raise ValueError("horizon=None asks the env for its horizon: use the transform in an env")
+            env = innermost(self.container)
+            found = env.max_episode_length if isinstance(env, EpisodeLimit) else upstream.gym_horizon(env)
+            if not found:
+                raise ValueError(
+                    f"horizon=None, but the episodes of {type(env).__name__} never time out: give it"
+                )
+            self.horizon = int(found)
+        return self.horizon
+
+    def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
+        return self._count(tensordict_reset, mask_E)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._sized()
+        return self._count(next_tensordict, None)
+
+    def _count(self, tensordict: TensorDictBase, mask_E: Tensor | None) -> TensorDictBase:
+        horizon = float(self._horizon())
+        left_E = count_down(self.left_E, mask_E, horizon, horizon if self.normalize else 1.0)
+        return tensordict.set(self.out_keys[0], left_E.reshape(*tensordict.batch_size, 1))

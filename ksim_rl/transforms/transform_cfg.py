@@ -64,14 +64,17 @@ class TransformCfg(OwnTree):
         # Built once to try: what the class refuses shows before anything compiles.
         self.build()
 
-    def build(self) -> Transform:
-        """Return a new transform.
+    def build(self, name: str | None = None) -> Transform:
+        """Return a new transform; with a name it draws from a stream of that name, unless its arguments give one.
 
         Raises:
             ValueError: if the class refuses an argument.
         """
+        arguments = self.arguments
+        if name is not None and "stream" in arguments and arguments["stream"] is None:
+            arguments = {**arguments, "stream": f"transforms.{name}"}
         try:
-            return self.transform(**self.arguments)
+            return self.transform(**arguments)
         except (TypeError, KeyError, RuntimeError, ImportError) as error:
             raise ValueError(f"{self.transform.__name__}: {error}") from error
 

@@ -49,3 +49,23 @@ def test_each_path_that_0_1_wrote_leads_to_its_class(target):
 @pytest.mark.parametrize("name", sorted(RUNS))
 def test_a_task_config_that_0_1_wrote_builds_the_same_task(name):
     assert from_tree(ManagerBasedRlEnvCfg, RUNS[name]) == envs.make_cfg(name)
+
+
+def test_classes_that_the_command_line_could_not_load_are_noted():
+    here, plugged = {"_target_": "__main__.Mine"}, {"_target_": "some_package.terms.Alive", "weight": 1.0}
+    own = {"_target_": "ksim_rl.mdp.Alive", "inside": [{"_target_": "torchrl.envs.transforms.InitTracker"}]}
+    in_a_function = {"_target_": "other_package.build.<locals>.Term"}
+    rewards = {"a": here, "b": plugged, "c": [plugged, {**plugged, "_target_": "some_package.more.Dead"}]}
+    notes = class_paths.loading_notes({"task": {"rewards": rewards, "own": own, "f": in_a_function}})
+    assert [note.split(":")[0] for note in notes] == [
+        "this run names __main__.Mine, which no other process can import",
+        "this run names some_package.terms.Alive",
+        "this run names other_package.build.<locals>.Term, which no other process can import",
+    ]
+    assert notes[1].endswith("give `ksim-rl` --plugin some_package")
+    assert class_paths.loading_notes(to_tree(envs.task("go1_velocity_flat").cfg())) == []
+
+
+def test_a_named_plug_in_needs_no_note(monkeypatch):
+    monkeypatch.setattr(class_paths.plugins, "_named", ["some_package.tasks"])
+    assert class_paths.loading_notes({"_target_": "some_package.terms.Alive"}) == []

@@ -22,7 +22,7 @@ from ksim_rl.transforms import (
     group_specs,
     observation_columns,
 )
-from ksim_rl.transforms.groups.compile_groups import compile_groups
+from ksim_rl.transforms.groups.group_cfg import compile_groups
 from tests.transforms.chains import assert_same, fixed_rollout
 
 

@@ -14,7 +14,7 @@ from ksim_rl.transforms import (
     ObservationNoise,
     UniformNoise,
 )
-from ksim_rl.transforms.groups.compile_groups import compile_groups
+from ksim_rl.transforms.groups.group_cfg import compile_groups
 
 NOISE = "ksim_rl.transforms.noise.cfg"
 

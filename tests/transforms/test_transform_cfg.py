@@ -1,7 +1,9 @@
 """Transforms described as data: checked by signature, and the same after a trip through YAML."""
 
 import pytest
+import torch
 import yaml
+from tensordict import TensorDict
 
 from ksim_rl.envs import from_tree, to_tree
 from ksim_rl.envs.transforms import (
@@ -79,3 +81,15 @@ def test_python_gives_data_too():
         TransformCfg(type("Own", (ActionDelay,), {"__init__": lambda self, fn: None}), fn=lambda x: x)
     with pytest.raises(ValueError, match="expected a class of transforms"):
         TransformCfg(CFGS[0].build())  # pyright: ignore[reportArgumentType]
+
+
+def test_two_of_one_class_and_key_draw_from_streams_of_their_own():
+    noise = TransformCfg(ObservationNoise, in_keys=["x"], noise=UniformNoise(low=0.0, high=1.0))
+    first, second = noise.build("first"), noise.build("second")
+    assert (first.stream, second.stream) == ("transforms.first", "transforms.second")
+    batch = TensorDict({"x": torch.zeros(4, 3)}, batch_size=4)
+    assert not bool((first(batch.clone())["x"] == second(batch.clone())["x"]).any())
+    named = TransformCfg(
+        ObservationNoise, in_keys=["x"], noise=UniformNoise(low=0.0, high=1.0), stream="mine"
+    )
+    assert named.build("first").stream == "mine"

@@ -1,6 +1,7 @@
 """Observations are concatenated into the vectors that networks read by the transform of this module."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,17 +12,66 @@ from torchrl.envs.transforms import Transform
 
 from ksim_rl import checks
 from ksim_rl.transforms.columns import side_by_side
-from ksim_rl.transforms.groups.group_spec import GroupSpec, spell
 from ksim_rl.transforms.row_transform import as_keys
 from ksim_rl.transforms.specs import (
     Device,
     bounded,
     bounds,
     drop_leaf_spec,
-    flat_size,
     leaf_spec,
     set_leaf_spec,
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroupSpec:
+    """The map from terms to columns of one group vector.
+
+    Args:
+        name: the key of the vector.
+        terms: keys of the terms, in order.
+        sizes: their numbers of columns.
+    """
+
+    name: NestedKey
+    terms: tuple[NestedKey, ...]
+    sizes: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of columns of the vector."""
+        return sum(self.sizes)
+
+    def slice(self, term: NestedKey) -> slice:
+        """Return the columns of `term`, given by its key or by the last part of it.
+
+        Raises:
+            ValueError: if no term has that name, or more than one.
+        """
+        found = [i for i, key in enumerate(self.terms) if key == term] or [
+            i for i, key in enumerate(self.terms) if last_name(key) == term
+        ]
+        if not found:
+            raise checks.unknown_name(f"term of group {self.name!r}", str(term), map(last_name, self.terms))
+        if len(found) > 1:
+            raise ValueError(f"group {self.name!r} has {len(found)} terms named {term!r}: give the whole key")
+        start = sum(self.sizes[: found[0]])
+        return slice(start, start + self.sizes[found[0]])
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data for a checkpoint or an export: term name -> [start, stop)."""
+        columns = {spell(key): self.slice(key) for key in self.terms}
+        return {name: [found.start, found.stop] for name, found in columns.items()}
+
+
+def last_name(key: NestedKey) -> str:
+    """Return the last part of a key."""
+    return key if isinstance(key, str) else str(key[-1])
+
+
+def spell(key: NestedKey) -> str:
+    """Return a key as one string."""
+    return key if isinstance(key, str) else "/".join(map(str, key))
 
 
 class ObservationGroups(Transform):
@@ -87,7 +137,7 @@ class ObservationGroups(Transform):
                 self._concatenable.add(name)
             else:
                 self._concatenable.discard(name)
-            sizes = tuple(flat_size(spec, len(batch_size)) for spec in specs)
+            sizes = tuple(spec.shape[len(batch_size) :].numel() for spec in specs)
             self.group_specs[name] = GroupSpec(name=name, terms=tuple(terms), sizes=sizes)
         for name, spec in vectors.items():
             set_leaf_spec(observation_spec, name, spec)
@@ -100,7 +150,7 @@ class ObservationGroups(Transform):
         for spec in specs[1:]:
             dtype = torch.promote_types(dtype, spec.dtype)
         if not all(spec.dtype.is_floating_point for spec in specs):
-            size = sum(flat_size(spec, len(batch_size)) for spec in specs)
+            size = sum(spec.shape[len(batch_size) :].numel() for spec in specs)
             return Unbounded(torch.Size([*batch_size, size]), dtype=dtype, device=device)
         ends = [bounds(spec) for spec in specs]
         low = torch.cat([low.reshape(*batch_size, -1) for low, _ in ends], dim=-1)

@@ -1,27 +1,109 @@
-"""This module shows episodes and samples in a left-right mirror."""
+"""This module describes left-right mirror images, and shows episodes and samples in them."""
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float32, Int64, Num
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite
+from torchrl.data import Composite, TensorSpec
 
 from ksim_rl import checks
 from ksim_rl.device import random
-from ksim_rl.transforms.keyed_transform import KeyedTransform
-from ksim_rl.transforms.mirror.mirror_map import MirrorMap, image
-from ksim_rl.transforms.row_transform import Keys, as_keys, checked_out_keys
-from ksim_rl.transforms.specs import (
-    Device,
-    bounded,
-    bounds,
-    drop_leaf_spec,
-    leaf_spec,
-    set_leaf_spec,
-)
+from ksim_rl.transforms.row_transform import KeyedTransform, Keys, as_keys, checked_out_keys
+from ksim_rl.transforms.specs import Device, bounded, bounds, replace_leaves
 
 Bounds = tuple[Tensor, Tensor]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MirrorMap:
+    """The mirror image of a vector: `mirrored[i] = signs[i] * vector[source[i]]`.
+
+    The mirror image of a mirror image is the vector itself; maps for which it is not are refused.
+
+    Args:
+        source: column that each column of the image shows.
+        signs: 1 or -1 per column; those of None are 1.
+    """
+
+    source: tuple[int, ...]
+    signs: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "source", tuple(self.source))
+        object.__setattr__(self, "signs", tuple(float(s) for s in self.signs) or (1.0,) * len(self.source))
+        if sorted(self.source) != list(range(len(self.source))):
+            raise ValueError(f"source={self.source}: expected each of 0 to {len(self.source) - 1} once")
+        if len(self.signs) != len(self.source):
+            raise ValueError(f"signs has {len(self.signs)} numbers for the {len(self.source)} of source")
+        for index, (source, sign) in enumerate(zip(self.source, self.signs, strict=True)):
+            checks.check_choice(f"signs[{index}]", sign, (1.0, -1.0))
+            if self.source[source] != index or self.signs[source] != sign:
+                raise ValueError(
+                    f"columns {index} and {source} are no mirror images of each other: "
+                    f"source {source} and {self.source[source]}, signs {sign} and {self.signs[source]}"
+                )
+
+    @property
+    def size(self) -> int:
+        """Number of columns."""
+        return len(self.source)
+
+    def __call__(self, vector: Num[Tensor, "*batch L"]) -> Num[Tensor, "*batch L"]:
+        """Return the mirror image of vectors [..., L]."""
+        return image(vector, *self.tensors(vector.device))
+
+    def tensors(self, device: Device) -> tuple[Int64[Tensor, " L"] | None, Float32[Tensor, " L"]]:
+        """Return source (int64; None if no column moves) and signs (float32), [L]."""
+        return _tensors(self, device)
+
+    def repeat(self, times: int) -> "MirrorMap":
+        """Return the map of `times` such vectors one after another: a flat history, say."""
+        return concatenate([self] * times)
+
+
+def image(
+    vector: Num[Tensor, "*batch L"], source_L: Int64[Tensor, " L"] | None, signs_L: Float32[Tensor, " L"]
+) -> Num[Tensor, "*batch L"]:
+    """Return the mirror image of vectors [..., L]; a `source_L` of None leaves the columns in place."""
+    columns = vector if source_L is None else vector.index_select(-1, source_L)
+    return columns * signs_L.to(vector.dtype)
+
+
+@functools.lru_cache(maxsize=256)
+def _tensors(mirror: MirrorMap, device: Device) -> tuple[Tensor | None, Tensor]:
+    moves = mirror.source != tuple(range(mirror.size))
+    source_L = torch.tensor(mirror.source, device=device) if moves else None
+    return source_L, torch.tensor(mirror.signs, device=device)
+
+
+def concatenate(maps: Sequence[MirrorMap]) -> MirrorMap:
+    """Return the map of the vectors of `maps` one after another."""
+    source: list[int] = []
+    signs: list[float] = []
+    for mirror in maps:
+        start = len(source)
+        source += [start + column for column in mirror.source]
+        signs += mirror.signs
+    return MirrorMap(source=tuple(source), signs=tuple(signs))
+
+
+def unchanged(size: int) -> MirrorMap:
+    """Return the map of a vector that is its own mirror image: heights, phases common to both sides."""
+    return MirrorMap(source=tuple(range(size)))
+
+
+POLAR = MirrorMap(source=(0, 1, 2), signs=(1, -1, 1))
+"""Position, linear velocity, acceleration, force, projected gravity (x forward, y left, z up)."""
+AXIAL = MirrorMap(source=(0, 1, 2), signs=(-1, 1, -1))
+"""Angular velocity, torque (x forward, y left, z up)."""
+PLANAR_VELOCITY = MirrorMap(source=(0, 1, 2), signs=(1, -1, -1))
+"""The velocity command (vx, vy, wz)."""
+QUATERNION = MirrorMap(source=(0, 1, 2, 3), signs=(1, -1, 1, -1))
+"""Orientation (w, x, y, z)."""
 
 
 class Mirror(KeyedTransform):
@@ -82,28 +164,32 @@ class Mirror(KeyedTransform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Widen the bounds to those of both images."""
-        specs = [leaf_spec(observation_spec, key, type(self).__name__) for key in self.in_keys]
-        for key, out_key, spec in zip(self.in_keys, self.out_keys, specs, strict=True):
-            plain, other = bounds(spec), self._image(key, bounds(spec))
-            low, high = torch.minimum(plain[0], other[0]), torch.maximum(plain[1], other[1])
-            set_leaf_spec(observation_spec, out_key, bounded(low, high, dtype=spec.dtype, device=spec.device))
-        self._size(observation_spec.shape, observation_spec.device)
+        owner = type(self).__name__
+        replace_leaves(observation_spec, self.in_keys, self.out_keys, owner, self._widened)
+        self._size_rows(observation_spec)
+        self._size_buffer("mirrored_E", torch.bool)
         return observation_spec
+
+    def _widened(self, index: int, spec: TensorSpec) -> TensorSpec:
+        plain, other = bounds(spec), self._image(self.in_keys[index], bounds(spec))
+        low, high = torch.minimum(plain[0], other[0]), torch.maximum(plain[1], other[1])
+        return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
         """Narrow the bounds to those that both images have in common."""
-        specs = [leaf_spec(action_spec, key, type(self).__name__) for key in self.in_keys_inv]
-        for key, out_key, spec in zip(self.in_keys_inv, self.out_keys_inv, specs, strict=True):
-            plain, other = bounds(spec), self._image(key, bounds(spec))
-            low, high = torch.maximum(plain[0], other[0]), torch.minimum(plain[1], other[1])
-            if bool((low > high).any()):
-                raise ValueError(
-                    f"Mirror: the bounds of the action {key!r} and of its mirror image have nothing in common"
-                )
-            if key != out_key:
-                drop_leaf_spec(action_spec, key)
-            set_leaf_spec(action_spec, out_key, bounded(low, high, dtype=spec.dtype, device=spec.device))
+        owner = type(self).__name__
+        replace_leaves(action_spec, self.in_keys_inv, self.out_keys_inv, owner, self._narrowed, moves=True)
         return action_spec
+
+    def _narrowed(self, index: int, spec: TensorSpec) -> TensorSpec:
+        key = self.in_keys_inv[index]
+        plain, other = bounds(spec), self._image(key, bounds(spec))
+        low, high = torch.maximum(plain[0], other[0]), torch.minimum(plain[1], other[1])
+        if bool((low > high).any()):
+            raise ValueError(
+                f"Mirror: the bounds of the action {key!r} and of its mirror image have nothing in common"
+            )
+        return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
     def _image(self, key: NestedKey, ends: Bounds) -> Bounds:
         if ends[0].shape[-1:] != (self.maps[key].size,):
@@ -113,28 +199,19 @@ class Mirror(KeyedTransform):
         images = [self.maps[key](end) for end in ends]
         return torch.minimum(*images), torch.maximum(*images)
 
-    def _size(self, batch: torch.Size, device: Device) -> None:
-        self._size_rows(batch.numel(), device)
-        self._size_buffer("mirrored_E", (self.num_rows,), torch.bool, device)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if self._buffers["mirrored_E"] is None or not self.num_rows:
-            self._size(tensordict_reset.batch_size, tensordict_reset.device)
-        mask_E = self._reset_rows(tensordict, tensordict_reset)
+    def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
         drawn_E = random.uniform(self._reset_keys("reset/mirrored"), 1)[:, 0] < self.probability
         self.mirrored_E.copy_(torch.where(mask_E, drawn_E, self.mirrored_E))
         return self._call(tensordict_reset)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._sized()
         for index, (key, out_key) in enumerate(zip(self.in_keys, self.out_keys, strict=True)):
             next_tensordict.set(out_key, self._seen(index, next_tensordict.get(key)))
         return next_tensordict
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self._buffers["mirrored_E"] is None:
-            raise RuntimeError(
-                "Mirror has state per env: use it in an env, and `mirrored` on a batch of samples"
-            )
+        self._sized()
         pairs = zip(self.in_keys_inv, self.out_keys_inv, strict=True)
         for index, (key, out_key) in enumerate(pairs, start=len(self.in_keys)):
             tensordict.set(key, self._seen(index, tensordict.get(out_key)))

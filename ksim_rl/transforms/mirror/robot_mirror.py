@@ -9,8 +9,8 @@ import numpy as np
 from tensordict import NestedKey
 
 from ksim_rl import checks
-from ksim_rl.transforms.groups.group_spec import GroupSpec, last_name
-from ksim_rl.transforms.mirror.mirror_map import MirrorMap, concatenate
+from ksim_rl.transforms.groups.groups import GroupSpec, last_name
+from ksim_rl.transforms.mirror.mirror import MirrorMap, concatenate
 
 _SIDES = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "hl": "hr", "bl": "br", "ml": "mr"}
 _SIDES |= {"lf": "rf", "lh": "rh", "lr": "rr", "lb": "rb", "lm": "rm"}

@@ -4,12 +4,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Literal
+from typing import Annotated, ClassVar, Literal
 
-from ksim_rl import checks
+from ksim_rl.checked import Checked, Share, Within
 
 PerDim = float | tuple[float, ...]
 """One number, or one per element of the (flattened) observation."""
+NonNegativePerDim = Annotated[PerDim, Within(low=0.0)]
 
 
 class Draw(Enum):
@@ -21,7 +22,7 @@ class Draw(Enum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class NoiseCfg(ABC):
+class NoiseCfg(Checked, ABC):
     """What all noise has in common: a sample is offset + spread * draw.
 
     A reading goes through it in this order: bias, walk, the noise itself, resolution, dropout.
@@ -39,29 +40,23 @@ class NoiseCfg(ABC):
             level * s ("multiply": 1 + level * (s - 1)), and walk, resolution and dropout are multiplied by the level.
     """
 
+    draw: ClassVar[Draw]
+    """What the sample is made from."""
+
     operation: Literal["add", "multiply"] = "add"
     bias: "NoiseCfg | None" = None
-    walk_std: PerDim = 0.0
-    resolution: PerDim = 0.0
-    dropout: float = 0.0
+    walk_std: NonNegativePerDim = 0.0
+    resolution: NonNegativePerDim = 0.0
+    dropout: Share = 0.0
     lost: Literal["last", "zero"] = "last"
     by_level: bool = False
 
     def __post_init__(self) -> None:
-        checks.check_choice("operation", self.operation, ("add", "multiply"))
-        _checked("walk_std", self.walk_std, low=0.0)
-        _checked("resolution", self.resolution, low=0.0)
-        checks.check_in_range("dropout", self.dropout, low=0.0, high=1.0)
-        checks.check_choice("lost", self.lost, ("last", "zero"))
+        super().__post_init__()
         if self.bias is not None:
             for field in ("bias", "walk_std", "resolution", "dropout", "by_level"):
                 if getattr(self.bias, field) not in (None, 0.0):
                     raise ValueError(f"bias={self.bias!r}: a bias has no {field} of its own")
-
-    @property
-    @abstractmethod
-    def draw(self) -> Draw:
-        """The draw that the sample is made from."""
 
     @abstractmethod
     def affine(self, size: int) -> tuple[list[float], list[float]]:
@@ -76,22 +71,19 @@ class NoiseCfg(ABC):
 class UniformNoise(NoiseCfg):
     """Noise uniform on [low, high)."""
 
+    draw: ClassVar = Draw.UNIFORM
+
     low: PerDim
     high: PerDim
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        low, high = _checked("low", self.low), _checked("high", self.high)
+        low, high = _numbers(self.low), _numbers(self.high)
         if len(low) != len(high) and 1 not in (len(low), len(high)):
             raise ValueError(f"low has {len(low)} numbers and high has {len(high)}: give as many, or one")
         width = max(len(low), len(high))
         if any(low[i % len(low)] > high[i % len(high)] for i in range(width)):
             raise ValueError(f"low={self.low!r} exceeds high={self.high!r}")
-
-    @property
-    def draw(self) -> Draw:
-        """Uniform."""
-        return Draw.UNIFORM
 
     def affine(self, size: int) -> tuple[list[float], list[float]]:
         """Offset low, spread high - low."""
@@ -103,18 +95,10 @@ class UniformNoise(NoiseCfg):
 class GaussianNoise(NoiseCfg):
     """Normal noise."""
 
-    std: PerDim
+    draw: ClassVar = Draw.GAUSSIAN
+
+    std: NonNegativePerDim
     mean: PerDim = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _checked("std", self.std, low=0.0)
-        _checked("mean", self.mean)
-
-    @property
-    def draw(self) -> Draw:
-        """Gaussian."""
-        return Draw.GAUSSIAN
 
     def affine(self, size: int) -> tuple[list[float], list[float]]:
         """Offset mean, spread std."""
@@ -125,16 +109,9 @@ class GaussianNoise(NoiseCfg):
 class ConstantNoise(NoiseCfg):
     """The same value always; the default suits a sensor that only drifts, rounds or loses readings."""
 
+    draw: ClassVar = Draw.NONE
+
     value: PerDim = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _checked("value", self.value)
-
-    @property
-    def draw(self) -> Draw:
-        """None."""
-        return Draw.NONE
 
     def affine(self, size: int) -> tuple[list[float], list[float]]:
         """Offset value, spread 0."""
@@ -157,10 +134,3 @@ def per_dim(field: str, value: PerDim, size: int) -> list[float]:
 
 def _numbers(value: PerDim) -> tuple[float, ...]:
     return tuple(value) if isinstance(value, Sequence) else (value,)
-
-
-def _checked(field: str, value: PerDim, *, low: float | None = None) -> tuple[float, ...]:
-    numbers = _numbers(value)
-    for index, number in enumerate(numbers):
-        checks.check_in_range(field if len(numbers) == 1 else f"{field}[{index}]", number, low=low)
-    return numbers

@@ -10,7 +10,7 @@ import warp as wp
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import QuickLaunch, address
+from ksim_rl.device.quick_launch import QuickLaunch, address, as_operator
 from ksim_rl.device.random import DRAWS
 
 GAUSSIAN, MULTIPLY, BIAS_GAUSSIAN, BIAS_MULTIPLY, BY_LEVEL, HOLD = (1 << bit for bit in range(6))
@@ -194,11 +194,11 @@ def step_noise(
     """Go on by one env step, which adds 1 to the counter of each row, and return the noisy readings.
 
     Args:
-        clean_EL: E * L readings in any shape, float32; the result is like it.
-        state: see there; its `bias_EL`, `walk_EL` and `last_EL` change.
+        clean_EL: E * L readings in any shape; the result is like it.
+        state: its `bias_EL`, `walk_EL` and `last_EL` change.
         features: what any column has.
         stream: the id of the stream of draws.
-        counter_E: int64; the draws are those of the count that it reaches.
+        counter_E: the draws are those of the count that it reaches.
     """
     return _run(clean_EL, *state, features, _STEP, None, stream, counter_E)
 
@@ -214,13 +214,6 @@ def reset_noise(
 ) -> Float32[Tensor, "*leaf"]:
     """Begin the episodes of the masked rows, and count them; return their noisy readings and the others' clean ones."""
     return _run(clean_EL, *state, features, _RESET, mask_E, stream, counter_E)
-
-
-def _run(*arguments: object) -> Tensor:
-    # Eager code goes past torch's dispatcher, which takes longer than the launch.
-    if torch.compiler.is_compiling():
-        return _noise(*arguments)  # pyright: ignore[reportArgumentType]
-    return _launch(*arguments)  # pyright: ignore[reportArgumentType]
 
 
 def _launch(
@@ -244,30 +237,16 @@ def _launch(
     num_columns = flags_L.numel()
     num_rows = clean_EL.numel() // max(num_columns, 1)
     device = clean_EL.device
-    tensors = (
-        seed,
-        counter,
-        enabled,
-        level,
-        mask_E,
-        table_PL,
-        flags_L,
-        clean_EL,
-        bias_EL,
-        walk_EL,
-        last_EL,
-        out_EL,
-    )
+    state = seed, counter, enabled, level, mask_E, table_PL, flags_L
+    tensors = *state, clean_EL, bias_EL, walk_EL, last_EL, out_EL
     dim = (num_rows, 1 if device.type == "cpu" else _LANES)
     _quick(device, dim, num_columns, moment, features, stream, *map(address, tensors))
     return out_EL
 
 
-_noise = torch.library.custom_op(
-    "ksim_rl::noise", _launch, mutates_args=("bias_EL", "walk_EL", "last_EL", "counter")
+_run = as_operator(
+    "noise",
+    _launch,
+    lambda clean_EL, *_others: clean_EL.new_empty(clean_EL.shape),
+    mutates=("bias_EL", "walk_EL", "last_EL", "counter"),
 )
-
-
-@_noise.register_fake
-def _(clean_EL: Tensor, *others: object) -> Tensor:
-    return clean_EL.new_empty(clean_EL.shape)

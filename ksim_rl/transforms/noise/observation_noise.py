@@ -1,18 +1,18 @@
-"""Sensor noise is added by the transform of this module."""
+"""Sensor noise is added by the transform of this module; all observations of one transform share a kernel."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import torch
+from jaxtyping import Float, Float32
 from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
-from torchrl.data import Composite
+from torch import Tensor, nn
+from torchrl.data import Composite, TensorSpec
 
+from ksim_rl.transforms import upstream
 from ksim_rl.transforms.columns import side_by_side, split
-from ksim_rl.transforms.keyed_transform import KeyedTransform
-from ksim_rl.transforms.level import FollowsLevel
-from ksim_rl.transforms.noise.cfg import NoiseCfg
-from ksim_rl.transforms.noise.columns import NoiseColumns, widen
+from ksim_rl.transforms.noise import kernel as noise_kernel
+from ksim_rl.transforms.noise.cfg import Draw, NoiseCfg, per_dim
 from ksim_rl.transforms.noise.kernel import (
     HAS_BIAS,
     HAS_DROPOUT,
@@ -23,18 +23,15 @@ from ksim_rl.transforms.noise.kernel import (
     step_noise,
 )
 from ksim_rl.transforms.row_transform import (
+    FollowsLevel,
+    KeyedTransform,
     Keys,
     RowTransform,
     as_keys,
     checked_out_keys,
+    one_per_key,
 )
-from ksim_rl.transforms.specs import (
-    Device,
-    bounded,
-    bounds,
-    leaf_spec,
-    set_leaf_spec,
-)
+from ksim_rl.transforms.specs import Device, add_bounds, bounded, bounds, multiply_bounds, replace_leaves
 
 
 class ObservationNoise(FollowsLevel, KeyedTransform):
@@ -101,36 +98,31 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
     def train(self, mode: bool = True) -> Self:
         """Follow the mode of the env: noise is for training only."""
         super().train(mode)
-        # TorchRL calls eval() on each transform that it attaches: that is no wish for evaluation.
-        if self._in_env():
+        if upstream.is_in_env(self):
             self.enabled.fill_(self._wanted and mode)
         return self
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Widen the bounds by the reach of the noise."""
         batch_dims = observation_spec.ndim
-        specs = [leaf_spec(observation_spec, key, type(self).__name__) for key in self.in_keys]
-        for key, spec in zip(self.in_keys, specs, strict=True):
-            if not spec.dtype.is_floating_point:
-                raise ValueError(
-                    f"ObservationNoise: {key!r} is {spec.dtype}: noise needs floating-point observations"
-                )
-        for key, out_key, spec, cfg in zip(self.in_keys, self.out_keys, specs, self.noise, strict=True):
-            low, high = widen(cfg, key, *bounds(spec), batch_dims)
-            set_leaf_spec(observation_spec, out_key, bounded(low, high, dtype=spec.dtype, device=spec.device))
-        self._size_rows(observation_spec.shape.numel(), observation_spec.device)
-        self._size_columns([spec.shape[batch_dims:] for spec in specs])
+
+        def widened(index: int, spec: TensorSpec) -> TensorSpec:
+            low, high = widen(self.noise[index], self.in_keys[index], *bounds(spec), batch_dims)
+            return bounded(low, high, dtype=spec.dtype, device=spec.device)
+
+        owner = type(self).__name__
+        leaves = replace_leaves(
+            observation_spec, self.in_keys, self.out_keys, owner, widened, is_floating=True
+        )
+        self._size_rows(observation_spec)
+        self._size_buffer("step_count_E", torch.int64)
+        self._size_columns([leaf.shape[batch_dims:] for leaf in leaves], observation_spec.device)
         return observation_spec
 
-    def _size_rows(self, num_rows: int, device: Device) -> None:
-        super()._size_rows(num_rows, device)
-        self._size_buffer("step_count_E", (num_rows,), torch.int64, device)
-
-    def _size_columns(self, shapes: list[torch.Size]) -> None:
+    def _size_columns(self, shapes: list[torch.Size], device: Device) -> None:
         if self._layout == (self.num_rows, shapes):
             return
         self._layout = (self.num_rows, shapes)
-        device = self.step_count.device
         columns = NoiseColumns(self.noise, self.in_keys, [shape.numel() for shape in shapes], device)
         self.noise_columns = columns
         shape = (self.num_rows, columns.size)
@@ -138,21 +130,15 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
             present = self._buffers["bias_EL"]
             if present is None or present.shape != shape:
                 self._buffers["bias_EL"] = columns.neutral_bias().expand(shape).clone()
-        if columns.has(HAS_WALK):
-            self._size_buffer("walk_EL", shape, torch.float32, device)
-        if columns.has(HAS_DROPOUT):
-            self._size_buffer("last_EL", shape, torch.float32, device)
+        for name, feature in (("walk_EL", HAS_WALK), ("last_EL", HAS_DROPOUT)):
+            if columns.has(feature):
+                self._size_buffer(name, torch.float32, (columns.size,))
 
-    def _size_by(self, tensordict: TensorDictBase) -> None:
-        """Make what the specs have not made yet: TorchRL may reset or resume an env before it asks for them."""
-        if self._layout is None:
-            self._size_rows(tensordict.numel(), tensordict.device)
-            self._size_columns([tensordict.get(key).shape[tensordict.ndim :] for key in self.in_keys])
+    def _rows_that_reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
+        # The kernel counts the resets, and in `_step` the steps.
+        return RowTransform._rows_that_reset(self, tensordict, tensordict_reset)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        self._size_by(tensordict_reset)
-        # The kernel counts the resets, and below the steps.
-        mask_E = RowTransform._reset_rows(self, tensordict, tensordict_reset)
+    def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
         values = [tensordict_reset.get(key) for key in self.in_keys]
         state, features = self._state()
         stream, counter_E = self._stream_ids["reset"], self.reset_count_E
@@ -161,17 +147,18 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         return self._write(tensordict_reset, noisy_EL, values)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self._size_by(next_tensordict)
+        buffers = self._sized()
         values = [next_tensordict.get(key) for key in self.in_keys]
         state, features = self._state()
-        stream, counter_E = self._stream_ids["step"], cast(Tensor, self._buffers["step_count_E"])
+        stream, counter_E = self._stream_ids["step"], buffers["step_count_E"]
         noisy_EL = step_noise(self._joined(values), state, features, stream=stream, counter_E=counter_E)
         return self._write(next_tensordict, noisy_EL, values)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add fresh noise to a batch of samples; they belong to no episode, so there is no bias, walk or dropout."""
         values = [tensordict.get(key) for key in self.in_keys]
-        self._size_columns([value.shape[tensordict.ndim :] for value in values])
+        shapes = [value.shape[tensordict.ndim :] for value in values]
+        self._size_columns(shapes, self.step_count.device)
         state, features = self._state()
         stream, counter = self._stream_ids["forward"], self.step_count
         clean_EL = self._joined(values, tensordict.numel())
@@ -185,16 +172,9 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         buffers: dict[str, Any] = self._buffers
         columns: Any = self._modules["noise_columns"]
         parameters: dict[str, Any] = columns._buffers
-        state = NoiseState(
-            parameters["table_PL"],
-            parameters["flags_L"],
-            buffers["enabled"],
-            buffers["level"],
-            buffers["seed_value"],
-            buffers["bias_EL"],
-            buffers["walk_EL"],
-            buffers["last_EL"],
-        )
+        read = parameters["table_PL"], parameters["flags_L"], buffers["enabled"], buffers["level"]
+        changed = buffers["bias_EL"], buffers["walk_EL"], buffers["last_EL"]
+        state = NoiseState(*read, buffers["seed_value"], *changed)
         return state, columns.features
 
     def _joined(self, values: list[Tensor], num_rows: int | None = None) -> Tensor:
@@ -214,14 +194,126 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
 def _one_per_key(
     noise: NoiseCfg | Sequence[NoiseCfg] | Mapping[NestedKey, NoiseCfg], in_keys: Sequence[NestedKey]
 ) -> list[NoiseCfg]:
-    if isinstance(noise, NoiseCfg):
-        return [noise] * len(in_keys)
-    if isinstance(noise, Mapping):
-        if set(noise) != set(in_keys):
-            raise ValueError(
-                f"noise has the keys {list(noise)}, but in_keys={list(in_keys)}: give one per key"
-            )
-        return [noise[key] for key in in_keys]
+    if isinstance(noise, NoiseCfg | Mapping):
+        return one_per_key("noise", noise, in_keys)
     if len(noise) != len(in_keys):
         raise ValueError(f"noise has {len(noise)} entries for the {len(in_keys)} of in_keys={list(in_keys)}")
     return list(noise)
+
+
+class NoiseColumns(nn.Module):
+    """Parameters of the noise, column by column, as `noise_kernel` reads them.
+
+    Attributes:
+        features: which of bias, walk, resolution, dropout and normal draws any column has.
+
+    Args:
+        cfgs: one per observation.
+        keys: their names, for errors.
+        sizes: their numbers of columns.
+    """
+
+    table_PL: Tensor
+    flags_L: Tensor
+
+    def __init__(
+        self, cfgs: Sequence[NoiseCfg], keys: Sequence[NestedKey], sizes: Sequence[int], device: Device
+    ) -> None:
+        super().__init__()
+        self.size = sum(sizes)
+        table = torch.zeros(noise_kernel.NUM_PARAMETERS, self.size)
+        flags = torch.zeros(self.size, dtype=torch.int32)
+        start = 0
+        for index, (cfg, key, size) in enumerate(zip(cfgs, keys, sizes, strict=True)):
+            columns = slice(start, start + size)
+            table[:, columns] = torch.tensor(_parameters(cfg, key, size))
+            flags[columns] = _flags(cfg) | index << noise_kernel.KEY_SHIFT
+            start += size
+        found = {
+            noise_kernel.HAS_GAUSSIAN: any(_is_gaussian(cfg) or _is_gaussian(cfg.bias) for cfg in cfgs),
+            noise_kernel.HAS_BIAS: any(cfg.bias is not None for cfg in cfgs),
+            noise_kernel.HAS_WALK: bool(table[noise_kernel.WALK_STD].any()),
+            noise_kernel.HAS_RESOLUTION: bool(table[noise_kernel.RESOLUTION].any()),
+            noise_kernel.HAS_DROPOUT: bool(table[noise_kernel.DROPOUT].any()),
+        }
+        self.features = sum(feature for feature, is_there in found.items() if is_there)
+        self.by_level = any(cfg.by_level for cfg in cfgs)
+        self.register_buffer("table_PL", table.to(device), persistent=False)
+        self.register_buffer("flags_L", flags.to(device), persistent=False)
+
+    def has(self, feature: int) -> bool:
+        """Whether any column has it."""
+        return bool(self.features & feature)
+
+    def neutral_bias(self) -> Float32[Tensor, " L"]:
+        """Return the bias that changes nothing, [L]."""
+        return (self.flags_L & noise_kernel.BIAS_MULTIPLY != 0).to(torch.float32)
+
+
+def _parameters(cfg: NoiseCfg, key: NestedKey, size: int) -> list[list[float]]:
+    """Return the parameters of one observation, one row per kind."""
+    try:
+        bias = cfg.bias.affine(size) if cfg.bias is not None else ([0.0] * size, [0.0] * size)
+        rows = {
+            noise_kernel.OFFSET: cfg.affine(size)[0],
+            noise_kernel.SPREAD: cfg.affine(size)[1],
+            noise_kernel.BIAS_OFFSET: bias[0],
+            noise_kernel.BIAS_SPREAD: bias[1],
+            noise_kernel.WALK_STD: per_dim("walk_std", cfg.walk_std, size),
+            noise_kernel.RESOLUTION: per_dim("resolution", cfg.resolution, size),
+            noise_kernel.DROPOUT: [cfg.dropout] * size,
+        }
+    except ValueError as error:
+        raise ValueError(f"{type(cfg).__name__} of {key!r}: {error}") from None
+    return [rows[row] for row in range(noise_kernel.NUM_PARAMETERS)]
+
+
+def _flags(cfg: NoiseCfg) -> int:
+    flags = {
+        noise_kernel.GAUSSIAN: _is_gaussian(cfg),
+        noise_kernel.MULTIPLY: cfg.operation == "multiply",
+        noise_kernel.BIAS_GAUSSIAN: _is_gaussian(cfg.bias),
+        noise_kernel.BIAS_MULTIPLY: cfg.bias is not None and cfg.bias.operation == "multiply",
+        noise_kernel.BY_LEVEL: cfg.by_level,
+        noise_kernel.HOLD: cfg.lost == "last",
+    }
+    return sum(flag for flag, is_set in flags.items() if is_set)
+
+
+def _is_gaussian(cfg: NoiseCfg | None) -> bool:
+    return cfg is not None and cfg.draw is Draw.GAUSSIAN
+
+
+def widen(
+    cfg: NoiseCfg, key: NestedKey, low: Float[Tensor, "*leaf"], high: Float[Tensor, "*leaf"], batch_dims: int
+) -> tuple[Float[Tensor, "*leaf"], Float[Tensor, "*leaf"]]:
+    """Return the bounds of the noisy observation; they hold the clean one too, as noise can be off or weaker."""
+    shape = low.shape[batch_dims:]
+    rows = [
+        torch.tensor(row, device=low.device).reshape(shape) for row in _parameters(cfg, key, shape.numel())
+    ]
+    ends = low, high
+    if cfg.bias is not None:
+        ends = _noisy(cfg.bias, rows[noise_kernel.BIAS_OFFSET], rows[noise_kernel.BIAS_SPREAD], ends)
+    drift = torch.where(rows[noise_kernel.WALK_STD] > 0, torch.inf, 0.0)
+    ends = ends[0] - drift, ends[1] + drift
+    ends = _noisy(cfg, rows[noise_kernel.OFFSET], rows[noise_kernel.SPREAD], ends)
+    half = rows[noise_kernel.RESOLUTION] / 2
+    lowest, highest = torch.minimum(low, ends[0] - half), torch.maximum(high, ends[1] + half)
+    if cfg.dropout and cfg.lost == "zero":
+        lowest, highest = lowest.clamp(max=0.0), highest.clamp(min=0.0)
+    return lowest, highest
+
+
+def _noisy(
+    cfg: NoiseCfg, offset: Tensor, spread: Tensor, ends: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Return the bounds after a noise of any strength from none to full."""
+    low, high = ends
+    if cfg.draw is Draw.GAUSSIAN:
+        reach = torch.where(spread > 0, torch.inf, 0.0)
+        noise = (offset - reach).expand(low.shape), (offset + reach).expand(low.shape)
+    else:
+        noise = offset.expand(low.shape), (offset + spread).expand(low.shape)
+    noisy_low, noisy_high = (multiply_bounds if cfg.operation == "multiply" else add_bounds)(ends, noise)
+    return torch.minimum(low, noisy_low), torch.maximum(high, noisy_high)

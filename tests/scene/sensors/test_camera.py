@@ -13,7 +13,7 @@ from ksim_rl.envs import (
 )
 from ksim_rl.mdp import CameraImage, JointPos
 from ksim_rl.scene.rendering import rendering
-from ksim_rl.transforms.groups.compile_groups import compile_groups
+from ksim_rl.transforms.groups.group_cfg import compile_groups
 from tests.envs.probe_env import puck_cfg
 from tests.scene.sensors.bench import SensorBench
 

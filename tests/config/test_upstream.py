@@ -1,10 +1,20 @@
-"""Stored configs cost nothing until Hydra loads them."""
+"""What configs use of Hydra beyond its documents is still there: stored configs cost nothing until it loads them."""
 
 import copy
+from dataclasses import fields
+from importlib.metadata import version
 
-from hydra.core.config_store import ConfigStore
+from hydra.core.config_store import ConfigNode, ConfigStore
 
-from ksim_rl.config import stored_configs
+from ksim_rl.config import upstream
+
+
+def test_hydra_stores_nodes_of_these_fields_in_nested_dicts():
+    moved = f"Hydra {version('hydra-core')}: ConfigStore.repo or ConfigNode"
+    assert isinstance(ConfigStore.instance().repo, dict), moved
+    assert {field.name for field in fields(ConfigNode)} == {"name", "node", "group", "package", "provider"}, (
+        moved
+    )
 
 
 def test_a_config_is_made_once_when_it_is_loaded_first(monkeypatch):
@@ -15,7 +25,7 @@ def test_a_config_is_made_once_when_it_is_loaded_first(monkeypatch):
         made.append(True)
         return {"value": 1}
 
-    stored_configs.store("some/group", "one", make, package="_global_")
+    upstream.store_config("some/group", "one", make, package="_global_")
     assert copy.deepcopy(store).list("some/group") == ["one.yaml"]
     assert not made
 
@@ -30,6 +40,6 @@ def test_what_others_stored_is_kept_whole(monkeypatch):
     store = ConfigStore.instance()
     monkeypatch.setattr(store, "repo", {})
     store.store(name="one", group="group", node={"value": 1})
-    stored_configs.quicken()
+    upstream.quicken()
     assert copy.deepcopy(store).load("group/one.yaml") == store.load("group/one.yaml")
     assert store.load("group/one.yaml").node == {"value": 1}

@@ -1,8 +1,9 @@
-"""This module puts configs into Hydra's store that cost nothing until Hydra loads them.
+"""This module holds what configs use of Hydra beyond its documents, checked with Hydra 1.3.8 and OmegaConf 2.3.1.
 
 `ConfigStore.store` makes OmegaConf nodes of whatever it is given, which takes most of a second for all of our tasks.
 And Hydra copies all that it holds whenever it lists a group, which `ksim-rl train --help` does a hundred times; what it
-loads it copies once more, so the first copy protects nothing.
+loads it copies once more, so the first copy protects nothing. So configs are put into its store as nodes that are made
+late and not copied. `tests/config/test_upstream.py` names the part that a new version moved.
 """
 
 from collections.abc import Callable
@@ -40,23 +41,21 @@ def _made(make: Callable[[], dict[str, Any]]) -> DictConfig:
     return OmegaConf.create(make())
 
 
-def store(group: str, name: str, make: Callable[[], dict[str, Any]], *, package: str | None = None) -> None:
+def store_config(
+    group: str, name: str, make: Callable[[], dict[str, Any]], *, package: str | None = None
+) -> None:
     """Store a config in a group; `make` is called for its tree when Hydra first loads it."""
     folder = ConfigStore.instance().repo
     for part in group.split("/"):
         folder = folder.setdefault(part, {})
-    file = f"{name}.yaml"
-    folder[file] = _Made(make, name=file, group=group, package=package)
+    folder[f"{name}.yaml"] = _Made(make, name=f"{name}.yaml", group=group, package=package)
 
 
-def quicken() -> None:
+def quicken(folder: dict[str, Any] | None = None) -> None:
     """Let what others stored so far be listed without copies of it."""
-    _visit(ConfigStore.instance().repo)
-
-
-def _visit(folder: dict[str, Any]) -> None:
+    folder = ConfigStore.instance().repo if folder is None else folder
     for name, entry in folder.items():
         if isinstance(entry, dict):
-            _visit(entry)
+            quicken(entry)
         elif type(entry) is ConfigNode:
             folder[name] = _Kept(**vars(entry))
