@@ -80,10 +80,7 @@ class RandomCommandCurriculum(KeyedTransform):
             raise ValueError(f"lower_below={lower_below} exceeds raise_above={raise_above}")
         checks.check_in_range("step", step, low=0.0, high=1.0, low_open=True)
         checks.check_in_range("initial_level", initial_level, low=0.0, high=1.0)
-        if isinstance(resample_every, bool) or not isinstance(resample_every, int) or resample_every < 0:
-            raise ValueError(
-                f"resample_every={resample_every!r}: expected a whole number of env steps of at least 0"
-            )
+        checks.check_count("resample_every", resample_every, low=0)
         names = ["level_E", "score_E", "age_E", "command_EL"]
         super().__init__(keys, outs, row_buffers=names, seed=seed, stream=stream)
         self.raise_above, self.lower_below, self.step = raise_above, lower_below, step

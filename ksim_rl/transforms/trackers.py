@@ -209,8 +209,8 @@ class TimeAwareObservation(RowTransform):
         keys = as_keys(out_keys)
         if len(keys) != 1:
             raise ValueError(f"out_keys={keys}: expected one key")
-        if horizon is not None and (isinstance(horizon, bool) or not isinstance(horizon, int) or horizon < 1):
-            raise ValueError(f"horizon={horizon!r}: expected a whole number of env steps of at least 1")
+        if horizon is not None:
+            checks.check_count("horizon", horizon)
         super().__init__([], keys, row_buffers=["left_E"])
         self.horizon, self.normalize = horizon, normalize
 
