@@ -4,7 +4,7 @@ A term is public once it is imported here.
 """
 # ruff: noqa: F401
 
-from ksim_rl.mdp.actions.joints import (
+from ksim_rl.mdp.actions import (
     ActuatorAction,
     JointEffortAction,
     JointPositionAction,
@@ -12,43 +12,54 @@ from ksim_rl.mdp.actions.joints import (
     JointVelocityAction,
     RelativeJointPositionAction,
 )
-from ksim_rl.mdp.commands.gait import SinusoidalGaitCommand
-from ksim_rl.mdp.commands.joystick import JoystickCommand
+from ksim_rl.mdp.commands.locomotion import JoystickCommand, SinusoidalGaitCommand, UniformVelocityCommand
 from ksim_rl.mdp.commands.pose import (
     BaseHeightCommand,
     CartesianCommand,
     JointPositionCommand,
     StartPoseCommand,
 )
-from ksim_rl.mdp.commands.velocity import UniformVelocityCommand
-from ksim_rl.mdp.curricula.level import (
+from ksim_rl.mdp.curricula import (
+    CommandRangesByLevel,
+    CommandRangesByStage,
     DistanceLevel,
     EpisodeLengthLevel,
     LinearLevel,
-    SaturationLevel,
-)
-from ksim_rl.mdp.curricula.scale import (
-    CommandRangesByLevel,
-    CommandRangesByStage,
     RewardWeightByLevel,
     RewardWeightByStage,
+    SaturationLevel,
+    TerrainLevels,
 )
-from ksim_rl.mdp.curricula.terrain_levels import TerrainLevels
-from ksim_rl.mdp.events.joint_resets import ResetJoints, ResetJointsByScale
-from ksim_rl.mdp.events.motion import ResetToMotion
-from ksim_rl.mdp.events.pushes import Jump, PushByForce, PushByVelocity
-from ksim_rl.mdp.events.root_resets import ResetHeading, ResetHeight, ResetRootUniform
+from ksim_rl.mdp.events import (
+    Jump,
+    PushByForce,
+    PushByVelocity,
+    ResetHeading,
+    ResetHeight,
+    ResetJoints,
+    ResetJointsByScale,
+    ResetRootUniform,
+)
 from ksim_rl.mdp.manipulation import NearBody, OffsetToBody, OffsetToCommand
-from ksim_rl.mdp.metrics.effort import CostOfTransport, Power
-from ksim_rl.mdp.metrics.feet import FootSlipSpeed, PeakContactForce, PeakFootHeight
-from ksim_rl.mdp.metrics.motion import ActionAcceleration, AngularVelocityError, LinearVelocityError
-from ksim_rl.mdp.metrics.success import Success, TargetReached
+from ksim_rl.mdp.metrics import (
+    ActionAcceleration,
+    AngularVelocityError,
+    CostOfTransport,
+    FootSlipSpeed,
+    LinearVelocityError,
+    PeakContactForce,
+    PeakFootHeight,
+    Power,
+    Success,
+    TargetReached,
+)
 from ksim_rl.mdp.motion_tracking import (
     FarFromMotion,
     MotionBodyOffset,
     MotionFinished,
     MotionJoints,
     MotionPhase,
+    ResetToMotion,
     TrackMotionBodyPos,
     TrackMotionBodyQuat,
     TrackMotionJointPos,
@@ -62,8 +73,6 @@ from ksim_rl.mdp.observations.bodies import (
     BodyRotation6d,
     CenterOfMassPos,
     CenterOfMassVel,
-)
-from ksim_rl.mdp.observations.contacts import (
     Contact,
     ContactForce,
     FootAirTime,
@@ -72,7 +81,6 @@ from ksim_rl.mdp.observations.contacts import (
     FootHeight,
     FootPos,
 )
-from ksim_rl.mdp.observations.height_scan import HeightScan
 from ksim_rl.mdp.observations.joints import (
     ActuatorForce,
     JointAcc,
@@ -82,9 +90,12 @@ from ksim_rl.mdp.observations.joints import (
     JointVel,
 )
 from ksim_rl.mdp.observations.root import (
+    Clock,
     Command,
+    EpisodeTime,
     LastAction,
     ProjectedGravity,
+    RemainingTime,
     RootAngVel,
     RootLinVel,
     RootPos,
@@ -92,17 +103,21 @@ from ksim_rl.mdp.observations.root import (
     RootRotation6d,
     SensorReading,
 )
-from ksim_rl.mdp.observations.sensors import CameraImage, ImuReading, RayDistance, RayHeight
-from ksim_rl.mdp.observations.time import Clock, EpisodeTime, RemainingTime
+from ksim_rl.mdp.observations.sensors import CameraImage, HeightScan, ImuReading, RayDistance, RayHeight
 from ksim_rl.mdp.randomization.actuators import RandomizeActuatorGains, RandomizeEffortLimit
-from ksim_rl.mdp.randomization.bodies import RandomizeBodyCom, RandomizeBodyInertia, RandomizeBodyMass
+from ksim_rl.mdp.randomization.bodies import (
+    RandomizeBodyCom,
+    RandomizeBodyInertia,
+    RandomizeBodyMass,
+    RandomizeGravity,
+    RandomizePseudoInertia,
+)
 from ksim_rl.mdp.randomization.geoms import (
     RandomizeGeomFriction,
     RandomizeGeomPos,
     RandomizeGeomQuat,
     RandomizeGeomSize,
 )
-from ksim_rl.mdp.randomization.gravity import RandomizeGravity
 from ksim_rl.mdp.randomization.joints import (
     RandomizeDefaultJointPos,
     RandomizeEncoderBias,
@@ -113,22 +128,25 @@ from ksim_rl.mdp.randomization.joints import (
     RandomizeJointStiffness,
     RandomizeJointZero,
 )
-from ksim_rl.mdp.randomization.pseudo_inertia import RandomizePseudoInertia
 from ksim_rl.mdp.rewards.actions import (
     ActionAccelerationL2,
     ActionJerkL2,
     ActionRateL2,
+    ActionSymmetryL2,
     Alive,
+    JointSymmetryL2,
     Terminated,
 )
-from ksim_rl.mdp.rewards.contacts import ContactForceAbove, SelfCollision, UndesiredContacts
 from ksim_rl.mdp.rewards.feet import (
+    ContactForceAbove,
     FeetAirTime,
     FootClearance,
     FootSlip,
     FootSwingHeight,
     GaitPhase,
+    SelfCollision,
     SoftLanding,
+    UndesiredContacts,
 )
 from ksim_rl.mdp.rewards.joints import (
     ActuatorForceL2,
@@ -142,21 +160,18 @@ from ksim_rl.mdp.rewards.joints import (
     JointVelL2,
     JointVelLimits,
 )
-from ksim_rl.mdp.rewards.motion import (
+from ksim_rl.mdp.rewards.posture import (
     AngularMomentum,
     AngVelXYL2,
     BodyAngularVelocity,
     LinkAccelerationL2,
     LinVelZL2,
     MotionlessAtRest,
-)
-from ksim_rl.mdp.rewards.posture import (
     Pose,
     RootHeightL2,
     TiltL2,
     Upright,
 )
-from ksim_rl.mdp.rewards.symmetry import ActionSymmetryL2, JointSymmetryL2
 from ksim_rl.mdp.rewards.tracking import (
     TrackAngularVelocity,
     TrackJointPosition,

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.commands.target_pose import OfTarget, point_pos_w
-from ksim_rl.mdp.rewards.gaussian_reward import GaussianReward
+from ksim_rl.mdp.commands.pose import OfTarget, point_pos_w
+from ksim_rl.mdp.fields import GaussianReward
 
 
 @dataclass(frozen=True, kw_only=True)

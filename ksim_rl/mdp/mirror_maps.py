@@ -14,7 +14,7 @@ from ksim_rl import mdp
 from ksim_rl.checks import near
 from ksim_rl.envs.contract import part
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
-from ksim_rl.mdp.actions.joint_action import JointAction, per_joint
+from ksim_rl.mdp.actions import JointAction, per_joint
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.sensors import ContactSensor
 from ksim_rl.scene.sensors.ray_patterns import grid_points

@@ -1,4 +1,4 @@
-"""These terms read, rate and end episodes that follow a reference motion, from where `ResetToMotion` began them.
+"""These terms begin, read, rate and end episodes that follow a reference motion.
 
 `file` is what `view.motion` reads. Kernels are those of Peng et al., "DeepMimic" (2018), with their scales k written as
 std = 1 / sqrt(k): joint positions 2, joint velocities 0.1, ends of limbs 40, root or centre of mass 10.
@@ -6,19 +6,25 @@ std = 1 / sqrt(k): joint positions 2, joint velocities 0.1, ends of limbs 40, ro
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ksim_rl.checked import Positive
-from ksim_rl.envs.term import ObservationTerm, TerminationTerm
+from ksim_rl.checked import Positive, Within
+from ksim_rl.envs.term import EventTerm, ObservationTerm, TerminationTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.fields import OfJoints
-from ksim_rl.mdp.rewards.gaussian_reward import GaussianReward
+from ksim_rl.mdp.fields import GaussianReward, OfJoints
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
-from ksim_rl.scene.state.motion_clock import motion_bodies, motion_joints, motion_time
+from ksim_rl.scene.state.motion_clock import (
+    motion_bodies,
+    motion_joints,
+    motion_shift,
+    motion_start_time,
+    motion_time,
+)
 
 # -- observations ------------------------------------------------------------------------------------------------
 
@@ -157,3 +163,32 @@ def _body_offset(view: EnvView, file: str, bodies: Patterns) -> Tensor:
     """Return the motion's positions of bodies minus their own, world frame, m, [E, N, 3]."""
     pos_EN3, _ = motion_bodies(view, file, bodies)
     return pos_EN3 - view.bodies(bodies).pos_EN3
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResetToMotion(EventTerm):
+    """Put the whole scene into a state of a reference motion, and remember its time for `motion.motion_time`.
+
+    On a terrain all free roots are moved with the env's origin.
+
+    Attributes:
+        file: what `view.motion` reads.
+        start_range: of the motion's duration, both in [0, 1]: where episodes begin.
+    """
+
+    file: str
+    start_range: Annotated[tuple[float, float], Within(low=0.0, high=1.0, ordered=True)] = (0.0, 1.0)
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        motion, start_E = view.motion(self.file), motion_start_time(view, self.file)
+        drawn_E = view.uniform(1, *self.start_range)[:, 0] * motion.duration_s
+        start_E.copy_(torch.where(mask_E, drawn_E, start_E))
+        qpos_EL, qvel_EL = motion.sample(start_E)
+        shift_E3 = motion_shift(view)
+        if shift_E3 is not None:
+            for entity in view.entities.values():
+                if entity.free_root:
+                    start = entity.root_qpos.start
+                    qpos_EL[:, start : start + 3] += shift_E3
+        view.write_qpos(mask_E, qpos_EL)
+        view.write_qvel(mask_E, qvel_EL)

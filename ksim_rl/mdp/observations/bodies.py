@@ -1,12 +1,21 @@
-"""Each of these observations has one block for each body that its names match."""
+"""Each of these observations has one block for each body, site or contact that its names match.
+
+Contacts and their forces are those of the last physics substep (acceleration stage), in the order of the sensor's
+elements; poses and velocities are of the current state.
+"""
 
 from dataclasses import dataclass
+from typing import Literal
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ksim_rl.checked import NonNegative
+from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.observations.framed_observation import FramedObservation
+from ksim_rl.mdp.fields import FramedObservation, OfContacts
+from ksim_rl.mdp.quantities import contact_force
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
 
@@ -84,3 +93,83 @@ class CenterOfMassVel(BodyObservation):
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return self.vectors(view, view.bodies(self.bodies).subtree_com_vel_EN3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contact(OfContacts, ObservationTerm):
+    """1 where the net contact force exceeds a threshold, else 0, [E, N]; acceleration stage."""
+
+    threshold: NonNegative = 0.0
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E N"]:
+        return (contact_force(view, self.sensor) > self.threshold).to(torch.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactForce(FramedObservation):
+    """Net contact forces, N, [E, 3N]; acceleration stage. MuJoCo's sign: what weighs on the ground reads negative z.
+
+    Attributes:
+        sensor: a contact sensor of `scene.sensors`.
+    """
+
+    sensor: str
+    frame: Literal["root", "world"] = "world"
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return self.vectors(view, view.contact(self.sensor).force_EN3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootPos(FramedObservation):
+    """Positions of sites, m, [E, 3F]; position stage."""
+
+    sites: Patterns
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return self.points(view, view.sites(self.sites).pos_EN3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootHeight(ObservationTerm):
+    """Heights of sites above the ground right below them, m, [E, F]; position stage."""
+
+    sites: Patterns
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.sites(self.sites).height_EN
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootAirTime(ObservationTerm):
+    """Seconds since each foot left the ground, 0 while it touches, [E, F]; acceleration stage."""
+
+    sensor: str
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.contact(self.sensor).air_time_EN
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootContact(ObservationTerm):
+    """1 where a foot touches the ground, else 0, [E, F]; acceleration stage."""
+
+    sensor: str
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.contact(self.sensor).found_EN
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootContactForces(ObservationTerm):
+    """Net force of each foot on the ground, world frame, sign(f) log(1 + |f|) of newtons, [E, 3F]; acceleration stage.
+
+    MuJoCo's sign: a foot that stands presses down, z is negative.
+    The logarithm keeps an impact of hundreds of newtons in the range of the other observations.
+    """
+
+    sensor: str
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        force_EL = view.contact(self.sensor).force_EN3.flatten(start_dim=1)
+        return torch.sign(force_EL) * torch.log1p(torch.abs(force_EL))

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ksim_rl.mdp.rewards.tolerance import tolerance
+from ksim_rl.mdp.rewards.tracking import tolerance
 
 
 @pytest.mark.parametrize("shape", ["gaussian", "linear"])

@@ -1,0 +1,342 @@
+"""These curricula adapt difficulty, and change what they change only when envs reset.
+
+Some drive `view.level`, the one difficulty in [0, 1] that ranges, weights and noise may scale with; an env has at most
+one of them. Those that follow the level stand after it, if they are to follow it in the same reset. Others change
+ranges of commands and weights of rewards by stages of env steps, or move envs over the levels of a terrain.
+"""
+
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ksim_rl.checked import Count, NonNegative, Share, WholeNumber, Within
+from ksim_rl.checks import check_in_range, check_pair, unknown_name
+from ksim_rl.envs.term import CurriculumTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.constants import constant
+from ksim_rl.mdp.fields import OfEntity
+from ksim_rl.mdp.quantities import distance_from_origin
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelCurriculum(CurriculumTerm):
+    """What the terms of this file share.
+
+    Attributes:
+        initial_level: of an env that has just been built.
+    """
+
+    initial_level: Share = 0.0
+
+    @property
+    def first_level(self) -> float:
+        return self.initial_level
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearLevel(LevelCurriculum):
+    """The level rises linearly to 1 between two counts of env steps.
+
+    Attributes:
+        begin_step, end_step: env steps since the env was seeded.
+    """
+
+    begin_step: WholeNumber = 0
+    end_step: int
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_in_range("end_step", self.end_step, low=self.begin_step, low_open=True)
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
+        share = (view.step_count - self.begin_step) / (self.end_step - self.begin_step)
+        level = self.initial_level + (1.0 - self.initial_level) * share.clamp(0.0, 1.0)
+        view.level.copy_(torch.where(mask_E.any(), level.to(torch.float32), view.level))
+        return view.level.clone()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteppedLevel(LevelCurriculum):
+    """The level moves by 1 / `num_levels` whenever the mean score of the last episodes is high or low enough.
+
+    Attributes:
+        raise_above: a mean score above this makes it harder.
+        lower_below: a mean score below this makes it easier; None never does.
+        num_levels: how many steps lead from 0 to 1.
+        min_episodes: how many episodes must end before the level may move (and again before the next move); None: one
+            per env.
+    """
+
+    raise_above: float
+    lower_below: float | None = None
+    num_levels: Count = 10
+    min_episodes: Count | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.lower_below is not None:
+            check_in_range("lower_below", self.lower_below, high=self.raise_above)
+
+    @abstractmethod
+    def score(self, view: EnvView) -> Float[Tensor, " E"]:
+        """Return how well the running episodes have gone so far, float32 [E]."""
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
+        """Take in the episodes that ended, adapt, and return the level."""
+        ended_E = mask_E & (view.episode_step_E > 0)
+        held_2 = view.shared("episodes_and_score_2", (0.0, 0.0))
+        ended_E2 = torch.stack((torch.ones_like(ended_E, dtype=torch.float32), self.score(view)), dim=-1)
+        total_2 = held_2 + torch.where(ended_E[:, None], ended_E2, 0.0).sum(0)
+        is_enough = total_2[0] >= (self.min_episodes or view.num_envs)
+        mean = total_2[1] / total_2[0].clamp(min=1.0)
+        move = (mean > self.raise_above).to(torch.float32)
+        if self.lower_below is not None:
+            move = move - (mean < self.lower_below).to(torch.float32)
+        level = (view.level + move / self.num_levels).clamp(0.0, 1.0)
+        view.level.copy_(torch.where(is_enough, level, view.level))
+        held_2.copy_(torch.where(is_enough, 0.0, total_2))
+        return view.level.clone()
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeLengthLevel(SteppedLevel):
+    """Moves with how long episodes last: the score is the share of the longest possible one, in [0, 1]."""
+
+    raise_above: float = 0.8
+
+    def score(self, view: EnvView) -> Float[Tensor, " E"]:
+        if view.max_episode_length == 0:
+            raise ValueError(
+                "EpisodeLengthLevel with episode_length_s=0: episodes have no longest length; set one"
+            )
+        return view.episode_step_E / _longest_E(view)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistanceLevel(OfEntity, SteppedLevel):
+    """Moves with how far robots get: the score is the horizontal distance from the env's origin at the end, m."""
+
+    def score(self, view: EnvView) -> Float[Tensor, " E"]:
+        """Return the distances, m, [E]."""
+        return distance_from_origin(view, self.entity)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SaturationLevel(SteppedLevel):
+    """Moves one step when a reward saturates: the score is what the log shows as `reward/<term>`.
+
+    That is the weighted sum over the episode per second of the longest possible one (the plain sum where episodes have
+    no limit), so that a term of weight 2 that is always 1 scores 2.
+
+    Attributes:
+        reward: its name.
+    """
+
+    reward: str
+
+    def score(self, view: EnvView) -> Float[Tensor, " E"]:
+        if self.reward not in view.episode_rewards:
+            raise unknown_name("reward", self.reward, view.episode_rewards)
+        sum_E = view.episode_rewards[self.reward]
+        return sum_E if view.max_episode_length == 0 else sum_E / (_longest_E(view) * view.step_dt)
+
+
+def _longest_E(view: EnvView) -> Tensor:
+    """Return how many env steps each running episode can have; first episodes may have been cut short, [E]."""
+    return (view.max_episode_length - view.time_out_offset_E).to(torch.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TerrainLevels(OfEntity, CurriculumTerm):
+    """Moves the envs whose episodes ended to other levels of `scene.terrain`, a `TerrainGrid`; reports the mean level.
+
+    An env moves up one level when its robot got at least `up_distance` away from its origin (horizontally, at the end
+    of the episode), and down one when it got less than `down_share` of the way that its last command asks for in a
+    whole episode, be it that it was slow or that it fell. An env that has mastered the last level goes on at a random
+    one, so that none is forgotten. The rule is that of Rudin et al., "Learning to walk in minutes", 2022.
+
+    Attributes:
+        command: the velocity command, (vx, vy, ...) in m/s.
+        up_distance: share of the distance from the centre of a patch to its edge, in (0, 1].
+        down_share: of the commanded way.
+    """
+
+    command: str
+    up_distance: Annotated[float, Within(low=0.0, high=1.0, low_open=True)] = 0.8
+    down_share: NonNegative = 0.5
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
+        """Move the rows of `mask_E` that have had an episode, and return the mean level of all envs, float32 []."""
+        terrain = view.terrain
+        level_E, top = terrain.levels_E, terrain.num_levels - 1
+        distance_E = distance_from_origin(view, self.entity)
+        speed_E = torch.linalg.vector_norm(view.command(self.command)[:, :2], dim=-1)
+        asked_E = speed_E * (view.max_episode_length * view.step_dt)
+        up_E = distance_E >= self.up_distance * terrain.half_width
+        down_E = ~up_E & (distance_E < self.down_share * asked_E)
+        moved_E = level_E + up_E.long() - down_E.long()
+        drawn_E = (view.uniform(1)[:, 0] * terrain.num_levels).long().clamp(max=top)
+        next_E = torch.where(moved_E > top, drawn_E, moved_E.clamp(min=0))
+        terrain.set_levels(mask_E & (view.episode_step_E > 0), next_E)
+        return terrain.levels_E.to(torch.float32).mean()
+
+
+Ranges = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardWeight(CurriculumTerm):
+    """A curriculum of a reward's weight, which is also the reported level.
+
+    Attributes:
+        reward: its name.
+    """
+
+    reward: str
+
+    @property
+    def adapted_rewards(self) -> tuple[str, ...]:
+        return (self.reward,)
+
+    @abstractmethod
+    def weight(self, view: EnvView, held: Float[Tensor, ""]) -> Float[Tensor, ""]:
+        """Return the weight that the reward should have; `held` is its present one."""
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
+        held = view.reward_weights[self.reward]
+        held.copy_(torch.where(mask_E.any(), self.weight(view, held), held))
+        return held.clone()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardWeightByStage(RewardWeight):
+    """Gives a reward another weight from certain env steps on; until the first stage it has its own.
+
+    Attributes:
+        stages: weights by the env step (since the env was seeded) from which on they hold.
+    """
+
+    stages: Mapping[int, float]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_steps(self.stages)
+        for step, weight in self.stages.items():
+            check_in_range(f"stages.{step}", weight)
+
+    def weight(self, view: EnvView, held: Float[Tensor, ""]) -> Float[Tensor, ""]:
+        for step, value in sorted(self.stages.items()):
+            held = torch.where(view.step_count >= step, float(value), held)
+        return held
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardWeightByLevel(RewardWeight):
+    """Moves a reward's weight linearly with `view.level`.
+
+    Attributes:
+        start, end: the weights at level 0 and at level 1.
+    """
+
+    start: float
+    end: float
+
+    def weight(self, view: EnvView, held: Float[Tensor, ""]) -> Float[Tensor, ""]:
+        return self.start + (self.end - self.start) * view.level
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommandRangesByStage(CurriculumTerm):
+    """Gives a command other ranges from certain env steps on; until the first stage it has its own.
+
+    The reported level is the number of stages that have begun.
+
+    Attributes:
+        command: its name.
+        stages: ranges by field of the command, by the env step (since the env was seeded) from which on they hold. A
+            field that a stage leaves out stays as it is.
+    """
+
+    command: str
+    stages: Mapping[int, Ranges]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_steps(self.stages)
+        for step, ranges in self.stages.items():
+            _check_ranges(f"stages.{step}", ranges)
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
+        """Adapt and return the number of the stage."""
+        held = _ranges_of(view, self.command, {field for ranges in self.stages.values() for field in ranges})
+        wanted = dict(held)
+        for step, ranges in sorted(self.stages.items()):
+            for field, pair in ranges.items():
+                wanted[field] = torch.where(
+                    view.step_count >= step, constant(pair, view.device), wanted[field]
+                )
+        for field, held_2 in held.items():
+            held_2.copy_(torch.where(mask_E.any(), wanted[field], held_2))
+        stage = (view.step_count >= constant(sorted(self.stages), view.device)).sum().to(torch.float32)
+        held_stage = view.shared("stage", 0.0)
+        held_stage.copy_(torch.where(mask_E.any(), stage, held_stage))
+        return held_stage.clone()
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommandRangesByLevel(CurriculumTerm):
+    """Moves the ranges of a command linearly with `view.level`, which is also the reported level.
+
+    Attributes:
+        command: its name.
+        start, end: ranges by field of the command at level 0 and at level 1; the same fields in both.
+    """
+
+    command: str
+    start: Ranges
+    end: Ranges
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_ranges("start", self.start)
+        _check_ranges("end", self.end)
+        if self.start.keys() != self.end.keys():
+            raise ValueError(
+                f"start has the fields {sorted(self.start)} and end {sorted(self.end)}: give the same"
+            )
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
+        for field, held_2 in _ranges_of(view, self.command, self.start).items():
+            start_2, end_2 = constant(self.start[field], view.device), constant(self.end[field], view.device)
+            held_2.copy_(torch.where(mask_E.any(), torch.lerp(start_2, end_2, view.level), held_2))
+        return view.level.clone()
+
+
+def _check_steps(stages: Mapping[int, object]) -> None:
+    if not stages:
+        raise ValueError("stages={}: give at least one, by the env step at which it begins")
+    for step in stages:
+        check_in_range("stages (the env step of one)", step, low=0)
+
+
+def _check_ranges(where: str, ranges: Ranges) -> None:
+    if not ranges:
+        raise ValueError(f"{where}={{}}: name at least one field of the command")
+    for field, pair in ranges.items():
+        check_pair(f"{where}.{field}", pair)
+
+
+def _ranges_of(view: EnvView, command: str, fields: Iterable[str]) -> dict[str, Tensor]:
+    """Return the present ranges of some fields of a command, (low, high) [2] each."""
+    if command not in view.command_ranges:
+        raise unknown_name("command with ranges", command, view.command_ranges)
+    present = view.command_ranges[command]
+    for field in fields:
+        if field not in present:
+            raise unknown_name(f"range of the command {command!r}", field, present)
+    return {field: present[field] for field in present if field in set(fields)}

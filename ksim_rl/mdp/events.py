@@ -1,0 +1,243 @@
+"""These events reset joints and free roots, and disturb a robot by a kick, by a force that lasts, by a jump."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ksim_rl.checked import NonNegativeRange, Range
+from ksim_rl.checks import check_in_range, check_pair
+from ksim_rl.envs.term import EventTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp import se3_ranges
+from ksim_rl.mdp.constants import constant
+from ksim_rl.mdp.fields import OfFreeRoot, OfJoints
+from ksim_rl.mdp.quantities import root_height
+from ksim_rl.scene import quaternion
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointReset(OfJoints, EventTerm):
+    """A reset of joints, whose positions stay in the soft limits."""
+
+    def write(
+        self,
+        view: EnvView,
+        mask_E: Bool[Tensor, " E"],
+        pos_EL: Float[Tensor, "E L"],
+        vel_EL: Float[Tensor, "E L"],
+    ) -> None:
+        """Set positions and velocities of the joints in the rows of `mask_E`."""
+        joints = view.joints(self.joints)
+        low_L, high_L = joints.soft_limits_L2.unbind(-1)
+        joints.write_pos(mask_E, torch.clamp(pos_EL, low_L, high_L))
+        joints.write_vel(mask_E, vel_EL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResetJoints(JointReset):
+    """Put joints at their default positions plus an offset, at a drawn velocity.
+
+    Attributes:
+        position_range: rad or m. With `distribution="gaussian"`: (mean, standard deviation).
+        velocity_range: rad/s or m/s; likewise.
+    """
+
+    position_range: tuple[float, float] = (0.0, 0.0)
+    velocity_range: tuple[float, float] = (0.0, 0.0)
+    distribution: Literal["uniform", "gaussian"] = "uniform"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("position_range", "velocity_range"):
+            if self.distribution == "uniform":
+                check_pair(name, getattr(self, name))
+            else:
+                check_in_range(f"{name}[1]", getattr(self, name)[1], low=0.0)
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        default_EL = view.joints(self.joints).default_pos_EL
+        count = default_EL.shape[1]
+        pos_EL = default_EL + self._draw(view, count, self.position_range)
+        self.write(view, mask_E, pos_EL, self._draw(view, count, self.velocity_range))
+
+    def _draw(self, view: EnvView, count: int, pair: tuple[float, float]) -> Float[Tensor, "E L"]:
+        first, second = float(pair[0]), float(pair[1])
+        if second == (0.0 if self.distribution == "gaussian" else first):
+            return constant([first] * count, view.device).expand(view.num_envs, count)
+        if self.distribution == "gaussian":
+            return first + second * view.normal(count)
+        return view.uniform(count, first, second)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResetJointsByScale(JointReset):
+    """Put joints at their default positions times a uniform factor, per joint.
+
+    Attributes:
+        position_scale: the factor's range.
+        velocity_range: rad/s or m/s, uniform.
+    """
+
+    position_scale: Range
+    velocity_range: Range = (0.0, 0.0)
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        default_EL = view.joints(self.joints).default_pos_EL
+        count = default_EL.shape[1]
+        pos_EL = default_EL * view.uniform(count, *self.position_scale)
+        self.write(view, mask_E, pos_EL, view.uniform(count, *self.velocity_range))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResetRootUniform(OfFreeRoot, EventTerm):
+    """Put the free root body at its default pose plus a uniform offset, with a uniform velocity.
+
+    On a terrain the default pose stands at the env's origin.
+
+    Attributes:
+        pose_range: by axis: x, y, z (m, world frame), roll, pitch, yaw (rad, in the default pose's frame).
+        velocity_range: by axis: x, y, z (m/s), roll, pitch, yaw (rad/s), world frame.
+    """
+
+    pose_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    velocity_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        se3_ranges.check_ranges("pose_range", self.pose_range)
+        se3_ranges.check_ranges("velocity_range", self.velocity_range)
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        body = self.root_of(view)
+        offset_E6 = se3_ranges.draw(view, self.pose_range)
+        velocity_E6 = se3_ranges.draw(view, self.velocity_range)
+        turn_E4 = quaternion.from_euler_xyz(*offset_E6[:, 3:].unbind(-1))
+        quat_E4 = quaternion.multiply(body.default_root_quat_L.expand(view.num_envs, 4), turn_E4)
+        pos_E3 = body.default_root_pos_L + offset_E6[:, :3]
+        if not view.terrain.is_flat:
+            pos_E3 = pos_E3 + view.terrain.origins_E3
+        body.write_root_pose(mask_E, pos_E3, quat_E4)
+        body.write_root_velocity(mask_E, velocity_E6[:, :3], velocity_E6[:, 3:])
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResetHeading(OfFreeRoot, EventTerm):
+    """Turn the free root body about the world's z axis until its heading is a drawn one; its tilt stays.
+
+    It may follow `ResetRootUniform` in the same reset.
+
+    Attributes:
+        heading_range: rad.
+    """
+
+    heading_range: Range = (-math.pi, math.pi)
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        body = self.root_of(view)
+        turn_E = view.uniform(1, *self.heading_range)[:, 0] - body.heading_E
+        nothing_E = torch.zeros_like(turn_E)
+        turn_E4 = quaternion.from_euler_xyz(nothing_E, nothing_E, turn_E)
+        body.write_root_pose(mask_E, body.root_pos_EL, quaternion.multiply(turn_E4, body.root_quat_EL))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResetHeight(OfFreeRoot, EventTerm):
+    """Lift or lower the free root body until it is a drawn height above the ground right below it.
+
+    It may follow `ResetRootUniform` in the same reset.
+
+    Attributes:
+        height_range: m.
+    """
+
+    height_range: Range
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        body = self.root_of(view)
+        rise_E1 = view.uniform(1, *self.height_range) - root_height(view, self.entity)[:, None]
+        pos_E3 = torch.cat((body.root_pos_EL[:, :2], body.root_pos_EL[:, 2:] + rise_E1), dim=-1)
+        body.write_root_pose(mask_E, pos_E3, body.root_quat_EL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushByVelocity(OfFreeRoot, EventTerm):
+    """Kick the free root body: add a uniform draw to its velocity, whatever its mass.
+
+    Attributes:
+        velocity_range: by axis: x, y, z (m/s), roll, pitch, yaw (rad/s), world frame.
+    """
+
+    velocity_range: Mapping[str, tuple[float, float]]
+    mode: Literal["startup", "reset", "interval", "step"] = "interval"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        se3_ranges.check_ranges("velocity_range", self.velocity_range)
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        body = self.root_of(view)
+        kick_E6 = se3_ranges.draw(view, self.velocity_range)
+        lin_vel_E3 = body.root_lin_vel_w_EL + kick_E6[:, :3]
+        body.write_root_velocity(mask_E, lin_vel_E3, body.root_ang_vel_w_EL + kick_E6[:, 3:])
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushByForce(EventTerm):
+    """Press on a body for a while with a constant wrench at its centre of mass; both are drawn when the interval ends.
+
+    A push that is due while another lasts replaces it. Several of these events on one body add up.
+
+    Attributes:
+        body: its name.
+        wrench_range: by axis: x, y, z (N), roll, pitch, yaw (N m), world frame.
+        duration_s: range, s; taken as the nearest whole number of env steps, and at least one.
+    """
+
+    body: str
+    wrench_range: Mapping[str, tuple[float, float]]
+    duration_s: NonNegativeRange
+    mode: Literal["startup", "reset", "interval", "step"] = "interval"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        se3_ranges.check_ranges("wrench_range", self.wrench_range)
+        if self.mode != "interval":
+            raise ValueError(f"mode={self.mode!r}: expected 'interval', which also says when a push ends")
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        """Begin a push in the rows of `mask_E`, and go on with or end those of the others; once per env step."""
+        held_E6, applied_E6 = view.buffer("wrench_E6", 6), view.buffer("applied_E6", 6)
+        left_E = view.buffer("left_s_E")
+        drawn_E6 = se3_ranges.draw(view, self.wrench_range)
+        duration_E = view.uniform(1, *self.duration_s)[:, 0].clamp(min=view.step_dt)
+        left_E.copy_(torch.where(mask_E, duration_E, left_E - view.step_dt))
+        held_E6.copy_(torch.where(mask_E[:, None], drawn_E6, held_E6))
+        # The clock has run out at the env step that is nearest, whatever the subtractions round to.
+        wrench_E6 = torch.where((left_E > 0.5 * view.step_dt)[:, None], held_E6, 0.0)
+        view.world.xfrc_applied_EL[:, view.resolver.one("body", self.body)].add_(wrench_E6 - applied_E6)
+        applied_E6.copy_(wrench_E6)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Jump(OfFreeRoot, EventTerm):
+    """Throw the free root body up: add the upward velocity sqrt(2 g h) that carries it a drawn height h further.
+
+    Attributes:
+        height_range: h, m, in free flight.
+    """
+
+    height_range: NonNegativeRange
+    mode: Literal["startup", "reset", "interval", "step"] = "interval"
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        body = self.root_of(view)
+        height_E = view.uniform(1, *self.height_range)[:, 0]
+        up_E = torch.sqrt(2.0 * torch.linalg.vector_norm(view.world.gravity_EL, dim=-1) * height_E)
+        lin_vel_E3 = body.root_lin_vel_w_EL.clone()
+        lin_vel_E3[:, 2] += up_E
+        body.write_root_velocity(mask_E, lin_vel_E3, body.root_ang_vel_w_EL)

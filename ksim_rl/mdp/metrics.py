@@ -1,0 +1,187 @@
+"""These metrics say how well and how smoothly commands are followed, what moving costs, and who succeeds.
+
+Poses and velocities are of the current state; contacts and forces belong to the last physics substep (acceleration
+stage).
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ksim_rl.checked import Positive
+from ksim_rl.checks import unknown_name
+from ksim_rl.envs.term import MetricTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.commands.pose import OfTarget
+from ksim_rl.mdp.fields import OfEntity, OfFeet, OfJoints
+from ksim_rl.mdp.quantities import contact_force, mechanical_power
+from ksim_rl.scene.names import Patterns
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearVelocityError(OfEntity, MetricTerm):
+    """|c_xy - v_xy| between command and root velocity, both in the root's frame, m/s; velocity stage.
+
+    Attributes:
+        command: (vx, vy, wz), by name.
+    """
+
+    command: str
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        error_E2 = view.command(self.command)[:, :2] - view.entity(self.entity).root_lin_vel_b_EL[:, :2]
+        return torch.linalg.vector_norm(error_E2, dim=-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AngularVelocityError(OfEntity, MetricTerm):
+    """|c_z - w_z| between command and root velocity, both in the root's frame, rad/s; velocity stage.
+
+    Attributes:
+        command: (vx, vy, wz), by name.
+    """
+
+    command: str
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        return (view.command(self.command)[:, 2] - view.entity(self.entity).root_ang_vel_b_EL[:, 2]).abs()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActionAcceleration(MetricTerm):
+    """Mean over columns of |a_t - 2 a_{t-1} + a_{t-2}|; actions before an episode are 0."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        rate_EL = view.action_EL - view.last_action_EL
+        last_rate_EL = view.buffer("last_rate_EL", rate_EL.shape[-1])
+        acceleration_E = (rate_EL - last_rate_EL).abs().mean(-1)
+        last_rate_EL.copy_(rate_EL)
+        return acceleration_E
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootSlipSpeed(OfFeet, MetricTerm):
+    """Mean over the feet in contact of their horizontal speed, world frame, m/s; 0 while none touches."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        found_EF = self.contact(view).found_EN
+        speed_EF = torch.linalg.vector_norm(view.sites(self.sites).lin_vel_EN3[..., :2], dim=-1)
+        return (speed_EF * found_EF).sum(-1) / found_EF.sum(-1).clamp(min=1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeakFootHeight(MetricTerm):
+    """Height of the highest foot above the ground below it, m, [E]; by default its greatest value in the episode.
+
+    Attributes:
+        sites: the feet.
+    """
+
+    sites: Patterns
+    reduce: Literal["mean", "last", "max", "sum"] = "max"
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        return view.sites(self.sites).height_EN.amax(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeakContactForce(MetricTerm):
+    """Magnitude of the greatest net contact force, N, [E]; by default its greatest value in the episode.
+
+    It is sampled once per env step, at its last physics substep: an impact may have been harder.
+
+    Attributes:
+        sensor: a contact sensor of `scene.sensors`.
+    """
+
+    sensor: str
+    reduce: Literal["mean", "last", "max", "sum"] = "max"
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        """Return the value of the last substep, [E]."""
+        return contact_force(view, self.sensor).amax(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Power(OfJoints, MetricTerm):
+    """sum_j |effort_j * velocity_j|, W, [E]: mechanical power of the actuators; braking costs as much as driving."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        return mechanical_power(view, self.joints)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CostOfTransport(OfJoints, OfEntity, MetricTerm):
+    """Energy / (weight * distance) since the start of the episode, no unit; it needs gravity.
+
+    Energy is the integral of `Power`; distance is the length of the root's path over the ground; the weight is that of
+    the nominal model (m g of the root body with all that hangs on it).
+
+    Attributes:
+        min_distance: m; a path that is still shorter counts as this long, so that standing still gives a finite value.
+    """
+
+    min_distance: Positive = 0.1
+    reduce: Literal["mean", "last", "max", "sum"] = "last"
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        robot, model = view.entity(self.entity), view.world.mj_model
+        weight = float(model.body_subtreemass[robot.root.id] * np.linalg.norm(model.opt.gravity))
+        if weight == 0.0:
+            raise ValueError("CostOfTransport without gravity: a weight of 0 N has no cost of transport")
+        energy_E, distance_E = view.buffer("energy_E"), view.buffer("distance_E")
+        energy_E.add_(mechanical_power(view, self.joints) * view.step_dt)
+        distance_E.add_(torch.linalg.vector_norm(robot.root_lin_vel_w_EL[:, :2], dim=-1) * view.step_dt)
+        return energy_E / (weight * distance_E.clamp(min=self.min_distance))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Success(MetricTerm):
+    """1 where the episode ends by one of the named terminations and by no other, else 0, [E].
+
+    With the time-out it is the share of episodes that survived. Envs that are not made of terms have `SuccessTracker`.
+
+    Attributes:
+        terminations: names in the env's `terminations`.
+    """
+
+    terminations: tuple[str, ...]
+    reduce: Literal["mean", "last", "max", "sum"] = "last"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.terminations:
+            raise ValueError("terminations=(): name at least one, such as ('time_out',)")
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        for name in self.terminations:
+            if name not in view.terminations:
+                raise unknown_name("termination", name, view.terminations)
+        wanted = [flag_E for name, flag_E in view.terminations.items() if name in self.terminations]
+        others = [flag_E for name, flag_E in view.terminations.items() if name not in self.terminations]
+        succeeds_E = torch.stack(wanted).any(0)
+        if others:
+            succeeds_E = succeeds_E & ~torch.stack(others).any(0)
+        return succeeds_E.to(torch.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetReached(OfTarget, MetricTerm):
+    """1 while a body or site is within a tolerance of the position that a `CartesianCommand` asks for, else 0.
+
+    Position stage, with the command that the policy saw. `reduce="last"` (the default) asks whether it is there in the
+    end, "max" whether it ever was, "mean" for which share of the time.
+
+    Attributes:
+        tolerance: m.
+    """
+
+    tolerance: Positive
+    reduce: Literal["mean", "last", "max", "sum"] = "last"
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        return (self.distance(view) <= self.tolerance).to(torch.float32)
