@@ -20,8 +20,12 @@ MOVED = {
     "ksim_rl.envs.tasks": "ksim_rl.tasks",
     "ksim_rl.envs.terrains": "ksim_rl.scene.terrains",
     "ksim_rl.envs.transforms": "ksim_rl.transforms",
+    **dict.fromkeys(
+        [f"ksim_rl.tasks.{task}" for task in ("cheetah_run", "hopper", "walker")], "ksim_rl.tasks.planar"
+    ),
+    "ksim_rl.tasks.walker_amp": "ksim_rl.tasks.walker_motion",
 }
-"""Packages of 0.1 and where their classes are now; modules inside them are found by the package's exports."""
+"""Paths of 0.1 and where their classes are now, applied in turn; else a class is found by its package's exports."""
 
 
 def public_path(cls: type) -> str:
@@ -86,9 +90,10 @@ def _modules(name: str) -> list[str]:
     """Return the module of a path and, for ours, where its classes may have moved to: the packages above it."""
     if name.split(".")[0] != OWN:
         return [name]
-    moved = next(
-        (name.replace(old, new, 1) for old, new in MOVED.items() if f"{name}.".startswith(f"{old}.")), name
-    )
+    moved = name
+    for old, new in MOVED.items():
+        if f"{moved}.".startswith(f"{old}."):
+            moved = moved.replace(old, new, 1)
     parts = moved.split(".")
     return list(dict.fromkeys([name, *(".".join(parts[:end]) for end in range(len(parts), 1, -1))]))
 

@@ -20,7 +20,7 @@ from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import EventTerm, ObservationTerm, RewardTerm, TerminationTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.rewards.tolerance import tolerance
+from ksim_rl.mdp.rewards.tracking import tolerance
 from ksim_rl.scene.robots.control_models import Cartpole
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.viewer_cfg import ViewerCfg

@@ -1,9 +1,10 @@
-"""The planar runners share this module: a robot in the xz plane, on the ground, is rated by posture and forward speed.
+"""Planar robots stand, walk, run and hop: in the xz plane, on the ground, rated by posture and forward speed.
 
 The tasks are those of dm_control's suite (Tassa et al., "DeepMind Control Suite", 2018) on robots of our own:
 rewards in [0, 1], 1000 steps per episode, no early end. Unlike there, episodes start standing; who falls has to get up.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,13 +12,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl import mdp
+from ksim_rl.checked import NonNegative
 from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import MetricTerm, RewardTerm
 from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.rewards.tracking import tolerance
 from ksim_rl.modules import ActorCfg, CriticCfg
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.physics import SimCfg
+from ksim_rl.scene.robots.control_models import Cheetah, Hopper, Walker
 from ksim_rl.scene.scene import Robot, SceneCfg
 from ksim_rl.scene.terrains import PlaneTerrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
@@ -46,6 +51,12 @@ def forward_speed(view: EnvView) -> Float[Tensor, " E"]:
 def small_effort(view: EnvView) -> Float[Tensor, " E"]:
     """Return 1 without any action, 0 where each is at or beyond its limit, [E]."""
     return (1.0 - view.action_EL.clamp(-1.0, 1.0).square()).mean(-1)
+
+
+def _fast(view: EnvView, speed: float, *, margin: float, value_at_margin: float = 0.0) -> Float[Tensor, " E"]:
+    """Return 1 from a forward speed (m/s) on, falling linearly to `value_at_margin` a margin below it."""
+    forward_E = forward_speed(view)
+    return tolerance(forward_E, low=speed, margin=margin, value_at_margin=value_at_margin, shape="linear")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,3 +118,141 @@ def training(*, num_iterations: int = 500, objective: PPOCfg | None = None) -> T
         ),
         trainer=TrainerCfg(num_iterations=num_iterations, eval_interval=50),
     )
+
+
+def _task(
+    cfg: Callable[[], ManagerBasedRlEnvCfg],
+    what: str,
+    num_iterations: int = 500,
+    solved_at: float | None = None,
+) -> Task:
+    return Task(
+        name=cfg.__name__,
+        description=what,
+        cfg=cfg,
+        training=training(num_iterations=num_iterations),
+        solved_at=solved_at,
+    )
+
+
+# -- a hind and a fore leg ---------------------------------------------------------------------------------------
+
+CHEETAH_SPEED = 8.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheetahReward(RewardTerm):
+    """Forward speed over `CHEETAH_SPEED`, clipped to [0, 1]; velocity stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        return _fast(view, CHEETAH_SPEED, margin=CHEETAH_SPEED)
+
+
+def cheetah_run() -> ManagerBasedRlEnvCfg:
+    """Return the config of running as fast as 8 m/s."""
+    return planar_cfg(
+        Cheetah(), motors=Cheetah.joints, reward=CheetahReward(), decimation=2, step_dt=0.01, distance=3.5
+    )
+
+
+CHEETAH_RUN = _task(cheetah_run, "a planar quadruped runs at 8 m/s", solved_at=700.0)
+
+# -- one leg -----------------------------------------------------------------------------------------------------
+
+HOPPER_HEIGHT = 0.7
+"""m from the foot to the torso; standing at rest gives 0.81."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HopperReward(RewardTerm):
+    """tall * fast, or tall * (4 + small effort) / 5 without a speed, in [0, 1]; position and velocity stage.
+
+    "tall" is 1 where the torso is `HOPPER_HEIGHT` above the foot, which holds in flight too, and where it is upright;
+    "fast" rates the forward speed against `speed`.
+
+    Attributes:
+        speed: m/s, from which on the robot is fast enough; 0 only asks it to stand.
+    """
+
+    speed: NonNegative = 0.0
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        foot_E = view.body("foot").pos_EL[:, 2]
+        tall_E = tolerance(height(view) - foot_E, low=HOPPER_HEIGHT, margin=HOPPER_HEIGHT / 2)
+        stand_E = tall_E * upright(view)
+        if self.speed == 0.0:
+            return stand_E * (4.0 + small_effort(view)) / 5.0
+        return stand_E * _fast(view, self.speed, margin=self.speed)
+
+
+def _hopper_cfg(speed: float) -> ManagerBasedRlEnvCfg:
+    reward = HopperReward(speed=speed)
+    return planar_cfg(Hopper(), motors=Hopper.joints, reward=reward, decimation=4, step_dt=0.02, distance=3.5)
+
+
+def hopper_stand() -> ManagerBasedRlEnvCfg:
+    """Return the config of balancing on one leg."""
+    return _hopper_cfg(0.0)
+
+
+def hopper_hop() -> ManagerBasedRlEnvCfg:
+    """Return the config of hopping forward at 1.5 m/s or faster."""
+    return _hopper_cfg(1.5)
+
+
+HOPPER_STAND = _task(hopper_stand, "a one-legged planar robot balances", solved_at=900.0)
+HOPPER_HOP = _task(hopper_hop, "a one-legged planar robot hops forward at 1.5 m/s", 1000)
+
+# -- two legs ----------------------------------------------------------------------------------------------------
+
+WALKER_HEIGHT = 1.15
+"""m of the torso above the ground."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WalkerReward(RewardTerm):
+    """(3 tall + upright) / 4 * (5 fast + 1) / 6, in [0, 1]; position and velocity stage.
+
+    "tall" rates the torso's height against `WALKER_HEIGHT`, "fast" the forward speed against `speed`. Standing alone
+    gives 1 where no speed is asked, else 1/6.
+
+    Attributes:
+        speed: m/s, from which on the robot is fast enough; 0 only asks it to stand.
+    """
+
+    speed: NonNegative = 0.0
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        tall_E = tolerance(height(view), low=WALKER_HEIGHT, margin=WALKER_HEIGHT / 2)
+        stand_E = (3.0 * tall_E + upright(view)) / 4.0
+        if self.speed == 0.0:
+            return stand_E
+        fast_E = _fast(view, self.speed, margin=self.speed / 2, value_at_margin=0.5)
+        return stand_E * (5.0 * fast_E + 1.0) / 6.0
+
+
+def _walker_cfg(speed: float) -> ManagerBasedRlEnvCfg:
+    reward = WalkerReward(speed=speed)
+    return planar_cfg(
+        Walker(), motors=Walker.joints, reward=reward, decimation=5, step_dt=0.025, distance=4.0
+    )
+
+
+def walker_stand() -> ManagerBasedRlEnvCfg:
+    """Return the config of standing upright."""
+    return _walker_cfg(0.0)
+
+
+def walker_walk() -> ManagerBasedRlEnvCfg:
+    """Return the config of walking at 1 m/s or faster."""
+    return _walker_cfg(1.0)
+
+
+def walker_run() -> ManagerBasedRlEnvCfg:
+    """Return the config of running at 5 m/s or faster."""
+    return _walker_cfg(5.0)
+
+
+WALKER_STAND = _task(walker_stand, "a planar biped stands upright", solved_at=950.0)
+WALKER_WALK = _task(walker_walk, "a planar biped walks at 1 m/s", solved_at=900.0)
+WALKER_RUN = _task(walker_run, "a planar biped runs at 5 m/s", 1000)

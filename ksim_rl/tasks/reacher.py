@@ -16,7 +16,7 @@ from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import CommandTerm, ObservationTerm, RewardTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.rewards.tolerance import tolerance
+from ksim_rl.mdp.rewards.tracking import tolerance
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.robots.control_models import Reacher
 from ksim_rl.scene.scene import SceneCfg

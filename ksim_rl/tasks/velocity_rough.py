@@ -16,7 +16,7 @@ from ksim_rl.scene.terrains import (
     TerrainPatch,
     Waves,
 )
-from ksim_rl.tasks import g1_velocity_flat, go1_velocity_flat, velocity
+from ksim_rl.tasks import velocity, velocity_flat
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 
 PATCHES: Mapping[str, TerrainPatch] = {
@@ -70,14 +70,14 @@ def _with(group: ObservationGroupCfg, scan: ObservationTermCfg) -> ObservationGr
 
 def go1_velocity_rough() -> ManagerBasedRlEnvCfg:
     """Return the config of Unitree Go1."""
-    flat, robot = go1_velocity_flat.go1_velocity_flat(), go1_velocity_flat.ROBOT
-    return on_rough_ground(flat, root_height=robot.init_pos[2], njmax=120, nconmax=40)
+    flat, height = velocity_flat.go1_velocity_flat(), velocity_flat.GO1_ROBOT.init_pos[2]
+    return on_rough_ground(flat, root_height=height, njmax=120, nconmax=40)
 
 
 def g1_velocity_rough() -> ManagerBasedRlEnvCfg:
     """Return the config of Unitree G1."""
-    flat, robot = g1_velocity_flat.g1_velocity_flat(), g1_velocity_flat.ROBOT
-    return on_rough_ground(flat, root_height=robot.init_pos[2], njmax=250, nconmax=80)
+    flat, height = velocity_flat.g1_velocity_flat(), velocity_flat.G1_ROBOT.init_pos[2]
+    return on_rough_ground(flat, root_height=height, njmax=250, nconmax=80)
 
 
 GO1 = Task(

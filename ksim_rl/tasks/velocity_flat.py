@@ -1,0 +1,267 @@
+"""Legged robots follow a velocity command on flat ground.
+
+The figures of Go1 and G1 are those of mjlab 1.6.0's `Mjlab-Velocity-Flat-Unitree-Go1` and `-G1`. The quadruped and the
+humanoid are our own, with nothing to download; Go2's motors run PD control.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.task import Task
+from ksim_rl.physics import SimCfg
+from ksim_rl.scene.robots.booster_t1 import BoosterT1
+from ksim_rl.scene.robots.legged_robot import LeggedRobot
+from ksim_rl.scene.robots.own_robots import Humanoid, Quadruped
+from ksim_rl.scene.robots.unitree_g1 import UnitreeG1
+from ksim_rl.scene.robots.unitree_go1 import UnitreeGo1
+from ksim_rl.scene.robots.unitree_go2 import UnitreeGo2
+from ksim_rl.scene.sensors import ContactSensor
+from ksim_rl.scene.viewer_cfg import ViewerCfg
+from ksim_rl.tasks import velocity
+from ksim_rl.transforms import ActionDelay, DelayCfg
+from ksim_rl.transforms.transform_cfg import TransformCfg
+
+GO1_ROBOT, GO2_ROBOT, QUADRUPED_ROBOT = UnitreeGo1(), UnitreeGo2(), Quadruped()
+G1_ROBOT, T1_ROBOT, HUMANOID_ROBOT = UnitreeG1(), BoosterT1(), Humanoid()
+
+
+def _task(cfg: Callable[[], ManagerBasedRlEnvCfg], robot: str, *, num_iterations: int, **others: Any) -> Task:
+    return Task(
+        name=cfg.__name__,
+        description=f"{robot} follows a velocity command on flat ground",
+        cfg=cfg,
+        training=velocity.training(num_iterations=num_iterations),
+        **others,
+    )
+
+
+# -- four legs ---------------------------------------------------------------------------------------------------
+
+
+def _four_legs_pose(hips: str, knees: str) -> velocity.PoseStd:
+    moving = {hips: 0.3, knees: 0.6}
+    return velocity.PoseStd(standing={hips: 0.05, knees: 0.1}, walking=moving, running=moving)
+
+
+UNITREE_POSE = _four_legs_pose(".*_(hip|thigh)_joint", ".*_calf_joint")
+UNITREE_VIEW = ViewerCfg(distance=1.5, elevation=-10.0, azimuth=90.0)
+# Sliding, spinning and rolling: the contacts of Go1's feet have all six dimensions.
+GO1_FRICTION = {
+    "foot_friction_slide": velocity.foot_friction(GO1_ROBOT, axis=0, low=0.3, high=1.5),
+    "foot_friction_spin": velocity.foot_friction(GO1_ROBOT, axis=1, low=1e-4, high=2e-2, log=True),
+    "foot_friction_roll": velocity.foot_friction(GO1_ROBOT, axis=2, low=1e-5, high=5e-3, log=True),
+}
+
+
+def go1_velocity_flat() -> ManagerBasedRlEnvCfg:
+    """Return the config of Unitree Go1."""
+    return velocity.velocity_cfg(
+        GO1_ROBOT,
+        sim=velocity.sim(cone="elliptic", impratio=10.0),
+        feet=ContactSensor(geoms=GO1_ROBOT.foot_geoms),
+        observations=velocity.observations(GO1_ROBOT),
+        rewards=velocity.rewards(GO1_ROBOT, pose=UNITREE_POSE),
+        events=velocity.events(GO1_ROBOT) | GO1_FRICTION,
+        viewer=dataclasses.replace(UNITREE_VIEW, body=GO1_ROBOT.root_body),
+    )
+
+
+def go2_velocity_flat() -> ManagerBasedRlEnvCfg:
+    """Return the config of Unitree Go2."""
+    return velocity.velocity_cfg(
+        GO2_ROBOT,
+        sim=velocity.sim(),
+        feet=ContactSensor(geoms=GO2_ROBOT.foot_geoms),
+        observations=velocity.observations(GO2_ROBOT),
+        rewards=velocity.rewards(GO2_ROBOT, pose=UNITREE_POSE),
+        events=velocity.events(GO2_ROBOT)
+        | {"foot_friction": velocity.foot_friction(GO2_ROBOT, low=0.3, high=1.5)},
+        viewer=dataclasses.replace(UNITREE_VIEW, body=GO2_ROBOT.root_body),
+    )
+
+
+def quadruped_velocity_flat() -> ManagerBasedRlEnvCfg:
+    """Return the config of our own quadruped."""
+    robot = QUADRUPED_ROBOT
+    return velocity.velocity_cfg(
+        robot,
+        sim=velocity.sim(),
+        feet=ContactSensor(geoms=robot.foot_geoms),
+        observations=velocity.observations(robot),
+        rewards=velocity.rewards(robot, pose=_four_legs_pose(".*_(roll|hip)", ".*_knee"), foot_height=0.08),
+        events=velocity.events(robot) | {"foot_friction": velocity.foot_friction(robot, low=0.3, high=1.2)},
+        viewer=ViewerCfg(body=robot.root_body, distance=1.6, elevation=-15.0, azimuth=120.0),
+    )
+
+
+def quadruped_velocity_delayed() -> ManagerBasedRlEnvCfg:
+    """Return the same with actions that arrive up to 40 ms late, as on a robot's bus: each env draws its own lags."""
+    lag = TransformCfg(ActionDelay, delay=DelayCfg(min_lag=0, max_lag=2))
+    return dataclasses.replace(quadruped_velocity_flat(), transforms={"lag": lag})
+
+
+GO1 = _task(
+    go1_velocity_flat,
+    "Unitree Go1",
+    num_iterations=10_000,
+    other_trainings=velocity.off_policy_trainings(),
+)
+GO2 = _task(go2_velocity_flat, "Unitree Go2", num_iterations=10_000)
+QUADRUPED = _task(quadruped_velocity_flat, "our quadruped", num_iterations=2_000)
+DELAYED = Task(
+    name="quadruped_velocity_delayed",
+    description="our quadruped follows a velocity command with actions that arrive late",
+    cfg=quadruped_velocity_delayed,
+    training=velocity.training(num_iterations=2_000),
+)
+
+
+# -- two legs ----------------------------------------------------------------------------------------------------
+
+G1_POSE = velocity.PoseStd(
+    standing={".*": 0.05},
+    walking={
+        ".*_hip_pitch_joint": 0.3,
+        ".*_hip_(roll|yaw)_joint": 0.15,
+        ".*_knee_joint": 0.35,
+        ".*_ankle_pitch_joint": 0.25,
+        ".*_ankle_roll_joint": 0.1,
+        "waist_yaw_joint": 0.2,
+        "waist_roll_joint": 0.08,
+        "waist_pitch_joint": 0.1,
+        ".*_shoulder_(pitch|roll)_joint": 0.15,
+        ".*_shoulder_yaw_joint": 0.1,
+        ".*_elbow_joint": 0.15,
+        ".*_wrist_.*": 0.3,
+    },
+    running={
+        ".*_hip_pitch_joint": 0.5,
+        ".*_hip_(roll|yaw)_joint": 0.2,
+        ".*_knee_joint": 0.6,
+        ".*_ankle_pitch_joint": 0.35,
+        ".*_ankle_roll_joint": 0.15,
+        "waist_yaw_joint": 0.3,
+        "waist_roll_joint": 0.08,
+        "waist_pitch_joint": 0.2,
+        ".*_shoulder_pitch_joint": 0.5,
+        ".*_shoulder_roll_joint": 0.2,
+        ".*_shoulder_yaw_joint": 0.15,
+        ".*_elbow_joint": 0.35,
+        ".*_wrist_.*": 0.3,
+    },
+)
+T1_POSE = velocity.PoseStd(
+    standing={".*": 0.05},
+    walking={
+        ".*_Hip_Pitch": 0.3,
+        ".*_Hip_(Roll|Yaw)": 0.15,
+        ".*_Knee_Pitch": 0.35,
+        ".*_Ankle_Pitch": 0.25,
+        ".*_Ankle_Roll": 0.1,
+        "Waist": 0.2,
+        ".*_Shoulder_.*": 0.15,
+        ".*_Elbow_.*": 0.15,
+        "AAHead_yaw|Head_pitch": 0.1,
+    },
+    running={
+        ".*_Hip_Pitch": 0.5,
+        ".*_Hip_(Roll|Yaw)": 0.2,
+        ".*_Knee_Pitch": 0.6,
+        ".*_Ankle_Pitch": 0.35,
+        ".*_Ankle_Roll": 0.15,
+        "Waist": 0.3,
+        ".*_Shoulder_.*": 0.4,
+        ".*_Elbow_.*": 0.35,
+        "AAHead_yaw|Head_pitch": 0.1,
+    },
+)
+HUMANOID_POSE = velocity.PoseStd(
+    standing={".*": 0.05},
+    walking={
+        ".*_hip_pitch": 0.3,
+        ".*_hip_(roll|yaw)": 0.15,
+        ".*_knee": 0.35,
+        ".*_ankle_pitch": 0.25,
+        ".*_ankle_roll": 0.1,
+        "waist_yaw": 0.2,
+        ".*_shoulder_(pitch|roll)|.*_elbow": 0.15,
+    },
+    running={
+        ".*_hip_pitch": 0.5,
+        ".*_hip_(roll|yaw)": 0.2,
+        ".*_knee": 0.6,
+        ".*_ankle_pitch": 0.35,
+        ".*_ankle_roll": 0.15,
+        "waist_yaw": 0.3,
+        ".*_shoulder_(pitch|roll)|.*_elbow": 0.4,
+    },
+)
+
+
+def _two_legs_cfg(
+    robot: LeggedRobot,
+    pose: velocity.PoseStd,
+    *,
+    feet: ContactSensor,
+    viewer: ViewerCfg,
+    torso: str | None = None,
+    foot_height: float = 0.1,
+    sim: SimCfg | None = None,
+) -> ManagerBasedRlEnvCfg:
+    rewards = velocity.rewards(
+        robot, pose=pose, torso=torso, body_ang_vel=-0.05, angular_momentum=-0.02, foot_height=foot_height
+    )
+    friction = {"foot_friction": velocity.foot_friction(robot, low=0.3, high=1.2)}
+    return velocity.velocity_cfg(
+        robot,
+        sim=sim or velocity.sim(),
+        feet=feet,
+        observations=velocity.observations(robot),
+        sensors=velocity.self_contact(robot),
+        rewards=rewards | velocity.self_collisions(),
+        events=velocity.events(robot, torso=torso) | friction,
+        viewer=viewer,
+    )
+
+
+def g1_velocity_flat() -> ManagerBasedRlEnvCfg:
+    """Return the config of Unitree G1."""
+    torso = G1_ROBOT.torso_body
+    return _two_legs_cfg(
+        G1_ROBOT,
+        G1_POSE,
+        feet=ContactSensor(subtrees=G1_ROBOT.foot_bodies),
+        torso=torso,
+        # A robot that lies on its arms needs 221 rows, more than the probe of the model finds.
+        sim=dataclasses.replace(velocity.sim(), njmax=256),
+        viewer=ViewerCfg(body=torso, distance=3.0, elevation=-10.0, azimuth=90.0),
+    )
+
+
+def t1_velocity_flat() -> ManagerBasedRlEnvCfg:
+    """Return the config of Booster T1."""
+    return _two_legs_cfg(
+        T1_ROBOT,
+        T1_POSE,
+        feet=ContactSensor(subtrees=T1_ROBOT.foot_bodies),
+        viewer=ViewerCfg(body=T1_ROBOT.root_body, distance=3.0, elevation=-10.0, azimuth=90.0),
+    )
+
+
+def humanoid_velocity_flat() -> ManagerBasedRlEnvCfg:
+    """Return the config of our own humanoid."""
+    return _two_legs_cfg(
+        HUMANOID_ROBOT,
+        HUMANOID_POSE,
+        feet=ContactSensor(bodies=HUMANOID_ROBOT.foot_bodies),
+        torso=HUMANOID_ROBOT.torso_body,
+        foot_height=0.06,
+        viewer=ViewerCfg(body=HUMANOID_ROBOT.root_body, distance=2.2, elevation=-12.0, azimuth=130.0),
+    )
+
+
+G1 = _task(g1_velocity_flat, "Unitree G1", num_iterations=30_000)
+T1 = _task(t1_velocity_flat, "Booster T1", num_iterations=30_000)
+HUMANOID = _task(humanoid_velocity_flat, "our humanoid", num_iterations=3_000)
