@@ -70,6 +70,9 @@ class RowTransform(Transform):
             if env is None:
                 self._refuse_samples()
             assert env.output_spec is not None and env.input_spec is not None
+            if not self.num_rows:  # appended to the chain of an env that has its specs already
+                env.empty_cache()
+                assert env.output_spec is not None and env.input_spec is not None
         return self._buffers
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:

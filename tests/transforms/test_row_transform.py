@@ -2,14 +2,19 @@ import math
 
 import pytest
 import torch
+from torchrl.envs import TransformedEnv
+from torchrl.envs.transforms import Compose
 
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
+from ksim_rl.testing import CounterEnv
 from ksim_rl.transforms import (
     ActionDelay,
     ConstantNoise,
     DelayCfg,
     GaussianNoise,
+    ObservationClip,
     ObservationDelay,
+    ObservationHistory,
     ObservationNoise,
     UniformNoise,
     follow_level,
@@ -113,3 +118,10 @@ def test_noise_that_follows_full_level_equals_noise_that_follows_none():
 def test_wrong_levels_are_refused(level):
     with pytest.raises(ValueError, match="level"):
         ObservationNoise("count", noise=ConstantNoise(value=1.0)).follow_level_(level)
+
+
+def test_one_is_appended_to_the_chain_of_an_env_that_runs_already():
+    env = TransformedEnv(CounterEnv((3, 5, 4)), Compose(ObservationClip("count", clip=(0.0, 2.0))))
+    env.rollout(3, break_when_any_done=False)
+    env.transform.append(ObservationHistory("count", length=3))
+    assert env.rollout(3, break_when_any_done=False)["count"].shape == (3, 3, 3)
