@@ -159,26 +159,17 @@ def get_up_cfg(
 
 
 def _observations(robot: LeggedRobot) -> dict[str, ObservationGroupCfg]:
-    ang_vel, gravity = mdp.SensorReading(sensor="imu_ang_vel"), mdp.ProjectedGravity()
-    joint_vel = mdp.JointVel(joints=robot.joint_names)
-    actions = ObservationTermCfg(term=mdp.LastAction())
-    actor = {
-        "base_ang_vel": velocity.noisy(ang_vel, 0.2),
-        "projected_gravity": velocity.noisy(gravity, 0.05),
-        "joint_pos_biased": velocity.noisy(mdp.JointPosRel(joints=robot.joint_names, biased=True), 0.01),
-        "joint_vel": velocity.noisy(joint_vel, 1.5),
-        "actions": actions,
+    """Return those of the velocity tasks without velocity, command and feet; the critic also sees its height."""
+    groups = velocity.observations(robot)
+    own = ("base_ang_vel", "projected_gravity", "joint_pos_biased", "joint_vel", "actions")
+    seen = ("base_lin_vel", *own[:2], "joint_pos", *own[3:])
+    actor = {name: groups["actor"].terms[name] for name in own}
+    critic = {name: groups["critic"].terms[name] for name in seen}
+    height = ObservationTermCfg(term=mdp.FootHeight(sites=("imu", *robot.foot_sites)))
+    return {
+        "actor": ObservationGroupCfg(terms=actor),
+        "critic": ObservationGroupCfg(terms={**critic, "imu_and_foot_height": height}),
     }
-    critic = {
-        "base_lin_vel": ObservationTermCfg(term=mdp.SensorReading(sensor="imu_lin_vel")),
-        "base_ang_vel": ObservationTermCfg(term=ang_vel),
-        "projected_gravity": ObservationTermCfg(term=gravity),
-        "joint_pos": ObservationTermCfg(term=mdp.JointPosRel(joints=robot.joint_names)),
-        "joint_vel": ObservationTermCfg(term=joint_vel),
-        "actions": actions,
-        "imu_and_foot_height": ObservationTermCfg(term=mdp.FootHeight(sites=("imu", *robot.foot_sites))),
-    }
-    return {"actor": ObservationGroupCfg(terms=actor), "critic": ObservationGroupCfg(terms=critic)}
 
 
 def training(*, num_iterations: int) -> TrainingCfg:

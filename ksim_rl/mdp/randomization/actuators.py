@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -77,10 +78,7 @@ class RandomizeActuatorGains(RandomizeActuator):
             if getattr(self, name) is not None:
                 self.check_range(name, getattr(self, name))
 
-    @property
-    def per_world_fields(self) -> tuple[str, ...]:
-        """The fields that built-in servos keep their gains in."""
-        return ("actuator_gainprm", "actuator_biasprm")
+    per_world_fields: ClassVar[tuple[str, ...]] = ("actuator_gainprm", "actuator_biasprm")
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         joints = view.resolver.ids("joint", self.joints)
@@ -127,10 +125,7 @@ class RandomizeEffortLimit(RandomizeActuator, RandomizeNumber):
     `effort_limit`, which stays at 0 or above.
     """
 
-    @property
-    def per_world_fields(self) -> tuple[str, ...]:
-        """The force ranges of actuators and of joints."""
-        return ("actuator_forcerange", "jnt_actfrcrange")
+    per_world_fields: ClassVar[tuple[str, ...]] = ("actuator_forcerange", "jnt_actfrcrange")
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         joints = view.resolver.ids("joint", self.joints)

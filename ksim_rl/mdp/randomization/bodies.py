@@ -49,10 +49,7 @@ class RandomizeBodyMass(RandomizeBodyField):
     lowest: ClassVar[float | None] = _LEAST_MASS
     operation: Operation = "scale"
 
-    @property
-    def per_world_fields(self) -> tuple[str, ...]:
-        """Mass and principal moments."""
-        return ("body_mass", "body_inertia")
+    per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_inertia")
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         super().__call__(view, mask_E)
@@ -88,10 +85,7 @@ class RandomizeBodyInertia(RandomizeBodyField):
         super().__post_init__()
         check_choice("operation", self.operation, ("scale",))
 
-    @property
-    def per_world_fields(self) -> tuple[str, ...]:
-        """Principal moments, and the mass that they go with."""
-        return ("body_mass", "body_inertia")
+    per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_inertia")
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         ids, pairs = self.ids(view), self.pairs()
@@ -159,10 +153,7 @@ class RandomizePseudoInertia(Randomize):
         for name in ("alpha", "stretch", "shear", "shift"):
             self.check_range(name, getattr(self, name))
 
-    @property
-    def per_world_fields(self) -> tuple[str, ...]:
-        """All inertial parameters."""
-        return ("body_mass", "body_ipos", "body_inertia", "body_iquat")
+    per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         ids, model = view.resolver.ids("body", self.bodies), view.world.mj_model
@@ -221,10 +212,7 @@ class RandomizeGravity(Randomize):
             check_choice("ranges", axis, range(3))
             self.check_range(f"ranges[{axis}]", pair)
 
-    @property
-    def per_world_fields(self) -> tuple[str, ...]:
-        """Gravity, which differs between worlds without more memory."""
-        return ("gravity",)
+    per_world_fields: ClassVar[tuple[str, ...]] = ("gravity",)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         if not self.ranges:

@@ -125,10 +125,7 @@ class RandomizeGeomQuat(Randomize):
                 f"distribution='log_uniform': ranges needs all of {ANGLES}, {missing[0]!r} is missing"
             )
 
-    @property
-    def per_world_fields(self) -> tuple[str, ...]:
-        """The geoms' quaternions."""
-        return ("geom_quat",)
+    per_world_fields: ClassVar[tuple[str, ...]] = ("geom_quat",)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         ids = view.resolver.ids("geom", self.geoms)
