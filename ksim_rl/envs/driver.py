@@ -47,4 +47,5 @@ class EnvDriver(Simulation):
 
     def freeze(self) -> None:
         """End construction: no new buffers, and all that lives on is known to `detached`."""
-        super().freeze(self.view.default_qpos_L)
+        super().freeze()
+        self._lasting.add(self.view.default_qpos_L.untyped_storage().data_ptr())

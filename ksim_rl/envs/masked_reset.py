@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Shaped
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -80,7 +81,7 @@ class MaskedReset(EnvBase):
         tensordict: TensorDictBase | None = None,
         *,
         seed: int | None = None,
-        env_ids: Sequence[int] | Tensor | None = None,
+        env_ids: Sequence[int] | Shaped[Tensor, "*rows"] | None = None,
         options: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> TensorDictBase:
@@ -150,7 +151,7 @@ class MaskedReset(EnvBase):
     def _masked_reset(
         self,
         tensordict: TensorDictBase | None,
-        mask_E1: Tensor | None,
+        mask_E1: Bool[Tensor, "*batch 1"] | None,
         *,
         set_state: bool | None = None,
         select_reset_only: bool = False,
@@ -178,7 +179,9 @@ class MaskedReset(EnvBase):
         self._complete_done(self.full_done_spec, fresh)
         return fresh
 
-    def _merge(self, root: TensorDictBase, fresh: TensorDictBase, mask_E1: Tensor) -> TensorDictBase:
+    def _merge(
+        self, root: TensorDictBase, fresh: TensorDictBase, mask_E1: Bool[Tensor, "*batch 1"]
+    ) -> TensorDictBase:
         """Write the rows of `fresh` that the mask names into `root`, leaf by leaf, and return `root`."""
         batch_size = root.batch_size
         masks: dict[int, Tensor] = {}
@@ -233,7 +236,7 @@ class MaskedReset(EnvBase):
         return mask.reshape(done_shape)
 
     def _with_mask_of(
-        self, tensordict: TensorDictBase | None, env_ids: Sequence[int] | Tensor
+        self, tensordict: TensorDictBase | None, env_ids: Sequence[int] | Shaped[Tensor, "*rows"]
     ) -> TensorDictBase:
         """Turn row numbers into the mask before any transform sees them."""
         if tensordict is not None and tensordict.get(_RESET, None) is not None:
@@ -246,8 +249,8 @@ class MaskedReset(EnvBase):
 
 
 def mask_from_env_ids(
-    env_ids: Sequence[int] | Tensor, batch_size: torch.Size, device: torch.device | None
-) -> Tensor:
+    env_ids: Sequence[int] | Shaped[Tensor, "*rows"], batch_size: torch.Size, device: torch.device | None
+) -> Bool[Tensor, " E"]:
     """Return the bool mask [E] of the rows `env_ids`.
 
     Raises:
@@ -276,7 +279,9 @@ def mask_from_env_ids(
     return torch.tensor(mask, device=device)
 
 
-def _mask_like(leaf: Tensor, mask_E1: Tensor, batch_size: torch.Size, masks: dict[int, Tensor]) -> Tensor:
+def _mask_like(
+    leaf: Tensor, mask_E1: Bool[Tensor, "*batch 1"], batch_size: torch.Size, masks: dict[int, Tensor]
+) -> Tensor:
     """Return the mask with as many dims as `leaf`; `masks` keeps them."""
     if leaf.ndim not in masks:
         masks[leaf.ndim] = mask_E1.view(*batch_size, *[1] * (leaf.ndim - len(batch_size)))

@@ -19,7 +19,7 @@ class Readings:
     def __init__(self, simulation: Simulation) -> None:
         num_envs, device = simulation.num_envs, simulation.device
         self.sensors: dict[str, SensorTracker] = {}
-        self.commands: dict[str, Float[Tensor, "E K"]] = {}
+        self.commands: dict[str, Float[Tensor, "E ?K"]] = {}
         self.command_ranges: dict[str, dict[str, Float[Tensor, " 2"]]] = {}
         self.reward_weights: dict[str, Float[Tensor, ""]] = {}
         self.episode_rewards: dict[str, Float[Tensor, " E"]] = {}

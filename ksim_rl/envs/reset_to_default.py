@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.envs.term import EventTerm
@@ -16,7 +17,7 @@ class ResetToDefault(EventTerm):
     On a terrain the pose stands at the env's origin.
     """
 
-    def __call__(self, view: EnvView, mask_E: Tensor) -> None:
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Write positions; the masked reset has already zeroed the velocities."""
         qpos_EL = view.default_qpos_L.expand(view.num_envs, -1)
         if not view.terrain.is_flat:

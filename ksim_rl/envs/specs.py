@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import torch
+from jaxtyping import Shaped
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 
@@ -10,7 +11,9 @@ from ksim_rl import dims
 
 
 def observation(
-    readings: Mapping[str, Mapping[str, Tensor]], batch_size: torch.Size, device: torch.device | None
+    readings: Mapping[str, Mapping[str, Shaped[Tensor, " E *?leaf"]]],
+    batch_size: torch.Size,
+    device: torch.device | None,
 ) -> Composite:
     """Return the spec of the readings by group and name, [E, ...] each; empty groups are left out."""
     groups = {

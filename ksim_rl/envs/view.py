@@ -45,7 +45,7 @@ class EnvView(WorldView):
         super().__init__(simulation, **parts)
         self._readings = readings
         self.sensors: Mapping[str, SensorTracker] = readings.sensors
-        self.commands: Mapping[str, Float[Tensor, "E K"]] = readings.commands
+        self.commands: Mapping[str, Float[Tensor, "E ?K"]] = readings.commands
         self.command_ranges: Mapping[str, Mapping[str, Float[Tensor, " 2"]]] = readings.command_ranges
         self.reward_weights: Mapping[str, Float[Tensor, ""]] = readings.reward_weights
         self.episode_rewards: Mapping[str, Float[Tensor, " E"]] = readings.episode_rewards

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 import torch
+from jaxtyping import Int64
 from torch import Tensor
 
 from ksim_rl.checks import near
 
 Patterns = str | Sequence[str]
-Index = Tensor | slice
+Index = Int64[Tensor, " N"] | slice
 
 
 class NameResolver:

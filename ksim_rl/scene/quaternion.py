@@ -4,49 +4,52 @@ On a GPU each tensor operation is a kernel, and small ones cost the same however
 """
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
-def multiply(a: Tensor, b: Tensor) -> Tensor:
+def multiply(a: Float[Tensor, "*a 4"], b: Float[Tensor, "*b 4"]) -> Float[Tensor, "*batch 4"]:
     """Return the Hamilton product of quaternions [..., 4]."""
     aw, au, bw, bu = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
     vector = torch.addcmul(torch.addcmul(torch.linalg.cross(au, bu), aw, bu), bw, au)
     return torch.cat((aw * bw - (au * bu).sum(-1, keepdim=True), vector), dim=-1)
 
 
-def conjugate(q: Tensor) -> Tensor:
+def conjugate(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
     """Return the inverse of unit quaternions [..., 4]."""
     return torch.cat((q[..., :1], -q[..., 1:]), dim=-1)
 
 
-def rotate(q: Tensor, v: Tensor) -> Tensor:
+def rotate(q: Float[Tensor, "*q 4"], v: Float[Tensor, "*v 3"]) -> Float[Tensor, "*batch 3"]:
     """Rotate vectors [..., 3] by quaternions [..., 4] (body to world, if `q` is the body's orientation)."""
     w, u = q[..., :1], q[..., 1:]
     across = torch.linalg.cross(u, v)
     return torch.add(v, torch.addcmul(torch.linalg.cross(u, across), w, across), alpha=2.0)
 
 
-def rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
+def rotate_inverse(q: Float[Tensor, "*q 4"], v: Float[Tensor, "*v 3"]) -> Float[Tensor, "*batch 3"]:
     """Rotate vectors [..., 3] by the inverse of quaternions [..., 4] (world to body)."""
     w, u = q[..., :1], q[..., 1:]
     across = torch.linalg.cross(u, v)
     return torch.add(v, torch.addcmul(torch.linalg.cross(u, across), w, across, value=-1.0), alpha=2.0)
 
 
-def angle_between(a: Tensor, b: Tensor) -> Tensor:
+def angle_between(a: Float[Tensor, "*a 4"], b: Float[Tensor, "*b 4"]) -> Float[Tensor, "*batch"]:
     """Return the angle of the rotation that turns orientation `a` into `b`, [..., 4] each: rad in [0, pi], [...]."""
     # By the chord, which unlike the cosine is well-conditioned at 0. `b` and `-b` are the same orientation.
     chord = torch.minimum(torch.linalg.vector_norm(a - b, dim=-1), torch.linalg.vector_norm(a + b, dim=-1))
     return 4.0 * torch.asin((0.5 * chord).clamp(max=1.0))
 
 
-def yaw(q: Tensor) -> Tensor:
+def yaw(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch"]:
     """Return the heading of quaternions [..., 4]: the angle of the rotated x axis in the xy plane, rad, [...]."""
     w, x, y, z = q.unbind(-1)
     return torch.atan2(torch.addcmul(w * z, x, y), 0.5 - torch.addcmul(y * y, z, z))
 
 
-def from_euler_xyz(roll: Tensor, pitch: Tensor, yaw_angle: Tensor) -> Tensor:
+def from_euler_xyz(
+    roll: Float[Tensor, "*batch"], pitch: Float[Tensor, "*batch"], yaw_angle: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 4"]:
     """Return Rz(yaw) Ry(pitch) Rx(roll) as quaternions [..., 4]; angles in rad, [...]."""
     half = 0.5 * torch.stack((roll, pitch, yaw_angle), dim=-1)
     cos_sin = torch.stack((torch.cos(half), torch.sin(half)), dim=-1)
@@ -58,6 +61,6 @@ def from_euler_xyz(roll: Tensor, pitch: Tensor, yaw_angle: Tensor) -> Tensor:
     return torch.addcmul(cos_sin[..., 0, :1] * by_cos, cos_sin[..., 0, 1:], by_sin)
 
 
-def wrap_to_pi(angle: Tensor) -> Tensor:
+def wrap_to_pi(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """Return the angle's equivalent in [-pi, pi), rad."""
     return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi

@@ -1,9 +1,10 @@
 """Products of small matrices in full precision."""
 
+from jaxtyping import Float
 from torch import Tensor
 
 
-def product(a: Tensor, b: Tensor) -> Tensor:
+def product(a: Float[Tensor, "*a N K"], b: Float[Tensor, "*b K M"]) -> Float[Tensor, "*batch N M"]:
     """Return the matrix product of [..., N, K] and [..., K, M], for small K.
 
     `a @ b` would keep three digits on a GPU, once a trainer has set `torch.set_float32_matmul_precision("high")` for

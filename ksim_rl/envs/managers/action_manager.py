@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.envs.driver import EnvDriver
@@ -31,7 +32,7 @@ class ActionManager:
         )
         self._run_terms(self._action_EL)
 
-    def apply(self, action_EL: Tensor) -> Tensor:
+    def apply(self, action_EL: Float[Tensor, "E L"]) -> Bool[Tensor, " E"]:
         """Write the controls of `action_EL` [E, L]; rows with a non-finite entry repeat their last action.
 
         Returns:
@@ -44,7 +45,7 @@ class ActionManager:
         self._run_terms(self._action_EL)
         return finite_E
 
-    def _run_terms(self, action_EL: Tensor) -> None:
+    def _run_terms(self, action_EL: Float[Tensor, "E L"]) -> None:
         for scope, term, columns in self._parts:
             with self._driver.scope(scope):
                 term(self._view, action_EL[:, columns])

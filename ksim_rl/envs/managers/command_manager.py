@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import torch
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from ksim_rl.checks import unknown_name
@@ -46,14 +47,17 @@ class CommandManager:
                 )
             self.values[name] = view.buffers.get(f"commands/{name}.value_EK", value_EK.shape[1])
 
-    def time_left(self, name: str) -> Tensor:
+    def time_left(self, name: str) -> Float[Tensor, " E"]:
         """Return the seconds until each env resamples, [E]; infinite for a command that resets alone resample."""
         if name in self._clocks:
             return self._clocks[name]
         return torch.full((self._view.num_envs,), torch.inf, device=self._view.device)
 
     def set(
-        self, name: str, values: Tensor | Sequence[float], env_ids: Sequence[int] | Tensor | None = None
+        self,
+        name: str,
+        values: Shaped[Tensor, "*shape"] | Sequence[float],
+        env_ids: Sequence[int] | Shaped[Tensor, "*rows"] | None = None,
     ) -> None:
         """Set a command that takes values from outside (`JoystickCommand`); call it between two steps.
 
@@ -76,12 +80,12 @@ class CommandManager:
         with self._driver.scope(f"commands/{name}"):
             self._terms[name].set(view, value_EK, mask_E)
 
-    def resample(self, mask_E: Tensor) -> None:
+    def resample(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Draw new targets for the rows of `mask_E` that reset."""
         for name, term in self._terms.items():
             self._draw(name, term, mask_E, "reset", self._view.reset_count_E)
 
-    def refresh(self, mask_E: Tensor) -> None:
+    def refresh(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Recompute the command vectors of the rows of `mask_E` from the current state and targets."""
         for name, term in self._terms.items():
             with self._driver.scope(f"commands/{name}"):
@@ -90,7 +94,7 @@ class CommandManager:
             held_EK.copy_(torch.where(mask_E[:, None], value_EK, held_EK))
         self._view.command_cache.clear()
 
-    def step(self, going_on_E: Tensor) -> None:
+    def step(self, going_on_E: Bool[Tensor, " E"]) -> None:
         """Run the clocks of the rows that go on, resample where they ran out, and recompute these rows' vectors."""
         for name, term in self._terms.items():
             if name in self._clocks:
@@ -100,7 +104,9 @@ class CommandManager:
                 self._draw(name, term, due_E, "step", self._view.step_count)
         self.refresh(going_on_E)
 
-    def _draw(self, name: str, term: CommandTerm, mask_E: Tensor, moment: str, counter: Tensor) -> None:
+    def _draw(
+        self, name: str, term: CommandTerm, mask_E: Bool[Tensor, " E"], moment: str, counter: Tensor
+    ) -> None:
         if term.resampling_time_range_s is not None:
             clock_E = self._clocks[name]
             with self._driver.scope(f"commands/{name}/clock/{moment}", counter):

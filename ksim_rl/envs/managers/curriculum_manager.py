@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.envs.driver import EnvDriver
@@ -29,7 +30,7 @@ class CurriculumManager:
         self.levels_C = torch.zeros(len(self.names), device=view.device)
         self.reset(torch.zeros(view.num_envs, dtype=torch.bool, device=view.device))
 
-    def reset(self, mask_E: Tensor) -> None:
+    def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Adapt to the episodes that just ended in the rows of `mask_E`."""
         for index, (name, term) in enumerate(self._terms.items()):
             with self._driver.scope(f"curriculum/{name}", self._view.reset_count_E):

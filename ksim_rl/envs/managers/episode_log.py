@@ -1,6 +1,7 @@
 """Sums over finished episodes, kept on the device until the trainer reads them."""
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.envs.managers.metric_manager import MetricManager
@@ -34,7 +35,7 @@ class EpisodeLog:
         )
         self.totals_N = torch.zeros(len(self.names), device=view.device)
 
-    def step(self, done_E: Tensor) -> None:
+    def step(self, done_E: Bool[Tensor, " E"]) -> None:
         """Add the episodes that end now, bool [E]."""
         done_E1 = done_E[:, None]
         sums_ER = self._rewards.episode_sums_ER
@@ -51,7 +52,7 @@ class EpisodeLog:
         )
         self.totals_N.add_(torch.where(done_E1, rows_EN, 0.0).sum(0))
 
-    def read(self) -> dict[str, Tensor]:
+    def read(self) -> dict[str, Float[Tensor, ""]]:
         """Return the sums by name, float32 [] each, still on the device."""
         return dict(zip(self.names, self.totals_N.unbind(), strict=True))
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.envs.driver import EnvDriver
@@ -43,7 +44,7 @@ class EventManager:
                 term(self._view, everybody_E)
         self._view.world.set_const(self._fields.get("startup", ()))
 
-    def reset(self, mask_E: Tensor) -> None:
+    def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Run the reset events for the rows of `mask_E`, and restart their interval clocks."""
         view = self._view
         for scope, term in self._by_mode.get("reset", []):
@@ -77,7 +78,7 @@ class EventManager:
                     term(view, everybody_E)
             view.world.set_const(self._fields["step"], everybody_E)
 
-    def _restart(self, scope: str, term: EventTerm, mask_E: Tensor) -> None:
+    def _restart(self, scope: str, term: EventTerm, mask_E: Bool[Tensor, " E"]) -> None:
         assert term.interval_range_s is not None
         low, high = term.interval_range_s
         clock_E = self._clocks[scope]

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.envs.driver import EnvDriver
@@ -29,7 +30,7 @@ class MetricManager:
         )
         self.step(torch.ones(view.num_envs, dtype=torch.bool, device=view.device))
 
-    def step(self, finite_E: Tensor) -> None:
+    def step(self, finite_E: Bool[Tensor, " E"]) -> None:
         """Take in the values of the current state; rows whose physics failed add nothing."""
         values = []
         for name, term in self._terms.items():
@@ -54,7 +55,7 @@ class MetricManager:
         held_EM.copy_(next_EM)
 
     @property
-    def reduced_EM(self) -> Tensor:
+    def reduced_EM(self) -> Float[Tensor, "E M"]:
         """The reduced values of the episodes so far, float32 [E, M]."""
         if "mean" not in self._occurring:
             return self._held_EM

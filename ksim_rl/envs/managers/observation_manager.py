@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import torch
+from jaxtyping import Shaped
 from torch import Tensor
 
 from ksim_rl.envs.driver import EnvDriver
@@ -33,7 +34,7 @@ class ObservationManager:
                     f"observation term {name!r} returns {reading.dtype} {tuple(reading.shape)}: expected {expected}"
                 )
 
-    def read(self) -> dict[str, Tensor]:
+    def read(self) -> dict[str, Shaped[Tensor, " E *?leaf"]]:
         """Return the readings of the current state by term, none of them aliasing the state.
 
         They are float32 [E, L], side by side in one tensor, and images [E, H, W] or [E, H, W, C].

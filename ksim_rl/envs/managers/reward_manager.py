@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checks import near
@@ -36,7 +37,7 @@ class RewardManager:
         driver.readings.episode_rewards.update(zip(self.names, self.episode_sums_ER.unbind(-1), strict=True))
         self.step(torch.ones(view.num_envs, dtype=torch.bool, device=view.device))
 
-    def step(self, finite_E: Tensor) -> Tensor:
+    def step(self, finite_E: Bool[Tensor, " E"]) -> Float[Tensor, " E"]:
         """Return the reward of the current state, float32 [E]; rows whose physics failed get 0."""
         values = []
         for name, term in self._terms.items():

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.envs.driver import EnvDriver
@@ -27,7 +28,7 @@ class TerminationManager:
         self._failure_K = ~self._time_out_K
         self.step(torch.ones(view.num_envs, dtype=torch.bool, device=view.device))
 
-    def step(self, finite_E: Tensor) -> tuple[Tensor, Tensor]:
+    def step(self, finite_E: Bool[Tensor, " E"]) -> tuple[Bool[Tensor, " E"], Bool[Tensor, " E"]]:
         """Return `terminated` and `truncated` of the current state, bool [E] each.
 
         Rows whose physics failed are terminated. A row may be both; `terminated` is what ends the return.

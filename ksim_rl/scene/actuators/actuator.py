@@ -7,6 +7,7 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 
 import mujoco
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checked import Checked, NonNegative, Positive
@@ -14,7 +15,7 @@ from ksim_rl.scene.actuators.drive import Drive
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKind
 
-Law = Callable[[JointState, JointTarget], Tensor]
+Law = Callable[[JointState, JointTarget], Float[Tensor, "E N"]]
 """The control [E, N] of a law's motors; of explicit ones, the effort itself."""
 
 

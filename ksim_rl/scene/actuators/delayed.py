@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import mujoco
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.checked import WholeNumber
@@ -73,7 +74,7 @@ class DelayedActuator(Actuator):
         fields = [f"{kind}_EN" for kind in sorted(self.takes)]
         ring = SubstepRing(drive, "targets", self.max_lag + 1, len(fields) * drive.num_joints)
 
-        def draw(mask_E: Tensor) -> None:
+        def draw(mask_E: Bool[Tensor, " E"]) -> None:
             drawn_E = drive.integers(1, self.min_lag, self.max_lag)[:, 0]
             lag_E.copy_(torch.where(mask_E, drawn_E, lag_E))
 

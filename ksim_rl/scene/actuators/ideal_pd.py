@@ -4,6 +4,7 @@ from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checked import NonNegative
@@ -47,14 +48,14 @@ class IdealPDActuator(ExplicitActuator):
     def law(self, drive: Drive) -> Law:
         """Return the controller."""
 
-        def effort_EN(state: JointState, target: JointTarget) -> Tensor:
+        def effort_EN(state: JointState, target: JointTarget) -> Float[Tensor, "E N"]:
             limit_EN = drive.param("effort_limit")
             return pd_effort(drive, state, target).clamp(-limit_EN, limit_EN)
 
         return effort_EN
 
 
-def pd_effort(drive: Drive, state: JointState, target: JointTarget) -> Tensor:
+def pd_effort(drive: Drive, state: JointState, target: JointTarget) -> Float[Tensor, "E N"]:
     """Return what a proportional-derivative controller asks its motors for, without limits, [E, N]."""
     asked_EN = torch.addcmul(target.effort_EN, drive.param("stiffness"), target.pos_EN - state.pos_EN)
     return torch.addcmul(asked_EN, drive.param("damping"), target.vel_EN - state.vel_EN)

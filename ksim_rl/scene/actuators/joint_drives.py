@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 
+from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.scene.actuators.actuator import Actuator, Law
@@ -50,7 +51,7 @@ class JointDrives:
             self._apply()
             simulation.before_substep.append(self._apply)
 
-    def reset(self, mask_E: Tensor) -> None:
+    def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Draw the lags of the rows of `mask_E`, bool [E]."""
         for drive, _ in self._drives:
             drive.reset(mask_E)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
@@ -27,7 +28,7 @@ class NetFile:
     tensors: dict[str, Tensor]
     metadata: dict[str, str]
 
-    def tensor(self, name: str, *shape: int) -> Tensor:
+    def tensor(self, name: str, *shape: int) -> Float[Tensor, "*shape"]:
         """Return a tensor of this shape, where -1 fits any size.
 
         Raises:

@@ -10,6 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from ksim_rl.checks import near
@@ -34,20 +35,20 @@ class ReferenceMotion:
     """
 
     fps: float
-    qpos_FL: Tensor
-    qvel_FL: Tensor
+    qpos_FL: Float[Tensor, "F L"]
+    qvel_FL: Float[Tensor, "F M"]
     quats: tuple[int, ...]
-    joint_pos_FL: Tensor
-    joint_vel_FL: Tensor
-    body_pos_FN3: Tensor
-    body_quat_FN4: Tensor
+    joint_pos_FL: Float[Tensor, "F N"]
+    joint_vel_FL: Float[Tensor, "F N"]
+    body_pos_FN3: Float[Tensor, "F B 3"]
+    body_quat_FN4: Float[Tensor, "F B 4"]
 
     @property
     def duration_s(self) -> float:
         """Seconds from the first frame to the last."""
         return (self.qpos_FL.shape[0] - 1) / self.fps
 
-    def sample(self, time_E: Tensor) -> tuple[Tensor, Tensor]:
+    def sample(self, time_E: Float[Tensor, " E"]) -> tuple[Float[Tensor, "E L"], Float[Tensor, "E M"]]:
         """Return qpos [E, nq] and qvel [E, nv] at times, s, [E]; before the first and after the last frame those stay.
 
         Between frames both are interpolated linearly, quaternions along the shorter arc and normalized.
@@ -60,8 +61,10 @@ class ReferenceMotion:
             qpos_EL[:, columns] = _blend(before_EL[:, columns], after_EL[:, columns], share_E1)
         return qpos_EL, torch.lerp(self.qvel_FL[low_E], self.qvel_FL[low_E + 1], share_E1)
 
-    def sample_joints(self, time_E: Tensor, joints: Index) -> tuple[Tensor, Tensor]:
-        """Return positions and velocities of hinges and slides, [E, L] each, at times, s, [E]."""
+    def sample_joints(
+        self, time_E: Float[Tensor, " E"], joints: Index
+    ) -> tuple[Float[Tensor, "E N"], Float[Tensor, "E N"]]:
+        """Return positions and velocities of hinges and slides, [E, N] each, at times, s, [E]."""
         low_E, share_E1 = self._between(time_E)
         pos_EL, vel_EL = (
             torch.lerp(_entries(table_FL, low_E, joints), _entries(table_FL, low_E + 1, joints), share_E1)
@@ -69,7 +72,9 @@ class ReferenceMotion:
         )
         return pos_EL, vel_EL
 
-    def sample_bodies(self, time_E: Tensor, bodies: Index) -> tuple[Tensor, Tensor]:
+    def sample_bodies(
+        self, time_E: Float[Tensor, " E"], bodies: Index
+    ) -> tuple[Float[Tensor, "E N 3"], Float[Tensor, "E N 4"]]:
         """Return the poses of bodies, [E, N, 3] and [E, N, 4], at times, s, [E]; between frames as in `sample`."""
         low_E, share_E1 = self._between(time_E)
         (pos_EN3, next_pos_EN3), (quat_EN4, next_quat_EN4) = (
@@ -79,7 +84,7 @@ class ReferenceMotion:
         share_E11 = share_E1[:, None]
         return torch.lerp(pos_EN3, next_pos_EN3, share_E11), _blend(quat_EN4, next_quat_EN4, share_E11)
 
-    def _between(self, time_E: Tensor) -> tuple[Tensor, Tensor]:
+    def _between(self, time_E: Float[Tensor, " E"]) -> tuple[Tensor, Tensor]:
         """Return the frame before each time, [E], and the part of the way to the next one, [E, 1]."""
         last = self.qpos_FL.shape[0] - 1
         frame_E = (time_E * self.fps).clamp(0.0, float(last))
@@ -176,7 +181,7 @@ def _check_joints(file: str | Path, names: list[str], model: mujoco.MjModel) -> 
         )
 
 
-def _entries(table: Tensor, frame_E: Tensor, columns: Index) -> Tensor:
+def _entries(table: Tensor, frame_E: Int64[Tensor, " E"], columns: Index) -> Tensor:
     """Return some columns of a table [F, N, ...] in each env's frame, [E, N, ...]."""
     return table[:, columns][frame_E] if isinstance(columns, slice) else table[frame_E[:, None], columns]
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import mujoco
 import torch
+from jaxtyping import Float, Int32, UInt8
 from torch import Tensor
 
 from ksim_rl.checked import Count, Positive, Within
@@ -101,17 +102,17 @@ class CameraTracker(SensorTracker):
         )
 
     @property
-    def rgb_EHW3(self) -> Tensor:
+    def rgb_EHW3(self) -> UInt8[Tensor, "E H W 3"]:
         """Colors, uint8 [E, H, W, 3]; the first row is the top of the picture."""
         return self._read("rgb")
 
     @property
-    def depth_EHW(self) -> Tensor:
+    def depth_EHW(self) -> Float[Tensor, "E H W"]:
         """Distance along the camera's axis, m, at most `max_depth`, float32 [E, H, W]."""
         return self._read("depth")
 
     @property
-    def segmentation_EHW(self) -> Tensor:
+    def segmentation_EHW(self) -> Int32[Tensor, "E H W"]:
         """Ids of the geoms that are seen, -1 for none, int32 [E, H, W]."""
         return self._read("segmentation")
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.scene.names import as_index
@@ -24,26 +25,26 @@ class ContactState(NamedTuple):
     All are float32, and rows that were just reset read zero.
     """
 
-    found_EN: Tensor
+    found_EN: Float[Tensor, "E N"]
     """1 where the element touches, else 0, [E, N]."""
-    force_EN3: Tensor
+    force_EN3: Float[Tensor, "E N 3"]
     """Force of the element on what it touches, N, world frame, [E, N, 3]: MuJoCo's sign, by which a robot's foot that
     carries weight reads negative z. The force on the element is the opposite."""
-    position_EN3: Tensor
+    position_EN3: Float[Tensor, "E N 3"]
     """Point of contact (weighted by force if there are several), m, world frame, [E, N, 3]; 0 without contact."""
-    air_time_EN: Tensor
+    air_time_EN: Float[Tensor, "E N"]
     """Seconds since the element left the ground, [E, N]; 0 while it touches."""
-    last_air_time_EN: Tensor
+    last_air_time_EN: Float[Tensor, "E N"]
     """Seconds that the last completed flight took, [E, N]."""
-    contact_time_EN: Tensor
+    contact_time_EN: Float[Tensor, "E N"]
     """Seconds since the element touched down, [E, N]; 0 while it is in the air."""
-    last_contact_time_EN: Tensor
+    last_contact_time_EN: Float[Tensor, "E N"]
     """Seconds that the last completed contact took, [E, N]."""
-    first_contact_EN: Tensor
+    first_contact_EN: Float[Tensor, "E N"]
     """1 in the env step in which the element touched down, else 0, [E, N]."""
-    first_air_EN: Tensor
+    first_air_EN: Float[Tensor, "E N"]
     """1 in the env step in which the element left the ground, else 0, [E, N]."""
-    force_history_ESN3: Tensor
+    force_history_ESN3: Float[Tensor, "E S N 3"]
     """`force_EN3` of each substep of the env step, oldest first, [E, S, N, 3]; S is 1 without `every_substep`."""
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import mujoco
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.scene import quaternion
@@ -53,12 +54,12 @@ class ImuTracker(SensorTracker):
         self._down = torch.tensor([0.0, 0.0, -1.0], device=view.device)
 
     @property
-    def ang_vel_EL(self) -> Tensor:
+    def ang_vel_EL(self) -> Float[Tensor, "E 3"]:
         """Angular velocity, rad/s, [E, 3]; velocity stage."""
         return self._view.sensor(f"{self._name}_gyro")
 
     @property
-    def lin_acc_EL(self) -> Tensor:
+    def lin_acc_EL(self) -> Float[Tensor, "E 3"]:
         """Acceleration minus gravity, m/s^2, [E, 3]: at rest it points up and is 9.81, in free fall it is zero.
 
         Acceleration stage: of the last physics substep, and zero in rows that were just reset.
@@ -66,12 +67,12 @@ class ImuTracker(SensorTracker):
         return self._view.sensor(f"{self._name}_accelerometer")
 
     @property
-    def quat_EL(self) -> Tensor:
+    def quat_EL(self) -> Float[Tensor, "E 4"]:
         """Orientation, from the unit's axes to the world's, (w, x, y, z), [E, 4]; position stage."""
         return self._view.sensor(f"{self._name}_orientation")
 
     @property
-    def projected_gravity_EL(self) -> Tensor:
+    def projected_gravity_EL(self) -> Float[Tensor, "E 3"]:
         """Unit vector of world -z, [E, 3]; position stage."""
         cache, key = self._view.cache, f"imu/{self._name}.projected_gravity"
         if key not in cache:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checked import Positive
@@ -21,13 +22,13 @@ from ksim_rl.scene.state.world_view import WorldView
 class RayState(NamedTuple):
     """What N rays hit first, float32 unless stated otherwise; position stage."""
 
-    distance_EN: Tensor
+    distance_EN: Float[Tensor, "E N"]
     """m from where the ray starts, [E, N]; `max_distance` where nothing is hit within it."""
-    hit_EN: Tensor
+    hit_EN: Bool[Tensor, "E N"]
     """Whether something is hit within `max_distance`, bool [E, N]."""
-    point_EN3: Tensor
+    point_EN3: Float[Tensor, "E N 3"]
     """The end of the ray, world frame, m, [E, N, 3]."""
-    normal_EN3: Tensor
+    normal_EN3: Float[Tensor, "E N 3"]
     """Unit normal of the surface that is hit, world frame, [E, N, 3]; zero where there is none."""
 
 
@@ -84,7 +85,7 @@ class RayTracker(SensorTracker):
         return RayState(*(cache[self._key + name] for name in RayState._fields))
 
     @property
-    def origin_E3(self) -> Tensor:
+    def origin_E3(self) -> Float[Tensor, "E 3"]:
         """Place of the sensor, world frame, m, [E, 3]."""
         return self._view.derived().site_xpos_EL[:, self._site]
 
@@ -111,7 +112,7 @@ class RayTracker(SensorTracker):
             normal_EN3=torch.where(hit_EN[..., None], batch.normal_EN3, 0.0),
         )
 
-    def _turned(self, vectors_N3: Tensor) -> Tensor:
+    def _turned(self, vectors_N3: Float[Tensor, "N 3"]) -> Tensor:
         """Turn vectors from the sensor's axes to the world's, [E, N, 3]."""
         if self._sensor.alignment == "world":
             return vectors_N3.expand(self._view.num_envs, -1, -1)

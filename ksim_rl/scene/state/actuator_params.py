@@ -4,6 +4,7 @@ import math
 from collections.abc import Collection, Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import unknown_name
@@ -35,12 +36,12 @@ class ActuatorParams:
         self._buffers[name].copy_(self._nominal[name].expand_as(self._buffers[name]))
         self._owners.setdefault(name, {}).update(dict.fromkeys(joints, value))
 
-    def get(self, name: str, joints: Collection[int] = ()) -> Tensor:
+    def get(self, name: str, joints: Collection[int] = ()) -> Float[Tensor, "E L"]:
         """Return the present numbers, [E, L]; an error if one of `joints` has none."""
         self._check(name, joints)
         return self._buffers[name]
 
-    def nominal(self, name: str) -> Tensor:
+    def nominal(self, name: str) -> Float[Tensor, " L"]:
         """Return the numbers of the config, [L]."""
         self._check(name, ())
         return self._nominal[name]

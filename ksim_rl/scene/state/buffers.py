@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 # Numbers per env that an arena has room for; a wider buffer has one of its own.
@@ -23,7 +24,7 @@ class Arena:
         """Whether a buffer of this width and dtype fits."""
         return dtype == self.values.dtype and self._used + self._num_envs * width <= self.values.numel()
 
-    def take(self, shape: tuple[int, ...]) -> Tensor:
+    def take(self, shape: tuple[int, ...]) -> Shaped[Tensor, " E *shape"]:
         """Return a buffer [E, *shape], contiguous, that nobody else has."""
         width = math.prod(shape)
         start, self._used = self._used, self._used + self._num_envs * width
@@ -32,7 +33,7 @@ class Arena:
         self._row_N = torch.cat((self._row_N, rows.repeat_interleave(width)))
         return self.values[start : self._used].view(self._num_envs, *shape)
 
-    def clear(self, mask_E: Tensor) -> None:
+    def clear(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Zero the rows of `mask_E`, bool [E], in all buffers."""
         self.values[: self._used].masked_fill_(mask_E.index_select(0, self._row_N), 0)
 
@@ -61,8 +62,8 @@ class Buffers:
         *shape: int,
         dtype: torch.dtype = torch.float32,
         keep: bool = False,
-        initial: Tensor | None = None,
-    ) -> Tensor:
+        initial: Shaped[Tensor, "*initial"] | None = None,
+    ) -> Shaped[Tensor, " E *shape"]:
         """Return the buffer `name`, [E, *shape].
 
         Args:
@@ -111,7 +112,7 @@ class Buffers:
             if name in self._initial:
                 buffer.copy_(self._initial[name].expand_as(buffer))
 
-    def clear(self, mask_E: Tensor) -> None:
+    def clear(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Let the rows of `mask_E`, bool [E], start anew in each buffer that is not kept."""
         for arena in self._arenas:
             arena.clear(mask_E)
@@ -121,7 +122,7 @@ class Buffers:
                 mask = mask_E.view(-1, *[1] * (buffer.ndim - 1))
                 buffer.copy_(torch.where(mask, initial, buffer))
 
-    def by_name(self) -> dict[str, Tensor]:
+    def by_name(self) -> dict[str, Shaped[Tensor, " E *?shape"]]:
         """Return the buffers by name."""
         return dict(self._buffers)
 
@@ -147,7 +148,9 @@ class SharedValues:
         self._tensors: dict[str, Tensor] = {}
         self._frozen = False
 
-    def get(self, name: str, initial: float | Sequence[float] | Sequence[Sequence[float]]) -> Tensor:
+    def get(
+        self, name: str, initial: float | Sequence[float] | Sequence[Sequence[float]]
+    ) -> Float[Tensor, "*shape"]:
         """Return the tensor `name`, which starts at `initial` and has its shape; the same tensor at each call.
 
         Raises:
@@ -166,6 +169,6 @@ class SharedValues:
         """Refuse new tensors from now on."""
         self._frozen = True
 
-    def by_name(self) -> dict[str, Tensor]:
+    def by_name(self) -> dict[str, Float[Tensor, "*?shape"]]:
         """Return the tensors by name."""
         return dict(self._tensors)

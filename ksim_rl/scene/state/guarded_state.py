@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from ksim_rl.physics import World
@@ -29,7 +29,7 @@ class GuardedState:
         self._caches: list[dict[str, Tensor]] = []
         self._body_root = torch.tensor(world.mj_model.body_rootid, device=world.device, dtype=torch.int64)
 
-    def new_cache(self) -> dict[str, Tensor]:
+    def new_cache(self) -> dict[str, Shaped[Tensor, "*?shape"]]:
         """Return a dict for quantities that is emptied whenever the state changes."""
         self._caches.append({})
         return self._caches[-1]
@@ -57,7 +57,9 @@ class GuardedState:
         self.forget()
         self._is_stale = True
 
-    def write(self, target_EL: Tensor, mask_E: Tensor, value_EL: Tensor) -> None:
+    def write(
+        self, target_EL: Float[Tensor, "E L"], mask_E: Bool[Tensor, " E"], value_EL: Float[Tensor, "E L"]
+    ) -> None:
         """Copy the rows of `mask_E` into a view of the state."""
         target_EL.copy_(torch.where(mask_E[:, None], value_EL, target_EL))
         self.changed()
@@ -67,13 +69,13 @@ class GuardedState:
         state_EL: Float[Tensor, "E L"],
         columns: Index,
         mask_E: Bool[Tensor, " E"],
-        value_EK: Float[Tensor, "E K"],
+        value_EN: Float[Tensor, "E N"],
     ) -> None:
         """Copy the rows of `mask_E` into some columns of the state."""
-        state_EL[:, columns] = torch.where(mask_E[:, None], value_EK, state_EL[:, columns])
+        state_EL[:, columns] = torch.where(mask_E[:, None], value_EN, state_EL[:, columns])
         self.changed()
 
-    def point_velocity(self, point_EN3: Tensor, body: Index) -> Tensor:
+    def point_velocity(self, point_EN3: Float[Tensor, "E N 3"], body: Index) -> Float[Tensor, "E N 3"]:
         """Return the velocities of points fixed to bodies, world frame, m/s, [E, N, 3]."""
         # MuJoCo's cvel is (angular, linear) about the centre of mass of the body's kinematic tree.
         world = self.derived()

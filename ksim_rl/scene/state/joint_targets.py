@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 
 import mujoco
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checks import near
@@ -27,16 +28,16 @@ TargetKind = Literal["pos", "vel", "effort"]
 class JointState(NamedTuple):
     """Where N joints are before a substep: rad or m, and rad/s or m/s, [E, N]."""
 
-    pos_EN: Tensor
-    vel_EN: Tensor
+    pos_EN: Float[Tensor, "E N"]
+    vel_EN: Float[Tensor, "E N"]
 
 
 class JointTarget(NamedTuple):
     """What N joints are asked for: position, velocity, and effort (N m or N) to add, [E, N]."""
 
-    pos_EN: Tensor
-    vel_EN: Tensor
-    effort_EN: Tensor
+    pos_EN: Float[Tensor, "E N"]
+    vel_EN: Float[Tensor, "E N"]
+    effort_EN: Float[Tensor, "E N"]
 
 
 _WORDS = {"pos": "a position", "vel": "a velocity", "effort": "an effort"}
@@ -61,7 +62,7 @@ class _Route(NamedTuple):
     joints: Index
     ctrl: Index | None
     columns: Index
-    limits_K2: Tensor | None
+    limits_K2: Float[Tensor, "K 2"] | None
 
 
 class JointTargets:
@@ -78,7 +79,12 @@ class JointTargets:
     """
 
     def __init__(
-        self, world: World, resolver: NameResolver, buffers: Buffers, *, default_joint_pos_EL: Tensor
+        self,
+        world: World,
+        resolver: NameResolver,
+        buffers: Buffers,
+        *,
+        default_joint_pos_EL: Float[Tensor, "E L"],
     ) -> None:
         model, num_joints = world.mj_model, default_joint_pos_EL.shape[1]
         self._world, self._resolver = world, resolver
@@ -125,7 +131,7 @@ class JointTargets:
         self._routes.clear()
         self._find_servos()
 
-    def write(self, kind: TargetKind, patterns: Patterns, value_EK: Tensor) -> None:
+    def write(self, kind: TargetKind, patterns: Patterns, value_EK: Float[Tensor, "E K"]) -> None:
         """Set the targets of the joints of `patterns`, in their order, in all rows.
 
         Raises:
@@ -154,7 +160,7 @@ class JointTargets:
                     "each substep: use an action on joints"
                 )
 
-    def reset(self, mask_E: Tensor) -> None:
+    def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Let the position servos of the rows of `mask_E` hold the default pose, until an action says otherwise."""
         if self._servo_ctrl is None:
             return

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from jaxtyping import Shaped
 from torch import Tensor
 
 
@@ -14,7 +15,7 @@ class HasCache(Protocol):
     cache: dict[str, Tensor]
 
 
-def quantity(compute: Callable[[Any], Tensor]) -> property:
+def quantity(compute: Callable[[Any], Shaped[Tensor, "*shape"]]) -> property:
     """Make a property that is computed at most once between two changes of the state."""
     name = compute.__name__
 

@@ -87,8 +87,8 @@ class Simulation(GuardedState):
         self._draws += 1
         return random.row_keys(self.seed, stream, self._counter, self.num_envs)
 
-    def freeze(self, *constants: Shaped[Tensor, ...]) -> None:
-        """End construction: no new buffers, and all that lives on, `constants` too, is known to `detached`."""
+    def freeze(self) -> None:
+        """End construction: no new buffers, and all that lives on is known to `detached`."""
         self.is_frozen = True
         self.buffers.freeze()
         self.shared_values.freeze()
@@ -96,7 +96,6 @@ class Simulation(GuardedState):
             *self.buffers.by_name().values(),
             *self.world.views().values(),
             self.episode_step_E,
-            *constants,
         ]
         lasting += [*self.shared_values.by_name().values(), *self.world.per_world_fields().values()]
         self._lasting = {tensor.untyped_storage().data_ptr() for tensor in lasting}

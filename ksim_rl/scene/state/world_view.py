@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int64, Shaped
 from torch import Tensor
 
 from ksim_rl.checks import near
@@ -202,7 +202,7 @@ class WorldView(FirstRobot):
 
     # -- sensors, motions, time -------------------------------------------------------------------------------------
 
-    def sensor(self, name: str) -> Tensor:
+    def sensor(self, name: str) -> Float[Tensor, "E L"]:
         """Return the reading of an MJCF sensor, [E, dim]."""
         if name not in self._sensor_slices:
             raise ValueError(f"no sensor {name!r}: {near(name, self._sensor_slices)}")
@@ -223,28 +223,28 @@ class WorldView(FirstRobot):
         return self._motions[file]
 
     @quantity
-    def episode_time_E(self) -> Tensor:
+    def episode_time_E(self) -> Float[Tensor, " E"]:
         """Time since the episode's start, s, [E]."""
         return self.episode_step_E.to(torch.float32) * self.step_dt
 
     # -- actuators -----------------------------------------------------------------------------------------------
 
     @property
-    def joint_pos_target_EL(self) -> Tensor:
+    def joint_pos_target_EL(self) -> Float[Tensor, "E L"]:
         """Positions that joints are asked for, rad or m, [E, L]; the default pose until an action asks otherwise."""
         return self.targets.pos_EL
 
     @property
-    def joint_vel_target_EL(self) -> Tensor:
+    def joint_vel_target_EL(self) -> Float[Tensor, "E L"]:
         """Velocities that joints are asked for, rad/s or m/s, [E, L]."""
         return self.targets.vel_EL
 
     @property
-    def joint_effort_target_EL(self) -> Tensor:
+    def joint_effort_target_EL(self) -> Float[Tensor, "E L"]:
         """Efforts that joints are asked for, N m or N, [E, L]."""
         return self.targets.effort_EL
 
-    def actuator_param(self, name: str, joints: Patterns | None = None) -> Tensor:
+    def actuator_param(self, name: str, joints: Patterns | None = None) -> Float[Tensor, "E L"]:
         """Return a number of explicit actuators, [E, L], such as "stiffness", to be read or written in place.
 
         `joints` names those that must have it. What an event writes holds from the next substep on, and until it is
@@ -255,7 +255,7 @@ class WorldView(FirstRobot):
         """
         return self.actuator_params.get(name, () if joints is None else self.resolver.ids("joint", joints))
 
-    def nominal_actuator_param(self, name: str) -> Tensor:
+    def nominal_actuator_param(self, name: str) -> Float[Tensor, " L"]:
         """Return the numbers of `actuator_param` as the config gives them, [L]."""
         return self.actuator_params.nominal(name)
 
@@ -263,37 +263,44 @@ class WorldView(FirstRobot):
 
     def buffer(
         self, name: str, *shape: int, dtype: torch.dtype = torch.float32, keep: bool = False
-    ) -> Tensor:
+    ) -> Shaped[Tensor, " E *shape"]:
         """Return a buffer [E, *shape] that belongs to the calling term; rows that reset are zeroed unless `keep`."""
         return self.buffers.get(self._simulation.scoped(name), *shape, dtype=dtype, keep=keep)
 
-    def shared(self, name: str, initial: float | Sequence[float] | Sequence[Sequence[float]]) -> Tensor:
+    def shared(
+        self, name: str, initial: float | Sequence[float] | Sequence[Sequence[float]]
+    ) -> Float[Tensor, "*shape"]:
         """Return a float32 tensor of the calling term that all envs share; it starts at `initial` and is saved."""
         return self._simulation.shared_values.get(self._simulation.scoped(name), initial)
 
-    def uniform(self, n: int, low: float | Tensor = 0.0, high: float | Tensor = 1.0) -> Tensor:
+    def uniform(
+        self,
+        n: int,
+        low: float | Float[Tensor, "*low"] = 0.0,
+        high: float | Float[Tensor, "*high"] = 1.0,
+    ) -> Float[Tensor, "E L"]:
         """Draw float32 [E, n] from [low, high); the numbers depend on seed, term, env and moment only."""
         return random.uniform(self._simulation.next_keys(), n, low, high)
 
-    def normal(self, n: int) -> Tensor:
+    def normal(self, n: int) -> Float[Tensor, "E L"]:
         """Draw float32 [E, n] from the standard normal distribution."""
         return random.normal(self._simulation.next_keys(), n)
 
-    def integers(self, n: int, low: int, high: int) -> Tensor:
+    def integers(self, n: int, low: int, high: int) -> Int64[Tensor, "E L"]:
         """Draw int64 [E, n] from {low, ..., high}, both included."""
         return random.integers(self._simulation.next_keys(), n, low, high)
 
     # -- writes --------------------------------------------------------------------------------------------------
 
-    def write_qpos(self, mask_E: Tensor, qpos_EL: Tensor) -> None:
+    def write_qpos(self, mask_E: Bool[Tensor, " E"], qpos_EL: Float[Tensor, "E L"]) -> None:
         """Set all generalized positions, MuJoCo's layout, in the rows of `mask_E`."""
         self._simulation.write(self.world.qpos_EL, mask_E, qpos_EL)
 
-    def write_qvel(self, mask_E: Tensor, qvel_EL: Tensor) -> None:
+    def write_qvel(self, mask_E: Bool[Tensor, " E"], qvel_EL: Float[Tensor, "E L"]) -> None:
         """Set all generalized velocities, MuJoCo's layout, in the rows of `mask_E`."""
         self._simulation.write(self.world.qvel_EL, mask_E, qvel_EL)
 
-    def write_joint_pos_target(self, joints: Patterns, target_EK: Tensor) -> None:
+    def write_joint_pos_target(self, joints: Patterns, target_EK: Float[Tensor, "E K"]) -> None:
         """Ask joints for positions, rad or m, in all rows; one column per joint, in the order of `joints`.
 
         Raises:
@@ -301,7 +308,7 @@ class WorldView(FirstRobot):
         """
         self.targets.write("pos", joints, target_EK)
 
-    def write_joint_vel_target(self, joints: Patterns, target_EK: Tensor) -> None:
+    def write_joint_vel_target(self, joints: Patterns, target_EK: Float[Tensor, "E K"]) -> None:
         """Ask joints for velocities, rad/s or m/s, in all rows; one column per joint, in the order of `joints`.
 
         Raises:
@@ -309,7 +316,7 @@ class WorldView(FirstRobot):
         """
         self.targets.write("vel", joints, target_EK)
 
-    def write_joint_effort_target(self, joints: Patterns, target_EK: Tensor) -> None:
+    def write_joint_effort_target(self, joints: Patterns, target_EK: Float[Tensor, "E K"]) -> None:
         """Ask joints for efforts, N m or N, in all rows; one column per joint, in the order of `joints`.
 
         The control ranges of motors clamp them. A motor of the MJCF multiplies them by its gear and gain.
@@ -319,11 +326,11 @@ class WorldView(FirstRobot):
         """
         self.targets.write("effort", joints, target_EK)
 
-    def write_ctrl(self, actuators: Index, ctrl_EK: Tensor) -> None:
+    def write_ctrl(self, actuators: Index, ctrl_EN: Float[Tensor, "E N"]) -> None:
         """Set the controls of `actuators` in all rows."""
-        self.world.ctrl_EL[:, actuators] = ctrl_EK
+        self.world.ctrl_EL[:, actuators] = ctrl_EN
 
-    def field(self, name: str) -> Tensor:
+    def field(self, name: str) -> Shaped[Tensor, " E *shape"]:
         """Return a model field with one row per world, to be written in place (see `EventTerm.per_world_fields`)."""
         return self.world.field(name)
 
@@ -334,7 +341,7 @@ class WorldView(FirstRobot):
         middle, half = limits.mean(-1), (limits[:, 1] - limits[:, 0]) / 2 * factor
         return self._limited(torch.stack((middle - half, middle + half), dim=-1), model.jnt_limited[joints])
 
-    def _limited(self, limits_L2: Tensor, is_limited: np.ndarray) -> Tensor:
+    def _limited(self, limits_L2: Float[Tensor, "L 2"], is_limited: np.ndarray) -> Tensor:
         """Make the limits of what has none infinite, [L, 2]."""
         mask_L1 = torch.tensor(is_limited, device=self.device, dtype=torch.bool).view(-1, 1)
         return torch.where(mask_L1, limits_L2, torch.tensor([-torch.inf, torch.inf], device=self.device))

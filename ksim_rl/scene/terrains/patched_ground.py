@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from ksim_rl.scene.state.ground import Ground
@@ -67,27 +68,27 @@ class PatchedGround(Ground):
         self._place(torch.ones(view.num_envs, dtype=torch.bool, device=device))
 
     @property
-    def levels_E(self) -> Tensor:
+    def levels_E(self) -> Int64[Tensor, " E"]:
         """The level of difficulty of each env, int64 [E] in [0, num_levels)."""
         return self._first_level_E + self._moved_E
 
     @property
-    def types_E(self) -> Tensor:
+    def types_E(self) -> Int64[Tensor, " E"]:
         """The kind of ground of each env, as an index into `TerrainGrid.patches`, int64 [E]; it never changes."""
         return self._types_E
 
     @property
-    def patches_E(self) -> Tensor:
+    def patches_E(self) -> Int64[Tensor, " E"]:
         """The height field that each env stands on, int64 [E]."""
         return self.levels_E * self._num_columns + self._column_E
 
     @property
-    def origins_E3(self) -> Tensor:
+    def origins_E3(self) -> Float[Tensor, "E 3"]:
         """Where each env starts: (0, 0) at the height of the highest point around, world frame, m, [E, 3]."""
         height_E = self._spawn_heights_P[self.patches_E]
         return torch.stack((torch.zeros_like(height_E), torch.zeros_like(height_E), height_E), dim=-1)
 
-    def heights(self, points_EN2: Tensor) -> Tensor:
+    def heights(self, points_EN2: Float[Tensor, "E N 2"]) -> Float[Tensor, "E N"]:
         """Return the height of the ground at x, y (world frame, m, [E, N, 2]), m, [E, N], exact on its triangles.
 
         Beyond the edge it is that of the nearest point within.
@@ -109,12 +110,12 @@ class PatchedGround(Ground):
         steep_EN, flat_EN = torch.maximum(x_EN, y_EN), torch.minimum(x_EN, y_EN)
         return low_EN + steep_EN * (mid_EN - low_EN) + flat_EN * (high_EN - mid_EN)
 
-    def set_levels(self, mask_E: Tensor, levels_E: Tensor) -> None:
+    def set_levels(self, mask_E: Bool[Tensor, " E"], levels_E: Int64[Tensor, " E"]) -> None:
         """Move the rows of `mask_E` (bool [E]) to other levels (int64 [E]), before their reset."""
         self._moved_E.copy_(torch.where(mask_E, levels_E - self._first_level_E, self._moved_E))
         self._place(mask_E)
 
-    def _place(self, mask_E: Tensor) -> None:
+    def _place(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Write the model fields of the patches into the rows of `mask_E`."""
         patch_E = self.patches_E
         for name, field in self._fields.items():
