@@ -1,4 +1,4 @@
-"""Which parts of an env draw themselves into its pictures."""
+"""This module finds the parts of an env that draw themselves into its pictures."""
 
 from __future__ import annotations
 

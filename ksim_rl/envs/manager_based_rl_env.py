@@ -1,4 +1,4 @@
-"""The env: a TorchRL `EnvBase` over Warp-batched MuJoCo, made of terms."""
+"""This module is the env: a TorchRL `EnvBase` over Warp-batched MuJoCo, made of terms."""
 
 from __future__ import annotations
 

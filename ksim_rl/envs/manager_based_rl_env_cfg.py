@@ -1,4 +1,4 @@
-"""The configuration of `ManagerBasedRlEnv`: one dataclass tree, in Python, YAML and Hydra alike."""
+"""This module configures `ManagerBasedRlEnv`: one dataclass tree, in Python, YAML and Hydra alike."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Resets as masks: no host sync in `step_and_maybe_reset`, and partial resets that leave the other rows alone."""
+"""This module resets by masks: `step_and_maybe_reset` never syncs, and partial resets leave the other rows alone."""
 
 import secrets
 from collections.abc import Sequence

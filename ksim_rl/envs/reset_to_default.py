@@ -1,4 +1,4 @@
-"""The event of an env that configures none."""
+"""This module has the event of an env whose config names none: it resets to the default pose."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What a registered task is."""
+"""This module defines a task: an env config under a name, with what is known about training it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A door: the tasks are the room `ksim_rl.tasks`; here are the modules from which others of a kind are made."""
+"""This door leads to the room `ksim_rl.tasks`: to the modules from which others of a kind are made."""
 
 from ksim_rl.tasks import get_up, planar, velocity, velocity_rough
 

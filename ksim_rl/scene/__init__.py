@@ -1,1 +1,1 @@
-"""The physical scene: robots, objects, terrains, sensors, actuators, and the state that terms read of them."""
+"""This package is the physical scene: robots, objects, terrains, sensors, actuators, and the state that terms read."""

@@ -1,4 +1,4 @@
-"""Where an entity of a scene stands."""
+"""This module says where an entity of a scene stands, and moves its spec there."""
 
 from __future__ import annotations
 

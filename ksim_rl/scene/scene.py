@@ -1,4 +1,4 @@
-"""The scene of one world: robots on a terrain, with the sensors that terms read."""
+"""This module puts the scene of one world together: robots on a terrain, with the sensors that terms read."""
 
 from __future__ import annotations
 

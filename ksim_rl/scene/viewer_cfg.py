@@ -1,4 +1,4 @@
-"""The camera of `render()`."""
+"""This module configures the camera of `render()`."""
 
 import re
 from dataclasses import dataclass

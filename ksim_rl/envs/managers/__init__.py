@@ -1,4 +1,4 @@
-"""One manager per kind of term: it runs the terms in their scopes and keeps their clocks and sums."""
+"""This package has one manager per kind of term: it runs the terms in their scopes and keeps their clocks and sums."""
 
 from ksim_rl.envs.managers.action_manager import ActionManager
 from ksim_rl.envs.managers.command_manager import CommandManager

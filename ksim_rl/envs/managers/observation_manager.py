@@ -1,4 +1,4 @@
-"""Reads each observation term once, clean."""
+"""This module reads each observation term once, clean; what groups add is done by transforms."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""Decides which episodes end, and whether by a failure or by time."""
+"""This module decides which episodes end, and whether by a failure or by time."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""What drives a joint: an edit of the model and, for motor models of our own, a law that runs before each substep."""
+"""This module says what an actuator is: an edit of the model and, for our own motor models, a law per substep."""
 
 from __future__ import annotations
 

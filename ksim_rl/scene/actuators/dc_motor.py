@@ -1,4 +1,4 @@
-"""A motor whose torque falls with its speed."""
+"""This module models a motor whose torque falls with its speed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Targets that arrive late."""
+"""This module lets the targets of another actuator arrive late."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What a law reads and keeps: the joints that it computes, and its buffers."""
+"""This module gives a law the joints that it computes, and its buffers."""
 
 from __future__ import annotations
 

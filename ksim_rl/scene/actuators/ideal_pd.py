@@ -1,4 +1,4 @@
-"""A motor with a proportional-derivative controller."""
+"""This module models a motor with a proportional-derivative controller."""
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What learned motor models have in common: their file, and the units of inputs and output."""
+"""This module has the fields that learned motor models share: their file, and the units of inputs and output."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,4 +1,4 @@
-"""The edit of a robot's `MjSpec` that gives its joints their actuators."""
+"""This module edits a robot's `MjSpec` so that its joints have their actuators."""
 
 from collections.abc import Sequence
 

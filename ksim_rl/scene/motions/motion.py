@@ -35,13 +35,13 @@ class ReferenceMotion:
     """
 
     fps: float
-    qpos_FL: Float[Tensor, "F L"]
-    qvel_FL: Float[Tensor, "F M"]
+    qpos_FL: Float[Tensor, "F ?L"]
+    qvel_FL: Float[Tensor, "F ?L"]
     quats: tuple[int, ...]
-    joint_pos_FL: Float[Tensor, "F N"]
-    joint_vel_FL: Float[Tensor, "F N"]
-    body_pos_FN3: Float[Tensor, "F B 3"]
-    body_quat_FN4: Float[Tensor, "F B 4"]
+    joint_pos_FL: Float[Tensor, "F ?L"]
+    joint_vel_FL: Float[Tensor, "F ?L"]
+    body_pos_FN3: Float[Tensor, "F N 3"]
+    body_quat_FN4: Float[Tensor, "F N 4"]
 
     @property
     def duration_s(self) -> float:
@@ -92,7 +92,7 @@ class ReferenceMotion:
         return low_E, (frame_E - low_E)[:, None]
 
 
-def load_motion(file: str | Path, model: mujoco.MjModel, device: torch.device) -> ReferenceMotion:
+def load_motion(file: str | Path, mj_model: mujoco.MjModel, device: torch.device) -> ReferenceMotion:
     """Read an .npz file of the model: `fps`, `qpos` [F, nq], `qvel` [F, nv] and, if it has them, `joint_names`.
 
     The file may be the name of a motion that comes with the package (`ksim_rl.scene.motions`).
@@ -106,7 +106,7 @@ def load_motion(file: str | Path, model: mujoco.MjModel, device: torch.device) -
         raise ValueError(
             f"motion {file}: fps={fps.tolist()!r}: expected one positive number of frames per second"
         )
-    for key, width, kind in (("qpos", model.nq, "nq"), ("qvel", model.nv, "nv")):
+    for key, width, kind in (("qpos", mj_model.nq, "nq"), ("qvel", mj_model.nv, "nv")):
         array = arrays[key]
         if array.ndim != 2 or array.shape[1] != width or array.shape[0] < 2:
             raise ValueError(
@@ -119,8 +119,8 @@ def load_motion(file: str | Path, model: mujoco.MjModel, device: torch.device) -
             f"motion {file}: qpos has {arrays['qpos'].shape[0]} frames and qvel {arrays['qvel'].shape[0]}"
         )
     if "joint_names" in arrays:
-        _check_joints(file, [str(name) for name in arrays["joint_names"]], model)
-    quats = _quaternion_columns(model)
+        _check_joints(file, [str(name) for name in arrays["joint_names"]], mj_model)
+    quats = _quaternion_columns(mj_model)
     for start in quats:
         norms = np.linalg.norm(arrays["qpos"][:, start : start + 4], axis=-1)
         if np.abs(norms - 1.0).max() > 1e-3:
@@ -128,8 +128,8 @@ def load_motion(file: str | Path, model: mujoco.MjModel, device: torch.device) -
                 f"motion {file}: qpos[:, {start}:{start + 4}] holds quaternions of lengths {norms.min():g} to "
                 f"{norms.max():g}: expected unit quaternions (w, x, y, z)"
             )
-    body_pos_FN3, body_quat_FN4 = _body_poses(model, arrays["qpos"])
-    joints = scalar_joint_ids(model)
+    body_pos_FN3, body_quat_FN4 = _body_poses(mj_model, arrays["qpos"])
+    joints = scalar_joint_ids(mj_model)
 
     def on_device(array: np.ndarray) -> Tensor:
         return torch.tensor(array, dtype=torch.float32, device=device)
@@ -139,8 +139,8 @@ def load_motion(file: str | Path, model: mujoco.MjModel, device: torch.device) -
         qpos_FL=on_device(arrays["qpos"]),
         qvel_FL=on_device(arrays["qvel"]),
         quats=quats,
-        joint_pos_FL=on_device(arrays["qpos"][:, model.jnt_qposadr[joints]]),
-        joint_vel_FL=on_device(arrays["qvel"][:, model.jnt_dofadr[joints]]),
+        joint_pos_FL=on_device(arrays["qpos"][:, mj_model.jnt_qposadr[joints]]),
+        joint_vel_FL=on_device(arrays["qvel"][:, mj_model.jnt_dofadr[joints]]),
         body_pos_FN3=on_device(body_pos_FN3),
         body_quat_FN4=on_device(body_quat_FN4),
     )
@@ -170,8 +170,8 @@ def _read(path: Path) -> Mapping[str, np.ndarray]:
     return arrays
 
 
-def _check_joints(file: str | Path, names: list[str], model: mujoco.MjModel) -> None:
-    own = [model.joint(i).name for i in range(model.njnt)]
+def _check_joints(file: str | Path, names: list[str], mj_model: mujoco.MjModel) -> None:
+    own = [mj_model.joint(i).name for i in range(mj_model.njnt)]
     for name in names:
         if name not in own:
             raise ValueError(f"motion {file}: the model has no joint {name!r}: {near(name, own)}")
@@ -193,19 +193,19 @@ def _blend(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
     return blend / torch.linalg.vector_norm(blend, dim=-1, keepdim=True)
 
 
-def _body_poses(model: mujoco.MjModel, qpos_FL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _body_poses(mj_model: mujoco.MjModel, qpos_FL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return where the bodies are in each frame, [F, N, 3] and [F, N, 4]."""
-    data = mujoco.MjData(model)
+    data = mujoco.MjData(mj_model)
     pos_FN3, quat_FN4 = [], []
     for qpos in qpos_FL:
         data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
+        mujoco.mj_kinematics(mj_model, data)
         pos_FN3.append(data.xpos.copy())
         quat_FN4.append(data.xquat.copy())
     return np.stack(pos_FN3), np.stack(quat_FN4)
 
 
-def _quaternion_columns(model: mujoco.MjModel) -> tuple[int, ...]:
+def _quaternion_columns(mj_model: mujoco.MjModel) -> tuple[int, ...]:
     kinds = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
-    joints = zip(model.jnt_type, model.jnt_qposadr, strict=True)
+    joints = zip(mj_model.jnt_type, mj_model.jnt_qposadr, strict=True)
     return tuple(int(address) + kinds[int(kind)] for kind, address in joints if int(kind) in kinds)

@@ -1,4 +1,4 @@
-"""A box that moves freely."""
+"""This module makes a box that moves freely."""
 
 from dataclasses import dataclass
 

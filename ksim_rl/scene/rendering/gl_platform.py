@@ -1,4 +1,4 @@
-"""Finds an OpenGL platform that works here: a display, then EGL, then OSMesa."""
+"""This module finds an OpenGL platform that works here: a display, then EGL, then OSMesa."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of an env, drawn off screen by MuJoCo's own renderer."""
+"""This module draws pictures of an env off screen, with MuJoCo's own renderer."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ class OffscreenRenderer:
         ValueError: if the camera tracks a body that the model does not have.
     """
 
-    def __init__(self, model: mujoco.MjModel, cfg: ViewerCfg, *, spacing: float) -> None:
+    def __init__(self, mj_model: mujoco.MjModel, cfg: ViewerCfg, *, spacing: float) -> None:
         # A copy, since each env that is drawn writes its own fields into it.
-        self._model, self._cfg, self._spacing = copy.copy(model), cfg, spacing
-        self._data = mujoco.MjData(self._model)
+        self._mj_model, self._cfg, self._spacing = copy.copy(mj_model), cfg, spacing
+        self._data = mujoco.MjData(self._mj_model)
         self._renderer: mujoco.Renderer | None = None
         self._camera = mujoco.MjvCamera()
         self._camera.distance, self._camera.elevation = cfg.distance, cfg.elevation
         self._camera.azimuth = cfg.azimuth
         self._body: int | None = None
         if cfg.body is not None:
-            names = [model.body(i).name for i in range(model.nbody)]
+            names = [mj_model.body(i).name for i in range(mj_model.nbody)]
             if cfg.body not in names:
                 raise ValueError(f"viewer.body={cfg.body!r}: {near(cfg.body, names)}")
             self._body = names.index(cfg.body)
@@ -57,18 +57,18 @@ class OffscreenRenderer:
         self._pose(world, first)
         target = self._cfg.lookat if self._body is None else self._data.xpos[self._body]
         self._camera.lookat[:] = target
-        renderer.update_scene(self._data, self._camera, visible_groups(self._model))
-        draw(SceneVisualizer(self._model, renderer.scene), first)
+        renderer.update_scene(self._data, self._camera, visible_groups(self._mj_model))
+        draw(SceneVisualizer(self._mj_model, renderer.scene), first)
         columns = int(np.ceil(np.sqrt(last - first)))
         for index in range(1, last - first):
             self._pose(world, first + index)
             row, column = divmod(index, columns)
             offset = np.array([column * self._spacing, row * self._spacing, 0.0])
-            add_geoms(self._model, self._data, renderer.scene, offset)
-            if self._model.nhfield:
+            add_geoms(self._mj_model, self._data, renderer.scene, offset)
+            if self._mj_model.nhfield:
                 static = mujoco.mjtCatBit.mjCAT_STATIC
-                add_geoms(self._model, self._data, renderer.scene, offset, category=static)
-            draw(SceneVisualizer(self._model, renderer.scene, offset), first + index)
+                add_geoms(self._mj_model, self._data, renderer.scene, offset, category=static)
+            draw(SceneVisualizer(self._mj_model, renderer.scene, offset), first + index)
         return renderer.render()
 
     def close(self) -> None:
@@ -80,21 +80,22 @@ class OffscreenRenderer:
     def _pose(self, world: World, env: int) -> None:
         """Take over what is visible of one env: its state, and its own model fields."""
         write_fields(
-            self._model, {name: field[env].cpu().numpy() for name, field in world.per_world_fields().items()}
+            self._mj_model,
+            {name: field[env].cpu().numpy() for name, field in world.per_world_fields().items()},
         )
         self._data.qpos[:] = world.qpos_EL[env].cpu()
-        if self._model.nmocap:
+        if self._mj_model.nmocap:
             self._data.mocap_pos[:] = world.view("mocap_pos")[env].cpu()
             self._data.mocap_quat[:] = world.view("mocap_quat")[env].cpu()
-        place(self._model, self._data)
+        place(self._mj_model, self._data)
 
     def _open(self) -> mujoco.Renderer:
         if self._renderer is None:
             platform = choose_gl_platform()
             try:
-                vis, cfg = self._model.vis.global_, self._cfg
+                vis, cfg = self._mj_model.vis.global_, self._cfg
                 vis.offwidth, vis.offheight = max(vis.offwidth, cfg.width), max(vis.offheight, cfg.height)
-                self._renderer = mujoco.Renderer(self._model, cfg.height, cfg.width, max_geom=20_000)
+                self._renderer = mujoco.Renderer(self._mj_model, cfg.height, cfg.width, max_geom=20_000)
             except Exception as error:  # MuJoCo's platforms raise whatever their loader raises
                 raise RuntimeError(f"{FIXES}. MUJOCO_GL is {platform!r}, and it said: {error}") from error
         return self._renderer

@@ -1,4 +1,4 @@
-"""Debug drawing: what terms may draw, and the drawing of it into a MuJoCo scene."""
+"""This module says what terms may draw for debugging, and draws it into a MuJoCo scene."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ class SceneVisualizer:
     """Draws into a `mujoco.MjvScene`; what exceeds the scene's capacity is refused, not dropped."""
 
     def __init__(
-        self, model: mujoco.MjModel, scene: mujoco.MjvScene, offset: Vector = (0.0, 0.0, 0.0)
+        self, mj_model: mujoco.MjModel, scene: mujoco.MjvScene, offset: Vector = (0.0, 0.0, 0.0)
     ) -> None:
-        self._model, self._scene = model, scene
+        self._mj_model, self._scene = mj_model, scene
         self._offset = np.asarray(offset, dtype=np.float64)
 
     def arrow(self, start: Vector, end: Vector, *, rgba: Rgba, width: float = 0.02) -> None:
@@ -66,11 +66,11 @@ class SceneVisualizer:
 
     def ghost(self, qpos: np.ndarray, *, rgba: Rgba) -> None:
         """Draw the robot in another pose, transparently."""
-        data = mujoco.MjData(self._model)
+        data = mujoco.MjData(self._mj_model)
         data.qpos[:] = qpos
-        place(self._model, data)
+        place(self._mj_model, data)
         first = self._scene.ngeom
-        add_geoms(self._model, data, self._scene, self._offset)
+        add_geoms(self._mj_model, data, self._scene, self._offset)
         for index in range(first, self._scene.ngeom):
             self._scene.geoms[index].rgba[:] = rgba
 
@@ -94,29 +94,29 @@ class SceneVisualizer:
         mujoco.mjv_connector(geom, kind, width, begin, finish)
 
 
-def place(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+def place(mj_model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Compute from `data.qpos` and the mocap poses what a picture shows."""
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_camlight(model, data)
-    mujoco.mj_tendon(model, data)
+    mujoco.mj_kinematics(mj_model, data)
+    mujoco.mj_comPos(mj_model, data)
+    mujoco.mj_camlight(mj_model, data)
+    mujoco.mj_tendon(mj_model, data)
 
 
-def visible_groups(model: mujoco.MjModel) -> mujoco.MjvOption:
+def visible_groups(mj_model: mujoco.MjModel) -> mujoco.MjvOption:
     """Return drawing options that show something of the robot.
 
     MuJoCo hides geom groups 3 to 5, where collision geoms are by custom. A robot without visual geoms would be
     invisible, so for such a model they are shown.
     """
     option = mujoco.MjvOption()
-    moving = model.geom_group[model.body_weldid[model.geom_bodyid] != 0]
+    moving = mj_model.geom_group[mj_model.body_weldid[mj_model.geom_bodyid] != 0]
     if moving.size and moving.min() > 2:
         option.geomgroup[moving.min()] = 1
     return option
 
 
 def add_geoms(
-    model: mujoco.MjModel,
+    mj_model: mujoco.MjModel,
     data: mujoco.MjData,
     scene: mujoco.MjvScene,
     offset: np.ndarray,
@@ -130,7 +130,9 @@ def add_geoms(
     """
     first = scene.ngeom
     with caught_warnings():
-        mujoco.mjv_addGeoms(model, data, visible_groups(model), mujoco.MjvPerturb(), category.value, scene)
+        mujoco.mjv_addGeoms(
+            mj_model, data, visible_groups(mj_model), mujoco.MjvPerturb(), category.value, scene
+        )
     if scene.status:
         raise RuntimeError(_full(scene))
     for index in range(first, scene.ngeom):

@@ -1,4 +1,4 @@
-"""Edits of a robot's `MjSpec`: one general function per kind, fed with the facts of the robot's own file.
+"""This module edits a robot's `MjSpec`: one general function per kind, fed with the facts of the robot's own file.
 
 A robot file holds tables of the small dataclasses below; adding a robot adds tables, no code here.
 """

@@ -1,4 +1,4 @@
-"""Unitree Go1: the menagerie's model with reflected motor inertia, position servos and a lean collision set.
+"""This module has Unitree Go1: the menagerie's model with reflected motor inertia, position servos, lean collisions.
 
 Frames: the root is `trunk` (x forward, y left, z up, origin at the body frame, not at the center of mass). Legs are
 FR, FL, RR, RL; each has hip (abduction, about x), thigh and calf (about y).

@@ -1,4 +1,4 @@
-"""Unitree Go2: the menagerie's model, whose legs have plain torque motors, under PD control with lean collisions.
+"""This module has Unitree Go2: the menagerie's model, whose legs have plain torque motors, under PD control.
 
 Frames: the root is `base` (x forward, y left, z up). Legs are FR, FL, RR, RL; each has hip (abduction, about x), thigh
 and calf (about y). Masses, joints, ranges and torque limits are those of mujoco_menagerie/unitree_go2; the gains are

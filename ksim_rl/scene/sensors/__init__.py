@@ -1,4 +1,4 @@
-"""Sensors of a scene, one file each; terms read them by name through the view."""
+"""This package has the sensors of a scene, one file each; terms read them by name through the view."""
 
 from ksim_rl.scene.sensors.camera import CameraSensor, CameraTracker
 from ksim_rl.scene.sensors.contact import ContactSensor

@@ -1,4 +1,4 @@
-"""Cameras that are drawn for all worlds at once, on the device."""
+"""This module draws cameras for all worlds at once, on the device."""
 
 from __future__ import annotations
 

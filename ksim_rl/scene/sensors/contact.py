@@ -1,4 +1,4 @@
-"""Contact sensors of a scene: what geoms, bodies or whole limbs touch, how hard, and since when."""
+"""This module senses contact: what geoms, bodies or whole limbs touch, how hard, and since when."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Inertial measurement units: gyroscope, accelerometer and orientation at a place on a body."""
+"""This module has inertial measurement units: gyroscope, accelerometer and orientation at a place on a body."""
 
 from __future__ import annotations
 

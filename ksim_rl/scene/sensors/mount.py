@@ -1,4 +1,4 @@
-"""Where a sensor sits: at a site of the model, or at a place on a body."""
+"""This module mounts a sensor at a site of the model, or at a place on a body."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rays from a place on a robot: how far it is to whatever they hit."""
+"""This module casts rays from a place on a robot, and says how far it is to whatever they hit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every sensor of a scene has: a config that edits the model, and a tracker that reads it."""
+"""This module has the base of all sensors: a config that edits the model, and a tracker that reads it."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Sensor(Checked, ABC):
         """Return the reader of this sensor in the worlds of `view`."""
 
 
-def sensor_columns(model: mujoco.MjModel, name: str) -> range:
+def sensor_columns(mj_model: mujoco.MjModel, name: str) -> range:
     """Return where the reading of an MJCF sensor stands in `sensordata_EL`."""
-    found = model.sensor(name)
+    found = mj_model.sensor(name)
     return range(int(found.adr[0]), int(found.adr[0] + found.dim[0]))

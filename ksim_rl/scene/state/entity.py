@@ -1,4 +1,4 @@
-"""One robot or object of a scene: its root's pose and velocity, its joints, and where it starts."""
+"""This module reads and moves one robot or object of a scene: its root, its joints, and where it starts."""
 
 from __future__ import annotations
 

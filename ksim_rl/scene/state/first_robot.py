@@ -1,4 +1,4 @@
-"""The root of a scene's first robot, which most scenes have no other than."""
+"""This module lets terms write `view.root_pos_EL` for the first robot, and most scenes have no other."""
 
 from jaxtyping import Bool, Float
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""The ground of E worlds as terms read it: where envs start, and how high it is at any place."""
+"""This module is the ground of E worlds as terms read it: where envs start, and how high it is at any place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The worlds' state as terms may touch it: masked writes, and no reading of what a write has made stale."""
+"""This module guards the worlds' state: writes go through masks, and what they made stale cannot be read."""
 
 from __future__ import annotations
 

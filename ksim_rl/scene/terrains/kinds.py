@@ -7,7 +7,7 @@ import numpy as np
 
 from ksim_rl.checked import NonNegative, NonNegativeRange, Positive, WholeNumber, Within
 from ksim_rl.checks import check_in_range
-from ksim_rl.scene.terrains.patch import TIE, Cell, Ends, Lattice, TerrainPatch, between
+from ksim_rl.scene.terrains.patch import TIE, Cell, EasyToHard, Lattice, TerrainPatch, between
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class RoughGround(TerrainPatch):
         amplitude: m, at difficulty 0 and 1.
     """
 
-    amplitude: Ends = (0.01, 0.06)
+    amplitude: EasyToHard = (0.01, 0.06)
     cell: Cell = 0.15
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
@@ -46,7 +46,7 @@ class Waves(TerrainPatch):
         wave_length: m.
     """
 
-    amplitude: Ends = (0.02, 0.2)
+    amplitude: EasyToHard = (0.02, 0.2)
     wave_length: float = 2.0
     cell: Cell = 0.2
 
@@ -73,7 +73,7 @@ class PyramidSlope(TerrainPatch):
         inverted: a pit instead of a pyramid.
     """
 
-    gradient: Ends = (0.0, 0.5)
+    gradient: EasyToHard = (0.0, 0.5)
     platform_width: Positive = 2.0
     inverted: bool = False
     cell: Cell = 0.25
@@ -97,7 +97,7 @@ class PyramidStairs(TerrainPatch):
         inverted: a pit instead of a pyramid.
     """
 
-    step_height: Ends = (0.02, 0.2)
+    step_height: EasyToHard = (0.02, 0.2)
     step_width: float = 0.3
     platform_width: Positive = 2.0
     inverted: bool = False
@@ -126,7 +126,7 @@ class DiscreteObstacles(TerrainPatch):
         platform_width: edge of the platform, m.
     """
 
-    height: Ends = (0.02, 0.2)
+    height: EasyToHard = (0.02, 0.2)
     width: NonNegativeRange = (0.3, 1.0)
     num_obstacles: WholeNumber = 60
     platform_width: NonNegative = 1.5
@@ -158,9 +158,9 @@ class SteppingStones(TerrainPatch):
         platform_width: edge of the platform, m.
     """
 
-    stone_width: Ends = (0.8, 0.35)
-    gap: Ends = (0.1, 0.3)
-    unevenness: Ends = (0.0, 0.05)
+    stone_width: EasyToHard = (0.8, 0.35)
+    gap: EasyToHard = (0.1, 0.3)
+    unevenness: EasyToHard = (0.0, 0.05)
     depth: NonNegative = 0.5
     platform_width: NonNegative = 1.5
     cell: Cell = 0.05
@@ -200,7 +200,7 @@ class Gaps(TerrainPatch):
         platform_width: edge of the platform, m.
     """
 
-    width: Ends = (0.1, 0.6)
+    width: EasyToHard = (0.1, 0.6)
     spacing: float = 0.8
     depth: NonNegative = 0.5
     platform_width: Positive = 1.5

@@ -1,4 +1,4 @@
-"""What a kind of ground is: a rule that gives the heights of a square patch at a difficulty."""
+"""This module has the base of all kinds of ground: a rule gives the heights of a square patch at a difficulty."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TIE = 1e-6
 
 Cell = Annotated[float, Within(low=0.01)]
 """m between the points at which heights are given."""
-Ends = Annotated[tuple[float, float], Within(low=0.0)]
+EasyToHard = Annotated[tuple[float, float], Within(low=0.0)]
 """Values at difficulty 0 and 1; either may be the greater one."""
 
 

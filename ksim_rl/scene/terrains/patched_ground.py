@@ -1,4 +1,4 @@
-"""The ground of worlds that each stand on one of many height fields."""
+"""This module has the ground of worlds that each stand on one of many height fields."""
 
 from __future__ import annotations
 
@@ -41,21 +41,22 @@ class PatchedGround(Ground):
         spawn_heights: Sequence[float],
     ) -> None:
         super().__init__(view.num_envs, view.device)
-        model, device = view.world.mj_model, view.device
+        mj_model, device = view.world.mj_model, view.device
         self.num_levels, self._num_columns = num_levels, len(kinds_of_columns)
         # A robot's own model may have height fields too.
-        first = int(model.hfield(patch_name(0, 0)).id)
+        first = int(mj_model.hfield(patch_name(0, 0)).id)
         patches = slice(first, first + len(spawn_heights))
-        self.half_width = float(model.hfield_size[first, 0])
-        self._geom = int(model.geom(BODY).id)
+        self.half_width = float(mj_model.hfield_size[first, 0])
+        self._geom = int(mj_model.geom(BODY).id)
         self._fields = {name: view.world.field(name) for name in GEOM_FIELDS}
         self._of_patch = {
-            name: torch.tensor(value[patches], device=device) for name, value in _geom_fields(model).items()
+            name: torch.tensor(value[patches], device=device)
+            for name, value in _geom_fields(mj_model).items()
         }
-        tops = np.repeat(model.hfield_size[:, 2], model.hfield_nrow * model.hfield_ncol)
-        self._heights = torch.tensor(model.hfield_data * tops, dtype=torch.float32, device=device)
-        self._address_P = torch.tensor(model.hfield_adr[patches], dtype=torch.int64, device=device)
-        self._columns_P = torch.tensor(model.hfield_ncol[patches], dtype=torch.int64, device=device)
+        tops = np.repeat(mj_model.hfield_size[:, 2], mj_model.hfield_nrow * mj_model.hfield_ncol)
+        self._heights = torch.tensor(mj_model.hfield_data * tops, dtype=torch.float32, device=device)
+        self._address_P = torch.tensor(mj_model.hfield_adr[patches], dtype=torch.int64, device=device)
+        self._columns_P = torch.tensor(mj_model.hfield_ncol[patches], dtype=torch.int64, device=device)
         self._spawn_heights_P = torch.tensor(spawn_heights, dtype=torch.float32, device=device)
 
         place_E = torch.arange(view.num_envs, device=device)
@@ -124,16 +125,16 @@ class PatchedGround(Ground):
             row.copy_(torch.where(mask, self._of_patch[name][patch_E], row))
 
 
-def _geom_fields(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+def _geom_fields(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
     """Return the values of `GEOM_FIELDS` for a geom of each height field of the model, by name, [P, ...].
 
     They are those that MuJoCo's compiler gives a geom of this height field.
     """
-    half_x, half_y, top, base = model.hfield_size.astype(np.float32).T
+    half_x, half_y, top, base = mj_model.hfield_size.astype(np.float32).T
     centre_P3 = np.stack((np.zeros_like(top), np.zeros_like(top), (top - base) / 2), axis=-1)
     half_P3 = np.stack((half_x, half_y, (top + base) / 2), axis=-1)
     return {
-        "geom_dataid": np.arange(model.nhfield, dtype=np.int32),
+        "geom_dataid": np.arange(mj_model.nhfield, dtype=np.int32),
         "geom_size": np.stack((half_x, half_y, 0.25 * top + 0.5 * base), axis=-1),
         "geom_aabb": np.stack((centre_P3, half_P3), axis=1),
         "geom_rbound": np.sqrt(half_x**2 + half_y**2 + np.maximum(top, base) ** 2),

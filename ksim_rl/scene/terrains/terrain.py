@@ -1,4 +1,4 @@
-"""What every terrain has: a config that edits the model, and the ground that terms read."""
+"""This module has the base of all terrains: a config edits the model, and makes the ground that terms read."""
 
 from __future__ import annotations
 
