@@ -11,6 +11,7 @@ CUDA a rollout is one CUDA graph, an update another, and nothing waits for the h
 
 import ast
 import importlib.util
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -207,6 +208,8 @@ def train(settings: Settings) -> list[dict[str, float]]:
     """Train, print a line every `log_interval` iterations, and return what the lines say."""
     torch.manual_seed(settings.seed)
     torch.set_float32_matmul_precision("high")
+    # One core stays free for Warp: threads that wait for a core that is taken make small products many times slower.
+    torch.set_num_threads(max(1, min(8, (os.cpu_count() or 1) - 1)))
     env = envs.make(settings.task, num_envs=settings.num_envs, device=settings.device, seed=settings.seed)
     ppo = PPO(settings, env)
     collector = RolloutCollector(
