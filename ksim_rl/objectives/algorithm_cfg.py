@@ -1,15 +1,20 @@
-"""The settings of all algorithms begin here: what a run asks of them, and the fields of gradient steps."""
+"""This module holds the settings of all algorithms: of gradient steps, of PPO, AMP and distillation, of SAC and TD3."""
 
-from dataclasses import dataclass
-from typing import ClassVar, Self
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal, Self
 
-from ksim_rl.checks import check_choice, check_count, check_in_range
+from ksim_rl.checked import Checked, Count, NonNegative, Positive, Share, Within
+from ksim_rl.checks import check_in_range
 
-SCHEDULES = ("adaptive", "fixed")
+PositiveShare = Annotated[float, Within(low=0.0, high=1.0, low_open=True)]
+Schedule = Literal["adaptive", "fixed"]
+DistillationKind = Literal["kl", "mse"]
+ValueReduction = Literal["min", "mean"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class AlgorithmCfg:
+class AlgorithmCfg(Checked):
     """The settings of an algorithm: a run's `objective`. A subclass of a registered one inherits its algorithm.
 
     Attributes:
@@ -46,20 +51,16 @@ class GradientCfg(AlgorithmCfg):
     """
 
     betas: tuple[float, float] = (0.9, 0.999)
-    adam_eps: float = 1e-8
-    weight_decay: float = 0.0
-    max_grad_norm: float | None = None
-    max_skipped_steps: int = 100
+    adam_eps: Positive = 1e-8
+    weight_decay: NonNegative = 0.0
+    max_grad_norm: Positive | None = None
+    max_skipped_steps: Count = 100
 
     def __post_init__(self) -> None:
-        """Refuse values out of range, naming the field."""
+        """Check all fields, and the bound of the betas, which is open."""
+        super().__post_init__()
         object.__setattr__(self, "betas", tuple(self.betas))
-        check_count("max_skipped_steps", self.max_skipped_steps)
-        check_in_range("adam_eps", self.adam_eps, low=0.0, low_open=True)
-        check_in_range("weight_decay", self.weight_decay, low=0.0)
-        if self.max_grad_norm is not None:
-            check_in_range("max_grad_norm", self.max_grad_norm, low=0.0, low_open=True)
-        if len(self.betas) != 2 or not all(0.0 <= beta < 1.0 for beta in self.betas):
+        if not all(0.0 <= beta < 1.0 for beta in self.betas):
             raise ValueError(f"betas={self.betas!r}: expected two numbers in [0, 1)")
 
 
@@ -78,21 +79,17 @@ class OnPolicyCfg(GradientCfg):
 
     learns_on_sequences: ClassVar[bool] = True
 
-    num_epochs: int = 1
-    learning_rate: float = 1e-3
-    schedule: str = "fixed"
-    desired_kl: float = 0.01
-    learning_rate_min: float = 1e-5
-    learning_rate_max: float = 1e-2
-    max_grad_norm: float | None = 1.0
+    num_epochs: Count = 1
+    learning_rate: Positive = 1e-3
+    schedule: Schedule = "fixed"
+    desired_kl: Positive = 0.01
+    learning_rate_min: Positive = 1e-5
+    learning_rate_max: Positive = 1e-2
+    max_grad_norm: Positive | None = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse values out of range, and a schedule that contradicts itself."""
+        """Check all fields, and refuse a schedule that contradicts itself."""
         super().__post_init__()
-        check_count("num_epochs", self.num_epochs)
-        for field in ("desired_kl", "learning_rate", "learning_rate_min", "learning_rate_max"):
-            check_in_range(field, getattr(self, field), low=0.0, low_open=True)
-        check_choice("schedule", self.schedule, SCHEDULES)
         low, high = self.learning_rate_min, self.learning_rate_max
         if low > high:
             raise ValueError(f"learning_rate_min={low!r} exceeds learning_rate_max={high!r}")
@@ -102,3 +99,211 @@ class OnPolicyCfg(GradientCfg):
                 f"learning_rate={self.learning_rate!r}: schedule=adaptive keeps it in [learning_rate_min, "
                 f"learning_rate_max] = [{low!r}, {high!r}]; start inside, move the bound, or use schedule=fixed"
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPOCfg(OnPolicyCfg):
+    """Proximal policy optimization (Schulman et al., arXiv 1707.06347); the defaults suit legged locomotion.
+
+    Attributes:
+        advantage: "gae", "td_lambda" (lambda returns; the same numbers in the rollout of a collector), or "vtrace",
+            whose weights follow the policy from epoch to epoch.
+        gamma, lmbda: discount per step, and weight of longer returns in the advantage.
+        rho_thresh, c_thresh: bounds of the probability ratios in V-trace; see `VTrace`.
+        estimate_each_epoch: estimate advantages and value targets anew before each epoch, with the present networks,
+            instead of once (Andrychowicz et al., arXiv 2006.05990, section 3.5). "vtrace" always does.
+        clip_epsilon: the probability ratio is clipped to [1 - clip_epsilon, 1 + clip_epsilon].
+        clip_value: radius of the value clipping; True takes `clip_epsilon`, False does not clip.
+        entropy_coeff, critic_coeff: weights of the entropy bonus and of the value loss.
+        normalize_advantage: over the whole "dataset", over each "minibatch", or "none".
+        symmetry: "augment" adds the mirror image of each env state to its minibatch, "loss" adds the mirror loss, which
+            is zero for a policy that acts in the mirror as its mirror image; "none" does neither.
+        symmetry_coeff: weight of the mirror loss.
+        precision: of what layers multiply in the gradient steps: "float32" (on CUDA as `trainer.matmul_precision`
+            says), or "bfloat16", which has 8 significant bits and moves the gradient by about half a percent of its
+            norm; "auto" is "bfloat16" on CUDA and "float32" elsewhere. Parameters, sums, losses and Adam are
+            always float32.
+        kernels: of a bfloat16 update: "auto" takes a few fused kernels where they fit device and networks, "torch"
+            never does. They differ by the order of sums. The metric `update/fused` says which it is.
+    """
+
+    num_epochs: Count = 5
+    schedule: Schedule = "adaptive"
+    advantage: Literal["gae", "td_lambda", "vtrace"] = "gae"
+    gamma: Share = 0.99
+    lmbda: Share = 0.95
+    rho_thresh: Positive = 1.0
+    c_thresh: Positive = 1.0
+    estimate_each_epoch: bool = False
+    clip_epsilon: PositiveShare = 0.2
+    clip_value: bool | NonNegative = True
+    entropy_coeff: NonNegative = 0.01
+    critic_coeff: NonNegative = 1.0
+    normalize_advantage: Literal["dataset", "minibatch", "none"] = "dataset"
+    symmetry: Literal["none", "augment", "loss"] = "none"
+    symmetry_coeff: NonNegative = 1.0
+    precision: Literal["float32", "bfloat16", "auto"] = "float32"
+    kernels: Literal["auto", "torch"] = "auto"
+
+    @property
+    def estimates_each_epoch(self) -> bool:
+        """Whether advantages are estimated anew before each epoch."""
+        return self.estimate_each_epoch or self.advantage == "vtrace"
+
+    def check_memory(self) -> None:
+        """Refuse a symmetry, of which memories know nothing."""
+        if self.symmetry != "none":
+            raise ValueError(
+                f"objective.symmetry={self.symmetry!r}: the state of a memory has no known mirror image; use none, or "
+                "modules=mlp"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AMPCfg(PPOCfg):
+    """PPO on the task's reward and on a style reward, learned from reference motions (Peng et al., arXiv 2104.02180).
+
+    A discriminator tells transitions of the motions from those of the policy; the style reward, in [0, 1] per step, is
+    how much a transition looks like the motions. The sum `task_coeff * reward + style_coeff * style` is what PPO
+    maximizes; where the env multiplies its rewards by the step's seconds, a fitting `style_coeff` is as small.
+
+    Attributes:
+        motions: reference motions, by name or file; the env sees their states in `style_group`.
+        style_group: the observation group that is compared. Its terms read positions and velocities, no commands,
+            actions, contacts or forces, which a motion does not have.
+        task_coeff, style_coeff: weights of the two rewards.
+        discriminator_hidden_dims, discriminator_activation: of the discriminator, an MLP.
+        discriminator_learning_rate, discriminator_weight_decay: of its Adam, which has the betas of PPO's.
+        gradient_penalty: weight of the squared norm of the discriminator's gradient at reference transitions.
+        logit_decay: weight of the squares of its last layer's weights.
+        num_discriminator_steps: gradient steps of the discriminator per rollout.
+        num_transitions_per_step: of the motions, and as many of the policy, in one such step.
+        replay_rollouts: the policy's transitions are drawn from so many of the last rollouts.
+    """
+
+    motions: tuple[str, ...] = ()
+    style_group: str = "style"
+    task_coeff: NonNegative = 0.5
+    style_coeff: NonNegative = 0.5
+    discriminator_hidden_dims: tuple[Count, ...] = (512, 256)
+    discriminator_activation: str = "relu"
+    discriminator_learning_rate: Positive = 3e-4
+    discriminator_weight_decay: NonNegative = 1e-4
+    gradient_penalty: NonNegative = 10.0
+    logit_decay: NonNegative = 0.05
+    num_discriminator_steps: Count = 10
+    num_transitions_per_step: Count = 4096
+    # A rollout whose episodes all end at once takes two places per env state, and must not overwrite itself.
+    replay_rollouts: Annotated[int, Within(low=3)] = 10
+
+    @property
+    def observation_groups(self) -> tuple[str, ...]:
+        """The group that is compared."""
+        return (self.style_group,)
+
+    def __post_init__(self) -> None:
+        """Check all fields, and that there are motions."""
+        super().__post_init__()
+        for field in ("motions", "discriminator_hidden_dims"):
+            object.__setattr__(self, field, tuple(getattr(self, field)))
+        if not self.motions:
+            raise ValueError("motions=(): name at least one reference motion, such as [walker_walk]")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistillationCfg(OnPolicyCfg):
+    """A student learns to act as a teacher does in the states that the student itself visits.
+
+    That is DAgger (Ross et al., arXiv 1011.0686) without its aggregate of all data: the newest rollout of thousands of
+    envs stands for it.
+
+    Attributes:
+        teacher: a run folder or a checkpoint, whose policy is the teacher.
+        loss: "kl", the divergence of the student's distribution from the teacher's, which also learns how actions
+            scatter; or "mse", of the actions that both take deterministically, without noise while the student
+            collects, for teachers without a distribution or with another kind of it.
+        teacher_share: the chance that the teacher acts instead of the student, in each env state of the first rollout.
+        teacher_share_decay: factor of it from rollout to rollout.
+    """
+
+    teacher: str = ""
+    loss: DistillationKind = "kl"
+    num_epochs: Count = 2
+    teacher_share: Share = 0.0
+    teacher_share_decay: Share = 0.95
+
+    def with_absolute_paths(self) -> Self:
+        """Return the same settings, whose teacher is found from any folder."""
+        return replace(self, teacher=str(Path(self.teacher).resolve()))
+
+    def __post_init__(self) -> None:
+        """Check all fields, and that there is a teacher."""
+        super().__post_init__()
+        if not self.teacher:
+            raise ValueError("teacher='': name a run folder or a checkpoint, objective.teacher=RUN")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffPolicyCfg(GradientCfg):
+    """What all off-policy objectives share.
+
+    Attributes:
+        gamma: discount per step.
+        tau: share of the new weights in each update of the target networks.
+        value_reduction: "min" learns from, and climbs, the lowest of the predicted values (clipped double Q-learning,
+            Fujimoto et al., arXiv 1802.09477); "mean" lets each network learn from its own target and climbs the mean.
+        policy_delay: gradient steps of the critics for each of the actor.
+        critic_learning_rate, actor_learning_rate: of AdamW.
+        autocast: run the networks in bfloat16, with float32 weights.
+    """
+
+    gamma: Share = 0.99
+    tau: PositiveShare = 0.005
+    value_reduction: ValueReduction = "min"
+    policy_delay: Count = 1
+    critic_learning_rate: Positive = 3e-4
+    actor_learning_rate: Positive = 3e-4
+    autocast: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACCfg(OffPolicyCfg):
+    """Soft actor-critic with a learned temperature (Haarnoja et al., arXiv 1801.01290 and 1812.05905).
+
+    With critics of many atoms, large minibatches and many envs it is FastSAC (Seo et al., arXiv 2512.01996).
+
+    Attributes:
+        alpha_init: temperature at the start, in units of the return per nat.
+        alpha_learning_rate: of the temperature's logarithm; 0 keeps `alpha_init`.
+        target_entropy_per_action: entropy that the temperature aims at, in nats per action, of actions scaled to
+            [-1, 1].
+    """
+
+    alpha_init: Positive = 1.0
+    alpha_learning_rate: NonNegative = 3e-4
+    target_entropy_per_action: float = -1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TD3Cfg(OffPolicyCfg):
+    """Twin delayed deterministic policy gradients (Fujimoto et al., arXiv 1802.09477).
+
+    Targets take the present policy, not a slow copy of it, as FastTD3 does (Seo et al., arXiv 2505.22642).
+
+    Attributes:
+        exploration_noise_min, exploration_noise_max: range of the standard deviation of the noise on the actions that
+            are taken, one per env, in units of half the range of an action.
+        target_noise, target_noise_clip: standard deviation and bound of the noise on the actions that targets are
+            computed for, in the same units.
+    """
+
+    policy_delay: Count = 2
+    exploration_noise_min: NonNegative = 0.1
+    exploration_noise_max: float = 0.1
+    target_noise: NonNegative = 0.2
+    target_noise_clip: NonNegative = 0.5
+
+    def __post_init__(self) -> None:
+        """Check all fields, and the order of the two bounds."""
+        super().__post_init__()
+        check_in_range("exploration_noise_max", self.exploration_noise_max, low=self.exploration_noise_min)

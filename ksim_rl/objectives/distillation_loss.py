@@ -12,8 +12,8 @@ from torch.distributions import Distribution
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
-from ksim_rl.checks import check_choice
-from ksim_rl.objectives.distillation_cfg import LOSSES
+from ksim_rl.checked import check_value
+from ksim_rl.objectives.algorithm_cfg import DistillationKind
 from ksim_rl.objectives.masked import mask_of, masked_mean
 from ksim_rl.objectives.policy_kl import (
     distribution_keys,
@@ -46,10 +46,10 @@ class DistillationLoss(nn.Module):
         actor_network: ProbabilisticTensorDictSequential,
         teacher: TensorDictModuleBase,
         *,
-        loss: str = "kl",
+        loss: DistillationKind = "kl",
     ) -> None:
         super().__init__()
-        check_choice("loss", loss, LOSSES)
+        check_value("loss", loss, DistillationKind)
         self.actor_network = actor_network
         # Not a submodule: its parameters are not the student's.
         self._teacher: Any = (teacher,)

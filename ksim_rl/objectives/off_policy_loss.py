@@ -1,20 +1,29 @@
-"""This module has what the losses of off-policy learning share: critics, their targets, and means over a minibatch."""
+"""This module has the losses of off-policy learning, SAC and TD3, free of host syncs."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import LossModule
 
-from ksim_rl.checks import check_choice, check_in_range
-from ksim_rl.objectives.distributional import cross_entropy, mean_of, project_distribution
-from ksim_rl.objectives.off_policy_cfg import VALUE_REDUCTIONS
-from ksim_rl.objectives.target_network import follow_, make_target
+from ksim_rl.checked import Share, check_value
+from ksim_rl.checks import check_in_range
+from ksim_rl.objectives.algorithm_cfg import ValueReduction
+from ksim_rl.objectives.critic_target import (
+    cross_entropy,
+    follow_,
+    frozen,
+    make_target,
+    mean_of,
+    project_distribution,
+)
 
 Scalar = Float[Tensor, ""]
 
@@ -61,11 +70,11 @@ class OffPolicyLoss(LossModule):
         *,
         support_A: Float[Tensor, " A"] | None = None,
         gamma: float = 0.99,
-        value_reduction: str = "min",
+        value_reduction: ValueReduction = "min",
     ) -> None:
         super().__init__()
-        check_in_range("gamma", gamma, low=0.0, high=1.0)
-        check_choice("value_reduction", value_reduction, VALUE_REDUCTIONS)
+        check_value("gamma", gamma, Share)
+        check_value("value_reduction", value_reduction, ValueReduction)
         self.actor_network, self.critic_network = actor_network, critic_network
         # Under a name that `parameters()` leaves out.
         self._target_critic = make_target(critic_network)
@@ -186,3 +195,120 @@ class OffPolicyLoss(LossModule):
 
 def _next(key: NestedKey) -> tuple[str, ...]:
     return ("next", key) if isinstance(key, str) else ("next", *key)  # type: ignore[misc]
+
+
+class SACLoss(OffPolicyLoss):
+    """Soft actor-critic with a learned temperature (Haarnoja et al., arXiv 1812.05905), and FastSAC with a `support_A`.
+
+    With values for critics and `value_reduction="min"` it has the losses and gradients of TorchRL's `SACLoss` with
+    `loss_function="l2"`. All critics are evaluated in one batched product instead of a `vmap`, and may predict
+    distributions.
+
+    `loss_qvalue` = sum over the critics of mean((Q - y)^2), or of the cross entropy to the projected target
+    distribution, y = r + gamma^n (1 - terminated) (Q'(s', a') - alpha log p(a'|s')); `loss_actor` = mean(alpha log
+    p(a|s) - Q(s, a)); `loss_alpha` = -log_alpha * mean(log p(a|s) + target_entropy).
+
+    Args:
+        actor_network: probabilistic.
+        critic_network, **options: see `OffPolicyLoss`.
+        alpha_init: temperature at the start.
+        learn_alpha: whether the temperature learns.
+        target_entropy: that the temperature aims at, in nats.
+    """
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModule,
+        *,
+        target_entropy: float,
+        alpha_init: float = 1.0,
+        learn_alpha: bool = True,
+        **options: Any,
+    ) -> None:
+        super().__init__(actor_network, critic_network, **options)
+        check_in_range("alpha_init", alpha_init, low=0.0, low_open=True)
+        check_in_range("target_entropy", target_entropy)
+        self.target_entropy = target_entropy
+        device = next(critic_network.parameters()).device
+        log_alpha = torch.tensor(math.log(alpha_init), device=device)
+        self.log_alpha = nn.Parameter(log_alpha, requires_grad=learn_alpha)
+
+    @property
+    def alpha(self) -> Scalar:
+        """The temperature, without gradients."""
+        return self.log_alpha.detach().exp()
+
+    def critic_loss(self, tensordict: TensorDictBase) -> tuple[Scalar, dict[str, Scalar]]:
+        """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
+        with torch.no_grad():
+            following = tensordict.get("next").select(*self.actor_network.in_keys)
+            next_action, log_prob_B = rsample_and_log_prob(self.actor_network.get_dist(following))
+            bonus_B = -self.alpha * log_prob_B
+        return self._critic_loss(tensordict, next_action, bonus_B)
+
+    def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
+        """Return the losses of actor and temperature, each with gradients for it alone, and what is logged."""
+        observed = tensordict.select(*self.actor_network.in_keys)
+        action, log_prob_B = rsample_and_log_prob(self.actor_network.get_dist(observed))
+        with frozen(self.critic_network):
+            value_B = self._value(tensordict, action)
+        log_prob = self._mean(log_prob_B.detach(), tensordict)
+        losses = {
+            "loss_actor": self._mean(self.alpha * log_prob_B - value_B, tensordict),
+            "loss_alpha": -self.log_alpha * (log_prob + self.target_entropy),
+        }
+        return losses, {"alpha": self.alpha, "entropy": -log_prob}
+
+
+class TD3Loss(OffPolicyLoss):
+    """TD3 (Fujimoto et al., arXiv 1802.09477), and FastTD3 (Seo et al., arXiv 2505.22642) with a `support_A`.
+
+    `loss_qvalue` = sum over the critics of mean((Q - y)^2), or of the cross entropy to the projected target
+    distribution, y = r + gamma^n (1 - terminated) Q'(s', clip(a(s') + clip(noise))); `loss_actor` = -mean(Q(s, a(s))).
+    As in FastTD3, a(s') is the present policy, not a slow copy of it.
+
+    Args:
+        actor_network: deterministic.
+        critic_network, **options: see `OffPolicyLoss`.
+        low_L, high_L: bounds of the actions.
+        target_noise, target_noise_clip: standard deviation and bound of the noise on a(s'), in units of half the range
+            of an action.
+    """
+
+    def __init__(
+        self,
+        actor_network: TensorDictModuleBase,
+        critic_network: TensorDictModule,
+        *,
+        low_L: Float[Tensor, " L"],
+        high_L: Float[Tensor, " L"],
+        target_noise: float = 0.2,
+        target_noise_clip: float = 0.5,
+        **options: Any,
+    ) -> None:
+        super().__init__(actor_network, critic_network, **options)
+        check_in_range("target_noise", target_noise, low=0.0)
+        check_in_range("target_noise_clip", target_noise_clip, low=0.0)
+        self.low_L, self.high_L = low_L, high_L
+        self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
+
+    def critic_loss(self, tensordict: TensorDictBase) -> tuple[Scalar, dict[str, Scalar]]:
+        """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
+        with torch.no_grad():
+            following = tensordict.get("next").select(*self.actor_network.in_keys)
+            action = self.actor_network(following).get(self.tensor_keys.action)
+            noise = (torch.randn_like(action) * self.target_noise).clamp(
+                -self.target_noise_clip, self.target_noise_clip
+            )
+            action = action + noise * (self.high_L - self.low_L) / 2
+            next_action = torch.maximum(torch.minimum(action, self.high_L), self.low_L)
+        return self._critic_loss(tensordict, next_action)
+
+    def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
+        """Return the loss of the actor, which has gradients for it alone, and an empty dict."""
+        observed = tensordict.select(*self.actor_network.in_keys)
+        action = self.actor_network(observed).get(self.tensor_keys.action)
+        with frozen(self.critic_network):
+            value_B = self._value(tensordict, action)
+        return {"loss_actor": -self._mean(value_B, tensordict)}, {}

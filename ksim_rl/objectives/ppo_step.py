@@ -1,5 +1,6 @@
 """This module makes one gradient step of PPO, and builds what it needs from one config."""
 
+import dataclasses
 from collections.abc import Mapping
 from functools import reduce
 from operator import add
@@ -12,18 +13,39 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from ksim_rl.objectives.adaptive_learning_rate import adapt_learning_rate_
-from ksim_rl.objectives.algorithm_cfg import OnPolicyCfg
+from ksim_rl.objectives.advantage_estimators import GAE, TDLambda, VTrace
+from ksim_rl.objectives.algorithm_cfg import OnPolicyCfg, PPOCfg
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
-from ksim_rl.objectives.gae import GAE
-from ksim_rl.objectives.gradient_step import descend
-from ksim_rl.objectives.ppo_cfg import PPOCfg
+from ksim_rl.objectives.gradient_step import StepGuard, adapt_learning_rate_, descend
 from ksim_rl.objectives.rollout_estimator import RolloutEstimator
-from ksim_rl.objectives.step_guard import StepGuard
 from ksim_rl.objectives.symmetry import Loss, SymmetricAugmentation, with_augmentation, with_mirror_loss
-from ksim_rl.objectives.td_lambda import TDLambda
-from ksim_rl.objectives.vtrace import VTrace
 from ksim_rl.transforms import MirrorMap
+
+
+def with_precision_of(cfg: PPOCfg, device: torch.device | str) -> PPOCfg:
+    """Return `cfg` with the precision that "auto" stands for on a device: "bfloat16" on CUDA, else "float32"."""
+    if cfg.precision != "auto":
+        return cfg
+    return dataclasses.replace(
+        cfg, precision="bfloat16" if torch.device(device).type == "cuda" else "float32"
+    )
+
+
+def in_precision(loss: Loss, precision: str, *, device: torch.device | str) -> Loss:
+    """Return `loss` with its products in `precision`; the loss itself for "float32".
+
+    With "bfloat16" torch's autocast rounds what layers multiply to 8 significant bits. Parameters, their gradients,
+    sums and the losses stay float32.
+    """
+    if precision == "float32":
+        return loss
+    dtype, kind = getattr(torch, precision), torch.device(device).type
+
+    def rounded(minibatch_B: TensorDictBase) -> TensorDictBase:
+        with torch.autocast(kind, dtype):
+            return loss(minibatch_B)
+
+    return rounded
 
 
 def make_advantage(

@@ -10,8 +10,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from ksim_rl import dims
-from ksim_rl.objectives.gaussian_kl import gaussian_parameters
 from ksim_rl.objectives.masked import mask_of, masked_mean
+from ksim_rl.objectives.policy_kl import gaussian_parameters
 from ksim_rl.transforms.mirror.mirror import MirrorMap, image
 
 Loss = Callable[[TensorDictBase], TensorDictBase]

@@ -5,7 +5,7 @@ from torch.distributions import kl_divergence as torch_kl
 from torchrl.modules import TanhNormal
 
 from ksim_rl.objectives import kl_divergence
-from ksim_rl.objectives.gaussian_kl import gaussian_parameters
+from ksim_rl.objectives.policy_kl import gaussian_parameters
 
 
 def test_equals_torchs_closed_form():

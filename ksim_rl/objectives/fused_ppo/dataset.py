@@ -7,12 +7,10 @@ from jaxtyping import Float, Int64
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from ksim_rl.objectives.fused_ppo.advantage_kernel import estimate_advantages
-from ksim_rl.objectives.fused_ppo.launch import launch, parts
-from ksim_rl.objectives.fused_ppo.layout import FusedLayout
-from ksim_rl.objectives.fused_ppo.loss_kernels import LOG_PROB, MASK
+from ksim_rl.objectives.algorithm_cfg import PPOCfg
+from ksim_rl.objectives.fused_ppo.layout import FusedLayout, launch, parts
+from ksim_rl.objectives.fused_ppo.loss_kernels import LOG_PROB, MASK, estimate_advantages
 from ksim_rl.objectives.masked import standardized
-from ksim_rl.objectives.ppo_cfg import PPOCfg
 
 # Envs per program.
 ENVS = 32

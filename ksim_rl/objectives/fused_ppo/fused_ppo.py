@@ -15,15 +15,20 @@ from jaxtyping import Float, Int64
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from ksim_rl.objectives.algorithm_cfg import PPOCfg
 from ksim_rl.objectives.fused_ppo.dataset import FusedDataset, Observe
-from ksim_rl.objectives.fused_ppo.launch import launch, parts
-from ksim_rl.objectives.fused_ppo.layout import FusedLayout, FusedNetworks, power_of_two
+from ksim_rl.objectives.fused_ppo.layout import (
+    FusedLayout,
+    FusedNetworks,
+    Tuning,
+    launch,
+    parts,
+    power_of_two,
+)
 from ksim_rl.objectives.fused_ppo.mlp_kernels import minibatch_gradients, state_values, weight_gradients
 from ksim_rl.objectives.fused_ppo.parameters import FusedParameters
 from ksim_rl.objectives.fused_ppo.step_kernels import SUMMARY, adam_step, sum_gradients
-from ksim_rl.objectives.fused_ppo.tuning import Tuning
-from ksim_rl.objectives.ppo_cfg import PPOCfg
-from ksim_rl.objectives.step_guard import StepGuard
+from ksim_rl.objectives.gradient_step import StepGuard
 
 # Sums that each block leaves beside its gradients.
 NUM_STATISTICS = 16

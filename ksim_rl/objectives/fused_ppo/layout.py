@@ -1,11 +1,15 @@
-"""This module says where each parameter of a fused actor and critic is, in the two forms that the kernels need."""
+"""This module says where the parameters of fused networks are, how work is cut, and what cannot be fused."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Float, Int32
 from torch import Tensor, nn
+
+from ksim_rl.objectives.algorithm_cfg import PPOCfg
 
 # The smallest dim that a tensor core multiplies.
 MIN_WIDTH = 16
@@ -114,3 +118,115 @@ def _width(dim: int) -> int:
 def power_of_two(number: int) -> int:
     """Return the smallest power of two that is not below `number`."""
     return 1 << (number - 1).bit_length()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tuning:
+    """How the work is cut. The defaults were the fastest on an H200 for layers of 512, 256 and 128.
+
+    Attributes:
+        block: rows of a minibatch that one program takes through a network.
+        chunk: columns of the widest layer that exist at a time.
+        stages: how far loads of weights run ahead.
+        warps: of such a program.
+        tile: rows and columns of the weights whose gradient one program computes.
+        depth: rows of a minibatch that it multiplies at a time.
+        tile_stages, tile_warps: as `stages` and `warps`.
+        splits: programs that share a tile, each with a part of the minibatch.
+        size: elements per program in sums and Adam.
+        columns, rows: of the blocks in which sums over programs are taken.
+    """
+
+    block: int = 64
+    chunk: int = 32
+    stages: int = 3
+    warps: int = 4
+    tile: int = 128
+    depth: int = 64
+    tile_stages: int = 3
+    tile_warps: int = 8
+    splits: int = 8
+    size: int = 1024
+    columns: int = 32
+    rows: int = 64
+
+    @classmethod
+    def of(cls, layout: FusedLayout) -> "Tuning":
+        """Return what suits networks of a layout: the first and the third width must be whole numbers of chunks."""
+        return cls(chunk=math.gcd(cls.chunk, layout.hidden[0], layout.hidden[2]))
+
+
+MAX_OBS = 256
+MAX_ACTIONS = 64
+# The second hidden layer is held in registers as a whole; the others are computed in chunks.
+SECOND_WIDTHS = (16, 32, 64, 128, 256)
+WIDTH_STEP = 16
+MAX_PLACES = 2**31
+
+
+class MinibatchSizes(Protocol):
+    """Sizes of dataset and minibatch, as `DatasetCfg` has them."""
+
+    @property
+    def num_env_states_per_minibatch(self) -> int:
+        """B."""
+        ...
+
+    @property
+    def num_env_states(self) -> int:
+        """D."""
+        ...
+
+
+def why_not_fused(cfg: PPOCfg, networks: FusedNetworks, *, data: MinibatchSizes) -> str | None:
+    """Return why the kernels cannot make the gradient steps of `cfg`, or None if they can."""
+    if cfg.kernels == "torch":
+        return "kernels='torch'"
+    if cfg.precision == "float32":
+        # As TF32 they would be no faster than torch's.
+        return "precision='float32', and the kernels multiply bfloat16"
+    refused = {
+        "advantage": cfg.advantage != "gae",
+        "estimate_each_epoch": cfg.estimates_each_epoch,
+        "symmetry": cfg.symmetry != "none",
+        "normalize_advantage": cfg.normalize_advantage == "minibatch",
+    }
+    for field, is_set in refused.items():
+        if is_set:
+            return f"{field}={getattr(cfg, field)!r}"
+    return _shape_reason(networks) or _size_reason(networks, data)
+
+
+def _shape_reason(networks: FusedNetworks) -> str | None:
+    hidden = [layer.out_features for layer in networks.actor[:-1]]
+    if hidden != [layer.out_features for layer in networks.critic[:-1]] or len(hidden) != 3:
+        return "actor and critic do not both have the same three hidden layers"
+    if hidden[1] not in SECOND_WIDTHS or any(width % WIDTH_STEP for width in hidden):
+        return (
+            f"hidden_dims={tuple(hidden)}: the second must be one of {SECOND_WIDTHS}, the others multiples "
+            f"of {WIDTH_STEP}"
+        )
+    widest = max(networks.actor[0].in_features, networks.critic[0].in_features)
+    if widest > MAX_OBS or networks.actor[-1].out_features > MAX_ACTIONS:
+        return f"there are more than {MAX_OBS} observations or {MAX_ACTIONS} actions"
+    return None
+
+
+def _size_reason(networks: FusedNetworks, data: MinibatchSizes) -> str | None:
+    columns = sum(layer.out_features for layer in networks.actor) + MAX_OBS
+    if (
+        data.num_env_states_per_minibatch * columns >= MAX_PLACES
+        or data.num_env_states * MAX_OBS >= MAX_PLACES
+    ):
+        return f"{data.num_env_states_per_minibatch} env states in a minibatch are too many"
+    return None
+
+
+def launch(kernel: Any, grid: tuple[int, ...], *args: Any, **options: Any) -> None:
+    """Run `grid` programs of a Triton kernel, whose signature type checkers cannot read, on the current stream."""
+    kernel[grid](*args, **options)
+
+
+def parts(total: int, size: int) -> int:
+    """Return how many programs of `size` elements cover `total`."""
+    return -(-total // size)
