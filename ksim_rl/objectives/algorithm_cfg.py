@@ -15,13 +15,10 @@ ValueReduction = Literal["min", "mean"]
 
 @dataclass(frozen=True, kw_only=True)
 class AlgorithmCfg(Checked):
-    """The settings of an algorithm: a run's `objective`. A subclass of a registered one inherits its algorithm.
-
-    Attributes:
-        learns_on_sequences: whether networks may have a memory.
-    """
+    """The settings of an algorithm: a run's `objective`. A subclass of a registered one inherits its algorithm."""
 
     learns_on_sequences: ClassVar[bool] = False
+    """Whether networks may have a memory."""
 
     @property
     def observation_groups(self) -> tuple[str, ...]:
@@ -29,11 +26,7 @@ class AlgorithmCfg(Checked):
         return ()
 
     def check_memory(self) -> None:
-        """Refuse settings that networks with a memory do not allow.
-
-        Raises:
-            ValueError: naming the field and its value.
-        """
+        """Refuse settings that networks with a memory do not allow, by a ValueError."""
 
     def with_absolute_paths(self) -> Self:
         """Return the same settings with paths that lead to the same files from any folder."""

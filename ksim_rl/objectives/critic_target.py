@@ -51,12 +51,8 @@ def project_distribution(
     """Return the distribution of `reward + discount * z` on the atoms, for `z` distributed as `probs`.
 
     The mass of each moved atom goes to the two atoms that it falls between, in proportion to how near they are; beyond
-    the ends it goes to the last atom (algorithm 1 of the paper).
-
-    Args:
-        probs: probabilities of the atoms.
-        reward, discount: of the step.
-        support_A: values of the atoms, evenly spaced, rising.
+    the ends it goes to the last atom (algorithm 1 of Bellemare et al., arXiv 1707.06887). `support_A` has the values of
+    the atoms, evenly spaced, rising.
     """
     low, high, count = support_A[0], support_A[-1], support_A.shape[0]
     spacing = (high - low) / (count - 1)

@@ -26,9 +26,8 @@ def discriminator_loss(
 
     Args:
         judge: D.
-        reference_CL, policy_BL: what D reads of transitions; their numbers may differ.
         gradient_penalty: w.
-        mask_B: which of the policy's count; None is all.
+        mask_B: which of the policy's transitions count; None is all.
 
     Returns:
         The loss, and `loss`, `penalty` (without w / 2), `reference_score`, `policy_score` (means of D), and `accuracy`,

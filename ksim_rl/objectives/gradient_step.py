@@ -69,15 +69,9 @@ def clip_and_guard(
 
     As `torch.nn.utils.clip_grad_norm_`, without host syncs.
 
-    Args:
-        parameters: their `.grad` is clipped; those without one are left out.
-        max_grad_norm: bound on the 2-norm over all gradients; None does not clip.
-        loss: also tested for being finite.
-
     Returns:
-        The norm before clipping, and `found_inf`: 1 if the norm or the loss is not
-        finite, else 0. Set it as `optimizer.found_inf` of a fused optimizer, which then leaves parameters,
-        moments and step count as they are.
+        The norm before clipping, and `found_inf`: 1 if the norm or the loss is not finite, else 0. A fused optimizer
+        whose `found_inf` is 1 leaves parameters, moments and step count as they are.
     """
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     norm = nn.utils.get_total_norm(gradients)
@@ -99,18 +93,11 @@ def adapt_learning_rate_(
 ) -> Float32[Tensor, ""]:
     """Divide `lr` by `factor` if `kl` exceeds twice the desired one, multiply it if below half, in place.
 
-    The rule of rsl_rl, on the device: no host sync, so it can be captured in a CUDA graph. A divergence of
-    exactly zero (the policy has not moved yet), or one that is NaN, changes nothing.
+    The rule of rsl_rl, without host syncs. A divergence of exactly zero (the policy has not moved yet), or one that is
+    NaN, changes nothing.
 
     Args:
-        lr: the learning rate of the optimizer.
         kl: mean divergence in nats between the policy that collected the data and the present one.
-        desired_kl: target, in nats.
-        factor: step of the change, > 1.
-        lr_min, lr_max: bounds.
-
-    Returns:
-        `lr`.
     """
     slower = (lr / factor).clamp_min(lr_min)
     faster = (lr * factor).clamp_max(lr_max)
@@ -175,10 +162,7 @@ def descend(
 ) -> tuple[Float32[Tensor, ""], Float32[Tensor, ""]]:
     """Make one gradient step on the parameters of a fused optimizer, unless loss or gradient are not finite.
 
-    Makes no host sync and can be captured in a CUDA graph. A skipped step changes no parameter, moment or step count.
-
-    Returns:
-        The norm of the gradient before clipping, and 1 if the step was skipped, else 0.
+    It can be captured in a CUDA graph. Returned are the norm before clipping, and 1 if the step was skipped, else 0.
     """
     optimizer.zero_grad(set_to_none=True)
     loss.backward()

@@ -27,8 +27,7 @@ def standardized(
 ) -> Float[Tensor, "*batch"]:
     """Shift and scale values to mean 0 and standard deviation 1 over those that `mask` marks.
 
-    Args:
-        lowest_std: values that are all alike stay near zero, as they are divided by this at least.
+    Values that are all alike stay near zero, as they are divided by `lowest_std` at least.
     """
     zero, count = torch.zeros_like(values), mask.sum()
     error = values - torch.where(mask, values, zero).sum() / count.clamp_min(1)

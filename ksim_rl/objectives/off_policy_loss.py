@@ -133,8 +133,9 @@ class OffPolicyLoss(LossModule):
         return critic(inputs).get(critic.out_keys[0]).float()
 
     def _value(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
-        """Return the value of an action [B], which the actor climbs."""
-        predicted = self._predict(self.critic_network, tensordict, action)
+        """Return the value of an action [B], which the actor climbs; no gradients reach the critics."""
+        with frozen(self.critic_network):
+            predicted = self._predict(self.critic_network, tensordict, action)
         values_BN = predicted if self.support_A is None else mean_of(predicted.softmax(-1), self.support_A)
         return values_BN.amin(-1) if self.value_reduction == "min" else values_BN.mean(-1)
 
@@ -209,10 +210,8 @@ class SACLoss(OffPolicyLoss):
     p(a|s) - Q(s, a)); `loss_alpha` = -log_alpha * mean(log p(a|s) + target_entropy).
 
     Args:
-        actor_network: probabilistic.
-        critic_network, **options: see `OffPolicyLoss`.
+        actor_network: probabilistic; it, critic_network and **options are those of `OffPolicyLoss`.
         alpha_init: temperature at the start.
-        learn_alpha: whether the temperature learns.
         target_entropy: that the temperature aims at, in nats.
     """
 
@@ -251,8 +250,7 @@ class SACLoss(OffPolicyLoss):
         """Return the losses of actor and temperature, each with gradients for it alone, and what is logged."""
         observed = tensordict.select(*self.actor_network.in_keys)
         action, log_prob_B = rsample_and_log_prob(self.actor_network.get_dist(observed))
-        with frozen(self.critic_network):
-            value_B = self._value(tensordict, action)
+        value_B = self._value(tensordict, action)
         log_prob = self._mean(log_prob_B.detach(), tensordict)
         losses = {
             "loss_actor": self._mean(self.alpha * log_prob_B - value_B, tensordict),
@@ -269,8 +267,7 @@ class TD3Loss(OffPolicyLoss):
     As in FastTD3, a(s') is the present policy, not a slow copy of it.
 
     Args:
-        actor_network: deterministic.
-        critic_network, **options: see `OffPolicyLoss`.
+        actor_network: deterministic; it, critic_network and **options are those of `OffPolicyLoss`.
         low_L, high_L: bounds of the actions.
         target_noise, target_noise_clip: standard deviation and bound of the noise on a(s'), in units of half the range
             of an action.
@@ -309,6 +306,4 @@ class TD3Loss(OffPolicyLoss):
         """Return the loss of the actor, which has gradients for it alone, and an empty dict."""
         observed = tensordict.select(*self.actor_network.in_keys)
         action = self.actor_network(observed).get(self.tensor_keys.action)
-        with frozen(self.critic_network):
-            value_B = self._value(tensordict, action)
-        return {"loss_actor": -self._mean(value_B, tensordict)}, {}
+        return {"loss_actor": -self._mean(self._value(tensordict, action), tensordict)}, {}

@@ -92,10 +92,7 @@ def policy_kl(old: Distribution, new: Distribution) -> Float[Tensor, "*batch"] |
 def estimated_kl(log_ratio: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """Return an unbiased estimate of KL(old || new) that is never negative, from actions of the old policy.
 
-    It is r - 1 - log r with r = new / old (Schulman, "Approximating KL divergence", 2020).
-
-    Args:
-        log_ratio: log r of each action.
+    It is r - 1 - log r with r = new / old, from log r (Schulman, "Approximating KL divergence", 2020).
     """
     return torch.expm1(log_ratio) - log_ratio
 

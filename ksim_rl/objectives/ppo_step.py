@@ -18,7 +18,7 @@ from ksim_rl.objectives.algorithm_cfg import OnPolicyCfg, PPOCfg
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.gradient_step import StepGuard, adapt_learning_rate_, descend
 from ksim_rl.objectives.rollout_estimator import RolloutEstimator
-from ksim_rl.objectives.symmetry import Loss, SymmetricAugmentation, with_augmentation, with_mirror_loss
+from ksim_rl.objectives.symmetry import Loss, SymmetricAugmentation, mirror_loss
 from ksim_rl.transforms import MirrorMap
 
 
@@ -97,15 +97,19 @@ def make_symmetric(
     if cfg.symmetry == "none":
         return loss
     actor: Any = loss.actor_network
-    critic = loss.critic_network
-    read = dict.fromkeys([*actor.in_keys, *critic.in_keys, "action"])
+    read = dict.fromkeys([*actor.in_keys, *loss.critic_network.in_keys, "action"])
     missing = [key for key in read if key not in (maps or {})]
     if missing:
         raise ValueError(f"symmetry={cfg.symmetry!r} needs the mirror image of {missing}: add it to the maps")
     mirror = SymmetricAugmentation(maps or {}, device=device)
     if cfg.symmetry == "augment":
-        return with_augmentation(loss, mirror)
-    return with_mirror_loss(loss, actor, mirror, coeff=cfg.symmetry_coeff)
+        return lambda minibatch_B: loss(mirror(minibatch_B))
+
+    def with_mirror_loss(minibatch_B: TensorDictBase) -> TensorDictBase:
+        losses = loss(minibatch_B)
+        return losses.set("loss_mirror", cfg.symmetry_coeff * mirror_loss(actor, minibatch_B, mirror))
+
+    return with_mirror_loss
 
 
 def ppo_step(
@@ -122,11 +126,8 @@ def ppo_step(
     or gradient is not finite changes no parameter, moment or step count of the optimizer.
 
     Args:
-        loss: a `ClipPPOLoss`, also a compiled one; any callable that returns `loss_*` and, for the adaptive
-            schedule, `kl`.
+        loss: any callable that returns `loss_*` and, for the adaptive schedule, `kl`.
         optimizer: from `make_optimizer`; another one must be fused, with a tensor as learning rate.
-        minibatch_B: `["B"]`.
-        guard: counts skipped steps.
 
     Returns:
         What the loss returns, detached, and `loss`, `grad_norm` (before clipping), `learning_rate` (of this

@@ -21,10 +21,7 @@ from ksim_rl.objectives.masked import standardized
 class Signals:
     """What an advantage is made of, all of one shape; ET stands for whatever the batch dims are.
 
-    Attributes:
-        value_ET_t, value_ET_t_plus_1: V before and after the step; the latter of the true next observation.
-        reward_ET, done_ET, terminated_ET: of the step.
-        time_dim: the batch dim that is time, >= 0.
+    The value after the step is that of the true next observation; `time_dim` is the batch dim that is time, >= 0.
     """
 
     value_ET_t: Float[Tensor, "*batch 1"]
@@ -115,8 +112,7 @@ class RolloutEstimator(ValueEstimatorBase):
 
         Args:
             tensordict: batch dims with time among them, e.g. `["E","T"]`; what the critic reads at the root
-                and under "next", and "reward", "done", "terminated" under "next". Its memory may be
-                time-major.
+                and under "next", and "reward", "done", "terminated" under "next".
             params, target_params: parameters of a functional critic, at the root and under "next".
             time_dim: overrides that of the constructor.
 

@@ -73,19 +73,11 @@ def mirror_loss(
 ) -> Float[Tensor, ""]:
     """Return the mean squared difference between pi(mirror(s)) and mirror(pi(s)) (Yu et al., arXiv 1801.08093).
 
-    The mean is over env states and actions, pi the mean of the policy's gaussian; the gradient flows through both.
-    (Yu et al. sum over actions.) Env states whose `("collector", "mask")` is False are left out.
-
-    Args:
-        actor: its distribution is a gaussian, or made of one.
-        minibatch_B: what the actor reads.
-        mirror: for all that the actor reads, and the action.
-
-    Returns:
-        In squared units of the action.
+    The mean is over env states and actions, in squared units of the action; pi is the mean of the policy's gaussian,
+    and the gradient flows through both. (Yu et al. sum over actions.) Masked env states are left out.
 
     Raises:
-        ValueError: if the distribution has no mean of that kind.
+        ValueError: if the actor's distribution is not a gaussian or made of one.
     """
     # One pass of the network for both.
     dist = actor.get_dist(mirror(minibatch_B.select(*actor.in_keys)))
@@ -96,23 +88,3 @@ def mirror_loss(
     image_of_loc_BL = mirror.image_of("action", loc_BL)
     error_B = (loc_of_image_BL - image_of_loc_BL).square().mean(-1)
     return masked_mean(error_B, mask_of(minibatch_B, error_B))
-
-
-def with_mirror_loss(
-    loss: Loss, actor: ProbabilisticTensorDictSequential, mirror: SymmetricAugmentation, *, coeff: float
-) -> Loss:
-    """Return `loss` with `loss_mirror`, coeff * `mirror_loss`, beside its own results."""
-
-    def losses(minibatch_B: TensorDictBase) -> TensorDictBase:
-        return loss(minibatch_B).set("loss_mirror", coeff * mirror_loss(actor, minibatch_B, mirror))
-
-    return losses
-
-
-def with_augmentation(loss: Loss, mirror: SymmetricAugmentation) -> Loss:
-    """Return `loss` of each minibatch together with its mirror image."""
-
-    def losses(minibatch_B: TensorDictBase) -> TensorDictBase:
-        return loss(mirror(minibatch_B))
-
-    return losses

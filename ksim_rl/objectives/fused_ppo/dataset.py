@@ -26,8 +26,6 @@ class FusedDataset:
         records: [D, columns]; see `loss_kernels`.
 
     Args:
-        cfg: of the objective.
-        layout: of the networks.
         observe_actor, observe_critic: from a TensorDict to what the first layers of actor and critic take, [..., L].
         size: D.
         dtype: of the products.

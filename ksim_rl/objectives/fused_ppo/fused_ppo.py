@@ -9,6 +9,7 @@ moved the gradient of each parameter by 0.2 to 0.6 percent of its norm, where to
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int64
@@ -39,10 +40,8 @@ class FusedPPO:
 
     Args:
         cfg: of the objective, for which `why_not_fused` has no reason.
-        networks: what learns.
         observe_actor, observe_critic: from a TensorDict to what the first layers of actor and critic take, [..., L].
         optimizer: Adam from `make_optimizer`; its moments, step counts and learning rate are used and kept.
-        guard: counts skipped steps.
         num_env_states_per_minibatch, num_minibatches: B, and how many there are in an epoch.
         tuning: sizes of blocks; None takes those that suit the networks.
     """
@@ -79,8 +78,7 @@ class FusedPPO:
             device=device,
         )
 
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(shape, dtype=dtype, device=device)
+        zeros = partial(torch.zeros, device=device)
 
         self._blocks = parts(self.batch, tuning.block)
         self._tiles = layout.weight_tiles(tuning.tile).to(device)

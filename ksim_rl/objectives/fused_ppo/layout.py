@@ -47,9 +47,6 @@ class FusedLayout:
     works on. The padded one, [2, P], has a row for the actor and one for the critic, each with first all weights and
     then all biases and the std, in blocks whose sizes are the same in both rows: the observation is padded to
     `obs_width` and the outputs to `out_width`, both powers of two. Padding is zero, and so is its gradient.
-
-    Args:
-        networks: what is laid out.
     """
 
     def __init__(self, networks: FusedNetworks) -> None:
@@ -170,12 +167,10 @@ class MinibatchSizes(Protocol):
     @property
     def num_env_states_per_minibatch(self) -> int:
         """B."""
-        ...
 
     @property
     def num_env_states(self) -> int:
         """D."""
-        ...
 
 
 def why_not_fused(cfg: PPOCfg, networks: FusedNetworks, *, data: MinibatchSizes) -> str | None:
@@ -194,7 +189,10 @@ def why_not_fused(cfg: PPOCfg, networks: FusedNetworks, *, data: MinibatchSizes)
     for field, is_set in refused.items():
         if is_set:
             return f"{field}={getattr(cfg, field)!r}"
-    return _shape_reason(networks) or _size_reason(networks, data)
+    columns = sum(layer.out_features for layer in networks.actor) + MAX_OBS
+    places = max(data.num_env_states_per_minibatch * columns, data.num_env_states * MAX_OBS)
+    too_many = f"{data.num_env_states_per_minibatch} env states in a minibatch are too many"
+    return _shape_reason(networks) or (too_many if places >= MAX_PLACES else None)
 
 
 def _shape_reason(networks: FusedNetworks) -> str | None:
@@ -209,16 +207,6 @@ def _shape_reason(networks: FusedNetworks) -> str | None:
     widest = max(networks.actor[0].in_features, networks.critic[0].in_features)
     if widest > MAX_OBS or networks.actor[-1].out_features > MAX_ACTIONS:
         return f"there are more than {MAX_OBS} observations or {MAX_ACTIONS} actions"
-    return None
-
-
-def _size_reason(networks: FusedNetworks, data: MinibatchSizes) -> str | None:
-    columns = sum(layer.out_features for layer in networks.actor) + MAX_OBS
-    if (
-        data.num_env_states_per_minibatch * columns >= MAX_PLACES
-        or data.num_env_states * MAX_OBS >= MAX_PLACES
-    ):
-        return f"{data.num_env_states_per_minibatch} env states in a minibatch are too many"
     return None
 
 

@@ -20,8 +20,6 @@ class FusedParameters:
         steps: the optimizer's number of steps before the first gradient step of the update and after each, [steps + 1].
 
     Args:
-        networks: whose parameters.
-        layout: of `networks`.
         optimizer: Adam; moments that it does not have yet are made.
         dtype: of the products.
         num_steps: gradient steps of an update.
