@@ -16,10 +16,6 @@ class GAE(RolloutEstimator, value.GAE):
     """Computes `advantage` and `value_target` of a rollout (Schulman et al., arXiv 1506.02438).
 
     It is TorchRL's `GAE` with the same keys and results; see `RolloutEstimator` for what differs.
-
-    Args:
-        lmbda: weight of longer returns, in [0, 1].
-        normalize_advantage, **options: of `RolloutEstimator`, gamma and critic among them.
     """
 
     def __init__(self, *, lmbda: float, normalize_advantage: bool = False, **options: Any) -> None:
@@ -51,10 +47,6 @@ class TDLambda(RolloutEstimator, value.TDLambdaEstimator):
     G_t = r_t + gamma ((1 - lambda) V(s_{t+1}) + lambda G_{t+1}), cut at the end of an episode. In a rollout whose next
     observation is the observation of the next step, as collectors give it, the result is that of `GAE`; it is not where
     the two values differ, such as with the values of a target critic under "next".
-
-    Args:
-        lmbda: weight of longer returns, in [0, 1].
-        **options: of `RolloutEstimator`, gamma and critic among them.
     """
 
     def __init__(self, *, lmbda: float, **options: Any) -> None:
@@ -92,10 +84,10 @@ class VTrace(RolloutEstimator, value.VTrace):
 
     Args:
         actor: the present policy; what it reads, `action` and `action_log_prob` are in the data.
-        lmbda: weight of longer returns, in [0, 1]; TorchRL's has 1.
-        normalize_advantage, **options: of `RolloutEstimator`, gamma and critic among them; and of TorchRL's `VTrace`:
-            `rho_thresh`, the bound of the ratio that decides whose value is learned (the present policy's at infinity),
-            and `c_thresh`, of the one that decides how far later steps count.
+        lmbda: TorchRL's has 1.
+        **options: of `RolloutEstimator`; and of TorchRL's `VTrace`: `rho_thresh`, the bound of the ratio that decides
+            whose value is learned (the present policy's at infinity), and `c_thresh`, of the one that decides how far
+            later steps count.
     """
 
     lmbda: Tensor

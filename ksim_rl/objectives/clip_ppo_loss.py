@@ -32,8 +32,8 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
 
     The stock loss reads tensor values on the host 1 to 3 times per call and breaks `fullgraph` compilation
     with `clip_value`; this one never does. It also writes `kl`, the divergence from the policy that collected the
-    data to the present one: exact where there is a closed form and the data has the parameters of the old distribution
-    (`loc` and `scale`, say), else an estimate from the actions.
+    data to the present one: exact where there is a closed form and the data has the parameters of the old distribution,
+    else an estimate from the actions.
 
     Losses are means over the env states, without a factor 0.5:
     `loss_objective` = -mean(min(r A, clip(r, 1 - clip_epsilon, 1 + clip_epsilon) A)), r the probability
@@ -43,7 +43,6 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
     `("collector", "mask")` is False are left out.
 
     Args:
-        actor_network, critic_network: TensorDict modules; the actor is probabilistic.
         clip_value: radius of the value clipping, in units of the value; True takes `clip_epsilon`, None or
             False does not clip. It is a plain number here: a captured graph or a compiled loss keeps the one
             it saw.
@@ -76,11 +75,6 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
     def dataset_keys(self) -> list[NestedKey]:
         """The leaves that a dataset needs for this loss, advantages already estimated."""
         keys, actor = self.tensor_keys, self.actor_network
-        critic_keys = (
-            []
-            if self.critic_network is None
-            else [*self.critic_network.in_keys, keys.value, keys.value_target]
-        )
         wanted = [
             *observation_keys(actor),
             *_as_list(keys.action),
@@ -88,7 +82,9 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
             *distribution_keys(actor),
             keys.advantage,
         ]
-        return list(dict.fromkeys([*wanted, *critic_keys]))
+        if self.critic_network is not None:
+            wanted += [*self.critic_network.in_keys, keys.value, keys.value_target]
+        return list(dict.fromkeys(wanted))
 
     @dispatch  # type: ignore[arg-type]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -239,10 +235,7 @@ def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:
 
 
 def _ratio_statistics(log_weight: Tensor) -> dict[str, Tensor]:
-    """Return TorchRL's statistics of the probability ratio.
-
-    Effective sample size (as a share), maximum and mean.
-    """
+    """Return TorchRL's statistics of the probability ratio: effective sample size (a share), maximum and mean."""
     log_weight_B = log_weight.squeeze(-1)
     log_size = 2.0 * log_weight_B.logsumexp(0) - (2.0 * log_weight_B).logsumexp(0)
     ratio = log_weight.exp()

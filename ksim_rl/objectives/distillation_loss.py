@@ -90,8 +90,7 @@ class DistillationLoss(nn.Module):
     def forward(self, minibatch_B: TensorDictBase) -> TensorDictBase:
         """Return `loss_distillation`, and detached `kl`: how far the student moved since it collected, in nats.
 
-        Args:
-            minibatch_B: `["B"]` or `["B","T"]` with the `dataset_keys`.
+        The minibatch, `["B"]` or `["B","T"]`, has the `dataset_keys`.
         """
         minibatch_B = minibatch_B.clone(False)
         before = stored_distribution(self.actor_network, minibatch_B)

@@ -56,7 +56,7 @@ class RolloutEstimator(ValueEstimatorBase):
     value after a step is that of the true next observation and the state after the step.
 
     Args:
-        gamma: discount per step, in [0, 1].
+        gamma: discount per step, in [0, 1]. The `lmbda` of its subclasses is the weight of longer returns, in [0, 1].
         critic: any TensorDict module that writes `state_value` [..., 1]; None reads the values from the data.
             `value_network` is TorchRL's name for it.
         normalize_advantage: shift and scale the finite advantages to mean 0 and standard deviation 1 over all

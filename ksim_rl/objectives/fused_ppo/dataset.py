@@ -57,13 +57,10 @@ class FusedDataset:
     def read(self, rollout_ET: TensorDictBase, *, evaluate: Evaluate) -> Int64[Tensor, ""]:
         """Take over a rollout `["E","T"]`, whose advantages are estimated here.
 
-        An env state with an element that is not finite takes no part, as in `DatasetStorage`.
+        An env state with an element that is not finite takes no part, as in `DatasetStorage`; returned is how many.
 
         Args:
             evaluate: writes the values of observations of the critic into its second argument.
-
-        Returns:
-            How many env states take no part.
         """
         following = rollout_ET.get("next")
         for obs_DL, observe, dim in zip(self.obs, self._observe, self.layout.obs_dims, strict=True):
