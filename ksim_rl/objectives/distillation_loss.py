@@ -15,12 +15,7 @@ from torchrl.modules import set_recurrent_mode
 from ksim_rl.checked import check_value
 from ksim_rl.objectives.algorithm_cfg import DistillationKind
 from ksim_rl.objectives.masked import mask_of, masked_mean
-from ksim_rl.objectives.policy_kl import (
-    distribution_keys,
-    observation_keys,
-    policy_kl,
-    stored_distribution,
-)
+from ksim_rl.objectives.policy_kl import distribution_keys, observation_keys, policy_kl, stored_distribution
 
 TEACHER = "teacher"
 """Under this key a dataset holds what the teacher would do: its action and, for "kl", its distribution."""

@@ -35,7 +35,8 @@ class OffPolicyLoss(LossModule):
     "state_action_value" [B, N], or "state_action_logits" [B, N, A] if there is a `support_A`: logits of the return's
     distribution on its A atoms.
 
-    Losses are sums over the N networks and means over the env states of a minibatch; those whose
+    `loss_qvalue` = sum over the critics of mean((Q - y)^2), or of the cross entropy to the projected target
+    distribution; the subclasses say what y is. Losses are means over the env states of a minibatch; those whose
     `("collector", "mask")` is False are left out, and `"priority_weight"` weighs them where it is present. No host
     syncs.
 
@@ -205,9 +206,8 @@ class SACLoss(OffPolicyLoss):
     `loss_function="l2"`. All critics are evaluated in one batched product instead of a `vmap`, and may predict
     distributions.
 
-    `loss_qvalue` = sum over the critics of mean((Q - y)^2), or of the cross entropy to the projected target
-    distribution, y = r + gamma^n (1 - terminated) (Q'(s', a') - alpha log p(a'|s')); `loss_actor` = mean(alpha log
-    p(a|s) - Q(s, a)); `loss_alpha` = -log_alpha * mean(log p(a|s) + target_entropy).
+    y = r + gamma^n (1 - terminated) (Q'(s', a') - alpha log p(a'|s')); `loss_actor` = mean(alpha log p(a|s) - Q(s, a));
+    `loss_alpha` = -log_alpha * mean(log p(a|s) + target_entropy).
 
     Args:
         actor_network: probabilistic; it, critic_network and **options are those of `OffPolicyLoss`.
@@ -262,9 +262,8 @@ class SACLoss(OffPolicyLoss):
 class TD3Loss(OffPolicyLoss):
     """TD3 (Fujimoto et al., arXiv 1802.09477), and FastTD3 (Seo et al., arXiv 2505.22642) with a `support_A`.
 
-    `loss_qvalue` = sum over the critics of mean((Q - y)^2), or of the cross entropy to the projected target
-    distribution, y = r + gamma^n (1 - terminated) Q'(s', clip(a(s') + clip(noise))); `loss_actor` = -mean(Q(s, a(s))).
-    As in FastTD3, a(s') is the present policy, not a slow copy of it.
+    y = r + gamma^n (1 - terminated) Q'(s', clip(a(s') + clip(noise))); `loss_actor` = -mean(Q(s, a(s))). As in FastTD3,
+    a(s') is the present policy, not a slow copy of it.
 
     Args:
         actor_network: deterministic; it, critic_network and **options are those of `OffPolicyLoss`.

@@ -167,10 +167,12 @@ class MinibatchSizes(Protocol):
     @property
     def num_env_states_per_minibatch(self) -> int:
         """B."""
+        ...
 
     @property
     def num_env_states(self) -> int:
         """D."""
+        ...
 
 
 def why_not_fused(cfg: PPOCfg, networks: FusedNetworks, *, data: MinibatchSizes) -> str | None:
