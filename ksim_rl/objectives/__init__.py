@@ -11,14 +11,6 @@ from ksim_rl.objectives.algorithm_cfg import (
     TD3Cfg,
 )
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
-from ksim_rl.objectives.critic_target import (
-    cross_entropy,
-    follow_,
-    frozen,
-    make_target,
-    mean_of,
-    project_distribution,
-)
 from ksim_rl.objectives.discriminator_loss import discriminator_loss, style_reward
 from ksim_rl.objectives.distillation_loss import DistillationLoss, observation_keys_of
 from ksim_rl.objectives.gradient_step import (
@@ -31,7 +23,17 @@ from ksim_rl.objectives.gradient_step import (
     make_adamw,
     make_optimizer,
 )
-from ksim_rl.objectives.off_policy_loss import OffPolicyLoss, SACLoss, TD3Loss
+from ksim_rl.objectives.off_policy_loss import (
+    OffPolicyLoss,
+    SACLoss,
+    TD3Loss,
+    cross_entropy,
+    follow_,
+    frozen,
+    make_target,
+    mean_of,
+    project_distribution,
+)
 from ksim_rl.objectives.policy_kl import distribution_keys, kl_divergence, observation_keys
 from ksim_rl.objectives.ppo_step import (
     in_precision,
