@@ -18,8 +18,7 @@ from ksim_rl.envs.term import (
     TerminationTerm,
 )
 from ksim_rl.envs.view import EnvView
-from ksim_rl.scene.placement import Placement
-from ksim_rl.scene.scene import MjcfRobot, Robot, SceneCfg
+from ksim_rl.scene.scene import MjcfRobot, Placement, Robot, SceneCfg
 from ksim_rl.scene.sensors import (
     CameraSensor,
     ContactSensor,

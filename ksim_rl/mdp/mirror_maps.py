@@ -17,7 +17,7 @@ from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.mdp.actions import JointAction, per_joint
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.sensors import ContactSensor
-from ksim_rl.scene.sensors.ray_patterns import grid_points
+from ksim_rl.scene.sensors.rays import grid_points
 from ksim_rl.transforms import (
     AXIAL,
     PLANAR_VELOCITY,

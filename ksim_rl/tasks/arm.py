@@ -12,9 +12,8 @@ from ksim_rl.modules import ActorCfg, CriticCfg
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.physics import SimCfg
 from ksim_rl.scene.objects import Box
-from ksim_rl.scene.placement import Placement
 from ksim_rl.scene.robots.control_models import Arm
-from ksim_rl.scene.scene import SceneCfg
+from ksim_rl.scene.scene import Placement, SceneCfg
 from ksim_rl.scene.terrains import PlaneTerrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg

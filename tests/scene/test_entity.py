@@ -10,8 +10,7 @@ import torch
 from ksim_rl.envs import MjcfRobot, SceneCfg
 from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.physics import World, load_model
-from ksim_rl.scene.placement import Placement
-from ksim_rl.scene.scene import build_spec
+from ksim_rl.scene.scene import Placement, build_spec
 from tests.envs.random_states import FIXED_BASE, E, close, engine, velocity
 from tests.mdp.bench import FREE_BODY
 

@@ -13,7 +13,7 @@ from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
 from ksim_rl.mdp.fields import OfEntity
-from ksim_rl.scene.sensors.ray_patterns import grid_points
+from ksim_rl.scene.sensors.rays import grid_points
 
 IMU_QUANTITIES = ("ang_vel", "lin_acc", "quat", "projected_gravity")
 CAMERA_OUTPUTS = ("rgb", "depth", "segmentation")

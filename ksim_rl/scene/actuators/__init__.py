@@ -11,13 +11,10 @@ from ksim_rl.scene.actuators.builtin import (
     PositionActuator,
     VelocityActuator,
 )
-from ksim_rl.scene.actuators.dc_motor import DCMotorActuator
 from ksim_rl.scene.actuators.delayed import DelayedActuator
-from ksim_rl.scene.actuators.ideal_pd import IdealPDActuator
-from ksim_rl.scene.actuators.joint_drives import JointDrives
-from ksim_rl.scene.actuators.lstm import LSTMActuator
-from ksim_rl.scene.actuators.mlp import MLPActuator
-from ksim_rl.scene.actuators.set_actuators import set_actuators
+from ksim_rl.scene.actuators.joint_drives import JointDrives, set_actuators
+from ksim_rl.scene.actuators.nets import LSTMActuator, MLPActuator
+from ksim_rl.scene.actuators.pd import DCMotorActuator, IdealPDActuator
 from ksim_rl.scene.state.actuator_params import ActuatorParams
 from ksim_rl.scene.state.joint_targets import JointTargets
 

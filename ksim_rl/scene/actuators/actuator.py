@@ -1,22 +1,106 @@
-"""This module says what an actuator is: an edit of the model and, for our own motor models, a law per substep."""
-
-from __future__ import annotations
+"""This module has the bases of actuators: an edit of the model and, for motor models of our own, a law per substep."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import mujoco
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float, Int64, Shaped
 from torch import Tensor
 
 from ksim_rl.checked import Checked, NonNegative, Positive
-from ksim_rl.scene.actuators.drive import Drive
-from ksim_rl.scene.names import Patterns
+from ksim_rl.scene.names import Patterns, as_index, scalar_joint_ids
 from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKind
+from ksim_rl.scene.state.simulation import Simulation
+from ksim_rl.scene.state.world_view import WorldView
 
 Law = Callable[[JointState, JointTarget], Float[Tensor, "E N"]]
 """The control [E, N] of a law's motors; of explicit ones, the effort itself."""
+
+
+class Drive:
+    """The N joints of one law, in the model's order.
+
+    Attributes:
+        num_envs, num_joints, device: E, N, and where the buffers live.
+    """
+
+    def __init__(self, name: str, simulation: Simulation, view: WorldView, joint_ids: Sequence[int]) -> None:
+        model = view.world.mj_model
+        scalar = scalar_joint_ids(model)
+        self.num_envs, self.num_joints, self.device = view.num_envs, len(joint_ids), view.device
+        self._name, self._simulation, self._view = name, simulation, view
+        self._joints = as_index(joint_ids, view.device)
+        self._qpos = as_index([model.jnt_qposadr[scalar[i]] for i in joint_ids], view.device)
+        self._qvel = as_index([model.jnt_dofadr[scalar[i]] for i in joint_ids], view.device)
+        self._motors = as_index([view.targets.motor(i) for i in joint_ids], view.device)
+        self._at_reset: list[Callable[[Bool[Tensor, " E"]], None]] = []
+
+    def param(self, name: str) -> Float[Tensor, "E N"]:
+        """Return the present values of a number of `Actuator.params`, [E, N]."""
+        return self._view.actuator_param(name)[:, self._joints]
+
+    def buffer(
+        self, name: str, *shape: int, dtype: torch.dtype = torch.float32, keep: bool = False
+    ) -> Shaped[Tensor, " E *shape"]:
+        """Return a buffer [E, *shape] of the law; rows that reset are zeroed unless `keep`."""
+        return self._view.buffers.get(f"{self._name}.{name}", *shape, dtype=dtype, keep=keep)
+
+    def on_reset(self, draw: Callable[[Bool[Tensor, " E"]], None]) -> None:
+        """Call `draw` with the mask of the rows that reset, bool [E]; it may draw by `integers`."""
+        self._at_reset.append(draw)
+
+    def integers(self, n: int, low: int, high: int) -> Int64[Tensor, "E L"]:
+        """Draw int64 [E, n] from {low, ..., high}; the numbers depend on seed, law, env and count of resets only."""
+        return self._view.integers(n, low, high)
+
+    def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
+        """Draw anew for the rows of `mask_E`."""
+        if self._at_reset:
+            with self._simulation.scope(self._name, self._view.reset_count_E, draws="reset"):
+                for draw in self._at_reset:
+                    draw(mask_E)
+
+    def state(self) -> JointState:
+        """Return where the joints are now, in the middle of an env step too."""
+        world = self._view.world
+        return JointState(world.qpos_EL[:, self._qpos], world.qvel_EL[:, self._qvel])
+
+    def target(self) -> JointTarget:
+        """Return what the joints are asked for."""
+        targets, joints = self._view.targets, self._joints
+        return JointTarget(targets.pos_EL[:, joints], targets.vel_EL[:, joints], targets.effort_EL[:, joints])
+
+    def write(self, control_EN: Float[Tensor, "E N"]) -> None:
+        """Set the controls of the motors."""
+        self._view.world.ctrl_EL[:, self._motors] = control_EN
+
+
+class SubstepRing:
+    """The last `depth` values [E, L] of a signal, the newest first; before an episode's first value lies that value."""
+
+    def __init__(self, drive: Drive, name: str, depth: int, width: int) -> None:
+        # Of a row that resets, what lies there is never read again, so there is no need to clear it.
+        self._ring_EKL = drive.buffer(f"{name}_EKL", depth, width, keep=True)
+        self._started_E = drive.buffer(f"{name}_started_E", dtype=torch.bool)
+
+    def push(self, value_EL: Float[Tensor, "E L"]) -> None:
+        """Add the value of this substep."""
+        newest_E1L = value_EL[:, None]
+        shifted_EKL = torch.cat((newest_E1L, self._ring_EKL[:, :-1]), dim=1)
+        self._ring_EKL.copy_(torch.where(self._started_E[:, None, None], shifted_EKL, newest_E1L))
+        self._started_E.fill_(True)
+
+    def at(self, lag: int) -> Float[Tensor, "E L"]:
+        """Return the value of `lag` substeps ago, [E, L]."""
+        return self._ring_EKL[:, lag]
+
+    def at_rows(self, lag_E: Int64[Tensor, " E"]) -> Float[Tensor, "E L"]:
+        """Return the value of each row's own number of substeps ago (int64 [E]), [E, L]."""
+        index_E1L = lag_E[:, None, None].expand(-1, 1, self._ring_EKL.shape[2])
+        return self._ring_EKL.gather(1, index_E1L)[:, 0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,8 +108,11 @@ class Actuator(Checked, ABC):
     """What drives some joints of a robot, one actuator of the model for each of them.
 
     MuJoCo computes the effort of built-in actuators from `ctrl`, which is their target. Explicit ones are plain motors
-    in the model, whose effort `law` computes before each substep.
+    in the model, whose effort `law` computes before each substep: of `is_explicit` entries it must run there.
     """
+
+    is_explicit: ClassVar[bool] = False
+    _takes: ClassVar[frozenset[TargetKind]] = frozenset()
 
     @property
     @abstractmethod
@@ -33,14 +120,9 @@ class Actuator(Checked, ABC):
         """The names or patterns of the joints."""
 
     @property
-    @abstractmethod
     def takes(self) -> frozenset[TargetKind]:
         """The kinds of target that have an effect."""
-
-    @property
-    def is_explicit(self) -> bool:
-        """Whether `law` must run before each substep."""
-        return False
+        return self._takes
 
     @property
     def params(self) -> Mapping[str, float]:
@@ -107,10 +189,7 @@ class ExplicitActuator(JointActuator):
     `damping * timestep` well below the inertia that the joint feels, or use a built-in actuator.
     """
 
-    @property
-    def is_explicit(self) -> bool:
-        """True."""
-        return True
+    is_explicit: ClassVar[bool] = True
 
     @property
     def params(self) -> Mapping[str, float]:

@@ -8,14 +8,13 @@ MuJoCo's effort is `gain * ctrl + bias`, clamped to `forcerange`, times the gear
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import mujoco
 from torch import Tensor
 
 from ksim_rl.checked import NonNegative, Positive, Range
-from ksim_rl.scene.actuators.actuator import JointActuator, Law
-from ksim_rl.scene.actuators.drive import Drive
+from ksim_rl.scene.actuators.actuator import Drive, JointActuator, Law
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKind, control_kind
 
@@ -90,10 +89,7 @@ class PositionActuator(BuiltinActuator):
             damping=2.0 * damping_ratio * armature * 2.0 * math.pi * natural_frequency,
         )
 
-    @property
-    def takes(self) -> frozenset[TargetKind]:
-        """A position."""
-        return frozenset({"pos"})
+    _takes: ClassVar[frozenset[TargetKind]] = frozenset({"pos"})
 
     def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
         """Make the servo."""
@@ -114,10 +110,7 @@ class VelocityActuator(BuiltinActuator):
 
     damping: Positive
 
-    @property
-    def takes(self) -> frozenset[TargetKind]:
-        """A velocity."""
-        return frozenset({"vel"})
+    _takes: ClassVar[frozenset[TargetKind]] = frozenset({"vel"})
 
     def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
         """Make the servo."""
@@ -129,10 +122,7 @@ class VelocityActuator(BuiltinActuator):
 class MotorActuator(BuiltinActuator):
     """MuJoCo's motor: effort = target."""
 
-    @property
-    def takes(self) -> frozenset[TargetKind]:
-        """An effort."""
-        return frozenset({"effort"})
+    _takes: ClassVar[frozenset[TargetKind]] = frozenset({"effort"})
 
     def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
         """Make the motor; its control range is its effort limit."""

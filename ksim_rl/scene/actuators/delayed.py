@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import mujoco
 import torch
@@ -9,16 +10,9 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.checked import WholeNumber
-from ksim_rl.scene.actuators.actuator import (
-    Actuator,
-    JointState,
-    JointTarget,
-    Law,
-    TargetKind,
-)
-from ksim_rl.scene.actuators.drive import Drive
-from ksim_rl.scene.actuators.substep_ring import SubstepRing
+from ksim_rl.scene.actuators.actuator import Actuator, Drive, Law, SubstepRing
 from ksim_rl.scene.names import Patterns
+from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKind
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +27,8 @@ class DelayedActuator(Actuator):
         min_lag, max_lag: physics substeps, both included. With lag k the first k substeps after a change of the target
             still see the old one.
     """
+
+    is_explicit: ClassVar[bool] = True  # built-in actuators too get their control before each substep
 
     actuator: Actuator
     min_lag: WholeNumber = 0
@@ -52,11 +48,6 @@ class DelayedActuator(Actuator):
     def takes(self) -> frozenset[TargetKind]:
         """What the actuator inside takes."""
         return self.actuator.takes
-
-    @property
-    def is_explicit(self) -> bool:
-        """True: built-in actuators too get their control before each substep."""
-        return True
 
     @property
     def params(self) -> Mapping[str, float]:

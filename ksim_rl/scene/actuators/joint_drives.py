@@ -1,17 +1,67 @@
-"""The motor models of a scene at work."""
-
-from __future__ import annotations
+"""This module edits a spec so that joints have their actuators, and runs the laws of these in the worlds."""
 
 from collections.abc import Hashable, Mapping, Sequence
 
+import mujoco
 from jaxtyping import Bool
 from torch import Tensor
 
-from ksim_rl.scene.actuators.actuator import Actuator, Law
-from ksim_rl.scene.actuators.drive import Drive
-from ksim_rl.scene.actuators.set_actuators import driven_joints
+from ksim_rl.scene.actuators.actuator import Actuator, Drive, Law
+from ksim_rl.scene.names import as_patterns, match_names
 from ksim_rl.scene.state.simulation import Simulation
 from ksim_rl.scene.state.world_view import WorldView
+
+_OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def set_actuators(spec: mujoco.MjSpec, actuators: Sequence[Actuator]) -> None:
+    """Give each matching joint one actuator, named as its joint, in the order of `actuators`.
+
+    Actuators of the model that drive the same joints are replaced, and their sensors read the new ones; the model's
+    other actuators stay, in front.
+
+    Raises:
+        ValueError: naming the pattern that matches no joint, or the joint that two entries drive.
+    """
+    joints = {joint.name: joint for joint in spec.joints if joint.type in _SCALAR}
+    driven = driven_joints(actuators, list(joints))
+    new_names = {name for _, names in driven for name in names}
+    replaced: dict[str, str] = {}
+    for old in list(spec.actuators):
+        if old.trntype in _OF_JOINTS and old.target in new_names:
+            replaced[old.name] = old.target
+            spec.delete(old)
+    for sensor in spec.sensors:
+        if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR and sensor.objname in replaced:
+            sensor.objname = replaced[sensor.objname]
+    for actuator, names in driven:
+        for name in names:
+            new = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            actuator.configure(new, joints[name])
+
+
+def driven_joints(
+    actuators: Sequence[Actuator], joint_names: Sequence[str]
+) -> list[tuple[Actuator, list[str]]]:
+    """Return which of the joints each entry drives, in the order of `joint_names`.
+
+    Raises:
+        ValueError: naming the pattern that matches no joint, or the joint that two entries drive.
+    """
+    driven: list[tuple[Actuator, list[str]]] = []
+    entry_of: dict[str, int] = {}
+    for number, actuator in enumerate(actuators):
+        found = match_names("joint", as_patterns(actuator.driven), joint_names)
+        names = [joint_names[i] for i in sorted(found)]
+        for name in names:
+            if name in entry_of:
+                raise ValueError(
+                    f"joint {name!r} is driven by actuators[{entry_of[name]}] and actuators[{number}]: expected one"
+                )
+            entry_of[name] = number
+        driven.append((actuator, names))
+    return driven
 
 
 class JointDrives:

@@ -1,9 +1,14 @@
-"""This module draws pictures of an env off screen, with MuJoCo's own renderer."""
+"""This module draws pictures of an env off screen, by MuJoCo's renderer on an OpenGL platform that works here."""
 
 from __future__ import annotations
 
 import copy
+import importlib
+import os
+import subprocess
+import sys
 from collections.abc import Callable
+from functools import cache
 
 import mujoco
 import numpy as np
@@ -11,7 +16,6 @@ import numpy as np
 from ksim_rl.checks import near
 from ksim_rl.physics import World
 from ksim_rl.physics.fields import write_fields
-from ksim_rl.scene.rendering.gl_platform import FIXES, choose_gl_platform
 from ksim_rl.scene.rendering.visualizer import (
     DebugVisualizer,
     SceneVisualizer,
@@ -20,6 +24,45 @@ from ksim_rl.scene.rendering.visualizer import (
     visible_groups,
 )
 from ksim_rl.scene.viewer_cfg import ViewerCfg
+
+_PROBE = "import mujoco; context = mujoco.GLContext(16, 16); context.make_current(); context.free()"
+_PROBE_SECONDS = 60
+_FIXES = (
+    "no OpenGL platform for off-screen rendering. Fixes: EGL, from a GPU's driver or Mesa (Debian: libegl1 libgles2); "
+    "OSMesa, in software (Debian: libosmesa6); or a display, real or virtual (Xvfb :1 & DISPLAY=:1 MUJOCO_GL=glfw)"
+)
+
+
+@cache
+def choose_gl_platform() -> str:
+    """Make MuJoCo draw with a platform that works, and return its name.
+
+    The environment variable MUJOCO_GL has the last word. Without it each candidate is tried in a process of its own,
+    because a platform that fails cannot be exchanged for another in the same process.
+
+    Raises:
+        RuntimeError: if none works, with the ways to get one.
+    """
+    if os.environ.get("MUJOCO_GL"):
+        return os.environ["MUJOCO_GL"]
+    said = []
+    for platform in (["glfw"] if os.environ.get("DISPLAY") else []) + ["egl", "osmesa"]:
+        environment = {**os.environ, "MUJOCO_GL": platform}
+        command = [sys.executable, "-c", _PROBE]
+        try:
+            tried = subprocess.run(
+                command, env=environment, capture_output=True, text=True, timeout=_PROBE_SECONDS, check=False
+            )
+        except subprocess.TimeoutExpired:
+            said.append(f"{platform}: no answer in {_PROBE_SECONDS} s")
+            continue
+        if tried.returncode == 0:
+            os.environ["MUJOCO_GL"] = platform
+            # MuJoCo reads the variable when it is imported, which has happened.
+            importlib.reload(importlib.import_module("mujoco.rendering.classic.gl_context"))
+            return platform
+        said.append(f"{platform}: {(tried.stderr.strip().splitlines() or ['failed'])[-1]}")
+    raise RuntimeError(f"{_FIXES}. Tried {'; '.join(said)}")
 
 
 class OffscreenRenderer:
@@ -97,5 +140,5 @@ class OffscreenRenderer:
                 vis.offwidth, vis.offheight = max(vis.offwidth, cfg.width), max(vis.offheight, cfg.height)
                 self._renderer = mujoco.Renderer(self._mj_model, cfg.height, cfg.width, max_geom=20_000)
             except Exception as error:  # MuJoCo's platforms raise whatever their loader raises
-                raise RuntimeError(f"{FIXES}. MUJOCO_GL is {platform!r}, and it said: {error}") from error
+                raise RuntimeError(f"{_FIXES}. MUJOCO_GL is {platform!r}, and it said: {error}") from error
         return self._renderer

@@ -1,14 +1,15 @@
 """This package has the sensors of a scene, one file each; terms read them by name through the view."""
 
 from ksim_rl.scene.sensors.camera import CameraSensor, CameraTracker
-from ksim_rl.scene.sensors.contact import ContactSensor
-from ksim_rl.scene.sensors.contact_tracker import ContactState, ContactTracker
+from ksim_rl.scene.sensors.contact import ContactSensor, ContactState, ContactTracker
 from ksim_rl.scene.sensors.imu import ImuSensor, ImuTracker
-from ksim_rl.scene.sensors.ray_caster import RayCaster, RayState, RayTracker
-from ksim_rl.scene.sensors.ray_patterns import (
+from ksim_rl.scene.sensors.rays import (
     GridPattern,
     PinholePattern,
+    RayCaster,
     RayPattern,
+    RayState,
+    RayTracker,
     RingPattern,
 )
 from ksim_rl.scene.sensors.sensor import Sensor, SensorTracker

@@ -11,10 +11,9 @@ from jaxtyping import Float, Int32, UInt8
 from torch import Tensor
 
 from ksim_rl.checked import Count, Positive, Within
-from ksim_rl.checks import near
 from ksim_rl.physics.ray_casting import BatchCamera
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
-from ksim_rl.scene.sensors.sensor import GeomGroup, Sensor, SensorTracker
+from ksim_rl.scene.sensors.sensor import GeomGroup, Sensor, SensorTracker, check_present
 from ksim_rl.scene.state.world_view import WorldView
 
 
@@ -26,11 +25,8 @@ class CameraSensor(Sensor):
     being equal to them, and depth and segmentation agree with them up to the edges of things.
 
     Attributes:
-        camera: a camera of the model; None puts a new one on `body`.
-        body: with `camera=None`, the body that carries it, such as "world".
-        pos: with `camera=None`, its place in the body's frame, m.
-        xyaxes: with `camera=None`, the directions in the body's frame of the picture's right and up.
-        fovy: with `camera=None`, the vertical field of view, degrees.
+        camera: a camera of the model; None puts a new one on `body`, such as "world", at `pos`, m, with the picture's
+            right and up along `xyaxes`, all in the body's frame, and a vertical field of view of `fovy` degrees.
         width, height: pixels.
         rgb, depth, segmentation: what is drawn.
         max_depth: m; what is farther, or not there at all, has this depth.
@@ -65,15 +61,9 @@ class CameraSensor(Sensor):
             ValueError: if the model has no such camera or body.
         """
         if self.camera is not None:
-            cameras = [camera.name for camera in spec.cameras]
-            if self.camera not in cameras:
-                raise ValueError(
-                    f"scene.sensors.{name}: no camera {self.camera!r}: {near(self.camera, cameras)}"
-                )
+            check_present(name, "camera", self.camera, spec.cameras)
             return
-        bodies = [body.name for body in spec.bodies]
-        if self.body not in bodies:
-            raise ValueError(f"scene.sensors.{name}: no body {self.body!r}: {near(self.body, bodies)}")
+        check_present(name, "body", self.body, spec.bodies)
         spec.body(self.body).add_camera(
             name=name, pos=list(self.pos), xyaxes=list(self.xyaxes), fovy=self.fovy
         )
@@ -88,18 +78,9 @@ class CameraTracker(SensorTracker):
 
     def __init__(self, name: str, sensor: CameraSensor, view: WorldView) -> None:
         self._name, self._sensor, self._view = name, sensor, view
-        self._camera = BatchCamera(
-            view.world,
-            sensor.camera or name,
-            width=sensor.width,
-            height=sensor.height,
-            rgb=sensor.rgb,
-            depth=sensor.depth,
-            segmentation=sensor.segmentation,
-            geom_groups=sensor.geom_groups,
-            textures=sensor.textures,
-            shadows=sensor.shadows,
-        )
+        drawn = ("width", "height", "rgb", "depth", "segmentation", "geom_groups", "textures", "shadows")
+        settings = {field: getattr(sensor, field) for field in drawn}
+        self._camera = BatchCamera(view.world, sensor.camera or name, **settings)
 
     @property
     def rgb_EHW3(self) -> UInt8[Tensor, "E H W 3"]:

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
-from ksim_rl.scene.sensors.mount import MountedSensor
-from ksim_rl.scene.sensors.sensor import SensorTracker
+from ksim_rl.scene.sensors.sensor import MountedSensor, SensorTracker
 from ksim_rl.scene.state.world_view import WorldView
 
 _SENSORS = {

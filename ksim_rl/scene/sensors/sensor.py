@@ -1,14 +1,14 @@
-"""This module has the base of all sensors: a config that edits the model, and a tracker that reads it."""
-
-from __future__ import annotations
+"""This module has the bases of sensors: a config that edits the model, perhaps mounted on a body, and a reader."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import mujoco
 
 from ksim_rl.checked import Checked, Within
+from ksim_rl.checks import near
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.state.world_view import WorldView
 
@@ -53,7 +53,56 @@ class Sensor(Checked, ABC):
         """Return the reader of this sensor in the worlds of `view`."""
 
 
+def check_present(name: str, kind: str, wanted: str | None, elements: Sequence[Any]) -> None:
+    """Refuse a sensor `name` that wants an element which is not among these of the spec, by a ValueError."""
+    present = [element.name for element in elements]
+    if wanted not in present:
+        raise ValueError(
+            f"scene.sensors.{name}: no {kind} {wanted!r}: {near(str(wanted), filter(None, present))}"
+        )
+
+
 def sensor_columns(mj_model: mujoco.MjModel, name: str) -> range:
     """Return where the reading of an MJCF sensor stands in `sensordata_EL`."""
     found = mj_model.sensor(name)
     return range(int(found.adr[0]), int(found.adr[0] + found.dim[0]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountedSensor(Sensor, ABC):
+    """A sensor at a site of the model, or at a place on a body, whose axes it then has.
+
+    Attributes:
+        site: a site of the model, or None.
+        body: a body of the model, or None; exactly one of the two is given.
+        pos: with `body`, where on it, in its frame, m.
+    """
+
+    site: str | None = None
+    body: str | None = None
+    pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.site is None) == (self.body is None):
+            raise ValueError(f"site={self.site!r}, body={self.body!r}: give exactly one of them")
+        if self.site is not None and any(self.pos):
+            raise ValueError(
+                f"pos={self.pos!r} with site={self.site!r}: a site has its own place; give a body"
+            )
+
+    def mounting_site(self, name: str) -> str:
+        """Return the name of the site at which the sensor `name` sits."""
+        return self.site or f"{name}_mount"
+
+    def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
+        """Add the site `<name>_mount`, if the sensor is on a body.
+
+        Raises:
+            ValueError: if the model has no such site or body.
+        """
+        if self.body is None:
+            check_present(name, "site", self.site, spec.sites)
+        else:
+            check_present(name, "body", self.body, spec.bodies)
+            spec.body(self.body).add_site(name=self.mounting_site(name), pos=list(self.pos))

@@ -1,0 +1,277 @@
+"""This module has learned motor models: networks whose weights and settings stand in a safetensors file."""
+
+import hashlib
+import json
+import re
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError
+from safetensors.torch import load
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ksim_rl.checks import check_choice, check_in_range, near
+from ksim_rl.scene.actuators.actuator import Drive, ExplicitActuator, Law, SubstepRing
+from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKind
+
+ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "softsign": nn.Softsign, "tanh": nn.Tanh}
+_SCALES = ("position_scale", "velocity_scale", "effort_scale")
+_LSTM_PARTS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+
+Predictor = Callable[[Tensor, Tensor], Tensor]
+"""A network at work: efforts [E, N] from position errors [E, N] and velocities [E, N]."""
+
+
+class NetFile:
+    """What a safetensors file holds; nothing in it is ever executed.
+
+    Args:
+        file: its path; `~` is the home folder.
+        sha256: what its bytes must hash to (hexadecimal), or None.
+
+    Attributes:
+        where: path and SHA-256, for errors.
+        tensors: float32, by name.
+        metadata: text by name.
+
+    Raises:
+        ValueError: in one line with the path and the hash, if the file is missing, damaged or another one.
+    """
+
+    def __init__(self, file: str, sha256: str | None) -> None:
+        try:
+            data = Path(file).expanduser().read_bytes()
+        except OSError as error:
+            raise ValueError(
+                f"file={file!r}: {error.strerror or error}: expected a safetensors file"
+            ) from None
+        digest = hashlib.sha256(data).hexdigest()
+        self.where = f"file={file!r} (SHA-256 {digest})"
+        if sha256 is not None and digest != sha256.lower():
+            raise ValueError(f"{self.where}: expected sha256={sha256!r}: the file is damaged, or another one")
+        try:
+            tensors = load(data)
+        except SafetensorError as error:
+            raise ValueError(f"{self.where}: no safetensors file: {' '.join(str(error).split())}") from None
+        # The header: its length in 8 bytes, then JSON (https://github.com/huggingface/safetensors#format).
+        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+        self.tensors = {name: tensor.to(torch.float32) for name, tensor in tensors.items()}
+        self.metadata: dict[str, str] = header.get("__metadata__", {})
+
+    def tensor(self, name: str, *shape: int) -> Float[Tensor, "*shape"]:
+        """Return a tensor of this shape, where -1 fits any size.
+
+        Raises:
+            ValueError: in one line, if it is missing, of another shape, or not finite.
+        """
+        if name not in self.tensors:
+            raise ValueError(f"{self.where}: no tensor {name!r}: {near(name, self.tensors)}")
+        tensor = self.tensors[name]
+        fits = tensor.ndim == len(shape) and all(
+            wanted in (-1, found) for wanted, found in zip(shape, tensor.shape, strict=True)
+        )
+        if not fits:
+            wanted = ", ".join("any" if size == -1 else str(size) for size in shape)
+            raise ValueError(f"{self.where}: {name} has shape {tuple(tensor.shape)}: expected ({wanted})")
+        if not bool(torch.isfinite(tensor).all()):
+            raise ValueError(f"{self.where}: {name} holds numbers that are not finite")
+        return tensor
+
+    def check_all_known(self, names: set[str]) -> None:
+        """Refuse tensors that the net would not use, by a ValueError that names them."""
+        unknown = sorted(self.tensors.keys() - names)
+        if unknown:
+            raise ValueError(f"{self.where}: unknown tensors {unknown}: expected {sorted(names)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetActuator(ExplicitActuator):
+    """A motor whose effort a small network predicts from position errors and velocities, joint by joint.
+
+    One network serves all joints of the entry, as in Hwangbo et al., "Learning agile and dynamic motor skills for
+    legged robots", Science Robotics 4 (2019). Its effort is kept inside the effort limit.
+
+    Attributes:
+        file: path of a safetensors file with the weights.
+        sha256: what the file must hash to (hexadecimal); None takes any.
+        position_scale, velocity_scale: multiply position errors (target - position, rad or m) and velocities (rad/s or
+            m/s) on their way in. None: the file's metadata of that name, else 1.
+        effort_scale: multiplies the output, which gives N m or N. None: likewise.
+    """
+
+    _takes: ClassVar[frozenset[TargetKind]] = frozenset({"pos"})
+
+    file: str
+    sha256: str | None = None
+    position_scale: float | None = None
+    velocity_scale: float | None = None
+    effort_scale: float | None = None
+
+    @abstractmethod
+    def load(self, net: NetFile, drive: Drive) -> Predictor:
+        """Return the network of a file, with the buffers that it needs; inputs and output are scaled already."""
+
+    def law(self, drive: Drive) -> Law:
+        """Load the network, and return it between its scales."""
+        net = NetFile(self.file, self.sha256)
+        position_scale, velocity_scale, effort_scale = (
+            float(self.setting(net, name, 1.0)) for name in _SCALES
+        )
+        predict = self.load(net, drive)
+
+        def effort_EN(state: JointState, target: JointTarget) -> Tensor:
+            error_EN = (target.pos_EN - state.pos_EN) * position_scale
+            predicted_EN = predict(error_EN, state.vel_EN * velocity_scale) * effort_scale
+            limit_EN = drive.param("effort_limit")
+            return predicted_EN.clamp(-limit_EN, limit_EN)
+
+        return effort_EN
+
+    def setting(self, net: NetFile, name: str, default: Any = None) -> Any:
+        """Return a field or, if that is None, the metadata of its name, as text, or the default.
+
+        Raises:
+            ValueError: if none of them has it, or the metadata is no number where the field is one.
+        """
+        value = getattr(self, name)
+        if value is not None:
+            return value
+        text = net.metadata.get(name)
+        if text is None:
+            if default is None:
+                raise ValueError(f"{net.where}: no {name!r} in its metadata: give the field `{name}`")
+            return default
+        if name in _SCALES:
+            try:
+                number = float(text)
+            except ValueError:
+                raise ValueError(f"{net.where}: {name}={text!r} in its metadata: expected a number") from None
+            check_in_range(f"{net.where}: {name}", number)
+            return number
+        return text
+
+
+@dataclass(frozen=True, kw_only=True)
+class MLPActuator(NetActuator):
+    """A feed-forward network of the position errors and velocities at some past substeps.
+
+    The file holds what `nn.Sequential(Linear, activation, Linear, ...).state_dict()` gives: `0.weight` [H, F],
+    `0.bias` [H], `2.weight`, ... The F inputs are the position errors at `input_lags`, in that order, then the
+    velocities; the output is one number. After a reset the first state counts as having been there before.
+
+    Attributes:
+        activation: None: the file's metadata `activation`.
+        input_lags: physics substeps, 0 is the present. None: the file's metadata `input_lags`, such as "[0, 2, 4]".
+    """
+
+    activation: Literal["elu", "relu", "softsign", "tanh"] | None = None
+    input_lags: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.input_lags is not None:
+            _check_lags("input_lags", self.input_lags)
+
+    def load(self, net: NetFile, drive: Drive) -> Predictor:
+        """Return the network with its history."""
+        lags = self._lags(net)
+        activation = self.setting(net, "activation")
+        check_choice(f"{net.where}: activation", activation, ACTIVATIONS)
+        layers = _layers(net, 2 * len(lags), ACTIVATIONS[activation]).to(drive.device)
+        seen = SubstepRing(drive, "seen", max(lags) + 1, 2 * drive.num_joints)
+
+        def predict(error_EN: Tensor, vel_EN: Tensor) -> Tensor:
+            seen.push(torch.cat((error_EN, vel_EN), dim=1))
+            errors, velocities = zip(*(seen.at(lag).chunk(2, dim=1) for lag in lags), strict=True)
+            return layers(torch.stack((*errors, *velocities), dim=-1))[..., 0]
+
+        return predict
+
+    def _lags(self, net: NetFile) -> tuple[int, ...]:
+        lags = self.setting(net, "input_lags")
+        if isinstance(lags, str):
+            name = f"{net.where}: input_lags"
+            try:
+                lags = tuple(json.loads(lags))
+            except (TypeError, ValueError):
+                raise ValueError(
+                    f"{name}={lags!r} in its metadata: expected a list such as [0, 2, 4]"
+                ) from None
+            _check_lags(name, lags)
+        return lags
+
+
+def _check_lags(name: str, lags: tuple[int, ...]) -> None:
+    whole = all(isinstance(lag, int) and not isinstance(lag, bool) and lag >= 0 for lag in lags)
+    if not lags or not whole:
+        raise ValueError(f"{name}={lags!r}: expected whole numbers of substeps of at least 0")
+
+
+def _layers(net: NetFile, num_inputs: int, activation: type[nn.Module]) -> nn.Sequential:
+    """Build the network of a file, checked layer by layer."""
+    numbers = sorted(
+        int(name.removesuffix(".weight"))
+        for name in net.tensors
+        if name.endswith(".weight") and name.removesuffix(".weight").isdecimal()
+    )
+    if not numbers:
+        net.tensor("0.weight", -1, num_inputs)
+    net.check_all_known({f"{number}.{part}" for number in numbers for part in ("weight", "bias")})
+    layers: list[nn.Module] = []
+    width = num_inputs
+    for number in numbers:
+        weight = net.tensor(f"{number}.weight", 1 if number == numbers[-1] else -1, width)
+        bias = net.tensor(f"{number}.bias", weight.shape[0])
+        linear = nn.Linear(width, weight.shape[0])
+        linear.weight.data, linear.bias.data = weight.clone(), bias.clone()
+        layers += [linear, activation()]
+        width = weight.shape[0]
+    return nn.Sequential(*layers[:-1]).requires_grad_(False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LSTMActuator(NetActuator):
+    """A recurrent network of position error and velocity, which advances by one step per physics substep.
+
+    The file holds the state of a module with `lstm = nn.LSTM(2, H, num_layers)` and `head = nn.Linear(H, 1)`:
+    `lstm.weight_ih_l0` [4 H, 2], `lstm.weight_hh_l0`, `lstm.bias_ih_l0`, `lstm.bias_hh_l0`, further layers, and
+    `head.weight`, `head.bias`. Rows that reset start with hidden and cell state zero, as `nn.LSTM` does.
+    """
+
+    def load(self, net: NetFile, drive: Drive) -> Predictor:
+        """Return the network with its state."""
+        found = [re.fullmatch(r"lstm\.weight_ih_l(\d+)", name) for name in net.tensors]
+        num_layers = max(1, sum(match is not None for match in found))
+        size = net.tensor("lstm.weight_hh_l0", -1, -1).shape[1]
+        layers: list[list[Tensor]] = []
+        for layer in range(num_layers):
+            shapes = ((4 * size, size if layer else 2), (4 * size, size), (4 * size,), (4 * size,))
+            named = zip((f"lstm.{part}_l{layer}" for part in _LSTM_PARTS), shapes, strict=True)
+            layers.append([net.tensor(name, *shape) for name, shape in named])
+        names = {f"lstm.{part}_l{layer}" for part in _LSTM_PARTS for layer in range(num_layers)}
+        net.check_all_known(names | {"head.weight", "head.bias"})
+        head, head_bias = net.tensor("head.weight", 1, size), net.tensor("head.bias", 1)
+        layers = [[weight.to(drive.device) for weight in layer] for layer in layers]
+        head, head_bias = head.to(drive.device), head_bias.to(drive.device)
+        num_rows = drive.num_envs * drive.num_joints
+        buffers = [
+            tuple(drive.buffer(f"{kind}{layer}_ENH", drive.num_joints, size) for kind in ("hidden", "cell"))
+            for layer in range(num_layers)
+        ]
+
+        def predict(error_EN: Tensor, vel_EN: Tensor) -> Tensor:
+            value = torch.stack((error_EN, vel_EN), dim=-1).view(num_rows, 2)
+            for (hidden_ENH, cell_ENH), layer in zip(buffers, layers, strict=True):
+                hidden, cell = hidden_ENH.view(num_rows, size), cell_ENH.view(num_rows, size)
+                value, next_cell = torch.lstm_cell(value, (hidden, cell), *layer)
+                hidden.copy_(value)
+                cell.copy_(next_cell)
+            return functional.linear(value, head, head_bias).view(drive.num_envs, drive.num_joints)
+
+        return predict
