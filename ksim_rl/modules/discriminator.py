@@ -31,7 +31,7 @@ class Discriminator(nn.Module):
         self.layers = mlp(2 * dim, hidden_dims, 1, activation=activation, device=device)
 
     @property
-    def logit_weight(self) -> Float[Tensor, "1 L"]:
+    def logit_weight_1L(self) -> Float[Tensor, "1 L"]:
         """The weights of the last layer."""
         last = self.layers[-1]
         assert isinstance(last, nn.Linear)

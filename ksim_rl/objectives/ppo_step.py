@@ -130,7 +130,7 @@ def ppo_step(
         optimizer: from `make_optimizer`; another one must be fused, with a tensor as learning rate.
 
     Returns:
-        What the loss returns, detached, and `loss`, `grad_norm` (before clipping), `learning_rate` (of this
+        The tensors that the loss returns, detached, and `loss`, `grad_norm` (before clipping), `learning_rate` (of this
         step), `skipped` (0 or 1).
     """
     losses = loss(minibatch_B)
@@ -148,7 +148,8 @@ def ppo_step(
     if guard is not None:
         guard.count_(found_inf)
     return {
-        **{name: value.detach() for name, value in losses.items()},
+        # Several actions have an entropy each, in a TensorDict beside their sum.
+        **{name: value.detach() for name, value in losses.items() if isinstance(value, Tensor)},
         "loss": total.detach(),
         "grad_norm": grad_norm,
         "learning_rate": learning_rate.clone(),

@@ -1,10 +1,11 @@
 """The page about learning: it lists what there is, and its examples run as they stand."""
 
 import re
-from importlib.resources import files
 
 import pytest
+from hydra.core.config_store import ConfigStore
 
+from ksim_rl import conf
 from tests.docs.guide import DOCS
 
 PAGE = (DOCS / "learning.md").read_text()
@@ -13,7 +14,8 @@ EXAMPLES = dict(re.findall(r"<!-- example: (\w+) -->\n```python\n(.*?)```", PAGE
 
 @pytest.mark.parametrize("group", ["objective", "modules"])
 def test_every_choice_of_a_group_is_in_its_table(group):
-    choices = {path.name.removesuffix(".yaml") for path in files("ksim_rl.conf").joinpath(group).iterdir()}
+    conf.register()
+    choices = {name.removesuffix(".yaml") for name in ConfigStore.instance().repo[group]}
     table = PAGE.split(f"| `{group}=` |")[1].split("\n\n")[0]
     listed = {name for row in table.splitlines()[1:] for name in re.findall(r"`(\w+)`", row.split("|")[1])}
     assert listed == choices

@@ -10,7 +10,6 @@ import torch
 from ksim_rl import envs
 from ksim_rl.config import plugins
 from ksim_rl.physics import SimCfg
-from ksim_rl.physics.sim_cfg import CONES, INTEGRATORS, SOLVERS
 from ksim_rl.scene.rendering import rendering
 
 DT = 0.01
@@ -158,7 +157,7 @@ def test_sim_fields_reach_the_physics():
     world = made(*(f"task.sim.{name}={value}" for name, value in SIM.items())).base_env.world
     option, warp_option = world.mj_model.opt, world.warp_model.opt
     assert (option.timestep, option.impratio, option.ccd_iterations) == (0.002, 3.0, 7)
-    named = (INTEGRATORS["euler"], SOLVERS["cg"], CONES["elliptic"])
+    named = (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtSolver.mjSOL_CG, mujoco.mjtCone.mjCONE_ELLIPTIC)
     assert (option.integrator, option.solver, option.cone) == named
     assert (int(warp_option.integrator), int(warp_option.solver), int(warp_option.cone)) == named
     assert (warp_option.iterations, warp_option.ls_iterations, warp_option.ccd_iterations) == (3, 4, 7)

@@ -9,13 +9,13 @@ import importlib
 import pytest
 import torch
 
+from ksim_rl.algorithms import gradient_steps as gradient_steps_module
+from ksim_rl.algorithms.ppo import update as ppo_update_module
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.data import EpochSampler
 from ksim_rl.modules import ObservationNormalizer
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.rollout_estimator import RolloutEstimator, Signals
-from ksim_rl.trainers import gradient_steps as gradient_steps_module
-from ksim_rl.trainers import ppo_update as ppo_update_module
 from tests.integration.probes import GAMMA, E, ProbeEnv, Run, T, one, sign_only, the_sign
 
 # The package has a function of the same name.
@@ -87,7 +87,7 @@ def test_bootstrap_from_the_reset_observation(advantage, monkeypatch):
 @pytest.mark.parametrize("advantage", ESTIMATORS)
 def test_bootstrap_after_a_termination(advantage, monkeypatch):
     check_termination(advantage)
-    monkeypatch.setattr(Signals, "discounted", lambda self, value, gamma: gamma * value)
+    monkeypatch.setattr(Signals, "bootstrap", lambda self, value, gamma: gamma * value)
     with pytest.raises(AssertionError):
         check_termination(advantage)
 
@@ -99,7 +99,7 @@ def test_returns_that_leak_over_the_end_of_an_episode(advantage, monkeypatch):
 
     def buggy(self, *args):
         found = signals(self, *args)
-        object.__setattr__(found, "done", found.terminated)  # "time is up" is taken for "goes on"
+        object.__setattr__(found, "done_ET", found.terminated_ET)  # "time is up" is taken for "goes on"
         return found
 
     monkeypatch.setattr(RolloutEstimator, "_signals", buggy)

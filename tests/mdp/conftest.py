@@ -30,3 +30,9 @@ def make_bench():
 def boxes(make_bench):
     """Two worlds with boxes "a" (3 kg) and "b" (1 kg) and the contact sensor "touch"."""
     return make_bench(BOXES, 2, {"touch": ContactSensor(geoms=("a", "b"))})
+
+
+@pytest.fixture
+def crowd(make_bench):
+    """Return 500 worlds of the trunk with two legs, for events that draw."""
+    return make_bench(FREE_BODY, 500, soft_joint_pos_limit_factor=0.5)

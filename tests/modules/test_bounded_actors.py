@@ -62,7 +62,7 @@ def test_exploration_is_uniform_first_and_then_has_the_noise_of_each_env():
         obs_dim=4,
         action_spec=Bounded(LOW, HIGH, (2,)),
     )
-    policy = ExploringPolicy(actor, low=LOW, high=HIGH, num_envs=6, noise_min=0.05, noise_max=0.3)
+    policy = ExploringPolicy(actor, low_L=LOW, high_L=HIGH, num_envs=6, noise_min=0.05, noise_max=0.3)
     obs = torch.randn(6, 4)
 
     def actions():

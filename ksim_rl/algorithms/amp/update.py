@@ -185,7 +185,7 @@ class AMPUpdate(RolloutUpdate):
                 gradient_penalty=self.cfg.gradient_penalty,
                 mask_B=minibatch_B.get(("collector", "mask")).squeeze(-1),
             )
-            loss = loss + self.cfg.logit_decay * net.logit_weight.square().sum()
+            loss = loss + self.cfg.logit_decay * net.logit_weight_1L.square().sum()
             _, skipped = descend(loss, self.optimizer, max_grad_norm=self.cfg.max_grad_norm)
             self.guard.count_(skipped)
             made.append(
