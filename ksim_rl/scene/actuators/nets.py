@@ -24,7 +24,7 @@ ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "softsign": nn.Softsign, "tanh": 
 _SCALES = ("position_scale", "velocity_scale", "effort_scale")
 _LSTM_PARTS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 
-Predictor = Callable[[Tensor, Tensor], Tensor]
+Predictor = Callable[[Float[Tensor, "E N"], Float[Tensor, "E N"]], Float[Tensor, "E N"]]
 """A network at work: efforts [E, N] from position errors [E, N] and velocities [E, N]."""
 
 
@@ -186,7 +186,7 @@ class MLPActuator(NetActuator):
         layers = _layers(net, 2 * len(lags), ACTIVATIONS[activation]).to(drive.device)
         seen = SubstepRing(drive, "seen", max(lags) + 1, 2 * drive.num_joints)
 
-        def predict(error_EN: Tensor, vel_EN: Tensor) -> Tensor:
+        def predict(error_EN: Float[Tensor, "E N"], vel_EN: Float[Tensor, "E N"]) -> Float[Tensor, "E N"]:
             seen.push(torch.cat((error_EN, vel_EN), dim=1))
             errors, velocities = zip(*(seen.at(lag).chunk(2, dim=1) for lag in lags), strict=True)
             return layers(torch.stack((*errors, *velocities), dim=-1))[..., 0]
@@ -265,7 +265,7 @@ class LSTMActuator(NetActuator):
             for layer in range(num_layers)
         ]
 
-        def predict(error_EN: Tensor, vel_EN: Tensor) -> Tensor:
+        def predict(error_EN: Float[Tensor, "E N"], vel_EN: Float[Tensor, "E N"]) -> Float[Tensor, "E N"]:
             value = torch.stack((error_EN, vel_EN), dim=-1).view(num_rows, 2)
             for (hidden_ENH, cell_ENH), layer in zip(buffers, layers, strict=True):
                 hidden, cell = hidden_ENH.view(num_rows, size), cell_ENH.view(num_rows, size)
