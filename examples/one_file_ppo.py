@@ -36,7 +36,7 @@ from ksim_rl.modules import (
     observation_dim,
     update_normalizers,
 )
-from ksim_rl.modules.gaussian_head import MIN_STD
+from ksim_rl.modules.heads import MIN_STD
 from ksim_rl.objectives import (
     PPOCfg,
     StepGuard,

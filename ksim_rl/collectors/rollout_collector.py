@@ -1,8 +1,7 @@
 """This module collects rollouts of fixed length from all envs, as one CUDA graph where there is CUDA."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -13,11 +12,28 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl import dims
+from ksim_rl.checked import Checked, Count
 from ksim_rl.checks import check_count
-from ksim_rl.collectors.collector_cfg import CollectorCfg
 from ksim_rl.device.capture import Captured
 from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.envs.masked_reset import MaskedReset
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectorCfg(Checked):
+    """Options of `RolloutCollector` that a config may set.
+
+    Attributes:
+        require_graphs: on CUDA, fail where CUDA graphs are unavailable instead of running slower with a warning.
+        stagger_episodes: at the first reset, spread the time-outs of the envs over an episode's length, where the env
+            offers it, so that not all episodes are in the same phase.
+        warmup: on CUDA, how many rollouts run eagerly before one is captured; they are ordinary rollouts.
+    """
+
+    require_graphs: bool = False
+    stagger_episodes: bool = False
+    warmup: Count = 2
+
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 

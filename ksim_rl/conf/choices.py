@@ -19,8 +19,8 @@ HINTS = get_type_hints(RunCfg)
 DEFAULTS = default_tree(RunCfg)
 
 
-def _with_memory(kind: str) -> ModulesCfg:
-    return ModulesCfg(recurrent_actor=RecurrentCfg(kind=kind), recurrent_critic=RecurrentCfg(kind=kind))
+def _with_memory(memory: RecurrentCfg) -> ModulesCfg:
+    return ModulesCfg(recurrent_actor=memory, recurrent_critic=memory)
 
 
 # By group and name. The data and networks of an algorithm that are none of these go by its own name.
@@ -28,8 +28,8 @@ CHOICES: dict[str, dict[str, Any]] = {
     "data": {"on_policy": DATA, "off_policy": MANY_ENVS, "off_policy_small": FEW_ENVS},
     "modules": {
         "mlp": ModulesCfg(),
-        "gru": _with_memory("gru"),
-        "lstm": _with_memory("lstm"),
+        "gru": _with_memory(RecurrentCfg(kind="gru")),
+        "lstm": _with_memory(RecurrentCfg(kind="lstm")),
         "shared_trunk": ModulesCfg(
             trunk=SharedTrunkCfg(),
             # The trunk normalizes.

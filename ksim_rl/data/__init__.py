@@ -1,13 +1,10 @@
 """This room has TorchRL replay buffers for the env states that an RL update learns from."""
 
-from ksim_rl.data.dataset_buffer import DatasetBuffer
-from ksim_rl.data.dataset_cfg import DatasetCfg, rollout_length
+from ksim_rl.data.dataset_buffer import DatasetBuffer, DatasetCfg, rollout_length
 from ksim_rl.data.dataset_storage import MASK_KEY, DatasetStorage, DatasetWriter
 from ksim_rl.data.epoch_sampler import EpochSampler
-from ksim_rl.data.priority_sampler import PrioritySampler
-from ksim_rl.data.replay_cfg import ReplayCfg
-from ksim_rl.data.replay_ring import ReplayRing
-from ksim_rl.data.replay_sampler import ReplaySampler
+from ksim_rl.data.replay_ring import ReplayCfg, ReplayRing
+from ksim_rl.data.replay_samplers import PrioritySampler, ReplaySampler
 from ksim_rl.data.replay_storage import ReplayStorage, ReplayWriter
 from ksim_rl.data.sequence_sampler import BURN_IN_KEY, SequenceSampler, sequence_length
 

@@ -7,10 +7,31 @@ import torch
 from jaxtyping import Int64
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data.replay_buffers import Writer
 from torchrl.data.replay_buffers.storages import TensorStorage
 
 from ksim_rl import dims
-from ksim_rl.data.stateless_writer import StatelessWriter
+
+
+class Stateless:
+    """The part of TorchRL writers and samplers without a state of their own: all that they know is the storage's."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return nothing."""
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Read nothing."""
+
+    def dumps(self, path: Any) -> None:
+        """Write nothing."""
+
+    def loads(self, path: Any) -> None:
+        """Read nothing."""
+
+    def _empty(self, empty_write_count: bool = True) -> None:
+        """Forget nothing."""
+
 
 # Where TorchRL's losses look for rows to leave out (`LossModule.loss_mask_key`), stock ones included.
 MASK_KEY = ("collector", "mask")
@@ -112,7 +133,7 @@ class DatasetStorage(TensorStorage):
         return stored
 
 
-class DatasetWriter(StatelessWriter):
+class DatasetWriter(Stateless, Writer):
     """Writes a whole dataset at once into a `DatasetStorage`."""
 
     _storage: DatasetStorage

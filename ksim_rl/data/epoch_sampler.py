@@ -28,14 +28,12 @@ class EpochSampler(Sampler):
         drop_last: leave out the last, smaller minibatch when the sizes do not divide.
     """
 
+    # Whether the last minibatch was the last of its epoch; iterating over the buffer stops there.
+    ran_out: bool = False  # pyright: ignore[reportIncompatibleMethodOverride]
+
     def __init__(self, *, seed: int = 0, shuffle: bool = True, drop_last: bool = False) -> None:
-        self.seed = seed
-        self.shuffle = shuffle
-        self.drop_last = drop_last
-        self._size = 0
-        self._position = 0
-        self._ran_out = False
-        self._first_epoch = 0
+        self.seed, self.shuffle, self.drop_last = seed, shuffle, drop_last
+        self._size = self._position = self._first_epoch = 0
         # Device tensors: epochs started so far, and the order of the present one.
         self._epoch: Tensor | None = None
         self._order_D: Tensor | None = None
@@ -54,8 +52,7 @@ class EpochSampler(Sampler):
 
     def restart(self) -> None:
         """Leave the present epoch: the next sample is the first of a new one."""
-        self._position = 0
-        self._ran_out = False
+        self._position, self.ran_out = 0, False
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
         """Return the indices of the next minibatch [B] and an empty info dict.
@@ -91,8 +88,8 @@ class EpochSampler(Sampler):
         index = self._order_D[self._position : self._position + batch_size]
         self._position += batch_size
         left = size - self._position
-        self._ran_out = left <= 0 or (self.drop_last and left < batch_size)
-        if self._ran_out:
+        self.ran_out = left <= 0 or (self.drop_last and left < batch_size)
+        if self.ran_out:
             self._position = 0
         self._remaining_batches = left // batch_size if self.drop_last else -(-left // batch_size)
         return index
@@ -106,15 +103,6 @@ class EpochSampler(Sampler):
         self._epoch.add_(1)
         return order_D
 
-    @property
-    def ran_out(self) -> bool:
-        """Whether the last minibatch was the last of its epoch; iterating over the buffer stops there."""
-        return self._ran_out
-
-    @ran_out.setter
-    def ran_out(self, value: bool) -> None:
-        self._ran_out = value
-
     def state_dict(self) -> dict[str, int]:
         """Return the integers from which the orders continue exactly (reads the epoch counter on the host)."""
         epoch = self._first_epoch if self._epoch is None else int(self._epoch)
@@ -125,17 +113,14 @@ class EpochSampler(Sampler):
         self.seed = int(state_dict["seed"])
         self._first_epoch = int(state_dict["epoch"])
         self._size, self._position = int(state_dict["size"]), int(state_dict["position"])
-        self._ran_out = False
+        self.ran_out = False
         device = torch.device("cpu") if self._epoch is None else self._epoch.device
         if self._epoch is not None:
             self._epoch.fill_(self._first_epoch)
         if self._position > 0:
             previous = torch.full((), self._first_epoch - 1, dtype=torch.int64, device=device)
-            self._order_D = (
-                permutation(self.seed, previous, self._size)
-                if self.shuffle
-                else torch.arange(self._size, device=device)
-            )
+            unshuffled = torch.arange(self._size, device=device)
+            self._order_D = permutation(self.seed, previous, self._size) if self.shuffle else unshuffled
 
     def dumps(self, path: str | Path) -> None:
         """Write the state as JSON into the folder `path`."""
@@ -149,9 +134,8 @@ class EpochSampler(Sampler):
 
     def _empty(self) -> None:
         self._size = 0
-        self._position = 0
-        self._ran_out = False
         self._order_D = None
+        self.restart()
 
 
 def permutation(seed: int, epoch: Int64[Tensor, ""], size: int) -> Int64[Tensor, " D"]:

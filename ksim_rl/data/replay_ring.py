@@ -1,6 +1,7 @@
 """This module has the replay of off-policy learning: it holds the last env states of each env."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,10 +12,60 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 
 from ksim_rl import dims
-from ksim_rl.data.priority_sampler import PrioritySampler
-from ksim_rl.data.replay_cfg import ReplayCfg
-from ksim_rl.data.replay_sampler import ReplaySampler
+from ksim_rl.checked import Checked, Count, NonNegative, Share
+from ksim_rl.data.replay_samplers import PrioritySampler, ReplaySampler
 from ksim_rl.data.replay_storage import ReplayStorage, ReplayWriter
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayCfg(Checked):
+    """How many env states a rollout adds to the replay, how many it keeps, and how many a gradient step sees.
+
+    One iteration is `num_steps` steps of each env and then `num_minibatches` gradient steps, so that there are
+    `num_minibatches / num_steps` gradient steps per step. The recipe of FastTD3 alternates 1 step and u gradient steps;
+    T steps and then T * u gradient steps is the same but for actions that are up to T - 1 steps older than the newest
+    policy, and each iteration is only two graphs, whatever T is.
+
+    Attributes:
+        num_env_states_per_minibatch: B, env states in one gradient step.
+        num_minibatches: gradient steps per iteration.
+        num_steps: T, steps of each env per iteration.
+        capacity: env states that are kept per env. An episode's end takes one more, for its terminal observation.
+        n_step: rewards that a target sums before it bootstraps.
+        learning_starts: steps of each env with random actions before the first gradient step.
+        prioritized: draw env states by their last temporal-difference error (Schaul et al., arXiv 1511.05952) and not
+            uniformly.
+        priority_alpha: how strongly the error counts; 0 is uniform.
+        priority_beta: how far the weights of the losses undo that; 1 is wholly.
+        save_replay: keep the env states in checkpoints. Without, checkpoints are small and a resumed run begins with
+            an empty replay and random actions until `learning_starts`, so that it is not the same run any more.
+    """
+
+    num_env_states_per_minibatch: Count
+    num_minibatches: Count
+    num_steps: Count = 1
+    capacity: Count = 1024
+    n_step: Count = 1
+    learning_starts: Count = 10
+    prioritized: bool = False
+    priority_alpha: NonNegative = 0.6
+    priority_beta: Share = 0.4
+    save_replay: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse a ring that is too small for its rollouts."""
+        super().__post_init__()
+        # A rollout whose episodes all end at once takes two places per env state, and must not overwrite itself.
+        least = 2 * self.num_steps + self.n_step
+        if self.capacity < least:
+            raise ValueError(
+                f"capacity={self.capacity} is less than 2 * num_steps + n_step = {least}: "
+                "one rollout would overwrite itself; raise capacity"
+            )
+
+    def rollout_length(self, num_envs: int) -> int:
+        """Return T, which does not depend on the number of envs."""
+        return self.num_steps
 
 
 class ReplayRing(ReplayBuffer):
@@ -55,7 +106,7 @@ class ReplayRing(ReplayBuffer):
             storage=self._ring,
             sampler=priorities if cfg.prioritized else ReplaySampler(),
             writer=ReplayWriter(),
-            collate_fn=_as_it_is,
+            collate_fn=lambda data: data,
             batch_size=cfg.num_env_states_per_minibatch,
         )
         self.cfg = cfg
@@ -101,7 +152,3 @@ class ReplayRing(ReplayBuffer):
             return
         self._ring.load_state_dict(state_dict["ring"])
         self._sampler.load_state_dict(state_dict["sampler"])
-
-
-def _as_it_is(data: TensorDictBase) -> TensorDictBase:
-    return data

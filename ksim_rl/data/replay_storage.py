@@ -7,11 +7,11 @@ from jaxtyping import Int64
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data.replay_buffers import Writer
 from torchrl.data.replay_buffers.storages import Storage
 
 from ksim_rl import dims
-from ksim_rl.data.dataset_storage import MASK_KEY
-from ksim_rl.data.stateless_writer import StatelessWriter
+from ksim_rl.data.dataset_storage import MASK_KEY, Stateless
 
 REWARD: NestedKey = ("next", "reward")
 DONE: NestedKey = ("next", "done")
@@ -20,7 +20,19 @@ STEPS: NestedKey = "steps_to_next_obs"
 _LEAVES = (REWARD, DONE, TERMINATED)
 
 
-class ReplayStorage(Storage):
+class SavedByStateDict:
+    """The part of TorchRL storages and samplers that are saved by their `state_dict` alone, as checkpoints do."""
+
+    def dumps(self, path: Any) -> None:
+        """Refuse, as does `loads`."""
+        raise NotImplementedError(
+            f"a {type(self).__name__} is saved by its state_dict() and restored by load_state_dict()"
+        )
+
+    loads = dumps
+
+
+class ReplayStorage(SavedByStateDict, Storage):
     """A TorchRL storage of the last env states of E envs, at addresses that never change.
 
     Each env has a ring of places. An env state takes one: its observation, action, reward and flags. The observation
@@ -161,9 +173,8 @@ class ReplayStorage(Storage):
 
     def state_dict(self) -> dict[str, Any]:
         """Return the ring and where its newest places are."""
-        content = {} if self.content is None else self.content.flatten_keys("/").to_dict()
         return {
-            "content": content,
+            "content": {} if self.content is None else self.content.flatten_keys("/").to_dict(),
             "available": self.available,
             "head": self.head_E,
             "filled": self.filled_E,
@@ -198,28 +209,17 @@ class ReplayStorage(Storage):
         for tensor in (self.available, self.head_E, self.filled_E):
             tensor.zero_()
 
-    def dumps(self, path: Any) -> None:
-        """Refuse: the trainer's checkpoints hold the `state_dict`."""
-        raise NotImplementedError("a replay is saved by its state_dict()")
-
-    def loads(self, path: Any) -> None:
-        """Refuse: the trainer's checkpoints hold the `state_dict`."""
-        raise NotImplementedError("a replay is restored by load_state_dict()")
-
     def _allocate(self, rollout_ET: TensorDictBase) -> None:
         produced = list(rollout_ET.keys(True, True))
-        missing = [
-            key
-            for key in (*self.observations, *map(_next, self.observations), *_LEAVES)
-            if key not in produced
-        ]
+        needed = (*self.observations, *map(_next, self.observations), *_LEAVES)
+        missing = [key for key in needed if key not in produced]
         if missing:
             raise ValueError(f"the rollout lacks {missing}; it has {sorted(map(str, produced))}")
-        kept = [key for key in produced if key[0] != "next" or key in _LEAVES]
-        ring = {}
-        for key in kept:
-            leaf = rollout_ET.get(key)
-            ring[key] = torch.zeros(self.max_size, *leaf.shape[2:], dtype=leaf.dtype, device=self.device)
+        ring = {
+            key: torch.zeros(self.max_size, *leaf.shape[2:], dtype=leaf.dtype, device=self.device)
+            for key, leaf in rollout_ET.items(True, True)
+            if key[0] != "next" or key in _LEAVES
+        }
         self.content = TensorDict(ring, batch_size=[self.max_size], device=self.device)
 
     def _head_index(self) -> Tensor:
@@ -270,7 +270,7 @@ class ReplayStorage(Storage):
         return reward_B, done_B, terminated_B, steps_B
 
 
-class ReplayWriter(StatelessWriter):
+class ReplayWriter(Stateless, Writer):
     """Adds rollouts to a `ReplayStorage`."""
 
     _storage: ReplayStorage

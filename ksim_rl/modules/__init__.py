@@ -1,7 +1,6 @@
 """This room has the networks: actor, critic and the parts that they are made of, each a TorchRL or torch module."""
 
 from ksim_rl.modules.actor import PolicyNetwork, make_actor
-from ksim_rl.modules.actor_cfg import ActorCfg
 from ksim_rl.modules.bounded_actors import (
     DeterministicActorCfg,
     SquashedActorCfg,
@@ -9,30 +8,34 @@ from ksim_rl.modules.bounded_actors import (
     make_squashed_actor,
 )
 from ksim_rl.modules.categorical import Categorical
-from ksim_rl.modules.critic import CriticCfg, ValueNetwork, make_critic
-from ksim_rl.modules.diagonal_gaussian import DiagonalGaussian
+from ksim_rl.modules.collecting_policies import ExploringPolicy, MixedPolicy
+from ksim_rl.modules.critic import CriticCfg, QNetwork, QNetworkCfg, ValueNetwork, make_critic, make_q_network
 from ksim_rl.modules.discriminator import Discriminator
-from ksim_rl.modules.exploring_policy import ExploringPolicy
-from ksim_rl.modules.mixed_policy import MixedPolicy
+from ksim_rl.modules.gaussians import DiagonalGaussian, TanhGaussian, TruncatedGaussian
+from ksim_rl.modules.heads import ActorCfg
 from ksim_rl.modules.mlp import ACTIVATIONS, mlp
-from ksim_rl.modules.observation_keys import ObservationKey, observation_dim
-from ksim_rl.modules.observation_normalizer import ObservationNormalizer, update_normalizers
-from ksim_rl.modules.q_network import QNetwork, QNetworkCfg, make_q_network
+from ksim_rl.modules.network import (
+    FEATURES,
+    ObservationKey,
+    ObservationNormalizer,
+    SharedTrunkCfg,
+    make_shared_trunk,
+    observation_dim,
+    update_normalizers,
+)
 from ksim_rl.modules.recurrent import (
     RecurrentCfg,
     RecurrentModule,
     RecurrentNetwork,
+    RecurrentStatePrimer,
     make_recurrent_actor,
     make_recurrent_critic,
     memories,
+    recurrent_transforms,
     state_spec,
     with_memory,
 )
-from ksim_rl.modules.recurrent_primer import RecurrentStatePrimer, recurrent_transforms
 from ksim_rl.modules.recurrent_state import CarriedState, burnt_in
-from ksim_rl.modules.shared_trunk import FEATURES, SharedTrunkCfg, make_shared_trunk
-from ksim_rl.modules.tanh_gaussian import TanhGaussian
-from ksim_rl.modules.truncated_gaussian import TruncatedGaussian
 
 __all__ = [
     "ACTIVATIONS",

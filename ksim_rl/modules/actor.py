@@ -1,6 +1,5 @@
 """This module builds the stochastic policy: normalization, an MLP and a distribution of the action."""
 
-import torch
 from jaxtyping import Float
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
@@ -10,9 +9,8 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor
 
 from ksim_rl.modules.action_head import make_head
-from ksim_rl.modules.actor_cfg import ActorCfg
-from ksim_rl.modules.mixed_head import PARAMETERS, MixedHead
-from ksim_rl.modules.mlp import trunk
+from ksim_rl.modules.heads import PARAMETERS, ActorCfg, MixedHead
+from ksim_rl.modules.mlp import Device, mlp
 from ksim_rl.modules.network import ObservingNetwork
 
 
@@ -23,11 +21,9 @@ class PolicyNetwork(ObservingNetwork):
         head: the last layer, which also knows the distribution.
     """
 
-    def __init__(
-        self, cfg: ActorCfg, *, obs_dim: int, head: nn.Module, device: torch.device | str | None = None
-    ) -> None:
+    def __init__(self, cfg: ActorCfg, *, obs_dim: int, head: nn.Module, device: Device = None) -> None:
         super().__init__(cfg, obs_dim=obs_dim, device=device)
-        self.trunk = trunk(obs_dim, cfg.hidden_dims, activation=cfg.activation, device=device)
+        self.trunk = mlp(obs_dim, cfg.hidden_dims, None, activation=cfg.activation, device=device)
         self.head = head
 
     def forward(self, *observations: Float[Tensor, "*batch ?L"]) -> tuple[Float[Tensor, "*batch ?N"], ...]:
@@ -41,7 +37,7 @@ def make_actor(
     obs_dim: int,
     action_dim: int | None = None,
     action_spec: TensorSpec | None = None,
-    device: torch.device | str | None = None,
+    device: Device = None,
 ) -> ProbabilisticActor:
     """Build the policy as TorchRL's `ProbabilisticActor`.
 

@@ -1,8 +1,8 @@
 """This module builds policies whose actions lie in a box: TD3's deterministic one and SAC's squashed gaussian."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
-import torch
 from jaxtyping import Float, Float32
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
@@ -11,11 +11,11 @@ from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor
 
-from ksim_rl.checks import check_in_range
-from ksim_rl.modules.action_range import action_range
-from ksim_rl.modules.mlp import mlp
+from ksim_rl.checked import NonNegative, Positive
+from ksim_rl.modules.action_head import action_range
+from ksim_rl.modules.gaussians import TanhGaussian
+from ksim_rl.modules.mlp import Device
 from ksim_rl.modules.network import ObservingNetwork, OffPolicyNetworkCfg
-from ksim_rl.modules.tanh_gaussian import TanhGaussian
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,13 +26,8 @@ class BoundedActorCfg(OffPolicyNetworkCfg):
         action_bound: actions lie in [-action_bound, action_bound] where the env's action spec has no bounds.
     """
 
-    output_gain: float = 0.01
-    action_bound: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range, naming the field."""
-        super().__post_init__()
-        check_in_range("action_bound", self.action_bound, low=0.0, low_open=True)
+    output_gain: NonNegative = 0.01
+    action_bound: Positive = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,10 +49,8 @@ class SquashedActorCfg(BoundedActorCfg):
     log_std_max: float = 2.0
 
     def __post_init__(self) -> None:
-        """Refuse values out of range, naming the field."""
+        """Refuse an empty range."""
         super().__post_init__()
-        check_in_range("log_std_min", self.log_std_min)
-        check_in_range("log_std_max", self.log_std_max)
         if self.log_std_min >= self.log_std_max:
             raise ValueError(
                 f"log_std_min={self.log_std_min!r} is not below log_std_max={self.log_std_max!r}"
@@ -65,38 +58,25 @@ class SquashedActorCfg(BoundedActorCfg):
 
 
 class BoundedActor(ObservingNetwork):
-    """Normalization, hidden layers, and a last layer: [..., L] to [..., output_dim].
+    """Normalization, hidden layers, and a last layer: [..., L] to [..., outputs_per_action * action_dim].
 
     Attributes:
         low, high: of the actions, [action_dim].
     """
 
+    outputs_per_action: ClassVar[int] = 1
     low: Tensor
     high: Tensor
 
     def __init__(
-        self,
-        cfg: BoundedActorCfg,
-        *,
-        obs_dim: int,
-        output_dim: int,
-        action_spec: TensorSpec,
-        device: torch.device | str | None = None,
+        self, cfg: BoundedActorCfg, *, obs_dim: int, action_spec: TensorSpec, device: Device = None
     ) -> None:
         super().__init__(cfg, obs_dim=obs_dim, device=device)
         self.cfg = cfg
         low, high = action_range(action_spec, cfg.action_bound, device=device)
         self.register_buffer("low", low)
         self.register_buffer("high", high)
-        self.layers = mlp(
-            obs_dim,
-            cfg.hidden_dims,
-            output_dim,
-            activation=cfg.activation,
-            layer_norm=cfg.layer_norm,
-            output_gain=cfg.output_gain,
-            device=device,
-        )
+        self.layers = cfg.build(obs_dim, self.outputs_per_action * action_spec.shape[-1], device=device)
 
     def output(self, obs: Float[Tensor, "*batch L"]) -> Float32[Tensor, "*batch output_dim"]:
         """Return what the last layer says."""
@@ -116,6 +96,7 @@ class DeterministicPolicy(BoundedActor):
 class SquashedPolicy(BoundedActor):
     """Maps an observation [..., L] to `loc` and `scale` before squashing, each [..., action_dim]."""
 
+    outputs_per_action = 2
     cfg: SquashedActorCfg
 
     def forward(
@@ -134,16 +115,14 @@ def make_deterministic_actor(
     obs_dim: int,
     action_spec: TensorSpec,
     in_key: NestedKey = "actor",
-    device: torch.device | str | None = None,
+    device: Device = None,
 ) -> TensorDictModule:
     """Build the policy as a TensorDict module: reads `in_key` [..., obs_dim], writes "action" [..., action_dim].
 
     Args:
         action_spec: the env's; its bounds, where it has any, are those of the actions.
     """
-    policy = DeterministicPolicy(
-        cfg, obs_dim=obs_dim, output_dim=action_spec.shape[-1], action_spec=action_spec, device=device
-    )
+    policy = DeterministicPolicy(cfg, obs_dim=obs_dim, action_spec=action_spec, device=device)
     return TensorDictModule(policy, in_keys=[in_key], out_keys=["action"])
 
 
@@ -153,7 +132,7 @@ def make_squashed_actor(
     obs_dim: int,
     action_spec: TensorSpec,
     in_key: NestedKey = "actor",
-    device: torch.device | str | None = None,
+    device: Device = None,
 ) -> ProbabilisticActor:
     """Build the policy as TorchRL's `ProbabilisticActor`.
 
@@ -163,9 +142,7 @@ def make_squashed_actor(
     Args:
         action_spec: the env's; its bounds, where it has any, are those of the actions.
     """
-    policy = SquashedPolicy(
-        cfg, obs_dim=obs_dim, output_dim=2 * action_spec.shape[-1], action_spec=action_spec, device=device
-    )
+    policy = SquashedPolicy(cfg, obs_dim=obs_dim, action_spec=action_spec, device=device)
     return ProbabilisticActor(
         TensorDictModule(policy, in_keys=[in_key], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],

@@ -1,16 +1,18 @@
-"""This module builds the state value function: normalization and an MLP."""
+"""This module builds value functions: of states, and of actions, as numbers or distributions, several at once."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.modules import ValueOperator
 
-from ksim_rl.checks import check_in_range
-from ksim_rl.modules.mlp import mlp
-from ksim_rl.modules.network import ObservingNetwork, OnPolicyNetworkCfg
-from ksim_rl.modules.observation_keys import ObservationKey
+from ksim_rl.checked import Count, NonNegative
+from ksim_rl.modules.mlp import Device, mlp
+from ksim_rl.modules.network import ObservationKey, ObservingNetwork, OffPolicyNetworkCfg, OnPolicyNetworkCfg
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,37 +24,97 @@ class CriticCfg(OnPolicyNetworkCfg):
     """
 
     in_keys: tuple[ObservationKey, ...] = ("critic",)
-    output_gain: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range, naming the field."""
-        super().__post_init__()
-        check_in_range("output_gain", self.output_gain, low=0.0)
+    output_gain: NonNegative = 1.0
 
 
 class ValueNetwork(ObservingNetwork):
     """Maps observations [..., L_i] to a state value [..., 1]."""
 
-    def __init__(self, cfg: CriticCfg, *, obs_dim: int, device: torch.device | str | None = None) -> None:
+    def __init__(self, cfg: CriticCfg, *, obs_dim: int, device: Device = None) -> None:
         super().__init__(cfg, obs_dim=obs_dim, device=device)
-        self.layers = mlp(
-            obs_dim,
-            cfg.hidden_dims,
-            1,
-            activation=cfg.activation,
-            output_gain=cfg.output_gain,
-            device=device,
-        )
+        options: Any = {"activation": cfg.activation, "output_gain": cfg.output_gain, "device": device}
+        self.layers = mlp(obs_dim, cfg.hidden_dims, 1, **options)
 
     def forward(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch 1"]:
         """Return the state value for observations that stand side by side."""
         return self.layers(self.observe(*observations))
 
 
-def make_critic(cfg: CriticCfg, *, obs_dim: int, device: torch.device | str | None = None) -> ValueOperator:
+def make_critic(cfg: CriticCfg, *, obs_dim: int, device: Device = None) -> ValueOperator:
     """Build the critic as TorchRL's `ValueOperator`.
 
     Reads `cfg.in_keys`, `obs_dim` numbers side by side, and writes `state_value` [..., 1].
     """
     network = ValueNetwork(cfg, obs_dim=obs_dim, device=device)
     return ValueOperator(network, in_keys=list(cfg.in_keys), out_keys=["state_value"])
+
+
+@dataclass(frozen=True, kw_only=True)
+class QNetworkCfg(OffPolicyNetworkCfg):
+    """The action value networks.
+
+    Attributes:
+        num_networks: N, networks that differ in their first weights only; two for clipped double Q-learning.
+        num_atoms: A, probabilities on A values spread evenly over [v_min, v_max] (Bellemare et al., arXiv 1707.06887);
+            1 predicts the value itself.
+        v_min, v_max: the values that returns can have; of no effect with `num_atoms=1`.
+    """
+
+    num_networks: Count = 2
+    num_atoms: Count = 1
+    v_min: float = -10.0
+    v_max: float = 10.0
+
+    def __post_init__(self) -> None:
+        """Refuse an empty range of values."""
+        super().__post_init__()
+        if self.v_min >= self.v_max:
+            raise ValueError(f"v_min={self.v_min!r} is not below v_max={self.v_max!r}")
+
+
+class QNetwork(ObservingNetwork):
+    """Maps observation [..., L] and action [..., action_dim] to what N networks predict.
+
+    Attributes:
+        support: the values of the A atoms [A], or None where the value itself is predicted.
+    """
+
+    support: Tensor | None
+
+    def __init__(self, cfg: QNetworkCfg, *, obs_dim: int, action_dim: int, device: Device = None) -> None:
+        super().__init__(cfg, obs_dim=obs_dim, device=device)
+        self.cfg = cfg
+        support = torch.linspace(cfg.v_min, cfg.v_max, cfg.num_atoms, device=device)
+        # It follows from the config, so that it is no part of a checkpoint.
+        self.register_buffer("support", support if cfg.num_atoms > 1 else None, persistent=False)
+        self.layers = cfg.build(
+            obs_dim + action_dim, cfg.num_atoms, num_networks=cfg.num_networks, device=device
+        )
+
+    def forward(
+        self, obs: Float[Tensor, "*batch L"], action: Float[Tensor, "*batch action_dim"]
+    ) -> Float[Tensor, "*batch N"] | Float[Tensor, "*batch N A"]:
+        """Return action values [..., N], or with atoms the logits of their probabilities [..., N, A]."""
+        features = torch.cat((self.observe(obs), action), dim=-1)
+        batch = features.shape[:-1]
+        features_NBL = features.reshape(1, -1, features.shape[-1]).expand(self.cfg.num_networks, -1, -1)
+        out = self.layers(features_NBL).transpose(0, 1).unflatten(0, batch)
+        return out.squeeze(-1) if self.support is None else out
+
+
+def make_q_network(
+    cfg: QNetworkCfg,
+    *,
+    obs_dim: int,
+    action_dim: int,
+    in_key: NestedKey = "critic",
+    device: Device = None,
+) -> TensorDictModule:
+    """Build the networks as a TensorDict module.
+
+    Reads `in_key` [..., obs_dim] and "action" [..., action_dim]; writes "state_action_value" [..., N], or with atoms
+    "state_action_logits" [..., N, A].
+    """
+    network = QNetwork(cfg, obs_dim=obs_dim, action_dim=action_dim, device=device)
+    out_key = "state_action_value" if cfg.num_atoms == 1 else "state_action_logits"
+    return TensorDictModule(network, in_keys=[in_key, "action"], out_keys=[out_key])

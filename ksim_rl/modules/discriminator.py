@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ksim_rl.modules.mlp import mlp
-from ksim_rl.modules.observation_normalizer import ObservationNormalizer
+from ksim_rl.modules.mlp import Device, mlp
+from ksim_rl.modules.network import ObservationNormalizer
 
 
 class Discriminator(nn.Module):
@@ -24,7 +23,7 @@ class Discriminator(nn.Module):
         *,
         hidden_dims: Sequence[int] = (512, 256),
         activation: str = "relu",
-        device: torch.device | str | None = None,
+        device: Device = None,
     ) -> None:
         super().__init__()
         self.normalizer = ObservationNormalizer(dim, device=device)

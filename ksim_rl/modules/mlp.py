@@ -1,13 +1,17 @@
-"""This module builds the multi-layer perceptron that actors and critics are made of."""
+"""This module builds the multi-layer perceptrons that actors and critics are made of."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
 
 from ksim_rl.checks import check_choice, check_in_range
 
+Device = torch.device | str | None
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "elu": nn.ELU,
     "gelu": nn.GELU,
@@ -35,13 +39,14 @@ def check_network(hidden_dims: Sequence[int], activation: str) -> None:
 def mlp(
     input_dim: int,
     hidden_dims: Sequence[int],
-    output_dim: int,
+    output_dim: int | None,
     *,
     activation: str = "elu",
     layer_norm: bool = False,
     hidden_gain: float = math.sqrt(2.0),
     output_gain: float = 1.0,
-    device: torch.device | str | None = None,
+    num_networks: int | None = None,
+    device: Device = None,
 ) -> nn.Sequential:
     """Build Linear layers with activations between them; the last one is linear.
 
@@ -50,59 +55,84 @@ def mlp(
     reinforcement learning?", 2021: the gain of the last policy layer matters most, and should be small).
 
     Args:
-        input_dim, output_dim: sizes of the first and the last dim L.
+        input_dim, output_dim: sizes of the first and the last dim L; None leaves the last layer out.
         hidden_dims: widths of the layers between; `()` gives one linear layer.
         activation: one of `ACTIVATIONS`.
-        layer_norm: normalize before each activation.
+        layer_norm: normalize before each activation, which keeps the values of actions that were never tried from
+            growing without bound (Ball et al., "Efficient online reinforcement learning with offline data", 2023).
         hidden_gain, output_gain: scales of the orthogonal weights.
+        num_networks: N, so many networks of this shape at once.
 
     Returns:
-        A module from [..., input_dim] to [..., output_dim].
-    """
-    check_in_range("output_gain", output_gain, low=0.0)
-    layers = trunk(
-        input_dim,
-        hidden_dims,
-        activation=activation,
-        layer_norm=layer_norm,
-        hidden_gain=hidden_gain,
-        device=device,
-    )
-    width = hidden_dims[-1] if hidden_dims else input_dim
-    return layers.append(linear(width, output_dim, gain=output_gain, device=device))
-
-
-def trunk(
-    input_dim: int,
-    hidden_dims: Sequence[int],
-    *,
-    activation: str = "elu",
-    layer_norm: bool = False,
-    hidden_gain: float = math.sqrt(2.0),
-    device: torch.device | str | None = None,
-) -> nn.Sequential:
-    """Build the hidden layers of an `mlp` alone, each with its activation.
-
-    [..., input_dim] to the last width.
+        A module from [..., input_dim] to [..., output_dim], or for N networks [N, B, input_dim] to [N, B, output_dim].
     """
     check_network(hidden_dims, activation)
-    layers = nn.Sequential()
-    width = input_dim
+    check_in_range("output_gain", output_gain, low=0.0)
+    layer: Callable[..., nn.Module] = linear
+    norm: Callable[..., nn.Module] = nn.LayerNorm
+    if num_networks is not None:
+        layer, norm = partial(EnsembleLinear, num_networks), partial(EnsembleLayerNorm, num_networks)
+    layers, width = nn.Sequential(), input_dim
     for hidden_dim in hidden_dims:
-        layers.append(linear(width, hidden_dim, gain=hidden_gain, device=device))
+        layers.append(layer(width, hidden_dim, gain=hidden_gain, device=device))
         if layer_norm:
-            layers.append(nn.LayerNorm(hidden_dim, device=device))
+            layers.append(norm(hidden_dim, device=device))
         layers.append(ACTIVATIONS[activation]())
         width = hidden_dim
+    if output_dim is not None:
+        layers.append(layer(width, output_dim, gain=output_gain, device=device))
     return layers
 
 
-def linear(
-    input_dim: int, output_dim: int, *, gain: float, device: torch.device | str | None = None
-) -> nn.Linear:
+def linear(input_dim: int, output_dim: int, *, gain: float, device: Device = None) -> nn.Linear:
     """Build one layer with orthogonal weights of scale `gain` and zero bias."""
     # Drawn on the CPU, so that one seed gives the same network on every device.
     layer = nn.Linear(input_dim, output_dim)
     nn.init.orthogonal_(layer.weight, gain)
     nn.init.zeros_(layer.bias)
     return layer.to(device)
+
+
+class EnsembleLinear(nn.Module):
+    """N linear layers as one batched product: [N, B, input_dim] to [N, B, output_dim].
+
+    Weights are orthogonal with scale `gain`, drawn on the CPU network by network, and biases zero.
+    """
+
+    def __init__(
+        self,
+        num_networks: int,
+        input_dim: int,
+        output_dim: int,
+        *,
+        gain: float,
+        device: Device = None,
+    ) -> None:
+        super().__init__()
+        weight = torch.empty(num_networks, output_dim, input_dim)
+        for network in weight:
+            nn.init.orthogonal_(network, gain)
+        self.weight = nn.Parameter(weight.transpose(1, 2).contiguous().to(device))
+        self.bias = nn.Parameter(torch.zeros(num_networks, 1, output_dim, device=device))
+
+    def forward(self, features_NBL: Float[Tensor, "N B L"]) -> Float[Tensor, "N B M"]:
+        """Return what each layer gives for its own input."""
+        return torch.baddbmm(self.bias, features_NBL, self.weight)
+
+
+class EnsembleLayerNorm(nn.Module):
+    """N layer norms (Ba et al., arXiv 1607.06450) of the last dim, each with its own scale and offset."""
+
+    def __init__(self, num_networks: int, dim: int, *, device: Device = None) -> None:
+        super().__init__()
+        self.dim = dim
+        self.weight = nn.Parameter(torch.ones(num_networks, 1, dim, device=device))
+        self.bias = nn.Parameter(torch.zeros(num_networks, 1, dim, device=device))
+
+    def forward(self, features_NBL: Float[Tensor, "N B L"]) -> Float[Tensor, "N B L"]:
+        """Normalize the last dim, and apply each network's own scale and offset."""
+        # Autocast would go on in float32 up to the next product, which moves twice the memory.
+        with torch.autocast(features_NBL.device.type, enabled=False):
+            normalized_NBL = functional.layer_norm(features_NBL, (self.dim,))
+            weight, bias = (parameter.to(features_NBL.dtype) for parameter in (self.weight, self.bias))
+            return torch.addcmul(bias, normalized_NBL, weight)

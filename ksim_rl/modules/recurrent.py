@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,16 +17,53 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torch.nn import functional
 from torchrl.data import Composite, Unbounded
+from torchrl.envs import EnvBase, InitTracker
+from torchrl.envs.transforms import TensorDictPrimer, Transform
 from torchrl.modules import SafeProbabilisticTensorDictSequential, recurrent_mode
 
-from ksim_rl.checks import check_choice, check_count
+from ksim_rl.checked import Checked, Count
 from ksim_rl.modules.actor import make_actor
-from ksim_rl.modules.actor_cfg import ActorCfg
 from ksim_rl.modules.critic import CriticCfg, make_critic
-from ksim_rl.modules.observation_keys import ObservationKey, side_by_side
-from ksim_rl.modules.observation_normalizer import ObservationNormalizer
+from ksim_rl.modules.heads import ActorCfg
+from ksim_rl.modules.mlp import Device
+from ksim_rl.modules.network import ObservationKey, ObservationNormalizer, side_by_side
 from ksim_rl.modules.recurrent_cells import gru_layer, lstm_layer
-from ksim_rl.modules.recurrent_primer import RecurrentStatePrimer
+
+
+class RecurrentStatePrimer(TensorDictPrimer):
+    """TorchRL's primer, free of host syncs: each episode begins with zeros, each step goes on with what was written.
+
+    Rows that do not reset keep their values.
+
+    Args:
+        primers: specs of the state of one env, each [N, H].
+    """
+
+    def __init__(self, primers: Composite) -> None:
+        super().__init__(primers, expand_specs=True)
+        self.state_keys: list[Any] = list(primers.keys(True, True))
+
+    def _reset_func(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> Any:
+        mask = None if tensordict is None else tensordict.get(self.reset_key, None)
+        for key in self.state_keys:
+            zero = self.primers[key].zero()  # pyright: ignore[reportOptionalSubscript]
+            before = None if tensordict is None else tensordict.get(key, None)
+            if mask is not None and before is not None:
+                zero = torch.where(mask.reshape(*zero.shape[:-2], 1, 1), zero, before)
+            tensordict_reset.set(key, zero)
+        return tensordict_reset
+
+
+def recurrent_transforms(env: EnvBase, *primers: TensorDictPrimer) -> list[Transform]:
+    """Return what an env needs to carry recurrent states: `is_init` where it has none yet, and the primers.
+
+    Example:
+        >>> for transform in recurrent_transforms(env, memory.make_tensordict_primer()):
+        ...     env.append_transform(transform)
+    """
+    tracker = [] if "is_init" in env.observation_spec.keys() else [InitTracker()]
+    return [*tracker, *primers]
+
 
 # What the state of each kind consists of, and how many gates it has.
 STATES = {"lstm": ("h", "c"), "gru": ("h",)}
@@ -38,7 +75,7 @@ AnyCfg = TypeVar("AnyCfg", ActorCfg, CriticCfg)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecurrentCfg:
+class RecurrentCfg(Checked):
     """The memory before a network.
 
     Attributes:
@@ -47,15 +84,9 @@ class RecurrentCfg:
         num_layers: N, layers on top of each other.
     """
 
-    kind: str = "lstm"
-    hidden_dim: int = 256
-    num_layers: int = 1
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range, naming the field."""
-        check_choice("kind", self.kind, STATES)
-        for name in ("hidden_dim", "num_layers"):
-            check_count(name, getattr(self, name))
+    kind: Literal["lstm", "gru"] = "lstm"
+    hidden_dim: Count = 256
+    num_layers: Count = 1
 
 
 class RecurrentNetwork(nn.Module):
@@ -74,7 +105,7 @@ class RecurrentNetwork(nn.Module):
         *,
         obs_dim: int,
         obs_normalization: bool = False,
-        device: torch.device | str | None = None,
+        device: Device = None,
     ) -> None:
         super().__init__()
         self.cfg = cfg
@@ -153,7 +184,7 @@ class RecurrentModule(TensorDictModule):
         in_keys: Sequence[ObservationKey],
         name: str,
         obs_normalization: bool = False,
-        device: torch.device | str | None = None,
+        device: Device = None,
     ) -> None:
         network = RecurrentNetwork(cfg, obs_dim=obs_dim, obs_normalization=obs_normalization, device=device)
         self.obs_keys, self.state_keys = list(in_keys), state_keys(cfg, name)
@@ -283,7 +314,7 @@ def state_spec(cfg: RecurrentCfg, name: str) -> Composite:
 
 
 def _memory_before(
-    network: AnyCfg, cfg: RecurrentCfg, *, obs_dim: int, name: str, device: torch.device | str | None
+    network: AnyCfg, cfg: RecurrentCfg, *, obs_dim: int, name: str, device: Device
 ) -> tuple[RecurrentModule, AnyCfg]:
     """Return a memory, and the settings of a network that reads its features instead of the observations."""
     memory = RecurrentModule(

@@ -1,12 +1,12 @@
 import pytest
 import torch
 
-from ksim_rl.modules.gaussian_head import MIN_STD, GaussianHead
+from ksim_rl.modules import ActorCfg
+from ksim_rl.modules.heads import MIN_STD, GaussianHead
 
 
 def _head(**kwargs):
-    defaults = {"init_std": 0.7, "std_type": "scalar", "state_dependent_std": False, "output_gain": 1.0}
-    return GaussianHead(6, 3, **(defaults | kwargs))
+    return GaussianHead(ActorCfg(**{"init_std": 0.7, "output_gain": 1.0, **kwargs}), 6, 3)
 
 
 @pytest.mark.parametrize("state_dependent_std", [False, True])

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from ksim_rl.modules import QNetworkCfg, make_q_network
-from ksim_rl.modules.ensemble import ensemble_mlp
+from ksim_rl.modules.mlp import mlp
 
 
 def _alone(layers, which):
@@ -30,7 +30,7 @@ def _alone(layers, which):
 @pytest.mark.parametrize("layer_norm", [False, True])
 def test_an_ensemble_is_its_networks(layer_norm):
     torch.manual_seed(0)
-    ensemble = ensemble_mlp(3, 5, (16, 8), 2, layer_norm=layer_norm)
+    ensemble = mlp(5, (16, 8), 2, num_networks=3, activation="silu", layer_norm=layer_norm)
     for parameter in ensemble.parameters():
         parameter.data.add_(0.1 * torch.randn_like(parameter))
     inputs = torch.randn(3, 7, 5)
@@ -40,7 +40,7 @@ def test_an_ensemble_is_its_networks(layer_norm):
 
 def test_half_precision_stays_near_single():
     torch.manual_seed(0)
-    ensemble = ensemble_mlp(2, 60, (256, 128), 51, layer_norm=True)
+    ensemble = mlp(60, (256, 128), 51, num_networks=2, activation="silu", layer_norm=True)
     inputs = 3.0 * torch.randn(2, 512, 60)
 
     def outputs_and_gradients():
@@ -57,7 +57,7 @@ def test_half_precision_stays_near_single():
 
 
 def test_networks_start_different_orthogonal_and_with_zero_biases():
-    first = ensemble_mlp(2, 6, (16,), 1)[0]
+    first = mlp(6, (16,), 1, num_networks=2)[0]
     assert not torch.equal(first.weight[0], first.weight[1]) and not first.bias.any()
     for weight in first.weight:
         torch.testing.assert_close(weight @ weight.T, 2.0 * torch.eye(6))

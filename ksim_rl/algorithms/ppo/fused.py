@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from ksim_rl.data import DatasetBuffer, EpochSampler
 from ksim_rl.device.running_moments import has_ranks
 from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, ValueNetwork
-from ksim_rl.modules.gaussian_head import MIN_STD, GaussianHead
-from ksim_rl.modules.observation_keys import side_by_side
+from ksim_rl.modules.heads import MIN_STD, GaussianHead
+from ksim_rl.modules.network import side_by_side
 from ksim_rl.objectives import PPOCfg, StepGuard
 from ksim_rl.objectives.fused_ppo import FusedNetworks, why_not_fused
 

@@ -1,4 +1,4 @@
-"""This module draws by priorities, on the device."""
+"""This module draws from a replay, uniformly or by priorities, on the device."""
 
 from typing import Any
 
@@ -8,11 +8,41 @@ from torch import Tensor
 from torchrl.data.replay_buffers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
-from ksim_rl.checks import check_in_range
-from ksim_rl.data.replay_storage import ReplayStorage
+from ksim_rl.checks import check_count, check_in_range
+from ksim_rl.data.dataset_storage import Stateless
+from ksim_rl.data.replay_storage import ReplayStorage, SavedByStateDict
 
 
-class PrioritySampler(Sampler):
+class ReplaySampler(Stateless, Sampler):
+    """Draws env states of a `ReplayStorage`, each with the same probability, with replacement.
+
+    A place is drawn among all that may hold an env state. Those that do not (terminal observations, env states that are
+    not finite) are drawn again, up to `tries` times; what is left then is masked. The first that holds one is taken, so
+    what is drawn is exactly uniform over the env states. Makes no host sync; numbers come from torch's default
+    generator of the device.
+
+    Args:
+        tries: with a share q of such places, a share q^tries of a minibatch is masked.
+    """
+
+    def __init__(self, *, tries: int = 4) -> None:
+        check_count("tries", tries)
+        self.tries = tries
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
+        """Return indices [B] and an empty info dict."""
+        assert isinstance(storage, ReplayStorage)
+        shape, device = (self.tries, batch_size), storage.device
+        env = torch.randint(storage.num_envs, shape, device=device)
+        # float64: float32 cannot tell the places of a ring of more than 2^24.
+        unit = torch.rand(shape, dtype=torch.float64, device=device)
+        age = 1 + (unit * storage.max_age.clamp_min(1)).to(torch.int64)
+        index = storage.index(env, age)
+        first = storage.available[index].to(torch.uint8).argmax(0, keepdim=True)
+        return index.gather(0, first).squeeze(0), {}
+
+
+class PrioritySampler(SavedByStateDict, Sampler):
     """Draws what is stored in proportion to (priority + eps)^alpha (Schaul et al., arXiv 1511.05952), with replacement.
 
     It stands in for TorchRL's `PrioritizedSampler` in any replay buffer whose storage has one dim, with the default
@@ -115,14 +145,6 @@ class PrioritySampler(Sampler):
         """Continue where `state_dict` was taken; tensors keep their addresses."""
         self._priority_N.copy_(state_dict["priority"])
         self._highest.copy_(state_dict["highest"])
-
-    def dumps(self, path: Any) -> None:
-        """Refuse: the priorities are saved by the `state_dict`."""
-        raise NotImplementedError("priorities are saved by their state_dict()")
-
-    def loads(self, path: Any) -> None:
-        """Refuse: the priorities are restored by `load_state_dict`."""
-        raise NotImplementedError("priorities are restored by load_state_dict()")
 
     def _empty(self) -> None:
         self._priority_N.zero_()
