@@ -1,4 +1,4 @@
-"""The updates share what is here: their dataset, its epochs of gradient steps, and what these measured."""
+"""The updates share what is here: their datasets, gradient steps, what these measured, and what a checkpoint holds."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,56 +7,13 @@ import torch
 from jaxtyping import Num
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 
 from ksim_rl.data import DatasetBuffer, DatasetCfg, SequenceSampler
+from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
-from ksim_rl.modules import burnt_in
-from ksim_rl.objectives import NonFiniteStepsError, StepGuard, ppo_step
-
-
-def make_dataset(
-    data: DatasetCfg,
-    *,
-    keys: Sequence[NestedKey],
-    memories: Sequence[TensorDictModuleBase],
-    seed: int,
-    device: torch.device,
-) -> DatasetBuffer:
-    """Build the dataset of one rollout; networks with a memory learn on sequences.
-
-    Args:
-        data: sizes of dataset, minibatch and sequence.
-        keys: the leaves that are kept.
-        memories: of the networks that learn from it.
-        seed: of the order of the env states in the minibatches.
-        device: where it lives.
-    """
-    sampler = SequenceSampler(sequence_length=data.sequence_length, burn_in=data.burn_in, seed=seed)
-    return DatasetBuffer(data, keys=keys, seed=seed, sampler=sampler if memories else None, device=device)
-
-
-def epoch_of_steps(
-    dataset: DatasetBuffer,
-    loss: Any,
-    optimizer: torch.optim.Optimizer,
-    *,
-    cfg: Any,
-    guard: StepGuard,
-    memories: Sequence[TensorDictModuleBase],
-) -> list[dict[str, Num[Tensor, ""]]]:
-    """Make a gradient step on each minibatch of one epoch; return what each measured, as `ppo_step` names it.
-
-    Beside it stands `skipped_in_a_row`, the guard's count after the step.
-    """
-    steps = []
-    for minibatch_B in dataset.epoch():
-        if memories:
-            minibatch_B = burnt_in(minibatch_B, *memories, steps=dataset.cfg.burn_in)
-        step = ppo_step(loss, optimizer, minibatch_B, cfg=cfg, guard=guard)
-        steps.append(step | {"skipped_in_a_row": guard.skipped_in_a_row.clone()})
-    return steps
+from ksim_rl.modules import burnt_in, memories
+from ksim_rl.objectives import NonFiniteStepsError, StepGuard, load_optimizer_state_, make_optimizer, ppo_step
 
 
 def in_columns(steps: Sequence[Mapping[str, Num[Tensor, ""]]]) -> dict[str, Num[Tensor, " steps"]]:
@@ -93,6 +50,7 @@ class RolloutUpdate:
     what `RolloutCollector` gives.
 
     Args:
+        networks: all that learn, by the names that a checkpoint gives them.
         max_skipped_steps: so many gradient steps in a row that are not finite end the run.
         device: where all of it lives.
 
@@ -100,8 +58,10 @@ class RolloutUpdate:
         guard: counts gradient steps that were skipped.
     """
 
-    def __init__(self, *, max_skipped_steps: int, device: torch.device | str) -> None:
-        self.device = torch.device(device)
+    def __init__(
+        self, networks: Mapping[str, nn.Module], *, max_skipped_steps: int, device: torch.device | str
+    ) -> None:
+        self.device, self.networks = torch.device(device), networks
         self.guard = StepGuard(device=self.device)
         self._max_skipped_steps = max_skipped_steps
         self._rollout_ET: TensorDictBase | None = None
@@ -136,3 +96,141 @@ class RolloutUpdate:
 
     def _update(self) -> None:
         raise NotImplementedError
+
+    def state_dict(self) -> state_tree.State:
+        """Return everything that the next update depends on."""
+        networks = {name: network.state_dict() for name, network in self.networks.items()}
+        return {**networks, "guard": self.guard.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue where `state_dict` was taken; tensors keep their addresses.
+
+        Raises:
+            ValueError: naming the tensor that is missing, unknown or of another shape or type.
+        """
+        self.load_weights(state)
+        state_tree.copy_into(self.guard.state_dict(), state["guard"], what="guard")
+
+    def load_weights(self, state: Mapping[str, Any]) -> None:
+        """Take only the networks of a `state_dict`.
+
+        Raises:
+            ValueError: naming the tensor that is missing, unknown or of another shape or type.
+        """
+        for name, network in self.networks.items():
+            state_tree.copy_into(network.state_dict(), state[name], what=name.replace("_", " "))
+
+
+class DatasetUpdate(RolloutUpdate):
+    """What the updates have in common that make epochs of gradient steps on the dataset of each rollout.
+
+    Args:
+        cfg: of the objective.
+        loss: says which leaves the dataset keeps.
+        networks: see `RolloutUpdate`; those with a memory learn on sequences.
+        data: sizes of dataset, minibatch and sequence.
+        seed: of the order of the env states in the minibatches.
+        device: where all of it lives.
+        logged: names of the logged means, by the names that `ppo_step` gives them.
+    """
+
+    def __init__(
+        self,
+        cfg: Any,
+        *,
+        loss: Any,
+        networks: Mapping[str, TensorDictModuleBase],
+        data: DatasetCfg,
+        seed: int,
+        device: torch.device | str,
+        logged: Mapping[str, str],
+    ) -> None:
+        super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, device=device)
+        self.cfg, self.loss = cfg, loss
+        self.num_env_states = data.num_env_states
+        self.optimizer = make_optimizer(cfg, *networks.values())
+        self._memories = memories(*networks.values())
+        sampler = SequenceSampler(sequence_length=data.sequence_length, burn_in=data.burn_in, seed=seed)
+        self.dataset = DatasetBuffer(
+            data,
+            keys=loss.dataset_keys,
+            seed=seed,
+            sampler=sampler if self._memories else None,
+            device=self.device,
+        )
+        self._means = StepMeans(logged)
+
+    def metrics(self) -> dict[str, Num[Tensor, ""]]:
+        """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
+        return {
+            **self._means,
+            **self._skipped(),
+            "update/learning_rate": self.optimizer.param_groups[0]["lr"],
+            "update/non_finite_env_states": self.dataset.non_finite_count,
+        }
+
+    def _epoch(self, loss: Any) -> list[dict[str, Tensor]]:
+        """Make a gradient step on each minibatch of one epoch; return what each measured, as `ppo_step` names it.
+
+        Beside it stands `skipped_in_a_row`, the guard's count after the step.
+        """
+        steps = []
+        for minibatch_B in self.dataset.epoch():
+            if self._memories:
+                minibatch_B = burnt_in(minibatch_B, *self._memories, steps=self.dataset.cfg.burn_in)
+            step = ppo_step(loss, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard)
+            steps.append(step | {"skipped_in_a_row": self.guard.skipped_in_a_row.clone()})
+        return steps
+
+    def _measure_(self, steps: Mapping[str, Tensor]) -> None:
+        self._means.take_(steps)
+        self._longest_skip.copy_(steps["skipped_in_a_row"].max())
+
+    def state_dict(self) -> state_tree.State:
+        """Return networks, optimizer, sampler and counters."""
+        return {
+            **super().state_dict(),
+            "optimizer": optimizer_state(self.optimizer),
+            "sampler": self.dataset.sampler.state_dict(),
+            "non_finite_env_states": self.dataset.non_finite_count,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue where `state_dict` was taken; see `RolloutUpdate`."""
+        super().load_state_dict(state)
+        load_optimizer_state(self.optimizer, state["optimizer"], what="optimizer")
+        self.dataset.sampler.load_state_dict(state["sampler"])
+        self.dataset.non_finite_count.copy_(state["non_finite_env_states"])
+
+
+def optimizer_state(optimizer: torch.optim.Optimizer) -> state_tree.State:
+    """Return learning rate and moments; a parameter that no loss has reached has an empty entry."""
+    state = optimizer.state_dict()
+    group = state["param_groups"][0]
+    moments = {index: state["state"].get(index, {}) for index in range(len(group["params"]))}
+    return {"learning_rate": group["lr"], "moments": moments}
+
+
+def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, Any], *, what: str) -> None:
+    """Continue where `optimizer_state` was taken.
+
+    Raises:
+        ValueError: naming what does not fit this optimizer's parameters.
+    """
+    parameters = optimizer.param_groups[0]["params"]
+    moments = {int(index): entry for index, entry in state["moments"].items()}
+    if set(moments) != set(range(len(parameters))):
+        raise ValueError(
+            f"{what}: {len(moments)} parameters in the checkpoint, {len(parameters)} in this run"
+        )
+    moments = {index: entry for index, entry in moments.items() if entry}
+    for index, entry in moments.items():
+        for name in ("exp_avg", "exp_avg_sq"):
+            if entry[name].shape != parameters[index].shape:
+                raise ValueError(
+                    f"{what}: {name} of parameter {index} has shape {list(entry[name].shape)} in the checkpoint and "
+                    f"{list(parameters[index].shape)} in this run"
+                )
+    groups = optimizer.state_dict()["param_groups"]
+    groups[0] = groups[0] | {"lr": state["learning_rate"]}
+    load_optimizer_state_(optimizer, {"state": moments, "param_groups": groups})

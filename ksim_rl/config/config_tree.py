@@ -19,7 +19,7 @@ from typing import Any, Literal, Self, TypeVar, Union
 
 from tensordict import NestedKey
 
-from ksim_rl.checks import near
+from ksim_rl.checks import check_choice, near
 from ksim_rl.config import class_paths
 from ksim_rl.config.class_paths import TARGET
 
@@ -116,6 +116,8 @@ def build_value(annotation: Any, value: Any, path: str) -> Any:
         built = _match(option, value, path)
         if built is not _NO_MATCH:
             return built
+    if len(alternatives) == 1 and typing.get_origin(alternatives[0]) is Literal:
+        check_choice(path, value, typing.get_args(alternatives[0]))
     raise ValueError(f"{path}={value!r}: expected {_describe(annotation)}")
 
 

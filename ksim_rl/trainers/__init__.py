@@ -9,10 +9,9 @@ from ksim_rl.trainers.checkpoint import Checkpoint, CheckpointError
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
 from ksim_rl.trainers.hooks import Hook
 from ksim_rl.trainers.progress import RunProgress
-from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg, TrainingCfg
+from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg, TrainerCfg, TrainingCfg
 from ksim_rl.trainers.run_folder import Policy, load_policy, record_video, run
 from ksim_rl.trainers.trainer import Outcome, Trainer
-from ksim_rl.trainers.trainer_cfg import TrainerCfg
 
 __all__ = [
     "Algorithm",

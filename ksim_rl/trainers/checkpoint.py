@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from ksim_rl.trainers import checkpoint_formats
 MANIFEST, TENSORS = "manifest.json", "tensors.safetensors"
 _TEMPORARY, _DISCARDED = ".writing-", ".discarded-"
 _MAX_MANIFEST_BYTES = 64 * 2**20
+Columns = Mapping[str, Mapping[str, Sequence[int]]]
 
 
 class CheckpointError(ValueError):
@@ -140,6 +141,28 @@ def remove_leftovers(folder: Path) -> None:
         for entry in folder.iterdir():
             if entry.name.startswith((_TEMPORARY, _DISCARDED)):
                 shutil.rmtree(entry)
+
+
+def check_columns(saved: Columns, own: Columns) -> None:
+    """Refuse observations with other terms or other columns than the checkpoint's; both are group -> term -> range.
+
+    Raises:
+        ValueError: naming the terms that only one of the two has, or whose columns differ.
+    """
+    faults = []
+    for group in dict.fromkeys([*saved, *own]):
+        theirs, ours = saved.get(group, {}), own.get(group, {})
+        surplus, missing = [n for n in theirs if n not in ours], [n for n in ours if n not in theirs]
+        moved = [name for name in theirs if name in ours and list(theirs[name]) != list(ours[name])]
+        if surplus:
+            faults.append(f"group {group!r}: only the checkpoint has {', '.join(surplus)}")
+        if missing:
+            faults.append(f"group {group!r}: only this run has {', '.join(missing)}")
+        if moved and not surplus and not missing:
+            places = ", ".join(f"{n} at {list(theirs[n])}, here {list(ours[n])}" for n in moved)
+            faults.append(f"group {group!r}: the checkpoint has {places}")
+    if faults:
+        raise ValueError(f"the checkpoint is of other observations: {'; '.join(faults)}")
 
 
 def _seal(manifest: dict[str, Any]) -> bytes:

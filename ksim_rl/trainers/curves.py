@@ -7,7 +7,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from ksim_rl.trainers.loggers.csv_table import STEP, read_table
+from ksim_rl.trainers.csv_table import STEP, read_table
 
 # Panels in reading order: title, the metrics drawn in it with their labels.
 PANELS: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (

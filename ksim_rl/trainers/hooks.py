@@ -8,8 +8,7 @@ from ksim_rl.collectors import RolloutCollector
 from ksim_rl.trainers.algorithm import Update
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
 from ksim_rl.trainers.interrupt import InterruptRequest
-from ksim_rl.trainers.progress import RunProgress
-from ksim_rl.trainers.run_clock import RunClock
+from ksim_rl.trainers.progress import RunClock, RunProgress
 
 
 class Run(Protocol):

@@ -1,10 +1,17 @@
-"""Metrics come from the device to the host in one copy per iteration, however many there are."""
+"""Metrics are read from env and physics on the device, come to the host in one copy, and are explained there."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float64, Shaped
+from jaxtyping import Float64, Int64, Num, Shaped
+from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ksim_rl.envs.contract import DifficultyLevels, EpisodeSums, SimulatedWorld, part
+
+_OVERFLOW, _NAN = "overflow/", "nan/worlds"
 
 
 class PendingMetrics:
@@ -40,3 +47,91 @@ def start_copy(metrics: Mapping[str, Shaped[Tensor, ""]], *, device: torch.devic
     copied = torch.cuda.Event()
     copied.record(torch.cuda.current_stream(device))
     return PendingMetrics(names, on_host_M, copied)
+
+
+def read_episode_sums(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Num[Tensor, ""]]:
+    """Return what happened in this rollout, each a tensor [] on the device, and start the env's sums anew.
+
+    Any env gives the mean reward per step; one with `EpisodeSums` also its sums over the episodes that ended, and one
+    with `DifficultyLevels` those.
+    """
+    sums = {"rollout/reward": rollout_ET.get(("next", "reward")).mean()}
+    if (episodes := part(env, EpisodeSums)) is not None:
+        # Copies, because the sums are cleared before they are read on the host.
+        sums |= {f"sum/{name}": total.clone() for name, total in episodes.episode_log().items()}
+        episodes.episode_log_reset_()
+    if (levels := part(env, DifficultyLevels)) is not None:
+        sums |= {f"curriculum/{name}": level for name, level in levels.curriculum_levels().items()}
+        sums |= {f"command/{name}": level for name, level in levels.command_levels().items()}
+    return sums
+
+
+def episode_means(sums: Mapping[str, float], *, max_episode_length_s: float) -> dict[str, float]:
+    """Turn sums over episodes into means per episode; without a finished episode those are left out.
+
+    `episode/return`, `episode/length` (env steps) and `metric/<name>` are means. `termination/<name>` is a share of
+    episodes. `reward/<term>` is the weighted sum over an episode, per second of the longest possible episode (or as it
+    is where episodes have no limit), so that a term of weight w that is always 1 reads w.
+    """
+    metrics = {name: value for name, value in sums.items() if not name.startswith("sum/")}
+    episodes = sums.get("sum/episodes")
+    if episodes is None:
+        return metrics
+    metrics["episode/count"] = episodes
+    metrics["episode/non_finite"] = sums.get("sum/termination/non_finite", 0.0)
+    if episodes == 0.0:
+        return metrics
+    metrics["episode/return"] = sums["sum/return_sum"] / episodes
+    metrics["episode/length"] = sums["sum/length_sum"] / episodes
+    for name, total in sums.items():
+        room, _, term = name.removeprefix("sum/").partition("/")
+        if room == "reward":
+            metrics[f"reward/{term}"] = total / episodes / (max_episode_length_s or 1.0)
+        elif room in ("termination", "metric"):
+            metrics[f"{room}/{term}"] = total / episodes
+    return metrics
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhysicsReport:
+    """What happened in the physics of one rollout.
+
+    Attributes:
+        metrics: shares and counts to log, `physics/<name>`.
+        lost: one line for each kind of contacts or constraints that did not fit.
+        saved: one line for each state that the NaN guard wrote to a file.
+    """
+
+    metrics: dict[str, float]
+    lost: tuple[str, ...] = ()
+    saved: tuple[str, ...] = ()
+
+
+def read_physics(env: EnvBase) -> dict[str, Int64[Tensor, ""]]:
+    """Return the counts of this rollout, each a tensor [] on the device, and start anew; none without a world."""
+    simulated = part(env, SimulatedWorld)
+    if simulated is None:
+        return {}
+    world = simulated.world
+    counts = {f"{_OVERFLOW}{index}": count for index, count in enumerate(world.overflow_counts().unbind())}
+    return counts | {_NAN: world.nan_count()}
+
+
+def explain_physics(env: EnvBase, counts: Mapping[str, float]) -> PhysicsReport:
+    """Say what the counts mean, which other metrics may stand beside; reads the device only if a world failed."""
+    simulated = part(env, SimulatedWorld)
+    if simulated is None:
+        return PhysicsReport(metrics={})
+    world = simulated.world
+    numbers = [int(value) for name, value in counts.items() if name.startswith(_OVERFLOW)]
+    overflow = world.explain_overflow(numbers)
+    return PhysicsReport(
+        metrics={f"physics/{name}": value for name, value in overflow.metrics.items()},
+        lost=tuple(overflow.messages),
+        saved=tuple(world.nan_report().messages) if counts[_NAN] else (),
+    )
+
+
+def without_counts(metrics: Mapping[str, float]) -> dict[str, float]:
+    """Leave out what only `explain_physics` reads."""
+    return {name: value for name, value in metrics.items() if not name.startswith((_OVERFLOW, _NAN))}

@@ -1,8 +1,10 @@
-"""The progress of a run is one live panel on a terminal, and plain lines in a pipe."""
+"""The progress of a run is timed, and shown as one live panel on a terminal or as plain lines in a pipe."""
 
 import sys
-from collections.abc import Mapping
-from contextlib import suppress
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -120,6 +122,47 @@ class RunProgress:
         for start in range(0, len(figures), 3):
             table.add_row(*(f"[dim]{label}[/dim] {text}" for label, text in figures[start : start + 3]))
         return Group(self._bar, table, *([self._status] if self._status else []))
+
+
+class RunClock:
+    """Measures iterations; evaluations and checkpoints count in the total, not in an iteration.
+
+    Attributes:
+        total: s, over all sessions of a resumed run.
+    """
+
+    def __init__(self) -> None:
+        self.total = 0.0
+        self._last: float | None = None
+        self._laps: deque[float] = deque(maxlen=20)
+        self._created = time.monotonic()
+
+    def lap(self) -> float:
+        """End an iteration, and return its seconds."""
+        now = time.monotonic()
+        seconds = max(now - (self._created if self._last is None else self._last), 1e-9)
+        # The first iteration compiles kernels, so it says nothing about the rest.
+        if self._last is not None:
+            self._laps.append(seconds)
+        self.total += seconds
+        self._last = now
+        return seconds
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Leave what happens inside out of the iteration."""
+        start = time.monotonic()
+        yield
+        elapsed = time.monotonic() - start
+        self.total += elapsed
+        if self._last is not None:
+            self._last += elapsed
+
+    def seconds_left(self, iterations: int) -> float | None:
+        """Estimate the time for so many more iterations from the latest ones; None before the second."""
+        if not self._laps:
+            return None
+        return iterations * sum(self._laps) / len(self._laps)
 
 
 def clock(seconds: float) -> str:

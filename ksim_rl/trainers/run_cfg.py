@@ -3,11 +3,12 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
 
-from ksim_rl.checks import check_count, near
+from ksim_rl.checked import Checked, Count, Positive, WholeNumber, Within
+from ksim_rl.checks import near
 from ksim_rl.collectors import CollectorCfg
 from ksim_rl.config import class_paths, plugins
 from ksim_rl.config.config_tree import from_tree, to_tree
@@ -26,8 +27,6 @@ from ksim_rl.modules import (
 )
 from ksim_rl.objectives import AlgorithmCfg
 from ksim_rl.trainers.loggers import LoggerCfg
-from ksim_rl.trainers.old_configs import up_to_date
-from ksim_rl.trainers.trainer_cfg import TrainerCfg
 
 # Seeds of evaluations lie above a run's own, and must fit 64 bits as well.
 MOST_SEED = 2**62
@@ -35,7 +34,48 @@ PLUGINS = "plugins"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModulesCfg:
+class TrainerCfg(Checked):
+    """Options of `Trainer`. Intervals are in iterations; 0 means never.
+
+    Attributes:
+        num_iterations: an iteration is one rollout and one update, D env states.
+        eval_interval: between evaluations with deterministic actions in envs of their own.
+        eval_episodes: episodes of an evaluation, one env each; 0 means no evaluation at all.
+        stop_when_solved: end the run as soon as an evaluation reaches the task's threshold.
+        stop_at: end the run as soon as each of these metrics reaches its value in one and the same iteration, such as
+            `{"reward/track_linear_velocity": 1.39}`; figures of evaluations count as well. None has no such targets.
+        checkpoint_interval: between checkpoints; the last iteration is always saved.
+        keep_checkpoints: how many of the newest checkpoints stay.
+        log_interval: between rows of the logs and lines of progress.
+        overlap: read the metrics of an iteration while the next one runs; None does so on CUDA. Where nothing else
+            asks for them earlier, `stop_at` and the guards then act one iteration later. What is learned, logged and
+            saved is the same.
+        num_threads: torch's threads on the CPU; None leaves one core free, and takes eight at most for a run on CUDA. A
+            thread that has to wait for a core that is busy elsewhere stalls all others: on two cores that made runs
+            beside other work twenty times slower.
+        matmul_precision: of float32 products on CUDA; "high" is TF32.
+        video: record the final policy.
+        video_s: seconds of it.
+    """
+
+    num_iterations: Count = 100
+    eval_interval: WholeNumber = 20
+    eval_episodes: WholeNumber = 100
+    stop_when_solved: bool = True
+    stop_at: Mapping[str, float] | None = None
+    checkpoint_interval: WholeNumber = 20
+    keep_checkpoints: Count = 3
+    log_interval: Count = 1
+    overlap: bool | None = None
+    # Where threads cannot be made, torch ends the process instead of raising.
+    num_threads: Annotated[int, Within(low=1, high=1024)] | None = None
+    matmul_precision: Literal["highest", "high", "medium"] = "high"
+    video: bool = True
+    video_s: Positive = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModulesCfg(Checked):
     """The networks.
 
     Attributes:
@@ -53,6 +93,7 @@ class ModulesCfg:
 
     def __post_init__(self) -> None:
         """Refuse a trunk that a network does not read, and features that nothing writes."""
+        super().__post_init__()
         for name, cfg in (("actor", self.actor), ("critic", self.critic)):
             if (FEATURES in self._read_by(name)) != (self.trunk is not None):
                 raise ValueError(
@@ -87,7 +128,7 @@ class ModulesCfg:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingCfg:
+class TrainingCfg(Checked):
     """What training needs to know beside the env: what a task recommends, and the larger part of a run's config.
 
     Attributes:
@@ -99,8 +140,8 @@ class TrainingCfg:
         collector, trainer: of `RolloutCollector` and `Trainer`.
     """
 
-    num_envs: int
-    seed: int = 1
+    num_envs: Count
+    seed: WholeNumber = 1
     objective: AlgorithmCfg
     data: DatasetCfg | ReplayCfg
     modules: ModulesCfg = field(default_factory=ModulesCfg)
@@ -129,8 +170,7 @@ class RunCfg(TrainingCfg):
 
     def __post_init__(self) -> None:
         """Refuse values that no run can have, before any model is compiled."""
-        check_count("num_envs", self.num_envs)
-        check_count("seed", self.seed, low=0)
+        super().__post_init__()
         if self.seed > MOST_SEED:
             raise ValueError(f"seed={self.seed}: expected at most {MOST_SEED}")
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):
@@ -218,3 +258,13 @@ def without_env_size(tree: Mapping[str, Any]) -> dict[str, Any]:
                 f"{where}={value!r} differs from {name}={tree.get(name)!r}: set {name}, which is the env's as well"
             )
     return {**tree, "task": task}
+
+
+def up_to_date(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the config tree of a run as this version writes it."""
+    tree = dict(tree)
+    objective = tree.get("objective")
+    # Up to 0.1 an objective without a class was that of PPO.
+    if isinstance(objective, Mapping) and "_target_" not in objective:
+        tree["objective"] = {"_target_": "ksim_rl.objectives.PPOCfg", **objective}
+    return tree

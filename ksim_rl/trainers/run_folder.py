@@ -17,7 +17,6 @@ from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.trainers import checkpoint, video
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build, build_env, load_actor
-from ksim_rl.trainers.columns import check_columns
 from ksim_rl.trainers.evaluation import Evaluation
 from ksim_rl.trainers.hooks import Hook
 from ksim_rl.trainers.progress import RunProgress
@@ -94,7 +93,7 @@ def load_policy(path: Path, *, device: str = "auto", plugins: Sequence[str] = ()
     saved = checkpoint.load(checkpoint.latest(path))
     cfg = RunCfg.from_tree({**saved.config, "device": device})
     env = build_env(cfg, num_envs=1, seed=cfg.seed)
-    check_columns(saved.state["observation_columns"], observation_columns(env))
+    checkpoint.check_columns(saved.state["observation_columns"], observation_columns(env))
     actor = make_policy(cfg, env)
     env.close(raise_if_closed=False)
     load_actor(actor, saved.state)

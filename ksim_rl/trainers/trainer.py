@@ -6,25 +6,31 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+from jaxtyping import UInt8
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from ksim_rl.checks import near
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.envs.contract import EpisodeClock, missing_parts, part
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.algorithm import Update
-from ksim_rl.trainers.columns import check_columns
-from ksim_rl.trainers.episode_metrics import episode_means, read_episode_sums
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
 from ksim_rl.trainers.hooks import CheckpointHook, EvaluationHook, Hook
 from ksim_rl.trainers.interrupt import InterruptRequest
 from ksim_rl.trainers.loggers import MetricLogger
-from ksim_rl.trainers.metrics import PendingMetrics, start_copy
-from ksim_rl.trainers.physics_metrics import explain_physics, read_physics, without_counts
-from ksim_rl.trainers.progress import RunProgress
-from ksim_rl.trainers.run_clock import RunClock
-from ksim_rl.trainers.run_state import load_random_state, random_state
-from ksim_rl.trainers.trainer_cfg import TrainerCfg
+from ksim_rl.trainers.metrics import (
+    PendingMetrics,
+    episode_means,
+    explain_physics,
+    read_episode_sums,
+    read_physics,
+    start_copy,
+    without_counts,
+)
+from ksim_rl.trainers.progress import RunClock, RunProgress
+from ksim_rl.trainers.run_cfg import TrainerCfg
 from ksim_rl.transforms import observation_columns
 
 
@@ -294,7 +300,7 @@ class Trainer:
             ValueError: when its networks or the observations that they read are others.
         """
         state = checkpoint.load(checkpoint.latest(path)).state
-        check_columns(state["observation_columns"], observation_columns(self.collector.env))
+        checkpoint.check_columns(state["observation_columns"], observation_columns(self.collector.env))
         try:
             self.update.load_weights(state["update"])
         except KeyError as error:
@@ -324,7 +330,7 @@ class Trainer:
         Raises:
             ValueError: if it is of a run whose networks or observations are others.
         """
-        check_columns(state["observation_columns"], observation_columns(self.collector.env))
+        checkpoint.check_columns(state["observation_columns"], observation_columns(self.collector.env))
         if len(state["hooks"]) != len(self._own_hooks):
             raise ValueError(
                 f"the checkpoint is of a run with {len(state['hooks'])} hooks, and this one has {len(self._own_hooks)}"
@@ -346,3 +352,18 @@ class Trainer:
         self.iteration = self.saved_at = state["iteration"]
         self.clock.total = state["seconds"]
         load_random_state(state["random"], self.update.device)
+
+
+def random_state(device: torch.device) -> dict[str, UInt8[Tensor, "?L"]]:
+    """Return the state of the default generators of the host and of `device`."""
+    state = {"cpu": torch.get_rng_state()}
+    if device.type == "cuda":
+        state["cuda"] = torch.cuda.get_rng_state(device)
+    return state
+
+
+def load_random_state(state: Mapping[str, UInt8[Tensor, "?L"]], device: torch.device) -> None:
+    """Continue the default generators; a run that moves to another kind of device keeps that one's present state."""
+    torch.set_rng_state(state["cpu"])
+    if device.type == "cuda" and "cuda" in state:
+        torch.cuda.set_rng_state(state["cuda"], device)

@@ -9,7 +9,8 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.record.loggers import CSVLogger
 
-from ksim_rl.trainers.loggers import LoggerCfg, MLflowCfg, WandbCfg, check_installed, logger_cfg, make_loggers
+from ksim_rl.trainers import loggers
+from ksim_rl.trainers.loggers import LoggerCfg, MLflowCfg, WandbCfg, check_installed, make_loggers
 from tests.trainers.target_env import make_trainer
 
 CONFIG = {"task_name": "probe", "objective": {"gamma": 0.99, "betas": [0.9, 0.999]}}
@@ -123,6 +124,6 @@ def test_a_service_that_is_not_there_is_named_with_the_way_out(monkeypatch, tmp_
     def refuse(*_):
         raise Exception("no such host")
 
-    monkeypatch.setattr(logger_cfg, "open_wandb", refuse)
+    monkeypatch.setattr(loggers, "open_wandb", refuse)
     with pytest.raises(RuntimeError, match=r"logger\.wandb .*logger\.wandb\.offline=true.*no such host"):
         make_loggers(LoggerCfg(wandb=WandbCfg()), tmp_path)

@@ -27,7 +27,7 @@ def test_a_pipe_gets_one_plain_line_per_update():
         progress.update(3, METRICS, seconds_left=75.0)
     text = progress.console.file.getvalue()
     assert text == (
-        "iteration 3/10: env states 16,384, env states/s 51,234, reward 12.3, value loss 0.5, left 1:15\n"
+        "iteration 3/10: env states 16,384, env states/s 51,234, return 12.3, value loss 0.5, left 1:15\n"
     )
 
 

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from ksim_rl.trainers.run_clock import RunClock
+from ksim_rl.trainers.progress import RunClock
 
 
 @pytest.fixture

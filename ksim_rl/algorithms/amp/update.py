@@ -7,13 +7,17 @@ from typing import Any
 import torch
 from jaxtyping import Float32, Num
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential
 from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.algorithms.gradient_steps import RolloutUpdate, StepMeans, in_columns
-from ksim_rl.algorithms.optimizer_state import load_optimizer_state, optimizer_state
+from ksim_rl.algorithms.gradient_steps import (
+    RolloutUpdate,
+    StepMeans,
+    in_columns,
+    load_optimizer_state,
+    optimizer_state,
+)
 from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.algorithms.ppo.wiring import make_ppo_update
 from ksim_rl.data import ReplayCfg, ReplayRing
@@ -76,19 +80,22 @@ class AMPUpdate(RolloutUpdate):
     def __init__(
         self, cfg: AMPCfg, *, ppo: PPOUpdate, reference_N2L: Float32[Tensor, "N 2 L"], num_envs: int
     ) -> None:
-        super().__init__(max_skipped_steps=cfg.max_skipped_steps, device=ppo.device)
-        self.cfg, self.ppo = cfg, ppo
         if not bool(reference_N2L.isfinite().all()):
             raise ValueError(
                 f"motions={cfg.motions!r}: group {cfg.style_group!r} is not finite in their states"
             )
-        self.reference_N2L = reference_N2L.to(self.device)
+        self.cfg, self.ppo = cfg, ppo
+        self.actor = self.behavior = ppo.actor
+        self.num_env_states = ppo.num_env_states
+        self.reference_N2L = reference_N2L.to(ppo.device)
         self.discriminator = Discriminator(
             reference_N2L.shape[-1],
             hidden_dims=cfg.discriminator_hidden_dims,
             activation=cfg.discriminator_activation,
-            device=self.device,
+            device=ppo.device,
         )
+        networks = {"discriminator": self.discriminator}
+        super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, device=ppo.device)
         # So that the first scores are of features in a fitting range.
         self.discriminator.normalizer.update(self.reference_N2L)
         own = {
@@ -111,21 +118,6 @@ class AMPUpdate(RolloutUpdate):
         )
         self._means = StepMeans(LOGGED)
         self._style = torch.zeros((), device=self.device)
-
-    @property
-    def actor(self) -> ProbabilisticTensorDictSequential:
-        """The policy."""
-        return self.ppo.actor
-
-    @property
-    def behavior(self) -> ProbabilisticTensorDictSequential:
-        """The policy that collects: the actor, which samples."""
-        return self.ppo.behavior
-
-    @property
-    def num_env_states(self) -> int:
-        """D, the env states of one rollout."""
-        return self.ppo.num_env_states
 
     @property
     def rollout_keys(self) -> list[Any]:
@@ -208,13 +200,9 @@ class AMPUpdate(RolloutUpdate):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue where `state_dict` was taken; tensors keep their addresses.
-
-        Raises:
-            ValueError: naming the tensor that is missing, unknown or of another shape or type.
-        """
+        """Continue where `state_dict` was taken; see `RolloutUpdate`."""
         self.ppo.load_state_dict(state)
-        state_tree.copy_into(self.discriminator.state_dict(), state["discriminator"], what="discriminator")
+        super().load_weights(state)
         load_optimizer_state(
             self.optimizer, state["discriminator_optimizer"], what="optimizer of the discriminator"
         )
@@ -223,15 +211,10 @@ class AMPUpdate(RolloutUpdate):
         self.replay.load_state_dict(state["replay"])
 
     def load_weights(self, state: Mapping[str, Any]) -> None:
-        """Take only the networks of a `state_dict`; from a run of plain PPO, those of the policy.
-
-        Raises:
-            ValueError: naming the tensor that is missing, unknown or of another shape or type.
-        """
+        """Take only the networks of a `state_dict`; from a run of plain PPO, those of the policy."""
         self.ppo.load_weights(state)
         if "discriminator" in state:
-            own = self.discriminator.state_dict()
-            state_tree.copy_into(own, state["discriminator"], what="discriminator")
+            super().load_weights(state)
 
 
 def _transitions(env_states: TensorDictBase, before: Any, after: Any) -> Tensor:

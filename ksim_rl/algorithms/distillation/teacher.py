@@ -13,7 +13,6 @@ from ksim_rl.device import state_tree
 from ksim_rl.modules import memories
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.algorithm import make_policy
-from ksim_rl.trainers.columns import check_columns
 from ksim_rl.trainers.run_cfg import RunCfg
 from ksim_rl.transforms import observation_columns
 
@@ -81,7 +80,7 @@ def restored_teacher(state: Mapping[str, Any], env: EnvBase, *, cfg: RunCfg) -> 
                 "task.observations as the teacher's run has it"
             )
     groups = [key for key in read if isinstance(key, str)]
-    check_columns(
+    checkpoint.check_columns(
         *({group: columns[group] for group in groups if group in columns} for columns in (theirs, ours))
     )
     policy = make_policy(teacher_cfg, env)

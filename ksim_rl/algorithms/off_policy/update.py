@@ -10,8 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from ksim_rl.algorithms.gradient_steps import RolloutUpdate
-from ksim_rl.algorithms.optimizer_state import load_optimizer_state, optimizer_state
+from ksim_rl.algorithms.gradient_steps import RolloutUpdate, load_optimizer_state, optimizer_state
 from ksim_rl.data import ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
@@ -63,11 +62,16 @@ class OffPolicyUpdate(RolloutUpdate):
                 f"data.num_minibatches={data.num_minibatches} is no multiple of objective.policy_delay="
                 f"{cfg.policy_delay}: each iteration makes the same gradient steps"
             )
-        super().__init__(max_skipped_steps=cfg.max_skipped_steps, device=device)
-        self.cfg, self.loss, self.data, self.num_envs = cfg, loss, data, num_envs
+        networks = {
+            "actor": loss.actor_network,
+            "critic": loss.critic_network,
+            "target_critic": loss.target_critic_network,
+        }
+        super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, device=device)
+        self.cfg, self.loss, self.data = cfg, loss, data
         self.actor: TensorDictModuleBase = loss.actor_network
         self.critic = loss.critic_network
-        self.behavior = behavior
+        self.behavior, self.num_env_states = behavior, num_envs * data.num_steps
         observations = [key for key in (*self.actor.in_keys, *self.critic.in_keys) if key != "action"]
         self._observations: list[Any] = list(dict.fromkeys(observations))
         self.replay = ReplayRing(
@@ -88,11 +92,6 @@ class OffPolicyUpdate(RolloutUpdate):
         self._sums = {name: self._zero() for name in logged.values()}
         self._counts = {name: self._zero() for name in ("critic", "actor")}
         self._store_only = Captured(self._store, device=self.device)
-
-    @property
-    def num_env_states(self) -> int:
-        """Env states of one rollout, E * T."""
-        return self.num_envs * self.data.num_steps
 
     @property
     def rollout_keys(self) -> list[Any]:
@@ -187,12 +186,8 @@ class OffPolicyUpdate(RolloutUpdate):
 
     def state_dict(self) -> state_tree.State:
         """Return networks, optimizers, replay, exploration and counters."""
-        state = {
-            "actor": self.actor.state_dict(),
-            "critic": self.critic.state_dict(),
-            "target_critic": self.loss.target_critic_network.state_dict(),
+        state = super().state_dict() | {
             "optimizers": {name: optimizer_state(own) for name, own in self.optimizers.items()},
-            "guard": self.guard.state_dict(),
             "replay": self.replay.state_dict(),
             "exploration": self.behavior.exploration_state(),
             "steps_made": self.steps_made,
@@ -205,14 +200,10 @@ class OffPolicyUpdate(RolloutUpdate):
         """Continue where `state_dict` was taken; tensors keep their addresses.
 
         Without a replay in it the run begins with random actions again, until there is one.
-
-        Raises:
-            ValueError: naming the tensor that is missing, unknown or of another shape or type.
         """
-        self.load_weights(state)
+        super().load_state_dict(state)
         for name, optimizer in self.optimizers.items():
             load_optimizer_state(optimizer, state["optimizers"][name], what=f"{name} optimizer")
-        state_tree.copy_into(self.guard.state_dict(), state["guard"], what="guard")
         state_tree.copy_into(self.behavior.exploration_state(), state["exploration"], what="exploration")
         self.replay.load_state_dict(state["replay"])
         self.steps_made = state["steps_made"] if state["replay"] else 0
@@ -226,10 +217,7 @@ class OffPolicyUpdate(RolloutUpdate):
                 that is another.
         """
         self._check_action_bounds(state["actor"])
-        state_tree.copy_into(self.actor.state_dict(), state["actor"], what="actor")
-        state_tree.copy_into(self.critic.state_dict(), state["critic"], what="critic")
-        target = self.loss.target_critic_network.state_dict()
-        state_tree.copy_into(target, state["target_critic"], what="target critic")
+        super().load_weights(state)
         if isinstance(self.loss, SACLoss):
             with torch.no_grad():
                 self.loss.log_alpha.copy_(state["log_alpha"])

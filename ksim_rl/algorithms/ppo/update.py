@@ -10,25 +10,17 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import unravel_key
 from torch import Tensor
 
-from ksim_rl.algorithms.gradient_steps import (
-    RolloutUpdate,
-    StepMeans,
-    epoch_of_steps,
-    in_columns,
-    make_dataset,
-)
-from ksim_rl.algorithms.optimizer_state import load_optimizer_state, optimizer_state
+from ksim_rl.algorithms.gradient_steps import DatasetUpdate, in_columns
 from ksim_rl.algorithms.ppo.fused import make_fused_ppo
 from ksim_rl.data import DatasetCfg
 from ksim_rl.device import state_tree
-from ksim_rl.modules import CarriedState, memories, update_normalizers
+from ksim_rl.modules import CarriedState, update_normalizers
 from ksim_rl.objectives import (
     PPOCfg,
     distribution_keys,
     in_precision,
     make_advantage,
     make_loss,
-    make_optimizer,
     make_symmetric,
     observation_keys,
     with_precision_of,
@@ -48,7 +40,7 @@ LOGGED = {
 }
 
 
-class PPOUpdate(RolloutUpdate):
+class PPOUpdate(DatasetUpdate):
     """Improves actor and critic with one rollout at a time; see `RolloutUpdate`.
 
     Args:
@@ -75,20 +67,19 @@ class PPOUpdate(RolloutUpdate):
         device: torch.device | str = "cpu",
         mirror: Mapping[Any, MirrorMap] | None = None,
     ) -> None:
-        super().__init__(max_skipped_steps=cfg.max_skipped_steps, device=device)
-        self.cfg = cfg = with_precision_of(cfg, device)
-        self.actor, self.critic = actor, critic
+        cfg = with_precision_of(cfg, device)
+        self.actor = self.behavior = actor
+        self.critic = critic
         self.advantage = make_advantage(cfg, actor, critic)
-        self.loss = make_loss(cfg, actor, critic)
-        losses = make_symmetric(cfg, self.loss, mirror, device=self.device)
-        self._losses = in_precision(losses, cfg.precision, device=self.device)
-        self.optimizer = make_optimizer(cfg, actor, critic)
-        # The rollouts hold the states of the actor's memory, and not those of the critic's.
-        self._memories = memories(actor, critic)
-        self._carried = CarriedState(critic, acting=actor)
-        self.dataset = make_dataset(
-            data, keys=self.loss.dataset_keys, memories=self._memories, seed=seed, device=self.device
+        loss = make_loss(cfg, actor, critic)
+        networks = {"actor": actor, "critic": critic}
+        super().__init__(
+            cfg, loss=loss, networks=networks, data=data, seed=seed, device=device, logged=LOGGED
         )
+        losses = make_symmetric(cfg, loss, mirror, device=self.device)
+        self._losses = in_precision(losses, cfg.precision, device=self.device)
+        # The rollouts hold the states of the actor's memory, and not those of the critic's.
+        self._carried = CarriedState(critic, acting=actor)
         self.fused = make_fused_ppo(
             cfg,
             actor=actor,
@@ -99,19 +90,8 @@ class PPOUpdate(RolloutUpdate):
             device=self.device,
         )
         self._is_fused = torch.tensor(float(not isinstance(self.fused, str)), device=self.device)
-        self._means = StepMeans(LOGGED)
         self._std = torch.zeros((), device=self.device)
         self._scale_keys = [key for key in distribution_keys(actor) if key == "scale" or key[-1] == "scale"]
-
-    @property
-    def behavior(self) -> ProbabilisticTensorDictSequential:
-        """The policy that collects: the actor, which samples."""
-        return self.actor
-
-    @property
-    def num_env_states(self) -> int:
-        """D, the env states of one rollout."""
-        return self.dataset.cfg.num_env_states
 
     @property
     def rollout_keys(self) -> list[Any]:
@@ -125,16 +105,7 @@ class PPOUpdate(RolloutUpdate):
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
         std = {"policy/std": self._std} if self._scale_keys else {}
-        return (
-            self._means
-            | std
-            | self._skipped()
-            | {
-                "update/learning_rate": self.optimizer.param_groups[0]["lr"],
-                "update/fused": self._is_fused,
-                "update/non_finite_env_states": self.dataset.non_finite_count,
-            }
-        )
+        return super().metrics() | std | {"update/fused": self._is_fused}
 
     def _update(self) -> None:
         rollout_ET = self.rollout_ET
@@ -144,8 +115,7 @@ class PPOUpdate(RolloutUpdate):
             orders = [self.dataset.epoch_order() for _ in range(self.cfg.num_epochs)]
             steps, left_out = self.fused(rollout_ET, orders)
             self.dataset.non_finite_count.add_(left_out)
-        self._means.take_(steps)
-        self._longest_skip.copy_(steps["skipped_in_a_row"].max())
+        self._measure_(steps)
         if self._scale_keys:
             self._std.copy_(torch.stack([rollout_ET.get(key).nanmean() for key in self._scale_keys]).mean())
         # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
@@ -161,14 +131,7 @@ class PPOUpdate(RolloutUpdate):
         for epoch in range(self.cfg.num_epochs):
             if epoch > 0 and self.cfg.estimates_each_epoch:
                 self._estimate_anew(rollout_ET)
-            steps += epoch_of_steps(
-                self.dataset,
-                self._losses,
-                self.optimizer,
-                cfg=self.cfg,
-                guard=self.guard,
-                memories=self._memories,
-            )
+            steps += self._epoch(self._losses)
         return in_columns(steps)
 
     def _estimate_anew(self, rollout_ET: TensorDictBase) -> None:
@@ -179,34 +142,9 @@ class PPOUpdate(RolloutUpdate):
 
     def state_dict(self) -> state_tree.State:
         """Return networks, optimizer, sampler and counters."""
-        return {
-            "actor": self.actor.state_dict(),
-            "critic": self.critic.state_dict(),
-            "optimizer": optimizer_state(self.optimizer),
-            "sampler": self.dataset.sampler.state_dict(),
-            "guard": self.guard.state_dict(),
-            "non_finite_env_states": self.dataset.non_finite_count,
-            "recurrent_state": self._carried.state_dict(),
-        }
+        return super().state_dict() | {"recurrent_state": self._carried.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue where `state_dict` was taken; tensors keep their addresses.
-
-        Raises:
-            ValueError: naming the tensor that is missing, unknown or of another shape or type.
-        """
-        self.load_weights(state)
-        state_tree.copy_into(self.guard.state_dict(), state["guard"], what="guard")
-        load_optimizer_state(self.optimizer, state["optimizer"], what="optimizer")
-        self.dataset.sampler.load_state_dict(state["sampler"])
-        self.dataset.non_finite_count.copy_(state["non_finite_env_states"])
+        """Continue where `state_dict` was taken; see `RolloutUpdate`."""
+        super().load_state_dict(state)
         self._carried.load_state_dict(state["recurrent_state"], device=self.device)
-
-    def load_weights(self, state: Mapping[str, Any]) -> None:
-        """Take only the networks of a `state_dict`.
-
-        Raises:
-            ValueError: naming the tensor that is missing, unknown or of another shape or type.
-        """
-        state_tree.copy_into(self.actor.state_dict(), state["actor"], what="actor")
-        state_tree.copy_into(self.critic.state_dict(), state["critic"], what="critic")
