@@ -1,7 +1,5 @@
 """This module shows an env as Gymnasium's `VectorEnv`, with NumPy arrays or with tensors that stay on the device."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -36,13 +34,7 @@ class GymnasiumVectorEnv(VectorEnv):
             for all rows.
     """
 
-    def __init__(
-        self,
-        env: EnvBase,
-        *,
-        keys: Keys = None,
-        tensors: bool = False,
-    ) -> None:
+    def __init__(self, env: EnvBase, *, keys: Keys = None, tensors: bool = False) -> None:
         self.env, self.tensors = env, tensors
         self._stepper = Stepper(env, keys)
         self.num_envs, self.render_mode = self._stepper.num_envs, self._stepper.render_mode

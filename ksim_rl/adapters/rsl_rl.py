@@ -1,7 +1,5 @@
 """This module shows an env as rsl_rl's `VecEnv`, so that rsl_rl's runners train on it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from jaxtyping import Float, Int64

@@ -1,7 +1,5 @@
 """This module turns the TorchRL spec of one leaf into the Gymnasium space of one row."""
 
-from __future__ import annotations
-
 import numpy as np
 from gymnasium import spaces
 from torchrl.data import TensorSpec, Unbounded

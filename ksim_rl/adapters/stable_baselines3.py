@@ -1,7 +1,5 @@
 """This module shows an env as stable-baselines3's `VecEnv`, so that its algorithms train on it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

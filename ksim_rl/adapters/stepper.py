@@ -1,7 +1,5 @@
 """This module drives an env by actions alone, for all adapters: it resets itself, and a step is one graph on CUDA."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

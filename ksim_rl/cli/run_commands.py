@@ -27,7 +27,6 @@ def run_command(command: str, arguments: list[str]) -> int:
 def _resume(arguments: list[str]) -> int:
     parser = _parser("resume", "Continue a run from its newest checkpoint, in the same folder.")
     parser.add_argument("--num-iterations", type=int, help="of the whole run; default: as it was configured")
-    parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:<index> or auto")
     options = parser.parse_args(arguments)
     saved = checkpoint.load(checkpoint.latest(options.run))
     cfg = RunCfg.from_tree({**saved.config, "device": options.device})
@@ -47,7 +46,6 @@ def _evaluate(arguments: list[str]) -> int:
     parser = _parser("eval", "Evaluate a policy: deterministic actions, fresh envs, whole episodes.")
     parser.add_argument("--episodes", type=int, help="default: as the run was configured")
     parser.add_argument("--seed", type=int, help="of the initial states; default: the run's evaluation seed")
-    parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:<index> or auto")
     options = parser.parse_args(arguments)
     if options.episodes is not None and options.episodes < 1:
         raise ValueError(f"--episodes {options.episodes}: expected at least 1")
@@ -69,7 +67,6 @@ def _play(arguments: list[str]) -> int:
         "--output", type=Path, help="an .mp4 or .gif file; default: play.mp4 in the run folder"
     )
     parser.add_argument("--seed", type=int, default=0, help="of the initial state")
-    parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:<index> or auto")
     options = parser.parse_args(arguments)
     if options.seconds is not None:
         check_in_range("--seconds", options.seconds, low=0.0, low_open=True)
@@ -128,4 +125,5 @@ def _envs(arguments: list[str]) -> int:
 def _parser(command: str, description: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=f"ksim-rl {command}", description=description)
     parser.add_argument("run", type=Path, metavar="RUN", help="a run folder, or one of its checkpoints")
+    parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:<index> or auto")
     return parser

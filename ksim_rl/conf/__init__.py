@@ -5,15 +5,17 @@ from functools import cache, partial
 from pathlib import Path
 
 import hydra
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from ksim_rl import algorithms, envs
-from ksim_rl.conf import choices, search_path
-from ksim_rl.conf.training import objective_defaults, training_defaults
+from ksim_rl.conf import choices
 from ksim_rl.config import plugins, upstream
 from ksim_rl.trainers import RunCfg
 from ksim_rl.trainers.run_cfg import without_env_size
@@ -51,14 +53,14 @@ def register() -> None:
 
 @cache
 def _register(_named: tuple[str, ...]) -> None:
-    search_path.register()
+    Plugins.instance().register(DeclaredConfigs)
     envs.register_configs()
     store = partial(upstream.store_config, package="_global_")
     choices.store_choices()
     for name in envs.names():
-        store("task/training", name, partial(training_defaults, name))
+        store("task/training", name, partial(choices.training_defaults, name))
         for objective in algorithms.names():
-            make = partial(objective_defaults, name, objective)
+            make = partial(choices.objective_defaults, name, objective)
             store("task/objective_training", f"{name}_{objective}", make)
     upstream.quicken()
 
@@ -82,3 +84,12 @@ def register_run(folder: Path) -> bool:
     plain = without_env_size({str(key): value for key, value in tree.items()})
     ConfigStore.instance().store(name=RUN_AGAIN, node={"defaults": ["launch", "_self_"], **plain})
     return True
+
+
+class DeclaredConfigs(SearchPathPlugin):
+    """Lets Hydra find the configs that other packages declare (see `ksim_rl.config.plugins`); ours come first."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Append them."""
+        for origin, package in plugins.conf_packages():
+            search_path.append(provider=f"ksim_rl.conf:{origin}", path=f"pkg://{package}")

@@ -1,7 +1,5 @@
 """This module finds steps that make the host wait, and tensors that steps leave behind."""
 
-from __future__ import annotations
-
 import gc
 
 from torch import Tensor

@@ -1,7 +1,5 @@
 """This module compares one physics substep of an env with MuJoCo's C engine."""
 
-from __future__ import annotations
-
 import copy
 
 import mujoco

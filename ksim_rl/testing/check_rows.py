@@ -1,7 +1,5 @@
 """This module finds rows that do not repeat, that a reset of others changes, or whose last observation is lost."""
 
-from __future__ import annotations
-
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor

@@ -1,7 +1,5 @@
 """This module finds wrong specs, dim names and values, and wrong actions that an env takes."""
 
-from __future__ import annotations
-
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Composite

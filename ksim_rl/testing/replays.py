@@ -1,7 +1,5 @@
 """This module gives a check the same actions from the same start, as often as it needs them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -26,9 +26,6 @@ class Update(Protocol):
 
     Attributes:
         device: where all of it lives.
-        actor: the policy that is evaluated, recorded and saved.
-        behavior: the policy that collects; often the actor itself.
-        num_env_states: how many env states a rollout has, E * T.
     """
 
     device: torch.device
@@ -40,7 +37,7 @@ class Update(Protocol):
 
     @property
     def behavior(self) -> TensorDictModuleBase:
-        """The policy that collects."""
+        """The policy that collects; often the actor itself."""
         ...
 
     @property

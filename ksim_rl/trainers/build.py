@@ -2,9 +2,8 @@
 
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -12,7 +11,6 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from ksim_rl import envs
 from ksim_rl.collectors import RolloutCollector
-from ksim_rl.device import state_tree
 from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.modules import RecurrentStatePrimer, recurrent_transforms, state_spec
 from ksim_rl.trainers.algorithm import make_update
@@ -106,15 +104,6 @@ def _with_recurrent_state(env: TransformedEnv, modules: ModulesCfg) -> Transform
         for transform in recurrent_transforms(env, *primers):
             env.append_transform(transform)
     return env
-
-
-def load_actor(actor: TensorDictModuleBase, state: Mapping[str, Any]) -> None:
-    """Copy a checkpoint's policy into an actor of the same shape.
-
-    Raises:
-        ValueError: naming the tensor that does not fit.
-    """
-    state_tree.copy_into(actor.state_dict(), state["update"]["actor"], what="actor")
 
 
 def build_evaluator(

@@ -64,30 +64,21 @@ def _draw_panel(
     *,
     solved_at: float | None,
 ) -> None:
-    labelled = 0
     for (key, label), color in zip(series, _COLORS, strict=False):
         points = [(float(row[STEP]), float(row[key])) for row in rows if row.get(key)]
         if points:
             marker = "o" if len(points) < 25 else None
-            axes.plot(
-                *zip(*points, strict=True),
-                color=color,
-                label=label,
-                marker=marker,
-                markersize=3,
-                linewidth=1.6,
-            )
-            labelled += 1
+            style = {"marker": marker, "markersize": 3, "linewidth": 1.6}
+            axes.plot(*zip(*points, strict=True), color=color, label=label, **style)
     if solved_at is not None:
         axes.axhline(
             solved_at, color="#4e9a06", linestyle="--", linewidth=1.2, label=f"solved at {solved_at:g}"
         )
-        labelled += 1
     axes.set_title(name, fontsize=10.5)
     axes.set_xlabel("env states", fontsize=9)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.tick_params(labelsize=8)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
-    if labelled > 1:
+    if len(axes.lines) > 1:
         axes.legend(fontsize=8, frameon=False)

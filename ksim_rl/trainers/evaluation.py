@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -82,7 +81,7 @@ class Evaluator:
         assert self._current_E is not None
         acting_E = self.policy(self._current_E.copy())
         stepped_E, current_E = self.env.step_and_maybe_reset(acting_E)
-        reward_E, done_E = (_column(stepped_E, key) for key in (("next", "reward"), ("next", "done")))
+        reward_E, done_E = (stepped_E["next", name].squeeze(-1) for name in ("reward", "done"))
         self._return_E.add_(torch.where(self._running_E, reward_E.to(torch.float64), 0.0))
         self._length_E.add_(self._running_E)
         self._running_E.logical_and_(~done_E)
@@ -93,7 +92,3 @@ class Evaluator:
         assert self._current_E is not None
         for key in self._current_E.keys(True, True):
             self._current_E.get(key).copy_(source_E.get(key))
-
-
-def _column(td: TensorDictBase, key: tuple[str, ...]) -> Tensor:
-    return td.get(key).squeeze(-1)

@@ -12,11 +12,12 @@ from tensordict.nn import TensorDictModuleBase
 
 from ksim_rl.config.class_paths import loading_notes
 from ksim_rl.config.plugins import load as load_plugins
+from ksim_rl.device import state_tree
 from ksim_rl.device.memory import memory_for
 from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.trainers import checkpoint, video
 from ksim_rl.trainers.algorithm import make_policy
-from ksim_rl.trainers.build import build, build_env, load_actor
+from ksim_rl.trainers.build import build, build_env
 from ksim_rl.trainers.evaluation import Evaluation
 from ksim_rl.trainers.hooks import Hook
 from ksim_rl.trainers.progress import RunProgress
@@ -96,7 +97,7 @@ def load_policy(path: Path, *, device: str = "auto", plugins: Sequence[str] = ()
     checkpoint.check_columns(saved.state["observation_columns"], observation_columns(env))
     actor = make_policy(cfg, env)
     env.close(raise_if_closed=False)
-    load_actor(actor, saved.state)
+    state_tree.copy_into(actor.state_dict(), saved.state["update"]["actor"], what="actor")
     return Policy(cfg=cfg, actor=actor, iteration=saved.iteration)
 
 

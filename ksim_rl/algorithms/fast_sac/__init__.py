@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from ksim_rl.algorithms.off_policy import MANY_ENVS
-from ksim_rl.algorithms.sac.wiring import make_sac_policy, make_sac_update
+from ksim_rl.algorithms.sac import make_sac_policy, make_sac_update
 from ksim_rl.modules import QNetworkCfg, SquashedActorCfg
 from ksim_rl.objectives import SACCfg
 from ksim_rl.trainers.algorithm import Algorithm

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from ksim_rl.algorithms.off_policy import MANY_ENVS
-from ksim_rl.algorithms.td3.wiring import make_td3_policy, make_td3_update
+from ksim_rl.algorithms.td3 import make_td3_policy, make_td3_update
 from ksim_rl.modules import DeterministicActorCfg, QNetworkCfg
 from ksim_rl.objectives import TD3Cfg
 from ksim_rl.trainers.algorithm import Algorithm
