@@ -16,10 +16,10 @@ from ksim_rl.trainers.loggers import LoggerCfg, MLflowCfg, WandbCfg
 def test_without_a_task_of_its_own_settings_a_run_has_the_dataclasses_defaults(monkeypatch):
     bare = dataclasses.replace(envs.task("cartpole_balance"), training=None)
     monkeypatch.setattr(envs, "task", lambda name: bare)
-    from ksim_rl.conf import training
+    from ksim_rl.conf import choices
 
-    assert training.objective_defaults("cartpole_balance", "ppo") == {}
-    assert set(training.training_defaults("cartpole_balance")) == {"task_name", "num_envs", "task"}
+    assert choices.objective_defaults("cartpole_balance", "ppo") == {}
+    assert set(choices.training_defaults("cartpole_balance")) == {"task_name", "num_envs", "task"}
 
 
 def test_the_defaults_are_those_of_the_dataclasses():
@@ -70,10 +70,10 @@ def test_what_a_task_sets_lies_over_other_networks(name):
 def test_a_task_with_settings_as_they_were_in_0_1_is_refused(monkeypatch):
     old = Task(name="old", description="", cfg=envs.task("arm_reach").cfg, training={"objective.gamma": 0.9})
     monkeypatch.setattr(envs, "task", lambda name: old)
-    from ksim_rl.conf import training
+    from ksim_rl.conf import choices
 
     with pytest.raises(ValueError, match="task 'old': training is a dict; expected a .*TrainingCfg"):
-        training.training_defaults("old")
+        choices.training_defaults("old")
 
 
 def test_the_command_line_overrides_the_tasks_defaults():
