@@ -83,8 +83,10 @@ def check_value(field: str, value: object, annotation: Any) -> None:
         for bound in bounds:
             if arguments[0] is int and bound.high is None and bound.low is not None:
                 check_count(field, value, low=int(bound.low))
-            else:
-                bound.check(field, value)
+                continue
+            if arguments[0] is int:
+                _check_instance(field, value, int)
+            bound.check(field, value)
     elif origin in (typing.Union, types.UnionType):
         _check_union(field, value, arguments)
     elif origin is Literal:

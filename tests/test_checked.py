@@ -73,3 +73,14 @@ def test_what_annotations_do_not_allow_is_refused_by_name(given, message):
 def test_a_count_is_a_whole_number_of_at_least_one(size):
     with pytest.raises(ValueError, match="size="):
         Inner(size=size)
+
+
+@pytest.mark.parametrize("group", [6, -1, 1.5, True])
+def test_whole_numbers_with_two_bounds_are_whole(group):
+    @dataclass(frozen=True, kw_only=True)
+    class Groups(Checked):
+        group: Annotated[int, Within(low=0, high=5)] = 0
+
+    assert Groups(group=5).group == 5
+    with pytest.raises(ValueError, match="group="):
+        Groups(group=group)
