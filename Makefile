@@ -24,7 +24,7 @@ $(STAMP): pyproject.toml constraints.txt
 train: setup
 	$(BIN)/ksim-rl train $(ARGS)
 
-check: lint types imports
+check: lint types imports house
 
 lint: setup
 	$(BIN)/ruff check .

@@ -36,7 +36,7 @@ from ksim_rl.modules import (
     observation_dim,
     update_normalizers,
 )
-from ksim_rl.modules.heads import MIN_STD
+from ksim_rl.modules.actor import MIN_STD
 from ksim_rl.objectives import (
     PPOCfg,
     StepGuard,
@@ -180,7 +180,12 @@ def make_fused(settings: Settings, ppo: PPO) -> Any:
         log_std=settings.actor.std_type == "log",
         min_std=MIN_STD,
     )
-    if why_not_fused(settings.objective, networks, data=settings.data) is not None:
+    data = settings.data
+    sizes: Any = {
+        "num_env_states_per_minibatch": data.num_env_states_per_minibatch,
+        "num_minibatches": data.num_minibatches,
+    }
+    if why_not_fused(settings.objective, networks, **sizes) is not None:
         return None
     from ksim_rl.objectives.fused_ppo.fused_ppo import FusedPPO
 
@@ -191,8 +196,7 @@ def make_fused(settings: Settings, ppo: PPO) -> Any:
         observe_critic=lambda td: value.observe(*(td.get(key) for key in settings.critic.in_keys)),
         optimizer=ppo.optimizer,
         guard=ppo.guard,
-        num_env_states_per_minibatch=settings.data.num_env_states_per_minibatch,
-        num_minibatches=settings.data.num_minibatches,
+        **sizes,
     )
 
 

@@ -1,14 +1,14 @@
 """This module shows an env as Gymnasium's `VectorEnv`, with NumPy arrays or with tensors that stay on the device."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Float
+from jaxtyping import Shaped
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.adapters.spaces import box
+from ksim_rl.adapters.spaces import space_of
 from ksim_rl.adapters.stepper import Keys, Observations, Stepper, to_numpy
 from ksim_rl.envs.contract import EpisodeClock, part
 
@@ -23,15 +23,11 @@ except ImportError as error:
 class GymnasiumVectorEnv(VectorEnv):
     """Steps an env for Gymnasium: `(obs, reward [E], terminated [E], truncated [E], infos)`, reset in the same step.
 
-    `obs` is a dict of arrays [E, L] by name. Where an episode ended, `infos["final_obs"]` has its last observations
-    and `infos["_final_obs"]` the mask, as Gymnasium's own vector envs do with `AutoresetMode.SAME_STEP`.
-
-    Args:
-        env: what `envs.make` returns, or any env of batch size [E] with a continuous action.
-        keys: the observations to give; see `Stepper`.
-        tensors: False gives NumPy arrays, and `final_obs` is an object array with one dict per ended env (else None).
-            True gives tensors on the env's device without any host sync, and `final_obs` is a dict of tensors [E, L]
-            for all rows.
+    `obs` is a dict of arrays [E, L] by name, of the observations `keys`; see `Stepper`. Where an episode ended,
+    `infos["final_obs"]` has its last observations and `infos["_final_obs"]` the mask, as Gymnasium's own vector envs do
+    with `AutoresetMode.SAME_STEP`. Arrays are NumPy's, and `final_obs` is an object array with one dict per ended env
+    (else None). With `tensors` they are tensors on the env's device without any host sync, and `final_obs` is a dict of
+    tensors [E, L] for all rows. The env is what `envs.make` returns, or any of batch size [E] with a continuous action.
     """
 
     def __init__(self, env: EnvBase, *, keys: Keys = None, tensors: bool = False) -> None:
@@ -44,32 +40,32 @@ class GymnasiumVectorEnv(VectorEnv):
             "render_modes": [mode for mode in (self.render_mode,) if mode],
             "render_fps": round(1.0 / clock.step_dt) if clock else 1,
         }
+        dims, spec = self._stepper.batch_dims, env.full_observation_spec
         self.single_observation_space = spaces.Dict(
-            {name: box(env.full_observation_spec[key]) for name, key in self._stepper.keys.items()}
+            {name: space_of(spec[key], batch_dims=dims) for name, key in self._stepper.keys.items()}
         )
-        self.single_action_space = box(env.full_action_spec[env.action_key])
+        self.single_action_space = space_of(self._stepper.action_spec, batch_dims=dims)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Reset all envs.
+        """Reset all envs, whose draws follow from one seed; a list of one per env, as Gymnasium takes, makes one.
 
-        Raises:
-            ValueError: on options, of which there are none.
+        There are no `options`. A list s, s + 1, s + 2, ... is the seed s, which means the same in Gymnasium.
         """
         if options:
             raise ValueError(f"options={options!r}: this env has no reset options; use seed=")
+        seed = seed if seed is None or isinstance(seed, int) else _one_seed(seed, self.num_envs)
         super().reset(seed=seed)
         return self._out(self._stepper.reset(seed)), {}
 
     def step(
-        self, action_EL: Float[np.ndarray, "E L"] | Float[Tensor, "E L"]
+        self, actions_E: Shaped[np.ndarray, " E *leaf"] | Shaped[Tensor, " E *leaf"]
     ) -> tuple[dict[str, Any], Any, Any, Any, dict[str, Any]]:
         """Step all envs."""
-        device = self._stepper.device
-        step = self._stepper.step(torch.as_tensor(action_EL, dtype=torch.float32, device=device))
+        step = self._stepper.step(self._stepper.as_action(actions_E))
         done_E = step.done_E
         infos: dict[str, Any] = {}
         if self.tensors:
@@ -91,6 +87,17 @@ class GymnasiumVectorEnv(VectorEnv):
 
     def _out(self, obs: Observations) -> dict[str, Any]:
         return obs if self.tensors else to_numpy(obs)
+
+
+def _one_seed(seeds: Sequence[int | None], num_envs: int) -> int | None:
+    if len(seeds) != num_envs:
+        raise ValueError(f"seed={list(seeds)!r}: expected one per env, {num_envs}")
+    if None in seeds:
+        return None
+    first = int(seeds[0] or 0)
+    if all(seed == first + row for row, seed in enumerate(seeds)):
+        return first
+    return int(np.random.SeedSequence([int(seed or 0) for seed in seeds]).generate_state(1)[0] >> 1)
 
 
 def _final_obs(obs: dict[str, np.ndarray], done_E: np.ndarray) -> dict[str, Any]:

@@ -21,15 +21,10 @@ except ImportError as error:
 class RslRlVecEnv(VecEnv):
     """Steps a `ManagerBasedRlEnv`, transformed or not, for rsl_rl.
 
-    Observations are a TensorDict [E] of the env's groups, which `obs_groups` of the runner's config refers to by name
-    (`{"actor": ["actor"], "critic": ["critic"]}`). `extras["time_outs"]` marks truncations, which rsl_rl bootstraps;
-    `extras["log"]` holds, every `log_interval` steps, what the episodes that ended since then came to: per-term reward
-    sums, metrics and shares of each termination.
-
-    Args:
-        env: what `envs.make` returns.
-        keys: the observations to give; see `Stepper`.
-        log_interval: env steps between two entries of `extras["log"]`; best the runner's `num_steps_per_env`.
+    Observations are a TensorDict [E] of the env's groups (or `keys`, see `Stepper`), which `obs_groups` of the runner's
+    config refers to by name (`{"actor": ["actor"], "critic": ["critic"]}`). `extras["time_outs"]` marks truncations,
+    which rsl_rl bootstraps; `extras["log"]` holds, every `log_interval` steps (best the runner's `num_steps_per_env`),
+    what the episodes that ended since then came to: per-term reward sums, metrics and shares of each termination.
     """
 
     def __init__(

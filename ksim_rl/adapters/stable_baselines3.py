@@ -3,8 +3,7 @@
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Float
+from jaxtyping import Shaped
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -15,23 +14,23 @@ try:
     from gymnasium import spaces
     from stable_baselines3.common.vec_env import VecEnv
 
-    from ksim_rl.adapters.spaces import box
+    from ksim_rl.adapters.spaces import space_of
 except ImportError as error:
     raise ImportError(
         'stable-baselines3 is not installed: pip install "ksim_rl[stable_baselines3]"'
     ) from error
 
 
+# What each row would have of its own, if it were a Gymnasium env.
+_OF_ROWS = ("render_mode", "observation_space", "action_space")
+
+
 class StableBaselines3VecEnv(VecEnv):
-    """Steps an env for stable-baselines3, with NumPy arrays.
+    """Steps an env of batch size [E] with a continuous action for stable-baselines3, with NumPy arrays.
 
-    With one observation the space is a `Box` ("MlpPolicy"), with several a `Dict` ("MultiInputPolicy"). Where an
-    episode ended, `infos[row]` has `"terminal_observation"` and `"TimeLimit.truncated"`.
-
-    Args:
-        env: what `envs.make` returns, or any env of batch size [E] with a continuous action.
-        keys: the observations to give; see `Stepper`.
-        action_limit: bound of an action that has none in the env's spec, since stable-baselines3 wants finite ones.
+    With one observation of `keys` (see `Stepper`) the space is a `Box` ("MlpPolicy"), with several a `Dict`
+    ("MultiInputPolicy"). Where an episode ended, `infos[row]` has `"terminal_observation"` and `"TimeLimit.truncated"`.
+    `action_limit` bounds actions without bounds in the env's spec, since stable-baselines3 wants finite ones.
     """
 
     def __init__(
@@ -44,17 +43,20 @@ class StableBaselines3VecEnv(VecEnv):
         check_in_range("action_limit", action_limit, low=0.0, low_open=True)
         self.env, self._stepper = env, Stepper(env, keys)
         self.render_mode = self._stepper.render_mode
-        boxes = {name: box(env.full_observation_spec[key]) for name, key in self._stepper.keys.items()}
+        dims, spec = self._stepper.batch_dims, env.full_observation_spec
+        boxes = {name: space_of(spec[key], batch_dims=dims) for name, key in self._stepper.keys.items()}
         self._single = next(iter(boxes)) if len(boxes) == 1 else None
-        action = box(env.full_action_spec[env.action_key])
-        low = np.where(np.isfinite(action.low), action.low, -action_limit)
-        high = np.where(np.isfinite(action.high), action.high, action_limit)
+        action = space_of(self._stepper.action_spec, batch_dims=dims)
+        if isinstance(action, spaces.Box):
+            low = np.where(np.isfinite(action.low), action.low, -action_limit)
+            high = np.where(np.isfinite(action.high), action.high, action_limit)
+            action = spaces.Box(low, high, dtype=np.float32)
         super().__init__(
             num_envs=self._stepper.num_envs,
             observation_space=spaces.Dict(dict(boxes)) if self._single is None else boxes[self._single],
-            action_space=spaces.Box(low, high, dtype=np.float32),
+            action_space=action,
         )
-        self._action_EL: Tensor | None = None
+        self._action: Tensor | None = None
 
     def reset(self) -> np.ndarray | dict[str, np.ndarray]:
         """Reset all envs, with the seed that `seed` was given, if any."""
@@ -63,15 +65,15 @@ class StableBaselines3VecEnv(VecEnv):
         self._reset_options()
         return self._out(obs)
 
-    def step_async(self, action_EL: Float[np.ndarray, "E L"]) -> None:
+    def step_async(self, actions_E: Shaped[np.ndarray, " E *leaf"]) -> None:
         """Take the actions of the next `step_wait`."""
-        self._action_EL = torch.as_tensor(action_EL, dtype=torch.float32, device=self._stepper.device)
+        self._action = self._stepper.as_action(actions_E)
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Step all envs."""
-        if self._action_EL is None:
+        if self._action is None:
             raise RuntimeError("step_wait without actions: call step_async first")
-        step, self._action_EL = self._stepper.step(self._action_EL), None
+        step, self._action = self._stepper.step(self._action), None
         done_E, terminated_E = step.done_E.cpu().numpy(), step.terminated_E.cpu().numpy()
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done_E.any():
@@ -93,8 +95,8 @@ class StableBaselines3VecEnv(VecEnv):
         return [self._stepper.picture()]
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of the env, once per index: all rows are one env."""
-        value = self.render_mode if attr_name == "render_mode" else getattr(self.env, attr_name)
+        """Return an attribute of the env, or what stable-baselines3 asks of an env, once per index: all are one env."""
+        value = getattr(self if attr_name in _OF_ROWS else self.env, attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:

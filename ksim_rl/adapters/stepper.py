@@ -2,18 +2,21 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Shaped
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torchrl.data import OneHot
 from torchrl.envs import EnvBase
 
 from ksim_rl.checks import near
 from ksim_rl.device.capture import Captured
 from ksim_rl.envs.contract import Pictures, part
 from ksim_rl.envs.masked_reset import MaskedReset
+from ksim_rl.envs.signal_keys import signal_keys
 
 Keys = Mapping[str, NestedKey] | Sequence[NestedKey] | None
 Observations = dict[str, Shaped[Tensor, "E *?leaf"]]
@@ -22,11 +25,9 @@ Observations = dict[str, Shaped[Tensor, "E *?leaf"]]
 
 @dataclass(frozen=True)
 class Step:
-    """One env step of E envs; rows that ended have been reset already.
+    """One env step of E envs; rows that ended have been reset already, and `obs` is of their new episode.
 
-    Attributes:
-        obs: the next root observations by name: after a reset, those of the new episode.
-        final_obs: the observations of the states reached; they differ from `obs` in rows that ended.
+    `final_obs` has the observations of the states reached.
     """
 
     obs: Observations
@@ -47,29 +48,29 @@ def to_numpy(obs: Observations) -> dict[str, np.ndarray]:
 
 
 class Stepper:
-    """Drives an env of batch size [E] and returns copies, which later steps do not change.
+    """Drives an env of batch size [E], or [] as one row, and returns copies, which later steps do not change.
 
-    Args:
-        env: an env such as `envs.make` returns.
-        keys: the observations to return, by the name to return them under, or as a list of keys. None: every leaf that
-            is not nested (`"actor"`, `"critic"`), or all leaves where there is no such.
-
-    Raises:
-        ValueError: if a key names no observation of the env.
+    It returns the observations at `keys`, by the name to return them under, or as a list of keys. None is every leaf
+    that is not nested (`"actor"`, `"critic"`), or all leaves where there is no such.
     """
 
     def __init__(self, env: EnvBase, keys: Keys = None) -> None:
-        if len(env.batch_size) != 1:
-            raise ValueError(f"env.batch_size={tuple(env.batch_size)}: expected one dim, [E]")
-        self.env = env
+        if len(env.batch_size) > 1:
+            raise ValueError(f"env.batch_size={tuple(env.batch_size)}: expected one dim, [E], or none")
+        self.env, self.batch_dims, self._signals = env, env.batch_dims, signal_keys(env)
         self.device = env.device or torch.device("cpu")
         self.keys = _named(env, keys)
-        self.num_envs = env.batch_size[0]
+        self.num_envs = env.batch_size.numel()
+        if env.full_reward_spec[self._signals.reward].shape.numel() != self.num_envs:
+            raise ValueError(
+                f"{self._signals.reward!r} has several numbers per row: adapters take one reward each"
+            )
         self.pictures = part(env, Pictures)
         self.render_mode = self.pictures.render_mode if self.pictures else None
         self._root: TensorDictBase | None = None
         self._out: dict[str, TensorDictBase] = {}
-        self._action = env.full_action_spec[env.action_key].zero()
+        self.action_spec = env.full_action_spec[env.action_key]
+        self._action = self.action_spec.zero()
         self._run = Captured(self._step, device=self.device)
 
     @property
@@ -95,35 +96,45 @@ class Stepper:
             self._root.update_(root_E)
         return self.read(self._root)
 
-    @torch.no_grad()
-    def step(self, action_EL: Shaped[Tensor, "E L"]) -> Step:
-        """Step all envs.
+    def as_action(self, values: Any) -> Shaped[Tensor, "*batch"]:
+        """Return what a foreign policy chose for E rows as an action of the env: numbers, or the index of a choice."""
+        action = torch.as_tensor(values, device=self.device)
+        if isinstance(self.action_spec, OneHot):
+            action = torch.nn.functional.one_hot(action.long().reshape(-1), self.action_spec.space.n)
+        if action.shape != self._action.shape and action.numel() == self._action.numel() == self.num_envs:
+            action = action.reshape(self._action.shape)
+        return (action if self.batch_dims or action.shape == self._action.shape else action[0]).to(
+            self._action.dtype
+        )
 
-        Raises:
-            ValueError: if the action's shape or dtype is not the env's.
-        """
+    @torch.no_grad()
+    def step(self, action: Shaped[Tensor, "*batch"]) -> Step:
+        """Step all envs, by an action of the env's own shape and dtype."""
         wanted = self._action
-        if action_EL.shape != wanted.shape or action_EL.dtype != wanted.dtype:
+        if action.shape != wanted.shape or action.dtype != wanted.dtype:
             raise ValueError(
-                f"action is {action_EL.dtype} of shape {tuple(action_EL.shape)}: "
+                f"action is {action.dtype} of shape {tuple(action.shape)}: "
                 f"expected {wanted.dtype} of shape {tuple(wanted.shape)}"
             )
         root = self.root
-        self._action.copy_(action_EL)
+        self._action.copy_(action)
         self._run()
         next_E = self._out["next"]
         root.update_(self._out["root"])
         if isinstance(self.env, MaskedReset):
             # The env's own reference points into the graph's memory, which the next replay overwrites.
             self.env.last_root = root
-        reward_E, terminated_E, truncated_E = (
-            next_E.get(key).flatten().clone() for key in ("reward", "terminated", "truncated")
+        keys = self._signals
+        reward_E, done_E, terminated_E = (next_E.get(key).flatten().clone() for key in keys[:3])
+        cut_E = (
+            done_E & ~terminated_E if keys.truncated is None else next_E.get(keys.truncated).flatten().clone()
         )
-        return Step(self.read(root), self.read(next_E), reward_E, terminated_E, truncated_E)
+        return Step(self.read(root), self.read(next_E), reward_E.float(), terminated_E, cut_E)
 
     def read(self, tensordict: TensorDictBase) -> Observations:
         """Return copies of the observations by name."""
-        return {name: tensordict.get(key).clone() for name, key in self.keys.items()}
+        leaves = {name: tensordict.get(key).clone() for name, key in self.keys.items()}
+        return leaves if self.batch_dims else {name: leaf.unsqueeze(0) for name, leaf in leaves.items()}
 
     def picture(self) -> np.ndarray | None:
         """Return a picture of the envs that `cfg.viewer` shows, or None without a render mode."""

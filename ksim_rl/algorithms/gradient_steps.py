@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ksim_rl.data import DatasetBuffer, DatasetCfg, SequenceSampler
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
-from ksim_rl.modules import burnt_in, memories
+from ksim_rl.modules import burnt_in, recurrent_modules
 from ksim_rl.objectives import NonFiniteStepsError, StepGuard, load_optimizer_state_, make_optimizer, ppo_step
 
 
@@ -22,11 +22,7 @@ def in_columns(steps: Sequence[Mapping[str, Num[Tensor, ""]]]) -> dict[str, Num[
 
 
 class StepMeans(dict[str, Tensor]):
-    """Means over the gradient steps of the last update, by their logged names, each a tensor [] that stays in place.
-
-    Args:
-        names: logged names by those of what a step measures; what no step measures is left out.
-    """
+    """Means over the steps of the last update, tensors [] that stay in place; `names` has logged names by measured."""
 
     def __init__(self, names: Mapping[str, str]) -> None:
         super().__init__()
@@ -47,15 +43,8 @@ class RolloutUpdate:
     """What the updates have in common: each is one piece of work on a rollout, without a host sync.
 
     On CUDA the first updates run eagerly and the next is captured. So each rollout must be the same memory, which is
-    what `RolloutCollector` gives.
-
-    Args:
-        networks: all that learn, by the names that a checkpoint gives them.
-        max_skipped_steps: so many gradient steps in a row that are not finite end the run.
-        device: where all of it lives.
-
-    Attributes:
-        guard: counts gradient steps that were skipped.
+    what `RolloutCollector` gives. The `networks` are all that learn, by the names that a checkpoint gives them; so many
+    as `max_skipped_steps` in a row that are not finite, which `guard` counts, end the run.
     """
 
     def __init__(
@@ -74,15 +63,11 @@ class RolloutUpdate:
         self._run()
 
     def check(self, metrics: Mapping[str, float]) -> None:
-        """Stop a run that skips its gradient steps; `metrics` are those of `metrics()`, on the host.
-
-        Raises:
-            NonFiniteStepsError: if `max_skipped_steps` or more in a row were skipped.
-        """
+        """Raise NonFiniteStepsError where `metrics()`, on the host, say that too many steps in a row were skipped."""
         # Not the guard, which knows only of those since the last step that was made.
         in_a_row, limit = int(metrics["update/skipped_in_a_row"]), self._max_skipped_steps
         if in_a_row >= limit:
-            raise NonFiniteStepsError.of(in_a_row, limit=limit, skipped=int(metrics["update/skipped_steps"]))
+            raise NonFiniteStepsError(in_a_row, limit=limit, skipped=int(metrics["update/skipped_steps"]))
 
     @property
     def rollout_ET(self) -> TensorDictBase:
@@ -103,20 +88,12 @@ class RolloutUpdate:
         return {**networks, "guard": self.guard.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue where `state_dict` was taken; tensors keep their addresses.
-
-        Raises:
-            ValueError: naming the tensor that is missing, unknown or of another shape or type.
-        """
+        """Continue where `state_dict` was taken, at the same addresses; a ValueError names what does not fit."""
         self.load_weights(state)
         state_tree.copy_into(self.guard.state_dict(), state["guard"], what="guard")
 
     def load_weights(self, state: Mapping[str, Any]) -> None:
-        """Take only the networks of a `state_dict`.
-
-        Raises:
-            ValueError: naming the tensor that is missing, unknown or of another shape or type.
-        """
+        """Take only the networks of a `state_dict`; a ValueError names the tensor that does not fit."""
         for name, network in self.networks.items():
             state_tree.copy_into(network.state_dict(), state[name], what=name.replace("_", " "))
 
@@ -124,14 +101,8 @@ class RolloutUpdate:
 class DatasetUpdate(RolloutUpdate):
     """What the updates have in common that make epochs of gradient steps on the dataset of each rollout.
 
-    Args:
-        cfg: of the objective.
-        loss: says which leaves the dataset keeps.
-        networks: see `RolloutUpdate`; those with a memory learn on sequences.
-        data: sizes of dataset, minibatch and sequence.
-        seed: of the order of the env states in the minibatches.
-        device: where all of it lives.
-        logged: names of the logged means, by the names that `ppo_step` gives them.
+    The loss says which leaves the dataset keeps; recurrent networks learn on sequences. The `seed` is of the order of
+    the env states in the minibatches; `logged` are names of logged means, by the names that `ppo_step` gives them.
     """
 
     def __init__(
@@ -149,14 +120,12 @@ class DatasetUpdate(RolloutUpdate):
         self.cfg, self.loss = cfg, loss
         self.num_env_states = data.num_env_states
         self.optimizer = make_optimizer(cfg, *networks.values())
-        self._memories = memories(*networks.values())
-        sampler = SequenceSampler(sequence_length=data.sequence_length, burn_in=data.burn_in, seed=seed)
+        self._recurrent = recurrent_modules(*networks.values())
+        sampler = None
+        if self._recurrent:
+            sampler = SequenceSampler(sequence_length=data.sequence_length, burn_in=data.burn_in, seed=seed)
         self.dataset = DatasetBuffer(
-            data,
-            keys=loss.dataset_keys,
-            seed=seed,
-            sampler=sampler if self._memories else None,
-            device=self.device,
+            data, keys=loss.dataset_keys, seed=seed, sampler=sampler, device=self.device
         )
         self._means = StepMeans(logged)
 
@@ -170,14 +139,11 @@ class DatasetUpdate(RolloutUpdate):
         }
 
     def _epoch(self, loss: Any) -> list[dict[str, Tensor]]:
-        """Make a gradient step on each minibatch of one epoch; return what each measured, as `ppo_step` names it.
-
-        Beside it stands `skipped_in_a_row`, the guard's count after the step.
-        """
+        """Make a gradient step on each minibatch of an epoch; return what each measured, with `skipped_in_a_row`."""
         steps = []
         for minibatch_B in self.dataset.epoch():
-            if self._memories:
-                minibatch_B = burnt_in(minibatch_B, *self._memories, steps=self.dataset.cfg.burn_in)
+            if self._recurrent:
+                minibatch_B = burnt_in(minibatch_B, *self._recurrent, steps=self.dataset.cfg.burn_in)
             step = ppo_step(loss, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard)
             steps.append(step | {"skipped_in_a_row": self.guard.skipped_in_a_row.clone()})
         return steps
@@ -212,11 +178,7 @@ def optimizer_state(optimizer: torch.optim.Optimizer) -> state_tree.State:
 
 
 def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, Any], *, what: str) -> None:
-    """Continue where `optimizer_state` was taken.
-
-    Raises:
-        ValueError: naming what does not fit this optimizer's parameters.
-    """
+    """Continue where `optimizer_state` was taken; a ValueError names what does not fit this optimizer's parameters."""
     parameters = optimizer.param_groups[0]["params"]
     moments = {int(index): entry for index, entry in state["moments"].items()}
     if set(moments) != set(range(len(parameters))):

@@ -2,8 +2,6 @@
 
 import importlib
 import pkgutil
-from collections.abc import Iterator
-from types import ModuleType
 
 from ksim_rl.checks import unknown_name
 from ksim_rl.config import plugins
@@ -16,11 +14,7 @@ _read: set[str] = set()
 
 
 def register(algorithm: Algorithm, *, origin: str = "a call of register") -> None:
-    """Add an algorithm; once more is the same.
-
-    Raises:
-        ValueError: if another one has its name.
-    """
+    """Add an algorithm; once more is the same, and another one of its name a ValueError."""
     first, known = _found.setdefault(algorithm.name, (origin, algorithm))
     if known is not algorithm:
         raise ValueError(
@@ -34,11 +28,7 @@ def names() -> list[str]:
 
 
 def algorithm(name: str) -> Algorithm:
-    """Return an algorithm by name.
-
-    Raises:
-        ValueError: if there is none of this name, with the near names.
-    """
+    """Return an algorithm by name."""
     found = _algorithms()
     if name not in found:
         raise unknown_name("algorithm", name, found)
@@ -46,11 +36,7 @@ def algorithm(name: str) -> Algorithm:
 
 
 def serving(cfg: type[AlgorithmCfg]) -> Algorithm:
-    """Return the algorithm whose settings these are: that of the class itself, or of its nearest base.
-
-    Raises:
-        ValueError: if there is none.
-    """
+    """Return the algorithm whose settings these are: that of the class itself, or of its nearest base."""
     by_class = {algorithm.cfg: algorithm for _, algorithm in _algorithms().values()}
     for base in cfg.__mro__:
         if base in by_class:
@@ -62,16 +48,12 @@ def serving(cfg: type[AlgorithmCfg]) -> Algorithm:
 
 
 def _algorithms() -> dict[str, tuple[str, Algorithm]]:
-    for origin, module in (*_own_modules(), *plugins.modules(plugins.ALGORITHMS)):
+    inside = pkgutil.iter_modules(importlib.import_module(PACKAGE).__path__, f"{PACKAGE}.")
+    ours = ((info.name, importlib.import_module(info.name)) for info in inside if info.ispkg)
+    for origin, module in (*ours, *plugins.modules(plugins.ALGORITHMS)):
         if module.__name__ not in _read:
             for value in vars(module).values():
                 if isinstance(value, Algorithm):
                     register(value, origin=origin)
             _read.add(module.__name__)
     return _found
-
-
-def _own_modules() -> Iterator[tuple[str, ModuleType]]:
-    for info in pkgutil.iter_modules(importlib.import_module(PACKAGE).__path__, f"{PACKAGE}."):
-        if info.ispkg:
-            yield info.name, importlib.import_module(info.name)

@@ -18,6 +18,7 @@ usage: ksim-rl <command> [arguments]
   play     record a video:          ksim-rl play RUN --seconds 10
   warmup   compile ahead of time:   ksim-rl warmup task=go1_velocity_flat device=cuda
   envs     list the tasks, or print what one is made of: ksim-rl envs cartpole_swingup
+  robot    analyse a robot's model: ksim-rl robot unitree_a1/a1 [--code]
 
 RUN is a run folder (its newest checkpoint) or one of its checkpoints.
 --plugin PACKAGE, with any command and repeatable, imports a package of yours: its tasks, and the terms, robots,
@@ -27,7 +28,7 @@ transforms, networks and algorithms that configs name. KSIM_RL_PLUGINS=PACKAGE,.
 exit codes: 0 done (and solved, or its target met, where there is one), 1 not solved, 2 refused: the command or its
 configuration is wrong, 3 the run failed, 130 / 143 interrupted and saved (SIGINT / SIGTERM)"""
 
-COMMANDS = ("train", "resume", "eval", "play", "warmup", "envs")
+COMMANDS = ("train", "resume", "eval", "play", "warmup", "envs", "robot")
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -10,9 +10,8 @@ from ksim_rl.trainers.build import solved_at
 
 def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None = None) -> int:
     """Train with progress on the terminal, say how it ended, and return the exit code."""
-    progress = RunProgress(
-        cfg.trainer.num_iterations, done=0 if resume_from is None else resume_from.iteration
-    )
+    done = 0 if resume_from is None else resume_from.iteration
+    progress = RunProgress(cfg.trainer.num_iterations, done=done)
     length = cfg.data.rollout_length(cfg.num_envs)
     progress.note(
         f"{cfg.task_name}: {cfg.num_envs} envs x {length} steps = {cfg.num_envs * length} env states per iteration, "

@@ -1,4 +1,4 @@
-"""This module holds the commands that take no Hydra overrides: resume, eval, play, envs."""
+"""This module holds the commands that take no Hydra overrides: resume, eval, play, envs, robot."""
 
 import argparse
 import dataclasses
@@ -11,24 +11,39 @@ from rich.table import Table
 from ksim_rl import envs
 from ksim_rl.checks import check_in_range
 from ksim_rl.cli.report import run_and_report, shown, verdict
+from ksim_rl.config.plain_data import check_links
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.envs.contract import part
+from ksim_rl.scene.robots import analyse
+from ksim_rl.scene.robots.analysis import TRIAL_S
 from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, load_policy, record_video
 from ksim_rl.trainers.build import build_evaluator, solved_at
+from ksim_rl.trainers.run_cfg import check_run_tree
 
 VIDEO_SUFFIXES = (".mp4", ".gif")
+# Folders in a run folder that a run writes to.
+FOLDERS = ("checkpoint", "tensorboard", "wandb", "mlflow")
 
 
 def run_command(command: str, arguments: list[str]) -> int:
     """Run one of the commands and return its exit code."""
-    return {"resume": _resume, "eval": _evaluate, "play": _play, "envs": _envs}[command](arguments)
+    commands = {"resume": _resume, "eval": _evaluate, "play": _play, "envs": _envs, "robot": _robot}
+    return commands[command](arguments)
 
 
 def _resume(arguments: list[str]) -> int:
     parser = _parser("resume", "Continue a run from its newest checkpoint, in the same folder.")
     parser.add_argument("--num-iterations", type=int, help="of the whole run; default: as it was configured")
+    parser.add_argument(
+        "--trust", action="store_true", help="the folder is yours: it may hold links, and say where to write"
+    )
     options = parser.parse_args(arguments)
     saved = checkpoint.load(checkpoint.latest(options.run))
+    # A checkpoint lies in <run folder>/checkpoint/<iteration>.
+    folder = saved.path.absolute().parent.parent
+    if not options.trust:
+        check_links(folder, below=FOLDERS)
+        check_run_tree(saved.config, saved.path)
     cfg = RunCfg.from_tree({**saved.config, "device": options.device})
     cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
     if options.num_iterations is not None:
@@ -38,8 +53,7 @@ def _resume(arguments: list[str]) -> int:
             )
         longer = dataclasses.replace(cfg.trainer, num_iterations=options.num_iterations)
         cfg = dataclasses.replace(cfg, trainer=longer)
-    # A checkpoint lies in <run folder>/checkpoint/<iteration>.
-    return run_and_report(cfg, saved.path.resolve().parent.parent, resume_from=saved)
+    return run_and_report(cfg, folder.resolve(), resume_from=saved)
 
 
 def _evaluate(arguments: list[str]) -> int:
@@ -77,7 +91,11 @@ def _play(arguments: list[str]) -> int:
     progress = RunProgress(1)
     with compile_notice(progress.status):
         policy = load_policy(options.run, device=options.device)
-        path = options.output or checkpoint.latest(options.run).resolve().parent.parent / "play.mp4"
+        path = options.output
+        if path is None:
+            folder = checkpoint.latest(options.run).absolute().parent.parent
+            check_links(folder, below=())
+            path = folder / "play.mp4"
         written = record_video(
             policy.cfg, policy.actor, path, note=progress.note, seconds=options.seconds, seed=options.seed
         )
@@ -120,6 +138,27 @@ def _envs(arguments: list[str]) -> int:
     # In a pipe nothing is wrapped, so that each task stays one line.
     Console(highlight=False, width=None if console.is_terminal else 240).print(table)
     return 0
+
+
+def _robot(arguments: list[str]) -> int:
+    """Analyse a robot; the code is 1 for one that does not stand."""
+    parser = argparse.ArgumentParser(
+        prog="ksim-rl robot",
+        description="Say what a legged robot's model holds, and propose all that walking needs.",
+    )
+    parser.add_argument(
+        "model", metavar="PATH", help="an MJCF or URDF file, or a menagerie name: unitree_a1/a1"
+    )
+    parser.add_argument("--code", action="store_true", help="print Python to paste, in place of the table")
+    parser.add_argument("--picture", type=Path, metavar="PNG", help="also draw the stance into this file")
+    options = parser.parse_args(arguments)
+    if options.picture is not None and options.picture.suffix != ".png":
+        raise ValueError(f"--picture {options.picture}: expected a file that ends in .png")
+    found = analyse(options.model)
+    print(found.code() if options.code else found.table(), end="")
+    if options.picture is not None:
+        found.draw(options.picture)
+    return 0 if found.stands_s >= TRIAL_S else 1
 
 
 def _parser(command: str, description: str) -> argparse.ArgumentParser:

@@ -14,21 +14,19 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from ksim_rl import conf
-from ksim_rl.cli.command_line import check_command_line
 from ksim_rl.cli.errors import report
 from ksim_rl.cli.report import run_and_report
 from ksim_rl.cli.upstream import parse_flags
 from ksim_rl.config import plugins
 from ksim_rl.trainers import RunCfg
+from ksim_rl.trainers.run_lock import is_locked
 
 
 def train(arguments: list[str]) -> int:
     """Run `ksim-rl train <arguments>` and return its exit code, the highest of all jobs of a multirun.
 
-    A job that fails says why; the others still run.
-
-    Raises:
-        ValueError: for a group, name, field or value that is wrong; nothing was built or written then.
+    A job that fails says why; the others still run. A ValueError names a group, name, field or value that is wrong;
+    nothing was built or written then.
     """
     conf.register()
     flags = parse_flags(arguments)
@@ -36,7 +34,7 @@ def train(arguments: list[str]) -> int:
     if not (flags.help or flags.hydra_help or flags.shell_completion or own_config):
         builds = flags.cfg is None and flags.info is None
         multirun = flags.multirun or not builds
-        check_command_line(flags.overrides, name=name, multirun=multirun, values=builds)
+        conf.check_command_line(flags.overrides, name=name, multirun=multirun, values=builds)
 
     codes: list[int] = []
     process = os.getpid()
@@ -55,7 +53,9 @@ def train(arguments: list[str]) -> int:
 
     # Hydra prints errors in its own way unless this is set; here they go to `ksim_rl.cli.main`.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-    sys.argv = ["ksim-rl train", *arguments]
+    # A run folder is data: Hydra must not look for configs in it. The last of two folders counts.
+    away = ["--config-dir", str(Path(conf.__file__).parent)] if name == conf.RUN_AGAIN else []
+    sys.argv = ["ksim-rl train", *arguments, *away]
     try:
         job()
     except HydraException as error:  # all that is left for Hydra to find, such as another --config-name
@@ -65,16 +65,18 @@ def train(arguments: list[str]) -> int:
 
 def _primary_config(flags: argparse.Namespace) -> tuple[str, bool]:
     """Return the name of the config to compose, and whether the user brings configs that only Hydra can check."""
+    for given in filter(None, (flags.config_dir, flags.config_path)):
+        if (flags.config_name or flags.config_path) and os.path.lexists(Path(given, conf.RUN_CONFIG)):
+            raise ValueError(
+                f"{given}: the config of a run is data and no primary config: give --config-dir {given} alone"
+            )
     if flags.config_dir and not flags.config_name:
         folder = Path(flags.config_dir)
-        if conf.register_run(folder):
+        if os.path.lexists(folder / conf.RUN_CONFIG):
+            fields = [text.lstrip("+~").partition("=")[0] for text in flags.overrides]
+            conf.register_run(folder, fields)
             return conf.RUN_AGAIN, False
-        if all(path.name == conf.RUN_CONFIG for path in folder.glob("*/**/*.yaml")):
-            # Nothing here is in a group, so Hydra would go on as if the folder had not been named.
-            raise ValueError(
-                f"--config-dir {folder}: expected a run folder, which has the {conf.RUN_CONFIG} of a run, or a folder "
-                "with config groups of yours"
-            )
+        conf.check_groups(folder)
     return conf.NAME, bool(flags.config_name or flags.config_dir or flags.config_path)
 
 
@@ -95,13 +97,17 @@ def _train_one(config: DictConfig) -> int:
     if cfg.checkpoint is not None:
         cfg = dataclasses.replace(cfg, checkpoint=str(Path(cfg.checkpoint).resolve()))
     cfg = dataclasses.replace(cfg, objective=cfg.objective.with_absolute_paths())
-    return run_and_report(cfg, _unused(Path(HydraConfig.get().runtime.output_dir)))
+    launched = HydraConfig.get()
+    folder = Path(launched.runtime.output_dir)
+    # Where the user named the folder of a run that is under way, that run's lock says so.
+    named = any(text.startswith("hydra.run.dir=") for text in launched.overrides.hydra) and is_locked(folder)
+    return run_and_report(cfg, folder if named else _unused(folder))
 
 
 def _unused(folder: Path) -> Path:
     """Return `folder`, or one beside it where a run that began in the same second has it already."""
     candidate, number = folder, 1
-    while (candidate / conf.RUN_CONFIG).exists():
+    while (candidate / conf.RUN_CONFIG).exists() or is_locked(candidate):
         number += 1
         candidate = folder.with_name(f"{folder.name}_{number}")
     return candidate

@@ -6,7 +6,6 @@ import time
 import warp as wp
 
 from ksim_rl import conf
-from ksim_rl.cli.command_line import check_command_line
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.trainers import RunProgress, build
 
@@ -17,30 +16,22 @@ that the next run with the same task starts at once: one iteration runs, with no
 
 
 def warmup(arguments: list[str]) -> int:
-    """Run one iteration of the config, say how long it took and where the kernels are, and return the exit code.
-
-    Raises:
-        ValueError: for an override that is wrong.
-    """
+    """Run one iteration of the config, say how long it took and where the kernels are, and return the exit code."""
     if arguments and arguments[0] in ("-h", "--help"):
         print(USAGE)
         return 0
-    conf.register()
-    check_command_line(arguments, name=conf.NAME, multirun=False, values=True)
     cfg = conf.compose([*arguments, "logger=none", "trainer.eval_episodes=0"])
     cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
     compiled: list[str] = []
-    progress = RunProgress(1)
+    progress, began = RunProgress(1), time.perf_counter()
 
     def notice(text: str) -> None:
         compiled.append(text)
         progress.status(text)
 
     with compile_notice(notice):
-        began = time.perf_counter()
-        trainer = build(cfg)
-        trainer.iterate()
-        seconds = time.perf_counter() - began
+        build(cfg).iterate()
+    seconds = time.perf_counter() - began
     print(
         f"{cfg.task_name} on {cfg.device}: {seconds:.1f} s; {len(compiled)} kernel modules were compiled, the others "
         f"were cached in {wp.config.kernel_cache_dir}"

@@ -15,6 +15,7 @@ from ksim_rl import dims
 from ksim_rl.checked import Checked, Count
 from ksim_rl.checks import check_count
 from ksim_rl.device.capture import Captured
+from ksim_rl.device.state_tree import copy_into
 from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.envs.masked_reset import MaskedReset
 
@@ -23,11 +24,9 @@ from ksim_rl.envs.masked_reset import MaskedReset
 class CollectorCfg(Checked):
     """Options of `RolloutCollector` that a config may set.
 
-    Attributes:
-        require_graphs: on CUDA, fail where CUDA graphs are unavailable instead of running slower with a warning.
-        stagger_episodes: at the first reset, spread the time-outs of the envs over an episode's length, where the env
-            offers it, so that not all episodes are in the same phase.
-        warmup: on CUDA, how many rollouts run eagerly before one is captured; they are ordinary rollouts.
+    `require_graphs` fails where CUDA graphs are unavailable, instead of running slower with a warning.
+    `stagger_episodes` spreads the time-outs of the envs over an episode's length at the first reset, where the env
+    offers it. The first `warmup` rollouts on CUDA run eagerly.
     """
 
     require_graphs: bool = False
@@ -42,21 +41,13 @@ class RolloutCollector:
     """Runs `policy` in `env` for T steps at a time; envs that end are reset within the rollout.
 
     On CUDA the T steps of policy, physics, terms, transforms and resets are one graph: the first rollouts run eagerly
-    (they warm the kernels up and are as good as any), the next is captured, and from then on each is one launch. On
-    CPU each control step's physics is one Warp graph and torch stays eager.
+    (they warm the kernels up and are as good as any), the next is captured, and from then on each is one launch. On CPU
+    each control step's physics is one Warp graph and torch stays eager.
 
-    The rollout is the same as that of `EnvBase.rollout(T, policy, break_when_any_done=False, auto_reset=False)`.
-
-    Args:
-        env: an env of batch size [E] whose `step_and_maybe_reset` does not synchronize (`ManagerBasedRlEnv`,
-            `MaskedTransformedEnv`); on CPU any TorchRL env of batch size [E].
-        policy: writes `"action"` (and what training needs) into the tensordict that it is given.
-        rollout_length: T.
-        keys: the leaves to store; None stores all. Fewer leaves cost less memory and time.
-        cfg: options of the capture.
-
-    Raises:
-        ValueError: if T is no positive whole number or `keys` names a leaf that no step produces.
+    The rollout is the same as that of `EnvBase.rollout(T, policy, break_when_any_done=False, auto_reset=False)`. On
+    CUDA the env's `step_and_maybe_reset` must not synchronize (`ManagerBasedRlEnv`, `MaskedTransformedEnv`); on CPU any
+    TorchRL env of batch size [E] will do. The policy writes the action, and what training needs. Stored are the leaves
+    at `keys`, None for all: fewer cost fewer bytes and less time.
     """
 
     def __init__(
@@ -89,10 +80,7 @@ class RolloutCollector:
 
     @torch.no_grad()
     def collect(self) -> TensorDict:
-        """Run T steps and return the rollout, `["E","T"]`.
-
-        The memory is reused: the next call overwrites what this one returned.
-        """
+        """Run T steps and return the rollout, `["E","T"]`, whose memory the next call overwrites."""
         if self._root is None:
             self.reset()
         self._run()
@@ -127,28 +115,12 @@ class RolloutCollector:
 
     @torch.no_grad()
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state_dict`; the env's own state is loaded apart.
-
-        Raises:
-            ValueError: if the state is of another env.
-        """
+        """Continue from a `state_dict` of such a collector; the env's own state is loaded apart."""
         if self._root is None:
             self.reset()
         assert self._root is not None
         own = {_flat(key): self._root.get(key) for key in self._root.keys(True, True)}
-        if own.keys() != state.keys():
-            raise ValueError(
-                f"state of another collector: missing {sorted(own.keys() - state.keys())}, "
-                f"unknown {sorted(state.keys() - own.keys())}"
-            )
-        for name, leaf in own.items():
-            if state[name].shape != leaf.shape or state[name].dtype != leaf.dtype:
-                raise ValueError(
-                    f"state of another collector: {name!r} is {state[name].dtype} of shape {tuple(state[name].shape)}, "
-                    f"but this env has {leaf.dtype} of shape {tuple(leaf.shape)}: build it with the same num_envs"
-                )
-        for name, leaf in own.items():
-            leaf.copy_(state[name])
+        copy_into(own, state, what="state of another collector (build the env with the same num_envs)")
 
     def _rollout(self) -> None:
         assert self._root is not None

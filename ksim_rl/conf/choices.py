@@ -23,8 +23,8 @@ OF_AN_ALGORITHM = ("objective", "data", "modules")
 Tree = dict[str, Any]
 
 
-def _with_memory(memory: RecurrentCfg) -> ModulesCfg:
-    return ModulesCfg(recurrent_actor=memory, recurrent_critic=memory)
+def _recurrent(cfg: RecurrentCfg) -> ModulesCfg:
+    return ModulesCfg(recurrent_actor=cfg, recurrent_critic=cfg)
 
 
 # By group and name. The data and networks of an algorithm that are none of these go by its own name.
@@ -32,8 +32,8 @@ CHOICES: dict[str, dict[str, Any]] = {
     "data": {"on_policy": DATA, "off_policy": MANY_ENVS, "off_policy_small": FEW_ENVS},
     "modules": {
         "mlp": ModulesCfg(),
-        "gru": _with_memory(RecurrentCfg(kind="gru")),
-        "lstm": _with_memory(RecurrentCfg(kind="lstm")),
+        "gru": _recurrent(RecurrentCfg(kind="gru")),
+        "lstm": _recurrent(RecurrentCfg(kind="lstm")),
         "shared_trunk": ModulesCfg(
             trunk=SharedTrunkCfg(),
             # The trunk normalizes.

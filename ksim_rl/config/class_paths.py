@@ -21,9 +21,16 @@ MOVED = {
     "ksim_rl.envs.terrains": "ksim_rl.scene.terrains",
     "ksim_rl.envs.transforms": "ksim_rl.transforms",
     **dict.fromkeys(
-        [f"ksim_rl.tasks.{task}" for task in ("cheetah_run", "hopper", "walker")], "ksim_rl.tasks.planar"
+        [
+            f"ksim_rl.tasks.{task}"
+            for task in ("cheetah_run", "hopper", "walker", "walker_amp", "walker_motion")
+        ],
+        "ksim_rl.tasks.planar",
     ),
-    "ksim_rl.tasks.walker_amp": "ksim_rl.tasks.walker_motion",
+    **dict.fromkeys(
+        [f"ksim_rl.tasks.{task}" for task in ("cartpole", "pendulum_swingup", "reacher")],
+        "ksim_rl.tasks.control_suite",
+    ),
 }
 """Paths of 0.1 and where their classes are now, applied in turn; else a class is found by its package's exports."""
 
@@ -47,17 +54,10 @@ def find(
     accepts: Callable[[Any], bool],
     besides: frozenset[str] = frozenset(),
 ) -> Any:
-    """Import the class that a `_target_` names, if its package is allowed.
+    """Import the class that a `_target_` names, if its package is ours, a plug-in's or one of `besides`.
 
-    Args:
-        target: the dotted path of a class.
-        path: where it stands in the config, for errors.
-        kind: what is looked for, for errors.
-        accepts: whether a class is of that kind.
-        besides: packages that are allowed here beside ours and those of plug-ins.
-
-    Raises:
-        ValueError: if the package is not allowed, or has no such class, with the near names.
+    A ValueError, with the near names, refuses other packages, and a class that is not there or that `accepts` declines.
+    It says where the target stands in the config (`path`), and what `kind` of class was looked for.
     """
     module_name, _, class_name = str(target).rpartition(".")
     where = f"{path}.{TARGET}={target!r}"
@@ -78,7 +78,7 @@ def find(
                 ) from error
             continue
         found = vars(module).get(class_name)
-        if isinstance(found, type) and accepts(found):
+        if isinstance(found, type) and accepts(found) and found.__module__.split(".")[0] in allowed:
             return found
         names += [name for name, value in vars(module).items() if isinstance(value, type) and accepts(value)]
     if not names:

@@ -5,8 +5,6 @@ which class it is (any term, any robot), the key `_target_` does. Only classes o
 or built, so that a config file cannot run code.
 """
 
-from __future__ import annotations
-
 import collections.abc
 import dataclasses
 import functools
@@ -36,11 +34,7 @@ class OwnTree(ABC):
     @classmethod
     @abstractmethod
     def from_tree(cls, tree: Any, path: str) -> Self:
-        """Build the config that stands at `path`.
-
-        Raises:
-            ValueError: naming the full path of what is wrong.
-        """
+        """Build the config that stands at `path`; a ValueError names the full path of what is wrong."""
 
 
 def to_tree(value: Any, annotation: Any = None) -> Any:
@@ -78,33 +72,19 @@ def default_tree(cls: type, annotation: Any = None) -> dict[str, Any]:
 
 
 def from_tree(annotation: type[Config], tree: Any, path: str = "") -> Config:
-    """Build the dataclass that a tree describes.
-
-    Args:
-        annotation: the dataclass that is expected.
-        tree: as `to_tree` returns it.
-        path: what stands before the fields' names in errors, such as "task".
-
-    Raises:
-        ValueError: with the full path of the field that is unknown, missing, of a wrong type or out of range, and what
-            would be valid.
-    """
+    """Build the dataclass that a tree describes; `path` precedes the fields in errors, which say what is valid."""
     return build_value(annotation, tree, path)
 
 
 def build_value(annotation: Any, value: Any, path: str) -> Any:
-    """Build what an annotation describes from a tree; `Any` takes it as it is.
-
-    Raises:
-        ValueError: as `from_tree`.
-    """
+    """Build what an annotation describes from a tree, as `from_tree` does; `Any` takes it as it is."""
     if annotation is Any:
         return value
     alternatives = _alternatives(annotation)
     if value is None and type(None) in alternatives:
         return None
     alternatives = [option for option in alternatives if option is not type(None)]
-    classes = [option for option in alternatives if isinstance(option, type) and not _is_scalar(option)]
+    classes = [option for option in alternatives if isinstance(option, type) and option not in _SCALARS]
     if len(classes) == 1 and issubclass(classes[0], OwnTree):
         return classes[0].from_tree(value, path)
     takes_mapping = any(typing.get_origin(option) in _MAPPINGS for option in alternatives)
@@ -122,6 +102,7 @@ def build_value(annotation: Any, value: Any, path: str) -> Any:
 
 
 _NO_MATCH = object()
+_SCALARS = (bool, int, float, str, NestedKey)
 _MAPPINGS = (collections.abc.Mapping, dict)
 
 
@@ -219,10 +200,6 @@ def _alternatives(annotation: Any) -> list[Any]:
 def _default_class(annotation: Any) -> Any:
     """Return the dataclass that a tree without `_target_` means: the first that the annotation names."""
     return next((option for option in _alternatives(annotation) if dataclasses.is_dataclass(option)), None)
-
-
-def _is_scalar(option: Any) -> bool:
-    return option in (bool, int, float, str, NestedKey)
 
 
 def _describe(annotation: Any) -> str:

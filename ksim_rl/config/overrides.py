@@ -13,11 +13,7 @@ from ksim_rl.checks import near
 
 
 def check_overrides(tree: Mapping[str, Any], overrides: Sequence[str]) -> None:
-    """Refuse overrides that do not parse, or that change a field which the tree does not have.
-
-    Raises:
-        ValueError: naming the override, and the near names at the level where its path leaves the tree.
-    """
+    """Refuse overrides that do not parse, or change a field which the tree does not have, with the near names there."""
     parsed = []
     for text in overrides:
         try:
@@ -28,11 +24,7 @@ def check_overrides(tree: Mapping[str, Any], overrides: Sequence[str]) -> None:
 
 
 def check_parsed(tree: Mapping[str, Any], overrides: Iterable[Override]) -> None:
-    """Do the same with overrides that are parsed: each sees what the ones before it have added and dropped.
-
-    Raises:
-        ValueError: as `check_overrides`.
-    """
+    """Do the same with overrides that are parsed: each sees what the ones before it have added and dropped."""
     tree = copy.deepcopy(dict(tree))
     for override in overrides:
         key = override.key_or_group

@@ -12,10 +12,9 @@ An installed package declares what it has in its pyproject.toml, and is then kno
     my_robots = "my_robots.conf"       # a package of YAML files, laid out like ksim_rl/conf
 
 Any other package is a plug-in where the user names it: `--plugin my_package` for one command, the environment variable
-`KSIM_RL_PLUGINS=my_package,other` for all. Its modules are imported at once, each `Task` and
-`Algorithm` at the top level of one is registered, its subpackage `conf`, where there is one, holds YAML files, and
-configs may name its classes as `_target_`.
-What a run folder or a checkpoint says is never a reason to import anything.
+`KSIM_RL_PLUGINS=my_package,other` for all. Its modules are imported at once, each `Task` and `Algorithm` at the top
+level of one is registered, its subpackage `conf`, where there is one, holds YAML files, and configs may name its
+classes as `_target_`. What a run folder or a checkpoint says is never a reason to import anything.
 """
 
 import importlib
@@ -50,10 +49,7 @@ def load(names: Sequence[str]) -> None:
     """Import the plug-ins that a command or a caller names, with those of `KSIM_RL_PLUGINS`.
 
     Packages of the working directory are found too, after installed ones. Processes that this one starts load the same
-    plug-ins, as the environment variable takes up the names.
-
-    Raises:
-        ValueError: if one cannot be imported; the message names it.
+    plug-ins, as the environment variable takes up the names. A ValueError names one that cannot be imported.
     """
     wanted = [*os.environ.get(VARIABLE, "").split(","), *names]
     for name in dict.fromkeys(name.strip() for name in wanted if name.strip()):
@@ -89,11 +85,7 @@ def hint(package: str) -> str:
 
 
 def check_remembered(names: Sequence[str]) -> None:
-    """Refuse a run whose plug-ins nobody named, allowed or installed here.
-
-    Raises:
-        ValueError: with the flag that names the plug-in.
-    """
+    """Refuse a run whose plug-ins nobody named, allowed or installed here; the ValueError has the flag that does."""
     for name in names:
         package = str(name).split(".")[0]
         if package not in packages():
@@ -103,13 +95,10 @@ def check_remembered(names: Sequence[str]) -> None:
 
 
 def modules(group: str) -> Iterator[tuple[str, ModuleType]]:
-    """Import the modules that a group of entry points names, and the plug-ins, with the origin of each for messages.
-
-    Raises:
-        ValueError: if one cannot be imported; the message names the package.
-    """
+    """Import the modules that a group of entry points names, and the plug-ins, with the origin of each for messages."""
     for point in declared(group):
-        origin = f"entry point {point.name} = {point.value!r} of {_distribution(point)}"
+        owner = "an unknown package" if point.dist is None else point.dist.name
+        origin = f"entry point {point.name} = {point.value!r} of {owner}"
         for module in _import(origin, point.module, "mend or uninstall that package"):
             yield origin, module
     for name in _named:
@@ -135,7 +124,3 @@ def _import(origin: str, name: str, fix: str) -> list[ModuleType]:
         return [module, *(importlib.import_module(f"{name}.{child}") for child in found)]
     except Exception as error:
         raise ValueError(f"{origin} cannot be loaded: {type(error).__name__}: {error}; {fix}") from error
-
-
-def _distribution(point: EntryPoint) -> str:
-    return "an unknown package" if point.dist is None else point.dist.name

@@ -2,11 +2,9 @@
 
 from ksim_rl.data.dataset_buffer import DatasetBuffer, DatasetCfg, rollout_length
 from ksim_rl.data.dataset_storage import MASK_KEY, DatasetStorage, DatasetWriter
-from ksim_rl.data.epoch_sampler import EpochSampler
-from ksim_rl.data.replay_ring import ReplayCfg, ReplayRing
-from ksim_rl.data.replay_samplers import PrioritySampler, ReplaySampler
+from ksim_rl.data.epoch_sampler import BURN_IN_KEY, EpochSampler, SequenceSampler, sequence_length
+from ksim_rl.data.replay_ring import PrioritySampler, ReplayCfg, ReplayRing, ReplaySampler
 from ksim_rl.data.replay_storage import ReplayStorage, ReplayWriter
-from ksim_rl.data.sequence_sampler import BURN_IN_KEY, SequenceSampler, sequence_length
 
 __all__ = [
     "BURN_IN_KEY",

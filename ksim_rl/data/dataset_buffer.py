@@ -17,19 +17,15 @@ from ksim_rl import dims
 from ksim_rl.checked import Checked, Count, WholeNumber
 from ksim_rl.checks import check_count
 from ksim_rl.data.dataset_storage import MASK_KEY, DatasetStorage, DatasetWriter
-from ksim_rl.data.epoch_sampler import EpochSampler
-from ksim_rl.data.sequence_sampler import BURN_IN_KEY, SequenceSampler
+from ksim_rl.data.epoch_sampler import BURN_IN_KEY, EpochSampler, SequenceSampler
 
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetCfg(Checked):
     """How many env states one RL update uses, and in how many gradient steps an epoch splits them.
 
-    Attributes:
-        num_env_states_per_minibatch: B, env states in one gradient step.
-        num_minibatches: gradient steps per epoch.
-        sequence_length: recurrent networks learn on so many successive steps of an env; None takes the whole rollout.
-        burn_in: so many steps before a sequence renew its first state, which is stored otherwise.
+    Recurrent networks learn on `sequence_length` successive steps of an env, None for the whole rollout, whose first
+    state is the stored one, or renewed by `burn_in` steps before it.
     """
 
     num_env_states_per_minibatch: Count
@@ -48,12 +44,7 @@ class DatasetCfg(Checked):
 
 
 def rollout_length(num_env_states_per_minibatch: int, num_minibatches: int, num_envs: int) -> int:
-    """Return T, the steps that each env takes for one dataset: D / num_envs.
-
-    Raises:
-        ValueError: if T is no whole number; the message has the three numbers and the nearest working values
-            of each.
-    """
+    """Return T = D / num_envs, the steps of each env for a dataset; a ValueError has the nearest values that work."""
     check_count("num_env_states_per_minibatch", num_env_states_per_minibatch)
     check_count("num_minibatches", num_minibatches)
     check_count("num_envs", num_envs)
@@ -93,18 +84,12 @@ def _near_divisors(number: int, value: int) -> str:
 class DatasetBuffer(ReplayBuffer):
     """Holds D env states and yields minibatches of B of them.
 
-    Storage, sampler and writer are TorchRL parts. `extend` takes a whole dataset, `["E","T"]` or `["D"]`, and
-    copies it into storage whose addresses never change; `sample` gives the next minibatch `["B"]`; `epoch`
-    gives `num_minibatches` of them that cover the dataset exactly once; `all` gives the dataset `["D"]`. None
-    of them makes a host sync, so whole epochs can be captured in a CUDA graph. Rows with a non-finite element
-    are removed, masked and counted: see `DatasetStorage`.
-
-    Args:
-        cfg: sizes of the dataset and its minibatches.
-        keys: leaves to store; None stores all that the data has.
-        seed: of the order of the env states.
-        sampler: any TorchRL sampler instead of `EpochSampler`.
-        device: where the dataset lives; "auto" takes the device of the first data.
+    Storage, sampler and writer are TorchRL parts. `extend` takes a whole dataset, `["E","T"]` or `["D"]`, and copies it
+    into storage whose addresses never change; `sample` gives the next minibatch `["B"]`; `epoch` gives
+    `num_minibatches` of them that cover the dataset exactly once; `all` gives the dataset `["D"]`. None of them makes a
+    host sync, so whole epochs can be captured in a CUDA graph. Rows with a non-finite element are removed, masked and
+    counted: see `DatasetStorage`. Stored are the leaves at `keys`, None for all; `seed` is of the order of the env
+    states.
     """
 
     def __init__(
@@ -132,14 +117,7 @@ class DatasetBuffer(ReplayBuffer):
         return self._dataset.non_finite_count
 
     def extend(self, data: TensorDictBase, *, update_priority: bool | None = None) -> Int64[Tensor, " D"]:
-        """Replace the dataset by `data` and return the indices written.
-
-        Args:
-            data: a rollout `["E","T"]` or any TensorDict of D env states; env-major order.
-
-        Raises:
-            ValueError: if `data` has not exactly D env states (the message has the numbers), or lacks a key.
-        """
+        """Replace the dataset by `data`, exactly D env states in env-major order, and return the indices written."""
         size = self.cfg.num_env_states
         if data.numel() != size:
             raise ValueError(
@@ -154,8 +132,8 @@ class DatasetBuffer(ReplayBuffer):
                     f"the data lacks {missing}; it has {sorted(map(str, data.keys(True, True)))}"
                 )
             data = data.select(*self._keys, ("collector", "mask"), strict=False)
-        if isinstance(self._sampler, SequenceSampler):
-            self._sampler.begin(data.batch_size, batch_size=self.cfg.num_env_states_per_minibatch)
+        if isinstance(self.sampler, SequenceSampler):
+            self.sampler.begin(data.batch_size, batch_size=self.cfg.num_env_states_per_minibatch)
         return super().extend(data, update_priority=update_priority)
 
     def sample(self, batch_size: int | None = None, return_info: bool = False) -> Any:
@@ -168,28 +146,19 @@ class DatasetBuffer(ReplayBuffer):
         return (data, info) if return_info else data
 
     def epoch(self) -> Iterator[TensorDictBase]:
-        """Yield `num_minibatches` minibatches `["B"]` that cover the dataset exactly once, in a new order.
-
-        With a `SequenceSampler` they are `["B","T"]`, as in `sample`.
-        """
-        if isinstance(self._sampler, EpochSampler):
-            self._sampler.restart()
+        """Yield `num_minibatches` minibatches, as of `sample`, that cover the dataset exactly once, in a new order."""
+        if isinstance(self.sampler, EpochSampler):
+            self.sampler.restart()
         # One gather for all minibatches: a quarter of the kernels, and each minibatch is a contiguous slice.
         data, info = self._sample(self.cfg.num_env_states)
         data = _labelled(data, info)
         yield from data.split(data.batch_size[0] // self.cfg.num_minibatches)
 
     def epoch_order(self) -> Int64[Tensor, " D"]:
-        """Begin an epoch, and return its whole order instead of its minibatches, on the device.
-
-        Raises:
-            TypeError: with a sampler that is no `EpochSampler`.
-        """
-        if type(self._sampler) is not EpochSampler:
-            raise TypeError(
-                f"a {type(self._sampler).__name__} has no order of single env states: use epoch()"
-            )
-        return self._sampler.epoch_order(self.cfg.num_env_states, device=self.non_finite_count.device)
+        """Begin an epoch of an `EpochSampler`, and return its whole order instead of its minibatches, on the device."""
+        if type(self.sampler) is not EpochSampler:
+            raise TypeError(f"a {type(self.sampler).__name__} has no order of single env states: use epoch()")
+        return self.sampler.epoch_order(self.cfg.num_env_states, device=self.non_finite_count.device)
 
     def all(self) -> TensorDictBase:
         """Return the dataset `["D"]`: views of the storage, which the next `extend` overwrites."""

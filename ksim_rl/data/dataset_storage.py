@@ -1,10 +1,10 @@
 """This module stores one dataset in place, and lets no non-finite number in."""
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Int64
+from jaxtyping import Int64, Shaped
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data.replay_buffers import Writer
@@ -24,10 +24,9 @@ class Stateless:
         """Read nothing."""
 
     def dumps(self, path: Any) -> None:
-        """Write nothing."""
+        """Write nothing, as `loads` reads nothing."""
 
-    def loads(self, path: Any) -> None:
-        """Read nothing."""
+    loads = dumps
 
     def _empty(self, empty_write_count: bool = True) -> None:
         """Forget nothing."""
@@ -40,19 +39,14 @@ MASK_KEY = ("collector", "mask")
 class DatasetStorage(TensorStorage):
     """A TorchRL storage of D env states that are always written together, in place.
 
-    The first write allocates it; later ones copy into the same addresses, so that a captured update stays
-    valid.
+    The first write allocates it; later ones copy into the same addresses, so that a captured update stays valid.
 
-    A row with a non-finite element in any leaf is removed without a host sync: its numbers become those of the
-    first row that is finite (its flags stay), `("collector", "mask")` reads False there, and `non_finite_count`
-    grows by one. All rows stay finite, so nothing non-finite reaches a loss or, through a zero times infinity, a
-    gradient; and TorchRL's losses leave rows with a False mask out of their means. (Zeros instead of a finite row would
-    not do: a standard deviation of zero has no logarithm.) If no row at all is finite, the leaves are zero
-    where they were not, and every mask is False.
-
-    Args:
-        max_size: D.
-        device: where the data lives; "auto" takes the device of the first data.
+    A row with a non-finite element in any leaf is removed without a host sync: its numbers become those of the first
+    row that is finite (its flags stay), `("collector", "mask")` reads False there, and `non_finite_count` grows by one.
+    All rows stay finite, so nothing non-finite reaches a loss or, through a zero times infinity, a gradient; and
+    TorchRL's losses leave rows with a False mask out of their means. (Zeros instead of a finite row would not do: a
+    standard deviation of zero has no logarithm.) If no row at all is finite, the leaves are zero where they were not,
+    and every mask is False.
     """
 
     def __init__(self, max_size: int, *, device: torch.device | str = "auto") -> None:
@@ -63,12 +57,8 @@ class DatasetStorage(TensorStorage):
             self.non_finite_count = self.non_finite_count.to(self.device)
 
     @torch.no_grad()
-    def write(self, data: TensorDictBase) -> None:
-        """Replace the content by `data`, whose batch dims are flattened, the last one running fastest.
-
-        Raises:
-            ValueError: if `data` has not D elements, or its leaves are not those of the first write.
-        """
+    def write(self, data: TensorDictBase) -> Int64[Tensor, " D"]:
+        """Replace the content by D elements, batch dims flattened, the last one running fastest; return all indices."""
         if data.numel() != self.max_size:
             raise ValueError(
                 f"the dataset holds {self.max_size} env states, the data has {data.numel()}: batch_size "
@@ -91,6 +81,7 @@ class DatasetStorage(TensorStorage):
         self.non_finite_count.add_((~finite_D1).sum())
         self._len = self.max_size
         self._bump_mutation_revision()
+        return torch.arange(self.max_size, device=self.device)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the content and the counter of removed rows."""
@@ -108,10 +99,7 @@ class DatasetStorage(TensorStorage):
         if self.device == "auto":
             self.device = next(iter(leaves.values())).device
             self.non_finite_count = self.non_finite_count.to(self.device)
-        content = TensorDict({}, batch_size=[self.max_size], device=self.device)
-        for key, leaf in leaves.items():
-            shape = (self.max_size, *leaf.shape[batch_dims:])
-            content.set(key, torch.empty(shape, dtype=leaf.dtype, device=self.device))
+        content = allocated(leaves, self.max_size, batch_dims=batch_dims, device=self.device)
         content.set(MASK_KEY, torch.ones((self.max_size, 1), dtype=torch.bool, device=self.device))
         self._storage = dims.name(content, dims.D)
         self.initialized = True
@@ -133,23 +121,38 @@ class DatasetStorage(TensorStorage):
         return stored
 
 
-class DatasetWriter(Stateless, Writer):
-    """Writes a whole dataset at once into a `DatasetStorage`."""
+def allocated(
+    leaves: Mapping[Any, Shaped[Tensor, "*?shape"]],
+    num_rows: int,
+    *,
+    batch_dims: int,
+    device: torch.device | str,
+) -> TensorDict:
+    """Return zeros for so many rows of leaves, whose own dims come after `batch_dims`."""
+    rows = {
+        key: torch.zeros(num_rows, *leaf.shape[batch_dims:], dtype=leaf.dtype, device=device)
+        for key, leaf in leaves.items()
+    }
+    return TensorDict(rows, batch_size=[num_rows], device=device)
 
-    _storage: DatasetStorage
+
+class DatasetWriter(Stateless, Writer):
+    """Hands data to the `write` of its storage, which takes a whole dataset or rollout at once."""
+
+    _storage: Any
+    refusal: ClassVar[str] = (
+        "a dataset is written as a whole: use extend() with all its env states instead of add()"
+    )
 
     def add(self, data: Any) -> int:
-        """Refuse: a dataset is written as a whole."""
-        raise ValueError(
-            "a dataset is written as a whole: use extend() with all its env states instead of add()"
-        )
+        """Refuse single elements."""
+        raise ValueError(self.refusal)
 
-    def extend(self, data: Sequence | TensorDictBase) -> Int64[Tensor, " D"]:
-        """Replace the content and return the indices written, which are all."""
+    def extend(self, data: Any) -> Int64[Tensor, " N"]:
+        """Write, and return the indices of the env states written."""
         if not isinstance(data, TensorDictBase):
             raise ValueError(f"extend() got {type(data).__name__}: expected a TensorDict, e.g. a rollout")
-        self._storage.write(data)
-        return torch.arange(self._storage.max_size, device=self._storage.device)
+        return self._storage.write(data)
 
 
 def _finite_rows(leaves_D: Iterable[Tensor]) -> Tensor:

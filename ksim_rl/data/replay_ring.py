@@ -1,20 +1,158 @@
-"""This module has the replay of off-policy learning: it holds the last env states of each env."""
+"""This module has the replay of off-policy learning: it holds the last env states of each env, and draws of them."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Int64
+from jaxtyping import Int64, Shaped
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import ReplayBuffer
+from torchrl.data.replay_buffers import Sampler
+from torchrl.data.replay_buffers.storages import Storage
 
 from ksim_rl import dims
 from ksim_rl.checked import Checked, Count, NonNegative, Share
-from ksim_rl.data.replay_samplers import PrioritySampler, ReplaySampler
-from ksim_rl.data.replay_storage import ReplayStorage, ReplayWriter
+from ksim_rl.checks import check_count, check_in_range
+from ksim_rl.data.dataset_storage import Stateless
+from ksim_rl.data.epoch_sampler import stored
+from ksim_rl.data.replay_storage import ReplayStorage, ReplayWriter, SavedByStateDict
+
+
+class ReplaySampler(Stateless, Sampler):
+    """Draws env states of a `ReplayStorage`, each with the same probability, with replacement.
+
+    A place is drawn among all that may hold an env state. Those that do not (terminal observations, env states that are
+    not finite) are drawn again, up to `tries` times; what is left then is masked: with a share q of such places,
+    q^tries of a minibatch. The first that holds one is taken, so what is drawn is exactly uniform over the env states.
+    Makes no host sync; numbers come from torch's default generator of the device.
+    """
+
+    def __init__(self, *, tries: int = 4) -> None:
+        check_count("tries", tries)
+        self.tries = tries
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
+        """Return indices [B] and an empty info dict."""
+        assert isinstance(storage, ReplayStorage)
+        shape, device = (self.tries, batch_size), storage.device
+        env = torch.randint(storage.num_envs, shape, device=device)
+        # float64: float32 cannot tell the places of a ring of more than 2^24.
+        unit = torch.rand(shape, dtype=torch.float64, device=device)
+        age = 1 + (unit * storage.max_age.clamp_min(1)).to(torch.int64)
+        index = storage.index(env, age)
+        first = storage.available[index].to(torch.uint8).argmax(0, keepdim=True)
+        return index.gather(0, first).squeeze(0), {}
+
+
+class PrioritySampler(SavedByStateDict, Sampler):
+    """Draws what is stored in proportion to (priority + eps)^alpha (Schaul et al., arXiv 1511.05952), with replacement.
+
+    It stands in for TorchRL's `PrioritizedSampler` in any replay buffer whose storage has one dim, with the default
+    priority of the paper: the highest so far, 1 at the start. Give it priorities by the buffer's
+    `update_priority(index, priority)`; TorchRL's `update_tensordict_priority` does so for TorchRL's own sampler only.
+
+    There is no tree: the cumulative sum over all priorities, in float64, and a binary search per draw are a few
+    kernels, make no host sync and can be captured in a CUDA graph. The draws are stratified: one falls in each of B
+    equal shares of the sum, as in the paper's appendix. The info dict has `priority_weight` [B]: (P(i) / min_j
+    P(j))^-beta, at most 1, so that `beta=1` undoes the priorities wholly.
+    """
+
+    def __init__(
+        self,
+        max_capacity: int,
+        *,
+        alpha: float = 0.6,
+        beta: float = 0.4,
+        eps: float = 1e-8,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        check_in_range("alpha", alpha, low=0.0)
+        check_in_range("beta", beta, low=0.0)
+        check_in_range("eps", eps, low=0.0, low_open=True)
+        self.alpha, self.beta, self.eps = alpha, beta, eps
+        self._priority_N = torch.zeros(max_capacity, device=device)
+        self._highest = torch.zeros((), device=device)
+
+    @torch.no_grad()
+    def extend(self, index: Any, **_: Any) -> None:
+        """Give new entries the default priority."""
+        default = self._default()
+        index_N = torch.as_tensor(index, device=self._priority_N.device).reshape(-1)
+        self._priority_N[index_N] = default.expand(index_N.shape[0])
+
+    add = mark_update = extend
+
+    @torch.no_grad()
+    def update_priority(
+        self,
+        index: Any,
+        priority: float | Shaped[Tensor, "#*batch"],
+        *,
+        storage: Storage | None = None,
+        **_: Any,
+    ) -> None:
+        """Set priorities [B] or [] of entries [B]; of an index that occurs twice the highest counts.
+
+        One that is negative or not finite is taken as the default priority.
+        """
+        device = self._priority_N.device
+        index_B = torch.as_tensor(index, device=device).reshape(-1)
+        priority_B = torch.as_tensor(priority, dtype=torch.float32, device=device).reshape(-1)
+        priority_B = priority_B.expand(index_B.shape[0])
+        valid_B = priority_B.isfinite() & (priority_B >= 0.0)
+        self._highest.copy_(torch.maximum(self._highest, torch.where(valid_B, priority_B, 0.0).amax()))
+        priority_B = torch.where(valid_B, priority_B, self._default())
+        self._priority_N.scatter_reduce_(0, index_B, priority_B, "amax", include_self=False)
+
+    @torch.no_grad()
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
+        """Return indices [B] and their weights."""
+        if getattr(storage, "ndim", 1) > 1:
+            raise ValueError(
+                f"the storage has ndim={storage.ndim}: PrioritySampler draws from storages of one dim; use ndim=1 and "
+                "extend by data with one batch dim"
+            )
+        score_N = self._scores(storage)
+        upto_N = score_N.cumsum(0)
+        device = upto_N.device
+        share_B = torch.arange(batch_size, dtype=torch.float64, device=device)
+        share_B = (share_B + torch.rand(batch_size, dtype=torch.float64, device=device)) / batch_size
+        # Rounding could lead past the last entry that has a score.
+        last = (score_N > 0.0).to(torch.int64).mul_(torch.arange(score_N.shape[0], device=device)).amax()
+        index_B = torch.searchsorted(upto_N, share_B * upto_N[-1], right=True)
+        index_B = torch.minimum(index_B, last)
+        lowest = torch.where(score_N > 0.0, score_N, torch.inf).amin()
+        # Where nothing has a score, what is drawn is masked: a finite weight keeps the losses' means finite.
+        weight_B = (score_N[index_B] / lowest).pow(-self.beta).clamp_max(1.0).to(torch.float32)
+        return index_B, {"priority_weight": weight_B}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the priorities."""
+        return {"priority": self._priority_N, "highest": self._highest}
+
+    @torch.no_grad()
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue where `state_dict` was taken; tensors keep their addresses."""
+        self._priority_N.copy_(state_dict["priority"])
+        self._highest.copy_(state_dict["highest"])
+
+    def _empty(self) -> None:
+        self._priority_N.zero_()
+        self._highest.zero_()
+
+    def _default(self) -> Tensor:
+        """Return the highest priority so far, [], or 1 where there is none above zero."""
+        return torch.where(self._highest > 0.0, self._highest, 1.0)
+
+    def _scores(self, storage: Storage) -> Tensor:
+        """Return (priority + eps)^alpha of what is stored and 0 elsewhere, float64 [N]."""
+        score_N = (self._priority_N.to(torch.float64) + self.eps).pow(self.alpha)
+        if isinstance(storage, ReplayStorage):
+            return torch.where(storage.available, score_N, 0.0)
+        return score_N[: stored(storage)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,30 +164,21 @@ class ReplayCfg(Checked):
     T steps and then T * u gradient steps is the same but for actions that are up to T - 1 steps older than the newest
     policy, and each iteration is only two graphs, whatever T is.
 
-    Attributes:
-        num_env_states_per_minibatch: B, env states in one gradient step.
-        num_minibatches: gradient steps per iteration.
-        num_steps: T, steps of each env per iteration.
-        capacity: env states that are kept per env. An episode's end takes one more, for its terminal observation.
-        n_step: rewards that a target sums before it bootstraps.
-        learning_starts: steps of each env with random actions before the first gradient step.
-        prioritized: draw env states by their last temporal-difference error (Schaul et al., arXiv 1511.05952) and not
-            uniformly.
-        priority_alpha: how strongly the error counts; 0 is uniform.
-        priority_beta: how far the weights of the losses undo that; 1 is wholly.
-        save_replay: keep the env states in checkpoints. Without, checkpoints are small and a resumed run begins with
-            an empty replay and random actions until `learning_starts`, so that it is not the same run any more.
+    Without `save_replay` checkpoints are small, and a resumed run begins with an empty replay and random actions until
+    `learning_starts`, so that it is not the same run any more.
     """
 
     num_env_states_per_minibatch: Count
-    num_minibatches: Count
-    num_steps: Count = 1
-    capacity: Count = 1024
-    n_step: Count = 1
-    learning_starts: Count = 10
-    prioritized: bool = False
-    priority_alpha: NonNegative = 0.6
-    priority_beta: Share = 0.4
+    num_minibatches: Count  # per iteration
+    num_steps: Count = 1  # of each env per iteration
+    capacity: Count = (
+        1024  # env states per env; an episode's end takes one more, for its terminal observation
+    )
+    n_step: Count = 1  # rewards that a target sums before it bootstraps
+    learning_starts: Count = 10  # steps of each env with random actions before the first gradient step
+    prioritized: bool = False  # by the last temporal-difference error (Schaul et al., arXiv 1511.05952)
+    priority_alpha: NonNegative = 0.6  # how strongly the error counts; 0 is uniform
+    priority_beta: Share = 0.4  # how far the weights of the losses undo that; 1 is wholly
     save_replay: bool = True
 
     def __post_init__(self) -> None:
@@ -71,15 +200,8 @@ class ReplayCfg(Checked):
 class ReplayRing(ReplayBuffer):
     """Holds the last env states of each env and yields minibatches of B of them, with what follows n steps later.
 
-    Its TorchRL parts are `ReplayStorage`, `ReplaySampler` or `PrioritySampler`, and `ReplayWriter`. `extend`
-    takes rollouts `["E","T"]`. None of its methods makes a host sync, so all can be captured in a CUDA graph.
-
-    Args:
-        cfg: sizes of the ring and its minibatches.
-        num_envs: E.
-        observations: the keys that are observed, each stored once.
-        gamma: discount per step, of rewards summed over several steps.
-        device: where the ring lives.
+    Its TorchRL parts are `ReplayStorage`, `ReplaySampler` or `PrioritySampler`, and `ReplayWriter`. `extend` takes
+    rollouts `["E","T"]`. None of its methods makes a host sync, so all can be captured in a CUDA graph.
     """
 
     def __init__(
@@ -121,8 +243,10 @@ class ReplayRing(ReplayBuffer):
         """Env states that are stored, on the device."""
         return self._ring.available.sum()
 
-    def minibatches(self, count: int) -> Iterator[TensorDictBase]:
-        """Yield `count` minibatches `["B"]`.
+    def minibatches(
+        self, count: int, *, change_: Callable[[TensorDictBase], None] | None = None
+    ) -> Iterator[TensorDictBase]:
+        """Yield `count` minibatches `["B"]`, of env states that `change_` has changed in place.
 
         With priorities they have "priority_weight" and "index", and each is drawn when it is asked for, by the
         priorities of that moment.
@@ -130,11 +254,15 @@ class ReplayRing(ReplayBuffer):
         if not self.cfg.prioritized:
             # One gather for all minibatches: a fraction of the kernels.
             data, _ = self._sample(count * self.cfg.num_env_states_per_minibatch)
+            if change_ is not None:
+                change_(data)
             for minibatch_B in data.split(self.cfg.num_env_states_per_minibatch):
                 yield dims.name(minibatch_B, dims.B)
             return
         for _ in range(count):
             minibatch_B, info = self._sample(self.cfg.num_env_states_per_minibatch)
+            if change_ is not None:
+                change_(minibatch_B)
             minibatch_B.set("priority_weight", info["priority_weight"][:, None])
             minibatch_B.set("index", info["index"])
             yield minibatch_B
@@ -143,7 +271,7 @@ class ReplayRing(ReplayBuffer):
         """Return the ring, and the priorities where there are any; without `save_replay` nothing."""
         if not self.cfg.save_replay:
             return {}
-        return {"ring": self._ring.state_dict(), "sampler": self._sampler.state_dict()}
+        return {"ring": self._ring.state_dict(), "sampler": self.sampler.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continue where `state_dict` was taken; an empty one empties the ring."""
@@ -151,4 +279,4 @@ class ReplayRing(ReplayBuffer):
             self.empty()
             return
         self._ring.load_state_dict(state_dict["ring"])
-        self._sampler.load_state_dict(state_dict["sampler"])
+        self.sampler.load_state_dict(state_dict["sampler"])

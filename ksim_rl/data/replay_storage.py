@@ -5,13 +5,13 @@ from typing import Any
 import torch
 from jaxtyping import Int64
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.data.replay_buffers import Writer
 from torchrl.data.replay_buffers.storages import Storage
 
 from ksim_rl import dims
-from ksim_rl.data.dataset_storage import MASK_KEY, Stateless
+from ksim_rl.data.dataset_storage import MASK_KEY, DatasetWriter, allocated
+from ksim_rl.device.state_tree import copy_into
 
 REWARD: NestedKey = ("next", "reward")
 DONE: NestedKey = ("next", "done")
@@ -33,32 +33,24 @@ class SavedByStateDict:
 
 
 class ReplayStorage(SavedByStateDict, Storage):
-    """A TorchRL storage of the last env states of E envs, at addresses that never change.
+    """A TorchRL storage of the last `capacity` env states of E envs, at addresses that never change.
 
     Each env has a ring of places. An env state takes one: its observation, action, reward and flags. The observation
     that follows it lies in the next place, as that of the next env state; only where an episode ends is a place spent
     on the terminal observation. So an env state costs its observation once, not twice: for Go1 (120 observed numbers,
-    12 actions) 535 bytes instead of 1015, 2.2 GB for 1000 env states of 4096 envs.
+    12 actions) 535 bytes instead of 1015, 2.2 GB for 1000 env states of 4096 envs. One more place holds the newest one.
 
     `write` and `get` make no host sync and can be captured in a CUDA graph: where the next env state goes is a tensor
     on the device.
 
-    `get` returns env states with what follows `n_step` steps later: ("next", "reward") is the sum of discounted
-    rewards until then, and "steps_to_next_obs" says how many they are, as TorchRL's losses read it. The sum ends early
-    at the end of an episode, whose terminal observation then follows, at an env state that is not finite, and at the
-    newest one.
+    `get` returns env states with what follows `n_step` steps later: ("next", "reward") is the sum of discounted rewards
+    until then, and "steps_to_next_obs" says how many they are, as TorchRL's losses read it. The sum ends early at the
+    end of an episode, whose terminal observation then follows, at an env state that is not finite, and at the newest
+    one.
 
     An env state with an element that is not finite is stored as invalid, with zeros for such elements, and counted.
     Invalid places have ("collector", "mask") False, which TorchRL's losses leave out of their means. All that is stored
-    is finite.
-
-    Args:
-        num_envs: E.
-        capacity: env states per env; one more place holds the newest observation.
-        n_step: steps until what follows.
-        gamma: discount per step; of no effect with `n_step=1`.
-        observations: the keys that are observed; each has a leaf at ("next", key) too.
-        device: where the ring lives.
+    is finite. Of the `observations`, which are stored once, each has a leaf at ("next", key) too.
     """
 
     def __init__(
@@ -94,11 +86,7 @@ class ReplayStorage(SavedByStateDict, Storage):
 
     @torch.no_grad()
     def write(self, rollout_ET: TensorDictBase) -> Int64[Tensor, " N"]:
-        """Add a rollout `["E","T"]` and return the indices of its N = E * T env states.
-
-        Raises:
-            ValueError: if it has another number of envs, lacks a leaf, or is too long for the ring.
-        """
+        """Add a rollout `["E","T"]` that cannot overwrite itself; return the indices of its N = E * T env states."""
         if rollout_ET.batch_dims != 2 or rollout_ET.shape[0] != self.num_envs:
             raise ValueError(
                 f"the rollout has batch_size {tuple(rollout_ET.batch_size)}: expected [{self.num_envs}, T]"
@@ -161,7 +149,7 @@ class ReplayStorage(SavedByStateDict, Storage):
 
     def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> None:
         """Refuse: a ring is written by whole rollouts."""
-        raise ValueError("a replay is written by rollouts: use extend() with one of batch_size [E, T]")
+        raise ValueError(ReplayWriter.refusal)
 
     def __len__(self) -> int:
         """Return the number of places; those that hold no env state are masked."""
@@ -183,11 +171,7 @@ class ReplayStorage(SavedByStateDict, Storage):
 
     @torch.no_grad()
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continue where `state_dict` was taken; tensors keep their addresses.
-
-        Raises:
-            ValueError: if it is of another number of envs or another capacity.
-        """
+        """Continue where `state_dict` was taken, with as many envs and places; tensors keep their addresses."""
         if state_dict["available"].shape != self.available.shape:
             raise ValueError(
                 f"the checkpoint's replay has {state_dict['available'].numel()} places, this run's "
@@ -195,14 +179,10 @@ class ReplayStorage(SavedByStateDict, Storage):
             )
         content = {tuple(name.split("/")): leaf for name, leaf in state_dict["content"].items()}
         if self.content is None and content:
-            ring = {key: torch.zeros_like(leaf, device=self.device) for key, leaf in content.items()}
-            self.content = TensorDict(ring, batch_size=[self.max_size], device=self.device)
-        for key, leaf in content.items():
-            assert self.content is not None
-            self.content.get(key).copy_(leaf)
-        for name, own in self.state_dict().items():
-            if name != "content":
-                own.copy_(state_dict[name])
+            self.content = allocated(content, self.max_size, batch_dims=1, device=self.device)
+        own = self.state_dict()
+        copy_into(own.pop("content"), state_dict["content"], what="the replay's content")
+        copy_into(own, {name: state_dict[name] for name in own}, what="the replay")
 
     @torch.no_grad()
     def _empty(self) -> None:
@@ -215,22 +195,17 @@ class ReplayStorage(SavedByStateDict, Storage):
         missing = [key for key in needed if key not in produced]
         if missing:
             raise ValueError(f"the rollout lacks {missing}; it has {sorted(map(str, produced))}")
-        ring = {
-            key: torch.zeros(self.max_size, *leaf.shape[2:], dtype=leaf.dtype, device=self.device)
-            for key, leaf in rollout_ET.items(True, True)
-            if key[0] != "next" or key in _LEAVES
+        leaves = {
+            key: leaf for key, leaf in rollout_ET.items(True, True) if key[0] != "next" or key in _LEAVES
         }
-        self.content = TensorDict(ring, batch_size=[self.max_size], device=self.device)
+        self.content = allocated(leaves, self.max_size, batch_dims=2, device=self.device)
 
     def _head_index(self) -> Tensor:
         """Return the index of the newest observation of each env, [E]."""
         return self.head_E * self.num_envs + self._env_E
 
     def _cut_where_not_continued(self, rollout_ET: TensorDictBase) -> None:
-        """Drop the newest env state of envs whose rollout does not begin at the newest observation.
-
-        Such an env was reset in between, and what followed its last env state is about to be overwritten.
-        """
+        """Drop the newest env state of envs that were reset in between: what followed it is about to be overwritten."""
         assert self.content is not None
         head_E = self._head_index()
         newest_E = self.index(self._env_E, torch.ones_like(self._env_E))
@@ -270,21 +245,11 @@ class ReplayStorage(SavedByStateDict, Storage):
         return reward_B, done_B, terminated_B, steps_B
 
 
-class ReplayWriter(Stateless, Writer):
-    """Adds rollouts to a `ReplayStorage`."""
+class ReplayWriter(DatasetWriter):
+    """Adds rollouts `["E","T"]` to a `ReplayStorage`."""
 
-    _storage: ReplayStorage
-
-    def add(self, data: Any) -> int:
-        """Refuse: a replay is written by rollouts."""
-        raise ValueError("a replay is written by rollouts: use extend() with one of batch_size [E, T]")
-
-    def extend(self, data: Any) -> Int64[Tensor, " N"]:
-        """Add a rollout `["E","T"]` and return the indices of its N = E * T env states."""
-        if not isinstance(data, TensorDictBase):
-            raise ValueError(f"extend() got {type(data).__name__}: expected a rollout of batch_size [E, T]")
-        return self._storage.write(data)
+    refusal = "a replay is written by rollouts: use extend() with one of batch_size [E, T]"
 
 
-def _next(key: NestedKey) -> tuple[str, ...]:
-    return ("next", key) if isinstance(key, str) else ("next", *key)  # type: ignore[misc]
+def _next(key: NestedKey) -> Any:
+    return unravel_key(("next", key))

@@ -39,11 +39,7 @@ def _wants_live_launches(device: torch.device) -> bool:
 
 
 def _refuse_or_warn(device: torch.device, *, require_graphs: bool) -> bool:
-    """Return whether graphs can be used on `device`; say it loudly, or refuse, where they cannot.
-
-    Raises:
-        RuntimeError: with `require_graphs`, naming the reason.
-    """
+    """Return whether graphs can be used on `device`; say it loudly, or refuse, where they cannot."""
     if device.type == "cpu" or wp.is_mempool_enabled(warp_device(device)):
         return True
     reason = (
@@ -91,14 +87,9 @@ class Captured:
     The first `warmup` calls run eagerly on a private stream (their work counts), the next one records the graph, and
     from then on each call replays it. So `body` must be fit for replay: it reads and writes tensors that stay where
     they are, allocates no size that depends on data, and neither syncs with the host nor branches on tensor values.
-    What it does in Python happens only while it is eager or recorded.
-
-    Args:
-        body: what to capture.
-        device: where it runs.
-        warmup: number of eager calls before the capture; at least one, so that all kernels are loaded.
-        require_graphs: refuse a CUDA device on which graphs are unavailable, instead of a warning and eager calls.
-        generators: random generators, other than the device's default, that `body` draws from.
+    What it does in Python happens only while it is eager or recorded. It may draw from the device's default random
+    generator and `generators`. With `require_graphs`, a CUDA device without graphs is refused instead of a warning and
+    eager calls.
     """
 
     def __init__(

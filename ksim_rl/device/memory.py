@@ -13,11 +13,7 @@ _UNITS = {None: 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 
 @contextmanager
 def memory_for(num_envs: int, device: torch.device) -> Iterator[None]:
-    """Explain an allocation that fails in this block, which makes what `num_envs` envs need.
-
-    Raises:
-        ValueError: with the memory that an env takes, as far as it is known by then, and the number of envs that fits.
-    """
+    """Turn an allocation that fails in this block into a ValueError: what one of the envs takes, and how many fit."""
     free = _free_bytes(device)
     try:
         yield
@@ -28,11 +24,8 @@ def memory_for(num_envs: int, device: torch.device) -> Iterator[None]:
         left = _free_bytes(device)
         taken = 0 if free is None or left is None else max(0, free - left)
         per_env = max(1, (taken + asked) // num_envs)
-        fits = (
-            ""
-            if free is None
-            else f" of the {free / 1e9:.1f} GB that were free, enough for {free // per_env}"
-        )
+        free_text = "" if free is None else f" of the {free / 1e9:.1f} GB that were free"
+        fits = "" if free is None else f"{free_text}, enough for {free // per_env}"
         raise ValueError(
             f"num_envs={num_envs}: out of memory on {device}; one env takes at least {per_env:,} bytes{fits}. Lower "
             "num_envs, or let other programs free what they hold"

@@ -36,9 +36,7 @@ _streams: dict[tuple[int, int], wp.Stream] = {}
 class QuickLaunch:
     """One Warp kernel whose only argument is a struct of numbers and addresses, launched on torch's stream.
 
-    Args:
-        kernel: without gradients.
-        arguments: the struct; addresses are `wp.uint64`, as wrapping a tensor takes longer than the launch.
+    Addresses are `wp.uint64`, as wrapping a tensor takes longer than the launch; the kernel has no gradients.
     """
 
     def __init__(self, kernel: wp.Kernel, arguments: type) -> None:
@@ -79,13 +77,8 @@ def as_operator(
 ) -> Callable[..., Any]:
     """Return `launch` as a function that is a torch operator where code is traced.
 
-    Eager code goes past torch's dispatcher, which takes longer than the launch.
-
-    Args:
-        name: of the operator.
-        launch: takes what the operator does, annotated.
-        fake: returns an empty result for its arguments.
-        mutates: names of the arguments that it changes.
+    Eager code goes past torch's dispatcher, which takes longer than the launch. `fake` returns an empty result for the
+    arguments, of which those named in `mutates` are changed.
     """
     operator = torch.library.custom_op(f"ksim_rl::{name}", launch, mutates_args=mutates)
     operator.register_fake(fake)

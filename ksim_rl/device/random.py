@@ -119,42 +119,29 @@ def uniform(
     low: float | Float32[Tensor, "*low"] = 0.0,
     high: float | Float32[Tensor, "*high"] = 1.0,
 ) -> Float32[Tensor, "E L"]:
-    """Draw from the uniform distribution on [low, high).
-
-    Args:
-        n: L, numbers per env row.
-        low, high: floats, or tensors that broadcast to [E, L].
-    """
+    """Draw `n` numbers per env row from the uniform distribution on [low, high); tensors broadcast to [E, L]."""
     if isinstance(low, Tensor) and isinstance(high, Tensor):
-        return torch.lerp(low, high, _draw(keys, n, _UNIFORM))
+        return torch.lerp(low, high, uniform(keys, n))
     if isinstance(low, Tensor) or isinstance(high, Tensor):
-        return low + _draw(keys, n, _UNIFORM) * (high - low)
-    return _draw(keys, n, _UNIFORM, low=float(low), high=float(high))
+        return low + uniform(keys, n) * (high - low)
+    return _drawn(*keys, n, _UNIFORM, float(low), float(high), 0, 1)
 
 
 def normal(keys: RowKeys, n: int) -> Float32[Tensor, "E L"]:
     """Draw `n` numbers per env row from the standard normal distribution."""
-    return _draw(keys, n, _NORMAL)
+    return _drawn(*keys, n, _NORMAL, 0.0, 1.0, 0, 1)
 
 
 def integers(
     keys: RowKeys, n: int, low: int | Int64[Tensor, "*low"], high: int | Int64[Tensor, "*high"]
 ) -> Int64[Tensor, "E L"]:
-    """Draw integers from {low, ..., high}, both included.
-
-    Args:
-        n: L, numbers per env row.
-        low, high: ints, or tensors that broadcast to [E, L]. `high - low` must be below 2^31.
-
-    Raises:
-        ValueError: if both are ints, and low exceeds high or is too far from it.
-    """
+    """Draw `n` integers per env row from {low, ..., high}; `high - low`, of [E, L], must be below 2^31."""
     # Scaling keeps the bias below span / 2^32, without the rejection loop that would need a host sync.
     if isinstance(low, int) and isinstance(high, int):
         if not 0 <= high - low < 1 << 31:
             raise ValueError(f"low={low}, high={high}: expected low <= high < low + 2^31")
-        return _draw(keys, n, _INTEGER, start=low, span=high - low + 1)
-    return low + ((_draw(keys, n, _INTEGER, span=1 << 32) * (high - low + 1)) >> 32)
+        return _drawn(*keys, n, _INTEGER, 0.0, 1.0, low, high - low + 1)
+    return low + ((_drawn(*keys, n, _INTEGER, 0.0, 1.0, 0, 1 << 32) * (high - low + 1)) >> 32)
 
 
 @wp.struct
@@ -214,19 +201,6 @@ def _fill(a: _Fill):
 
 
 _launch = QuickLaunch(_fill, _Fill)
-
-
-def _draw(
-    keys: RowKeys,
-    n: int,
-    kind: int,
-    *,
-    low: float = 0.0,
-    high: float = 1.0,
-    start: int = 0,
-    span: int = 1,
-) -> Tensor:
-    return _drawn(*keys, n, kind, low, high, start, span)
 
 
 def _draw_now(

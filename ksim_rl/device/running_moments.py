@@ -18,13 +18,8 @@ class RunningMoments(nn.Module):
     With several ranks, each keeps the moments of its own rows, and `publish` merges those of all ranks into `mean` and
     `var`: bit-identical everywhere, and equal to one process that saw all the rows.
 
-    Attributes:
-        mean, var: float32 [L], of all ranks; 0 and 1 before the first `publish`.
-        count: int64 []; rows counted so far, on this rank.
-
-    Args:
-        dim: L, size of the last dim of what is counted.
-        until: stop once this rank has counted so many rows; None never stops.
+    `mean` and `var`, float32 [L], of all ranks, are 0 and 1 before the first `publish`; `count`, int64 [], is the rows
+    counted so far on this rank, which stops counting at `until`.
     """
 
     mean: Tensor
@@ -48,14 +43,15 @@ class RunningMoments(nn.Module):
         self.register_buffer("exact_mean", torch.zeros(dim, dtype=torch.float64, device=device))
         self.register_buffer("exact_sum_of_squares", torch.zeros(dim, dtype=torch.float64, device=device))
 
+    def normalized(self, values: Float[Tensor, "*batch L"], eps: float) -> Float[Tensor, "*batch L"]:
+        """Return `(values - mean) / sqrt(var + eps)`."""
+        return (values - self.mean) * torch.rsqrt(self.var + eps)
+
     @torch.no_grad()
     def update(self, values: Float[Tensor, "*batch L"], valid: Bool[Tensor, "*rows"] | None = None) -> None:
         """Count every row of `values` once, and publish.
 
         Rows with a non-finite element, and rows that `valid` ([...] or [..., 1]) marks False, are left out.
-
-        Raises:
-            ValueError: if the last dim is not L, or `valid` does not have one element per row.
         """
         self.count_rows(values, valid)
         self.publish()

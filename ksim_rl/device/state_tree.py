@@ -14,12 +14,7 @@ State = dict[str, Any]
 
 
 def split(state: Mapping[str, Any]) -> tuple[dict[str, Shaped[Tensor, "*?leaf"]], dict[str, Any]]:
-    """Separate nested state into tensors (detached copies on the host) and JSON values, each by path.
-
-    Raises:
-        ValueError: for a leaf that is neither a tensor nor plain data (None, bool, int, float,
-            str, or a list of those).
-    """
+    """Separate nested state into tensors (detached copies on the host) and JSON values, each by path."""
     tensors: dict[str, Tensor] = {}
     values: dict[str, Any] = {}
 
@@ -61,11 +56,7 @@ def join(tensors: Mapping[str, Shaped[Tensor, "*?leaf"]], values: Mapping[str, A
 
 
 def copy_into(live: Mapping[str, Shaped[Tensor, "*?leaf"]], saved: Mapping[str, Any], *, what: str) -> None:
-    """Copy saved tensors into live ones, in place, so that captured graphs keep their addresses.
-
-    Raises:
-        ValueError: naming the first tensor that is missing, unknown, or of another shape or dtype.
-    """
+    """Copy saved tensors into live ones, whose addresses stay for captured graphs; a ValueError names the misfit."""
     for name in live:
         if name not in saved:
             raise ValueError(f"{what}: the checkpoint has no {name!r}")

@@ -50,11 +50,7 @@ def start_warp() -> None:
 
 
 def checked_device(device: str | torch.device) -> torch.device:
-    """Return the torch device with its index, or say what is wrong with it.
-
-    Raises:
-        ValueError: if it is no device, is of a kind that Warp does not run on, or is not there.
-    """
+    """Return the torch device with its index; a ValueError says what is wrong with it."""
     start_warp()
     try:
         checked = torch.device(device)

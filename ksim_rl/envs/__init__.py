@@ -1,4 +1,7 @@
 """The env, its terms, its transforms and its tasks."""
+# ruff: noqa: F401
+
+from types import ModuleType
 
 from ksim_rl.config.config_tree import from_tree, to_tree
 from ksim_rl.config.plugins import allow_package
@@ -34,45 +37,8 @@ from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.transforms.transform_cfg import TransformCfg
 
-__all__ = [
-    "ActionTerm",
-    "CameraSensor",
-    "CommandTerm",
-    "ContactSensor",
-    "CurriculumTerm",
-    "Entity",
-    "EnvView",
-    "EventTerm",
-    "GridPattern",
-    "ImuSensor",
-    "ManagerBasedRlEnv",
-    "ManagerBasedRlEnvCfg",
-    "MaskedTransformedEnv",
-    "MetricTerm",
-    "MjcfRobot",
-    "ObservationGroupCfg",
-    "ObservationTerm",
-    "ObservationTermCfg",
-    "PinholePattern",
-    "Placement",
-    "PlaneTerrain",
-    "RayCaster",
-    "RewardTerm",
-    "RingPattern",
-    "Robot",
-    "SceneCfg",
-    "Task",
-    "TerminationTerm",
-    "TerrainGrid",
-    "TransformCfg",
-    "ViewerCfg",
-    "allow_package",
-    "build",
-    "from_tree",
-    "make",
-    "make_cfg",
-    "names",
-    "register_configs",
-    "task",
-    "to_tree",
-]
+__all__ = sorted(
+    name
+    for name, value in globals().items()
+    if name[0] != "_" and value is not ModuleType and not isinstance(value, ModuleType)
+)  # pyright: ignore

@@ -23,11 +23,8 @@ Part = TypeVar("Part")
 class EpisodeClock(EpisodeLimit):
     """How long steps and episodes are.
 
-    Attributes:
-        step_dt: seconds of one env step.
-        max_episode_length_s: seconds after which an episode is cut; 0 for never.
-        max_episode_length: the same in env steps.
-        episode_step_E: env steps since each episode's start, int64 [E], one tensor that is written in place.
+    Seconds of one env step; seconds, and `max_episode_length` env steps, after which an episode is cut, 0 for never;
+    and env steps since each episode's start, in one tensor that is written in place.
     """
 
     without: ClassVar[str] = (

@@ -1,23 +1,15 @@
 """This module is what an env and its managers drive terms with; terms themselves see the driver's view only."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
-from ksim_rl.envs.readings import Readings
-from ksim_rl.envs.view import EnvView
+from ksim_rl.envs.view import EnvView, Readings
 from ksim_rl.physics import World
 from ksim_rl.scene.sensors import Sensor
 from ksim_rl.scene.state.simulation import Simulation
 
 
 class EnvDriver(Simulation):
-    """A `Simulation` with what sensors and managers read out, and the view of both that terms are called with.
-
-    Attributes:
-        readings: what managers and sensors write.
-        view: what terms read.
-    """
+    """A `Simulation` with `readings`, what managers and sensors write, and `view`, what terms read."""
 
     def __init__(
         self,
@@ -30,12 +22,8 @@ class EnvDriver(Simulation):
     ) -> None:
         super().__init__(world, step_dt=step_dt, max_episode_length=max_episode_length)
         self.readings = Readings(self)
-        self.view = EnvView(
-            self,
-            self.readings,
-            soft_joint_pos_limit_factor=soft_joint_pos_limit_factor,
-            entities=entities,
-        )
+        factor = soft_joint_pos_limit_factor
+        self.view = EnvView(self, self.readings, soft_joint_pos_limit_factor=factor, entities=entities)
 
     def add_sensors(self, sensors: Mapping[str, Sensor]) -> None:
         """Let sensors read the worlds from now on."""

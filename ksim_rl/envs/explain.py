@@ -1,7 +1,5 @@
 """This module writes what an env is made of as tables to read."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 from collections.abc import Iterable, Mapping
@@ -18,7 +16,7 @@ from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.physics import World
 from ksim_rl.transforms.groups.group_cfg import compile_groups
-from ksim_rl.transforms.groups.groups import spell
+from ksim_rl.transforms.specs import spell
 from ksim_rl.transforms.transform_cfg import TransformCfg
 
 WIDTH = 120
@@ -34,18 +32,10 @@ def explain(
     levels: Mapping[str, float],
     width: int,
 ) -> str:
-    """Return one table per manager: index, name, shape, weight, mode and parameters of each term.
+    """Return one table per manager: index, name, shape, weight, mode and parameters other than defaults of each term.
 
-    Parameters that have their defaults are left out.
-
-    Args:
-        cfg: of the env.
-        driver: of the env.
-        shapes: of the observation terms, [E, ...] each.
-        action_sizes: how many columns each action term takes.
-        events: the events that the env has, by name.
-        levels: of the curricula.
-        width: characters per line.
+    `shapes` are those of observation terms, [E, ...], and `action_sizes` numbers of columns; a line has `width`
+    characters.
     """
     output = io.StringIO()
     console = Console(file=output, width=width, highlight=False, markup=False, color_system=None)
@@ -103,14 +93,10 @@ def _tables(
     yield _table("commands", ("term", "shape", "resampled every", "parameters"), rows)
 
     weights = driver.readings.reward_weights
-    rows = [
-        (
-            name,
-            f"{float(weights[name]):g}" if name in weights else "0: not computed",
-            _described(term, ("weight",)),
-        )
-        for name, term in cfg.rewards.items()
-    ]
+    shown = {
+        name: f"{float(weights[name]):g}" if name in weights else "0: not computed" for name in cfg.rewards
+    }
+    rows = [(name, shown[name], _described(term, ("weight",))) for name, term in cfg.rewards.items()]
     scaled = f"times {driver.step_dt:g} s" if cfg.scale_rewards_by_dt else "per step"
     yield _table(f"rewards ({scaled})", ("term", "weight", "parameters"), rows)
 

@@ -1,12 +1,10 @@
 """This module is the env: a TorchRL `EnvBase` over Warp-batched MuJoCo, made of terms."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import secrets
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
 import mujoco_warp
@@ -19,25 +17,25 @@ from torch import Tensor
 
 from ksim_rl import dims
 from ksim_rl.device.streams import checked_device
-from ksim_rl.envs import specs
 from ksim_rl.envs.contract import DifficultyLevels, EpisodeClock, EpisodeSums, Pictures, SimulatedWorld
 from ksim_rl.envs.drawing import Drawing, drawings
 from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.explain import WIDTH, explain
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
-from ksim_rl.envs.managers import (
-    ActionManager,
-    CommandManager,
+from ksim_rl.envs.managers.action_manager import ActionManager
+from ksim_rl.envs.managers.command_manager import CommandManager
+from ksim_rl.envs.managers.event_manager import EventManager
+from ksim_rl.envs.managers.observation_manager import ObservationManager
+from ksim_rl.envs.managers.outcomes import (
     CurriculumManager,
     EpisodeLog,
-    EventManager,
     MetricManager,
-    ObservationManager,
     RewardManager,
     TerminationManager,
 )
 from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.envs.reset_to_default import ResetToDefault
+from ksim_rl.envs.specs import make_specs
 from ksim_rl.physics import World, load_model, prepare_spec
 from ksim_rl.scene.actuators import JointDrives
 from ksim_rl.scene.rendering.rendering import OffscreenRenderer
@@ -47,25 +45,30 @@ from ksim_rl.scene.scene import build_spec
 RENDER_MODES = (None, "rgb_array")
 
 
+class _Closed:
+    """Stands in the place of each part of an env that was closed, and says so."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise RuntimeError("the env is closed, and the memory of its worlds is free: make another one")
+
+
 class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels, SimulatedWorld, Pictures):
-    """E parallel worlds that emit EnvStates `["E"]`.
+    """E parallel worlds that emit EnvStates `["E"]`; a ValueError names the field of `cfg` that is wrong.
 
     Keys of a root: `("obs", term)` and `("command", name)`, float32 [E, L]; `"action"`, float32 [E, L]; and under
     `"next"` the same obs and command of the state reached, `"reward"` float32 and `"done"`, `"terminated"`,
     `"truncated"` bool, [E, 1] each. `next` holds the true observation of the state reached, also where the episode
     ended there. A world whose physics is not finite, or whose action is not, ends with `terminated` and reward 0; its
     `next` observation is that of the model's default state, since the state reached does not exist.
-
-    Args:
-        cfg: what the env is made of.
-        device: where worlds and data live.
-        render_mode: None, or "rgb_array" for `render()`.
-
-    Raises:
-        ValueError: naming the field of `cfg` that is wrong and what would be valid.
     """
 
     is_vector_env = True
+    metadata: ClassVar[dict[str, Any]] = {
+        "mujoco_version": mujoco.__version__,
+        "warp_version": warp.__version__,
+        "mujoco_warp_version": mujoco_warp.__version__,
+        "render_modes": list(RENDER_MODES),
+    }
 
     def __init__(
         self, cfg: ManagerBasedRlEnvCfg, device: str | torch.device = "cpu", render_mode: str | None = None
@@ -75,12 +78,6 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         super().__init__(device=checked_device(device), batch_size=torch.Size([cfg.scene.num_envs]))
         self.cfg = cfg
         self.render_mode = render_mode
-        self.metadata = {
-            "mujoco_version": mujoco.__version__,
-            "warp_version": warp.__version__,
-            "mujoco_warp_version": mujoco_warp.__version__,
-            "render_modes": list(RENDER_MODES),
-        }
         events = {"reset": ResetToDefault()} if cfg.events is None else dict(cfg.events)
         fields = [field for term in events.values() for field in term.per_world_fields]
         if cfg.scene.terrain is not None:
@@ -94,12 +91,9 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         )
         self._is_closed = False
 
+        varied = tuple(dict.fromkeys(fields))
         self.world = World(
-            model,
-            num_envs=cfg.scene.num_envs,
-            device=device,
-            sim=cfg.sim,
-            per_world_fields=tuple(dict.fromkeys(fields)),
+            model, num_envs=cfg.scene.num_envs, device=device, sim=cfg.sim, per_world_fields=varied
         )
         self.driver = EnvDriver(
             self.world,
@@ -127,14 +121,11 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         if cfg.scene.terrain is not None:
             driver.ground = cfg.scene.terrain.ground(view)
         driver.add_sensors(cfg.scene.sensors)
-        self.joint_drives = JointDrives(
-            {
-                view.entity(name).prefix: getattr(robot, "actuators", ())
-                for name, robot in cfg.scene.entities.items()
-            },
-            driver,
-            view,
-        )
+        actuators = {
+            view.entity(name).prefix: getattr(robot, "actuators", ())
+            for name, robot in cfg.scene.entities.items()
+        }
+        self.joint_drives = JointDrives(actuators, driver, view)
         self.event_manager = EventManager(self._events_cfg, driver)
         driver.refreshed()
         self.command_manager = CommandManager(cfg.commands, driver)
@@ -152,7 +143,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self._log = EpisodeLog(view, self.reward_manager, self.termination_manager, self.metric_manager)
 
     @property
-    def unwrapped(self) -> ManagerBasedRlEnv:
+    def unwrapped(self) -> "ManagerBasedRlEnv":
         """This env, without any wrapper."""
         return self
 
@@ -189,10 +180,10 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
 
     def _make_specs(self) -> None:
         readings = {"obs": self.observation_manager.read(), "command": self.command_manager.values}
-        self.observation_spec = specs.observation(readings, self.batch_size, self.device)
-        self.full_action_spec = specs.action(self.action_manager.size, self.batch_size, self.device)
-        self.full_reward_spec = specs.reward(self.batch_size, self.device)
-        self.full_done_spec = specs.done(self.batch_size, self.device)
+        size, bounds_L2 = self.action_manager.size, self.action_manager.bounds_L2
+        self.observation_spec, self.full_action_spec, self.full_reward_spec, self.full_done_spec = make_specs(
+            readings, size, bounds_L2, batch_size=self.batch_size, device=self.device
+        )
 
     # -- step and reset ------------------------------------------------------------------------------------------
 
@@ -272,7 +263,8 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
                 f"action has dtype {action_EL.dtype} and shape {tuple(action_EL.shape)}: expected torch.float32 and "
                 f"{expected}"
             )
-        return action_EL
+        # Physics has no gradient: a policy that is not run under `no_grad` has its own only.
+        return action_EL.detach()
 
     # -- seeds ---------------------------------------------------------------------------------------------------
 
@@ -286,10 +278,9 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self.event_manager.startup()
 
     def stagger_episodes_(self) -> None:
-        """Let the running episodes time out at random steps, so that the time-outs of different envs spread out.
+        """Let the running episodes time out at random steps; later episodes have their full length.
 
-        Without it all envs that start together also end together, and each rollout shows one phase of an episode
-        only. Later episodes have their full length.
+        Without it envs that start together also end together, and each rollout shows one phase of an episode only.
         """
         if self.max_episode_length:
             with self.driver.scope("stagger_episodes", self.driver.reset_count_E):
@@ -299,11 +290,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
     # -- what trainers read --------------------------------------------------------------------------------------
 
     def episode_log(self) -> dict[str, Float[Tensor, ""]]:
-        """Return sums over the episodes that ended since `episode_log_reset_`, float32 [] on the device.
-
-        Keys: `episodes`, `length_sum`, `return_sum`, `reward/<term>`, `termination/<term>` (with `non_finite`),
-        `metric/<name>`.
-        """
+        """Return sums over the episodes that ended since `episode_log_reset_`; see `EpisodeLog`."""
         return self._log.read()
 
     def episode_log_reset_(self) -> None:
@@ -311,16 +298,14 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self._log.clear()
 
     def curriculum_levels(self) -> dict[str, Float[Tensor, ""]]:
-        """Return the latest level of each curriculum, float32 [] on the device."""
-        return dict(
-            zip(self.curriculum_manager.names, self.curriculum_manager.levels_C.unbind(), strict=True)
-        )
+        """Return the latest level of each curriculum."""
+        curricula = self.curriculum_manager
+        return dict(zip(curricula.names, curricula.levels_C.unbind(), strict=True))
 
     def command_levels(self) -> dict[str, Float[Tensor, ""]]:
-        """Return the ranges that commands are drawn from now, float32 [] on the device.
+        """Return the ranges that commands are drawn from now; they change by curricula, and without any there are none.
 
-        Keys: `<command>/<field>_low` and `<command>/<field>_high`. Without a curriculum they do not change, and the
-        dict is empty.
+        Keys: `<command>/<field>_low` and `<command>/<field>_high`.
         """
         if not self.cfg.curriculum:
             return {}
@@ -340,15 +325,19 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> None:
-        """Continue from a `state_dict`.
+        """Continue from a `state_dict`; a ValueError says what differs in that of another env.
 
-        Raises:
-            ValueError: if entries are missing or unknown, or shapes differ: the state is of another env.
+        Without `strict`, entries that are missing stay as they are, and unknown ones are left out.
         """
         own = self._buffers_to_save()
-        given = {
-            name.removeprefix("env."): value for name, value in state_dict.items() if name.startswith("env.")
-        }
+        of_world, given = (
+            {name.removeprefix(room): value for name, value in state_dict.items() if name.startswith(room)}
+            for room in ("world.", "env.")
+        )
+        if not strict:
+            kept = self.world.state_dict()
+            of_world = kept | {name: value for name, value in of_world.items() if name in kept}
+            given = {name: given.get(name, buffer) for name, buffer in own.items()}
         if own.keys() != given.keys():
             raise ValueError(
                 f"state of another env: missing {sorted(own.keys() - given.keys())}, "
@@ -360,14 +349,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
                     f"state of another env: {name} has shape {tuple(given[name].shape)}, expected {tuple(buffer.shape)}"
                 )
             buffer.copy_(given[name])
-        prefix = "world."
-        self.world.load_state_dict(
-            {
-                name.removeprefix(prefix): value
-                for name, value in state_dict.items()
-                if name.startswith(prefix)
-            }
-        )
+        self.world.load_state_dict(of_world)
         self.world.refresh()
         self.driver.refreshed()
         self.cfg = dataclasses.replace(self.cfg, seed=int(self.view.seed))
@@ -388,12 +370,11 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
 
     def explain(self, *, width: int = WIDTH) -> str:
         """Return what the env is made of: a table per manager with index, name, shape, weight, mode and parameters."""
+        spec = self.observation_spec
         return explain(
             self.cfg,
             self.driver,
-            shapes={
-                name: self.observation_spec["obs", name].shape for name in self.observation_manager.terms
-            },
+            shapes={name: spec["obs", name].shape for name in self.observation_manager.terms},
             action_sizes=self.action_manager.sizes,
             events=self.event_manager.terms,
             levels={name: float(level) for name, level in self.curriculum_levels().items()},
@@ -414,21 +395,13 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
                 part.draw_debug(self.view, visualizer, shown)
 
     def render(self) -> np.ndarray | None:
-        """Return a picture of the current state, uint8 [H, W, 3], or None without a render mode.
-
-        Raises:
-            RuntimeError: if no OpenGL platform is there, with the ways to get one.
-        """
+        """Return a picture of the current state, None without a render mode; a RuntimeError tells how to get OpenGL."""
         if self._renderer is None:
             return None
         return self._renderer.render(self.world, draw=self.update_visualizers)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free the worlds' memory.
-
-        Raises:
-            RuntimeError: if the env is closed already and `raise_if_closed`.
-        """
+        """Free the worlds' memory; a RuntimeError if the env is closed already and `raise_if_closed`."""
         if self._is_closed:
             if raise_if_closed:
                 raise RuntimeError("the env is closed already")
@@ -438,3 +411,12 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         if self._renderer is not None:
             self._renderer.close()
         self.world.close()
+        managers = [name for name in vars(self) if name.endswith("_manager")]
+        for name in ("world", "driver", "view", "_log", "_renderer", *managers):
+            setattr(self, name, _Closed())
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        raise TypeError(
+            "an env holds worlds on a device, and is neither copied nor pickled: make a second one with "
+            "ksim_rl.envs.build(env.cfg, device=env.device), and load_state_dict(env.state_dict()) to go on there"
+        )

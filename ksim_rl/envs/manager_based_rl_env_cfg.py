@@ -1,11 +1,10 @@
 """This module configures `ManagerBasedRlEnv`: one dataclass tree, in Python, YAML and Hydra alike."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated
 
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Count, NonNegative, Within, check_value
 from ksim_rl.envs.term import (
     ActionTerm,
     CommandTerm,
@@ -21,64 +20,47 @@ from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg
 from ksim_rl.transforms.transform_cfg import TransformCfg
 
+Seed = Annotated[int, Within(low=0, high=2**63 - 1)] | None
+
 
 @dataclass(frozen=True, kw_only=True)
 class ManagerBasedRlEnvCfg:
-    """What an env is made of.
+    """What an env is made of: terms by name, of which each action term takes its columns of `"action"` in this order.
 
-    Attributes:
-        decimation: physics substeps per env step.
-        scene: robots, terrain, sensors, `num_envs`, spacing.
-        observations: groups of terms. The env emits each term once as `("obs", term)`, clean; `envs.make` compiles the
-            groups into transforms that add noise, delay and history and write one vector per group.
-        actions: terms; each takes its columns of `"action"`, in this order.
-        events: resets, randomization, pushes. None resets to the model's first keyframe or, without one, to its
-            default pose; `{}` leaves a reset row at MuJoCo's `qpos0`.
-        seed: None draws one; the env stores the seed that it used in its own `cfg`.
-        sim: physics options; None in a field keeps the model's own.
-        viewer: the camera of `render()`.
-        episode_length_s: s; 0 means that episodes never end by time, and goes without a time-out termination.
-        rewards: weighted terms; a term of weight 0 is not computed.
-        terminations: terms; `time_out=True` marks truncation. Empty: only non-finite physics ends an episode.
-        commands: generators with resampling clocks; emitted as `("command", name)`.
-        curriculum: terms that adapt difficulty.
-        metrics: values per step that are reduced over the episode.
-        is_finite_horizon: False: a time-out is `truncated`, and its value is bootstrapped; True: it is `terminated`.
-        scale_rewards_by_dt: True: rewards are per second and are multiplied by the env step's seconds.
-        transforms: what `envs.make` appends, in this order, to the transforms of the groups. What the env emits passes
-            them from the first to the last, and an action from the last to the first.
+    The env emits each observation term once as `("obs", term)`, clean; `envs.make` compiles the groups into transforms
+    that add noise, delay and history and write one vector per group. It appends `transforms` to these, in this order:
+    what the env emits passes them from the first to the last, and an action from the last to the first.
     """
 
-    decimation: int
+    decimation: int  # physics substeps per env step
     scene: SceneCfg
-    observations: Mapping[str, ObservationGroupCfg]
-    actions: Mapping[str, ActionTerm]
-    events: Mapping[str, EventTerm] | None = None
-    seed: int | None = None
+    observations: Mapping[str, ObservationGroupCfg] = field(default_factory=dict)
+    actions: Mapping[str, ActionTerm] = field(default_factory=dict)
+    events: Mapping[str, EventTerm] | None = None  # `ResetToDefault`; {} leaves rows at `qpos0`
+    seed: int | None = None  # None draws one; the env stores the seed that it used in its own `cfg`
     sim: SimCfg = field(default_factory=SimCfg)
-    viewer: ViewerCfg = field(default_factory=ViewerCfg)
-    episode_length_s: float = 0.0
-    rewards: Mapping[str, RewardTerm] = field(default_factory=dict)
-    terminations: Mapping[str, TerminationTerm] = field(default_factory=dict)
-    commands: Mapping[str, CommandTerm] = field(default_factory=dict)
+    viewer: ViewerCfg = field(default_factory=ViewerCfg)  # the camera of `render()`
+    episode_length_s: float = 0.0  # 0: no episode ends by time, and there must be no time-out termination
+    rewards: Mapping[str, RewardTerm] = field(default_factory=dict)  # a term of weight 0 is not computed
+    terminations: Mapping[str, TerminationTerm] = field(default_factory=dict)  # always: non-finite physics
+    commands: Mapping[str, CommandTerm] = field(default_factory=dict)  # emitted as `("command", name)`
     curriculum: Mapping[str, CurriculumTerm] = field(default_factory=dict)
     metrics: Mapping[str, MetricTerm] = field(default_factory=dict)
-    is_finite_horizon: bool = False
-    scale_rewards_by_dt: bool = True
+    is_finite_horizon: bool = False  # True: a time-out is `terminated`, else `truncated` and bootstrapped
+    scale_rewards_by_dt: bool = True  # rewards are per second and are multiplied by the env step's seconds
     transforms: Mapping[str, TransformCfg] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if isinstance(self.decimation, bool) or not isinstance(self.decimation, int) or self.decimation < 1:
-            raise ValueError(f"decimation={self.decimation!r}: expected a whole number of at least 1")
-        check_in_range("episode_length_s", self.episode_length_s, low=0.0)
-        if self.seed is not None:
-            check_in_range("seed", self.seed, low=0, high=2**63 - 1)
+        for name, annotation in (
+            ("decimation", Count),
+            ("episode_length_s", NonNegative),
+            ("seed", Seed),
+        ):
+            check_value(name, getattr(self, name), annotation)
         if self.viewer.env_index >= self.scene.num_envs:
             raise ValueError(
                 f"viewer.env_index={self.viewer.env_index}: expected less than scene.num_envs={self.scene.num_envs}"
             )
-        if not self.actions:
-            raise ValueError("actions={}: name at least one action term")
         for name, transform in self.transforms.items():
             if not isinstance(transform, TransformCfg):
                 raise ValueError(

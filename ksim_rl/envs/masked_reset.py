@@ -1,21 +1,43 @@
 """This module resets by masks: `step_and_maybe_reset` never syncs, and partial resets leave the other rows alone."""
 
+import functools
+import random
 import secrets
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Shaped
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.envs.batched_envs import BatchedEnvBase
-from torchrl.envs.common import _EnvWrapper
 
 from ksim_rl import checks, dims
+from ksim_rl.envs import upstream
+from ksim_rl.transforms.upstream import base_of
 
+upstream.let_none_keep_names()
 _RESET = "_reset"
 _RESET_KEYWORDS = ("tensordict", "seed", "env_ids", "options", "set_state", "select_reset_only")
+
+
+class _Seed:
+    """Is a method of an env, and of its class."""
+
+    def __get__(self, env: EnvBase | None, _owner: type) -> Callable[..., int]:
+        return functools.partial(_seed, env)
+
+
+def _seed(env: EnvBase | None, seed: int = -1) -> int:
+    seed = secrets.randbelow(2**31) if seed == -1 else seed
+    if env is not None:
+        env.set_seed(seed)
+    else:
+        random.seed(seed)
+        np.random.seed(seed % 2**32)
+        torch.manual_seed(seed)
+    return seed
 
 
 class MaskedReset(EnvBase):
@@ -28,7 +50,8 @@ class MaskedReset(EnvBase):
     * `maybe_reset`: `_reset` runs at every step with `done` as its mask, so that nothing is read by the host.
       Trajectories equal TorchRL's own if the draws in `_reset` are keyed per row (see `ksim_rl.device.random`).
     * `reset(tensordict, seed=, env_ids=, options=)`: untouched rows come back with their last root values.
-    * `seed(seed=-1)`: returns the seed used. It ends in `_set_seed`, so that is where an env stores it.
+    * `seed(seed=-1)`: returns the seed used. It ends in `_set_seed`, so that is where an env stores it. On the class,
+      which has no draws of its own, it seeds Python, NumPy and torch.
     * `rollout` labelled ("E", "T"), and the label "E" on all that `step` and `reset` return.
 
     An env with batch size [] and foreign simulators (Gym, batched processes) keep TorchRL's own reset: those cannot
@@ -38,6 +61,7 @@ class MaskedReset(EnvBase):
     # A reference, so that it costs nothing per step. Inside a captured graph it points to the graph's static output.
     _last_root: TensorDictBase | None = None
     _masks: bool | None = None
+    seed = _Seed()
 
     @property
     def last_root(self) -> TensorDictBase | None:
@@ -55,10 +79,7 @@ class MaskedReset(EnvBase):
     @property
     def dim_names(self) -> list[str | None]:
         """Labels of the batch dims: "E" for the first."""
-        names: list[str | None] = [None] * len(self.batch_size)
-        if names:
-            names[0] = dims.E
-        return names
+        return [dims.E, *[None] * (len(self.batch_size) - 1)] if self.batch_size else []
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         next_td = self._labelled(super()._step_proc_data(next_tensordict_out))
@@ -85,20 +106,11 @@ class MaskedReset(EnvBase):
         options: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> TensorDictBase:
-        """Reset all rows, or those of `env_ids` or of the mask `tensordict["_reset"]`.
+        """Reset all rows, or those of `env_ids` or of the mask `tensordict["_reset"]` (bool, [E] or [E, 1]).
 
-        Untouched rows keep their state and come back with their last root values, or with those of `tensordict`.
-
-        Args:
-            tensordict: may hold the mask `"_reset"` (bool, [E] or [E, 1]) and root values; updated in place.
-            seed: set first, as `env.seed(seed)` does.
-            env_ids: rows to reset. They are checked on the host: inside a hot loop pass a mask instead.
-            options: none exist; anything but None or {} is refused.
-            **kwargs: TorchRL's own `set_state` and `select_reset_only`.
-
-        Raises:
-            TypeError: on a keyword that does not exist.
-            ValueError: on options, on rows that do not exist, on a mask of the wrong shape or dtype.
+        Untouched rows keep their state and come back with their last root values, or with those of `tensordict`, which
+        is updated in place. `seed` is set first, as `env.seed(seed)` does. `env_ids` are checked on the host: inside a
+        hot loop pass a mask. No `options` exist; `kwargs` are TorchRL's own `set_state` and `select_reset_only`.
         """
         for keyword in kwargs:
             if keyword not in _RESET_KEYWORDS:
@@ -120,13 +132,6 @@ class MaskedReset(EnvBase):
         self._remember(root)
         return root
 
-    def seed(self, seed: int = -1) -> int:
-        """Seed the env, with a drawn seed for -1, and return the seed used."""
-        if seed == -1:
-            seed = secrets.randbelow(2**31)
-        self.set_seed(seed)
-        return seed
-
     def rollout(self, *args: Any, **kwargs: Any) -> TensorDictBase:
         """TorchRL's rollout, with its dims labelled ("E", "T")."""
         rollout_ET = super().rollout(*args, **kwargs)
@@ -138,13 +143,7 @@ class MaskedReset(EnvBase):
         """Whether resets go through masks; decided from what never changes, so it costs a dict look-up."""
         known = self._masks
         if known is None:
-            inner: Any = self
-            while "base_env" in inner._modules:
-                inner = inner.base_env
-            foreign = isinstance(inner, _EnvWrapper | BatchedEnvBase)
-            known = (
-                bool(self.batch_size) and not foreign and self.reset_keys == [_RESET] and self._simple_done
-            )
+            known = upstream.can_reset_nothing(self)
             object.__setattr__(self, "_masks", known)
         return known
 
@@ -156,9 +155,7 @@ class MaskedReset(EnvBase):
         set_state: bool | None = None,
         select_reset_only: bool = False,
     ) -> TensorDictBase:
-        if tensordict is not None:
-            self._assert_tensordict_shape(tensordict)
-        set_state = self._resolve_set_state(set_state, tensordict, select_reset_only)
+        set_state = upstream.resolved_set_state(self, tensordict, set_state, select_reset_only)
         forwarded = {} if set_state is None else {"set_state": set_state}
         reset_td = tensordict
         if tensordict is not None:
@@ -176,7 +173,7 @@ class MaskedReset(EnvBase):
 
     def _fresh(self, reset_td: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
         fresh = self._reset(reset_td, **kwargs)  # pyright: ignore[reportArgumentType]
-        self._complete_done(self.full_done_spec, fresh)
+        upstream.complete_done(self, fresh)
         return fresh
 
     def _merge(
@@ -251,11 +248,7 @@ class MaskedReset(EnvBase):
 def mask_from_env_ids(
     env_ids: Sequence[int] | Shaped[Tensor, "*rows"], batch_size: torch.Size, device: torch.device | None
 ) -> Bool[Tensor, " E"]:
-    """Return the bool mask [E] of the rows `env_ids`.
-
-    Raises:
-        ValueError: unless `env_ids` are distinct integers in [0, E).
-    """
+    """Return the mask of the rows `env_ids`; a ValueError unless they are distinct integers in [0, E)."""
     if len(batch_size) != 1:
         raise ValueError(f"env_ids need one batch dim, and this env has batch_size {tuple(batch_size)}")
     num_envs = batch_size[0]
@@ -273,10 +266,7 @@ def mask_from_env_ids(
     if len(set(ids)) != len(ids):
         repeated = sorted({row for row in ids if ids.count(row) > 1})
         raise ValueError(f"env_ids names {repeated} more than once: give each row once")
-    mask = [False] * num_envs
-    for row in ids:
-        mask[row] = True
-    return torch.tensor(mask, device=device)
+    return torch.tensor([row in ids for row in range(num_envs)], device=device)
 
 
 def _mask_like(
@@ -292,7 +282,7 @@ def _shared_rows(new: Tensor, old: Tensor) -> tuple[Tensor, Tensor] | None:
     """Return the tensors that two leaves are the same columns of, if there are such: one `where` serves all columns."""
     if torch.compiler.is_compiling():
         return None
-    new_base, old_base = new._base, old._base
+    new_base, old_base = base_of(new), base_of(old)
     if new_base is None or old_base is None or new_base.ndim != 2 or new_base.shape != old_base.shape:
         return None
     same_place = new.stride() == old.stride() and new.storage_offset() == old.storage_offset()

@@ -1,7 +1,9 @@
 """`TransformedEnv` with masked resets, labelled specs, one seed for env and transforms, and a complete state dict."""
 
+import copy
+import functools
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tensordict import TensorDict
@@ -12,7 +14,7 @@ from torchrl.envs.transforms import Compose, Transform
 
 from ksim_rl import dims
 from ksim_rl.envs.masked_reset import MaskedReset
-from ksim_rl.transforms.row_transform import KeyedTransform
+from ksim_rl.transforms.row_transform import seed_transforms
 
 _BASE, _TRANSFORM, _ROOT = "base_env.", "transform.", "last_root."
 
@@ -38,6 +40,15 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
         if isinstance(transform, Sequence):
             transform = Compose(*transform)  # pyright: ignore[reportArgumentType]
         super().__init__(base_env, transform, *args, **kwargs)
+        if type(base_env).rand_action is not EnvBase.rand_action:
+            object.__setattr__(self, "rand_action", functools.partial(TransformedEnv.rand_action, self))
+
+    # Not TorchRL's for transformed envs: a stock `TransformedEnv` around that one refuses random actions.
+    rand_action = EnvBase.rand_action
+
+    def __copy__(self) -> "MaskedTransformedEnv":
+        """Return a copy that shares nothing, where the base env can be copied."""
+        return copy.deepcopy(self)
 
     def _make_output_spec(self) -> Composite:
         return self._labelled_spec(super()._make_output_spec())
@@ -58,55 +69,39 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
 
     def seed_transforms_(self, seed: int) -> None:
         """Seed the transforms alone, as `set_seed` does: for a base env that has its seed already."""
-        for transform in keyed_transforms(self):
-            transform.seed_(seed)
+        seed_transforms(self, seed)
 
     def state_dict(self, *args: Any, **kwargs: Any) -> OrderedDict[str, Any]:
         """Return a copy of all that a bit-exact continuation needs: base env, transforms, the last root values."""
-        state: OrderedDict[str, Any] = OrderedDict()
-        for key, value in self.base_env.state_dict(*args, **kwargs).items():
-            state[_BASE + key] = _copy(value)
-        for key, value in self.transform.state_dict(*args, **kwargs).items():
-            state[_TRANSFORM + key] = _copy(value)
+        parts = {
+            _BASE: self.base_env.state_dict(*args, **kwargs),
+            _TRANSFORM: self.transform.state_dict(*args, **kwargs),
+        }
         if self.last_root is not None:
             keys = [*self.full_observation_spec.keys(True, True), *self.full_done_spec.keys(True, True)]
-            root = self.last_root.select(*keys, strict=False)
-            for key in root.keys(True, True):
-                state[_ROOT + ("/".join(key) if isinstance(key, tuple) else key)] = _copy(root.get(key))
-        return state
+            parts[_ROOT] = self.last_root.select(*keys, strict=False).flatten_keys("/")
+        return OrderedDict(
+            (f"{prefix}{key}", value.clone() if isinstance(value, Tensor) else value)
+            for prefix, part in parts.items()
+            for key, value in part.items()
+        )
 
-    def load_state_dict(self, state_dict: Mapping[str, Any], **kwargs: Any) -> None:
-        """Load what `state_dict` returned.
-
-        Raises:
-            KeyError: if an entry belongs to no part of the env.
-        """
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, **kwargs: Any) -> None:
+        """Load what `state_dict` returned; a KeyError names an entry that belongs to no part of the env."""
         parts: dict[str, OrderedDict[str, Any]] = {p: OrderedDict() for p in (_BASE, _TRANSFORM, _ROOT)}
         for key, value in state_dict.items():
             prefix = next((prefix for prefix in parts if key.startswith(prefix)), None)
+            if prefix is None and not strict:
+                continue
             if prefix is None:
                 raise KeyError(
                     f"state_dict entry {key!r}: expected a name that starts with {' or '.join(parts)}"
                 )
             parts[prefix][key.removeprefix(prefix)] = value
-        self.base_env.load_state_dict(parts[_BASE], **kwargs)
-        self.transform.load_state_dict(parts[_TRANSFORM], **kwargs)
+        self.base_env.load_state_dict(parts[_BASE], strict=strict, **kwargs)
+        self.transform.load_state_dict(parts[_TRANSFORM], strict=strict, **kwargs)
         if parts[_ROOT]:
             root = TensorDict({}, batch_size=self.batch_size, device=self.device)
             for key, value in parts[_ROOT].items():
                 root.set(tuple(key.split("/")) if "/" in key else key, value.to(self.device).clone())
             self.last_root = dims.name(root, *self.dim_names) if self.batch_size else root  # pyright: ignore
-
-
-def _copy(value: Any) -> Any:
-    return value.clone() if isinstance(value, Tensor) else value
-
-
-def keyed_transforms(env: TransformedEnv) -> Iterator[KeyedTransform]:
-    """Yield each transform with draws or counters of its own, also those of a `TransformedEnv` further inside."""
-    inner: Any = env
-    while isinstance(inner, TransformedEnv):
-        for module in inner.transform.modules():
-            if isinstance(module, KeyedTransform):
-                yield module
-        inner = inner.base_env

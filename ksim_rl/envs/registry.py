@@ -1,6 +1,4 @@
-"""The tasks by name, as Python functions and as the Hydra config group `task`."""
-
-from __future__ import annotations
+"""This module finds the tasks by name, for Python and for the Hydra config group `task`, and builds their envs."""
 
 import importlib
 import pkgutil
@@ -63,11 +61,7 @@ def names() -> list[str]:
 
 
 def task(name: str) -> Task:
-    """Return a task by name.
-
-    Raises:
-        ValueError: if there is none of this name, with the near names.
-    """
+    """Return a task by name; a ValueError gives the near names."""
     tasks = _tasks()
     if name not in tasks:
         raise unknown_name("task", name, tasks)
@@ -93,9 +87,8 @@ def _tree(name: str) -> dict[str, Any]:
 def make_cfg(name: str, overrides: Sequence[str] = ()) -> ManagerBasedRlEnvCfg:
     """Return a task's config with Hydra overrides applied, such as `"task.rewards.upright.weight=0.5"`.
 
-    Raises:
-        ValueError: naming the task or field that does not exist, or the value that is not valid, before any model is
-            compiled.
+    A ValueError names the task or field that does not exist, or the value that is not valid, before any model is
+    compiled.
     """
     check_overrides({"task": _tree(name)}, overrides)
     register_configs()
@@ -108,15 +101,11 @@ def make_cfg(name: str, overrides: Sequence[str] = ()) -> ManagerBasedRlEnvCfg:
 
 
 def build(
-    cfg: ManagerBasedRlEnvCfg,
-    *,
-    device: str | torch.device = "cpu",
-    render_mode: str | None = None,
+    cfg: ManagerBasedRlEnvCfg, *, device: str | torch.device = "cpu", render_mode: str | None = None
 ) -> MaskedTransformedEnv:
     """Build the env of a config, with the transforms that its observation groups ask for and its own after them.
 
-    Raises:
-        ValueError: naming the transform that does not fit the env.
+    A ValueError names the transform that does not fit the env.
     """
     base_env = ManagerBasedRlEnv(cfg, device=device, render_mode=render_mode)
     level = base_env.view.level
@@ -126,9 +115,8 @@ def build(
         follow_level([transform], level)
         try:
             env.append_transform(transform)
-            assert (
-                env.output_spec is not None and env.input_spec is not None
-            )  # made, which shows what does not fit
+            # Specs that are made show what does not fit.
+            assert env.output_spec is not None and env.input_spec is not None
         except (KeyError, ValueError, RuntimeError, TypeError) as error:
             reason = error.args[0] if isinstance(error, KeyError) and error.args else error
             raise ValueError(f"task.transforms.{name}: {reason}") from error
@@ -147,21 +135,10 @@ def make(
     overrides: Sequence[str] = (),
     render_mode: str | None = None,
 ) -> MaskedTransformedEnv:
-    """Build a registered task, ready to train on.
+    """Build a registered task, ready to train on, with keys `"actor"`, `"critic"` (or what groups it has), `"action"`.
 
-    Args:
-        name: one of `names()`.
-        num_envs: E.
-        device: where worlds and data live.
-        seed: of all draws; None keeps the task's own, and if that is None too, draws one.
-        overrides: Hydra overrides of the task's config.
-        render_mode: None, or "rgb_array" for `render()`.
-
-    Returns:
-        The transformed env, keys `"actor"`, `"critic"` (or whatever groups the task has) and `"action"`.
-
-    Raises:
-        ValueError: naming the task, field or value that is wrong and what would be valid.
+    `seed` is of all draws; None keeps the task's own, and if that is None too, draws one. `overrides` are Hydra's, of
+    the task's config. A ValueError names the task, field or value that is wrong and what would be valid.
     """
     given = [f"task.scene.num_envs={num_envs}"] + ([] if seed is None else [f"task.seed={seed}"])
     return build(make_cfg(name, [*overrides, *given]), device=device, render_mode=render_mode)

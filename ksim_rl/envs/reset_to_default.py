@@ -12,10 +12,7 @@ from ksim_rl.envs.view import EnvView
 
 @dataclass(frozen=True, kw_only=True)
 class ResetToDefault(EventTerm):
-    """Put rows that reset into the model's first keyframe or, without one, its default pose, at rest.
-
-    On a terrain the pose stands at the env's origin.
-    """
+    """Put rows that reset into the first keyframe, else the default pose, at rest; on a terrain at the env's origin."""
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Write positions; the masked reset has already zeroed the velocities."""

@@ -1,60 +1,52 @@
-"""The specs of an env: shapes, dtypes and dim names of what it takes and gives, `["E"]`."""
+"""This module makes the specs of an env: shapes, dtypes and dim names of what it takes and gives, `["E"]`."""
 
 from collections.abc import Mapping
 
 import torch
-from jaxtyping import Shaped
+from jaxtyping import Float, Shaped
 from torch import Tensor
-from torchrl.data import Binary, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from ksim_rl import dims
 
 
-def observation(
+def make_specs(
     readings: Mapping[str, Mapping[str, Shaped[Tensor, " E *?leaf"]]],
+    size: int,
+    bounds_L2: Float[Tensor, "L 2"] | None,
+    *,
     batch_size: torch.Size,
     device: torch.device | None,
-) -> Composite:
-    """Return the spec of the readings by group and name, [E, ...] each; empty groups are left out."""
+) -> tuple[Composite, Composite, Composite, Composite]:
+    """Return the specs of observation, action, reward and done.
+
+    `readings` are the observations by group and name, without empty groups; the action has `size` entries,
+    between bounds (low, high) if there are any.
+    """
+
+    def composite(leaves: Mapping[str, object]) -> Composite:
+        return Composite(dict(leaves), shape=batch_size, device=device)
+
+    def unbounded(value: Shaped[Tensor, "*shape"]) -> Unbounded:
+        return Unbounded(shape=value.shape, dtype=value.dtype, device=device)
+
     groups = {
-        group: Composite(
-            {
-                name: Unbounded(shape=value.shape, dtype=value.dtype, device=device)
-                for name, value in values.items()
-            },
-            shape=batch_size,
-            device=device,
-        )
+        group: composite({name: unbounded(value) for name, value in values.items()})
         for group, values in readings.items()
         if values
     }
-    return _named(groups, batch_size, device)
-
-
-def action(size: int, batch_size: torch.Size, device: torch.device | None) -> Composite:
-    """Return the spec of the action, float32 [E, size]."""
-    return _named({"action": Unbounded(shape=_leaf(batch_size, size), device=device)}, batch_size, device)
-
-
-def reward(batch_size: torch.Size, device: torch.device | None) -> Composite:
-    """Return the spec of the reward, float32 [E, 1]."""
-    return _named({"reward": Unbounded(shape=_leaf(batch_size, 1), device=device)}, batch_size, device)
-
-
-def done(batch_size: torch.Size, device: torch.device | None) -> Composite:
-    """Return the spec of `done`, `terminated` and `truncated`, bool [E, 1] each."""
+    shape_E1, shape_EL = torch.Size((*batch_size, 1)), torch.Size((*batch_size, size))
+    action: Unbounded | Bounded = Unbounded(shape=shape_EL, device=device)
+    if bounds_L2 is not None:
+        low_EL, high_EL = (edge_L.expand(shape_EL).clone() for edge_L in bounds_L2.unbind(-1))
+        action = Bounded(low_EL, high_EL, shape=shape_EL, dtype=torch.float32, device=device)
     flags = {
-        name: Binary(n=1, shape=_leaf(batch_size, 1), dtype=torch.bool, device=device)
+        name: Binary(n=1, shape=shape_E1, dtype=torch.bool, device=device)
         for name in ("done", "terminated", "truncated")
     }
-    return _named(flags, batch_size, device)
-
-
-def _leaf(batch_size: torch.Size, size: int) -> torch.Size:
-    return torch.Size((*batch_size, size))
-
-
-def _named(leaves: Mapping[str, object], batch_size: torch.Size, device: torch.device | None) -> Composite:
-    spec = Composite(dict(leaves), shape=batch_size, device=device)
-    spec.names = [dims.E]
-    return spec
+    leaves = (groups, {"action": action}, {"reward": Unbounded(shape=shape_E1, device=device)}, flags)
+    specs = tuple(map(composite, leaves))
+    for spec in specs:
+        spec.names = [dims.E]
+    observation, action_spec, reward, done = specs
+    return observation, action_spec, reward, done

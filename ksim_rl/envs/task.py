@@ -1,7 +1,5 @@
 """This module defines a task: an env config under a name, with what is known about training it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -13,26 +11,18 @@ class Training(Protocol):
     """What this room knows of the settings of training, which stand in rooms above."""
 
     @property
-    def num_envs(self) -> int:
-        """E, parallel envs."""
-        ...
-
+    def num_envs(self) -> int: ...  # noqa: D102
     @property
-    def seed(self) -> int:
-        """Of all draws."""
-        ...
+    def seed(self) -> int: ...  # noqa: D102
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """An env config with what is known about training it.
+    """An env config with what is known about training it; at the top level of a module of `ksim_rl/tasks/`.
 
-    A module in `ksim_rl/tasks/` that holds one at its top level registers it.
+    `name` is as in `task=<name>`, `description` one line for the table of tasks.
 
     Attributes:
-        name: as in `task=<name>`.
-        description: one line for the table of tasks.
-        cfg: returns the env's config.
         training: how it is trained, a `ksim_rl.trainers.TrainingCfg`; the command line overrides it. Other algorithms
             than its `objective`'s take of it what fits them. None leaves all to the defaults.
         other_trainings: the same with the settings of other algorithms.

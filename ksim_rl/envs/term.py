@@ -6,8 +6,6 @@ a named buffer of the view (`view.buffer`). A term must not branch on tensor val
 allocate sizes that depend on data: the step that calls it is captured into a CUDA graph.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -38,15 +36,12 @@ class ObservationTerm(Term):
 
     @abstractmethod
     def __call__(self, view: EnvView) -> Shaped[Tensor, " E *leaf"]:
-        """Return the reading of the current state, float32 [E, L], or an image."""
+        """Return the reading of the current state."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RewardTerm(Term):
-    """A reward per second (or per step, if the env does not scale by dt), before its weight.
-
-    A term of weight 0 is not computed.
-    """
+    """A reward per second (or per step, if the env does not scale by dt), before its weight; 0 is not computed."""
 
     weight: float = 1.0
 
@@ -133,11 +128,7 @@ class CommandTerm(Term):
         """Return the command of the current state and targets, float32 [E, K]."""
 
     def set(self, view: EnvView, value_EK: Float[Tensor, "*rows K"], mask_E: Bool[Tensor, " E"]) -> None:
-        """Take values from outside for the rows of `mask_E`, bool [E].
-
-        Raises:
-            ValueError: if this kind of command is drawn instead.
-        """
+        """Take values from outside for the rows of `mask_E`; a ValueError if this kind of command is drawn instead."""
         raise ValueError(
             f"a {type(self).__name__} draws its values; a JoystickCommand takes them from outside"
         )
@@ -153,6 +144,10 @@ class ActionTerm(Term):
     @abstractmethod
     def size(self, view: EnvView) -> int:
         """Return how many columns of the action this term takes."""
+
+    def bounds(self, view: EnvView) -> Float[Tensor, "K 2"] | None:
+        """Return the range, (low, high) [K, 2], outside of which a column does nothing more; None has no such range."""
+        return None
 
     @abstractmethod
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:

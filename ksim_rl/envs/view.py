@@ -1,15 +1,13 @@
 """This module is what the terms of an env read: the worlds, and what sensors and managers have made of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checks import near
-from ksim_rl.envs.readings import Readings
 from ksim_rl.scene.sensors import (
     CameraTracker,
     ContactState,
@@ -22,6 +20,25 @@ from ksim_rl.scene.state.simulation import Simulation
 from ksim_rl.scene.state.world_view import WorldView
 
 Tracker = TypeVar("Tracker", bound=SensorTracker)
+
+
+class Readings:
+    """What an `EnvView` shows beyond the worlds; managers fill it while the env is constructed, then write in place."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        num_envs, device = simulation.num_envs, simulation.device
+        self.sensors: dict[str, SensorTracker] = {}
+        self.commands: dict[str, Float[Tensor, "E ?K"]] = {}
+        self.command_ranges: dict[str, dict[str, Float[Tensor, " 2"]]] = {}
+        self.reward_weights: dict[str, Float[Tensor, ""]] = {}
+        self.episode_rewards: dict[str, Float[Tensor, " E"]] = {}
+        self.terminations: dict[str, Bool[Tensor, " E"]] = {}
+        self.terminated_E = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self.truncated_E = torch.zeros_like(self.terminated_E)
+        self.action_EL = torch.zeros(num_envs, 0, device=device)
+        self.last_action_EL = torch.zeros_like(self.action_EL)
+        self.level = simulation.shared_values.get("curriculum.level", 1.0)
+        self.command_cache = simulation.new_cache()
 
 
 class EnvView(WorldView):
@@ -80,11 +97,7 @@ class EnvView(WorldView):
         return self.tracker(name, CameraTracker, "camera")
 
     def tracker(self, name: str, kind: type[Tracker], described: str) -> Tracker:
-        """Return the reader of a sensor of `cfg.scene.sensors`.
-
-        Raises:
-            ValueError: if there is no such sensor of this kind.
-        """
+        """Return the reader of a sensor of `cfg.scene.sensors`; a ValueError if there is none of this kind."""
         tracker = self.sensors.get(name)
         if not isinstance(tracker, kind):
             names = [other for other, present in self.sensors.items() if isinstance(present, kind)]

@@ -12,12 +12,14 @@ from ksim_rl.mdp.actions import (
     JointVelocityAction,
     RelativeJointPositionAction,
 )
-from ksim_rl.mdp.commands.locomotion import JoystickCommand, SinusoidalGaitCommand, UniformVelocityCommand
-from ksim_rl.mdp.commands.pose import (
+from ksim_rl.mdp.commands import (
     BaseHeightCommand,
     CartesianCommand,
     JointPositionCommand,
+    JoystickCommand,
+    SinusoidalGaitCommand,
     StartPoseCommand,
+    UniformVelocityCommand,
 )
 from ksim_rl.mdp.curricula import (
     CommandRangesByLevel,
@@ -40,7 +42,6 @@ from ksim_rl.mdp.events import (
     ResetJointsByScale,
     ResetRootUniform,
 )
-from ksim_rl.mdp.manipulation import NearBody, OffsetToBody, OffsetToCommand
 from ksim_rl.mdp.metrics import (
     ActionAcceleration,
     AngularVelocityError,
@@ -80,21 +81,26 @@ from ksim_rl.mdp.observations.bodies import (
     FootContactForces,
     FootHeight,
     FootPos,
+    OffsetToBody,
+    OffsetToCommand,
 )
-from ksim_rl.mdp.observations.joints import (
+from ksim_rl.mdp.observations.robot import (
     ActuatorForce,
+    CameraImage,
+    Clock,
+    Command,
+    EpisodeTime,
+    HeightScan,
+    ImuReading,
     JointAcc,
     JointEffort,
     JointPos,
     JointPosRel,
     JointVel,
-)
-from ksim_rl.mdp.observations.root import (
-    Clock,
-    Command,
-    EpisodeTime,
     LastAction,
     ProjectedGravity,
+    RayDistance,
+    RayHeight,
     RemainingTime,
     RootAngVel,
     RootLinVel,
@@ -103,23 +109,20 @@ from ksim_rl.mdp.observations.root import (
     RootRotation6d,
     SensorReading,
 )
-from ksim_rl.mdp.observations.sensors import CameraImage, HeightScan, ImuReading, RayDistance, RayHeight
-from ksim_rl.mdp.randomization.actuators import RandomizeActuatorGains, RandomizeEffortLimit
 from ksim_rl.mdp.randomization.bodies import (
     RandomizeBodyCom,
     RandomizeBodyInertia,
     RandomizeBodyMass,
+    RandomizeGeomFriction,
+    RandomizeGeomSize,
     RandomizeGravity,
+    RandomizePairFriction,
     RandomizePseudoInertia,
 )
-from ksim_rl.mdp.randomization.geoms import (
-    RandomizeGeomFriction,
-    RandomizeGeomPos,
-    RandomizeGeomQuat,
-    RandomizeGeomSize,
-)
 from ksim_rl.mdp.randomization.joints import (
+    RandomizeActuatorGains,
     RandomizeDefaultJointPos,
+    RandomizeEffortLimit,
     RandomizeEncoderBias,
     RandomizeJointArmature,
     RandomizeJointDamping,
@@ -127,15 +130,30 @@ from ksim_rl.mdp.randomization.joints import (
     RandomizeJointRange,
     RandomizeJointStiffness,
     RandomizeJointZero,
+    RandomizeTendonArmature,
+    RandomizeTendonDamping,
+    RandomizeTendonFrictionLoss,
+    RandomizeTendonStiffness,
 )
-from ksim_rl.mdp.rewards.actions import (
-    ActionAccelerationL2,
-    ActionJerkL2,
-    ActionRateL2,
-    ActionSymmetryL2,
-    Alive,
-    JointSymmetryL2,
-    Terminated,
+from ksim_rl.mdp.randomization.looks import (
+    RandomizeCameraFieldOfView,
+    RandomizeCameraIntrinsic,
+    RandomizeGeomColor,
+    RandomizeLightColor,
+    RandomizeMaterialColor,
+    RandomizeMaterialShine,
+)
+from ksim_rl.mdp.randomization.poses import (
+    RandomizeBodyPos,
+    RandomizeBodyQuat,
+    RandomizeCameraPos,
+    RandomizeCameraQuat,
+    RandomizeGeomPos,
+    RandomizeGeomQuat,
+    RandomizeLightDir,
+    RandomizeLightPos,
+    RandomizeSitePos,
+    RandomizeSiteQuat,
 )
 from ksim_rl.mdp.rewards.feet import (
     ContactForceAbove,
@@ -149,7 +167,12 @@ from ksim_rl.mdp.rewards.feet import (
     UndesiredContacts,
 )
 from ksim_rl.mdp.rewards.joints import (
+    ActionAccelerationL2,
+    ActionJerkL2,
+    ActionRateL2,
+    ActionSymmetryL2,
     ActuatorForceL2,
+    Alive,
     Energy,
     JointAccL2,
     JointDeviationL1,
@@ -157,28 +180,29 @@ from ksim_rl.mdp.rewards.joints import (
     JointEffortL2,
     JointEffortLimits,
     JointPosLimits,
+    JointSymmetryL2,
     JointVelL2,
     JointVelLimits,
+    Terminated,
 )
-from ksim_rl.mdp.rewards.posture import (
+from ksim_rl.mdp.rewards.tracking import (
     AngularMomentum,
     AngVelXYL2,
     BodyAngularVelocity,
     LinkAccelerationL2,
     LinVelZL2,
     MotionlessAtRest,
+    NearBody,
     Pose,
     RootHeightL2,
     TiltL2,
-    Upright,
-)
-from ksim_rl.mdp.rewards.tracking import (
     TrackAngularVelocity,
     TrackJointPosition,
     TrackLinearVelocity,
     TrackOrientation,
     TrackPosition,
     TrackRootHeight,
+    Upright,
 )
 from ksim_rl.mdp.terminations import (
     BadOrientation,

@@ -1,6 +1,5 @@
 """These terms map actions to what joints or actuators are asked for."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -13,6 +12,8 @@ from ksim_rl.envs.term import ActionTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant, values_by_name
 from ksim_rl.scene.names import Patterns
+from ksim_rl.transforms.elementwise import clipped, scaled
+from ksim_rl.transforms.low_pass import low_pass_, smoothing
 
 PerJoint = float | Mapping[str, float]
 
@@ -22,29 +23,26 @@ class JointAction(ActionTerm):
     """An action with one column per joint, in the order of `joints`; the actuators may stand in any order.
 
     A raw action is clipped, squashed, scaled, filtered and shifted, in this order; each is left out by default. These
-    belong to this term and may differ by joint; latency, and what treats the whole action alike in any env, are
-    transforms of the task (`ActionDelay`, `ActionClip`, `ActionScale`, `ActionLowPass`).
-
-    Attributes:
-        joints: names or patterns.
-        scale: units of the target per unit action, one for all or by joint (keys are regular expressions).
-        offset: added at the end, in the target's units, one for all or by joint.
-        clip: bounds of the raw action, or None.
-        tanh: squashes the action into (-1, 1).
-        cutoff_hz: corner frequency of a first-order low-pass filter, or None. At each env step it takes the part
-            `1 - exp(-2 pi cutoff_hz step_dt)` of the way to the new value, as the continuous filter does under a
-            constant input. After a reset it starts at 0, which is what no action at all asks for.
+    belong to this term and may differ by joint (keys are regular expressions); clip, scale and filter are those of the
+    transforms `ActionClip`, `ActionScale` and `ActionLowPass`, which treat a whole action alike, in any env.
     """
 
     joints: Patterns
     scale: PerJoint = 1.0
+    """Units of the target per unit action."""
     offset: PerJoint = 0.0
+    """In the target's units."""
     clip: Range | None = None
     tanh: bool = False
+    """Squashes the action into (-1, 1)."""
     cutoff_hz: Positive | None = None
+    """Of a first-order low-pass filter. After a reset it starts at 0, which is what no action at all asks for."""
 
     def size(self, view: EnvView) -> int:
         return len(view.joints(self.joints))
+
+    def bounds(self, view: EnvView) -> Float[Tensor, "K 2"] | None:
+        return None if self.clip is None else constant(self.clip, view.device).expand(self.size(view), 2)
 
     def shaped(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> Float[Tensor, "E K"]:
         """Return the action after clip, tanh, scale, filter and offset."""
@@ -57,14 +55,14 @@ class JointAction(ActionTerm):
     ) -> Float[Tensor, "E K"]:
         """Return the action after clip, tanh, a scale (the field of that name) and the filter."""
         if self.clip is not None:
-            action_EK = action_EK.clamp(*self.clip)
+            action_EK = clipped(action_EK, self.clip)
         if self.tanh:
             action_EK = torch.tanh(action_EK)
-        action_EK = action_EK * per_joint(view, field, scale, self.joints)
+        action_EK = scaled(action_EK, per_joint(view, field, scale, self.joints))
         if self.cutoff_hz is None:
             return action_EK
         filtered_EK = view.buffer(f"filtered_{field}_EK", action_EK.shape[1])
-        return filtered_EK.lerp_(action_EK, 1.0 - math.exp(-2.0 * math.pi * self.cutoff_hz * view.step_dt))
+        return low_pass_(filtered_EK, action_EK, smoothing(self.cutoff_hz, view.step_dt))
 
 
 def per_joint(view: EnvView, field: str, value: PerJoint, joints: Patterns) -> float | Float[Tensor, " K"]:
@@ -106,12 +104,22 @@ class JointVelocityAction(JointAction):
 
 @dataclass(frozen=True, kw_only=True)
 class JointEffortAction(JointAction):
-    """Efforts (N m or N): the shaped action, kept inside each motor's control range.
-
-    A motor of the MJCF takes it as its control, which its gear and gain multiply.
-    """
+    """Efforts, N m or N, inside each motor's control range; a motor of the MJCF multiplies it by its gear and gain."""
 
     joints: Patterns = ".*"
+
+    def bounds(self, view: EnvView) -> Float[Tensor, "K 2"] | None:
+        own_K2, limits_K2 = super().bounds(view), view.targets.limits("effort", self.joints)
+        if limits_K2 is None or self.tanh:
+            return own_K2
+        scale, offset = (
+            torch.as_tensor(per_joint(view, name, value, self.joints), device=view.device).expand(
+                len(limits_K2)
+            )
+            for name, value in (("scale", self.scale), ("offset", self.offset))
+        )
+        range_K2 = ((limits_K2 - offset[:, None]) / scale[:, None]).sort(dim=-1).values
+        return range_K2 if own_K2 is None else range_K2.clamp(own_K2[:, :1], own_K2[:, 1:])
 
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         view.write_joint_effort_target(self.joints, self.shaped(view, action_EK))
@@ -119,15 +127,10 @@ class JointEffortAction(JointAction):
 
 @dataclass(frozen=True, kw_only=True)
 class JointPositionVelocityAction(JointPositionAction):
-    """Positions and velocities: first one column per joint for the positions, then as many for the velocities.
-
-    Clip, tanh and filter hold for both; scale and offset are those of the positions.
-
-    Attributes:
-        velocity_scale: rad/s or m/s per unit action, one for all or by joint.
-    """
+    """Positions of all joints, then velocities; clip, tanh and filter hold for both, scale and offset for positions."""
 
     velocity_scale: PerJoint = 1.0
+    """rad/s or m/s per unit action."""
 
     def size(self, view: EnvView) -> int:
         return 2 * super().size(view)
@@ -142,14 +145,7 @@ class JointPositionVelocityAction(JointPositionAction):
 
 @dataclass(frozen=True, kw_only=True)
 class ActuatorAction(ActionTerm):
-    """Controls of actuators as they are (tendons, muscles, grippers): the action, kept inside each control range.
-
-    One column per actuator, in the order of `actuators`.
-
-    Attributes:
-        actuators: names or patterns.
-        scale: control units per unit action.
-    """
+    """Controls of actuators as they are (tendons, muscles, grippers), one column each, inside each control range."""
 
     actuators: Patterns
     scale: float = 1.0
@@ -159,7 +155,11 @@ class ActuatorAction(ActionTerm):
         view.targets.check_no_law(ids)
         return len(ids)
 
+    def bounds(self, view: EnvView) -> Float[Tensor, "K 2"] | None:
+        limits_K2 = view.ctrl_limits_L2[view.resolver.index("actuator", self.actuators)]
+        return (limits_K2 / self.scale).sort(dim=-1).values
+
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         index = view.resolver.index("actuator", self.actuators)
         limits_K2 = view.ctrl_limits_L2[index]
-        view.write_ctrl(index, torch.clamp(action_EK * self.scale, limits_K2[:, 0], limits_K2[:, 1]))
+        view.write_ctrl(index, torch.clamp(scaled(action_EK, self.scale), limits_K2[:, 0], limits_K2[:, 1]))

@@ -42,11 +42,7 @@ def _index_constant(ids: tuple[int, ...], device: torch.device) -> Index:
 
 
 def values_by_name(field: str, table: Mapping[str, float], names: Sequence[str]) -> tuple[float, ...]:
-    """Spread a table of patterns (regular expressions, full match) over names: one value per name.
-
-    Raises:
-        ValueError: naming `field`, if a name matches no pattern or several, or a pattern matches no name.
-    """
+    """Spread a table of patterns (regular expressions, full match) over names, which must match one each."""
     return _values_by_name(field, tuple(table.items()), tuple(names))
 
 

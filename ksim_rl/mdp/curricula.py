@@ -8,28 +8,24 @@ ranges of commands and weights of rewards by stages of env steps, or move envs o
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ksim_rl.checked import Count, NonNegative, Share, WholeNumber, Within
-from ksim_rl.checks import check_in_range, check_pair, unknown_name
+from ksim_rl.checked import Count, NonNegative, Range, Share, WholeNumber, Within
+from ksim_rl.checks import check_in_range, unknown_name
 from ksim_rl.envs.term import CurriculumTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
-from ksim_rl.mdp.fields import OfEntity
-from ksim_rl.mdp.quantities import distance_from_origin
+from ksim_rl.mdp.fields import OfEntity, distance_from_origin
+from ksim_rl.transforms.row_transform import by_level, moved_level
 
 
 @dataclass(frozen=True, kw_only=True)
 class LevelCurriculum(CurriculumTerm):
-    """What the terms of this file share.
-
-    Attributes:
-        initial_level: of an env that has just been built.
-    """
+    """A curriculum that drives the level; `initial_level` is that of an env that has just been built."""
 
     initial_level: Share = 0.0
 
@@ -40,11 +36,7 @@ class LevelCurriculum(CurriculumTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class LinearLevel(LevelCurriculum):
-    """The level rises linearly to 1 between two counts of env steps.
-
-    Attributes:
-        begin_step, end_step: env steps since the env was seeded.
-    """
+    """The level rises linearly to 1 between two counts of env steps since the env was seeded."""
 
     begin_step: WholeNumber = 0
     end_step: int
@@ -64,12 +56,8 @@ class LinearLevel(LevelCurriculum):
 class SteppedLevel(LevelCurriculum):
     """The level moves by 1 / `num_levels` whenever the mean score of the last episodes is high or low enough.
 
-    Attributes:
-        raise_above: a mean score above this makes it harder.
-        lower_below: a mean score below this makes it easier; None never does.
-        num_levels: how many steps lead from 0 to 1.
-        min_episodes: how many episodes must end before the level may move (and again before the next move); None: one
-            per env.
+    A mean score below `lower_below` makes it easier; None never does. `min_episodes` must end before each move; None:
+    one per env.
     """
 
     raise_above: float
@@ -87,17 +75,13 @@ class SteppedLevel(LevelCurriculum):
         """Return how well the running episodes have gone so far, float32 [E]."""
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
-        """Take in the episodes that ended, adapt, and return the level."""
         ended_E = mask_E & (view.episode_step_E > 0)
         held_2 = view.shared("episodes_and_score_2", (0.0, 0.0))
         ended_E2 = torch.stack((torch.ones_like(ended_E, dtype=torch.float32), self.score(view)), dim=-1)
         total_2 = held_2 + torch.where(ended_E[:, None], ended_E2, 0.0).sum(0)
         is_enough = total_2[0] >= (self.min_episodes or view.num_envs)
         mean = total_2[1] / total_2[0].clamp(min=1.0)
-        move = (mean > self.raise_above).to(torch.float32)
-        if self.lower_below is not None:
-            move = move - (mean < self.lower_below).to(torch.float32)
-        level = (view.level + move / self.num_levels).clamp(0.0, 1.0)
+        level = moved_level(view.level, mean, 1.0 / self.num_levels, self.raise_above, self.lower_below)
         view.level.copy_(torch.where(is_enough, level, view.level))
         held_2.copy_(torch.where(is_enough, 0.0, total_2))
         return view.level.clone()
@@ -122,7 +106,6 @@ class DistanceLevel(OfEntity, SteppedLevel):
     """Moves with how far robots get: the score is the horizontal distance from the env's origin at the end, m."""
 
     def score(self, view: EnvView) -> Float[Tensor, " E"]:
-        """Return the distances, m, [E]."""
         return distance_from_origin(view, self.entity)
 
 
@@ -132,9 +115,6 @@ class SaturationLevel(SteppedLevel):
 
     That is the weighted sum over the episode per second of the longest possible one (the plain sum where episodes have
     no limit), so that a term of weight 2 that is always 1 scores 2.
-
-    Attributes:
-        reward: its name.
     """
 
     reward: str
@@ -160,10 +140,8 @@ class TerrainLevels(OfEntity, CurriculumTerm):
     whole episode, be it that it was slow or that it fell. An env that has mastered the last level goes on at a random
     one, so that none is forgotten. The rule is that of Rudin et al., "Learning to walk in minutes", 2022.
 
-    Attributes:
-        command: the velocity command, (vx, vy, ...) in m/s.
-        up_distance: share of the distance from the centre of a patch to its edge, in (0, 1].
-        down_share: of the commanded way.
+    The command is a velocity (vx, vy, ...) in m/s; `up_distance` is a share of the way from a patch's centre to its
+    edge.
     """
 
     command: str
@@ -171,7 +149,6 @@ class TerrainLevels(OfEntity, CurriculumTerm):
     down_share: NonNegative = 0.5
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
-        """Move the rows of `mask_E` that have had an episode, and return the mean level of all envs, float32 []."""
         terrain = view.terrain
         level_E, top = terrain.levels_E, terrain.num_levels - 1
         distance_E = distance_from_origin(view, self.entity)
@@ -186,16 +163,12 @@ class TerrainLevels(OfEntity, CurriculumTerm):
         return terrain.levels_E.to(torch.float32).mean()
 
 
-Ranges = Mapping[str, tuple[float, float]]
+Ranges = Mapping[str, Range]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RewardWeight(CurriculumTerm):
-    """A curriculum of a reward's weight, which is also the reported level.
-
-    Attributes:
-        reward: its name.
-    """
+    """A curriculum of the weight of the named reward, which is also the reported level."""
 
     reward: str
 
@@ -215,19 +188,13 @@ class RewardWeight(CurriculumTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class RewardWeightByStage(RewardWeight):
-    """Gives a reward another weight from certain env steps on; until the first stage it has its own.
+    """Gives a reward other weights from certain env steps (since the env was seeded) on; until then it has its own."""
 
-    Attributes:
-        stages: weights by the env step (since the env was seeded) from which on they hold.
-    """
-
-    stages: Mapping[int, float]
+    stages: Mapping[WholeNumber, float]
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_steps(self.stages)
-        for step, weight in self.stages.items():
-            check_in_range(f"stages.{step}", weight)
+        _check_some("stages", self.stages, "give at least one, by the env step at which it begins")
 
     def weight(self, view: EnvView, held: Float[Tensor, ""]) -> Float[Tensor, ""]:
         for step, value in sorted(self.stages.items()):
@@ -237,49 +204,39 @@ class RewardWeightByStage(RewardWeight):
 
 @dataclass(frozen=True, kw_only=True)
 class RewardWeightByLevel(RewardWeight):
-    """Moves a reward's weight linearly with `view.level`.
-
-    Attributes:
-        start, end: the weights at level 0 and at level 1.
-    """
+    """Moves a reward's weight linearly with `view.level` from `start` at level 0 to `end` at level 1."""
 
     start: float
     end: float
 
     def weight(self, view: EnvView, held: Float[Tensor, ""]) -> Float[Tensor, ""]:
-        return self.start + (self.end - self.start) * view.level
+        return by_level(self.start, self.end, view.level)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CommandRangesByStage(CurriculumTerm):
     """Gives a command other ranges from certain env steps on; until the first stage it has its own.
 
+    Stages begin at env steps since the env was seeded; a field of the command that a stage leaves out stays as it is.
     The reported level is the number of stages that have begun.
-
-    Attributes:
-        command: its name.
-        stages: ranges by field of the command, by the env step (since the env was seeded) from which on they hold. A
-            field that a stage leaves out stays as it is.
     """
 
     command: str
-    stages: Mapping[int, Ranges]
+    stages: Mapping[WholeNumber, Ranges]
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_steps(self.stages)
+        _check_some("stages", self.stages, "give at least one, by the env step at which it begins")
         for step, ranges in self.stages.items():
-            _check_ranges(f"stages.{step}", ranges)
+            _check_some(f"stages.{step}", ranges, "name at least one field of the command")
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
-        """Adapt and return the number of the stage."""
         held = _ranges_of(view, self.command, {field for ranges in self.stages.values() for field in ranges})
         wanted = dict(held)
         for step, ranges in sorted(self.stages.items()):
             for field, pair in ranges.items():
-                wanted[field] = torch.where(
-                    view.step_count >= step, constant(pair, view.device), wanted[field]
-                )
+                pair_2 = constant(pair, view.device)
+                wanted[field] = torch.where(view.step_count >= step, pair_2, wanted[field])
         for field, held_2 in held.items():
             held_2.copy_(torch.where(mask_E.any(), wanted[field], held_2))
         stage = (view.step_count >= constant(sorted(self.stages), view.device)).sum().to(torch.float32)
@@ -290,12 +247,7 @@ class CommandRangesByStage(CurriculumTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class CommandRangesByLevel(CurriculumTerm):
-    """Moves the ranges of a command linearly with `view.level`, which is also the reported level.
-
-    Attributes:
-        command: its name.
-        start, end: ranges by field of the command at level 0 and at level 1; the same fields in both.
-    """
+    """Moves the ranges of a command linearly from `start` at `view.level` 0, which is also reported, to `end` at 1."""
 
     command: str
     start: Ranges
@@ -303,8 +255,7 @@ class CommandRangesByLevel(CurriculumTerm):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_ranges("start", self.start)
-        _check_ranges("end", self.end)
+        _check_some("start", self.start, "name at least one field of the command")
         if self.start.keys() != self.end.keys():
             raise ValueError(
                 f"start has the fields {sorted(self.start)} and end {sorted(self.end)}: give the same"
@@ -313,22 +264,13 @@ class CommandRangesByLevel(CurriculumTerm):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         for field, held_2 in _ranges_of(view, self.command, self.start).items():
             start_2, end_2 = constant(self.start[field], view.device), constant(self.end[field], view.device)
-            held_2.copy_(torch.where(mask_E.any(), torch.lerp(start_2, end_2, view.level), held_2))
+            held_2.copy_(torch.where(mask_E.any(), by_level(start_2, end_2, view.level), held_2))
         return view.level.clone()
 
 
-def _check_steps(stages: Mapping[int, object]) -> None:
-    if not stages:
-        raise ValueError("stages={}: give at least one, by the env step at which it begins")
-    for step in stages:
-        check_in_range("stages (the env step of one)", step, low=0)
-
-
-def _check_ranges(where: str, ranges: Ranges) -> None:
-    if not ranges:
-        raise ValueError(f"{where}={{}}: name at least one field of the command")
-    for field, pair in ranges.items():
-        check_pair(f"{where}.{field}", pair)
+def _check_some(where: str, entries: Mapping[Any, object], advice: str) -> None:
+    if not entries:
+        raise ValueError(f"{where}={{}}: {advice}")
 
 
 def _ranges_of(view: EnvView, command: str, fields: Iterable[str]) -> dict[str, Tensor]:

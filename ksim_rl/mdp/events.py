@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,25 +13,29 @@ from ksim_rl.checked import NonNegativeRange, Range
 from ksim_rl.checks import check_in_range, check_pair
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp import se3_ranges
 from ksim_rl.mdp.constants import constant
-from ksim_rl.mdp.fields import OfFreeRoot, OfJoints
-from ksim_rl.mdp.quantities import root_height
+from ksim_rl.mdp.fields import OfFreeRoot, OfJoints, root_height
 from ksim_rl.scene import quaternion
+
+Axis = Literal["x", "y", "z", "roll", "pitch", "yaw"]
+Ranges = Mapping[Axis, Range]
+
+
+def _draw(view: EnvView, ranges: Ranges) -> Float[Tensor, "E 6"]:
+    """Draw x, y, z, roll, pitch, yaw (m and rad, or m/s and rad/s) uniformly; axes that are left out are 0."""
+    pairs = [ranges.get(axis, (0.0, 0.0)) for axis in get_args(Axis)]
+    low_6 = constant([float(low) for low, _ in pairs], view.device)
+    if all(low == high for low, high in pairs):
+        return low_6.expand(view.num_envs, 6)
+    high_6 = constant([float(high) for _, high in pairs], view.device)
+    return view.uniform(6, low_6, high_6)
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointReset(OfJoints, EventTerm):
     """A reset of joints, whose positions stay in the soft limits."""
 
-    def write(
-        self,
-        view: EnvView,
-        mask_E: Bool[Tensor, " E"],
-        pos_EL: Float[Tensor, "E L"],
-        vel_EL: Float[Tensor, "E L"],
-    ) -> None:
-        """Set positions and velocities of the joints in the rows of `mask_E`."""
+    def _write(self, view: EnvView, mask_E: Tensor, pos_EL: Tensor, vel_EL: Tensor) -> None:
         joints = view.joints(self.joints)
         low_L, high_L = joints.soft_limits_L2.unbind(-1)
         joints.write_pos(mask_E, torch.clamp(pos_EL, low_L, high_L))
@@ -40,12 +44,7 @@ class JointReset(OfJoints, EventTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class ResetJoints(JointReset):
-    """Put joints at their default positions plus an offset, at a drawn velocity.
-
-    Attributes:
-        position_range: rad or m. With `distribution="gaussian"`: (mean, standard deviation).
-        velocity_range: rad/s or m/s; likewise.
-    """
+    """Put joints at default positions plus an offset, rad or m, at a drawn velocity; "gaussian" ranges: (mean, std)."""
 
     position_range: tuple[float, float] = (0.0, 0.0)
     velocity_range: tuple[float, float] = (0.0, 0.0)
@@ -63,7 +62,7 @@ class ResetJoints(JointReset):
         default_EL = view.joints(self.joints).default_pos_EL
         count = default_EL.shape[1]
         pos_EL = default_EL + self._draw(view, count, self.position_range)
-        self.write(view, mask_E, pos_EL, self._draw(view, count, self.velocity_range))
+        self._write(view, mask_E, pos_EL, self._draw(view, count, self.velocity_range))
 
     def _draw(self, view: EnvView, count: int, pair: tuple[float, float]) -> Float[Tensor, "E L"]:
         first, second = float(pair[0]), float(pair[1])
@@ -76,12 +75,7 @@ class ResetJoints(JointReset):
 
 @dataclass(frozen=True, kw_only=True)
 class ResetJointsByScale(JointReset):
-    """Put joints at their default positions times a uniform factor, per joint.
-
-    Attributes:
-        position_scale: the factor's range.
-        velocity_range: rad/s or m/s, uniform.
-    """
+    """Put joints at their default positions times a uniform factor, per joint, with a velocity in rad/s or m/s."""
 
     position_scale: Range
     velocity_range: Range = (0.0, 0.0)
@@ -90,32 +84,24 @@ class ResetJointsByScale(JointReset):
         default_EL = view.joints(self.joints).default_pos_EL
         count = default_EL.shape[1]
         pos_EL = default_EL * view.uniform(count, *self.position_scale)
-        self.write(view, mask_E, pos_EL, view.uniform(count, *self.velocity_range))
+        self._write(view, mask_E, pos_EL, view.uniform(count, *self.velocity_range))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ResetRootUniform(OfFreeRoot, EventTerm):
-    """Put the free root body at its default pose plus a uniform offset, with a uniform velocity.
+    """Put the free root body at its default pose, on a terrain at the env's origin, plus uniform offset and velocity.
 
-    On a terrain the default pose stands at the env's origin.
-
-    Attributes:
-        pose_range: by axis: x, y, z (m, world frame), roll, pitch, yaw (rad, in the default pose's frame).
-        velocity_range: by axis: x, y, z (m/s), roll, pitch, yaw (rad/s), world frame.
+    `pose_range` is by axis: x, y, z (m, world frame), roll, pitch, yaw (rad, in the default pose's frame), and
+    `velocity_range` in m/s and rad/s, world frame.
     """
 
-    pose_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    velocity_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        se3_ranges.check_ranges("pose_range", self.pose_range)
-        se3_ranges.check_ranges("velocity_range", self.velocity_range)
+    pose_range: Ranges = field(default_factory=dict)
+    velocity_range: Ranges = field(default_factory=dict)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         body = self.root_of(view)
-        offset_E6 = se3_ranges.draw(view, self.pose_range)
-        velocity_E6 = se3_ranges.draw(view, self.velocity_range)
+        offset_E6 = _draw(view, self.pose_range)
+        velocity_E6 = _draw(view, self.velocity_range)
         turn_E4 = quaternion.from_euler_xyz(*offset_E6[:, 3:].unbind(-1))
         quat_E4 = quaternion.multiply(body.default_root_quat_L.expand(view.num_envs, 4), turn_E4)
         pos_E3 = body.default_root_pos_L + offset_E6[:, :3]
@@ -127,13 +113,7 @@ class ResetRootUniform(OfFreeRoot, EventTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class ResetHeading(OfFreeRoot, EventTerm):
-    """Turn the free root body about the world's z axis until its heading is a drawn one; its tilt stays.
-
-    It may follow `ResetRootUniform` in the same reset.
-
-    Attributes:
-        heading_range: rad.
-    """
+    """Turn the free root body about the world's z axis to a drawn heading (rad), also after `ResetRootUniform`."""
 
     heading_range: Range = (-math.pi, math.pi)
 
@@ -147,13 +127,7 @@ class ResetHeading(OfFreeRoot, EventTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class ResetHeight(OfFreeRoot, EventTerm):
-    """Lift or lower the free root body until it is a drawn height above the ground right below it.
-
-    It may follow `ResetRootUniform` in the same reset.
-
-    Attributes:
-        height_range: m.
-    """
+    """Put the free root body at a drawn height (m) above the ground right below it, also after `ResetRootUniform`."""
 
     height_range: Range
 
@@ -166,22 +140,14 @@ class ResetHeight(OfFreeRoot, EventTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class PushByVelocity(OfFreeRoot, EventTerm):
-    """Kick the free root body: add a uniform draw to its velocity, whatever its mass.
+    """Kick the free root body: add a uniform draw to its velocity (m/s and rad/s, world frame), whatever its mass."""
 
-    Attributes:
-        velocity_range: by axis: x, y, z (m/s), roll, pitch, yaw (rad/s), world frame.
-    """
-
-    velocity_range: Mapping[str, tuple[float, float]]
+    velocity_range: Ranges
     mode: Literal["startup", "reset", "interval", "step"] = "interval"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        se3_ranges.check_ranges("velocity_range", self.velocity_range)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         body = self.root_of(view)
-        kick_E6 = se3_ranges.draw(view, self.velocity_range)
+        kick_E6 = _draw(view, self.velocity_range)
         lin_vel_E3 = body.root_lin_vel_w_EL + kick_E6[:, :3]
         body.write_root_velocity(mask_E, lin_vel_E3, body.root_ang_vel_w_EL + kick_E6[:, 3:])
 
@@ -190,22 +156,17 @@ class PushByVelocity(OfFreeRoot, EventTerm):
 class PushByForce(EventTerm):
     """Press on a body for a while with a constant wrench at its centre of mass; both are drawn when the interval ends.
 
-    A push that is due while another lasts replaces it. Several of these events on one body add up.
-
-    Attributes:
-        body: its name.
-        wrench_range: by axis: x, y, z (N), roll, pitch, yaw (N m), world frame.
-        duration_s: range, s; taken as the nearest whole number of env steps, and at least one.
+    A push that is due while another lasts replaces it. Several of these events on one body add up. `wrench_range` is by
+    axis: x, y, z (N), roll, pitch, yaw (N m), world frame; `duration_s` is rounded to env steps, at least one.
     """
 
     body: str
-    wrench_range: Mapping[str, tuple[float, float]]
+    wrench_range: Ranges
     duration_s: NonNegativeRange
     mode: Literal["startup", "reset", "interval", "step"] = "interval"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        se3_ranges.check_ranges("wrench_range", self.wrench_range)
         if self.mode != "interval":
             raise ValueError(f"mode={self.mode!r}: expected 'interval', which also says when a push ends")
 
@@ -213,7 +174,7 @@ class PushByForce(EventTerm):
         """Begin a push in the rows of `mask_E`, and go on with or end those of the others; once per env step."""
         held_E6, applied_E6 = view.buffer("wrench_E6", 6), view.buffer("applied_E6", 6)
         left_E = view.buffer("left_s_E")
-        drawn_E6 = se3_ranges.draw(view, self.wrench_range)
+        drawn_E6 = _draw(view, self.wrench_range)
         duration_E = view.uniform(1, *self.duration_s)[:, 0].clamp(min=view.step_dt)
         left_E.copy_(torch.where(mask_E, duration_E, left_E - view.step_dt))
         held_E6.copy_(torch.where(mask_E[:, None], drawn_E6, held_E6))
@@ -225,11 +186,7 @@ class PushByForce(EventTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class Jump(OfFreeRoot, EventTerm):
-    """Throw the free root body up: add the upward velocity sqrt(2 g h) that carries it a drawn height h further.
-
-    Attributes:
-        height_range: h, m, in free flight.
-    """
+    """Throw the free root body up: add the velocity sqrt(2 g h) that carries it a drawn height h (m) in free flight."""
 
     height_range: NonNegativeRange
     mode: Literal["startup", "reset", "interval", "step"] = "interval"

@@ -1,4 +1,4 @@
-"""Terms take the fields of these classes, so that each is explained and checked once."""
+"""Terms take the fields of these classes and the quantities of these functions, so that each is said once."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,7 +10,6 @@ from torch import Tensor
 from ksim_rl.checked import NonNegative, Positive
 from ksim_rl.envs.term import ObservationTerm, RewardTerm, Term
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.quantities import is_commanded
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.sensors import ContactState
@@ -19,45 +18,40 @@ from ksim_rl.scene.state.entity import Entity
 
 @dataclass(frozen=True, kw_only=True)
 class OfEntity(Term):
-    """A term of one robot or object.
-
-    Attributes:
-        entity: its name in `scene.robots` or `scene.objects`; "" is the first robot.
-    """
+    """A term of one robot or object, by its name in `scene.robots` or `scene.objects`; "" is the first robot."""
 
     entity: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class InFrame(OfEntity):
-    """A term of something that is given in a frame.
-
-    Attributes:
-        frame: "root" is the frame of the root body of `entity`; "world".
-    """
+    """A term of something that is given in the frame of the root body of `entity`, or of the world."""
 
     frame: Literal["root", "world"] = "root"
 
 
 @dataclass(frozen=True, kw_only=True)
 class OfJoints(Term):
-    """A term of some joints.
-
-    Attributes:
-        joints: names or regular expressions of hinges and slides; ".*" is all, in the model's order.
-    """
+    """A term of hinges and slides, by names or regular expressions; ".*" is all, in the model's order."""
 
     joints: Patterns = ".*"
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfContacts(Term):
-    """A term of contacts that are stronger than a threshold.
+class SiteAndBody(Term):
+    """A term of where a site is and where a body's origin."""
 
-    Attributes:
-        sensor: a contact sensor of `scene.sensors`.
-        threshold: N, which the net force must exceed, sampled at the last physics substep of the env step.
-    """
+    site: str
+    body: str
+
+    def offset(self, view: EnvView) -> Float[Tensor, "E 3"]:
+        """Return the body's origin minus the site, world frame, m; position stage."""
+        return view.body(self.body).pos_EL - view.site(self.site).pos_EL
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfContacts(Term):
+    """A term of where the net force on a sensor of `scene.sensors` exceeds a threshold, N, at the last substep."""
 
     sensor: str
     threshold: NonNegative
@@ -65,22 +59,13 @@ class OfContacts(Term):
 
 @dataclass(frozen=True, kw_only=True)
 class OfFeet(Term):
-    """A term of how feet move and what they touch.
-
-    Attributes:
-        sensor: a contact sensor of `scene.sensors` with one geom or body per foot, in the order of `sites`.
-        sites: names or patterns of the feet.
-    """
+    """A term of how feet (sites) move, and of a contact sensor with one geom or body per foot in the same order."""
 
     sensor: str
     sites: Patterns
 
     def contact(self, view: EnvView) -> ContactState:
-        """Return the state of the contact sensor.
-
-        Raises:
-            ValueError: if it has another number of elements than feet: one alone would count for every foot.
-        """
+        """Return the state of the contact sensor; one element alone would count for all feet, and is refused."""
         contact, num_feet = view.contact(self.sensor), len(view.sites(self.sites))
         if contact.found_EN.shape[-1] != num_feet:
             raise ValueError(
@@ -92,11 +77,7 @@ class OfFeet(Term):
 
 @dataclass(frozen=True, kw_only=True)
 class GaussianReward(RewardTerm):
-    """exp(-error^2 / std^2): 1 without an error.
-
-    Attributes:
-        std: in the unit of the error.
-    """
+    """exp(-error^2 / std^2): 1 without an error; `std` is in the unit of the error."""
 
     std: Positive
 
@@ -110,11 +91,7 @@ class OfFreeRoot(OfEntity):
     """A term that moves the root of a robot or object."""
 
     def root_of(self, view: EnvView) -> Entity:
-        """Return the entity.
-
-        Raises:
-            ValueError: if there is none of this name, or its root is fixed.
-        """
+        """Return the entity; a ValueError says if its root is fixed."""
         entity = view.entity(self.entity)
         if not entity.free_root:
             raise ValueError(
@@ -145,11 +122,7 @@ class FramedObservation(InFrame, ObservationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class RewardWhileCommanded(RewardTerm):
-    """A reward that counts only while a velocity command asks to move.
-
-    Attributes:
-        command, command_threshold: the term is 0 unless the commanded speed exceeds the threshold.
-    """
+    """A reward that is 0 unless the speed that a velocity command asks for exceeds a threshold."""
 
     command: str
     command_threshold: NonNegative
@@ -157,3 +130,46 @@ class RewardWhileCommanded(RewardTerm):
     def while_commanded(self, view: EnvView, value_E: Float[Tensor, " E"]) -> Float[Tensor, " E"]:
         """Return the value where the command asks to move, else 0."""
         return value_E * is_commanded(view, self.command, self.command_threshold)
+
+
+def root_height(view: EnvView, entity: str = "") -> Float[Tensor, " E"]:
+    """Return the height of an entity's root frame above the ground right below it, m; position stage."""
+    return view.terrain.clearance(view.entity(entity).root_pos_EL[:, None])[:, 0]
+
+
+def distance_from_origin(view: EnvView, entity: str) -> Float[Tensor, " E"]:
+    """Return the horizontal distance of an entity's root from where its env starts, m; position stage."""
+    away_E3 = view.entity(entity).root_pos_EL - view.terrain.origins_E3
+    return torch.linalg.vector_norm(away_E3[:, :2], dim=-1)
+
+
+def mechanical_power(view: EnvView, joints: Patterns) -> Float[Tensor, " E"]:
+    """Return the sum over joints of |effort (acceleration stage) * velocity|, W: braking costs as much as driving."""
+    driven = view.joints(joints)
+    return (driven.effort_EL * driven.vel_EL).abs().sum(-1)
+
+
+def contact_force(view: EnvView, sensor: str) -> Float[Tensor, "E N"]:
+    """Return the magnitude of the net force on each element of a contact sensor, N; acceleration stage."""
+    return torch.linalg.vector_norm(view.contact(sensor).force_EN3, dim=-1)
+
+
+def commanded_speed(view: EnvView, command: str) -> Float[Tensor, " E"]:
+    """Return |c_xy| + |c_z| of the command (vx, vy, wz), m/s and rad/s added as numbers."""
+    key = f"speed of {command}"
+    speed_E = view.command_cache.get(key)
+    if speed_E is None:
+        command_EK = view.command(command)
+        speed_E = torch.linalg.vector_norm(command_EK[:, :2], dim=-1) + command_EK[:, 2].abs()
+        view.command_cache[key] = speed_E
+    return speed_E
+
+
+def is_commanded(view: EnvView, command: str, threshold: float) -> Float[Tensor, " E"]:
+    """Return 1 where the commanded speed exceeds the threshold, else 0."""
+    key = f"speed of {command} > {threshold}"
+    moves_E = view.command_cache.get(key)
+    if moves_E is None:
+        moves_E = (commanded_speed(view, command) > threshold).to(torch.float32)
+        view.command_cache[key] = moves_E
+    return moves_E

@@ -1,7 +1,6 @@
 """These metrics say how well and how smoothly commands are followed, what moving costs, and who succeeds.
 
-Poses and velocities are of the current state; contacts and forces belong to the last physics substep (acceleration
-stage).
+Poses and velocities are of the current state, contacts and forces of the last physics substep (acceleration stage).
 """
 
 from dataclasses import dataclass
@@ -16,19 +15,14 @@ from ksim_rl.checked import Positive
 from ksim_rl.checks import unknown_name
 from ksim_rl.envs.term import MetricTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.commands.pose import OfTarget
-from ksim_rl.mdp.fields import OfEntity, OfFeet, OfJoints
-from ksim_rl.mdp.quantities import contact_force, mechanical_power
+from ksim_rl.mdp.commands import OfTarget
+from ksim_rl.mdp.fields import OfEntity, OfFeet, OfJoints, contact_force, mechanical_power
 from ksim_rl.scene.names import Patterns
 
 
 @dataclass(frozen=True, kw_only=True)
 class LinearVelocityError(OfEntity, MetricTerm):
-    """|c_xy - v_xy| between command and root velocity, both in the root's frame, m/s; velocity stage.
-
-    Attributes:
-        command: (vx, vy, wz), by name.
-    """
+    """|c_xy - v_xy| of a command (vx, vy, wz) and the root velocity, both in the root's frame, m/s; velocity stage."""
 
     command: str
 
@@ -39,11 +33,7 @@ class LinearVelocityError(OfEntity, MetricTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class AngularVelocityError(OfEntity, MetricTerm):
-    """|c_z - w_z| between command and root velocity, both in the root's frame, rad/s; velocity stage.
-
-    Attributes:
-        command: (vx, vy, wz), by name.
-    """
+    """|c_z - w_z| of a command (vx, vy, wz) and the root velocity, both in the root's frame, rad/s; velocity stage."""
 
     command: str
 
@@ -75,11 +65,7 @@ class FootSlipSpeed(OfFeet, MetricTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class PeakFootHeight(MetricTerm):
-    """Height of the highest foot above the ground below it, m, [E]; by default its greatest value in the episode.
-
-    Attributes:
-        sites: the feet.
-    """
+    """Height of the highest foot above the ground below it, m, [E]; by default its greatest value in the episode."""
 
     sites: Patterns
     reduce: Literal["mean", "last", "max", "sum"] = "max"
@@ -90,19 +76,12 @@ class PeakFootHeight(MetricTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class PeakContactForce(MetricTerm):
-    """Magnitude of the greatest net contact force, N, [E]; by default its greatest value in the episode.
-
-    It is sampled once per env step, at its last physics substep: an impact may have been harder.
-
-    Attributes:
-        sensor: a contact sensor of `scene.sensors`.
-    """
+    """Greatest net contact force, N, [E], sampled at each env step's last substep; by default its peak so far."""
 
     sensor: str
     reduce: Literal["mean", "last", "max", "sum"] = "max"
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        """Return the value of the last substep, [E]."""
         return contact_force(view, self.sensor).amax(-1)
 
 
@@ -119,10 +98,8 @@ class CostOfTransport(OfJoints, OfEntity, MetricTerm):
     """Energy / (weight * distance) since the start of the episode, no unit; it needs gravity.
 
     Energy is the integral of `Power`; distance is the length of the root's path over the ground; the weight is that of
-    the nominal model (m g of the root body with all that hangs on it).
-
-    Attributes:
-        min_distance: m; a path that is still shorter counts as this long, so that standing still gives a finite value.
+    the nominal model (m g of the root body with all that hangs on it). A path counts as `min_distance` (m) at least, so
+    that standing still gives a finite value.
     """
 
     min_distance: Positive = 0.1
@@ -141,12 +118,9 @@ class CostOfTransport(OfJoints, OfEntity, MetricTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class Success(MetricTerm):
-    """1 where the episode ends by one of the named terminations and by no other, else 0, [E].
+    """1 where the episode ends by one of the named `terminations` of the env and by no other, else 0, [E].
 
     With the time-out it is the share of episodes that survived. Envs that are not made of terms have `SuccessTracker`.
-
-    Attributes:
-        terminations: names in the env's `terminations`.
     """
 
     terminations: tuple[str, ...]
@@ -171,13 +145,10 @@ class Success(MetricTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class TargetReached(OfTarget, MetricTerm):
-    """1 while a body or site is within a tolerance of the position that a `CartesianCommand` asks for, else 0.
+    """1 while a body or site is within `tolerance` (m) of the position that a `CartesianCommand` asks for, else 0.
 
     Position stage, with the command that the policy saw. `reduce="last"` (the default) asks whether it is there in the
     end, "max" whether it ever was, "mean" for which share of the time.
-
-    Attributes:
-        tolerance: m.
     """
 
     tolerance: Positive

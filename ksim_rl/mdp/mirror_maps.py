@@ -1,7 +1,7 @@
 """The left-right mirror image of what a policy reads and does is found here from the env's own terms."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -49,15 +49,8 @@ def mirror_maps(
     """Return the mirror image of observation groups and of the action, by key, in the plane y = 0 of the world.
 
     For a robot that is its own mirror image, in a scene and with rewards that are too, the image of an episode is an
-    episode. A history repeats the map of its term.
-
-    Args:
-        env: a `ManagerBasedRlEnv`, transformed or not.
-        groups: those to map.
-
-    Raises:
-        ValueError: if the image of a term is not known (register it with `term_mirror.register`), or if joints, default
-            pose or action scale are not symmetric.
+    episode. A history repeats the map of its term. A ValueError names a term whose image is not known (register it with
+    `term_mirror.register`), and joints, a default pose or an action scale that are not symmetric.
     """
     inner, specs = part(env, ManagerBasedRlEnv), group_specs(env)
     if inner is None:
@@ -91,17 +84,12 @@ def term_mirror(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
     Example:
         >>> @term_mirror.register
         ... def _(term: WindDirection, env): return POLAR
-
-    Raises:
-        ValueError: if nothing is registered for the term, or the robot is not symmetric there.
     """
     raise ValueError(
         f"the mirror image of {type(term).__name__} is not known: give it with "
         "ksim_rl.mdp.mirror_maps.term_mirror.register"
     )
 
-
-# -- root, sensors, time -----------------------------------------------------------------------------------------
 
 _FIXED = {
     **dict.fromkeys((mdp.RootPos, mdp.RootLinVel, mdp.ProjectedGravity), POLAR),
@@ -135,9 +123,6 @@ def _(term: mdp.HeightScan, env: ManagerBasedRlEnv) -> MirrorMap:
     rows = len(np.unique(points_N3[:, 1].round(6)))
     columns = np.arange(len(points_N3)).reshape(rows, -1)[::-1].ravel()
     return MirrorMap(source=tuple(map(int, columns)))
-
-
-# -- commands, joints, actions -----------------------------------------------------------------------------------
 
 
 @term_mirror.register
@@ -200,8 +185,7 @@ def _check_symmetric(what: str, value_K: Tensor, image_K: Tensor) -> None:
         raise ValueError(f"{what} {value_K.tolist()} is not its own mirror image {image_K.tolist()}")
 
 
-# -- bodies, feet and contacts: one number or vector for each name -----------------------------------------------
-
+# Bodies, feet and contacts: one number or vector for each name.
 _BODIES = {
     **dict.fromkeys((mdp.BodyPos, mdp.BodyLinVel, mdp.CenterOfMassPos, mdp.CenterOfMassVel), POLAR),
     mdp.BodyAngVel: AXIAL,
@@ -212,27 +196,21 @@ _CONTACTS = {
     **dict.fromkeys((mdp.Contact, mdp.FootContact, mdp.FootAirTime)),
     **dict.fromkeys((mdp.ContactForce, mdp.FootContactForces), POLAR),
 }
-for _kind, _image in _BODIES.items():
-    term_mirror.register(
-        _kind, lambda term, env, image=_image: mirror_by_name(_names(env, "body", term.bodies), image)
-    )
-for _kind, _image in _SITES.items():
-    term_mirror.register(
-        _kind, lambda term, env, image=_image: mirror_by_name(_names(env, "site", term.sites), image)
-    )
-for _kind, _image in _CONTACTS.items():
-    term_mirror.register(
-        _kind, lambda term, env, image=_image: mirror_by_name(_elements(env, term.sensor), image)
-    )
+_BY_NAME: Mapping[Any, Any] = {**_BODIES, **_SITES, **_CONTACTS}
 
 
-def _names(env: ManagerBasedRlEnv, kind: str, patterns: Patterns) -> list[str]:
-    names = env.view.resolver.names(kind)
-    return [names[i] for i in env.view.resolver.ids(kind, patterns)]
+def _of_names(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
+    resolver = env.view.resolver
+    if isinstance(term, tuple(_CONTACTS)):
+        contact = env.cfg.scene.sensors[term.sensor]
+        assert isinstance(contact, ContactSensor)
+        names = contact.elements(resolver.names("geom" if contact.kind == "geom" else "body"))
+    else:
+        is_body = isinstance(term, tuple(_BODIES))
+        kind, patterns = ("body", term.bodies) if is_body else ("site", term.sites)
+        names = [resolver.names(kind)[i] for i in resolver.ids(kind, patterns)]
+    return mirror_by_name(names, next(image for kind, image in _BY_NAME.items() if isinstance(term, kind)))
 
 
-def _elements(env: ManagerBasedRlEnv, sensor: str) -> list[str]:
-    contact = env.cfg.scene.sensors[sensor]
-    assert isinstance(contact, ContactSensor)
-    kind = "geom" if contact.kind == "geom" else "body"
-    return contact.elements(env.view.resolver.names(kind))
+for _kind in _BY_NAME:
+    term_mirror.register(_kind, _of_names)

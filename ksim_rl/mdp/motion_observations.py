@@ -37,15 +37,8 @@ def observe_motion(env: EnvBase, *, group: str, file: str) -> Float[Tensor, "F L
 
     Envs of their own, on a plane, are put into the motion's states, and the group's terms and transforms compute what
     they always do; noise is off. Terms that read more than positions and velocities (commands, actions, contacts,
-    forces) read what they have after a reset.
-
-    Args:
-        env: around a `ManagerBasedRlEnv`; it stays as it is.
-        group: one of its observation groups.
-        file: a reference motion, as `view.motion` reads it.
-
-    Raises:
-        ValueError: if the env is another, the motion does not fit the model, or is shorter than an env step.
+    forces) read what they have after a reset. The given env, around a `ManagerBasedRlEnv`, stays as it is; `file` is a
+    motion as `view.motion` reads it, at least as long as an env step.
     """
     base = part(env, ManagerBasedRlEnv)
     if base is None:

@@ -26,16 +26,10 @@ from ksim_rl.scene.state.motion_clock import (
     motion_time,
 )
 
-# -- observations ------------------------------------------------------------------------------------------------
-
 
 @dataclass(frozen=True, kw_only=True)
 class MotionPhase(ObservationTerm):
-    """Sine and cosine of 2 pi t / cycle, `t` the present time in the motion, [E, 2].
-
-    Attributes:
-        cycle_s: s, after which a periodic motion repeats; None is the motion's duration.
-    """
+    """Sine and cosine of 2 pi t / cycle, `t` the time in the motion, [E, 2]; a cycle of None is the whole motion."""
 
     file: str
     cycle_s: Positive | None = None
@@ -48,11 +42,7 @@ class MotionPhase(ObservationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class MotionJoints(OfJoints, ObservationTerm):
-    """Positions (rad or m), then velocities (per s), that joints have in the motion, [E, 2L].
-
-    Attributes:
-        ahead_s: s, how far ahead of the present time.
-    """
+    """Positions (rad or m), then velocities (per s), that joints have in the motion `ahead_s` from now, [E, 2L]."""
 
     file: str
     ahead_s: float = 0.0
@@ -75,23 +65,11 @@ class MotionBodyOffset(ObservationTerm):
         return _body_offset(view, self.file, self.bodies).flatten(start_dim=1)
 
 
-# -- rewards -----------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
-class MotionReward(GaussianReward):
-    """exp(-error^2 / std^2), [E], of an error that is summed over joints or bodies.
-
-    Attributes:
-        file: the motion.
-    """
+class TrackMotionJointPos(OfJoints, GaussianReward):
+    """exp(-sum_j (q_j - qref_j)^2 / std^2), rad or m, [E]; position stage."""
 
     file: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrackMotionJointPos(OfJoints, MotionReward):
-    """exp(-sum_j (q_j - qref_j)^2 / std^2), rad or m, [E]; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         pos_EL, _ = motion_joints(view, self.file, self.joints)
@@ -100,8 +78,10 @@ class TrackMotionJointPos(OfJoints, MotionReward):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackMotionJointVel(OfJoints, MotionReward):
+class TrackMotionJointVel(OfJoints, GaussianReward):
     """exp(-sum_j (v_j - vref_j)^2 / std^2), rad/s or m/s, [E]; velocity stage."""
+
+    file: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         _, vel_EL = motion_joints(view, self.file, self.joints)
@@ -110,9 +90,10 @@ class TrackMotionJointVel(OfJoints, MotionReward):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackMotionBodyPos(MotionReward):
+class TrackMotionBodyPos(GaussianReward):
     """exp(-sum_b |p_b - pref_b|^2 / std^2), world frame, m, [E]; position stage."""
 
+    file: str
     bodies: Patterns
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
@@ -120,18 +101,16 @@ class TrackMotionBodyPos(MotionReward):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackMotionBodyQuat(MotionReward):
+class TrackMotionBodyQuat(GaussianReward):
     """exp(-sum_b a_b^2 / std^2), `a` the angle of a body from its orientation in the motion, rad, [E]."""
 
+    file: str
     bodies: Patterns
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         _, quat_EN4 = motion_bodies(view, self.file, self.bodies)
         own_EN4 = view.bodies(self.bodies).quat_EN4
         return self.rate(quaternion.angle_between(own_EN4, quat_EN4).square().sum(-1))
-
-
-# -- terminations ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,11 +148,7 @@ def _body_offset(view: EnvView, file: str, bodies: Patterns) -> Tensor:
 class ResetToMotion(EventTerm):
     """Put the whole scene into a state of a reference motion, and remember its time for `motion.motion_time`.
 
-    On a terrain all free roots are moved with the env's origin.
-
-    Attributes:
-        file: what `view.motion` reads.
-        start_range: of the motion's duration, both in [0, 1]: where episodes begin.
+    Episodes begin in `start_range`, shares of its duration. On a terrain all free roots move with the env's origin.
     """
 
     file: str

@@ -11,8 +11,14 @@ from torch import Tensor
 from ksim_rl.checked import NonNegative, Positive, Within
 from ksim_rl.envs.term import TerminationTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.fields import OfContacts, OfEntity, OfJoints
-from ksim_rl.mdp.quantities import contact_force, distance_from_origin, root_height
+from ksim_rl.mdp.fields import (
+    OfContacts,
+    OfEntity,
+    OfJoints,
+    contact_force,
+    distance_from_origin,
+    root_height,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,11 +33,7 @@ class TimeOut(TerminationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class BadOrientation(OfEntity, TerminationTerm):
-    """The root is tilted further than a limit: the angle between its z axis and the world's; position stage.
-
-    Attributes:
-        limit_angle: rad, in (0, pi).
-    """
+    """The root is tilted further than a limit, rad, the angle between its z axis and the world's; position stage."""
 
     limit_angle: Annotated[float, Within(low=0.0, high=math.pi, low_open=True)]
 
@@ -42,11 +44,7 @@ class BadOrientation(OfEntity, TerminationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class RootHeightBelow(OfEntity, TerminationTerm):
-    """The root body's frame is closer than `minimum_height` (m) to the ground below it; position stage.
-
-    Attributes:
-        minimum_height: m; on flat ground, in the world frame.
-    """
+    """The root body's frame is closer than `minimum_height` (m) to the ground below it; position stage."""
 
     minimum_height: float
 
@@ -56,11 +54,7 @@ class RootHeightBelow(OfEntity, TerminationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class FarFromOrigin(OfEntity, TerminationTerm):
-    """The root is further than `distance` (m) from where its env starts, in the horizontal plane; position stage.
-
-    Attributes:
-        distance: m from the env's origin on the terrain; on a plane, from the world's.
-    """
+    """The root is further than `distance` (m) from where its env starts, in the horizontal plane; position stage."""
 
     distance: Positive
 
@@ -70,12 +64,9 @@ class FarFromOrigin(OfEntity, TerminationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class OutsideTerrain(OfEntity, TerminationTerm):
-    """The root is beyond the edge of its env's ground, or nearer to it than a margin: a truncation, not a failure.
+    """The root is beyond the edge of its env's ground, if it has one, or closer to it than a margin (m): a truncation.
 
-    On ground without end it never is.
-
-    Attributes:
-        margin: m inside of the edge; robots whose feet must not step over it need about their own reach.
+    Robots whose feet must not step over the edge need a margin of about their own reach.
     """
 
     time_out: bool = True
@@ -88,12 +79,7 @@ class OutsideTerrain(OfEntity, TerminationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class RootVelocityAbove(OfEntity, TerminationTerm):
-    """The root body moves or turns faster than a robot can: the physics has gone wrong; velocity stage.
-
-    Attributes:
-        linear: m/s, of the root frame's origin; None sets no limit.
-        angular: rad/s; None sets no limit.
-    """
+    """The root body moves (m/s) or turns (rad/s) faster than a robot can: physics has gone wrong; velocity stage."""
 
     linear: Positive | None = None
     angular: Positive | None = None
@@ -115,11 +101,7 @@ class RootVelocityAbove(OfEntity, TerminationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class JointVelocityAbove(OfJoints, TerminationTerm):
-    """A joint moves faster than `limit` (rad/s or m/s); velocity stage.
-
-    Attributes:
-        limit: rad/s or m/s.
-    """
+    """A joint moves faster than `limit` (rad/s or m/s); velocity stage."""
 
     limit: Positive
 
@@ -129,11 +111,7 @@ class JointVelocityAbove(OfJoints, TerminationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class JointLimitViolated(OfJoints, TerminationTerm):
-    """A joint is outside of its soft limits by more than `margin` (rad or m); position stage.
-
-    Attributes:
-        margin: rad or m.
-    """
+    """A joint is outside of its soft limits by more than `margin` (rad or m); position stage."""
 
     margin: NonNegative = 0.0
 

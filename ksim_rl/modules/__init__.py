@@ -1,18 +1,23 @@
 """This room has the networks: actor, critic and the parts that they are made of, each a TorchRL or torch module."""
 
-from ksim_rl.modules.actor import PolicyNetwork, make_actor
+from ksim_rl.modules.actor import ActorCfg, PolicyNetwork, make_actor
 from ksim_rl.modules.bounded_actors import (
     DeterministicActorCfg,
     SquashedActorCfg,
     make_deterministic_actor,
     make_squashed_actor,
 )
-from ksim_rl.modules.categorical import Categorical
 from ksim_rl.modules.collecting_policies import ExploringPolicy, MixedPolicy
-from ksim_rl.modules.critic import CriticCfg, QNetwork, QNetworkCfg, ValueNetwork, make_critic, make_q_network
-from ksim_rl.modules.discriminator import Discriminator
-from ksim_rl.modules.gaussians import DiagonalGaussian, TanhGaussian, TruncatedGaussian
-from ksim_rl.modules.heads import ActorCfg
+from ksim_rl.modules.critic import (
+    CriticCfg,
+    Discriminator,
+    QNetwork,
+    QNetworkCfg,
+    ValueNetwork,
+    make_critic,
+    make_q_network,
+)
+from ksim_rl.modules.distributions import Categorical, DiagonalGaussian, TanhGaussian, TruncatedGaussian
 from ksim_rl.modules.mlp import ACTIVATIONS, mlp
 from ksim_rl.modules.network import (
     FEATURES,
@@ -24,18 +29,19 @@ from ksim_rl.modules.network import (
     update_normalizers,
 )
 from ksim_rl.modules.recurrent import (
+    CarriedState,
     RecurrentCfg,
     RecurrentModule,
     RecurrentNetwork,
     RecurrentStatePrimer,
+    behind,
+    burnt_in,
     make_recurrent_actor,
     make_recurrent_critic,
-    memories,
+    recurrent_modules,
     recurrent_transforms,
     state_spec,
-    with_memory,
 )
-from ksim_rl.modules.recurrent_state import CarriedState, burnt_in
 
 __all__ = [
     "ACTIVATIONS",
@@ -63,6 +69,7 @@ __all__ = [
     "TanhGaussian",
     "TruncatedGaussian",
     "ValueNetwork",
+    "behind",
     "burnt_in",
     "make_actor",
     "make_critic",
@@ -72,11 +79,10 @@ __all__ = [
     "make_q_network",
     "make_shared_trunk",
     "make_squashed_actor",
-    "memories",
     "mlp",
     "observation_dim",
+    "recurrent_modules",
     "recurrent_transforms",
     "state_spec",
     "update_normalizers",
-    "with_memory",
 ]

@@ -1,25 +1,322 @@
-"""This module builds the stochastic policy: normalization, an MLP and a distribution of the action."""
+"""This module builds stochastic policies: normalization, an MLP, and the last layer that an env's actions need."""
 
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
 from jaxtyping import Float
-from tensordict.nn import TensorDictModule
+from tensordict import TensorDictBase
+from tensordict.nn import CompositeDistribution, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import TensorSpec, Unbounded
+from torch.distributions import Distribution
+from torch.nn import functional
+from torchrl import data as specs
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor
 
-from ksim_rl.modules.action_head import make_head
-from ksim_rl.modules.heads import PARAMETERS, ActorCfg, MixedHead
-from ksim_rl.modules.mlp import Device, mlp
-from ksim_rl.modules.network import ObservingNetwork
+from ksim_rl.checked import NonNegative, Positive
+from ksim_rl.modules.distributions import (
+    Categorical,
+    DiagonalGaussian,
+    TanhGaussian,
+    TruncatedGaussian,
+    VectorDistribution,
+)
+from ksim_rl.modules.mlp import Device, linear, mlp
+from ksim_rl.modules.network import ObservingNetwork, OnPolicyNetworkCfg
+
+MIN_STD = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActorCfg(OnPolicyNetworkCfg):
+    """The policy network.
+
+    Attributes:
+        distribution: of continuous actions: "gaussian", or within bounds "tanh_gaussian" or "truncated_gaussian".
+            "categorical" where all actions are discrete; beside continuous ones, discrete ones always are.
+        action_bound: the bounded distributions lie in [-action_bound, action_bound] where the env's action spec has no
+            bounds; None refuses such a spec.
+        init_std: standard deviation of each action at the start, in units of the action; of the bounded distributions
+            in units of half the range, before the tanh or the truncation.
+        std_type: "scalar" learns the standard deviation itself, "log" its logarithm.
+        state_dependent_std: predict the standard deviation from the state instead of learning one per action.
+        output_gain: scale of the last layer's weights. Small, so that the first policy acts around zero (the default
+            pose of a robot), or the center of the range, in every state.
+    """
+
+    distribution: Literal["gaussian", "tanh_gaussian", "truncated_gaussian", "categorical"] = "gaussian"
+    action_bound: Positive | None = None
+    init_std: Positive = 1.0
+    std_type: Literal["scalar", "log"] = "scalar"
+    state_dependent_std: bool = False
+    output_gain: NonNegative = 0.01
+
+    def __post_init__(self) -> None:
+        """Refuse a bound that does nothing."""
+        super().__post_init__()
+        if self.action_bound is not None and self.distribution not in ("tanh_gaussian", "truncated_gaussian"):
+            raise ValueError(
+                f"action_bound={self.action_bound!r} does nothing with distribution={self.distribution!r}: "
+                "use 'tanh_gaussian' or 'truncated_gaussian', or leave it out"
+            )
+
+
+class GaussianHead(nn.Module):
+    """Maps features [..., L] to `loc` and `scale`, each [..., action_dim].
+
+    With `cfg.state_dependent_std` the standard deviation is the output of a second layer, which starts at `init_std`
+    for every state; of type "scalar" it passes a softplus, so that it stays positive.
+    """
+
+    parameter_names = ("loc", "scale")
+    kind: type[VectorDistribution] = DiagonalGaussian
+    bounds: tuple[Tensor, ...] = ()
+
+    def __init__(self, cfg: ActorCfg, feature_dim: int, action_dim: int, *, device: Device = None) -> None:
+        super().__init__()
+        self.std_type, init_std = cfg.std_type, cfg.init_std
+        self.loc = linear(feature_dim, action_dim, gain=cfg.output_gain, device=device)
+        self.std_layer: nn.Linear | None = None
+        self.std: nn.Parameter | None = None
+        if cfg.state_dependent_std:
+            # softplus(x) = init_std at x = log(exp(init_std) - 1).
+            offset = math.log(init_std) if cfg.std_type == "log" else math.log(math.expm1(init_std))
+            self.std_layer = linear(feature_dim, action_dim, gain=0.0, device=device)
+            nn.init.constant_(self.std_layer.bias, offset)
+        else:
+            start = math.log(init_std) if cfg.std_type == "log" else init_std
+            self.std = nn.Parameter(torch.full((action_dim,), start, device=device))
+
+    def forward(
+        self, features: Float[Tensor, "*batch L"]
+    ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
+        """Return `(loc, scale)`; `scale` is at least `MIN_STD`."""
+        loc = self.loc(features)
+        if self.std_layer is None:
+            assert self.std is not None
+            scale = self.std.exp() if self.std_type == "log" else self.std
+        else:
+            raw = self.std_layer(features)
+            scale = raw.exp() if self.std_type == "log" else functional.softplus(raw)
+        # A std that the optimizer pushes to zero or below would give NaN log-probabilities. The gradient
+        # passes the bound (a plain clamp stops it), so that a std below it can come back.
+        bounded = scale + (scale.clamp_min(MIN_STD) - scale).detach()
+        return loc, bounded.expand_as(loc)
+
+    def distribution(self, loc: Float[Tensor, "*batch L"], scale: Float[Tensor, "*batch L"]) -> Distribution:
+        """Return the distribution of the action."""
+        return self.kind(loc, scale, *self.bounds)
+
+
+class TanhGaussianHead(GaussianHead):
+    """Maps features [..., L] to `loc` and `scale` of a `TanhGaussian` within [low_L, high_L], before the tanh."""
+
+    kind = TanhGaussian
+    low: Tensor
+    high: Tensor
+
+    def __init__(
+        self,
+        cfg: ActorCfg,
+        feature_dim: int,
+        *,
+        low_L: Float[Tensor, " L"],
+        high_L: Float[Tensor, " L"],
+        device: Device = None,
+    ) -> None:
+        super().__init__(cfg, feature_dim, len(low_L), device=device)
+        # They are the env's, so they are no part of a checkpoint.
+        self.register_buffer("low", low_L.to(device, copy=True), persistent=False)
+        self.register_buffer("high", high_L.to(device, copy=True), persistent=False)
+
+    @property
+    def bounds(self) -> tuple[Float[Tensor, " L"], ...]:  # type: ignore[override]
+        """The bounds, wherever the head is moved or copied."""
+        return self.low, self.high
+
+
+class TruncatedGaussianHead(TanhGaussianHead):
+    """Maps features [..., L] to `loc` and `scale` of a `TruncatedGaussian`, in units of the action.
+
+    `loc` stays within the bounds, by a tanh, so that no quantity of the distribution loses precision.
+    """
+
+    kind = TruncatedGaussian
+
+    def forward(
+        self, features: Float[Tensor, "*batch L"]
+    ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
+        """Return `(loc, scale)`."""
+        loc, scale = super().forward(features)
+        center, half_range = (self.high + self.low) / 2, (self.high - self.low) / 2
+        return center + half_range * torch.tanh(loc), half_range * scale
+
+
+class CategoricalHead(nn.Module):
+    """Maps features [..., L] to the `logits` [..., num_options] of a `Categorical`, which takes the other options."""
+
+    parameter_names = ("logits",)
+
+    def __init__(
+        self, cfg: ActorCfg, feature_dim: int, num_options: int, *, device: Device = None, **options: Any
+    ) -> None:
+        super().__init__()
+        self.logits = linear(feature_dim, num_options, gain=cfg.output_gain, device=device)
+        self.options = options
+
+    def forward(self, features: Float[Tensor, "*batch L"]) -> tuple[Float[Tensor, "*batch N"]]:
+        """Return `(logits,)`."""
+        return (self.logits(features),)
+
+    def distribution(self, logits: Float[Tensor, "*batch N"]) -> Categorical:
+        """Return the distribution of the choices."""
+        return Categorical(logits, **self.options)
+
+
+PARAMETERS = "params"
+
+
+class MixedHead(nn.Module):
+    """Maps features [..., L] to the parameters of the distributions of several independent actions, a head each."""
+
+    def __init__(self, heads: Mapping[NestedKey, nn.Module]) -> None:
+        super().__init__()
+        self.action_keys = list(heads)
+        self.heads = nn.ModuleList(heads.values())
+
+    @property
+    def parameter_keys(self) -> list[NestedKey]:
+        """Where the parameters go: `("params", *action key, name)`."""
+        return [
+            (PARAMETERS, *_path(key), name)
+            for key, head in zip(self.action_keys, self.heads, strict=True)
+            for name in head.parameter_names  # type: ignore[union-attr]
+        ]
+
+    def forward(self, features: Float[Tensor, "*batch L"]) -> tuple[Float[Tensor, "*batch ?N"], ...]:
+        """Return the parameters in the order of `parameter_keys`."""
+        return tuple(parameter for head in self.heads for parameter in head(features))
+
+    def distribution(self, params: TensorDictBase) -> CompositeDistribution:
+        """Return the distribution of all actions; `params` is what stands under "params"."""
+        parts: dict[Any, Any] = {}
+        for key, head in zip(self.action_keys, self.heads, strict=True):
+            parameters = {name: params.get((*_path(key), name)) for name in head.parameter_names}  # type: ignore[union-attr]
+            parts[key] = head.distribution(**parameters)  # type: ignore[operator]
+        return CompositeDistribution.from_distributions(params, parts)
+
+
+def _path(key: NestedKey) -> tuple[Any, ...]:
+    return (key,) if isinstance(key, str) else tuple(key)
+
+
+def action_range(
+    spec: TensorSpec, bound: float, *, device: Device = None
+) -> tuple[Float[Tensor, " L"], Float[Tensor, " L"]]:
+    """Return the lowest and highest action: the bounds of the spec, or -bound and bound where it has none.
+
+    Off-policy methods need bounded actions: their critics are asked about whatever the policy proposes, and there is no
+    trust region that keeps it near what was tried. `bound` is in the units of the action, before its term's own scale.
+    """
+    low, high = (getattr(getattr(spec, "space", None), name, None) for name in ("low", "high"))
+    shape = spec.shape[-1:]
+    lowest = torch.full(shape, -bound, device=device)
+    highest = torch.full(shape, bound, device=device)
+    if not isinstance(low, Tensor) or not isinstance(high, Tensor):
+        return lowest, highest
+    # A spec has the batch dims of its env; all envs have the same bounds. Unbounded ones are huge or infinite.
+    low, high = (edge.reshape(-1, *shape)[0].to(lowest) for edge in (low, high))
+    bounded = (low > -1e6) & (high < 1e6)
+    return torch.where(bounded, low, lowest), torch.where(bounded, high, highest)
+
+
+DISCRETE = (specs.Categorical, specs.OneHot)
+BOUNDED_HEADS: dict[str, type[TanhGaussianHead]] = {
+    "tanh_gaussian": TanhGaussianHead,
+    "truncated_gaussian": TruncatedGaussianHead,
+}
+
+
+def make_head(
+    cfg: ActorCfg, action_spec: TensorSpec, feature_dim: int, *, device: Device = None
+) -> tuple[nn.Module, list[NestedKey]]:
+    """Build the head for a spec, and return it with the keys of the actions.
+
+    The spec is of one action, under the key "action", or a `Composite` of one or several, such as the env's
+    `full_action_spec`, with its batch dims as shape. Raises ValueError, naming the action, where it does not go with
+    `cfg.distribution`.
+    """
+    leaves = _leaves(action_spec)
+    if cfg.distribution != "categorical" and all(isinstance(leaf, DISCRETE) for leaf, _ in leaves.values()):
+        names = " and ".join(f"the action {key!r}" for key in leaves)
+        raise ValueError(f"distribution={cfg.distribution!r}, but {names} is discrete: use 'categorical'")
+    heads: dict[NestedKey, nn.Module] = {}
+    for key, (leaf, shape) in leaves.items():
+        make = _choosing if isinstance(leaf, DISCRETE) else _continuous
+        heads[key] = make(cfg, key, leaf, tuple(shape), feature_dim=feature_dim, device=device)
+    keys = list(heads)
+    return (heads[keys[0]] if len(keys) == 1 else MixedHead(heads)), keys
+
+
+def _leaves(action_spec: TensorSpec) -> dict[NestedKey, tuple[TensorSpec, torch.Size]]:
+    """Return each action's spec and shape without batch dims, by key."""
+    if isinstance(action_spec, Composite):
+        batch_dims = len(action_spec.shape)
+        return {key: (leaf, leaf.shape[batch_dims:]) for key, leaf in action_spec.items(True, True)}
+    # An index has no dim of its own.
+    own_dims = 0 if type(action_spec) is specs.Categorical else 1
+    return {"action": (action_spec, action_spec.shape[len(action_spec.shape) - own_dims :])}
+
+
+def _choosing(
+    cfg: ActorCfg, key: NestedKey, leaf: Any, shape: tuple[int, ...], **layer: Any
+) -> CategoricalHead:
+    one_hot = isinstance(leaf, specs.OneHot)
+    if isinstance(leaf, specs.MultiOneHot):
+        sizes = tuple(int(size) for size in leaf.nvec)
+    elif isinstance(leaf, specs.MultiCategorical):
+        sizes = tuple(int(size) for size in leaf.nvec.reshape(-1, shape[-1])[0])
+    elif one_hot or not shape:
+        sizes = None
+    elif len(shape) == 1:
+        sizes = (int(leaf.space.n),) * shape[0]
+    else:
+        raise ValueError(f"action {key!r} has shape {shape}: expected an index or one dim of them")
+    num_options = sum(sizes) if sizes is not None else int(leaf.space.n)
+    return CategoricalHead(
+        cfg, num_options=num_options, sizes=sizes, one_hot=one_hot, dtype=leaf.dtype, **layer
+    )
+
+
+def _continuous(
+    cfg: ActorCfg, key: NestedKey, leaf: TensorSpec, shape: tuple[int, ...], **layer: Any
+) -> GaussianHead:
+    if cfg.distribution == "categorical" or not leaf.dtype.is_floating_point:
+        kind = f"{type(leaf).__name__} of {leaf.dtype}".replace("torch.", "")
+        raise ValueError(
+            f"distribution={cfg.distribution!r} does not go with the action {key!r}, {kind}: "
+            "'categorical' is for discrete actions, a kind of gaussian for floating-point ones"
+        )
+    if len(shape) != 1:
+        raise ValueError(f"action {key!r} has shape {shape}: expected one dim")
+    if cfg.distribution == "gaussian":
+        return GaussianHead(cfg, action_dim=shape[0], **layer)
+    low_L, high_L = action_range(leaf, math.inf if cfg.action_bound is None else cfg.action_bound)
+    if not bool((low_L.isfinite() & high_L.isfinite()).all()):
+        raise ValueError(
+            f"distribution={cfg.distribution!r} needs bounds, but the action {key!r} has no finite ones in the env's "
+            "spec: set action_bound, e.g. 1.0, or take 'gaussian'"
+        )
+    return BOUNDED_HEADS[cfg.distribution](cfg, low_L=low_L, high_L=high_L, **layer)
 
 
 class PolicyNetwork(ObservingNetwork):
-    """Maps observations [..., L_i] to the parameters of the action's distribution.
-
-    Attributes:
-        head: the last layer, which also knows the distribution.
-    """
+    """Maps observations [..., L_i] to the parameters of the action's distribution, which its `head` knows."""
 
     def __init__(self, cfg: ActorCfg, *, obs_dim: int, head: nn.Module, device: Device = None) -> None:
         super().__init__(cfg, obs_dim=obs_dim, device=device)
@@ -41,18 +338,12 @@ def make_actor(
 ) -> ProbabilisticActor:
     """Build the policy as TorchRL's `ProbabilisticActor`.
 
-    It reads `cfg.in_keys` and writes the parameters of the distribution (`loc` and `scale`, or `logits`), `action` and
-    `action_log_prob` [...]. Of several actions it writes each at its key, with `<key>_log_prob` beside it, and the
-    parameters under `("params", *key)`: the layout of `CompositeDistribution`. It samples unless TorchRL's exploration
-    type says otherwise; `ExplorationType.DETERMINISTIC` gives the mean, the median or the mode.
-
-    Args:
-        obs_dim: size of the last dim of the observations side by side.
-        action_dim: where there is no spec: of one action without bounds.
-        action_spec: the env's `full_action_spec`, or the spec of its one action.
-
-    Raises:
-        ValueError: if `cfg.distribution` does not go with the spec.
+    It reads `cfg.in_keys`, `obs_dim` numbers side by side, and writes the parameters of the distribution (`loc` and
+    `scale`, or `logits`), `action` and `action_log_prob` [...]. Of several actions it writes each at its key, with
+    `<key>_log_prob` beside it, and the parameters under `("params", *key)`: the layout of `CompositeDistribution`. It
+    samples unless TorchRL's exploration type says otherwise; `ExplorationType.DETERMINISTIC` gives the mean, the median
+    or the mode. `action_spec` is the env's `full_action_spec`, or the spec of its one action; `action_dim` stands for
+    one action without bounds. Raises ValueError where `cfg.distribution` does not go with the spec.
     """
     if action_spec is None:
         if action_dim is None:

@@ -1,9 +1,10 @@
 """This module builds policies whose actions lie in a box: TD3's deterministic one and SAC's squashed gaussian."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from jaxtyping import Float, Float32
+import torch
+from jaxtyping import Float
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -12,19 +13,15 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor
 
 from ksim_rl.checked import NonNegative, Positive
-from ksim_rl.modules.action_head import action_range
-from ksim_rl.modules.gaussians import TanhGaussian
+from ksim_rl.modules.actor import action_range
+from ksim_rl.modules.distributions import TanhGaussian
 from ksim_rl.modules.mlp import Device
 from ksim_rl.modules.network import ObservingNetwork, OffPolicyNetworkCfg
 
 
 @dataclass(frozen=True, kw_only=True)
 class BoundedActorCfg(OffPolicyNetworkCfg):
-    """The fields of policies whose actions lie in a box.
-
-    Attributes:
-        action_bound: actions lie in [-action_bound, action_bound] where the env's action spec has no bounds.
-    """
+    """The fields of policies whose actions lie in a box, within `action_bound` where the env's spec has no bounds."""
 
     output_gain: NonNegative = 0.01
     action_bound: Positive = 1.0
@@ -41,8 +38,7 @@ class DeterministicActorCfg(BoundedActorCfg):
 class SquashedActorCfg(BoundedActorCfg):
     """The policy of SAC: a gaussian squashed by tanh, whose standard deviation depends on the observation.
 
-    Attributes:
-        log_std_min, log_std_max: bounds of the log of the standard deviation, before squashing.
+    `log_std_min` and `log_std_max` bound the log of the standard deviation before squashing.
     """
 
     log_std_min: float = -5.0
@@ -58,11 +54,7 @@ class SquashedActorCfg(BoundedActorCfg):
 
 
 class BoundedActor(ObservingNetwork):
-    """Normalization, hidden layers, and a last layer: [..., L] to [..., outputs_per_action * action_dim].
-
-    Attributes:
-        low, high: of the actions, [action_dim].
-    """
+    """Normalization, hidden layers, and a last layer: [..., L] to [..., outputs_per_action * action_dim]."""
 
     outputs_per_action: ClassVar[int] = 1
     low: Tensor
@@ -78,16 +70,17 @@ class BoundedActor(ObservingNetwork):
         self.register_buffer("high", high)
         self.layers = cfg.build(obs_dim, self.outputs_per_action * action_spec.shape[-1], device=device)
 
-    def output(self, obs: Float[Tensor, "*batch L"]) -> Float32[Tensor, "*batch output_dim"]:
+    def output(self, obs: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch output_dim"]:
         """Return what the last layer says."""
         # Half precision would round the squashed action, and its density.
-        return self.layers(self.observe(obs)).float()
+        out = self.layers(self.observe(obs))
+        return out.to(torch.promote_types(out.dtype, torch.float32))
 
 
 class DeterministicPolicy(BoundedActor):
     """Maps an observation [..., L] to the action [..., action_dim]."""
 
-    def forward(self, obs: Float[Tensor, "*batch L"]) -> Float32[Tensor, "*batch action_dim"]:
+    def forward(self, obs: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch action_dim"]:
         """Return the action, in [low, high]."""
         center, half_range = (self.high + self.low) / 2, (self.high - self.low) / 2
         return center + half_range * self.output(obs).tanh()
@@ -101,7 +94,7 @@ class SquashedPolicy(BoundedActor):
 
     def forward(
         self, obs: Float[Tensor, "*batch L"]
-    ) -> tuple[Float32[Tensor, "*batch action_dim"], Float32[Tensor, "*batch action_dim"]]:
+    ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
         """Return `(loc, scale)`."""
         loc, raw = self.output(obs).chunk(2, dim=-1)
         # A tanh instead of a clamp: the gradient never vanishes wholly at a bound.
@@ -110,39 +103,22 @@ class SquashedPolicy(BoundedActor):
 
 
 def make_deterministic_actor(
-    cfg: DeterministicActorCfg,
-    *,
-    obs_dim: int,
-    action_spec: TensorSpec,
-    in_key: NestedKey = "actor",
-    device: Device = None,
+    cfg: DeterministicActorCfg, *, in_key: NestedKey = "actor", **network: Any
 ) -> TensorDictModule:
-    """Build the policy as a TensorDict module: reads `in_key` [..., obs_dim], writes "action" [..., action_dim].
-
-    Args:
-        action_spec: the env's; its bounds, where it has any, are those of the actions.
-    """
-    policy = DeterministicPolicy(cfg, obs_dim=obs_dim, action_spec=action_spec, device=device)
+    """Build a policy that reads `in_key` and writes "action" [..., action_dim], within the bounds of the spec."""
+    policy = DeterministicPolicy(cfg, **network)
     return TensorDictModule(policy, in_keys=[in_key], out_keys=["action"])
 
 
 def make_squashed_actor(
-    cfg: SquashedActorCfg,
-    *,
-    obs_dim: int,
-    action_spec: TensorSpec,
-    in_key: NestedKey = "actor",
-    device: Device = None,
+    cfg: SquashedActorCfg, *, in_key: NestedKey = "actor", **network: Any
 ) -> ProbabilisticActor:
-    """Build the policy as TorchRL's `ProbabilisticActor`.
+    """Build the policy as TorchRL's `ProbabilisticActor`, within the spec's bounds.
 
     It reads `in_key` [..., obs_dim] and writes `loc`, `scale` (before squashing) and `action` [..., action_dim]. It
     samples unless TorchRL's exploration type says otherwise; `ExplorationType.DETERMINISTIC` gives the median.
-
-    Args:
-        action_spec: the env's; its bounds, where it has any, are those of the actions.
     """
-    policy = SquashedPolicy(cfg, obs_dim=obs_dim, action_spec=action_spec, device=device)
+    policy = SquashedPolicy(cfg, **network)
     return ProbabilisticActor(
         TensorDictModule(policy, in_keys=[in_key], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],

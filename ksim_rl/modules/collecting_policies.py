@@ -14,16 +14,10 @@ from torchrl.envs.utils import ExplorationType, exploration_type, set_exploratio
 class ExploringPolicy(TensorDictModuleBase):
     """Lets a policy act with noise on its actions, and before learning starts with random actions instead.
 
-    Each env has its own scale of noise, drawn uniformly from a range and drawn anew at the end of an episode, so that
-    one batch of envs explores both timidly and boldly (Seo et al., "FastTD3", arXiv 2505.22642). Draws come from
+    Each env has its own scale of noise, drawn uniformly from [noise_min, noise_max], in units of half the range of an
+    action, and drawn anew at the end of an episode, so that one batch of envs explores both timidly and boldly (Seo et
+    al., "FastTD3", arXiv 2505.22642). Zeros add none, for policies that draw their actions themselves. Draws come from
     torch's default generator; nothing here makes a host sync.
-
-    Args:
-        actor: reads observations and writes "action".
-        low_L, high_L: bounds of the actions, [action_dim]; they stay where they are.
-        num_envs: E.
-        noise_min, noise_max: range of the standard deviation of the noise, in units of half the range of an action.
-            Zeros add none, for policies that draw their actions themselves.
     """
 
     random: Tensor
@@ -78,15 +72,9 @@ class MixedPolicy(TensorDictModuleBase):
     """Lets the teacher act with a chance of `share` in each env state, and the student otherwise.
 
     That is the policy that DAgger collects with (Ross et al., arXiv 1011.0686, algorithm 3.1). All but the action is
-    what the student writes. Draws come from torch's default generator; nothing here makes a host sync.
-
-    Args:
-        student: writes "action" and what training needs.
-        teacher: acts deterministically, on its own observations; None leaves all to the student.
-        teacher_keys: what the teacher reads.
-        share: [], in [0, 1], on the device; it stays where it is and may change in place.
-        explores: whether the student samples its actions, where TorchRL's exploration type says so; False takes those
-            that it finds best.
+    what the student writes. The teacher reads `teacher_keys` and acts deterministically; None leaves all to the
+    student. `share` may change in place. With `explores=False` the student takes the actions that it finds best. Draws
+    come from torch's default generator; nothing here makes a host sync.
     """
 
     share: Tensor

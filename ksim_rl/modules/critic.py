@@ -1,43 +1,40 @@
-"""This module builds value functions: of states, and of actions, as numbers or distributions, several at once."""
+"""This module builds networks that judge: values of states and of actions, and transitions beside those of a motion."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.modules import ValueOperator
 
 from ksim_rl.checked import Count, NonNegative
 from ksim_rl.modules.mlp import Device, mlp
-from ksim_rl.modules.network import ObservationKey, ObservingNetwork, OffPolicyNetworkCfg, OnPolicyNetworkCfg
+from ksim_rl.modules.network import (
+    LayeredNetwork,
+    ObservationKey,
+    ObservationNormalizer,
+    ObservingNetwork,
+    OffPolicyNetworkCfg,
+    OnPolicyNetworkCfg,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CriticCfg(OnPolicyNetworkCfg):
-    """The value network.
-
-    Attributes:
-        output_gain: scale of the last layer's weights.
-    """
+    """The value network; `output_gain` scales the last layer's weights."""
 
     in_keys: tuple[ObservationKey, ...] = ("critic",)
     output_gain: NonNegative = 1.0
 
 
-class ValueNetwork(ObservingNetwork):
+class ValueNetwork(LayeredNetwork):
     """Maps observations [..., L_i] to a state value [..., 1]."""
 
     def __init__(self, cfg: CriticCfg, *, obs_dim: int, device: Device = None) -> None:
-        super().__init__(cfg, obs_dim=obs_dim, device=device)
-        options: Any = {"activation": cfg.activation, "output_gain": cfg.output_gain, "device": device}
-        self.layers = mlp(obs_dim, cfg.hidden_dims, 1, **options)
-
-    def forward(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch 1"]:
-        """Return the state value for observations that stand side by side."""
-        return self.layers(self.observe(*observations))
+        super().__init__(cfg, obs_dim=obs_dim, output_dim=1, output_gain=cfg.output_gain, device=device)
 
 
 def make_critic(cfg: CriticCfg, *, obs_dim: int, device: Device = None) -> ValueOperator:
@@ -51,13 +48,10 @@ def make_critic(cfg: CriticCfg, *, obs_dim: int, device: Device = None) -> Value
 
 @dataclass(frozen=True, kw_only=True)
 class QNetworkCfg(OffPolicyNetworkCfg):
-    """The action value networks.
+    """The action value networks, which differ in their first weights only; two for clipped double Q-learning.
 
-    Attributes:
-        num_networks: N, networks that differ in their first weights only; two for clipped double Q-learning.
-        num_atoms: A, probabilities on A values spread evenly over [v_min, v_max] (Bellemare et al., arXiv 1707.06887);
-            1 predicts the value itself.
-        v_min, v_max: the values that returns can have; of no effect with `num_atoms=1`.
+    With `num_atoms` they predict probabilities of so many values, spread evenly over [v_min, v_max] (Bellemare et al.,
+    arXiv 1707.06887); 1 predicts the value itself.
     """
 
     num_networks: Count = 2
@@ -73,11 +67,7 @@ class QNetworkCfg(OffPolicyNetworkCfg):
 
 
 class QNetwork(ObservingNetwork):
-    """Maps observation [..., L] and action [..., action_dim] to what N networks predict.
-
-    Attributes:
-        support: the values of the A atoms [A], or None where the value itself is predicted.
-    """
+    """Maps observation [..., L] and action [..., action_dim] to what N networks predict, with atoms at `support`."""
 
     support: Tensor | None
 
@@ -110,11 +100,45 @@ def make_q_network(
     in_key: NestedKey = "critic",
     device: Device = None,
 ) -> TensorDictModule:
-    """Build the networks as a TensorDict module.
+    """Build the networks as a TensorDict module, which reads `in_key` [..., obs_dim] and "action" [..., action_dim].
 
-    Reads `in_key` [..., obs_dim] and "action" [..., action_dim]; writes "state_action_value" [..., N], or with atoms
-    "state_action_logits" [..., N, A].
+    It writes "state_action_value" [..., N], or with atoms "state_action_logits" [..., N, A].
     """
     network = QNetwork(cfg, obs_dim=obs_dim, action_dim=action_dim, device=device)
     out_key = "state_action_value" if cfg.num_atoms == 1 else "state_action_logits"
     return TensorDictModule(network, in_keys=[in_key, "action"], out_keys=[out_key])
+
+
+class Discriminator(nn.Module):
+    """Scores transitions [..., 2, L], the features before and after a step: 1 looks like the motions, -1 does not."""
+
+    def __init__(
+        self,
+        dim: int,
+        *,
+        hidden_dims: Sequence[int] = (512, 256),
+        activation: str = "relu",
+        device: Device = None,
+    ) -> None:
+        super().__init__()
+        self.normalizer = ObservationNormalizer(dim, device=device)
+        self.layers = mlp(2 * dim, hidden_dims, 1, activation=activation, device=device)
+
+    @property
+    def logit_weight_1L(self) -> Float[Tensor, "1 L"]:
+        """The weights of the last layer."""
+        last = self.layers[-1]
+        assert isinstance(last, nn.Linear)
+        return last.weight
+
+    def normalized(self, transition: Float[Tensor, "*batch 2 L"]) -> Float[Tensor, "*batch L+L"]:
+        """Return what the layers read of transitions."""
+        return self.normalizer(transition).flatten(-2)
+
+    def judge(self, normalized: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch"]:
+        """Return the scores of normalized transitions."""
+        return self.layers(normalized).squeeze(-1)
+
+    def forward(self, transition: Float[Tensor, "*batch 2 L"]) -> Float[Tensor, "*batch"]:
+        """Return the scores of transitions."""
+        return self.judge(self.normalized(transition))

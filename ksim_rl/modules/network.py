@@ -11,20 +11,16 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Composite
 
-from ksim_rl.checked import Checked, NonNegative
-from ksim_rl.checks import check_in_range
+from ksim_rl.checked import Checked, Count, NonNegative
+from ksim_rl.checks import check_choice, check_in_range
 from ksim_rl.device.running_moments import RunningMoments
-from ksim_rl.modules.mlp import Device, check_network, mlp
+from ksim_rl.modules.mlp import ACTIVATIONS, Device, mlp
 
 ObservationKey = str | tuple[str, ...]
 
 
 def checked_keys(keys: Sequence[ObservationKey]) -> tuple[ObservationKey, ...]:
-    """Return the keys as hashable ones.
-
-    Raises:
-        ValueError: if there is none, or one is no name or sequence of names, or one comes twice.
-    """
+    """Return the keys as hashable ones, or raise ValueError where there is none, one is no name, or one comes twice."""
     if isinstance(keys, str) or not keys:
         raise ValueError(f"in_keys={keys!r}: expected a list of one observation group or more")
     checked: list[ObservationKey] = []
@@ -41,11 +37,7 @@ def checked_keys(keys: Sequence[ObservationKey]) -> tuple[ObservationKey, ...]:
 
 
 def observation_dim(spec: Composite, keys: Sequence[ObservationKey]) -> int:
-    """Return the size of the last dim of the observations at `keys`, side by side.
-
-    Raises:
-        ValueError: if the spec lacks a key.
-    """
+    """Return the size of the last dim of the observations at `keys`, side by side; ValueError where one is missing."""
     there = list(spec.keys(True, True))
     for key in keys:
         if key not in there:
@@ -64,13 +56,8 @@ class ObservationNormalizer(RunningMoments):
     `forward` never updates; `update` is called once per env state, after the policy update that used the old
     statistics, so that stored and recomputed action log-probabilities refer to the same policy. With several ranks all
     of them have to call it. Statistics are exact, and both methods can be captured in a CUDA graph: see
-    `RunningMoments`.
-
-    Args:
-        dim: L, size of the last dim of observations.
-        eps: added to the variance. The default bounds the standard deviation below by 0.01: a constant
-            component stays small when it starts to move.
-        until: stop updating once so many observations are counted; None never stops.
+    `RunningMoments`. They stop once `until` observations are counted. The default of `eps` bounds the standard
+    deviation below by 0.01: a constant component stays small when it starts to move.
     """
 
     def __init__(
@@ -87,7 +74,7 @@ class ObservationNormalizer(RunningMoments):
 
     def forward(self, obs: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch L"]:
         """Normalize observations."""
-        return (obs - self.mean) * torch.rsqrt(self.var + self.eps)
+        return self.normalized(obs, self.eps)
 
     def extra_repr(self) -> str:
         """Describe the module in its repr."""
@@ -97,14 +84,10 @@ class ObservationNormalizer(RunningMoments):
 def update_normalizers(
     tensordict: TensorDictBase, *networks: nn.Module, valid: Bool[Tensor, "*batch"] | None = None
 ) -> None:
-    """Update each normalizer inside `networks` with the observations that its network reads.
+    """Update each normalizer inside `networks` once, with the observations that its network reads.
 
-    Call it once per dataset: a normalizer that two networks share, or that is listed twice, is updated once.
-
-    Args:
-        tensordict: the env states, e.g. a rollout `["E","T"]`.
-        networks: actors, critics; any other `nn.Module` is searched for networks that own a `normalizer`.
-        valid: env states marked False are left out.
+    Networks are actors, critics, or any other modules, which are searched for owners of a `normalizer`. Env states,
+    e.g. of a rollout `["E","T"]`, that are marked False in `valid` are left out.
     """
     seen: set[int] = set()
     for network in networks:
@@ -128,15 +111,9 @@ def _observation(tensordict: TensorDictBase, module: TensorDictModule, dim: int)
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkCfg(Checked):
-    """The fields that the configs of all networks have.
+    """The fields of the configs of all networks, which can normalize observations by running statistics inside."""
 
-    Attributes:
-        hidden_dims: widths of the hidden layers.
-        activation: one of `ksim_rl.modules.ACTIVATIONS`.
-        obs_normalization: normalize observations by running statistics inside the network.
-    """
-
-    hidden_dims: tuple[int, ...] = (512, 256, 128)
+    hidden_dims: tuple[Count, ...] = (512, 256, 128)
     activation: str = "elu"
     obs_normalization: bool = True
 
@@ -144,16 +121,12 @@ class NetworkCfg(Checked):
         """Check the fields, and keep what is hashable."""
         super().__post_init__()
         object.__setattr__(self, "hidden_dims", tuple(self.hidden_dims))
-        check_network(self.hidden_dims, self.activation)
+        check_choice("activation", self.activation, ACTIVATIONS)
 
 
 @dataclass(frozen=True, kw_only=True)
 class OnPolicyNetworkCfg(NetworkCfg):
-    """The fields of networks that choose what they read.
-
-    Attributes:
-        in_keys: the observation groups that it reads, side by side; a list names a nested key.
-    """
+    """The fields of networks that choose the observation groups they read, side by side; a list names a nested key."""
 
     in_keys: tuple[ObservationKey, ...] = ("actor",)
 
@@ -165,14 +138,9 @@ class OnPolicyNetworkCfg(NetworkCfg):
 
 @dataclass(frozen=True, kw_only=True)
 class OffPolicyNetworkCfg(NetworkCfg):
-    """The fields of the networks of off-policy methods.
+    """The fields of the networks of off-policy methods; `output_gain` scales the last layer's weights."""
 
-    Attributes:
-        layer_norm: normalize before each activation.
-        output_gain: scale of the last layer's weights; a small one lets the first policy act around the middle.
-    """
-
-    hidden_dims: tuple[int, ...] = (256, 256)
+    hidden_dims: tuple[Count, ...] = (256, 256)
     activation: str = "relu"
     layer_norm: bool = False
     output_gain: NonNegative = 1.0
@@ -184,11 +152,7 @@ class OffPolicyNetworkCfg(NetworkCfg):
 
 
 class ObservingNetwork(nn.Module):
-    """The base of networks that normalize what they read.
-
-    Attributes:
-        normalizer: an `ObservationNormalizer`, or None.
-    """
+    """The base of networks that normalize what they read by their `normalizer`, if they have one."""
 
     def __init__(self, cfg: NetworkCfg, *, obs_dim: int, device: Device = None) -> None:
         super().__init__()
@@ -207,7 +171,7 @@ FEATURES = "features"
 class SharedTrunkCfg(OnPolicyNetworkCfg):
     """Layers below actor and critic, which read what they write: the key "features"."""
 
-    hidden_dims: tuple[int, ...] = (512, 256)
+    hidden_dims: tuple[Count, ...] = (512, 256)
 
     def __post_init__(self) -> None:
         """Refuse values out of range, naming the field."""
@@ -216,22 +180,22 @@ class SharedTrunkCfg(OnPolicyNetworkCfg):
             raise ValueError("hidden_dims=(): expected at least one width")
 
 
-class TrunkNetwork(ObservingNetwork):
-    """Maps observations [..., L_i] to features [..., L], L the last width."""
+class LayeredNetwork(ObservingNetwork):
+    """Maps observations [..., L_i] to what an MLP of the config's layers makes of them; `options` are its others."""
 
-    def __init__(self, cfg: SharedTrunkCfg, *, obs_dim: int, device: Device = None) -> None:
+    def __init__(
+        self, cfg: NetworkCfg, *, obs_dim: int, output_dim: int | None, device: Device = None, **options: Any
+    ) -> None:
         super().__init__(cfg, obs_dim=obs_dim, device=device)
-        self.layers = mlp(obs_dim, cfg.hidden_dims, None, activation=cfg.activation, device=device)
+        options |= {"activation": cfg.activation, "device": device}
+        self.layers = mlp(obs_dim, cfg.hidden_dims, output_dim, **options)
 
-    def forward(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch L"]:
-        """Return the features for observations that stand side by side."""
+    def forward(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch M"]:
+        """Return the outputs for observations that stand side by side."""
         return self.layers(self.observe(*observations))
 
 
 def make_shared_trunk(cfg: SharedTrunkCfg, *, obs_dim: int, device: Device = None) -> TensorDictModule:
-    """Build the layers as a TensorDict module, the common part of TorchRL's `ActorValueOperator`.
-
-    Reads `cfg.in_keys`, `obs_dim` numbers side by side, and writes "features" [..., L].
-    """
-    network = TrunkNetwork(cfg, obs_dim=obs_dim, device=device)
+    """Build the layers that write "features" [..., L], the common part of TorchRL's `ActorValueOperator`."""
+    network = LayeredNetwork(cfg, obs_dim=obs_dim, output_dim=None, device=device)
     return TensorDictModule(network, in_keys=list(cfg.in_keys), out_keys=[FEATURES])

@@ -1,6 +1,6 @@
-"""This module gives any network a memory: it turns observations into features of the episode so far."""
+"""This module gives any network a recurrent state: it turns observations into features of the episode so far."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
@@ -19,25 +19,19 @@ from torch.nn import functional
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase, InitTracker
 from torchrl.envs.transforms import TensorDictPrimer, Transform
-from torchrl.modules import SafeProbabilisticTensorDictSequential, recurrent_mode
+from torchrl.modules import SafeProbabilisticTensorDictSequential, recurrent_mode, set_recurrent_mode
 
 from ksim_rl.checked import Checked, Count
-from ksim_rl.modules.actor import make_actor
+from ksim_rl.device.state_tree import copy_into
+from ksim_rl.modules.actor import ActorCfg, make_actor
 from ksim_rl.modules.critic import CriticCfg, make_critic
-from ksim_rl.modules.heads import ActorCfg
 from ksim_rl.modules.mlp import Device
 from ksim_rl.modules.network import ObservationKey, ObservationNormalizer, side_by_side
 from ksim_rl.modules.recurrent_cells import gru_layer, lstm_layer
 
 
 class RecurrentStatePrimer(TensorDictPrimer):
-    """TorchRL's primer, free of host syncs: each episode begins with zeros, each step goes on with what was written.
-
-    Rows that do not reset keep their values.
-
-    Args:
-        primers: specs of the state of one env, each [N, H].
-    """
+    """TorchRL's primer, free of host syncs: each episode begins with zeros, each step goes on with what was written."""
 
     def __init__(self, primers: Composite) -> None:
         super().__init__(primers, expand_specs=True)
@@ -55,12 +49,7 @@ class RecurrentStatePrimer(TensorDictPrimer):
 
 
 def recurrent_transforms(env: EnvBase, *primers: TensorDictPrimer) -> list[Transform]:
-    """Return what an env needs to carry recurrent states: `is_init` where it has none yet, and the primers.
-
-    Example:
-        >>> for transform in recurrent_transforms(env, memory.make_tensordict_primer()):
-        ...     env.append_transform(transform)
-    """
+    """Return what an env needs to carry recurrent states: `is_init` where it has none yet, and the primers."""
     tracker = [] if "is_init" in env.observation_spec.keys() else [InitTracker()]
     return [*tracker, *primers]
 
@@ -76,13 +65,7 @@ AnyCfg = TypeVar("AnyCfg", ActorCfg, CriticCfg)
 
 @dataclass(frozen=True, kw_only=True)
 class RecurrentCfg(Checked):
-    """The memory before a network.
-
-    Attributes:
-        kind: "lstm" or "gru".
-        hidden_dim: H, size of its state and of the features that the network reads.
-        num_layers: N, layers on top of each other.
-    """
+    """The recurrent layers before a network: N layers, whose state and features have H = `hidden_dim` numbers each."""
 
     kind: Literal["lstm", "gru"] = "lstm"
     hidden_dim: Count = 256
@@ -94,9 +77,6 @@ class RecurrentNetwork(nn.Module):
 
     Weights are orthogonal gate by gate, biases zero but for the LSTM's forget gate, whose bias is one (Jozefowicz et
     al., "An empirical exploration of recurrent network architectures", 2015).
-
-    Attributes:
-        normalizer: an `ObservationNormalizer` before the first layer, or None.
     """
 
     def __init__(
@@ -121,12 +101,9 @@ class RecurrentNetwork(nn.Module):
         state_BNH: tuple[Float[Tensor, "B N H"], ...],
         reset_TB1: Bool[Tensor, "T B 1"] | None = None,
     ) -> tuple[Float[Tensor, "T B H"], tuple[Float[Tensor, "T B N H"], ...]]:
-        """Return the features, and the states after each step.
+        """Return the features, and the states after each step; `state_BNH`, h (and c), is that before the first.
 
-        Args:
-            obs_TBL: the observations.
-            state_BNH: before the first step: h (and c).
-            reset_TB1: whether an episode begins at the step, from a state of zeros.
+        Where `reset_TB1` marks the begin of an episode, the step starts from zeros.
         """
         features_TBH = obs_TBL if self.normalizer is None else self.normalizer(obs_TBL)
         states_N: list[tuple[Tensor, ...]] = []
@@ -159,7 +136,8 @@ class RecurrentModule(TensorDictModule):
     """A `RecurrentNetwork` on TensorDicts, by TorchRL's conventions; a drop-in for its `LSTMModule` and `GRUModule`.
 
     Reads observations side by side [*batch, L], `is_init`, and the state under ("recurrent_state", name, "h") and, for
-    an LSTM, "c", each [*batch, N, H]; writes the features [*batch, H] and, under "next", the state after the step.
+    an LSTM, "c", each [*batch, N, H]; writes the features [*batch, H] and, under "next", the state after the step. The
+    name tells the states of several modules in one TensorDict apart.
 
     By default every element of the batch is one step. Under TorchRL's `set_recurrent_mode(True)`, where its and our
     losses run, the batch is [B, T]: sequences, of which only the first step's state is read. At each step whose
@@ -167,11 +145,6 @@ class RecurrentModule(TensorDictModule):
 
     An env carries the state from step to step, and begins each episode with zeros, if it has the transforms of
     `recurrent_transforms`; or TorchRL's `InitTracker` and `make_tensordict_primer()`.
-
-    Args:
-        obs_dim: L.
-        in_keys: of the observations.
-        name: tells the states of several modules in one TensorDict apart.
     """
 
     module: RecurrentNetwork
@@ -199,9 +172,8 @@ class RecurrentModule(TensorDictModule):
     def forward(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> TensorDictBase:
         """Write features and next state into `tensordict`, and return it.
 
-        Raises:
-            ValueError: where sequences are expected and the batch is not [B, T], or has no `is_init`; where there is no
-                state.
+        Raises ValueError where there is no state, or where sequences are expected and the batch is not [B, T] with
+        `is_init`.
         """
         obs = side_by_side([tensordict.get(key) for key in self.obs_keys])
         reset = tensordict.get(RESET_KEY, None)
@@ -250,35 +222,25 @@ class RecurrentModule(TensorDictModule):
 def make_recurrent_actor(
     cfg: RecurrentCfg, actor: ActorCfg, *, obs_dim: int, name: str = "actor", **options: Any
 ) -> ProbabilisticTensorDictSequential:
-    """Build a policy behind a memory, which reads and normalizes what the policy would.
-
-    Args:
-        cfg: of the memory.
-        actor: of the policy.
-        obs_dim: size of the observations side by side.
-        name: of the memory's state; see `RecurrentModule`.
-        **options: of `make_actor`.
-    """
-    memory, actor = _memory_before(actor, cfg, obs_dim=obs_dim, name=name, device=options.get("device"))
-    return with_memory(memory, make_actor(actor, obs_dim=cfg.hidden_dim, **options))
+    """Build a policy behind a recurrent module, which reads and normalizes what the policy would; see `make_actor`."""
+    return _made_behind(make_actor, cfg, actor, obs_dim=obs_dim, name=name, options=options)
 
 
 def make_recurrent_critic(
     cfg: RecurrentCfg, critic: CriticCfg, *, obs_dim: int, name: str = "critic", **options: Any
 ) -> TensorDictModule:
-    """Build a critic behind a memory of its own; as `make_recurrent_actor`."""
-    memory, critic = _memory_before(critic, cfg, obs_dim=obs_dim, name=name, device=options.get("device"))
-    return with_memory(memory, make_critic(critic, obs_dim=cfg.hidden_dim, **options))
+    """Build a critic behind a recurrent module of its own; as `make_recurrent_actor`."""
+    return _made_behind(make_critic, cfg, critic, obs_dim=obs_dim, name=name, options=options)
 
 
-def with_memory(memory: RecurrentModule, network: AnyModule) -> AnyModule:
-    """Return an actor or a critic behind a memory, whose features it reads at `memory.feature_key`."""
+def behind(recurrent: RecurrentModule, network: AnyModule) -> AnyModule:
+    """Return an actor or a critic that reads the features of a recurrent module, at its `feature_key`."""
     if isinstance(network, ProbabilisticTensorDictSequential):
-        return SafeProbabilisticTensorDictSequential(memory, *network.module)  # type: ignore[return-value, arg-type]
-    return TensorDictSequential(memory, network)  # type: ignore[return-value]
+        return SafeProbabilisticTensorDictSequential(recurrent, *network.module)  # type: ignore[return-value, arg-type]
+    return TensorDictSequential(recurrent, network)  # type: ignore[return-value]
 
 
-def memories(*networks: nn.Module) -> list[Any]:
+def recurrent_modules(*networks: nn.Module) -> list[Any]:
     """Return the recurrent TensorDict modules inside networks, each once: ours, TorchRL's, or any other."""
     found = [module for network in networks for module in network.modules() if carried_keys(module)]
     # A sequence of modules carries the states of those that it holds.
@@ -313,19 +275,14 @@ def state_spec(cfg: RecurrentCfg, name: str) -> Composite:
     return Composite({STATE_KEY: Composite({name: Composite(parts)})})
 
 
-def _memory_before(
-    network: AnyCfg, cfg: RecurrentCfg, *, obs_dim: int, name: str, device: Device
-) -> tuple[RecurrentModule, AnyCfg]:
-    """Return a memory, and the settings of a network that reads its features instead of the observations."""
-    memory = RecurrentModule(
-        cfg,
-        obs_dim=obs_dim,
-        in_keys=network.in_keys,
-        name=name,
-        obs_normalization=network.obs_normalization,
-        device=device,
-    )
-    return memory, replace(network, in_keys=(memory.feature_key,), obs_normalization=False)
+def _made_behind(
+    make: Any, cfg: RecurrentCfg, network: AnyCfg, *, obs_dim: int, name: str, options: dict[str, Any]
+) -> Any:
+    """Return a network that `make` builds, behind a recurrent module whose features it reads, not observations."""
+    reads = {"in_keys": network.in_keys, "obs_normalization": network.obs_normalization}
+    recurrent = RecurrentModule(cfg, obs_dim=obs_dim, name=name, device=options.get("device"), **reads)
+    network = replace(network, in_keys=(recurrent.feature_key,), obs_normalization=False)
+    return behind(recurrent, make(network, obs_dim=cfg.hidden_dim, **options))
 
 
 def _layer_parameters(cfg: RecurrentCfg, input_dim: int) -> dict[str, Tensor]:
@@ -344,3 +301,89 @@ def _layer_parameters(cfg: RecurrentCfg, input_dim: int) -> dict[str, Tensor]:
 
 def _orthogonal(rows: int, columns: int) -> Tensor:
     return nn.init.orthogonal_(torch.empty(rows, columns))
+
+
+class CarriedState:
+    """The states of networks that do not act, such as a critic: no rollout holds them.
+
+    A critic runs through a rollout when advantages are estimated, all steps at once, from the state in which it left
+    the rollout before. That state is kept here. `is_init` at the first step says where it must not be used. Networks
+    that are a part of `acting` have theirs in the rollouts. Raises ValueError where a recurrent module of `network`
+    does not give the state after each step of a sequence.
+    """
+
+    def __init__(self, network: nn.Module, *, acting: nn.Module) -> None:
+        for module in recurrent_modules(network):
+            if not isinstance(module, RecurrentModule):
+                raise ValueError(
+                    f"critic={type(module).__name__}: the values after each step need the state there, which TorchRL's "
+                    "modules give for the last step of a sequence only; use a RecurrentModule (make_recurrent_critic), "
+                    "or a critic that is not recurrent"
+                )
+        self._recurrent = [
+            module for module in recurrent_modules(network) if module not in recurrent_modules(acting)
+        ]
+        self._state_E: dict[Any, Tensor] = {}
+
+    @property
+    def keys(self) -> list[Any]:
+        """Where the states lie in a rollout."""
+        return [key for module in self._recurrent for key in module.state_keys]
+
+    def begin_(self, rollout_ET: TensorDictBase) -> None:
+        """Write the carried states into a rollout `["E","T"]`, of whose steps only the first is meant."""
+        num_envs, num_steps = rollout_ET.batch_size
+        for module in self._recurrent:
+            for key in module.state_keys:
+                if key not in self._state_E:
+                    shape = (num_envs, module.cfg.num_layers, module.cfg.hidden_dim)
+                    self._state_E[key] = torch.zeros(shape, device=rollout_ET.device)
+                state_E = self._state_E[key]
+                rollout_ET.set(key, state_E.unsqueeze(1).expand(-1, num_steps, -1, -1))
+
+    @torch.no_grad()
+    def end_(self, rollout_ET: TensorDictBase) -> None:
+        """Write the state before each step, and keep the last; those after each step lie under "next"."""
+        for key in self.keys:
+            after_ET, state_E = rollout_ET.get(("next", *key)), self._state_E[key]
+            before_ET = torch.cat([state_E.unsqueeze(1), after_ET[:, :-1]], 1)
+            rollout_ET.set(key, before_ET.masked_fill_(rollout_ET.get(RESET_KEY).unsqueeze(-1), 0.0))
+            state_E.copy_(after_ET[:, -1])
+
+    def state_dict(self) -> dict[str, Float[Tensor, "E N H"]]:
+        """Return the states by flat key."""
+        return {".".join(key): state_E for key, state_E in self._state_E.items()}
+
+    def load_state_dict(
+        self, state: Mapping[str, Float[Tensor, "E N H"]], *, device: torch.device | str = "cpu"
+    ) -> None:
+        """Continue where `state_dict` was taken; tensors keep their addresses."""
+        keys = {".".join(key): key for key in self.keys}
+        for name in keys.keys() & state.keys():
+            self._state_E.setdefault(keys[name], torch.empty_like(state[name], device=device))
+        if state:
+            copy_into(self.state_dict(), state, what="recurrent state")
+
+
+@torch.no_grad()
+def burnt_in(
+    sequences_BT: TensorDictBase, *networks: nn.Module, steps: int, key: str = "burn_in"
+) -> TensorDictBase:
+    """Renew the states by the first `steps` of sequences, with the networks as they are now, and return the rest.
+
+    No gradient reaches those steps, and no loss sees them. Sequences are `["B", "T"]`, as `SequenceSampler` gives them;
+    the flags at `key` tell which have such steps before them. The others begin with the state that is stored with them.
+    """
+    if not steps:
+        return sequences_BT
+    length = sequences_BT.batch_size[1] - steps
+    before_BT, rest_BT = sequences_BT.split([steps, length], 1)
+    renewed_B1 = before_BT.get(key)[:, -1]
+    for module in recurrent_modules(*networks):
+        with set_recurrent_mode(True):
+            unrolled_BT = module(before_BT.select(*module.in_keys))
+        for state_key in carried_keys(module):
+            renewed_B = unrolled_BT.get(next_key(state_key))[:, -1]
+            state_B = torch.where(renewed_B1.unsqueeze(-1), renewed_B, before_BT.get(state_key)[:, 0])
+            rest_BT.set(state_key, state_B.unsqueeze(1).expand_as(rest_BT.get(state_key)))
+    return rest_BT

@@ -25,14 +25,8 @@ def lstm_layer(
 ) -> tuple[Float[Tensor, "T B H"], ...]:
     """Run one LSTM layer (Hochreiter & Schmidhuber 1997, with forget gates; the formulas of `torch.nn.LSTM`).
 
-    Args:
-        gates_TBG: W_ih x + b_ih + b_hh of each step, G = 4 H: input, forget, cell, output.
-        weight_hh_GH: W_hh.
-        state_BH: h and c before the first step.
-        reset_TB1: whether the state is zeroed before the step; None never does.
-
-    Returns:
-        h and c after each step.
+    `gates_TBG` is W_ih x + b_ih + b_hh of each step, G = 4 H: input, forget, cell, output. The state, h and c, is
+    zeroed before the steps that `reset_TB1` marks; returned is that after each step.
     """
     return _LSTM.apply(gates_TBG, weight_hh_GH, *state_BH, reset_TB1)  # type: ignore[no-any-return]
 
@@ -46,14 +40,8 @@ def gru_layer(
 ) -> tuple[Float[Tensor, "T B H"], ...]:
     """Run one GRU layer (Cho et al., arXiv 1406.1078, in the variant of `torch.nn.GRU`).
 
-    Args:
-        gates_TBG: W_ih x + b_ih of each step, G = 3 H: reset, update, new.
-        weight_hh_GH, bias_hh_G: W_hh and b_hh.
-        state_BH: h before the first step, as a tuple of one.
-        reset_TB1: whether the state is zeroed before the step; None never does.
-
-    Returns:
-        h after each step, as a tuple of one.
+    `gates_TBG` is W_ih x + b_ih of each step, G = 3 H: reset, update, new. The state, a tuple of h, is zeroed before
+    the steps that `reset_TB1` marks; returned is that after each step.
     """
     return (_GRU.apply(gates_TBG, weight_hh_GH, bias_hh_G, *state_BH, reset_TB1),)
 

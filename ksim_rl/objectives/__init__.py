@@ -1,6 +1,6 @@
 """This room estimates advantages from a rollout, and has the losses and gradient steps that improve the policy."""
 
-from ksim_rl.objectives.advantage_estimators import GAE, TDLambda, VTrace
+from ksim_rl.objectives.advantage_estimators import GAE, RolloutEstimator, TDLambda, VTrace
 from ksim_rl.objectives.algorithm_cfg import (
     AlgorithmCfg,
     AMPCfg,
@@ -13,12 +13,14 @@ from ksim_rl.objectives.algorithm_cfg import (
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.discriminator_loss import discriminator_loss, style_reward
 from ksim_rl.objectives.distillation_loss import DistillationLoss, observation_keys_of
+from ksim_rl.objectives.distributional import cross_entropy, mean_of, project_distribution
 from ksim_rl.objectives.gradient_step import (
     NonFiniteStepsError,
     StepGuard,
     adapt_learning_rate_,
     clip_and_guard,
     descend,
+    descend_together,
     load_optimizer_state_,
     make_adamw,
     make_optimizer,
@@ -27,12 +29,7 @@ from ksim_rl.objectives.off_policy_loss import (
     OffPolicyLoss,
     SACLoss,
     TD3Loss,
-    cross_entropy,
-    follow_,
     frozen,
-    make_target,
-    mean_of,
-    project_distribution,
 )
 from ksim_rl.objectives.policy_kl import distribution_keys, kl_divergence, observation_keys
 from ksim_rl.objectives.ppo_step import (
@@ -43,7 +40,6 @@ from ksim_rl.objectives.ppo_step import (
     ppo_step,
     with_precision_of,
 )
-from ksim_rl.objectives.rollout_estimator import RolloutEstimator
 from ksim_rl.objectives.symmetry import SymmetricAugmentation, mirror_loss
 
 __all__ = [
@@ -70,8 +66,8 @@ __all__ = [
     "clip_and_guard",
     "cross_entropy",
     "descend",
+    "descend_together",
     "discriminator_loss",
-    "follow_",
     "frozen",
     "in_precision",
     "distribution_keys",
@@ -81,7 +77,6 @@ __all__ = [
     "make_advantage",
     "make_loss",
     "make_optimizer",
-    "make_target",
     "mean_of",
     "make_symmetric",
     "mirror_loss",

@@ -18,15 +18,15 @@ class AlgorithmCfg(Checked):
     """The settings of an algorithm: a run's `objective`. A subclass of a registered one inherits its algorithm."""
 
     learns_on_sequences: ClassVar[bool] = False
-    """Whether networks may have a memory."""
+    """Whether networks may be recurrent."""
 
     @property
     def observation_groups(self) -> tuple[str, ...]:
         """The observation groups that it reads beside those of the networks."""
         return ()
 
-    def check_memory(self) -> None:
-        """Refuse settings that networks with a memory do not allow, by a ValueError."""
+    def check_recurrent(self) -> None:
+        """Refuse settings that recurrent networks do not allow, by a ValueError."""
 
     def with_absolute_paths(self) -> Self:
         """Return the same settings with paths that lead to the same files from any folder."""
@@ -35,12 +35,9 @@ class AlgorithmCfg(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class GradientCfg(AlgorithmCfg):
-    """What all algorithms of this package say about their gradient steps.
+    """What all algorithms of this package say about their gradient steps, by Adam, or AdamW off policy.
 
-    Attributes:
-        betas, adam_eps, weight_decay: of Adam, or AdamW off policy.
-        max_grad_norm: bound on the norm of the gradient; None does not clip.
-        max_skipped_steps: so many gradient steps in a row that are not finite end the run.
+    `max_grad_norm=None` does not clip; so many as `max_skipped_steps` in a row that are not finite end the run.
     """
 
     betas: tuple[float, float] = (0.9, 0.999)
@@ -59,15 +56,10 @@ class GradientCfg(AlgorithmCfg):
 
 @dataclass(frozen=True, kw_only=True)
 class OnPolicyCfg(GradientCfg):
-    """What the algorithms share that pass over each rollout some times, with one Adam.
+    """What the algorithms share that pass over each rollout `num_epochs` times, with one Adam.
 
-    Attributes:
-        num_epochs: passes over each rollout.
-        learning_rate: of Adam, at the start; within its bounds if the schedule is adaptive.
-        schedule: "adaptive" changes it after each gradient step so that the divergence of the policy from the
-            one that collected the rollout stays near `desired_kl`; "fixed" keeps it.
-        desired_kl: in nats.
-        learning_rate_min, learning_rate_max: bounds of the adaptive schedule.
+    The "adaptive" schedule changes the learning rate before each gradient step, within its bounds, so that the
+    divergence of the policy from the one that collected the rollout stays near `desired_kl` nats.
     """
 
     learns_on_sequences: ClassVar[bool] = True
@@ -100,22 +92,14 @@ class PPOCfg(OnPolicyCfg):
 
     Attributes:
         advantage: "gae", "td_lambda" (lambda returns; the same numbers in the rollout of a collector), or "vtrace",
-            whose weights follow the policy from epoch to epoch.
-        gamma, lmbda: discount per step, and weight of longer returns in the advantage.
-        rho_thresh, c_thresh: bounds of the probability ratios in V-trace; see `VTrace`.
+            whose weights follow the policy from epoch to epoch, within `rho_thresh` and `c_thresh`; see `VTrace`.
         estimate_each_epoch: estimate advantages and value targets anew before each epoch, with the present networks,
             instead of once (Andrychowicz et al., arXiv 2006.05990, section 3.5). "vtrace" always does.
-        clip_epsilon: the probability ratio is clipped to [1 - clip_epsilon, 1 + clip_epsilon].
-        clip_value: radius of the value clipping; True takes `clip_epsilon`, False does not clip.
-        entropy_coeff, critic_coeff: weights of the entropy bonus and of the value loss.
-        normalize_advantage: over the whole "dataset", over each "minibatch", or "none".
-        symmetry: "augment" adds the mirror image of each env state to its minibatch, "loss" adds the mirror loss, which
-            is zero for a policy that acts in the mirror as its mirror image; "none" does neither.
-        symmetry_coeff: weight of the mirror loss.
+        symmetry: "augment" adds the mirror image of each env state to its minibatch, "loss" adds `symmetry_coeff` times
+            the mirror loss, which is zero for a policy that acts in the mirror as its mirror image.
         precision: of what layers multiply in the gradient steps: "float32" (on CUDA as `trainer.matmul_precision`
             says), or "bfloat16", which has 8 significant bits and moves the gradient by about half a percent of its
-            norm; "auto" is "bfloat16" on CUDA and "float32" elsewhere. Parameters, sums, losses and Adam are
-            always float32.
+            norm; "auto" is "bfloat16" on CUDA and "float32" elsewhere. All else is always float32.
         kernels: of a bfloat16 update: "auto" takes a few fused kernels where they fit device and networks, "torch"
             never does. They differ by the order of sums. The metric `update/fused` says which it is.
     """
@@ -129,7 +113,7 @@ class PPOCfg(OnPolicyCfg):
     c_thresh: Positive = 1.0
     estimate_each_epoch: bool = False
     clip_epsilon: PositiveShare = 0.2
-    clip_value: bool | NonNegative = True
+    clip_value: bool | NonNegative = True  # radius of the value clipping; True takes `clip_epsilon`
     entropy_coeff: NonNegative = 0.01
     critic_coeff: NonNegative = 1.0
     normalize_advantage: Literal["dataset", "minibatch", "none"] = "dataset"
@@ -143,11 +127,11 @@ class PPOCfg(OnPolicyCfg):
         """Whether advantages are estimated anew before each epoch."""
         return self.estimate_each_epoch or self.advantage == "vtrace"
 
-    def check_memory(self) -> None:
-        """Refuse a symmetry, of which memories know nothing."""
+    def check_recurrent(self) -> None:
+        """Refuse a symmetry, of which recurrent states know nothing."""
         if self.symmetry != "none":
             raise ValueError(
-                f"objective.symmetry={self.symmetry!r}: the state of a memory has no known mirror image; use none, or "
+                f"objective.symmetry={self.symmetry!r}: a recurrent state has no known mirror image; use none, or "
                 "modules=mlp"
             )
 
@@ -158,23 +142,13 @@ class AMPCfg(PPOCfg):
 
     A discriminator tells transitions of the motions from those of the policy; the style reward, in [0, 1] per step, is
     how much a transition looks like the motions. The sum `task_coeff * reward + style_coeff * style` is what PPO
-    maximizes; where the env multiplies its rewards by the step's seconds, a fitting `style_coeff` is as small.
-
-    Attributes:
-        motions: reference motions, by name or file; the env sees their states in `style_group`.
-        style_group: the observation group that is compared. Its terms read positions and velocities, no commands,
-            actions, contacts or forces, which a motion does not have.
-        task_coeff, style_coeff: weights of the two rewards.
-        discriminator_hidden_dims, discriminator_activation: of the discriminator, an MLP.
-        discriminator_learning_rate, discriminator_weight_decay: of its Adam, which has the betas of PPO's.
-        gradient_penalty: weight of the squared norm of the discriminator's gradient at reference transitions.
-        logit_decay: weight of the squares of its last layer's weights.
-        num_discriminator_steps: gradient steps of the discriminator per rollout.
-        num_transitions_per_step: of the motions, and as many of the policy, in one such step.
-        replay_rollouts: the policy's transitions are drawn from so many of the last rollouts.
+    maximizes; where the env multiplies its rewards by the step's seconds, a fitting `style_coeff` is as small. The
+    group `style_group` is compared: its terms read positions and velocities, no commands, actions, contacts or forces,
+    which a motion does not have. A gradient step of the discriminator is on `num_transitions_per_step` of the motions
+    and as many of the policy, from the last `replay_rollouts` rollouts.
     """
 
-    motions: tuple[str, ...] = ()
+    motions: tuple[str, ...] = ()  # by name or file; the env sees their states in `style_group`
     style_group: str = "style"
     task_coeff: NonNegative = 0.5
     style_coeff: NonNegative = 0.5
@@ -182,9 +156,9 @@ class AMPCfg(PPOCfg):
     discriminator_activation: str = "relu"
     discriminator_learning_rate: Positive = 3e-4
     discriminator_weight_decay: NonNegative = 1e-4
-    gradient_penalty: NonNegative = 10.0
-    logit_decay: NonNegative = 0.05
-    num_discriminator_steps: Count = 10
+    gradient_penalty: NonNegative = 10.0  # of the discriminator's squared gradient at reference transitions
+    logit_decay: NonNegative = 0.05  # of the squares of its last layer's weights
+    num_discriminator_steps: Count = 10  # per rollout
     num_transitions_per_step: Count = 4096
     # A rollout whose episodes all end at once takes two places per env state, and must not overwrite itself.
     replay_rollouts: Annotated[int, Within(low=3)] = 10
@@ -205,18 +179,14 @@ class AMPCfg(PPOCfg):
 
 @dataclass(frozen=True, kw_only=True)
 class DistillationCfg(OnPolicyCfg):
-    """A student learns to act as a teacher does in the states that the student itself visits.
+    """A student learns to act as a teacher (a run folder or a checkpoint) does, in the states that the student visits.
 
     That is DAgger (Ross et al., arXiv 1011.0686) without its aggregate of all data: the newest rollout of thousands of
-    envs stands for it.
-
-    Attributes:
-        teacher: a run folder or a checkpoint, whose policy is the teacher.
-        loss: "kl", the divergence of the student's distribution from the teacher's, which also learns how actions
-            scatter; or "mse", of the actions that both take deterministically, without noise while the student
-            collects, for teachers without a distribution or with another kind of it.
-        teacher_share: the chance that the teacher acts instead of the student, in each env state of the first rollout.
-        teacher_share_decay: factor of it from rollout to rollout.
+    envs stands for it. The loss "kl" is the divergence of the student's distribution from the teacher's, which also
+    learns how actions scatter; "mse" is that of the actions that both take deterministically, without noise while the
+    student collects, for teachers without a distribution or with another kind of it. `teacher_share` is the chance that
+    the teacher acts instead of the student, in each env state of the first rollout; it decays from rollout to rollout
+    by a factor.
     """
 
     teacher: str = ""
@@ -238,38 +208,34 @@ class DistillationCfg(OnPolicyCfg):
 
 @dataclass(frozen=True, kw_only=True)
 class OffPolicyCfg(GradientCfg):
-    """What all off-policy objectives share.
+    """What all off-policy objectives share, as learned by AdamW.
 
-    Attributes:
-        gamma: discount per step.
-        tau: share of the new weights in each update of the target networks.
-        value_reduction: "min" learns from, and climbs, the lowest of the predicted values (clipped double Q-learning,
-            Fujimoto et al., arXiv 1802.09477); "mean" lets each network learn from its own target and climbs the mean.
-        policy_delay: gradient steps of the critics for each of the actor.
-        critic_learning_rate, actor_learning_rate: of AdamW.
-        autocast: run the networks in bfloat16, with float32 weights.
+    `value_reduction="min"` learns from, and climbs, the lowest of the predicted values (clipped double Q-learning,
+    Fujimoto et al., arXiv 1802.09477); with "mean" each network learns from its own target, and the mean is climbed.
+
+    `compile` lets `torch.compile` fuse the kernels of the losses on CUDA: half the time of a gradient step, for most of
+    a minute at the first one. `symmetry="augment"` takes the mirror image of every second env state, for robots that
+    are their own.
     """
 
     gamma: Share = 0.99
-    tau: PositiveShare = 0.005
+    tau: PositiveShare = 0.005  # share of the new weights in each update of the target networks
     value_reduction: ValueReduction = "min"
-    policy_delay: Count = 1
+    policy_delay: Count = 1  # gradient steps of the critics for each of the actor
     critic_learning_rate: Positive = 3e-4
     actor_learning_rate: Positive = 3e-4
-    autocast: bool = False
+    autocast: bool = False  # run the networks in bfloat16, with float32 weights
+    compile: bool = False
+    symmetry: Literal["none", "augment"] = "none"
 
 
 @dataclass(frozen=True, kw_only=True)
 class SACCfg(OffPolicyCfg):
     """Soft actor-critic with a learned temperature (Haarnoja et al., arXiv 1801.01290 and 1812.05905).
 
-    With critics of many atoms, large minibatches and many envs it is FastSAC (Seo et al., arXiv 2512.01996).
-
-    Attributes:
-        alpha_init: temperature at the start, in units of the return per nat.
-        alpha_learning_rate: of the temperature's logarithm; 0 keeps `alpha_init`.
-        target_entropy_per_action: entropy that the temperature aims at, in nats per action, of actions scaled to
-            [-1, 1].
+    With critics of many atoms, large minibatches and many envs it is FastSAC (Seo et al., arXiv 2512.01996). The
+    temperature starts at `alpha_init`, in units of the return per nat, and stays there with `alpha_learning_rate=0`; it
+    aims at an entropy of `target_entropy_per_action` nats, of actions scaled to [-1, 1].
     """
 
     alpha_init: Positive = 1.0
@@ -281,13 +247,9 @@ class SACCfg(OffPolicyCfg):
 class TD3Cfg(OffPolicyCfg):
     """Twin delayed deterministic policy gradients (Fujimoto et al., arXiv 1802.09477).
 
-    Targets take the present policy, not a slow copy of it, as FastTD3 does (Seo et al., arXiv 2505.22642).
-
-    Attributes:
-        exploration_noise_min, exploration_noise_max: range of the standard deviation of the noise on the actions that
-            are taken, one per env, in units of half the range of an action.
-        target_noise, target_noise_clip: standard deviation and bound of the noise on the actions that targets are
-            computed for, in the same units.
+    Targets take the present policy, not a slow copy of it, as FastTD3 does (Seo et al., arXiv 2505.22642). Each env has
+    a standard deviation of the noise on its actions from [exploration_noise_min, exploration_noise_max]; that of the
+    actions of targets is `target_noise`, clipped. All are in units of half the range of an action.
     """
 
     policy_delay: Count = 2

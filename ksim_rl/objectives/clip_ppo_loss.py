@@ -22,27 +22,23 @@ from ksim_rl.objectives.policy_kl import (
 
 
 class ClipPPOLoss(objectives.ClipPPOLoss):
-    """TorchRL's `ClipPPOLoss` (Schulman et al., arXiv 1707.06347), with the same options, losses and
-    gradients.
+    """TorchRL's `ClipPPOLoss` (Schulman et al., arXiv 1707.06347), with the same options, losses and gradients.
 
-    The stock loss reads tensor values on the host 1 to 3 times per call and breaks `fullgraph` compilation
-    with `clip_value`; this one never does. It also writes `kl`, the divergence from the policy that collected the
-    data to the present one: exact where there is a closed form and the data has the parameters of the old distribution,
-    else an estimate from the actions.
+    The stock loss reads tensor values on the host 1 to 3 times per call and breaks `fullgraph` compilation with
+    `clip_value`; this one never does. It also writes `kl`, the divergence from the policy that collected the data to
+    the present one: exact where there is a closed form and the data has the parameters of the old distribution, else an
+    estimate from the actions.
 
-    Losses are means over the env states, without a factor 0.5:
-    `loss_objective` = -mean(min(r A, clip(r, 1 - clip_epsilon, 1 + clip_epsilon) A)), r the probability
-    ratio; `loss_critic` = critic_coeff * mean(max((v - R)^2, (v_old + clip(v - v_old, -clip_value,
-    clip_value) - R)^2)) with `loss_critic_type="l2"`, which is rsl_rl's clipped value loss with
-    `value_loss_coef = critic_coeff`; `loss_entropy` = -entropy_coeff * mean(entropy). Env states whose
+    Losses are means over the env states, without a factor 0.5: `loss_objective` = -mean(min(r A, clip(r, 1 -
+    clip_epsilon, 1 + clip_epsilon) A)), r the probability ratio; `loss_critic` = critic_coeff * mean(max((v - R)^2,
+    (v_old + clip(v - v_old, -clip_value, clip_value) - R)^2)) with `loss_critic_type="l2"`, which is rsl_rl's clipped
+    value loss with `value_loss_coef = critic_coeff`; `loss_entropy` = -entropy_coeff * mean(entropy). Env states whose
     `("collector", "mask")` is False are left out.
 
     Args:
-        clip_value: radius of the value clipping, in units of the value; True takes `clip_epsilon`, None or
-            False does not clip. It is a plain number here: a captured graph or a compiled loss keeps the one
-            it saw.
+        clip_value: radius of the value clipping, in units of the value; True takes `clip_epsilon`, None or False does
+            not clip. It is a plain number here: a captured graph or a compiled loss keeps the one it saw.
         log_ratio_statistics: also write TorchRL's `ESS`, `max_ratio` and `mean_ratio`.
-        **kwargs: all other options of TorchRL's `ClipPPOLoss`.
     """
 
     def __init__(
@@ -85,13 +81,10 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the losses and what is logged beside them, all detached but those named `loss_*`.
 
-        Args:
-            tensordict: a minibatch `["B"]`, or `["B","T"]` for recurrent networks, with the `dataset_keys`.
-                Without an advantage it must be a rollout, from which the value estimator computes one.
-
-        Returns:
-            TensorDict without batch dims: `loss_objective`, `loss_critic`, `loss_entropy`, `entropy`, `kl`,
-            `kl_approx`, `clip_fraction`, `value_clip_fraction`, `explained_variance`.
+        A minibatch is `["B"]`, or `["B","T"]` for recurrent networks, with the `dataset_keys`. Without an advantage it
+        must be a rollout, from which the value estimator computes one. Returned, without batch dims, are
+        `loss_objective`, `loss_critic`, `loss_entropy`, `entropy`, `kl`, `kl_approx`, `clip_fraction`,
+        `value_clip_fraction` and `explained_variance`.
         """
         tensordict = tensordict.clone(False)
         # Read before the actor runs, which writes its own distribution under the same keys.

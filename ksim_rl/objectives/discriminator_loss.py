@@ -19,19 +19,12 @@ def discriminator_loss(
     gradient_penalty: float,
     mask_B: Bool[Tensor, " B"] | None = None,
 ) -> tuple[Float[Tensor, ""], dict[str, Float[Tensor, ""]]]:
-    """Return the least-squares loss of a discriminator with a gradient penalty, and what is logged beside it.
+    """Return the least-squares loss of a discriminator D with a gradient penalty, and what is logged beside it.
 
     It is mean((D(r) - 1)^2) + mean((D(p) + 1)^2) + w / 2 mean(|dD(r)/dr|^2), r of the reference and p of the policy:
-    equation 8 of Peng et al., arXiv 2104.02180. The penalty's gradient needs D to be differentiable twice.
-
-    Args:
-        judge: D.
-        gradient_penalty: w.
-        mask_B: which of the policy's transitions count; None is all.
-
-    Returns:
-        The loss, and `loss`, `penalty` (without w / 2), `reference_score`, `policy_score` (means of D), and `accuracy`,
-        the share of transitions on their side of zero; all but the loss detached.
+    equation 8 of Peng et al., arXiv 2104.02180, w the `gradient_penalty`, whose gradient needs D to be differentiable
+    twice. Logged, detached, are `loss`, `penalty` (without w / 2), `reference_score`, `policy_score` (means of D), and
+    `accuracy`, the share of transitions on their side of zero. The policy's transitions count where `mask_B` is True.
     """
     reference_CL = reference_CL.detach().requires_grad_()
     reference_C, policy_B = judge(reference_CL), judge(policy_BL)

@@ -25,15 +25,9 @@ class DistillationLoss(nn.Module):
     """`loss_distillation` = mean over env states of |a - a*|^2 / A, or of KL(teacher || student) in nats.
 
     a and a* are the actions that student and teacher take deterministically, A their number. Env states whose
-    `("collector", "mask")` is False are left out. No value is read on the host.
-
-    Args:
-        actor_network: the student; a memory in it learns on sequences `["B","T"]`.
-        teacher: frozen; reads its own observations, writes "action" and, for "kl", parameters of a distribution.
-        loss: "mse" or "kl".
-
-    Raises:
-        ValueError: with "kl" for a teacher without a distribution; with "mse" for actions that are choices.
+    `("collector", "mask")` is False are left out. No value is read on the host. The teacher reads its own observations;
+    a recurrent student learns on sequences `["B","T"]`. Raises ValueError with loss "kl" for a teacher without a
+    distribution, and with "mse" for actions that are choices.
     """
 
     def __init__(

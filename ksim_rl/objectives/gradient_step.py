@@ -1,7 +1,7 @@
 """This module makes gradient steps without host syncs, skips what is not finite, and adapts the learning rate."""
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 import torch
@@ -14,10 +14,8 @@ from ksim_rl.objectives.algorithm_cfg import GradientCfg, OnPolicyCfg
 class NonFiniteStepsError(RuntimeError):
     """Too many gradient steps in a row had a loss or a gradient that was not finite."""
 
-    @classmethod
-    def of(cls, in_a_row: int, *, limit: int, skipped: int) -> "NonFiniteStepsError":
-        """Build the error for so many skipped steps in a row, and since the start."""
-        return cls(
+    def __init__(self, in_a_row: int, *, limit: int, skipped: int) -> None:
+        super().__init__(
             f"{in_a_row} gradient steps in a row had a loss or gradient that is not finite (limit {limit}, "
             f"{skipped} since the start); the parameters are those of the last good step. "
             "Lower the learning rate or max_grad_norm, or look for extreme rewards and observations"
@@ -25,12 +23,7 @@ class NonFiniteStepsError(RuntimeError):
 
 
 class StepGuard(nn.Module):
-    """Counts skipped gradient steps on the device.
-
-    Attributes:
-        skipped: int64 [], gradient steps skipped since the start.
-        skipped_in_a_row: int64 [], gradient steps skipped since the last one that was made.
-    """
+    """Counts gradient steps that were skipped on the device: since the start, and since the last one that was made."""
 
     skipped: Tensor
     skipped_in_a_row: Tensor
@@ -48,14 +41,10 @@ class StepGuard(nn.Module):
         self.skipped_in_a_row.add_(skipped).mul_(skipped)
 
     def check(self, limit: int) -> None:
-        """Read the counter on the host (once per iteration, not per step) and stop a run that cannot go on.
-
-        Raises:
-            NonFiniteStepsError: if the last `limit` steps or more were skipped.
-        """
+        """Raise `NonFiniteStepsError` if the last `limit` steps or more were skipped; reads the counter on the host."""
         in_a_row = int(self.skipped_in_a_row)
         if in_a_row >= limit:
-            raise NonFiniteStepsError.of(in_a_row, limit=limit, skipped=int(self.skipped))
+            raise NonFiniteStepsError(in_a_row, limit=limit, skipped=int(self.skipped))
 
 
 @torch.no_grad()
@@ -67,11 +56,9 @@ def clip_and_guard(
 ) -> tuple[Float32[Tensor, ""], Float32[Tensor, ""]]:
     """Scale the gradients down to a total norm of at most `max_grad_norm`, in place, and tell if they are finite.
 
-    As `torch.nn.utils.clip_grad_norm_`, without host syncs.
-
-    Returns:
-        The norm before clipping, and `found_inf`: 1 if the norm or the loss is not finite, else 0. A fused optimizer
-        whose `found_inf` is 1 leaves parameters, moments and step count as they are.
+    It is `torch.nn.utils.clip_grad_norm_` without host syncs. Returned are the norm before clipping, and `found_inf`: 1
+    if the norm or the loss is not finite, else 0. A fused optimizer whose `found_inf` is 1 leaves parameters, moments
+    and step count as they are.
     """
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     norm = nn.utils.get_total_norm(gradients)
@@ -91,13 +78,10 @@ def adapt_learning_rate_(
     lr_min: float = 1e-5,
     lr_max: float = 1e-2,
 ) -> Float32[Tensor, ""]:
-    """Divide `lr` by `factor` if `kl` exceeds twice the desired one, multiply it if below half, in place.
+    """Divide `lr` by `factor` if `kl`, in nats, exceeds twice the desired one, multiply it if below half, in place.
 
     The rule of rsl_rl, without host syncs. A divergence of exactly zero (the policy has not moved yet), or one that is
     NaN, changes nothing.
-
-    Args:
-        kl: mean divergence in nats between the policy that collected the data and the present one.
     """
     slower = (lr / factor).clamp_min(lr_min)
     faster = (lr * factor).clamp_max(lr_max)
@@ -111,10 +95,9 @@ AnyAdam = TypeVar("AnyAdam", torch.optim.Adam, torch.optim.AdamW)
 
 
 def make_optimizer(cfg: OnPolicyCfg, *modules: nn.Module) -> torch.optim.Adam:
-    """Build one fused Adam over the parameters of `modules`, each once, with the learning rate on the device.
+    """Build one fused Adam over the parameters of `modules`, each once, capturable on CUDA.
 
-    `optimizer.param_groups[0]["lr"]` is a float32 tensor [] that changes in place. On CUDA the optimizer is
-    capturable.
+    `optimizer.param_groups[0]["lr"]` is a float32 tensor [] on the device that changes in place.
     """
     parameters = dict.fromkeys(parameter for module in modules for parameter in module.parameters())
     return _fused(torch.optim.Adam, cfg, parameters, cfg.learning_rate, cfg.weight_decay)
@@ -164,11 +147,29 @@ def descend(
 
     It can be captured in a CUDA graph. Returned are the norm before clipping, and 1 if the step was skipped, else 0.
     """
-    optimizer.zero_grad(set_to_none=True)
-    loss.backward()
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    grad_norm, found_inf = clip_and_guard(parameters, max_grad_norm, loss=loss.detach())
-    # Fused optimizers read these two, which torch's GradScaler sets as well, and skip the step on the device.
-    optimizer.grad_scale, optimizer.found_inf = None, found_inf  # type: ignore[attr-defined]
-    optimizer.step()
-    return grad_norm, found_inf
+    return descend_together({"loss": loss}, {"loss": optimizer}, max_grad_norm=max_grad_norm)["loss"]
+
+
+def descend_together(
+    losses: Mapping[str, Float[Tensor, ""]],
+    optimizers: Mapping[str, torch.optim.Optimizer],
+    *,
+    max_grad_norm: float | None,
+) -> dict[str, tuple[Float32[Tensor, ""], Float32[Tensor, ""]]]:
+    """Do what `descend` says with each loss and the optimizer of its name, and go back through them at once.
+
+    No loss may reach a parameter of another's optimizer.
+    """
+    for name in losses:
+        optimizers[name].zero_grad(set_to_none=True)
+    torch.autograd.backward(list(losses.values()))
+    steps = {}
+    for name, loss in losses.items():
+        optimizer = optimizers[name]
+        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        grad_norm, found_inf = clip_and_guard(parameters, max_grad_norm, loss=loss.detach())
+        # Fused optimizers read these two, which torch's GradScaler sets as well, and skip the step on the device.
+        optimizer.grad_scale, optimizer.found_inf = None, found_inf  # type: ignore[attr-defined]
+        optimizer.step()
+        steps[name] = grad_norm, found_inf
+    return steps

@@ -25,10 +25,7 @@ def masked_mean(values: Float[Tensor, "*batch"], mask: Bool[Tensor, "*batch"]) -
 def standardized(
     values: Float[Tensor, "*batch"], mask: Bool[Tensor, "*batch"], *, lowest_std: float
 ) -> Float[Tensor, "*batch"]:
-    """Shift and scale values to mean 0 and standard deviation 1 over those that `mask` marks.
-
-    Values that are all alike stay near zero, as they are divided by `lowest_std` at least.
-    """
+    """Shift and scale values to mean 0 and standard deviation 1 (or divide by `lowest_std`) over those in `mask`."""
     zero, count = torch.zeros_like(values), mask.sum()
     error = values - torch.where(mask, values, zero).sum() / count.clamp_min(1)
     variance = torch.where(mask, error, zero).square().sum() / (count - 1).clamp_min(1)

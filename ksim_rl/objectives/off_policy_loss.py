@@ -5,13 +5,13 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
-from tensordict.utils import NestedKey
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import LossModule
@@ -20,23 +20,7 @@ from ksim_rl.checked import Share, check_value
 from ksim_rl.checks import check_in_range
 from ksim_rl.device.running_moments import RunningMoments
 from ksim_rl.objectives.algorithm_cfg import ValueReduction
-
-Network = TypeVar("Network", bound=nn.Module)
-
-
-def make_target(network: Network) -> Network:
-    """Return a copy of a network that takes no gradients.
-
-    Running statistics are shared, not copied: both networks see observations on the same scale at any time.
-    """
-    shared = {id(module): module for module in network.modules() if isinstance(module, RunningMoments)}
-    return copy.deepcopy(network, memo=dict(shared)).requires_grad_(False)
-
-
-@torch.no_grad()
-def follow_(target: nn.Module, network: nn.Module, tau: float) -> None:
-    """Move the weights of `target` by a share `tau` towards those of `network`, in a few kernels."""
-    torch._foreach_lerp_(list(target.parameters()), list(network.parameters()), tau)
+from ksim_rl.objectives.distributional import cross_entropy, mean_of, project_distribution
 
 
 @contextmanager
@@ -52,65 +36,20 @@ def frozen(network: nn.Module) -> Iterator[None]:
             parameter.requires_grad_(True)
 
 
-def project_distribution(
-    probs: Float[Tensor, "*batch A"],
-    reward: Float[Tensor, "#*batch 1"],
-    discount: Float[Tensor, "#*batch 1"],
-    support_A: Float[Tensor, " A"],
-) -> Float[Tensor, "*batch A"]:
-    """Return the distribution of `reward + discount * z` on the atoms, for `z` distributed as `probs`.
-
-    The mass of each moved atom goes to the two atoms that it falls between, in proportion to how near they are; beyond
-    the ends it goes to the last atom (algorithm 1 of Bellemare et al., arXiv 1707.06887). `support_A` has the values of
-    the atoms, evenly spaced, rising.
-    """
-    low, high, count = support_A[0], support_A[-1], support_A.shape[0]
-    spacing = (high - low) / (count - 1)
-    position = ((reward + discount * support_A).clamp(low, high) - low) / spacing
-    # The last atom itself counts as the upper neighbour of the one before, so that no index runs over the end.
-    lower = position.floor().clamp(0, count - 2)
-    upper_share = position - lower
-    lower_index = lower.to(torch.int64).expand_as(probs)
-    projected = torch.zeros_like(probs)
-    projected.scatter_add_(-1, lower_index, probs * (1.0 - upper_share))
-    projected.scatter_add_(-1, lower_index + 1, probs * upper_share)
-    return projected
-
-
-def mean_of(probs: Float[Tensor, "*batch A"], support_A: Float[Tensor, " A"]) -> Float[Tensor, "*batch"]:
-    """Return the means of distributions."""
-    # No product of matrices: autocast would round it to bfloat16.
-    return (probs * support_A).sum(-1)
-
-
-def cross_entropy(
-    logits: Float[Tensor, "*batch A"], probs: Float[Tensor, "*batch A"]
-) -> Float[Tensor, "*batch"]:
-    """Return -sum(probs * log softmax(logits)), in nats."""
-    return -(probs * logits.log_softmax(-1)).sum(-1)
-
-
 Scalar = Float[Tensor, ""]
 
 
 class OffPolicyLoss(LossModule):
     """The part of `SACLoss` and `TD3Loss` that is the same: how N critics learn, and what their values say.
 
-    The critics are one TensorDict module that reads observations and "action", and writes
-    "state_action_value" [B, N], or "state_action_logits" [B, N, A] if there is a `support_A`: logits of the return's
-    distribution on its A atoms.
+    The critics are one TensorDict module that reads observations and "action", and writes "state_action_value" [B, N],
+    or "state_action_logits" [B, N, A] if there is a `support_A`: logits of the return's distribution on its A atoms.
 
     `loss_qvalue` = sum over the critics of mean((Q - y)^2), or of the cross entropy to the projected target
     distribution; the subclasses say what y is. Losses are means over the env states of a minibatch; those whose
     `("collector", "mask")` is False are left out, and `"priority_weight"` weighs them where it is present. No host
-    syncs.
-
-    Args:
-        actor_network: reads observations, writes "action".
-        critic_network: as above.
-        support_A: the values of the atoms; None if the critics predict values.
-        gamma: discount per step; of n steps where the data says "steps_to_next_obs".
-        value_reduction: "min" or "mean"; see `OffPolicyCfg`.
+    syncs. `gamma` is the discount per step, of n steps where the data says "steps_to_next_obs"; `value_reduction` is
+    explained in `OffPolicyCfg`.
     """
 
     @dataclass
@@ -125,6 +64,7 @@ class OffPolicyLoss(LossModule):
         priority_weight: NestedKey = "priority_weight"
 
     default_keys = _AcceptedKeys
+    _written: ClassVar[tuple[str, ...]] = ("loss_qvalue", "loss_actor", "value", "td_error")
     tensor_keys: _AcceptedKeys  # type: ignore[assignment]
     actor_network: Any
     critic_network: Any
@@ -142,10 +82,14 @@ class OffPolicyLoss(LossModule):
         check_value("gamma", gamma, Share)
         check_value("value_reduction", value_reduction, ValueReduction)
         self.actor_network, self.critic_network = actor_network, critic_network
+        # Running statistics are shared: both networks see observations on the same scale at any time.
+        shared: Any = {
+            id(part): part for part in critic_network.modules() if isinstance(part, RunningMoments)
+        }
         # Under a name that `parameters()` leaves out.
-        self._target_critic = make_target(critic_network)
+        self._target_critic = copy.deepcopy(critic_network, memo=shared).requires_grad_(False)
         self.support_A, self.gamma, self.value_reduction = support_A, gamma, value_reduction
-        self.reduction = "mean"
+        self.reduction, self._selected = "mean", list[Any](self._written)
 
     @property
     def functional(self) -> bool:
@@ -158,13 +102,32 @@ class OffPolicyLoss(LossModule):
         return self._target_critic
 
     @property
+    def observation_keys(self) -> list[NestedKey]:
+        """What actor and critics observe, each key once."""
+        read = dict.fromkeys([*self.actor_network.in_keys, *self.critic_network.in_keys])
+        return [key for key in read if key != self.tensor_keys.action]
+
+    @property
     def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
         """What a minibatch must have."""
-        keys = self.tensor_keys
-        observed = [key for key in self.critic_network.in_keys if key != keys.action]
-        observed = list(dict.fromkeys([*self.actor_network.in_keys, *observed]))
+        keys, observed = self.tensor_keys, self.observation_keys
         following = [*observed, keys.reward, keys.terminated]
-        return [*observed, keys.action, *(_next(key) for key in following)]
+        return [*observed, keys.action, *(unravel_key(("next", key)) for key in following)]
+
+    @property
+    def out_keys(self) -> list[NestedKey]:  # type: ignore[override]
+        """What the forward returns, in the order of a call without a TensorDict; `select_out_keys` changes it."""
+        return self._selected
+
+    @out_keys.setter
+    def out_keys(self, keys: list[NestedKey]) -> None:
+        self._selected = keys
+
+    def reset_parameters_recursive(self) -> None:
+        """Draw the weights of the networks anew; targets begin as the critics do."""
+        for network in (self.actor_network, self.critic_network):
+            network.reset_parameters_recursive()
+        self.update_target_(1.0)
 
     def critic_loss(self, tensordict: TensorDictBase) -> tuple[Scalar, dict[str, Scalar]]:
         """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
@@ -174,20 +137,22 @@ class OffPolicyLoss(LossModule):
         """Return the losses of all else, each with gradients for its own network alone, and what is logged."""
         raise NotImplementedError
 
+    @dispatch  # type: ignore[arg-type]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return all losses, `loss_*`, and what is logged beside them, which is detached.
 
-        Args:
-            tensordict: a minibatch `["B"]` with the `in_keys`. Gets the absolute error of each env state as "td_error".
+        The minibatch `["B"]`, with the `in_keys`, gets the absolute error of each env state as "td_error".
         """
         loss_qvalue, logged = self.critic_loss(tensordict)
         losses, more = self.actor_losses(tensordict)
         detached = {name: value.detach() for name, value in (logged | more).items()}
         return TensorDict({"loss_qvalue": loss_qvalue, **losses, **detached})
 
+    @torch.no_grad()
     def update_target_(self, tau: float) -> None:
-        """Move the target critics by a share `tau` towards the critics."""
-        follow_(self._target_critic, self.critic_network, tau)
+        """Move the target critics by a share `tau` towards the critics, in a few kernels."""
+        target, network = self._target_critic, self.critic_network
+        torch._foreach_lerp_(list(target.parameters()), list(network.parameters()), tau)
 
     def _forward_value_estimator_keys(self, **_: NestedKey) -> None:
         """There is no value estimator."""
@@ -196,7 +161,8 @@ class OffPolicyLoss(LossModule):
         """Return what the N critics say of an action: values [B, N], or logits [B, N, A]."""
         keys = [key for key in critic.in_keys if key != self.tensor_keys.action]
         inputs = observed.select(*keys).set(self.tensor_keys.action, action)
-        return critic(inputs).get(critic.out_keys[0]).float()
+        out = critic(inputs).get(critic.out_keys[0])
+        return out.to(torch.promote_types(out.dtype, torch.float32))
 
     def _value(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         """Return the value of an action [B], which the actor climbs; no gradients reach the critics."""
@@ -260,25 +226,18 @@ class OffPolicyLoss(LossModule):
         return column_B.sum() / weight_B.sum().clamp_min(torch.finfo(torch.float32).tiny)
 
 
-def _next(key: NestedKey) -> tuple[str, ...]:
-    return ("next", key) if isinstance(key, str) else ("next", *key)  # type: ignore[misc]
-
-
 class SACLoss(OffPolicyLoss):
     """Soft actor-critic with a learned temperature (Haarnoja et al., arXiv 1812.05905), and FastSAC with a `support_A`.
 
     With values for critics and `value_reduction="min"` it has the losses and gradients of TorchRL's `SACLoss` with
     `loss_function="l2"`. All critics are evaluated in one batched product instead of a `vmap`, and may predict
-    distributions.
+    distributions. The temperature starts at `alpha_init` and aims at `target_entropy`, in nats.
 
     y = r + gamma^n (1 - terminated) (Q'(s', a') - alpha log p(a'|s')); `loss_actor` = mean(alpha log p(a|s) - Q(s, a));
     `loss_alpha` = -log_alpha * mean(log p(a|s) + target_entropy).
-
-    Args:
-        actor_network: probabilistic; it, critic_network and **options are those of `OffPolicyLoss`.
-        alpha_init: temperature at the start.
-        target_entropy: that the temperature aims at, in nats.
     """
+
+    _written = ("loss_qvalue", "loss_actor", "loss_alpha", "value", "td_error", "alpha", "entropy")
 
     def __init__(
         self,
@@ -328,13 +287,8 @@ class TD3Loss(OffPolicyLoss):
     """TD3 (Fujimoto et al., arXiv 1802.09477), and FastTD3 (Seo et al., arXiv 2505.22642) with a `support_A`.
 
     y = r + gamma^n (1 - terminated) Q'(s', clip(a(s') + clip(noise))); `loss_actor` = -mean(Q(s, a(s))). As in FastTD3,
-    a(s') is the present policy, not a slow copy of it.
-
-    Args:
-        actor_network: deterministic; it, critic_network and **options are those of `OffPolicyLoss`.
-        low_L, high_L: bounds of the actions.
-        target_noise, target_noise_clip: standard deviation and bound of the noise on a(s'), in units of half the range
-            of an action.
+    a(s') is the present policy, not a slow copy of it. `target_noise` and `target_noise_clip` are the standard
+    deviation and the bound of the noise, in units of half the range [low_L, high_L] of an action.
     """
 
     def __init__(

@@ -29,10 +29,9 @@ def kl_divergence(
 def gaussian_parameters(
     dist: Distribution,
 ) -> tuple[Float[Tensor, "*batch L"], Float[Tensor, "*batch L"]] | None:
-    """Return `loc` and `scale` of a distribution built on a gaussian (squashed ones included), else None.
+    """Return `loc` and `scale` of a distribution built on a gaussian, else None.
 
-    The divergence between two distributions that squash their samples in the same way is that of the
-    gaussians beneath them.
+    The divergence between two that squash their samples in the same way is that of the gaussians beneath them.
     """
     base = dist if hasattr(dist, "loc") else getattr(dist, "base_dist", dist)
     loc, scale = getattr(base, "loc", None), getattr(base, "scale", None)
@@ -54,10 +53,7 @@ def distribution_keys(actor: Any) -> list[NestedKey]:
 
 
 def observation_keys(actor: Any) -> list[NestedKey]:
-    """Return what an actor reads of an EnvState.
-
-    The `in_keys` of one with a `CompositeDistribution` also name the TensorDict of parameters that it writes itself.
-    """
+    """Return what an actor reads of an EnvState: its `in_keys` without the parameters that it writes itself."""
     return [key for key in actor.in_keys if key not in actor.dist_params_keys]
 
 
@@ -69,10 +65,7 @@ def stored_distribution(actor: Any, tensordict: TensorDictBase) -> Distribution 
 
 
 def policy_kl(old: Distribution, new: Distribution) -> Float[Tensor, "*batch"] | None:
-    """Return KL(old || new) in nats with the batch shape of the two, or None where no closed form is known.
-
-    The parts of a `CompositeDistribution` are independent: theirs add up.
-    """
+    """Return KL(old || new) in nats with the batch shape of the two, or None where no closed form is known."""
     if isinstance(old, CompositeDistribution) and isinstance(new, CompositeDistribution):
         parts = [policy_kl(part, new.dists[key]) for key, part in old.dists.items()]
         dims = len(old.batch_shape)

@@ -13,11 +13,10 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from ksim_rl.objectives.advantage_estimators import GAE, TDLambda, VTrace
+from ksim_rl.objectives.advantage_estimators import GAE, RolloutEstimator, TDLambda, VTrace
 from ksim_rl.objectives.algorithm_cfg import OnPolicyCfg, PPOCfg
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.gradient_step import StepGuard, adapt_learning_rate_, descend
-from ksim_rl.objectives.rollout_estimator import RolloutEstimator
 from ksim_rl.objectives.symmetry import Loss, SymmetricAugmentation, mirror_loss
 from ksim_rl.transforms import MirrorMap
 
@@ -34,8 +33,7 @@ def with_precision_of(cfg: PPOCfg, device: torch.device | str) -> PPOCfg:
 def in_precision(loss: Loss, precision: str, *, device: torch.device | str) -> Loss:
     """Return `loss` with its products in `precision`; the loss itself for "float32".
 
-    With "bfloat16" torch's autocast rounds what layers multiply to 8 significant bits. Parameters, their gradients,
-    sums and the losses stay float32.
+    With "bfloat16" torch's autocast rounds what layers multiply to 8 significant bits, and nothing else.
     """
     if precision == "float32":
         return loss
@@ -86,22 +84,15 @@ def make_symmetric(
     *,
     device: torch.device | str | None = None,
 ) -> Loss:
-    """Return `loss` with the symmetry that `cfg` asks for; the loss itself if it asks for none.
+    """Return `loss` with the symmetry that `cfg` asks for.
 
-    Args:
-        maps: the mirror image of all that the networks of `loss` read, and of "action".
-
-    Raises:
-        ValueError: if a map is missing.
+    Raises ValueError where `maps` lacks the mirror image of "action" or of what the networks of `loss` read.
     """
     if cfg.symmetry == "none":
         return loss
     actor: Any = loss.actor_network
-    read = dict.fromkeys([*actor.in_keys, *loss.critic_network.in_keys, "action"])
-    missing = [key for key in read if key not in (maps or {})]
-    if missing:
-        raise ValueError(f"symmetry={cfg.symmetry!r} needs the mirror image of {missing}: add it to the maps")
-    mirror = SymmetricAugmentation(maps or {}, device=device)
+    read = [*actor.in_keys, *loss.critic_network.in_keys]
+    mirror = SymmetricAugmentation.of(maps, read=read, symmetry=cfg.symmetry, device=device)
     if cfg.symmetry == "augment":
         return lambda minibatch_B: loss(mirror(minibatch_B))
 
@@ -122,16 +113,10 @@ def ppo_step(
 ) -> dict[str, Float[Tensor, ""]]:
     """Make one gradient step on a minibatch. Makes no host sync and can be captured in a CUDA graph.
 
-    With the adaptive schedule the learning rate is changed before the step, as in rsl_rl. A step whose loss
-    or gradient is not finite changes no parameter, moment or step count of the optimizer.
-
-    Args:
-        loss: any callable that returns `loss_*` and, for the adaptive schedule, `kl`.
-        optimizer: from `make_optimizer`; another one must be fused, with a tensor as learning rate.
-
-    Returns:
-        The tensors that the loss returns, detached, and `loss`, `grad_norm` (before clipping), `learning_rate` (of this
-        step), `skipped` (0 or 1).
+    With the adaptive schedule the learning rate is changed before the step, as in rsl_rl, by the `kl` that the loss
+    returns beside its `loss_*`. A step whose loss or gradient is not finite changes no parameter, moment or step count
+    of the optimizer, which must be fused, with a tensor as learning rate. Returned are the tensors that the loss
+    returns, detached, and `loss`, `grad_norm` (before clipping), `learning_rate` (of this step), `skipped` (0 or 1).
     """
     losses = loss(minibatch_B)
     total = reduce(add, [value for name, value in losses.items() if name.startswith("loss_")])

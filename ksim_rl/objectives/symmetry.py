@@ -1,6 +1,6 @@
 """This module learns from mirror images: for robots that are their own, by mirrored samples or by a loss."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import torch
 from jaxtyping import Float
@@ -22,14 +22,8 @@ class SymmetricAugmentation:
 
     The image of an env state has the mirrored observations, action and distribution of the policy that collected it;
     advantage, value target, state value and log-probability are those of the env state, as they are the same in the
-    mirror: there another policy collected, which is the image of the one that did. Makes no host sync.
-
-    Args:
-        maps: by key, of all observations that the networks read, and of "action".
-        device: of the minibatches.
-
-    Raises:
-        ValueError: if `maps` has no "action".
+    mirror: there another policy collected, which is the image of the one that did. `maps` has, by key, all observations
+    that the networks read, and "action". Makes no host sync.
     """
 
     def __init__(
@@ -43,6 +37,24 @@ class SymmetricAugmentation:
         self._images["loc"] = (source_L, signs_L)
         self._images["scale"] = (source_L, torch.ones_like(signs_L))
 
+    @classmethod
+    def of(
+        cls,
+        maps: Mapping[NestedKey, MirrorMap] | None,
+        *,
+        read: Iterable[NestedKey],
+        symmetry: str = "augment",
+        device: torch.device | str | None = None,
+    ) -> "SymmetricAugmentation":
+        """Return the one for networks that read these keys.
+
+        Raises ValueError where `maps` lacks the mirror image of "action" or of what the networks read.
+        """
+        missing = [key for key in dict.fromkeys([*read, "action"]) if key not in (maps or {})]
+        if missing:
+            raise ValueError(f"symmetry={symmetry!r} needs the mirror image of {missing}: add it to the maps")
+        return cls(maps or {}, device=device)
+
     def image_of(self, key: NestedKey, leaf_BL: Float[Tensor, "B L"]) -> Float[Tensor, "B L"]:
         """Return the mirror image of vectors of a kind that has a map."""
         return image(leaf_BL, *self._images[key])
@@ -55,6 +67,16 @@ class SymmetricAugmentation:
             if leaf_BL is not None:
                 reflected_B.set(key, self.image_of(key, leaf_BL))
         return reflected_B
+
+    def reflect_every_second_(self, minibatch_B: TensorDictBase) -> None:
+        """Replace every second env state, and what follows it under "next", by its mirror image."""
+        order_B = torch.arange(minibatch_B.batch_size[0], device=minibatch_B.device)
+        reflected_B1 = (order_B % 2 == 1)[:, None]
+        for part_B in (minibatch_B, minibatch_B.get("next")):
+            for key in self._images:
+                leaf_BL = part_B.get(key, None)
+                if leaf_BL is not None:
+                    part_B.set(key, torch.where(reflected_B1, self.image_of(key, leaf_BL), leaf_BL))
 
     def __call__(self, minibatch_B: TensorDictBase) -> TensorDictBase:
         """Return `minibatch_B` and its image, `["B"]` with twice the size; the first half is the minibatch."""
@@ -75,9 +97,6 @@ def mirror_loss(
 
     The mean is over env states and actions, in squared units of the action; pi is the mean of the policy's gaussian,
     and the gradient flows through both. (Yu et al. sum over actions.) Masked env states are left out.
-
-    Raises:
-        ValueError: if the actor's distribution is not a gaussian or made of one.
     """
     # One pass of the network for both.
     dist = actor.get_dist(mirror(minibatch_B.select(*actor.in_keys)))

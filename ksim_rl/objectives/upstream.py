@@ -18,7 +18,7 @@ INHERITED: dict[type, dict[str, tuple[str, str]]] = {
     objectives.ClipPPOLoss: {
         "_log_weight": (
             "self tensordict adv_shape",
-            "the log ratios, for all distributions and proximal policies",
+            "log ratios, for all distributions and proximal policies",
         ),
         "_maybe_normalize_advantage": (
             "self advantage tensordict update_norm",
@@ -29,10 +29,7 @@ INHERITED: dict[type, dict[str, tuple[str, str]]] = {
             "self target_return state_value old_state_value",
             "overridden: sequences [B, T]",
         ),
-        "_get_entropy": (
-            "self dist adv_shape",
-            "overridden: the stock one asks the host whether it is finite",
-        ),
+        "_get_entropy": ("self dist adv_shape", "overridden: the stock one asks the host"),
         "_weighted_loss_entropy": ("self entropy", "the entropy coefficients of several actions"),
         "_reduce_loss": ("self loss tensordict mask reduction weights", "reductions other than the mean"),
         "_clear_weakrefs": ("self tds", "frees functional parameters as the stock forward does"),

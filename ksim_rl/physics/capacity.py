@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from ksim_rl.physics.load import caught_warnings, model_bytes
+from ksim_rl.physics.load import caught_warnings
+from ksim_rl.physics.model_checks import model_bytes
 from ksim_rl.physics.sim_cfg import SimCfg
 
 # On what the probe saw: half as much again for rows and contacts; less for candidate pairs, which all worlds share.
@@ -31,18 +32,19 @@ def capacities(
     """Return (njmax, nconmax) per world: those of `sim`, or the probe's where they are None."""
     if sim.njmax is not None and sim.nconmax is not None:
         return sim.njmax, sim.nconmax
-    if "dof_frictionloss" in per_world_fields:
+    if {"dof_frictionloss", "tendon_frictionloss"} & set(per_world_fields):
         mj_model = _with_dry_friction(mj_model)
     njmax, nconmax = probe(mj_model)
     return sim.njmax or njmax, sim.nconmax or nconmax
 
 
 def _with_dry_friction(mj_model: mujoco.MjModel) -> mujoco.MjModel:
-    """Return the model with some dry friction in each hinge and slide, which is a constraint row each."""
+    """Return the model with some dry friction in each hinge, slide and tendon, which is a constraint row each."""
     rubbing = copy.copy(mj_model)
     kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     scalar = np.isin(mj_model.jnt_type[mj_model.dof_jntid], kinds)
     rubbing.dof_frictionloss[scalar & (rubbing.dof_frictionloss == 0.0)] = 1e-3
+    rubbing.tendon_frictionloss[rubbing.tendon_frictionloss == 0.0] = 1e-3
     return rubbing
 
 

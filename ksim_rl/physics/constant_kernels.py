@@ -4,6 +4,8 @@ The joint-space inertia is factored as M = L^T D L over the tree of dofs (Feathe
 Algorithms", 2008, section 6.5), and L is inverted row by row. Then J M^-1 J^T = sum_k (J L^-1)_k^2 / D_k for each
 Jacobian row, with no further solve. One matrix [nv, nv] per world holds D on its diagonal, L below and L^-1 above
 (transposed); entries of dofs that are not on one chain stay zero.
+
+Few worlds reset at a time, so that what counts is how long one takes: the lanes of a warp share its work.
 """
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
@@ -19,14 +21,17 @@ from ksim_rl.physics.structs import struct_with
 FREE = wp.constant(int(mujoco.mjtJoint.mjJNT_FREE))
 BALL = wp.constant(int(mujoco.mjtJoint.mjJNT_BALL))
 MINVAL = wp.constant(float(mujoco.mjMINVAL))
+KIN0 = wp.constant(int(mjw.SetConstGroup.KIN0))
+INERT0 = wp.constant(int(mjw.SetConstGroup.INERT0))
 
 
 @struct_with(
     (
         "",
         mjw.Model,
-        "nbody nv qpos0 body_parentid body_jntnum body_jntadr body_subtreenum body_pos body_quat body_mass "
-        "body_inertia body_ipos body_iquat body_invweight0 jnt_type jnt_qposadr jnt_dofadr jnt_pos jnt_axis "
+        "nbody nv ncam nlight qpos0 body_parentid body_jntnum body_jntadr body_subtreenum body_pos body_quat body_mass "
+        "body_inertia body_ipos body_iquat body_subtreemass body_invweight0 "
+        "jnt_type jnt_qposadr jnt_dofadr jnt_pos jnt_axis "
         "dof_bodyid dof_parentid dof_armature dof_invweight0 actuator_armature actuator_gear actuator_acc0 "
         "cam_bodyid cam_targetbodyid cam_pos cam_quat cam_pos0 cam_poscom0 cam_mat0 light_bodyid "
         "light_targetbodyid light_pos light_dir light_pos0 light_poscom0 light_dir0",
@@ -36,6 +41,7 @@ class Constants:
     """What the kernels read of a model and write into it, and their own memory; `axis` and `anchor` are per dof."""
 
     mask: wp.array[bool]
+    sums_masses: bool
     num_actuators: int
     dof_rotates: wp.array[float]
     group_start: wp.array[int]
@@ -136,12 +142,14 @@ def frames(c: Constants):
         c.xquat[world, body] = wp.normalize(quat)
 
 
-@wp.kernel(enable_backward=False)
-def inertias(c: Constants):
-    """Each body's centre of mass, and its inertia about that, in the world frame."""
-    world, body = wp.tid()
-    if not c.mask[world]:
-        return
+@wp.func
+def _add_up_body(world: int, body: int, c: Constants):
+    """The mass of all that hangs on a body, its centre of mass, and its inertia about that, in the world frame."""
+    mass = float(0.0)  # noqa: UP018 (Warp: a variable that changes in a loop)
+    for other in range(body, body + c.body_subtreenum[body]):
+        mass += c.body_mass[world % c.body_mass.shape[0], other]
+    if c.sums_masses:
+        c.body_subtreemass[world, body] = mass
     frame = world % c.xpos.shape[0]
     turn = c.xquat[frame, body]
     c.xipos[world, body] = c.xpos[frame, body] + _rotate(
@@ -152,12 +160,9 @@ def inertias(c: Constants):
     c.inertia[world, body] = axes @ wp.diag(moments) @ wp.transpose(axes)
 
 
-@wp.kernel(enable_backward=False)
-def mass_matrix(c: Constants):
+@wp.func
+def _mass_matrix_row(world: int, dof: int, c: Constants):
     """Row `dof` of M: what the momentum of its subtree, moved at unit speed, is along the dofs of its chain."""
-    world, dof = wp.tid()
-    if not c.mask[world]:
-        return
     frame = world % c.axis.shape[0]
     first = c.dof_bodyid[dof]
     point = c.xipos[world, first]
@@ -187,32 +192,50 @@ def mass_matrix(c: Constants):
         other = c.dof_parentid[other]
 
 
-@wp.kernel(enable_backward=False)
-def factorize(c: Constants):
-    """M = L^T D L, in place, from the leaves to the root."""
-    world = wp.tid()
-    if not c.mask[world]:
-        return
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+__syncthreads();
+#endif
+""")
+def _wait_for_all() -> None:
+    """Let the lanes of a world see what all have written."""
+
+
+@wp.func
+def _ancestor(dof: int, steps: int, c: Constants) -> int:
+    """Return the dof that is so many steps closer to the root, -1 beyond it."""
+    found = int(dof)
+    for _ in range(steps):
+        if found >= 0:
+            found = c.dof_parentid[found]
+    return found
+
+
+@wp.func
+def _factorize(world: int, lane: int, lanes: int, c: Constants):
+    """M = L^T D L, in place, from the leaves to the root; each lane has some ancestors of a dof."""
     for step in range(c.nv):
         k = c.nv - 1 - step
         inverse = 1.0 / c.factor[world, k, k]
-        i = c.dof_parentid[k]
+        i = _ancestor(k, lane + 1, c)
         while i >= 0:
             ratio = c.factor[world, k, i] * inverse
-            j = i
+            j = int(i)
             while j >= 0:
                 c.factor[world, i, j] = c.factor[world, i, j] - ratio * c.factor[world, k, j]
                 j = c.dof_parentid[j]
-            c.factor[world, k, i] = ratio
-            i = c.dof_parentid[i]
+            i = _ancestor(i, lanes, c)
+        _wait_for_all()
+        i = _ancestor(k, lane + 1, c)
+        while i >= 0:
+            c.factor[world, k, i] = c.factor[world, k, i] * inverse
+            i = _ancestor(i, lanes, c)
+    _wait_for_all()
 
 
-@wp.kernel(enable_backward=False)
-def invert(c: Constants):
+@wp.func
+def _invert_row(world: int, dof: int, c: Constants):
     """Row `dof` of X = L^-1, from X L = 1; X[dof, k] is kept at [k, dof]."""
-    world, dof = wp.tid()
-    if not c.mask[world]:
-        return
     k = c.dof_parentid[dof]
     while k >= 0:
         total = float(c.factor[world, dof, k])
@@ -224,13 +247,10 @@ def invert(c: Constants):
         k = c.dof_parentid[k]
 
 
-@wp.kernel(enable_backward=False)
-def dof_invweights(c: Constants):
+@wp.func
+def _dof_invweight(world: int, dof: int, c: Constants):
     """Diagonal of M^-1, averaged over the translations and over the rotations of one joint."""
-    world, dof = wp.tid()
-    if not c.mask[world]:
-        return
-    total = float(0.0)  # noqa: UP018 (Warp: a variable that changes in a loop)
+    total = float(0.0)  # noqa: UP018
     for member in range(c.group_start[dof], c.group_start[dof] + c.group_size[dof]):
         total += 1.0 / c.factor[world, member, member]
         k = c.dof_parentid[member]
@@ -240,12 +260,9 @@ def dof_invweights(c: Constants):
     c.dof_invweight0[world % c.dof_invweight0.shape[0], dof] = total / float(c.group_size[dof])
 
 
-@wp.kernel(enable_backward=False)
-def body_invweights(c: Constants):
+@wp.func
+def _body_invweight(world: int, body: int, c: Constants):
     """Mean diagonal of J M^-1 J^T at each centre of mass: translation, rotation."""
-    world, body = wp.tid()
-    if not c.mask[world]:
-        return
     frame = world % c.axis.shape[0]
     point = c.xipos[world, body]
     moved = float(0.0)  # noqa: UP018
@@ -265,22 +282,13 @@ def body_invweights(c: Constants):
         moved += wp.dot(linear, linear) / c.factor[world, k, k]
         turned += wp.dot(angular, angular) / c.factor[world, k, k]
         k = c.dof_parentid[k]
-    translation = moved / 3.0
-    rotation = turned / 3.0
-    # A body that can only slide, or only turn, takes the other figure, as in mujoco_warp.set_const.
-    if translation < MINVAL:
-        translation = rotation
-    elif rotation < MINVAL:
-        rotation = translation
-    c.body_invweight0[world % c.body_invweight0.shape[0], body] = wp.vec2(translation, rotation)
+    # As in C: a body that only slides has 0 for rotation, where mujoco_warp.set_const takes the other figure.
+    c.body_invweight0[world % c.body_invweight0.shape[0], body] = wp.vec2(moved / 3.0, turned / 3.0)
 
 
-@wp.kernel(enable_backward=False)
-def actuator_accelerations(c: Constants):
+@wp.func
+def _actuator_acceleration(world: int, actuator: int, c: Constants):
     """Norm of the acceleration from unit force: of column `actuator_dof` of M^-1, times the gear."""
-    world, actuator = wp.tid()
-    if not c.mask[world]:
-        return
     dof = c.actuator_dof[actuator]
     total = float(0.0)  # noqa: UP018
     for other in range(c.nv):
@@ -324,12 +332,9 @@ def _references(world: int, body: int, target: int, pos: wp.vec3, c: Constants):
     return offset, c.xpos[frame, body] + offset - _subtree_com(world, tracked, c)
 
 
-@wp.kernel(enable_backward=False)
-def camera_references(c: Constants):
+@wp.func
+def _camera_reference(world: int, camera: int, c: Constants):
     """Where cameras are at `qpos0`: from their body, and from the centre of mass that they track."""
-    world, camera = wp.tid()
-    if not c.mask[world]:
-        return
     body = c.cam_bodyid[camera]
     pos = c.cam_pos[world % c.cam_pos.shape[0], camera]
     offset, from_com = _references(world, body, c.cam_targetbodyid[camera], pos, c)
@@ -341,12 +346,9 @@ def camera_references(c: Constants):
     )
 
 
-@wp.kernel(enable_backward=False)
-def light_references(c: Constants):
+@wp.func
+def _light_reference(world: int, light: int, c: Constants):
     """Where lights are at `qpos0`: from their body, and from the centre of mass that they track."""
-    world, light = wp.tid()
-    if not c.mask[world]:
-        return
     body = c.light_bodyid[light]
     pos = c.light_pos[world % c.light_pos.shape[0], light]
     offset, from_com = _references(world, body, c.light_targetbodyid[light], pos, c)
@@ -356,3 +358,34 @@ def light_references(c: Constants):
     c.light_pos0[world % c.light_pos0.shape[0], light] = offset
     c.light_poscom0[world % c.light_poscom0.shape[0], light] = from_com
     c.light_dir0[world % c.light_dir0.shape[0], light] = wp.normalize(direction)
+
+
+@wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+def constants_at_qpos0(c: Constants, groups: int, lanes: int):
+    """Recompute the constants of `groups` in the worlds of the mask; launch it over (worlds, lanes)."""
+    world, lane = wp.tid()
+    if not c.mask[world]:
+        return
+    for body in range(lane, c.nbody, lanes):
+        _add_up_body(world, body, c)
+    _wait_for_all()
+    if groups & KIN0:
+        for camera in range(lane, c.ncam, lanes):
+            _camera_reference(world, camera, c)
+        for light in range(lane, c.nlight, lanes):
+            _light_reference(world, light, c)
+    if groups & INERT0 == 0:
+        return
+    for dof in range(lane, c.nv, lanes):
+        _mass_matrix_row(world, dof, c)
+    _wait_for_all()
+    _factorize(world, lane, lanes, c)
+    for dof in range(lane, c.nv, lanes):
+        _invert_row(world, dof, c)
+    _wait_for_all()
+    for dof in range(lane, c.nv, lanes):
+        _dof_invweight(world, dof, c)
+    for body in range(lane, c.nbody, lanes):
+        _body_invweight(world, body, c)
+    for actuator in range(lane, c.actuator_dof.shape[0], lanes):
+        _actuator_acceleration(world, actuator, c)

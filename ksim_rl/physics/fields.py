@@ -44,11 +44,7 @@ def derived_fields(groups: int) -> tuple[str, ...]:
 
 
 def fields_to_expand(fields: Sequence[str]) -> tuple[str, ...]:
-    """Return `fields` and, after them, the fields that are derived from them and so must differ as well.
-
-    Raises:
-        ValueError: naming a field that cannot differ between worlds, and the near names.
-    """
+    """Return `fields` and, after them, the fields that are derived from them and so must differ as well."""
     if isinstance(fields, str):
         raise ValueError(f"per_world_fields={fields!r}: expected a sequence of names, such as ({fields!r},)")
     valid = per_world_fields()

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import mujoco
-import numpy as np
 import warp as wp
 
 from ksim_rl.checks import near
 from ksim_rl.device.streams import start_warp
 from ksim_rl.physics.model_checks import check_finite, warp_model_of
+from ksim_rl.physics.sim_cfg import SimCfg
 
 SUFFIXES = (".xml", ".mjcf", ".urdf")
 Source = str | Path | mujoco.MjSpec
@@ -24,34 +24,29 @@ _NAMED_ELEMENT = re.compile(r"Element name '(?P<name>[^']*)', id (?P<id>-?\d+)(,
 _FILE_IN_MESSAGE = re.compile(r"file '(?P<file>[^']+)'")
 _SINGULAR = re.compile(r"Inertia matrix is too close to singular.* DOF (?P<dof>\d+)")
 _NAN_ATTRIBUTE = re.compile(r"=\s*[\"'][^\"']*\b[nN][aA][nN]\b")
+_PREFIXES = re.compile(r"^(XML Error: )?(Error: )?(ParseXML: )?")
 _LINE = re.compile(r"[Ll]ine number=(?P<line>\d+)")
 
 
 def load_spec(source: Source) -> mujoco.MjSpec:
     """Parse a model into an editable spec.
 
-    Args:
-        source: a path to an MJCF or URDF file, an XML string, a spec (which is copied), or a menagerie name such as
-            "unitree_go1" or "unitree_go1/go1".
-
-    Raises:
-        ValueError: naming the file and the element.
+    The source is the path of an MJCF or URDF file, an XML string, a spec (which is copied), or a menagerie name such as
+    "unitree_go1" or "unitree_go1/go1". Errors name the file and the element.
     """
     spec, _, label, caught = _parsed(source)
     _pass_on(caught, label)
     return spec
 
 
-def load_model(source: Source) -> mujoco.MjModel:
-    """Compile a model, and check that its numbers are finite and that MuJoCo Warp can simulate it.
+def load_model(source: Source, sim: SimCfg | None = None) -> mujoco.MjModel:
+    """Compile what `load_spec` parses, and check that its numbers are finite and MuJoCo Warp can simulate it.
 
-    Args:
-        source: as in `load_spec`.
-
-    Raises:
-        ValueError: naming the file and the element, the field and its value, or the unsupported feature.
+    Settings of `sim` are laid over its own first, such as a solver that MuJoCo Warp has.
     """
     spec, text, label, caught = _parsed(source)
+    if sim is not None:
+        sim.apply_to(spec)
     with caught_warnings() as caught_later:
         try:
             mj_model = spec.compile()
@@ -118,9 +113,7 @@ def _read(source: str | Path) -> tuple[Path | None, str, str]:
 def _readable(message: str, label: str, text: str) -> str:
     """Put MuJoCo's message on one line, with the source and the element."""
     message = message.strip()
-    what = (
-        message.splitlines()[0].removeprefix("XML Error: ").removeprefix("Error: ").removeprefix("ParseXML: ")
-    )
+    what = _PREFIXES.sub("", message.splitlines()[0])
     if message.startswith("XML parse error"):
         line = _LINE.search(message)
         number = int(line["line"]) if line else 0
@@ -185,15 +178,10 @@ def model_path(name: str) -> Path:
 
     Looks under the folder that the environment variable MENAGERIE_ROOT names, else in the cache of the package
     `mujoco-menagerie`, which downloads a robot on first use.
-
-    Raises:
-        ValueError: in one line, what is missing and how to get it with and without a network.
     """
     robot, _, entry = name.partition("/")
     root = os.environ.get("MENAGERIE_ROOT")
-    if root:
-        return _in_folder(Path(root), robot, entry)
-    return _from_package(robot, entry)
+    return _in_folder(Path(root), robot, entry) if root else _from_package(robot, entry)
 
 
 def _in_folder(root: Path, robot: str, entry: str) -> Path:
@@ -228,10 +216,3 @@ def _from_package(robot: str, entry: str) -> Path:
             f"menagerie model {robot!r} could not be downloaded ({error}): with a network, try again; without one, "
             "copy its folder from github.com/google-deepmind/mujoco_menagerie and set MENAGERIE_ROOT to its parent"
         ) from None
-
-
-def model_bytes(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Return a model in MuJoCo's binary format, uint8."""
-    data = np.empty(mujoco.mj_sizeModel(mj_model), dtype=np.uint8)
-    mujoco.mj_saveModel(mj_model, None, data)
-    return data

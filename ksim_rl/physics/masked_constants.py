@@ -1,7 +1,7 @@
 """This module recomputes the constants that follow from model fields in some worlds only, as a reset needs it.
 
-`mujoco_warp.set_const` recomputes all worlds, with one solve per dof and six per body: hundreds of launches. Here the
-work is a handful of launches, and worlds outside of the mask cost an early return.
+`mujoco_warp.set_const` recomputes all worlds, with one solve per dof and six per body: hundreds of launches. Here it is
+one launch, and worlds outside of the mask cost an early return.
 """
 
 from collections.abc import Iterable
@@ -14,12 +14,14 @@ import warp as wp
 from ksim_rl.physics import constant_kernels as kernels
 from ksim_rl.physics.fields import FIXED, INERT0, KIN0, const_groups
 from ksim_rl.physics.structs import filled
+from ksim_rl.physics.substeps import BODY_EQUALITIES
 from ksim_rl.physics.upstream import set_fixed_constants
 
 KINEMATIC = frozenset(("qpos0", "body_pos", "body_quat", "jnt_pos", "jnt_axis"))
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+LANES = 32
+"""Threads that share the work of one world on a GPU: a warp."""
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-_BODY_EQUALITIES = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 
 
 class MaskedConstants:
@@ -32,9 +34,10 @@ class MaskedConstants:
         self, mj_model: mujoco.MjModel, warp_model: mjw.Model, mask: wp.array, expanded: Iterable[str]
     ) -> None:
         self._warp_model = warp_model
-        self._moves = KINEMATIC & set(expanded)
+        self._moves, self._resizes = KINEMATIC & set(expanded), "geom_size" in expanded
+        self._lanes = LANES if mask.device.is_cuda else 1
         self._inert = not mj_model.ntendon and not mj_model.nflex and _drives_scalar_joints(mj_model)
-        self._ties_bodies = bool(np.isin(mj_model.eq_type, _BODY_EQUALITIES).any()) or mj_model.ntendon > 0
+        self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any()) or mj_model.ntendon > 0
         has_armature = "actuator_armature" in expanded or np.any(mj_model.actuator_armature)
         self._num_envs = num_envs = mask.shape[0]
         nbody, nv = mj_model.nbody, mj_model.nv
@@ -43,6 +46,7 @@ class MaskedConstants:
         num_frames = num_envs if self._moves else 1
         own = {
             "mask": wp.full(num_frames, True, dtype=bool),
+            "sums_masses": "body_subtreemass" in expanded,
             "num_actuators": mj_model.nu if has_armature else 0,
             "dof_rotates": wp.array(_rotates(mj_model), dtype=float),
             "group_start": wp.array(starts, dtype=int),
@@ -62,11 +66,7 @@ class MaskedConstants:
         self._constants.mask = mask
 
     def covers(self, fields: Iterable[str]) -> bool:
-        """Return whether the constants that follow from `fields` can be recomputed here.
-
-        Not for models with tendons or flexes or with actuators on anything but hinges and slides (where inertia
-        matters), nor for moved frames of bodies that equality constraints tie.
-        """
+        """Return whether the constants that follow from `fields` can be recomputed here, as `World.set_const` says."""
         fields = set(fields)
         groups = const_groups(fields)
         moves = bool(fields & (KINEMATIC | {"eq_data"}))
@@ -74,28 +74,19 @@ class MaskedConstants:
 
     def launch(self, groups: int) -> None:
         """Launch what recomputes the constants of `groups` in the rows of the mask."""
-        m = self._warp_model
-        if groups & FIXED:
+        if groups & FIXED and self._resizes:
             # Cheap, and the same bits again in rows whose fields did not change.
-            set_fixed_constants(m)
+            set_fixed_constants(self._warp_model)
         if not groups & (KIN0 | INERT0):
             return
         if self._moves:
-            self._launch(kernels.frames)
-        self._launch(kernels.inertias, m.nbody)
-        if groups & KIN0:
-            self._launch(kernels.camera_references, m.ncam)
-            self._launch(kernels.light_references, m.nlight)
-        if groups & INERT0 and m.nv:
-            self._launch(kernels.mass_matrix, m.nv)
-            self._launch(kernels.factorize)
-            self._launch(kernels.invert, m.nv)
-            self._launch(kernels.dof_invweights, m.nv)
-            self._launch(kernels.body_invweights, m.nbody)
-            self._launch(kernels.actuator_accelerations, self._constants.actuator_dof.shape[0])
-
-    def _launch(self, kernel: wp.Kernel, *width: int) -> None:
-        wp.launch(kernel, dim=(self._num_envs, *width), inputs=[self._constants])
+            wp.launch(kernels.frames, dim=self._num_envs, inputs=[self._constants])
+        wp.launch(
+            kernels.constants_at_qpos0,
+            dim=(self._num_envs, self._lanes),
+            inputs=[self._constants, groups, self._lanes],
+            block_dim=self._lanes,
+        )
 
 
 def _drives_scalar_joints(mj_model: mujoco.MjModel) -> bool:

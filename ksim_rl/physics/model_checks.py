@@ -25,11 +25,7 @@ ENUM_FIELDS = {
 
 
 def check_finite(mj_model: mujoco.MjModel, source: str) -> None:
-    """Refuse a model with a number that is NaN, infinite, or too large for float32.
-
-    Raises:
-        ValueError: naming the source, the field, its value, and the element that has it.
-    """
+    """Refuse a model with a number that is NaN, infinite, or too large for float32."""
     for field, values in _float_fields(mj_model):
         flat = np.asarray(values, dtype=np.float64).reshape(-1)
         bad = np.flatnonzero(~(np.abs(flat) <= LARGEST))
@@ -41,11 +37,7 @@ def check_finite(mj_model: mujoco.MjModel, source: str) -> None:
 
 
 def warp_model_of(mj_model: mujoco.MjModel, batch_sizes: dict[str, int] | None = None) -> mjw.Model:
-    """Put a model on Warp's current device.
-
-    Raises:
-        ValueError: naming the feature that MuJoCo Warp does not have, and what to do.
-    """
+    """Put a model on Warp's current device, or name the feature that MuJoCo Warp does not have."""
     try:
         with warnings.catch_warnings():
             # It doubts friction of geoms without contacts; MuJoCo itself accepts them.
@@ -58,11 +50,7 @@ def warp_model_of(mj_model: mujoco.MjModel, batch_sizes: dict[str, int] | None =
 
 
 def check_not_simple(mj_model: mujoco.MjModel, per_world_fields: Iterable[str]) -> None:
-    """Refuse moving centres of mass of bodies whose inertia was compiled as diagonal: Warp would keep it so.
-
-    Raises:
-        ValueError: naming the body and the fix.
-    """
+    """Refuse moving centres of mass of bodies whose inertia was compiled as diagonal: Warp would keep it so."""
     moving = sorted({"body_ipos", "body_iquat"} & set(per_world_fields))
     simple = np.flatnonzero(mj_model.body_simple[1:]) + 1
     if moving and simple.size:
@@ -117,16 +105,22 @@ def _with_elements(mj_model: mujoco.MjModel, message: str) -> str:
             if enum(int(value)).name in message:
                 users.append(_element(mj_model, field.split("_")[0], row))
     if "Actuator plugin" in message:
-        users += [
-            _element(mj_model, "actuator", int(i)) for i in np.flatnonzero(mj_model.actuator_plugin != -1)
-        ]
-    for enum in (
-        mujoco.mjtIntegrator,
-        mujoco.mjtCone,
-        mujoco.mjtSolver,
-        mujoco.mjtDisableBit,
-        mujoco.mjtEnableBit,
-    ):
-        users += ["<option>" for member in enum.__members__ if member in message]
+        plugins = np.flatnonzero(mj_model.actuator_plugin != -1)
+        users += [_element(mj_model, "actuator", int(i)) for i in plugins]
+    for name in ("Integrator", "Cone", "Solver", "DisableBit", "EnableBit"):
+        users += ["<option>" for member in getattr(mujoco, f"mjt{name}").__members__ if member in message]
     used_by = f" Used by {', '.join(users[:5])}." if users else ""
-    return f"{message.rstrip('.')}.{used_by} Remove it from the model, or replace it by a supported feature."
+    remedy = "Remove it from the model, or replace it by a supported feature."
+    if "mjSOL_" in message:
+        remedy = (
+            "Lay a supported solver over it: load_model(..., sim=SimCfg(solver='newton')), or task.sim.solver=newton "
+            "for an env."
+        )
+    return f"{message.rstrip('.')}.{used_by} {remedy}"
+
+
+def model_bytes(mj_model: mujoco.MjModel) -> np.ndarray:
+    """Return a model in MuJoCo's binary format, uint8."""
+    data = np.empty(mujoco.mj_sizeModel(mj_model), dtype=np.uint8)
+    mujoco.mj_saveModel(mj_model, None, data)
+    return data

@@ -22,14 +22,9 @@ BIT_NAMES = tuple(name for name, bit in mjw.OverflowType.__members__.items() if 
 class OverflowReport:
     """What the physics needed since the last report, beside what it has.
 
-    Args:
-        worlds: number of worlds that raised each overflow bit.
-        nefc: most constraint rows of any world, in any substep.
-        njmax: rows that each world has.
-        ncon: most contacts or candidate pairs in the pool of all worlds, in any substep.
-        naconmax: places in that pool.
-        num_envs: number of worlds.
-        messages: one line for each kind of loss, naming the needed and the present value. Empty: nothing was lost.
+    `worlds` counts those that raised each overflow bit. Of all substeps, `nefc` is the most constraint rows of any
+    world, which has `njmax`, and `ncon` the most contacts or candidate pairs in the pool of all worlds, which has
+    `naconmax` places. There is a message for each kind of loss, naming the needed and the present value.
     """
 
     worlds: dict[str, int]

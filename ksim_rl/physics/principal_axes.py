@@ -47,11 +47,9 @@ def _jacobi(matrices: wp.array[wp.mat33], moments: wp.array[wp.vec3], quats: wp.
 def principal_axes(
     inertia_33: Float32[Tensor, "*batch 3 3"],
 ) -> tuple[Float32[Tensor, "*batch 3"], Float32[Tensor, "*batch 4"]]:
-    """Diagonalize symmetric matrices by cyclic Jacobi rotations (Golub and Van Loan, section 8.5).
+    """Return principal moments, and the axes' orientation (w, x, y, z); a diagonal matrix keeps its order and axes.
 
-    Returns:
-        The principal moments, and the orientation of their axes, a unit quaternion (w, x, y, z). A diagonal matrix
-        keeps its order and its axes.
+    By cyclic Jacobi rotations (Golub and Van Loan, section 8.5).
     """
     matrices = inertia_33.reshape(-1, 3, 3).contiguous()
     moments, quats = matrices.new_empty(matrices.shape[0], 3), matrices.new_empty(matrices.shape[0], 4)

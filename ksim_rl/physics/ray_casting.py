@@ -18,19 +18,15 @@ Groups = wp.types.vector(length=mujoco.mjNGROUP, dtype=wp.float32)
 
 
 class RayBatch:
-    """N rays per world, with their places in memory: write `start_EN3` and `direction_EN3`, then `cast`.
+    """N rays per world: write `start_EN3` (m) and `direction_EN3` (unit vectors), both in the world frame, then `cast`.
 
-    Args:
-        world: the worlds; `refresh` must have run since their state changed.
-        num_rays: N.
-        geom_groups: which of MuJoCo's geom groups rays hit.
-        exclude_body: id of a body whose geoms no ray hits, or -1.
+    `refresh` must have run since the state changed. Rays hit geoms of MuJoCo's `geom_groups`, other than those of the
+    body with the id `exclude_body`.
 
     Attributes:
-        start_EN3, direction_EN3: where rays start, m, and their unit directions, world frame, float32 [E, N, 3].
-        distance_EN: m to the first geom that is hit, -1 for none, float32 [E, N]; after `cast`.
-        geom_EN: its id, -1 for none, int32 [E, N].
-        normal_EN3: unit normal of its surface there, world frame, float32 [E, N, 3].
+        distance_EN: m to the first geom that is hit, -1 for none, float32.
+        geom_EN: its id, -1 for none, int32.
+        normal_EN3: unit normal of its surface there, world frame, float32.
     """
 
     def __init__(
@@ -53,33 +49,15 @@ class RayBatch:
         self._world.launch(self, self._launch)
 
     def _launch(self) -> None:
-        mjw.rays(
-            self._world.warp_model,
-            self._world.warp_data_E,
-            self._start,
-            self._direction,
-            self._groups,
-            True,
-            self._exclude,
-            self._distance,
-            self._geom,
-            self._normal,
-        )
+        found = self._distance, self._geom, self._normal
+        m, d = self._world.warp_model, self._world.warp_data_E
+        mjw.rays(m, d, self._start, self._direction, self._groups, True, self._exclude, *found)
 
 
 class BatchCamera:
     """Pictures of a camera in each world, as MuJoCo Warp's ray-casting renderer drew them last.
 
-    Args:
-        world: the worlds; `refresh` must have run since their state changed.
-        camera: name of a camera of the model.
-        width, height: pixels.
-        rgb, depth, segmentation: what to draw.
-        geom_groups: which geoms are visible.
-        textures, shadows: drawn or left out; the model's sky counts as a texture.
-
-    Raises:
-        ValueError: if the model has no such camera.
+    `refresh` must have run since the state changed. The model's sky counts as a texture.
     """
 
     def __init__(

@@ -17,6 +17,7 @@ COLLISION_SENSORS = (
     mujoco.mjtSensor.mjSENS_GEOMNORMAL,
     mujoco.mjtSensor.mjSENS_GEOMFROMTO,
 )
+BODY_EQUALITIES = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 TRANSMISSION_SENSORS = (mujoco.mjtSensor.mjSENS_ACTUATORPOS, mujoco.mjtSensor.mjSENS_ACTUATORVEL)
 
 
@@ -43,7 +44,7 @@ class Substeps:
         self._silent_warp_model = warp_model if self._always_senses else upstream.without_sensors(warp_model)
         self._warp_model_of_solver: mjw.Model | None = None
         if one_kernel_solver:
-            # From the warm start even a world without constraints reaches qacc_smooth in one step.
+            # A world without constraints reaches that acceleration in one step.
             opt = dataclasses.replace(warp_model.opt, run_qacc_smooth=False)
             self._warp_model_of_solver = dataclasses.replace(warp_model, opt=opt)
             self._solve = newton.solver(self._warp_model_of_solver, warp_data_E)
@@ -51,13 +52,24 @@ class Substeps:
             warp_model, skip=has_history | np.isin(sensor_type, COLLISION_SENSORS), sensor_type=sensor_type
         )
         self._needs_transmission = bool(np.isin(sensor_type, TRANSMISSION_SENSORS).any())
-        self._needs_tendon_velocity = bool((sensor_type == mujoco.mjtSensor.mjSENS_TENDONVEL).any())
-        self.refreshes_subtree_velocities = bool(warp_model.sensor_subtree_vel)
+        self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any())
+        self.refreshed_on_demand: set[str] = set()
+        if (sensor_type == mujoco.mjtSensor.mjSENS_TENDONVEL).any():
+            self.refreshed_on_demand.add("ten_velocity")
+        if warp_model.sensor_subtree_vel:
+            self.refreshed_on_demand |= {"subtree_linvel", "subtree_angmom"}
 
     def advance(self, *, sensors: bool) -> None:
         """Launch one physics step. Sensors never change the state that it reaches."""
+        if self._ties_bodies:
+            # The rows of connect and weld read body velocities before a step computes them.
+            mjw.kinematics(self.warp_model, self.warp_data_E)
+            mjw.com_pos(self.warp_model, self.warp_data_E)
+            mjw.com_vel(self.warp_model, self.warp_data_E)
         if self._warp_model_of_solver is not None:
             sensors = sensors or self._always_senses
+            opt = self._warp_model_of_solver.opt
+            opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
             newton.step(self._warp_model_of_solver, self.warp_data_E, self._solve, sensors=sensors)
         else:
             mjw.step(self.warp_model if sensors else self._silent_warp_model, self.warp_data_E)
@@ -74,7 +86,14 @@ class Substeps:
         mjw.flex(m, d)
         mjw.tendon(m, d)
         mjw.com_vel(m, d)
-        if self._needs_tendon_velocity:
+        needed = self.refreshed_on_demand
+        if "M" in needed:
+            mjw.crb(m, d)
+            upstream.tendon_armature(m, d)
+        if "qfrc_bias" in needed:
+            mjw.rne(m, d)
+            upstream.tendon_bias(m, d, d.qfrc_bias)
+        if "ten_velocity" in needed:
             pattern = (m.ten_J_rownnz, m.ten_J_rowadr, m.ten_J_colind)
             shared = [array.reshape((1, -1)) for array in pattern]
             self._launch_product(shared, d.ten_J, d.ten_velocity)
@@ -83,7 +102,7 @@ class Substeps:
             pattern = (d.moment_rownnz, d.moment_rowadr, d.moment_colind)
             self._launch_product(pattern, d.actuator_moment, d.actuator_velocity)
         # A model with sensors of them computes them with these.
-        if self.refreshes_subtree_velocities and not m.sensor_subtree_vel:
+        if needed & {"subtree_linvel", "subtree_angmom"} and not m.sensor_subtree_vel:
             mjw.subtree_vel(m, d)
         mjw.sensor_pos(m, d)
         mjw.sensor_vel(m, d)

@@ -17,6 +17,10 @@ from mujoco_warp._src.bvh import build_hfield_bvh
 from mujoco_warp._src.collision_core import contact_params as contact_params
 from mujoco_warp._src.collision_core import write_contact as write_contact
 from mujoco_warp._src.math import make_frame as make_frame
+
+# What a step adds to the inertia matrix and to the bias forces for tendons.
+from mujoco_warp._src.smooth import tendon_armature as tendon_armature
+from mujoco_warp._src.smooth import tendon_bias as tendon_bias
 from torch import Tensor
 
 FIXED = int(mjw.SetConstGroup.FIXED)
@@ -67,12 +71,8 @@ def with_refreshable_sensors(
     """Return a model on the same arrays that computes only sensors that follow from qpos and qvel alone.
 
     Contact, limit, touch-grid and geom-distance sensors read rows or contacts of the last substep's collision pass.
-    They keep that substep's value; rows that reset since then read zero. Sensors can only be switched off all at once,
-    so the lists that `put_model` makes of them, one for each kernel, are replaced.
-
-    Args:
-        skip: bool [nsensor], further sensors to leave out.
-        sensor_type: int [nsensor].
+    They, and those of `skip` (bool [nsensor]), keep that substep's value; rows that reset since then read zero. Sensors
+    can only be switched off all at once, so the lists that `put_model` makes, one for each kernel, are replaced.
     """
     none = wp.zeros(0, dtype=int)
     pos, vel = (
@@ -92,6 +92,15 @@ def with_refreshable_sensors(
     )
 
 
+def collide_boxes_exactly(warp_model: mjw.Model) -> None:
+    """Let boxes collide as in C, by separating axes and clipping, in place, instead of by GJK and EPA.
+
+    MuJoCo Warp has that port, and takes it for models with the flag below, which nothing else of it heeds; C always
+    collides boxes that way.
+    """
+    warp_model.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
+
+
 def geom_pairs(warp_model: mjw.Model) -> tuple[np.ndarray, np.ndarray]:
     """Return the geom pairs that the broad phase looks at, [N, 2], and their ids, [N, 2]."""
     return warp_model.nxn_geom_pair.numpy(), warp_model.nxn_pairid.numpy()
@@ -100,8 +109,7 @@ def geom_pairs(warp_model: mjw.Model) -> tuple[np.ndarray, np.ndarray]:
 def drop_pairs(warp_model: mjw.Model, dropped: np.ndarray) -> None:
     """Let MuJoCo Warp make no contacts of some geom pairs, in place: it has no setting for a pair.
 
-    Args:
-        dropped: bool [N], in the order of `geom_pairs`.
+    `dropped` is bool [N], in the order of `geom_pairs`.
     """
     pairs, pair_ids = geom_pairs(warp_model)
     left_ids = np.where(dropped[:, None], (NO_CONTACT, NO_SENSOR), pair_ids)

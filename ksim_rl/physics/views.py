@@ -10,57 +10,30 @@ from torch import Tensor
 from ksim_rl.checks import unknown_name
 
 # Left as they were by mujoco_warp.reset_data, though they belong to the episode that ended.
-ACCELERATION_STAGE = (
-    "actuator_force",
-    "qfrc_actuator",
-    "qfrc_constraint",
-    "qfrc_passive",
-    "cacc",
-    "cfrc_int",
-    "cfrc_ext",
+_ACCELERATION_STAGE = "actuator_force qfrc_actuator qfrc_constraint qfrc_passive cacc cfrc_int cfrc_ext"
+# What a substep depends on: integrated, or set by the user.
+_INPUTS = "time qpos qvel act ctrl qfrc_applied xfrc_applied mocap_pos mocap_quat qacc_warmstart"
+# The rest of the state of a world, then results of the last substep that `refresh` does not recompute, but terms may
+# read before the next one.
+_KEPT = (
+    "history plastic eq_active userdata tree_asleep tree_awake body_awake body_awake_ind dof_awake_ind ntree_awake "
+    "nbody_awake nv_awake overflow sensordata qacc act_dot actuator_length actuator_velocity"
 )
-
-
-# Integrated or set by the user; empty arrays are left out.
-STATE = (
-    "time",
-    "qpos",
-    "qvel",
-    "act",
-    "history",
-    "plastic",
-    "qacc_warmstart",
-    "ctrl",
-    "qfrc_applied",
-    "xfrc_applied",
-    "eq_active",
-    "mocap_pos",
-    "mocap_quat",
-    "userdata",
-    "tree_asleep",
-    "tree_awake",
-    "body_awake",
-    "body_awake_ind",
-    "dof_awake_ind",
-    "ntree_awake",
-    "nbody_awake",
-    "nv_awake",
-    "overflow",
+# What `refresh` recomputes, and what it recomputes from when on it is read.
+_REFRESHED = (
+    "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat cam_xpos cam_xmat light_xpos "
+    "light_xdir subtree_com cdof cinert cvel cdof_dot ten_J ten_length ten_wrapadr ten_wrapnum wrap_obj wrap_xpos "
+    "flexvert_xpos flexedge_J flexedge_length"
 )
-# Results of the last substep that `refresh` does not recompute, but terms may read before the next one.
-LAST_SUBSTEP = (
-    "sensordata",
-    "qacc",
-    "act_dot",
-    *ACCELERATION_STAGE,
-    "actuator_length",
-    "actuator_velocity",
-)
+ON_DEMAND = frozenset(("subtree_linvel", "subtree_angmom", "ten_velocity", "M", "qfrc_bias"))
+ACCELERATION_STAGE, SUBSTEP_INPUTS = tuple(_ACCELERATION_STAGE.split()), tuple(_INPUTS.split())
+STATE = (*SUBSTEP_INPUTS, *_KEPT.split(), *ACCELERATION_STAGE)
+READABLE = ON_DEMAND.union(STATE, _REFRESHED.split())
 
 
 def state_tensors(warp_data_E: mjw.Data) -> dict[str, Shaped[Tensor, "*?leaf"]]:
-    """Return views of the arrays that make up the state of a world."""
-    tensors = {name: wp.to_torch(getattr(warp_data_E, name)) for name in (*STATE, *LAST_SUBSTEP)}
+    """Return views of the arrays that make up the state of a world; empty ones are left out."""
+    tensors = {name: wp.to_torch(getattr(warp_data_E, name)) for name in STATE}
     return {name: tensor for name, tensor in tensors.items() if tensor.numel()}
 
 
@@ -92,10 +65,7 @@ def arrays(data: object, prefix: str = "") -> dict[str, wp.array]:
 
 
 class DataViews:
-    """The torch views of a Data. They share its memory, and so show each change at once.
-
-    Each attribute is float32 of shape [E, ...], named as MuJoCo names it.
-    """
+    """The torch views of a Data, float32, named as MuJoCo names them; they show each change at once."""
 
     qpos_EL: Tensor
     qvel_EL: Tensor
@@ -126,13 +96,22 @@ class DataViews:
             setattr(self, attribute, self.view(attribute.rpartition("_")[0]))
 
     def view(self, name: str) -> Shaped[Tensor, "*shape"]:
-        """Return the view of any array of the Warp data, such as "qfrc_constraint", "efc.force" or "contact.dist".
+        """Return the view of an array of the Warp data, such as "qfrc_constraint", "xquat" or "M".
 
-        Vectors, quaternions (w x y z) and matrices become trailing dims. Rows of `efc` beyond `nefc`, and all of
-        `contact` after a reset, hold leftovers.
+        Vectors, quaternions (w x y z) and matrices become trailing dims. Arrays that no `refresh` makes current, such
+        as "efc.force" or "contact.dist", are refused: see `last_substep`.
+        """
+        if name in self._arrays and name not in READABLE:
+            raise ValueError(
+                f"data array {name!r} is what the last substep computed on its way, and nothing refreshes it: read a "
+                f"sensor, or last_substep({name!r}) where that moment is meant"
+            )
+        return self.last_substep(name)
 
-        Raises:
-            ValueError: with the near names, if there is no such array.
+    def last_substep(self, name: str) -> Shaped[Tensor, "*shape"]:
+        """Return the view of any array of the Warp data as the last substep left it.
+
+        Rows of `efc` beyond `nefc`, and all of `contact` after a reset, hold leftovers.
         """
         if name not in self._views:
             if name not in self._arrays:

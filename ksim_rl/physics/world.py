@@ -18,8 +18,8 @@ from ksim_rl.device.memory import memory_for
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.device.streams import checked_device, warp_scope
 from ksim_rl.physics import capacity, kernels, upstream, views
-from ksim_rl.physics.fields import FIXED, GRAVITY, const_groups, derived_fields, fields_to_expand
-from ksim_rl.physics.height_field.contacts import take_over_height_fields
+from ksim_rl.physics.contacts import follow_the_c_engine
+from ksim_rl.physics.fields import FIXED, GRAVITY, INERT0, const_groups, derived_fields, fields_to_expand
 from ksim_rl.physics.masked_constants import MaskedConstants
 from ksim_rl.physics.model_checks import check_not_simple, warp_model_of
 from ksim_rl.physics.nan_guard.guard import NanGuard, NanReport
@@ -30,7 +30,7 @@ from ksim_rl.physics.substeps import Substeps
 
 
 class World(views.DataViews):
-    """`num_envs` worlds of one model.
+    """`num_envs` worlds of one model, which is copied; `sim` is laid over its settings.
 
     Position- and velocity-stage quantities (poses, velocities, their sensors) are those of the present state after
     `refresh`. Acceleration-stage ones (`qacc`, actuator and contact forces, contact sensors, accelerometers) belong to
@@ -38,22 +38,14 @@ class World(views.DataViews):
     are changed in place. Everything after construction can be captured in a CUDA graph, except `overflow_report`,
     `state_dict` and `load_state_dict`.
 
-    Args:
-        mj_model: the compiled model; it is copied.
-        num_envs: number of worlds.
-        device: "cpu", "cuda" or "cuda:<index>".
-        sim: settings laid over those of the model.
-        per_world_fields: model fields that may differ between worlds, by MuJoCo's names, and "gravity" (which always
-            may). What MuJoCo derives from them at compile time differs as well; call `set_const` after writing.
+    The model fields named in `per_world_fields`, by MuJoCo's names, and gravity may differ between worlds, and with
+    them what MuJoCo derives from them at compile time: call `set_const` after writing.
 
     Attributes:
-        mj_model: the copy, with the settings of `sim`.
         njmax, nconmax: constraint rows and contacts that a world has room for.
+        is_frozen: whether graphs may hold `refresh`, so that it computes nothing further.
         one_kernel_unavailable: why MuJoCo Warp's own solver solves the constraints, several times slower on CUDA; None
             where one kernel does (`SimCfg.one_kernel_solver`). That one computes no `qacc_smooth`, which stays zero.
-
-    Raises:
-        ValueError: naming the argument, its value and what is valid.
     """
 
     def __init__(
@@ -72,19 +64,20 @@ class World(views.DataViews):
             raise ValueError(f"sim={sim!r}: expected a SimCfg, or None")
         self.sim = SimCfg() if sim is None else sim
         self.device = checked_device(device)
-        self.num_envs = num_envs
+        self.num_envs, self.is_frozen = num_envs, False
         self.mj_model = copy.copy(mj_model)
         self.sim.apply_to(self.mj_model)
         expanded = fields_to_expand(per_world_fields)
         check_not_simple(self.mj_model, expanded)
         self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
         self.one_kernel_unavailable = one_kernel_unavailable(self.mj_model, self.sim, njmax=self.njmax)
+        stored_model = copy.copy(self.mj_model)
         if self.has_one_kernel_solver:
-            self.mj_model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
+            stored_model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
         self._graphs = WarpGraphs(self.device, require_graphs=self.sim.require_graphs)
         with memory_for(num_envs, self.device), warp_scope(self.device):
-            self.warp_model = warp_model_of(self.mj_model, dict.fromkeys(expanded, num_envs))
-            take_over_height_fields(self.warp_model)
+            self.warp_model = warp_model_of(stored_model, dict.fromkeys(expanded, num_envs))
+            follow_the_c_engine(self.warp_model)
             self.warp_model.opt.warn_overflow = 0
             self.warp_model.opt.deterministic = self.sim.deterministic
             if self.sim.tolerance is not None:
@@ -94,12 +87,15 @@ class World(views.DataViews):
                     self.warp_model, supported=wp.is_conditional_graph_supported()
                 )
             self.warp_data_E = mjw.make_data(
-                self.mj_model, nworld=num_envs, nconmax=self.nconmax, njmax=self.njmax
+                stored_model, nworld=num_envs, nconmax=self.nconmax, njmax=self.njmax
             )
             gravity_EL = upstream.expand_gravity(self.warp_model, num_envs)
             self._overflow = OverflowRecord(self.warp_data_E)
             self._reset_mask = wp.zeros(num_envs, dtype=bool)
-            self._zeroed_at_reset = views.float_rows(self.warp_data_E, views.ACCELERATION_STAGE)
+            rows = views.float_rows(self.warp_data_E, views.ACCELERATION_STAGE)
+            widths = [row.shape[1] for row in rows]
+            places = wp.array([row.ptr or 0 for row in rows], dtype=wp.uint64)
+            self._zeroed_at_reset = places, wp.array(widths, dtype=int), max(widths)
             models = self.mj_model, self.warp_model, self.warp_data_E
             self._substeps = Substeps(*models, one_kernel_solver=self.has_one_kernel_solver)
             self._masked_constants = self._prepare_constants(expanded)
@@ -134,17 +130,12 @@ class World(views.DataViews):
         after: Sequence[Callable[[], None]] = (),
         sensors: Literal["last", "every"] = "last",
     ) -> None:
-        """Advance all worlds by `n` substeps under the present `ctrl`.
+        """Advance all worlds by `n` substeps under the present `ctrl`, with sensors on the last one or on every one.
 
-        Args:
-            n: number of substeps.
-            before: called, in order, before each substep, such as a motor model that writes `ctrl`.
-            after: called, in order, after each substep. `refresh` has not run by then: `qpos` and `qvel` are those of
-                the state reached, poses and sensors those that the substep computed on its way.
-            sensors: "last" computes them on the last substep only, "every" on each one.
-
-        With hooks the substeps are launches of their own, with the hooks' torch work in between; without, all of them
-        are one. Inside an outer capture both become part of its graph.
+        Hooks are called, in order, before each substep (such as a motor model that writes `ctrl`) and after it, when
+        `refresh` has not run: `qpos` and `qvel` are those of the state reached, poses and sensors those that the
+        substep computed on its way. With hooks the substeps are launches of their own, with the hooks' torch work in
+        between; without, all of them are one. Inside an outer capture both become part of its graph.
         """
         if n < 1:
             raise ValueError(f"n={n}: expected at least 1 substep")
@@ -170,34 +161,32 @@ class World(views.DataViews):
         """
         self._graphs.run("refresh", self._substeps.refresh)
 
-    @property
-    def has_subtree_velocities(self) -> bool:
-        """Whether `refresh` computes `subtree_linvel` and `subtree_angmom`."""
-        return self._substeps.refreshes_subtree_velocities
+    def view(self, name: str) -> Shaped[Tensor, "*shape"]:
+        """Return the view of an array that is current after `refresh`, and let `refresh` compute it from now on.
 
-    def refresh_subtree_velocities(self) -> None:
-        """Let `refresh` compute `subtree_linvel` and `subtree_angmom` from now on. Call it before any outer capture."""
-        if not self._substeps.refreshes_subtree_velocities:
-            self._substeps.refreshes_subtree_velocities = True
+        A RuntimeError once the world is frozen, if nothing has read that array before.
+        """
+        if name in views.ON_DEMAND - self._substeps.refreshed_on_demand:
+            if self.is_frozen:
+                raise RuntimeError(
+                    f"{name} is not computed: let a term of the config read it during construction"
+                )
+            self._substeps.refreshed_on_demand.add(name)
             self._graphs.clear()
             self._record_resets()
+        return super().view(name)
 
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Put the worlds where `mask_E` is true back to the model's `qpos0`, at rest, time 0.
 
         Their acceleration-stage quantities and sensors read zero until the next step; the other rows do not change.
-        Call `refresh` afterwards (and after writing another pose), before reading poses or stepping on: the rows of
-        equality constraints are made from body velocities, which are those of the last substep until then.
+        Call `refresh` afterwards, and after writing another pose, before reading poses.
         """
         self._take_mask(mask_E)
         self._graphs.run("reset", self._launch_reset)
 
     def field(self, name: str) -> Shaped[Tensor, " E *leaf"]:
-        """Return the view of a model field that differs between worlds.
-
-        Raises:
-            ValueError: if the field is not expanded per world.
-        """
+        """Return the view of a model field that differs between worlds."""
         if name not in self._fields:
             if hasattr(self.warp_model, name):
                 raise ValueError(
@@ -210,29 +199,24 @@ class World(views.DataViews):
     def set_const(self, fields: Sequence[str], mask_E: Bool[Tensor, " E"] | None = None) -> None:
         """Recompute the constants that MuJoCo derives from `fields`, after writing into them.
 
-        Args:
-            fields: model fields that have changed, by MuJoCo's names; those that nothing derives from cost nothing.
-            mask_E: the worlds in which they have changed; the others keep their constants bit for bit. On
-                most robots this is much cheaper than all worlds. On models with tendons or flexes, with actuators on
-                anything but hinges and slides, or with moved frames of bodies that equality constraints tie, it costs
-                as much.
-
-        Raises:
-            ValueError: if a field is not expanded per world.
+        Fields that nothing derives from cost nothing. Worlds outside of `mask_E` keep their constants bit for bit, and
+        on most robots cost little: as much as the others only on models with tendons or flexes, with actuators on
+        anything but hinges and slides, or with moved frames of bodies that equality constraints tie.
         """
         for name in fields:
             self.field(name)
         groups = const_groups(fields)
         if not groups:
             return
+        constants = self._masked_constants
+        if constants is not None and constants.covers(fields):
+            self._take_mask(torch.ones_like(self._reset_mask_E) if mask_E is None else mask_E)
+            self._graphs.run(("set_const of rows", groups), lambda: constants.launch(groups))
+            return
         if mask_E is None:
             self._set_const_everywhere(groups)
             return
         self._take_mask(mask_E)
-        constants = self._masked_constants
-        if constants is not None and constants.covers(fields):
-            self._graphs.run(("set_const of rows", groups), lambda: constants.launch(groups))
-            return
         held = {name: self._fields[name].clone() for name in derived_fields(groups)}
         self._set_const_everywhere(groups)
         for name, before in held.items():
@@ -242,8 +226,7 @@ class World(views.DataViews):
     def launch(self, key: Hashable, launches: Callable[[], None]) -> None:
         """Run Warp launches of the caller's own, such as a camera's, in order with the world's.
 
-        They are recorded once for each `key`, which names what they do, and replayed from then on, so they must use
-        arrays that keep their addresses.
+        They are recorded once for each `key` and replayed from then on: their arrays must keep their addresses.
         """
         self._graphs.run(("of others", key), launches)
 
@@ -277,9 +260,9 @@ class World(views.DataViews):
         return self._nan_guard.count()
 
     def nan_report(self) -> NanReport:
-        """Write the worlds that became non-finite since the last report to files; reads the device.
+        """Write the worlds that became non-finite since the last report to files; one transfer to the host.
 
-        Call it once per rollout. Without `sim.nan_guard` there is nothing to read, and the report is empty.
+        Without `sim.nan_guard` the report is empty.
         """
         return NanReport() if self._nan_guard is None else self._nan_guard.report()
 
@@ -288,11 +271,7 @@ class World(views.DataViews):
         return {name: tensor.clone() for name, tensor in self._state_tensors().items()}
 
     def load_state_dict(self, state_dict: dict[str, Shaped[Tensor, "*?leaf"]]) -> None:
-        """Write a saved state into the present arrays, then `refresh`.
-
-        Raises:
-            ValueError: if a tensor is missing, unknown, or of another shape (other model or `num_envs`).
-        """
+        """Write a saved state of the same model and `num_envs` into the present arrays, then `refresh`."""
         what = "state of a world (of the same model, num_envs and per_world_fields)"
         copy_into(self._state_tensors(), state_dict, what=what)
         self.refresh()
@@ -347,6 +326,10 @@ class World(views.DataViews):
         self._graphs.run(
             ("set_const", groups), lambda: mjw.set_const(self.warp_model, self.warp_data_E, groups)
         )
+        if groups & INERT0:
+            # As in C, where MuJoCo Warp lets a body that only slides turn as easily as it slides.
+            for body in (self.mj_model.body_invweight0[:, 1] == 0.0).nonzero()[0].tolist():
+                self._fields["body_invweight0"][:, body, 1].zero_()
 
     def _take_mask(self, mask_E: Tensor) -> None:
         if mask_E.dtype != torch.bool or mask_E.shape != (self.num_envs,):
@@ -380,10 +363,5 @@ class World(views.DataViews):
 
     def _launch_reset(self) -> None:
         mjw.reset_data(self.warp_model, self.warp_data_E, reset=self._reset_mask)
-        widest = max(rows.shape[1] for rows in self._zeroed_at_reset)
-        wp.launch(
-            kernels.zero_rows,
-            dim=(self.num_envs, widest),
-            inputs=[self._reset_mask],
-            outputs=list(self._zeroed_at_reset),
-        )
+        mask, places, widths, widest = self._reset_mask, *self._zeroed_at_reset
+        wp.launch(kernels.zero_rows, dim=(self.num_envs, widest), inputs=[mask, places, widths])

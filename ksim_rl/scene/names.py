@@ -1,4 +1,4 @@
-"""Names of a model's elements, resolved once to index tensors or slices."""
+"""This module resolves names of a model's elements, once, to index tensors or slices."""
 
 import re
 from collections.abc import Sequence
@@ -20,10 +20,8 @@ class NameResolver:
 
     Each pattern's matches come in the model's order; patterns keep the order in which they are given. So `".*"` gives
     the model's order, and a tuple of plain names gives its own. Results are remembered: a look-up in a step costs one
-    dict access, and the index is a slice wherever the ids are contiguous.
-
-    Raises:
-        ValueError: if a pattern matches nothing (with the near names), or two patterns match the same element.
+    dict access, and the index is a slice wherever the ids are contiguous. A ValueError if a pattern matches nothing
+    (with the near names), or two patterns match the same element.
     """
 
     def __init__(self, mj_model: mujoco.MjModel, device: torch.device) -> None:
@@ -35,6 +33,11 @@ class NameResolver:
             "joint": [mj_model.joint(i).name for i in scalar_joint_ids(mj_model)],
             "actuator": _names(mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, mj_model.nu),
             "sensor": _names(mj_model, mujoco.mjtObj.mjOBJ_SENSOR, mj_model.nsensor),
+            "tendon": _names(mj_model, mujoco.mjtObj.mjOBJ_TENDON, mj_model.ntendon),
+            "pair": _names(mj_model, mujoco.mjtObj.mjOBJ_PAIR, mj_model.npair),
+            "camera": _names(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, mj_model.ncam),
+            "light": _names(mj_model, mujoco.mjtObj.mjOBJ_LIGHT, mj_model.nlight),
+            "material": _names(mj_model, mujoco.mjtObj.mjOBJ_MATERIAL, mj_model.nmat),
         }
         self._ids: dict[tuple[str, tuple[str, ...]], tuple[int, ...]] = {}
         self._indices: dict[tuple[str, tuple[str, ...]], Index] = {}
@@ -51,11 +54,7 @@ class NameResolver:
         return self._ids[key]
 
     def one(self, kind: str, pattern: str) -> int:
-        """Return the id of the one element that `pattern` matches.
-
-        Raises:
-            ValueError: if it matches several.
-        """
+        """Return the id of the one element that `pattern` matches; a ValueError if it matches several."""
         first, *more = self.ids(kind, pattern)
         if more:
             names = [self._tables[kind][i] for i in (first, *more)]
@@ -94,11 +93,7 @@ def _names(mj_model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> list[st
 
 
 def match_names(kind: str, patterns: Sequence[str], table: Sequence[str]) -> tuple[int, ...]:
-    """Return the places in `table` that the patterns match in full: each pattern's matches in the table's order.
-
-    Raises:
-        ValueError: if a pattern matches nothing (with the near names), or two patterns match the same name.
-    """
+    """Return the places in `table` that the patterns match in full: each pattern's matches in the table's order."""
     found: list[int] = []
     for pattern in patterns:
         try:

@@ -1,7 +1,5 @@
 """This module puts the scene of one world together: robots at their places on a terrain, and sensors."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,12 +18,7 @@ from ksim_rl.scene.terrains import Terrain
 
 @dataclass(frozen=True, kw_only=True)
 class Placement(Checked):
-    """A rigid transform from an entity's own world frame into the scene's.
-
-    Attributes:
-        pos: m.
-        quat: (w, x, y, z), a unit quaternion.
-    """
+    """A rigid transform from an entity's own world frame into the scene's: m, and a unit quaternion (w, x, y, z)."""
 
     pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
@@ -51,16 +44,10 @@ class Placement(Checked):
         for key in spec.keys:
             qpos = np.array(key.qpos)
             for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
-                self._move_pose(qpos[model.jnt_qposadr[joint] :][:7])
+                pose = qpos[model.jnt_qposadr[joint] :][:7]
+                pos, quat = pose[:3].copy(), pose[3:].copy()
+                mujoco.mju_mulPose(pose[:3], pose[3:], np.array(self.pos), np.array(self.quat), pos, quat)
             key.qpos = qpos
-
-    def _move_pose(self, pose: np.ndarray) -> None:
-        """Transform position and orientation in place, [7]."""
-        pos, quat = np.zeros(3), np.zeros(4)
-        mujoco.mju_mulPose(
-            pos, quat, np.array(self.pos), np.array(self.quat), pose[:3].copy(), pose[3:].copy()
-        )
-        pose[:3], pose[3:] = pos, quat
 
 
 @runtime_checkable
@@ -78,11 +65,9 @@ class Robot(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class MjcfRobot:
-    """A robot, or a whole scene, as an MJCF file, an XML string or a menagerie name.
+    """A robot, or a whole scene, from what `physics.load_spec` takes: an MJCF file, an XML string or a menagerie name.
 
-    Attributes:
-        source: what `physics.load_spec` takes.
-        actuators: what drives the joints, in place of the model's own actuators of these joints.
+    `actuators` drive joints in place of the model's own actuators of these joints.
     """
 
     source: str
@@ -97,28 +82,21 @@ class MjcfRobot:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneCfg(Checked):
-    """What is in each world.
+    """What is in each world, by name; gravity and the other options are the first robot's.
 
-    Attributes:
-        robots: by name. All start at their own default poses; gravity and the other options are the first robot's.
-        objects: by name, what else stands or lies there: a cube, a ball, a door. The elements of an entity (robot or
-            object) that is alone keep their names; those of several get the prefix "<name>/".
-        placements: where entities stand, by name; the others stand where their own models put them.
-        terrain: the ground, or None if the robot's own model has what it needs.
-        sensors: by name, for `view.contact(name)` and its kin. Sensors of the MJCF need no entry here.
-        num_envs: E, the number of worlds.
-        spacing: m between neighbouring envs when several are drawn in one picture.
-        soft_joint_pos_limit_factor: fraction of each joint's range, about its middle, that counts as soft limits.
+    The elements of an entity (robot or object: a cube, a ball, a door) that is alone keep their names; those of several
+    get the prefix "<name>/". Entities without a placement stand where their own models put them. Sensors are for
+    `view.contact(name)` and its kin; those of the MJCF need no entry here.
     """
 
     robots: Mapping[str, Robot]
     objects: Mapping[str, Robot] = field(default_factory=dict)
     placements: Mapping[str, Placement] = field(default_factory=dict)
-    terrain: Terrain | None = None
+    terrain: Terrain | None = None  # None: the robot's own model has what it needs
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
     num_envs: Count = 1
-    spacing: NonNegative = 2.0
-    soft_joint_pos_limit_factor: Share = 1.0
+    spacing: NonNegative = 2.0  # m between neighbouring envs when several are drawn in one picture
+    soft_joint_pos_limit_factor: Share = 1.0  # of each joint's range, about its middle: the soft limits
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -138,24 +116,15 @@ class SceneCfg(Checked):
 
 
 def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
-    """Assemble the scene's spec: robots and objects, then terrain, then sensors.
-
-    Raises:
-        ValueError: if a robot cannot be loaded or a sensor names what the model does not have.
-    """
-    entities = {name: _placed(robot, cfg.placements.get(name)) for name, robot in cfg.entities.items()}
+    """Assemble the scene's spec: robots and objects, then terrain, then sensors."""
+    entities = {name: robot.spec() for name, robot in cfg.entities.items()}
+    for name, placement in cfg.placements.items():
+        placement.move(entities[name])
     spec = _joined(entities) if len(entities) > 1 else next(iter(entities.values()))
     if cfg.terrain is not None:
         cfg.terrain.add_to(spec)
     for name, sensor in cfg.sensors.items():
         sensor.add_to(spec, name)
-    return spec
-
-
-def _placed(robot: Robot, placement: Placement | None) -> mujoco.MjSpec:
-    spec = robot.spec()
-    if placement is not None:
-        placement.move(spec)
     return spec
 
 

@@ -5,7 +5,7 @@ from torch import Tensor
 
 
 def product(a: Float[Tensor, "*a N K"], b: Float[Tensor, "*b K M"]) -> Float[Tensor, "*batch N M"]:
-    """Return the matrix product of [..., N, K] and [..., K, M], for small K.
+    """Return the matrix product for small K, in full precision.
 
     `a @ b` would keep three digits on a GPU, once a trainer has set `torch.set_float32_matmul_precision("high")` for
     its networks.

@@ -9,29 +9,21 @@ from ksim_rl.checked import Checked, Count, Positive, WholeNumber, Within
 
 @dataclass(frozen=True, kw_only=True)
 class ViewerCfg(Checked):
-    """A camera that follows a body, or looks at a point.
+    """A camera that follows a `body`, or looks at a point (`lookat`, m, world frame) where that is None.
 
-    Attributes:
-        body: the body that the camera tracks; None looks at `lookat`.
-        lookat: m, world frame; used if `body` is None.
-        distance: m from what it looks at.
-        elevation, azimuth: degrees, as in MuJoCo's free camera.
-        width, height: pixels.
-        env_index: the env that is drawn.
-        num_envs: how many envs are drawn in the picture, `scene.spacing` apart, from `env_index` on.
-        draw: which of the commands, rewards and sensors that can draw themselves do so: regular expressions for
-            "commands/<name>", "rewards/<name>" and "sensors/<name>" that match in full; () for none.
+    `draw` has regular expressions that match in full "commands/<name>", "rewards/<name>" and "sensors/<name>" of those
+    that can draw themselves.
     """
 
     body: str | None = None
     lookat: tuple[float, float, float] = (0.0, 0.0, 0.5)
-    distance: Positive = 3.0
-    elevation: Annotated[float, Within(low=-90.0, high=90.0)] = -20.0
+    distance: Positive = 3.0  # m from what it looks at
+    elevation: Annotated[float, Within(low=-90.0, high=90.0)] = -20.0  # degrees, as in MuJoCo's free camera
     azimuth: Annotated[float, Within(low=-360.0, high=360.0)] = 120.0
-    width: Count = 640
+    width: Count = 640  # pixels
     height: Count = 480
     env_index: WholeNumber = 0
-    num_envs: Count = 1
+    num_envs: Count = 1  # drawn in one picture, `scene.spacing` apart, from `env_index` on
     draw: tuple[str, ...] = (".*",)
 
     def __post_init__(self) -> None:

@@ -20,14 +20,14 @@ from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import MetricTerm, RewardTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.quantities import root_height
+from ksim_rl.mdp.fields import root_height
 from ksim_rl.scene.robots.legged_robot import LeggedRobot
 from ksim_rl.scene.robots.own_robots import Humanoid, Quadruped
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.terrains import PlaneTerrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import velocity
-from ksim_rl.trainers import TrainingCfg
+from ksim_rl.tasks.planar import upright
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 
 
@@ -36,16 +36,12 @@ class Uprightness(RewardTerm):
     """(1 + cos tilt) / 2 of the root, [E]: 1 upright, 0 upside down; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        return uprightness(view)
+        return upright(view)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RisenHeight(RewardTerm):
-    """The root's height above the ground as a fraction of the standing one, within [0, 1], [E]; position stage.
-
-    Attributes:
-        standing_height: m.
-    """
+    """The root's height above the ground as a fraction of the standing one (m), within [0, 1], [E]; position stage."""
 
     standing_height: Positive
 
@@ -57,10 +53,7 @@ class RisenHeight(RewardTerm):
 class Standing(RewardTerm):
     """uprightness^2 * risen^2 * exp(-mean((q - q0)^2) / pose_std^2) * exp(-mean(dq^2) / speed_std^2), in [0, 1], [E].
 
-    Attributes:
-        standing_height: m.
-        pose_std: rad, about the default pose.
-        speed_std: rad/s; position and velocity stage.
+    `q0` is the default pose; units are m, rad and rad/s; position and velocity stage.
     """
 
     standing_height: Positive
@@ -68,7 +61,7 @@ class Standing(RewardTerm):
     speed_std: Positive = 2.0
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        up_E = (uprightness(view) * risen(view, self.standing_height)).square()
+        up_E = (upright(view) * risen(view, self.standing_height)).square()
         stray_E = view.joint_pos_rel_EL.square().mean(-1) / self.pose_std**2
         motion_E = view.joint_vel_EL.square().mean(-1) / self.speed_std**2
         return up_E * torch.exp(-stray_E - motion_E)
@@ -90,11 +83,6 @@ class Stands(MetricTerm):
         return (is_high_E & is_upright_E).to(torch.float32)
 
 
-def uprightness(view: EnvView) -> Float[Tensor, " E"]:
-    """Return (1 + cos tilt) / 2 of the root, [E]; position stage."""
-    return 0.5 * (1.0 - view.projected_gravity_EL[:, 2])
-
-
 def risen(view: EnvView, standing_height: float) -> Float[Tensor, " E"]:
     """Return the root's height as a fraction of the standing one, within [0, 1], [E]; position stage."""
     return (root_height(view) / standing_height).clamp(0.0, 1.0)
@@ -109,13 +97,9 @@ def get_up_cfg(
     action_scale: Mapping[str, float],
     viewer: ViewerCfg,
 ) -> ManagerBasedRlEnvCfg:
-    """Return the config: 50 Hz control for 6 s.
+    """Return the config: 50 Hz control for 6 s, for a root that stands at `standing_height`, m.
 
-    Args:
-        standing_height: of the root above the ground in the default pose, m.
-        drop_height: how far above that an episode starts, m.
-        bend: how far joints start from the default pose at most, rad.
-        action_scale: rad per unit action, by joint pattern.
+    Episodes start `drop_height` (m) above that, with joints up to `bend` (rad) from the default pose.
     """
     return ManagerBasedRlEnvCfg(
         decimation=4,
@@ -139,12 +123,9 @@ def get_up_cfg(
         events={
             "drop": mdp.ResetRootUniform(
                 pose_range={
-                    "x": (-0.5, 0.5),
-                    "y": (-0.5, 0.5),
+                    **dict.fromkeys(("x", "y"), (-0.5, 0.5)),
                     "z": drop_height,
-                    "roll": (-math.pi, math.pi),
-                    "pitch": (-math.pi, math.pi),
-                    "yaw": (-math.pi, math.pi),
+                    **dict.fromkeys(("roll", "pitch", "yaw"), (-math.pi, math.pi)),
                 }
             ),
             "bend": mdp.ResetJoints(position_range=(-bend, bend)),
@@ -170,11 +151,6 @@ def _observations(robot: LeggedRobot) -> dict[str, ObservationGroupCfg]:
         "actor": ObservationGroupCfg(terms=actor),
         "critic": ObservationGroupCfg(terms={**critic, "imu_and_foot_height": height}),
     }
-
-
-def training(*, num_iterations: int) -> TrainingCfg:
-    """Return the training settings: 24 steps of 4096 envs per update."""
-    return velocity.training(num_iterations=num_iterations, entropy_coeff=0.005)
 
 
 def quadruped_get_up() -> ManagerBasedRlEnvCfg:
@@ -207,11 +183,11 @@ QUADRUPED = Task(
     name="quadruped_get_up",
     description="our quadruped gets up from any pose",
     cfg=quadruped_get_up,
-    training=training(num_iterations=1_000),
+    training=velocity.training(num_iterations=1_000, entropy_coeff=0.005),
 )
 HUMANOID = Task(
     name="humanoid_get_up",
     description="our humanoid gets up from any pose",
     cfg=humanoid_get_up,
-    training=training(num_iterations=3_000),
+    training=velocity.training(num_iterations=3_000, entropy_coeff=0.005),
 )

@@ -1,13 +1,14 @@
-"""Planar robots stand, walk, run and hop: in the xz plane, on the ground, rated by posture and forward speed.
+"""Planar robots stand, walk, run and hop in the xz plane, rated by posture and speed, or as a recorded walk does.
 
 The tasks are those of dm_control's suite (Tassa et al., "DeepMind Control Suite", 2018) on robots of our own:
 rewards in [0, 1], 1000 steps per episode, no early end. Unlike there, episodes start standing; who falls has to get up.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -20,9 +21,10 @@ from ksim_rl.envs.term import MetricTerm, RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.rewards.tracking import tolerance
 from ksim_rl.modules import ActorCfg, CriticCfg
-from ksim_rl.objectives import PPOCfg
+from ksim_rl.objectives import AMPCfg, PPOCfg
 from ksim_rl.physics import SimCfg
-from ksim_rl.scene.robots.control_models import Cheetah, Hopper, Walker
+from ksim_rl.scene.names import Patterns
+from ksim_rl.scene.robots.control_models import WALKER_SERVOS, Cheetah, Hopper, Walker
 from ksim_rl.scene.scene import Robot, SceneCfg
 from ksim_rl.scene.terrains import PlaneTerrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
@@ -70,13 +72,10 @@ class ForwardSpeed(MetricTerm):
 def planar_cfg(
     robot: Robot, *, motors: str, reward: RewardTerm, decimation: int, step_dt: float, distance: float
 ) -> ManagerBasedRlEnvCfg:
-    """Put a planar task together.
+    """Put a planar task together, for joints that match `motors`; an env step lasts `step_dt`, s.
 
-    Args:
-        robot: has the joints "root_x", "root_z" and "root_y", a root body "torso" and a sensor "com_velocity".
-        motors: a pattern of the joints that motors drive; one action each, in [-1, 1].
-        step_dt: s of an env step, `decimation` physics steps.
-        distance: m from the camera to the robot.
+    The robot has the joints "root_x", "root_z" and "root_y", a root body "torso" and a sensor "com_velocity". The
+    camera's `distance` is in m.
     """
     terms = {
         "gravity": ObservationTermCfg(term=mdp.ProjectedGravity()),
@@ -126,13 +125,8 @@ def _task(
     num_iterations: int = 500,
     solved_at: float | None = None,
 ) -> Task:
-    return Task(
-        name=cfg.__name__,
-        description=what,
-        cfg=cfg,
-        training=training(num_iterations=num_iterations),
-        solved_at=solved_at,
-    )
+    settings = training(num_iterations=num_iterations)
+    return Task(name=cfg.__name__, description=what, cfg=cfg, training=settings, solved_at=solved_at)
 
 
 # -- a hind and a fore leg ---------------------------------------------------------------------------------------
@@ -168,10 +162,7 @@ class HopperReward(RewardTerm):
     """tall * fast, or tall * (4 + small effort) / 5 without a speed, in [0, 1]; position and velocity stage.
 
     "tall" is 1 where the torso is `HOPPER_HEIGHT` above the foot, which holds in flight too, and where it is upright;
-    "fast" rates the forward speed against `speed`.
-
-    Attributes:
-        speed: m/s, from which on the robot is fast enough; 0 only asks it to stand.
+    "fast" rates the forward speed against `speed`, m/s; 0 only asks the robot to stand.
     """
 
     speed: NonNegative = 0.0
@@ -213,11 +204,8 @@ WALKER_HEIGHT = 1.15
 class WalkerReward(RewardTerm):
     """(3 tall + upright) / 4 * (5 fast + 1) / 6, in [0, 1]; position and velocity stage.
 
-    "tall" rates the torso's height against `WALKER_HEIGHT`, "fast" the forward speed against `speed`. Standing alone
-    gives 1 where no speed is asked, else 1/6.
-
-    Attributes:
-        speed: m/s, from which on the robot is fast enough; 0 only asks it to stand.
+    "tall" rates the torso's height against `WALKER_HEIGHT`, "fast" the forward speed against `speed`, m/s. Standing
+    alone gives 1 where no speed is asked, else 1/6.
     """
 
     speed: NonNegative = 0.0
@@ -256,3 +244,119 @@ def walker_run() -> ManagerBasedRlEnvCfg:
 WALKER_STAND = _task(walker_stand, "a planar biped stands upright", solved_at=950.0)
 WALKER_WALK = _task(walker_walk, "a planar biped walks at 1 m/s", solved_at=900.0)
 WALKER_RUN = _task(walker_run, "a planar biped runs at 5 m/s", 1000)
+
+# -- a recorded walk ---------------------------------------------------------------------------------------------
+
+# `walker_track` follows the walk (Peng et al., "DeepMimic", 2018): episodes start anywhere in the motion, in its state
+# there, and end when the robot strays from it. The reward's parts are theirs; the robot's own root stands in for the
+# centre of mass. The reward of `walker_amp` asks for the speed alone (Peng et al., "AMP", arXiv 2104.02180): how to
+# walk is learned from the motion, as `objective=amp` compares the group "style"; the policy never sees the motion, nor
+# where in it it should be.
+
+MOTION = "walker_walk"
+SPEED, CYCLE_S = 0.8, 1.0
+"""m/s, and s of one stride, of that motion."""
+FEET = ("right_foot", "left_foot")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WalkAt(RewardTerm):
+    """1 at a forward speed within 0.1 m/s of `speed`, 0.1 where it is off by as much again as `speed` (m/s)."""
+
+    speed: float
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        low, high = self.speed - 0.1, self.speed + 0.1
+        return tolerance(forward_speed(view), low=low, high=high, margin=self.speed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseDistance(MetricTerm):
+    """The root mean square of the joint angles' distance to the nearest pose of a motion, rad, [E]; position stage."""
+
+    file: str
+    joints: Patterns
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        joints = view.joints(self.joints)
+        poses_FL, own_EL = view.motion(self.file).joint_pos_FL[:, joints.index], joints.pos_EL
+        return torch.cdist(own_EL, poses_FL).amin(-1) / own_EL.shape[-1] ** 0.5
+
+
+def _motion_cfg(
+    terms: Mapping[str, ObservationTermCfg], groups: Sequence[str] = ("actor", "critic"), **parts: Any
+) -> ManagerBasedRlEnvCfg:
+    """Put together what both tasks share: the robot, what it observes of itself and `terms`, and its servos."""
+    own = {
+        "gravity": ObservationTermCfg(term=mdp.ProjectedGravity()),
+        "joint_pos": ObservationTermCfg(term=mdp.JointPos(joints=("root_z", Walker.joints))),
+        "joint_vel": ObservationTermCfg(term=mdp.JointVel()),
+    }
+    robot = Walker(actuators=WALKER_SERVOS)
+    return ManagerBasedRlEnvCfg(
+        decimation=4,
+        scene=SceneCfg(robots={"walker": robot}, terrain=PlaneTerrain(), num_envs=2048),
+        sim=SIM,
+        observations=dict.fromkeys(groups, ObservationGroupCfg(terms={**own, **terms})),
+        actions={"legs": mdp.JointPositionAction(joints=Walker.joints, scale=0.5)},
+        episode_length_s=8.0,
+        viewer=ViewerCfg(body="torso", distance=4.0, elevation=-10.0, azimuth=90.0),
+        **parts,
+    )
+
+
+def walker_amp() -> ManagerBasedRlEnvCfg:
+    """Return the config of walking at the speed of the motion `walker_walk`."""
+    return _motion_cfg(
+        {},
+        ("actor", "critic", "style"),
+        events={"reset": mdp.ResetToMotion(file=MOTION)},
+        rewards={"walk": WalkAt(speed=SPEED)},
+        terminations={"time_out": mdp.TimeOut(), "fallen": mdp.RootHeightBelow(minimum_height=0.8)},
+        metrics={
+            "forward_speed": ForwardSpeed(),
+            "pose_distance": PoseDistance(file=MOTION, joints=Walker.joints),
+        },
+        scale_rewards_by_dt=False,
+    )
+
+
+def walker_track() -> ManagerBasedRlEnvCfg:
+    """Return the config of walking as the motion `walker_walk` does."""
+    terms = {
+        "phase": ObservationTermCfg(term=mdp.MotionPhase(file=MOTION, cycle_s=CYCLE_S)),
+        "reference": ObservationTermCfg(term=mdp.MotionJoints(file=MOTION, joints=Walker.joints)),
+        "drift": ObservationTermCfg(term=mdp.MotionBodyOffset(file=MOTION, bodies="torso")),
+    }
+    return _motion_cfg(
+        terms,
+        events={"reset": mdp.ResetToMotion(file=MOTION, start_range=(0.0, 0.9))},
+        rewards={
+            "joint_pos": mdp.TrackMotionJointPos(file=MOTION, joints=Walker.joints, std=0.7, weight=0.65),
+            "joint_vel": mdp.TrackMotionJointVel(file=MOTION, joints=Walker.joints, std=3.2, weight=0.1),
+            "feet": mdp.TrackMotionBodyPos(file=MOTION, bodies=FEET, std=0.16, weight=0.15),
+            "root": mdp.TrackMotionBodyPos(file=MOTION, bodies="torso", std=0.32, weight=0.05),
+            "root_rotation": mdp.TrackMotionBodyQuat(file=MOTION, bodies="torso", std=0.32, weight=0.05),
+            "action_rate": mdp.ActionRateL2(weight=-0.001),
+        },
+        terminations={
+            "finished": mdp.MotionFinished(file=MOTION),
+            "strayed": mdp.FarFromMotion(file=MOTION, bodies="torso", distance=0.4),
+        },
+    )
+
+
+AS_RECORDED = AMPCfg(motions=(MOTION,), **OBJECTIVE)
+AMP = Task(
+    name="walker_amp",
+    description="a planar biped walks at 0.8 m/s, with objective=amp as a recorded walk does",
+    cfg=walker_amp,
+    training=training(num_iterations=400),
+    other_trainings=(training(num_iterations=400, objective=AS_RECORDED),),
+)
+TRACK = Task(
+    name="walker_track",
+    description="a planar biped follows a walk",
+    cfg=walker_track,
+    training=training(num_iterations=400),
+)

@@ -8,10 +8,12 @@ servo targets.
 """
 
 import dataclasses
+import functools
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from ksim_rl import mdp
 from ksim_rl.algorithms import fast_sac, fast_td3
@@ -20,14 +22,29 @@ from ksim_rl.algorithms.fast_td3 import FastTD3Cfg
 from ksim_rl.algorithms.off_policy import MANY_ENVS
 from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import CurriculumTerm, EventTerm, ObservationTerm, RewardTerm
 from ksim_rl.modules import ActorCfg, QNetworkCfg
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.physics import SimCfg
-from ksim_rl.scene.robots.legged_robot import LeggedRobot
+from ksim_rl.physics.load import Source
+from ksim_rl.scene.robots import stance
+from ksim_rl.scene.robots.analysis import RobotAnalysis, analyse, robot_name
+from ksim_rl.scene.robots.legged_robot import LeggedRobot, ModelRobot
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.sensors import ContactSensor, Sensor
-from ksim_rl.scene.terrains import PlaneTerrain, Terrain
+from ksim_rl.scene.terrains import (
+    DiscreteObstacles,
+    FlatPatch,
+    PlaneTerrain,
+    PyramidSlope,
+    PyramidStairs,
+    RoughGround,
+    Terrain,
+    TerrainGrid,
+    TerrainPatch,
+    Waves,
+)
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
@@ -55,16 +72,7 @@ class PoseStd:
 
 def sim(*, cone: Literal["pyramidal", "elliptic"] = "pyramidal", impratio: float = 1.0) -> SimCfg:
     """Return the physics settings: 200 Hz, few solver iterations."""
-    return SimCfg(
-        timestep=0.005,
-        integrator="implicitfast",
-        solver="newton",
-        cone=cone,
-        impratio=impratio,
-        iterations=10,
-        ls_iterations=20,
-        ccd_iterations=50,
-    )
+    return dataclasses.replace(stance.SIM, cone=cone, impratio=impratio, ccd_iterations=50)
 
 
 def noisy(term: ObservationTerm, reach: float) -> ObservationTermCfg:
@@ -117,13 +125,7 @@ def rewards(
     angular_momentum: float = 0.0,
     foot_height: float = 0.1,
 ) -> dict[str, RewardTerm]:
-    """Return the rewards.
-
-    Args:
-        torso: the body that is to stay upright and calm; None is the root.
-        body_ang_vel, angular_momentum: weights.
-        foot_height: m, of a foot that swings.
-    """
+    """Return the rewards; `torso` is to stay upright and calm (None: the root), feet swing at `foot_height`, m."""
     sites = robot.foot_sites
     return {
         "track_linear_velocity": mdp.TrackLinearVelocity(weight=2.0, command=COMMAND, std=0.5),
@@ -159,11 +161,6 @@ def rewards(
     }
 
 
-def self_collisions(*, weight: float = -1.0) -> dict[str, RewardTerm]:
-    """Return the reward that counts substeps with a self-contact; it reads the sensor `SELF` (`self_contact`)."""
-    return {"self_collisions": mdp.SelfCollision(weight=weight, sensor=SELF, threshold=10.0)}
-
-
 def self_contact(robot: LeggedRobot) -> dict[str, Sensor]:
     """Return the sensor of the robot's strongest contact with itself, in every substep."""
     root = robot.root_body
@@ -174,10 +171,9 @@ def self_contact(robot: LeggedRobot) -> dict[str, Sensor]:
 
 
 def events(robot: LeggedRobot, *, torso: str | None = None) -> dict[str, EventTerm]:
-    """Return resets, pushes and start-up randomization; the friction of feet is the task's own (`foot_friction`).
+    """Return resets, pushes and start-up randomization, of the torso's centre of mass (None: the root's) too.
 
-    Args:
-        torso: the body whose centre of mass is uncertain; None is the root.
+    The friction of feet is the task's own (`foot_friction`).
     """
     return {
         "reset_base": mdp.ResetRootUniform(
@@ -187,11 +183,9 @@ def events(robot: LeggedRobot, *, torso: str | None = None) -> dict[str, EventTe
         "push_robot": mdp.PushByVelocity(
             interval_range_s=(1.0, 3.0),
             velocity_range={
-                "x": (-0.5, 0.5),
-                "y": (-0.5, 0.5),
+                **dict.fromkeys(("x", "y"), (-0.5, 0.5)),
                 "z": (-0.4, 0.4),
-                "roll": (-0.52, 0.52),
-                "pitch": (-0.52, 0.52),
+                **dict.fromkeys(("roll", "pitch"), (-0.52, 0.52)),
                 "yaw": (-0.78, 0.78),
             },
         ),
@@ -247,12 +241,15 @@ def velocity_cfg(
 ) -> ManagerBasedRlEnvCfg:
     """Return the config: 50 Hz control; an episode lasts 20 s, or until the root tilts by more than 70 degrees.
 
-    Args:
-        feet: the contact of each foot with the terrain, one element per foot in the order of `robot.foot_sites`.
-        command: None is `velocity_command()`.
-        terrain: None is a plane.
-        sensors: more sensors by name.
+    `feet` has one element per foot in the order of `robot.foot_sites`. By default the command is `velocity_command()`,
+    on a plane.
     """
+    elements, num_feet = feet.geoms or feet.bodies or feet.subtrees, len(robot.foot_sites)
+    if len(elements) != num_feet and all(re.fullmatch(r"[\w/-]+", element) for element in elements):
+        raise ValueError(
+            f"feet: {len(elements)} {feet.kind} elements {elements} for {num_feet} foot_sites: give one per foot; for "
+            "feet of several geoms ContactSensor(bodies=...) or ContactSensor(subtrees=...)"
+        )
     return ManagerBasedRlEnvCfg(
         decimation=4,
         sim=sim,
@@ -283,6 +280,102 @@ def velocity_cfg(
     )
 
 
+class VelocityTask(Task):
+    """A velocity task on flat ground, for a robot that nobody here has seen."""
+
+    @classmethod
+    def for_robot(
+        cls, robot: Source | ModelRobot, *, name: str = "", num_iterations: int = 3_000
+    ) -> "VelocityTask":
+        """Return the task of a model with all that `robots.analyse` proposes for it, or of an edited proposal.
+
+        The robot is analysed when the config is first asked for. `name` is "<robot>_velocity_flat" by default.
+        """
+        own = robot.name if isinstance(robot, ModelRobot) else robot_name(robot)
+
+        @functools.cache
+        def analysis() -> RobotAnalysis:
+            return analyse(robot.spec() if isinstance(robot, ModelRobot) else robot)
+
+        return cls(
+            name=name or f"{own}_velocity_flat",
+            description=f"{own} follows a velocity command on flat ground",
+            cfg=lambda: _proposed_cfg(
+                robot if isinstance(robot, ModelRobot) else analysis().robot, analysis()
+            ),
+            training=training(num_iterations=num_iterations),
+        )
+
+
+def _proposed_cfg(proposed: ModelRobot, analysis: RobotAnalysis) -> ManagerBasedRlEnvCfg:
+    """Return the config of a robot of any size; bipeds are slower and calmer, and keep their limbs apart."""
+    robot, height, biped = cast(LeggedRobot, proposed), proposed.init_pos[2], len(analysis.foot_bodies) == 2
+    moving = analysis.by_joint(0.35, 0.15, 0.15) if biped else analysis.by_joint(0.6, 0.3, 0.15)
+    pose = PoseStd(standing={".*": 0.05}, walking=moving, running=analysis.by_joint(0.6, 0.3, 0.4))
+    foot_height = round(min(0.1, 0.3 * height), 3)
+    earned = rewards(robot, pose=pose, foot_height=foot_height)
+    # A leg's natural speed grows with the root of its length: 1 m/s is much for a leg of 0.25 m.
+    speed = round(min(1.0, 0.5 * math.sqrt(9.81 * height)), 2) if biped else 1.0
+    if biped:
+        earned = rewards(
+            robot, pose=pose, foot_height=foot_height, body_ang_vel=-0.05, angular_momentum=-0.02
+        )
+        earned["self_collisions"] = mdp.SelfCollision(weight=-1.0, sensor=SELF, threshold=10.0)
+    return velocity_cfg(
+        robot,
+        sim=sim(),
+        feet=ContactSensor(bodies=analysis.foot_bodies),
+        observations=observations(robot),
+        rewards=earned,
+        events=events(robot) | {"foot_friction": foot_friction(robot, low=0.3, high=1.2)},
+        sensors=self_contact(robot) if biped else {},
+        command=dataclasses.replace(velocity_command(), lin_vel_x=(-speed, speed), lin_vel_y=(-speed, speed)),
+        viewer=ViewerCfg(body=robot.root_body, distance=max(1.0, 4.0 * height), elevation=-12.0),
+    )
+
+
+PATCHES: Mapping[str, TerrainPatch] = {
+    "flat": FlatPatch(),
+    "stairs_down": PyramidStairs(proportion=2.0),
+    "stairs_up": PyramidStairs(proportion=2.0, inverted=True),
+    "slope_down": PyramidSlope(),
+    "slope_up": PyramidSlope(inverted=True),
+    "rough": RoughGround(),
+    "obstacles": DiscreteObstacles(),
+    "waves": Waves(),
+}
+"""Up to 20 cm of step and 27 degrees of slope. A pyramid's top is where envs start, so that they walk down."""
+
+
+def on_rough_ground(
+    flat: ManagerBasedRlEnvCfg,
+    *,
+    root_height: float,
+    njmax: int,
+    nconmax: int,
+    patches: Mapping[str, TerrainPatch] = PATCHES,
+) -> ManagerBasedRlEnvCfg:
+    """Return the config of a flat velocity task on rough ground.
+
+    Actor and critic see the heights around the robot, episodes also end (as truncations) at the edge of the patch, and
+    envs move through the levels by how far their robots walk. Heights are seen relative to the soles of a robot whose
+    root stands at `root_height`, m. `njmax` and `nconmax` make room for edges, where a foot touches in several places.
+    """
+    scan, terrain = mdp.HeightScan(offset=root_height), TerrainGrid(patches=patches)
+    groups = {}
+    for name, seen in (("actor", noisy(scan, 0.1)), ("critic", ObservationTermCfg(term=scan))):
+        group = flat.observations[name]
+        groups[name] = dataclasses.replace(group, terms={**group.terms, "height_scan": seen})
+    return dataclasses.replace(
+        flat,
+        sim=dataclasses.replace(flat.sim, njmax=njmax, nconmax=nconmax),
+        scene=dataclasses.replace(flat.scene, terrain=terrain, spacing=terrain.size),
+        observations={**flat.observations, **groups},
+        terminations={**flat.terminations, "outside_terrain": mdp.OutsideTerrain()},
+        curriculum={**flat.curriculum, "terrain_level": mdp.TerrainLevels(command=COMMAND)},
+    )
+
+
 def training(*, num_iterations: int, entropy_coeff: float = 0.01) -> TrainingCfg:
     """Return the training settings: 24 steps of 4096 envs per update.
 
@@ -299,40 +392,41 @@ def training(*, num_iterations: int, entropy_coeff: float = 0.01) -> TrainingCfg
     )
 
 
-def off_policy_trainings() -> tuple[TrainingCfg, TrainingCfg]:
-    """Return the training settings of FastSAC and FastTD3: 4 steps of 4096 envs and 16 or 32 gradient steps in turn.
+def fast_sac_training() -> TrainingCfg:
+    """Return the training settings of FastSAC: 4 steps of 4096 envs and 48 gradient steps in turn.
 
-    Gradient steps per env state and noise are near those that the two papers have for quadrupeds (arXiv 2512.01996,
-    2505.22642). Rewards reach 0.12 per step, so that returns lie within the atoms: 0.12 / (1 - 0.98) = 6. Actions reach
-    twice the scale of the action term (0.75 rad on Go1), which is about what policies of PPO use. FastSAC's target
-    entropy is that of a standard deviation of 0.09 of them: with the paper's 0, one of 0.24, the noise alone costs Go1
-    half of what it can get for its turning rate.
+    Rewards reach 0.12 per step, so that returns lie within the atoms: 0.12 / (1 - 0.97) = 4. Actions reach twice the
+    scale of the action term (0.75 rad on Go1), which is about what policies of PPO use. The target entropy is that of a
+    standard deviation of 0.09 of them: with the paper's 0 (arXiv 2512.01996), one of 0.24, the noise alone costs Go1
+    half of what it can get for its turning rate, and G1 nearly all. G1 stands after 5.5 million env states, and after 9
+    million with 32 gradient steps of which the actor takes every fourth (a discount of 0.98, one seed each).
     """
-    # 2.2 GB for Go1; without it a resumed run fills the replay anew.
-    data = dataclasses.replace(MANY_ENVS, save_replay=False)
-    trainer = TrainerCfg(num_iterations=6_000, eval_interval=500, checkpoint_interval=500, log_interval=10)
+    objective = FastSACCfg(
+        target_entropy_per_action=-1.0, policy_delay=2, symmetry="augment", autocast=True, compile=True
+    )
+    data = dataclasses.replace(_REPLAY, num_env_states_per_minibatch=8192, num_minibatches=48)
+    return _off_policy(objective=objective, data=data, actor=fast_sac.ACTOR, critic=fast_sac.CRITIC)
 
-    def networks(actor: Any, critic: QNetworkCfg) -> ModulesCfg:
-        return ModulesCfg(
+
+def fast_td3_training() -> TrainingCfg:
+    """Return the training settings of FastTD3, with noise near that of the paper for quadrupeds (arXiv 2505.22642)."""
+    objective = FastTD3Cfg(target_noise=0.1, autocast=True)
+    return _off_policy(objective=objective, data=_REPLAY, actor=fast_td3.ACTOR, critic=fast_td3.CRITIC)
+
+
+# 2.2 GB for Go1; without it a resumed run fills the replay anew.
+_REPLAY = dataclasses.replace(MANY_ENVS, save_replay=False)
+
+
+def _off_policy(*, objective: Any, data: Any, actor: Any, critic: QNetworkCfg) -> TrainingCfg:
+    return TrainingCfg(
+        num_envs=4096,
+        seed=42,
+        objective=objective,
+        data=data,
+        modules=ModulesCfg(
             actor=dataclasses.replace(actor, action_bound=2.0),
             critic=dataclasses.replace(critic, v_min=-2.0, v_max=6.0),
-        )
-
-    return (
-        TrainingCfg(
-            num_envs=4096,
-            seed=42,
-            objective=FastSACCfg(gamma=0.98, target_entropy_per_action=-1.0, autocast=True),
-            data=dataclasses.replace(data, num_env_states_per_minibatch=8192, num_minibatches=32),
-            modules=networks(fast_sac.ACTOR, fast_sac.CRITIC),
-            trainer=trainer,
         ),
-        TrainingCfg(
-            num_envs=4096,
-            seed=42,
-            objective=FastTD3Cfg(target_noise=0.1, autocast=True),
-            data=data,
-            modules=networks(fast_td3.ACTOR, fast_td3.CRITIC),
-            trainer=trainer,
-        ),
+        trainer=TrainerCfg(num_iterations=6_000, eval_interval=500, checkpoint_interval=500, log_interval=10),
     )

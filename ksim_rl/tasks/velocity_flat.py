@@ -1,13 +1,14 @@
-"""This module has the tasks in which legged robots follow a velocity command on flat ground.
+"""This module has the tasks in which legged robots follow a velocity command on flat ground, two of them on rough too.
 
 The figures of Go1 and G1 are those of mjlab 1.6.0's `Mjlab-Velocity-Flat-Unitree-Go1` and `-G1`. The quadruped and the
 humanoid are our own, with nothing to download; Go2's motors run PD control.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
+from ksim_rl import mdp
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.physics import SimCfg
@@ -15,8 +16,7 @@ from ksim_rl.scene.robots.booster_t1 import BoosterT1
 from ksim_rl.scene.robots.legged_robot import LeggedRobot
 from ksim_rl.scene.robots.own_robots import Humanoid, Quadruped
 from ksim_rl.scene.robots.unitree_g1 import UnitreeG1
-from ksim_rl.scene.robots.unitree_go1 import UnitreeGo1
-from ksim_rl.scene.robots.unitree_go2 import UnitreeGo2
+from ksim_rl.scene.robots.unitree_go import UnitreeGo1, UnitreeGo2
 from ksim_rl.scene.sensors import ContactSensor
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import velocity
@@ -27,14 +27,17 @@ GO1_ROBOT, GO2_ROBOT, QUADRUPED_ROBOT = UnitreeGo1(), UnitreeGo2(), Quadruped()
 G1_ROBOT, T1_ROBOT, HUMANOID_ROBOT = UnitreeG1(), BoosterT1(), Humanoid()
 
 
-def _task(cfg: Callable[[], ManagerBasedRlEnvCfg], robot: str, *, num_iterations: int, **others: Any) -> Task:
-    return Task(
-        name=cfg.__name__,
-        description=f"{robot} follows a velocity command on flat ground",
-        cfg=cfg,
-        training=velocity.training(num_iterations=num_iterations),
-        **others,
-    )
+def _task(
+    cfg: Callable[[], ManagerBasedRlEnvCfg],
+    robot: str,
+    how: str = "on flat ground",
+    *,
+    num_iterations: int,
+    **others: Any,
+) -> Task:
+    description = f"{robot} follows a velocity command {how}"
+    training = velocity.training(num_iterations=num_iterations)
+    return Task(name=cfg.__name__, description=description, cfg=cfg, training=training, **others)
 
 
 # -- four legs ---------------------------------------------------------------------------------------------------
@@ -106,97 +109,63 @@ GO1 = _task(
     go1_velocity_flat,
     "Unitree Go1",
     num_iterations=10_000,
-    other_trainings=velocity.off_policy_trainings(),
+    other_trainings=(velocity.fast_sac_training(), velocity.fast_td3_training()),
 )
 GO2 = _task(go2_velocity_flat, "Unitree Go2", num_iterations=10_000)
 QUADRUPED = _task(quadruped_velocity_flat, "our quadruped", num_iterations=2_000)
-DELAYED = Task(
-    name="quadruped_velocity_delayed",
-    description="our quadruped follows a velocity command with actions that arrive late",
-    cfg=quadruped_velocity_delayed,
-    training=velocity.training(num_iterations=2_000),
-)
+LATE = "with actions that arrive late"
+DELAYED = _task(quadruped_velocity_delayed, "our quadruped", LATE, num_iterations=2_000)
 
 
 # -- two legs ----------------------------------------------------------------------------------------------------
 
-G1_POSE = velocity.PoseStd(
-    standing={".*": 0.05},
-    walking={
-        ".*_hip_pitch_joint": 0.3,
-        ".*_hip_(roll|yaw)_joint": 0.15,
-        ".*_knee_joint": 0.35,
-        ".*_ankle_pitch_joint": 0.25,
-        ".*_ankle_roll_joint": 0.1,
-        "waist_yaw_joint": 0.2,
-        "waist_roll_joint": 0.08,
-        "waist_pitch_joint": 0.1,
-        ".*_shoulder_(pitch|roll)_joint": 0.15,
-        ".*_shoulder_yaw_joint": 0.1,
-        ".*_elbow_joint": 0.15,
-        ".*_wrist_.*": 0.3,
-    },
-    running={
-        ".*_hip_pitch_joint": 0.5,
-        ".*_hip_(roll|yaw)_joint": 0.2,
-        ".*_knee_joint": 0.6,
-        ".*_ankle_pitch_joint": 0.35,
-        ".*_ankle_roll_joint": 0.15,
-        "waist_yaw_joint": 0.3,
-        "waist_roll_joint": 0.08,
-        "waist_pitch_joint": 0.2,
-        ".*_shoulder_pitch_joint": 0.5,
-        ".*_shoulder_roll_joint": 0.2,
-        ".*_shoulder_yaw_joint": 0.15,
-        ".*_elbow_joint": 0.35,
-        ".*_wrist_.*": 0.3,
-    },
+
+def _pose(moving: Mapping[str, tuple[float, float]]) -> velocity.PoseStd:
+    """Return how far joints may stray: little while standing, else by pattern (while walking, while running)."""
+    walking, running = ({joints: pair[gait] for joints, pair in moving.items()} for gait in (0, 1))
+    return velocity.PoseStd(standing={".*": 0.05}, walking=walking, running=running)
+
+
+G1_POSE = _pose(
+    {
+        ".*_hip_pitch_joint": (0.3, 0.5),
+        ".*_hip_(roll|yaw)_joint": (0.15, 0.2),
+        ".*_knee_joint": (0.35, 0.6),
+        ".*_ankle_pitch_joint": (0.25, 0.35),
+        ".*_ankle_roll_joint": (0.1, 0.15),
+        "waist_yaw_joint": (0.2, 0.3),
+        "waist_roll_joint": (0.08, 0.08),
+        "waist_pitch_joint": (0.1, 0.2),
+        ".*_shoulder_pitch_joint": (0.15, 0.5),
+        ".*_shoulder_roll_joint": (0.15, 0.2),
+        ".*_shoulder_yaw_joint": (0.1, 0.15),
+        ".*_elbow_joint": (0.15, 0.35),
+        ".*_wrist_.*": (0.3, 0.3),
+    }
 )
-T1_POSE = velocity.PoseStd(
-    standing={".*": 0.05},
-    walking={
-        ".*_Hip_Pitch": 0.3,
-        ".*_Hip_(Roll|Yaw)": 0.15,
-        ".*_Knee_Pitch": 0.35,
-        ".*_Ankle_Pitch": 0.25,
-        ".*_Ankle_Roll": 0.1,
-        "Waist": 0.2,
-        ".*_Shoulder_.*": 0.15,
-        ".*_Elbow_.*": 0.15,
-        "AAHead_yaw|Head_pitch": 0.1,
-    },
-    running={
-        ".*_Hip_Pitch": 0.5,
-        ".*_Hip_(Roll|Yaw)": 0.2,
-        ".*_Knee_Pitch": 0.6,
-        ".*_Ankle_Pitch": 0.35,
-        ".*_Ankle_Roll": 0.15,
-        "Waist": 0.3,
-        ".*_Shoulder_.*": 0.4,
-        ".*_Elbow_.*": 0.35,
-        "AAHead_yaw|Head_pitch": 0.1,
-    },
+T1_POSE = _pose(
+    {
+        ".*_Hip_Pitch": (0.3, 0.5),
+        ".*_Hip_(Roll|Yaw)": (0.15, 0.2),
+        ".*_Knee_Pitch": (0.35, 0.6),
+        ".*_Ankle_Pitch": (0.25, 0.35),
+        ".*_Ankle_Roll": (0.1, 0.15),
+        "Waist": (0.2, 0.3),
+        ".*_Shoulder_.*": (0.15, 0.4),
+        ".*_Elbow_.*": (0.15, 0.35),
+        "AAHead_yaw|Head_pitch": (0.1, 0.1),
+    }
 )
-HUMANOID_POSE = velocity.PoseStd(
-    standing={".*": 0.05},
-    walking={
-        ".*_hip_pitch": 0.3,
-        ".*_hip_(roll|yaw)": 0.15,
-        ".*_knee": 0.35,
-        ".*_ankle_pitch": 0.25,
-        ".*_ankle_roll": 0.1,
-        "waist_yaw": 0.2,
-        ".*_shoulder_(pitch|roll)|.*_elbow": 0.15,
-    },
-    running={
-        ".*_hip_pitch": 0.5,
-        ".*_hip_(roll|yaw)": 0.2,
-        ".*_knee": 0.6,
-        ".*_ankle_pitch": 0.35,
-        ".*_ankle_roll": 0.15,
-        "waist_yaw": 0.3,
-        ".*_shoulder_(pitch|roll)|.*_elbow": 0.4,
-    },
+HUMANOID_POSE = _pose(
+    {
+        ".*_hip_pitch": (0.3, 0.5),
+        ".*_hip_(roll|yaw)": (0.15, 0.2),
+        ".*_knee": (0.35, 0.6),
+        ".*_ankle_pitch": (0.25, 0.35),
+        ".*_ankle_roll": (0.1, 0.15),
+        "waist_yaw": (0.2, 0.3),
+        ".*_shoulder_(pitch|roll)|.*_elbow": (0.15, 0.4),
+    }
 )
 
 
@@ -220,7 +189,7 @@ def _two_legs_cfg(
         feet=feet,
         observations=velocity.observations(robot),
         sensors=velocity.self_contact(robot),
-        rewards=rewards | velocity.self_collisions(),
+        rewards=rewards | {"self_collisions": mdp.SelfCollision(weight=-1.0, sensor=velocity.SELF)},
         events=velocity.events(robot, torso=torso) | friction,
         viewer=viewer,
     )
@@ -262,6 +231,31 @@ def humanoid_velocity_flat() -> ManagerBasedRlEnvCfg:
     )
 
 
-G1 = _task(g1_velocity_flat, "Unitree G1", num_iterations=30_000)
+G1 = _task(
+    g1_velocity_flat,
+    "Unitree G1",
+    num_iterations=30_000,
+    other_trainings=(velocity.fast_sac_training(),),
+)
 T1 = _task(t1_velocity_flat, "Booster T1", num_iterations=30_000)
 HUMANOID = _task(humanoid_velocity_flat, "our humanoid", num_iterations=3_000)
+
+
+# -- rough ground ------------------------------------------------------------------------------------------------
+
+
+def go1_velocity_rough() -> ManagerBasedRlEnvCfg:
+    """Return the config of Unitree Go1."""
+    flat, height = go1_velocity_flat(), GO1_ROBOT.init_pos[2]
+    return velocity.on_rough_ground(flat, root_height=height, njmax=120, nconmax=40)
+
+
+def g1_velocity_rough() -> ManagerBasedRlEnvCfg:
+    """Return the config of Unitree G1."""
+    flat, height = g1_velocity_flat(), G1_ROBOT.init_pos[2]
+    return velocity.on_rough_ground(flat, root_height=height, njmax=250, nconmax=80)
+
+
+ROUGH = "over stairs, slopes and rough ground"
+GO1_ROUGH = _task(go1_velocity_rough, "Unitree Go1", ROUGH, num_iterations=10_000)
+G1_ROUGH = _task(g1_velocity_rough, "Unitree G1", ROUGH, num_iterations=30_000)

@@ -1,4 +1,4 @@
-"""This module compares one physics substep of an env with MuJoCo's C engine."""
+"""This module compares the physics of an env with MuJoCo's C engine, from states that random actions lead to."""
 
 import copy
 
@@ -8,19 +8,28 @@ from torchrl.envs import EnvBase
 
 from ksim_rl.envs.contract import SimulatedWorld, part
 from ksim_rl.physics import World
+from ksim_rl.physics.fields import write_fields
 from ksim_rl.testing.replays import Replays
 
-# Of the scale of a velocity, per substep: float32 and a solver that stops early stay far below; a field or an option
-# that one engine does not know of goes far beyond.
-TOLERANCE = 1e-2
+SUBSTEPS = 20
+# Of the scale of a velocity, after these substeps: float32 and a solver that stops early stay far below; a field or an
+# option that one engine does not know of goes far beyond.
+MEDIAN_TOLERANCE, TOLERANCE = 1e-3, 1e-2
+# How far, relatively, states are moved to see what becomes of rounding and of contacts that just begin in the C engine
+# itself, and by how much more a row may differ.
+MOVED, ALLOWANCE = 1e-5, 10.0
 # The C engine finds several contacts of a geom with neighbouring triangles of a height field where we find the one that
 # a plane would have: the same place, but stiffer.
 HEIGHT_FIELD_TOLERANCE = 1e-1
-_INPUTS = ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat", "time")
+_INPUTS = "qpos qvel act ctrl qfrc_applied xfrc_applied mocap_pos mocap_quat qacc_warmstart eq_active time"
 
 
 def check_c_engine(env: EnvBase, num_steps: int) -> None:
-    """One physics substep from the states that random actions lead to agrees with MuJoCo's C engine, in most rows."""
+    """20 substeps from the states that random actions lead to agree with MuJoCo's C engine, in the worst row too.
+
+    A row may differ by more where the C engine itself does, from states moved by 1e-5. On height fields, whose contacts
+    are not those of the C engine, only the median row counts.
+    """
     simulated = part(env, SimulatedWorld)
     if simulated is None:
         return
@@ -29,39 +38,45 @@ def check_c_engine(env: EnvBase, num_steps: int) -> None:
     for index in range(num_steps):
         _, root = replays.step(root, index)
     world = simulated.world
-    expected_EL = np.stack([_c_step(world, row) for row in range(world.num_envs)])
-    world.step(1)
+    expected_EL, *moved = (_c_engine(world, by) for by in (0.0, MOVED, -MOVED))
+    world.step(SUBSTEPS)
     actual_EL = world.qvel_EL.cpu().numpy().astype(np.float64)
     env.reset()
-    scale = 1.0 + np.abs(expected_EL).max(axis=-1)
-    error_E = np.abs(actual_EL - expected_EL).max(axis=-1) / scale
+    scale_E1 = 1.0 + np.abs(expected_EL).max(axis=-1, keepdims=True)
+    error_EL = np.abs(actual_EL - expected_EL) / scale_E1
+    spread_E = np.max([np.abs(other_EL - expected_EL) / scale_E1 for other_EL in moved], axis=(0, -1))
+    error_E = error_EL.max(axis=-1)
     on_height_field = np.isin(mujoco.mjtGeom.mjGEOM_HFIELD, world.mj_model.geom_type)
-    tolerance = HEIGHT_FIELD_TOLERANCE if on_height_field else TOLERANCE
-    if np.median(error_E) > tolerance:
+    median = HEIGHT_FIELD_TOLERANCE if on_height_field else MEDIAN_TOLERANCE
+    allowed_E = np.where(on_height_field, np.inf, TOLERANCE + ALLOWANCE * spread_E)
+    worst = int(np.argmax(error_E - allowed_E))
+    if np.median(error_E) > median or (error_E > allowed_E).any():
+        joint = world.mj_model.joint(int(world.mj_model.dof_jntid[np.argmax(error_EL[worst])])).name
         raise AssertionError(
-            f"after one substep qvel differs from the C engine's by {np.median(error_E):.2g} of its scale in the "
-            f"median row (allowed {tolerance}). Look for a model feature that Warp treats otherwise, for too few "
+            f"after {SUBSTEPS} substeps qvel differs from the C engine's by {np.median(error_E):.2g} of its scale "
+            f"in the median row (allowed {median}), and by {error_E[worst]:.2g} in row {worst} at joint {joint!r} "
+            f"(allowed {allowed_E[worst]:.2g}). Look for a model feature that Warp treats otherwise, for too few "
             "solver iterations (`sim.iterations`), and for contacts that did not fit (`world.overflow_report()`)"
         )
 
 
-def _c_step(world: World, row: int) -> np.ndarray:
-    """Return qvel after one step of the C engine from the state, and with the model, of a row."""
-    mj_model = copy.copy(world.mj_model)
-    for name, values_E in world.per_world_fields().items():
-        values = values_E[row].cpu().numpy()
-        if name == "gravity":
-            mj_model.opt.gravity[:] = values
-        else:
-            getattr(mj_model, name)[:] = values.reshape(getattr(mj_model, name).shape)
-    data = mujoco.MjData(mj_model)
-    for name in _INPUTS:
-        target = np.asarray(getattr(data, name))
-        if target.size:
-            values = world.view(name)[row].cpu().numpy()
+def _c_engine(world: World, moved: float) -> np.ndarray:
+    """Return qvel [E, nv] after substeps of the C engine from the rows' states, moved by a share of themselves."""
+    inputs = {name: world.view(name).cpu().numpy() for name in _INPUTS.split()}
+    fields = {name: values_E.cpu().numpy() for name, values_E in world.per_world_fields().items()}
+    reached = []
+    for row in range(world.num_envs):
+        mj_model = copy.copy(world.mj_model)
+        write_fields(mj_model, {name: values[row] for name, values in fields.items()})
+        mj_data = mujoco.MjData(mj_model)
+        for name, values in inputs.items():
             if name == "time":
-                data.time = float(values)
-            else:
-                target[:] = values.reshape(target.shape)
-    mujoco.mj_step(mj_model, data)
-    return np.array(data.qvel)
+                mj_data.time = float(values[row])
+            elif values[row].size:
+                target = getattr(mj_data, name)
+                target[:] = values[row].reshape(target.shape)
+        mj_data.qpos *= 1.0 + moved
+        mj_data.qvel *= 1.0 + moved
+        mujoco.mj_step(mj_model, mj_data, SUBSTEPS)
+        reached.append(np.array(mj_data.qvel))
+    return np.stack(reached)

@@ -7,7 +7,29 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from ksim_rl import dims
-from ksim_rl.testing.dims import assert_dims
+
+
+def assert_dims(td: TensorDictBase, *names: str) -> None:
+    """Check that the batch dims of `td`, and of each tensordict inside, bear `names`, such as "E", "T"."""
+    _assert_dims(td, list(names), "the tensordict")
+
+
+def assert_leaf(td: TensorDictBase, key: str | tuple[str, ...], *leaf_shape: int) -> None:
+    """Check the shape of a leaf beyond the batch dims: `assert_leaf(rollout_ET, "actor", 48)` for [E, T, 48]."""
+    found = tuple(td[key].shape[td.batch_dims :])
+    assert found == leaf_shape, f"{key!r} has shape {found} beyond {td.names}: expected {leaf_shape}"
+
+
+def _assert_dims(td: TensorDictBase, names: list[str], where: str) -> None:
+    assert td.names[: len(names)] == names and td.batch_dims >= len(names), (
+        f"{where} has dims {td.names} (batch size {tuple(td.batch_size)}): expected {names}"
+    )
+    if where == "the tensordict":
+        assert td.batch_dims == len(names), f"{where} has dims {td.names}: expected exactly {names}"
+    for key, value in td.items():
+        if isinstance(value, TensorDictBase):
+            _assert_dims(value, names, f"{where}[{key!r}]")
+
 
 SPECS = ("full_observation_spec", "full_action_spec", "full_reward_spec", "full_done_spec")
 

@@ -11,18 +11,16 @@ from torchrl.envs import EnvBase
 
 from ksim_rl import dims
 from ksim_rl.device import random
+from ksim_rl.testing.check_specs import SPECS
 
 
 class CounterEnv(EnvBase):
     """Env e counts its own steps and ends after `lengths[e]` of them; a plain `EnvBase`, with masked `_reset`.
 
     Observations ([E, 1] float32 unless stated): "count" (steps since the reset), "episode" (resets so far), "row" (its
-    own number), "drawn" (uniform on [0, 1), drawn at the reset from seed, row and episode), and ("obs", "vector")
-    [E, 3] = count + (0, 100, 200). Reward is the action's sum. Even rows terminate, odd rows are truncated.
-
-    Args:
-        lengths: steps per episode, one per env; `()` gives one env with batch size [] that ends after 3 steps.
-        action_size: A of the action [E, A].
+    own number), "drawn" (uniform on [0, 1), drawn at the reset from seed, row and episode), and ("obs", "vector") [E,
+    3] = count + (0, 100, 200). Reward is the action's sum. Even rows terminate, odd rows are truncated. Without
+    `lengths` it is one env with batch size [] that ends after 3 steps.
     """
 
     count_E: Tensor
@@ -47,9 +45,7 @@ class CounterEnv(EnvBase):
         shape_1 = torch.Size([*batch, 1])
         scalar = Unbounded(shape_1, device=self.device)
         self.observation_spec = Composite(
-            count=scalar.clone(),
-            episode=scalar.clone(),
-            row=scalar.clone(),
+            {name: scalar.clone() for name in ("count", "episode", "row")},
             drawn=Bounded(0.0, 1.0, shape_1, device=self.device),
             obs=Composite(
                 vector=Unbounded(torch.Size([*batch, 3]), device=self.device), shape=batch, device=self.device
@@ -64,14 +60,8 @@ class CounterEnv(EnvBase):
         self.full_done_spec = Composite(
             done=done, terminated=done.clone(), truncated=done.clone(), shape=batch, device=self.device
         )
-        specs = (
-            self.full_observation_spec,
-            self.full_action_spec,
-            self.full_reward_spec,
-            self.full_done_spec,
-        )
-        for spec in specs:
-            spec.names = [dims.E] * len(batch)
+        for which in SPECS:
+            getattr(self, which).names = [dims.E] * len(batch)
 
     def _observe(self) -> dict[str, Any]:
         keys = random.row_keys(self.seed_value, 1, self.episode_E, self.num_rows)

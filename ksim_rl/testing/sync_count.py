@@ -45,11 +45,7 @@ _INTERNAL = ("/torch/", "/contextlib.py", __file__)
 
 @dataclass(kw_only=True)
 class SyncCount:
-    """What `count_syncs` saw.
-
-    Args:
-        calls: one line per sync, with the place in the code.
-    """
+    """What `count_syncs` saw: one line per sync, with the place in the code."""
 
     calls: list[str] = field(default_factory=list)
 
@@ -71,39 +67,32 @@ def count_syncs() -> Iterator[SyncCount]:
     It sees values read by Python, boolean indexing, results whose size depends on data, copies between devices, and
     tensors made from Python data. It does not see what C++ reads without the dispatcher: on a GPU,
     `torch.cuda.set_sync_debug_mode("error")` is the last word. Inside compiled code it sees nothing.
-
-    Example:
-        >>> with count_syncs() as syncs:
-        ...     env.step_and_maybe_reset(td)
-        >>> assert syncs.total == 0, syncs.report()
     """
     count = SyncCount()
     with _Methods(count), _Operations(count):
         yield count
 
 
-class _Methods(TorchFunctionMode):
+class _Counting:
     def __init__(self, count: SyncCount) -> None:
         super().__init__()
         self.count = count
 
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        what = _METHODS.get(func)
+    def note(self, what: str | None) -> None:
         if what is not None:
             self.count.calls.append(f"{what} at {_place()}")
+
+
+class _Methods(_Counting, TorchFunctionMode):
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.note(_METHODS.get(func))
         return func(*args, **(kwargs or {}))
 
 
-class _Operations(TorchDispatchMode):
-    def __init__(self, count: SyncCount) -> None:
-        super().__init__()
-        self.count = count
-
+class _Operations(_Counting, TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        what = _why_it_syncs(func, args, kwargs)
-        if what is not None:
-            self.count.calls.append(f"{what} at {_place()}")
+        self.note(_why_it_syncs(func, args, kwargs))
         return func(*args, **kwargs)
 
 
@@ -122,7 +111,8 @@ def _why_it_syncs(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> s
     if name == "aten::_to_copy" and _differs(args[0].device, kwargs.get("device")):
         return "copy to another device"
     if name == "aten::copy_" and isinstance(args[1], Tensor) and _differs(args[0].device, args[1].device):
-        return "copy between devices"
+        into_pinned = len(args) > 2 and args[2] and args[0].is_cpu and args[0].is_pinned()
+        return None if into_pinned else "copy between devices"
     return None
 
 

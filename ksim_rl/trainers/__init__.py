@@ -1,4 +1,5 @@
 """This room holds the training loop and what surrounds it: evaluation, checkpoints, logs, progress, pictures."""
+# ruff: noqa: F401
 
 import importlib
 from typing import Any
@@ -7,33 +8,10 @@ from ksim_rl.trainers.algorithm import Algorithm, Update
 from ksim_rl.trainers.build import build
 from ksim_rl.trainers.checkpoint import Checkpoint, CheckpointError
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
-from ksim_rl.trainers.hooks import Hook
 from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg, TrainerCfg, TrainingCfg
 from ksim_rl.trainers.run_folder import Policy, load_policy, record_video, run
-from ksim_rl.trainers.trainer import Outcome, Trainer
-
-__all__ = [
-    "Algorithm",
-    "Checkpoint",
-    "CheckpointError",
-    "Evaluation",
-    "Evaluator",
-    "Hook",
-    "ModulesCfg",
-    "Outcome",
-    "Policy",
-    "RunCfg",
-    "RunProgress",
-    "Trainer",
-    "TrainerCfg",
-    "TrainingCfg",
-    "Update",
-    "build",
-    "load_policy",
-    "record_video",
-    "run",
-]
+from ksim_rl.trainers.trainer import Hook, Outcome, Trainer
 
 
 def __getattr__(name: str) -> Any:

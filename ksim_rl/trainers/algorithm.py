@@ -1,9 +1,9 @@
 """This module says what a trainer asks of an algorithm, and finds that of a run's config."""
 
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Num
@@ -22,11 +22,7 @@ REGISTRY = "ksim_rl.algorithms.registry"
 
 
 class Update(Protocol):
-    """Improves a policy with one rollout at a time. `PPOUpdate` and its siblings are such; so may be a class of yours.
-
-    Attributes:
-        device: where all of it lives.
-    """
+    """Improves a policy with one rollout at a time: `PPOUpdate`, one of its siblings, or a class of yours."""
 
     device: torch.device
 
@@ -71,35 +67,33 @@ class Update(Protocol):
         """Take only the networks of a `state_dict`: a new run that starts from them."""
 
 
+@runtime_checkable
+class HasNotes(Protocol):
+    """An update that has something to say at the start of a run, such as why it is slower than it could be."""
+
+    @property
+    def notes(self) -> Sequence[str]: ...  # noqa: D102
+
+
 @dataclass(frozen=True, kw_only=True)
 class Algorithm:
     """How the parts of an algorithm are made for a run and its env, and which data and networks suit it.
 
-    A module of a registered package that holds one at its top level registers it.
-
-    Attributes:
-        name: as in `objective=<name>`.
-        cfg: its settings; a run whose objective is one of these, or of a subclass, is trained by this algorithm.
-        update: builds everything that learns. Its third argument is the `state_dict` of the update that a resumed run
-            goes on from, for parts that are made from it; the trainer loads it afterwards. None begins anew.
-        policy: builds the policy alone, whose weights a checkpoint holds under `update/actor`.
-        data, modules: what `objective=<name>` chooses beside its settings.
+    A module of a registered package that holds one at its top level registers it. The third argument of `update` is the
+    `state_dict` of the update that a resumed run goes on from, for parts that are made from it; the trainer loads it
+    afterwards. None begins anew.
     """
 
-    name: str
-    cfg: type[AlgorithmCfg]
+    name: str  # as in `objective=<name>`
+    cfg: type[AlgorithmCfg]  # a run whose objective is one of these, or of a subclass, is trained by it
     update: Callable[[RunCfg, EnvBase, Mapping[str, Any] | None], Update]
-    policy: Callable[[RunCfg, EnvBase], TensorDictModuleBase]
-    data: DatasetCfg | ReplayCfg
+    policy: Callable[[RunCfg, EnvBase], TensorDictModuleBase]  # its weights: `update/actor` of a checkpoint
+    data: DatasetCfg | ReplayCfg  # what `objective=<name>` chooses beside its settings, as are the modules
     modules: ModulesCfg = field(default_factory=ModulesCfg)
 
 
 def algorithm_of(cfg: RunCfg) -> Algorithm:
-    """Return the algorithm of a run.
-
-    Raises:
-        ValueError: if none is registered for its objective.
-    """
+    """Return the algorithm of a run; a ValueError where none is registered for its objective."""
     return importlib.import_module(REGISTRY).serving(type(cfg.objective))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from ksim_rl import envs
 from ksim_rl.collectors import RolloutCollector
@@ -16,10 +16,9 @@ from ksim_rl.modules import RecurrentStatePrimer, recurrent_transforms, state_sp
 from ksim_rl.trainers.algorithm import make_update
 from ksim_rl.trainers.checkpoint import Checkpoint
 from ksim_rl.trainers.evaluation import Evaluator
-from ksim_rl.trainers.hooks import Hook
 from ksim_rl.trainers.loggers import check_installed, make_loggers
-from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg
-from ksim_rl.trainers.trainer import Trainer
+from ksim_rl.trainers.run_cfg import RunCfg
+from ksim_rl.trainers.trainer import Hook, Trainer
 
 # Evaluations see other initial states than training does.
 EVALUATION_SEED_OFFSET = 1_000_003
@@ -38,21 +37,16 @@ def build(
 ) -> Trainer:
     """Build everything that a run needs, with all its memory allocated.
 
-    Torch's global seed, matmul precision and number of CPU threads are set from the config.
-
-    Args:
-        cfg: of the run.
-        run_folder: takes logs and checkpoints; None writes nothing.
-        hooks: what else to do between iterations.
-        resume_from: what the run continues from; None starts anew, with the weights of `cfg.checkpoint` if it has one.
-
-    Raises:
-        ValueError: if a logger's package is missing, or a checkpoint is of another network or env.
+    Torch's global seed, matmul precision and number of CPU threads are set from the config. Without a `run_folder`
+    nothing is written; without `resume_from` the run starts anew, with the weights of `cfg.checkpoint` if it has one.
+    Raises ValueError where a logger's package is missing, or a checkpoint is of another network or env.
     """
     check_installed(cfg.logger)
     torch.manual_seed(cfg.seed)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
-    torch.set_num_threads(cfg.trainer.num_threads or _num_threads(cfg.resolved_device()))
+    all_but_one = max(1, (os.cpu_count() or 1) - 1)
+    most = MOST_THREADS_BESIDE_CUDA if cfg.resolved_device().type == "cuda" else all_but_one
+    torch.set_num_threads(cfg.trainer.num_threads or min(all_but_one, most))
 
     env = build_env(cfg, num_envs=cfg.num_envs, seed=cfg.seed)
     update = make_update(cfg, env, resumed=resume_from.state["update"] if resume_from else None)
@@ -83,40 +77,28 @@ def build(
     return trainer
 
 
-def _num_threads(device: torch.device) -> int:
-    all_but_one = max(1, (os.cpu_count() or 1) - 1)
-    return min(all_but_one, MOST_THREADS_BESIDE_CUDA) if device.type == "cuda" else all_but_one
-
-
 def build_env(cfg: RunCfg, *, num_envs: int, seed: int, render_mode: str | None = None) -> EnvBase:
-    """Build the env of a run, with another number of envs and another seed."""
+    """Build the env of a run, with another number of envs and another seed.
+
+    It carries what a recurrent policy remembers, and tells recurrent networks where episodes begin.
+    """
     scene = dataclasses.replace(cfg.task.scene, num_envs=num_envs)
     task = dataclasses.replace(cfg.task, scene=scene, seed=seed)
     env = envs.build(task, device=cfg.resolved_device(), render_mode=render_mode)
-    return _with_recurrent_state(env, cfg.modules)
-
-
-def _with_recurrent_state(env: TransformedEnv, modules: ModulesCfg) -> TransformedEnv:
-    """Let an env carry what the policy remembers, and tell networks with a memory where episodes begin."""
-    if modules.recurrent:
-        cfg = modules.recurrent_actor
-        primers = [] if cfg is None else [RecurrentStatePrimer(state_spec(cfg, "actor"))]
+    if cfg.modules.recurrent:
+        actor = cfg.modules.recurrent_actor
+        primers = [] if actor is None else [RecurrentStatePrimer(state_spec(actor, "actor"))]
         for transform in recurrent_transforms(env, *primers):
             env.append_transform(transform)
     return env
 
 
 def build_evaluator(
-    cfg: RunCfg,
-    actor: TensorDictModuleBase,
-    *,
-    episodes: int | None = None,
-    seed: int | None = None,
+    cfg: RunCfg, actor: TensorDictModuleBase, *, episodes: int | None = None, seed: int | None = None
 ) -> Evaluator:
-    """Build envs for evaluation, and what runs a policy in them.
+    """Build envs for evaluation, without sensor noise and curricula, and what runs a policy in them.
 
-    Sensor noise is off, and so are curricula: their weights and ranges are those of the config, whatever training has
-    come to.
+    Weights and ranges are those of the config, whatever curricula have come to in training.
     """
     seed = cfg.seed + EVALUATION_SEED_OFFSET if seed is None else seed
     cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, curriculum={}))

@@ -18,6 +18,7 @@ from typing import Any
 import safetensors.torch
 from safetensors import SafetensorError
 
+from ksim_rl.config import plain_data
 from ksim_rl.device import state_tree
 from ksim_rl.trainers import checkpoint_formats
 
@@ -44,11 +45,7 @@ class Checkpoint:
 def save(
     folder: Path, state: Mapping[str, Any], *, iteration: int, config: Mapping[str, Any], keep: int = 3
 ) -> Path:
-    """Write one more checkpoint into `folder` and drop all but the newest `keep`.
-
-    Raises:
-        OSError: when the disk is full or not writable; earlier checkpoints are untouched then.
-    """
+    """Write one more checkpoint into `folder`, and drop all but the newest `keep`; an OSError leaves these alone."""
     folder.mkdir(parents=True, exist_ok=True)
     tensors, values = state_tree.split(state)
     tensor_bytes = safetensors.torch.save(tensors)
@@ -84,11 +81,7 @@ def save(
 
 
 def load(path: Path) -> Checkpoint:
-    """Read one checkpoint, verifying every byte before any of it is used, and bring an older format up to date.
-
-    Raises:
-        CheckpointError: with the reason, when anything is absent, damaged, surplus or of a version that cannot be read.
-    """
+    """Read a checkpoint of any format, every byte verified first; a CheckpointError says what is damaged or unknown."""
     manifest = _read_manifest(path)
     files = manifest["files"]
     surplus = {entry.name for entry in path.iterdir()} - {MANIFEST, *files}
@@ -120,11 +113,7 @@ def saved(folder: Path) -> list[Path]:
 
 
 def latest(path: Path) -> Path:
-    """Find the newest checkpoint of a run folder or a checkpoint folder; a checkpoint itself is returned as it is.
-
-    Raises:
-        CheckpointError: when there is none.
-    """
+    """Find the newest checkpoint of a run folder or a checkpoint folder; a checkpoint itself is returned as it is."""
     if (path / MANIFEST).exists():
         return path
     for folder in (path / "checkpoint", path):
@@ -144,11 +133,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def check_columns(saved: Columns, own: Columns) -> None:
-    """Refuse observations with other terms or other columns than the checkpoint's; both are group -> term -> range.
-
-    Raises:
-        ValueError: naming the terms that only one of the two has, or whose columns differ.
-    """
+    """Refuse, by name, terms or columns other than the checkpoint's; both are group -> term -> range."""
     faults = []
     for group in dict.fromkeys([*saved, *own]):
         theirs, ours = saved.get(group, {}), own.get(group, {})
@@ -203,18 +188,10 @@ def _read_manifest(path: Path) -> dict[str, Any]:
 
 
 def _read_regular_file(path: Path, *, limit: int) -> bytes:
-    """Read a file, following no link; one byte beyond `limit` is read so that a longer file shows."""
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-        with os.fdopen(descriptor, "rb") as file:
-            content = file.read(limit + 1)
-    except FileNotFoundError as error:
-        raise CheckpointError(f"{path}: missing") from error
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read: {error.strerror}") from error
-    if len(content) > limit:
-        raise CheckpointError(f"{path}: damaged: longer than the {limit} bytes it may have")
-    return content
+        return plain_data.read_bytes(path, limit=limit)
+    except ValueError as error:
+        raise CheckpointError(str(error)) from error
 
 
 def _write_durably(path: Path, content: bytes) -> None:

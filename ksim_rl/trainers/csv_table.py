@@ -1,4 +1,4 @@
-"""All metrics of a run in one CSV file, one row per logged iteration."""
+"""This module keeps all metrics of a run in one CSV file, one row per logged iteration."""
 
 import csv
 import os

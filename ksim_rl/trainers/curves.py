@@ -28,17 +28,7 @@ _COLORS = ("#3465a4", "#cc5500")
 
 
 def draw(table: Path, picture: Path, *, title: str, solved_at: float | None = None) -> None:
-    """Draw the learning curves of a metrics table into a PNG.
-
-    Args:
-        table: the run's `metrics.csv`.
-        picture: the file to write.
-        title: stands above the panels.
-        solved_at: the return at which the task counts as solved; drawn as a line.
-
-    Raises:
-        ValueError: when the table has no rows.
-    """
+    """Draw the learning curves of a `metrics.csv` into a PNG, with a line at `solved_at`; ValueError without rows."""
     _, rows = read_table(table)
     if not rows:
         raise ValueError(f"{table}: no rows to draw")

@@ -1,7 +1,7 @@
 """An evaluation judges a policy by its deterministic actions in envs of their own, one whole episode in each."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
@@ -10,6 +10,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl.device.capture import Captured
+from ksim_rl.envs.signal_keys import signal_keys
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,23 +23,15 @@ class Evaluation:
     episodes: int
     unfinished: int
 
-    def as_dict(self) -> dict[str, float]:
-        """Return the figures by name."""
-        return asdict(self)
-
 
 class Evaluator:
     """Runs the first episode of each env from the same seed, with the policy's deterministic action.
 
-    Args:
-        env: envs that nothing else steps; one episode is counted in each. Its batch size is `["E"]`.
-        policy: reads the env's observations and writes its action.
-        max_steps: the step limit; the env's `max_episode_length` is the natural one.
-        seed: of the initial states, so that evaluations of one run compare.
+    The envs `["E"]` are stepped by nothing else. Their own `max_episode_length` is the natural `max_steps`.
     """
 
     def __init__(self, env: EnvBase, policy: TensorDictModuleBase, *, max_steps: int, seed: int) -> None:
-        self.env, self.policy = env, policy
+        self.env, self.policy, self._signals = env, policy, signal_keys(env)
         self.max_steps, self.seed = max_steps, seed
         num_envs, device = env.batch_size[0], env.device or torch.device("cpu")
         self._return_E = torch.zeros(num_envs, dtype=torch.float64, device=device)
@@ -57,11 +50,10 @@ class Evaluator:
                 self._step()
         std, mean = torch.std_mean(self._return_E, correction=0)
         figures = torch.stack([mean, std, self._length_E.mean(), self._running_E.sum().to(torch.float64)])
-        return_mean, return_std, length_mean, unfinished = figures.tolist()
+        *means, unfinished = figures.tolist()
+        names = ("return_mean", "return_std", "length_mean")
         return Evaluation(
-            return_mean=return_mean,
-            return_std=return_std,
-            length_mean=length_mean,
+            **dict(zip(names, means, strict=True)),
             episodes=self._return_E.numel(),
             unfinished=int(unfinished),
         )
@@ -81,7 +73,8 @@ class Evaluator:
         assert self._current_E is not None
         acting_E = self.policy(self._current_E.copy())
         stepped_E, current_E = self.env.step_and_maybe_reset(acting_E)
-        reward_E, done_E = (stepped_E["next", name].squeeze(-1) for name in ("reward", "done"))
+        next_E = stepped_E.get("next")
+        reward_E, done_E = (next_E.get(key).reshape(-1) for key in self._signals[:2])
         self._return_E.add_(torch.where(self._running_E, reward_E.to(torch.float64), 0.0))
         self._length_E.add_(self._running_E)
         self._running_E.logical_and_(~done_E)

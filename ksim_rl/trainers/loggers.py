@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import re
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -14,6 +15,7 @@ from torchrl.record.loggers.mlflow import MLFlowLogger
 from torchrl.record.loggers.wandb import WandbLogger
 
 from ksim_rl.checked import Checked
+from ksim_rl.config import plain_data
 from ksim_rl.trainers.csv_table import CsvTable
 
 # What MLflow takes in one request, and how long a value may be.
@@ -32,21 +34,13 @@ class MetricLogger(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class WandbCfg(Checked):
-    """A run on Weights & Biases.
-
-    Attributes:
-        project: that it belongs to.
-        entity: user or team; None is the default of the account.
-        name: of the run; None is that of the run folder.
-        tags: to find it by.
-        offline: write it into the run folder only; `wandb sync RUN/wandb/offline-*` sends it later.
-    """
+    """A run on Weights & Biases; by default of the account's entity, with the name of the run folder."""
 
     project: str = "ksim_rl"
     entity: str | None = None
     name: str | None = None
     tags: tuple[str, ...] = ()
-    offline: bool = False
+    offline: bool = False  # write into the run folder only; `wandb sync RUN/wandb/offline-*` sends it later
 
     def __post_init__(self) -> None:
         """Refuse a project without a name."""
@@ -57,10 +51,14 @@ class WandbCfg(Checked):
 
 def open_wandb(cfg: WandbCfg, run_folder: Path, config: Mapping[str, Any]) -> MetricLogger:
     """Begin the run with the config of a training run, or continue that of a resumed one."""
+    kept_id = run_folder / "wandb" / "run_id"
+    if not kept_id.exists():
+        kept_id.parent.mkdir(parents=True, exist_ok=True)
+        kept_id.write_text(uuid.uuid4().hex)
     logger = WandbLogger(
         cfg.name or run_folder.name,
         save_dir=run_folder,
-        id=_run_id(run_folder / "wandb" / "run_id"),
+        id=_kept_id(kept_id),
         project=cfg.project,
         entity=cfg.entity,
         tags=list(cfg.tags),
@@ -71,22 +69,20 @@ def open_wandb(cfg: WandbCfg, run_folder: Path, config: Mapping[str, Any]) -> Me
     return logger
 
 
-def _run_id(path: Path) -> str:
-    if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(uuid.uuid4().hex)
-    return path.read_text()
+def _kept_id(path: Path) -> str:
+    """Return the id in a file of a run folder, which becomes part of paths and addresses."""
+    text = plain_data.read_bytes(path, limit=100).decode(errors="replace")
+    if not re.fullmatch(r"[\w-]+", text, re.ASCII):
+        raise ValueError(f"{path}: {text!r} is not the id of a run: letters, digits, _ and -")
+    return text
 
 
 @dataclass(frozen=True, kw_only=True)
 class MLflowCfg(Checked):
-    """A run in MLflow.
+    """A run in MLflow, by default with the name of the run folder.
 
-    Attributes:
-        experiment: that it belongs to.
-        name: of the run; None is that of the run folder.
-        tracking_uri: of the server or database; None is `MLFLOW_TRACKING_URI`, and without that variable a database
-            in the run folder: `mlflow ui --backend-store-uri sqlite:///RUN/mlflow/mlflow.db` shows it.
+    The server or database `tracking_uri` is by default `MLFLOW_TRACKING_URI`, and without that variable a database in
+    the run folder: `mlflow ui --backend-store-uri sqlite:///RUN/mlflow/mlflow.db` shows it.
     """
 
     experiment: str = "ksim_rl"
@@ -120,7 +116,7 @@ def open_mlflow(cfg: MLflowCfg, run_folder: Path, config: Mapping[str, Any]) -> 
     resumes = kept_id.exists()
     if resumes:
         # `mlflow.start_run`, which the logger calls without one, takes the id from here.
-        os.environ["MLFLOW_RUN_ID"] = kept_id.read_text()
+        os.environ["MLFLOW_RUN_ID"] = _kept_id(kept_id)
     own = f"sqlite:///{(folder / 'mlflow.db').resolve()}"
     uri = cfg.tracking_uri or os.environ.get("MLFLOW_TRACKING_URI") or own
     artifacts = (folder / "artifacts").resolve().as_uri() if uri == own else None
@@ -144,27 +140,16 @@ def _flat(tree: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, str]]:
 
 @dataclass(frozen=True, kw_only=True)
 class LoggerCfg(Checked):
-    """Where metrics are written; files lie in the run folder.
+    """Where metrics are written; files lie in the run folder."""
 
-    Attributes:
-        csv: one table, `metrics.csv`; the learning curves are drawn from it.
-        tensorboard: event files in `tensorboard/`.
-        wandb: a run on Weights & Biases (needs `ksim_rl[wandb]`); None has none.
-        mlflow: a run in MLflow (needs `ksim_rl[mlflow]`); None has none.
-    """
-
-    csv: bool = True
-    tensorboard: bool = True
-    wandb: WandbCfg | None = None
-    mlflow: MLflowCfg | None = None
+    csv: bool = True  # one table, `metrics.csv`; the learning curves are drawn from it
+    tensorboard: bool = True  # event files in `tensorboard/`
+    wandb: WandbCfg | None = None  # needs `ksim_rl[wandb]`
+    mlflow: MLflowCfg | None = None  # needs `ksim_rl[mlflow]`
 
 
 def check_installed(cfg: LoggerCfg) -> None:
-    """Refuse loggers whose packages are missing.
-
-    Raises:
-        ValueError: with the command that installs the package.
-    """
+    """Refuse loggers whose packages are missing, with the command that installs the package."""
     for name in ("wandb", "mlflow"):
         if getattr(cfg, name) is not None and importlib.util.find_spec(name) is None:
             raise ValueError(f"logger.{name}: the package {name} is missing: pip install 'ksim_rl[{name}]'")
@@ -173,11 +158,7 @@ def check_installed(cfg: LoggerCfg) -> None:
 def make_loggers(
     cfg: LoggerCfg, run_folder: Path, *, config: Mapping[str, Any] | None = None
 ) -> list[MetricLogger]:
-    """Open the loggers of a run; those that show a run's config get `config`, plain data.
-
-    Raises:
-        RuntimeError: if a service is not there, or does not know the user.
-    """
+    """Open the loggers of a run, some of which show its `config`; a RuntimeError names a service that refuses."""
     loggers: list[MetricLogger] = []
     if cfg.csv:
         loggers.append(CsvTable(run_folder / "metrics.csv"))

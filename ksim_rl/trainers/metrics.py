@@ -6,10 +6,12 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float64, Int64, Num, Shaped
 from tensordict import TensorDictBase
+from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl.envs.contract import DifficultyLevels, EpisodeSums, SimulatedWorld, part
+from ksim_rl.envs.signal_keys import signal_keys
 
 _OVERFLOW, _NAN = "overflow/", "nan/worlds"
 
@@ -55,7 +57,7 @@ def read_episode_sums(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Num
     Any env gives the mean reward per step; one with `EpisodeSums` also its sums over the episodes that ended, and one
     with `DifficultyLevels` those.
     """
-    sums = {"rollout/reward": rollout_ET.get(("next", "reward")).mean()}
+    sums = {"rollout/reward": rollout_ET.get(unravel_key(("next", signal_keys(env).reward))).mean()}
     if (episodes := part(env, EpisodeSums)) is not None:
         # Copies, because the sums are cleared before they are read on the host.
         sums |= {f"sum/{name}": total.clone() for name, total in episodes.episode_log().items()}
@@ -94,17 +96,11 @@ def episode_means(sums: Mapping[str, float], *, max_episode_length_s: float) -> 
 
 @dataclass(frozen=True, kw_only=True)
 class PhysicsReport:
-    """What happened in the physics of one rollout.
+    """What happened in the physics of one rollout."""
 
-    Attributes:
-        metrics: shares and counts to log, `physics/<name>`.
-        lost: one line for each kind of contacts or constraints that did not fit.
-        saved: one line for each state that the NaN guard wrote to a file.
-    """
-
-    metrics: dict[str, float]
-    lost: tuple[str, ...] = ()
-    saved: tuple[str, ...] = ()
+    metrics: dict[str, float]  # shares and counts to log, `physics/<name>`
+    lost: tuple[str, ...] = ()  # one line for each kind of contacts or constraints that did not fit
+    saved: tuple[str, ...] = ()  # one line for each state that the NaN guard wrote to a file
 
 
 def read_physics(env: EnvBase) -> dict[str, Int64[Tensor, ""]]:

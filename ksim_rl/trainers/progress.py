@@ -42,13 +42,8 @@ class RunProgress:
     """Shows iteration, speed, return, episode length, losses and the time left.
 
     Use as a context manager around the run. `note` prints a line that stays; `status` shows what is going on while
-    nothing else moves (kernel compilation).
-
-    Args:
-        total: iterations of the whole run.
-        done: iterations of it that are already done.
-        console: where to write; the default is stdout.
-        enabled: False shows nothing but notes.
+    nothing else moves (kernel compilation). Of the `total` iterations of the whole run, `done` are already done;
+    without `enabled` only notes are shown.
     """
 
     def __init__(
@@ -94,11 +89,11 @@ class RunProgress:
             self._live.update(self._panel())
         elif self._enabled:
             shown = ", ".join(f"{label} {text}" for label, text in self._figures(metrics))
-            self._print(f"iteration {iteration}/{self.total}: {shown}, left {left}")
+            self.note(f"iteration {iteration}/{self.total}: {shown}, left {left}")
 
     def note(self, text: str) -> None:
         """Print one line that stays."""
-        self._print(text)
+        self.console.print(text, markup=False, soft_wrap=True)
 
     def status(self, text: str) -> None:
         """Show what is going on now; in a pipe, a repetition of the same beginning is printed once."""
@@ -108,10 +103,7 @@ class RunProgress:
             self._live.update(self._panel())
         elif beginning != self._status:
             self._status = beginning
-            self._print(text)
-
-    def _print(self, text: str) -> None:
-        self.console.print(text, markup=False, soft_wrap=True)
+            self.note(text)
 
     def _figures(self, metrics: Mapping[str, float]) -> list[tuple[str, str]]:
         return [(label, pattern.format(metrics[name])) for name, label, pattern in SHOWN if name in metrics]
@@ -125,14 +117,10 @@ class RunProgress:
 
 
 class RunClock:
-    """Measures iterations; evaluations and checkpoints count in the total, not in an iteration.
-
-    Attributes:
-        total: s, over all sessions of a resumed run.
-    """
+    """Measures iterations; evaluations and checkpoints count in the total, not in an iteration."""
 
     def __init__(self) -> None:
-        self.total = 0.0
+        self.total = 0.0  # s, over all sessions of a resumed run
         self._last: float | None = None
         self._laps: deque[float] = deque(maxlen=20)
         self._created = time.monotonic()

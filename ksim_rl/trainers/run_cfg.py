@@ -1,8 +1,10 @@
 """A training run is configured by one dataclass tree whose groups mirror the rooms."""
 
+import os
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
@@ -12,6 +14,7 @@ from ksim_rl.checks import near
 from ksim_rl.collectors import CollectorCfg
 from ksim_rl.config import class_paths, plugins
 from ksim_rl.config.config_tree import from_tree, to_tree
+from ksim_rl.config.plain_data import check_plain
 from ksim_rl.data import DatasetCfg, ReplayCfg, sequence_length
 from ksim_rl.envs import ManagerBasedRlEnvCfg
 from ksim_rl.modules import (
@@ -31,58 +34,50 @@ from ksim_rl.trainers.loggers import LoggerCfg
 # Seeds of evaluations lie above a run's own, and must fit 64 bits as well.
 MOST_SEED = 2**62
 PLUGINS = "plugins"
+# It becomes part of the path of the run folder.
+TASK_NAME = re.compile(r"\w[\w.+-]*")
+# Fields that name places to write to beside the run folder, and the variables of those that have one.
+WRITTEN = ("logger.mlflow.tracking_uri", "task.sim.nan_guard.folder")
+VOUCHED_BY = {"logger.mlflow.tracking_uri": "MLFLOW_TRACKING_URI"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainerCfg(Checked):
-    """Options of `Trainer`. Intervals are in iterations; 0 means never.
+    """Options of `Trainer`. Intervals are in iterations, of one rollout and one update each; 0 means never.
 
-    Attributes:
-        num_iterations: an iteration is one rollout and one update, D env states.
-        eval_interval: between evaluations with deterministic actions in envs of their own.
-        eval_episodes: episodes of an evaluation, one env each; 0 means no evaluation at all.
-        stop_when_solved: end the run as soon as an evaluation reaches the task's threshold.
-        stop_at: end the run as soon as each of these metrics reaches its value in one and the same iteration, such as
-            `{"reward/track_linear_velocity": 1.39}`; figures of evaluations count as well. None has no such targets.
-        checkpoint_interval: between checkpoints; the last iteration is always saved.
-        keep_checkpoints: how many of the newest checkpoints stay.
-        log_interval: between rows of the logs and lines of progress.
-        overlap: read the metrics of an iteration while the next one runs; None does so on CUDA. Where nothing else
-            asks for them earlier, `stop_at` and the guards then act one iteration later. What is learned, logged and
-            saved is the same.
-        num_threads: torch's threads on the CPU; None leaves one core free, and takes eight at most for a run on CUDA. A
-            thread that has to wait for a core that is busy elsewhere stalls all others: on two cores that made runs
-            beside other work twenty times slower.
-        matmul_precision: of float32 products on CUDA; "high" is TF32.
-        video: record the final policy.
-        video_s: seconds of it.
+    With `stop_at`, such as `{"reward/track_linear_velocity": 1.39}`, the run ends as soon as each of these metrics
+    reaches its value in one and the same iteration; figures of evaluations count as well.
+
+    With `overlap` the metrics of an iteration are read while the next one runs; None does so on CUDA. Where nothing
+    else asks for them earlier, `stop_at` and the guards then act one iteration later. What is learned, logged and saved
+    is the same.
+
+    `num_threads` are torch's on the CPU; None leaves one core free, and takes eight at most for a run on CUDA. A thread
+    that has to wait for a core that is busy elsewhere stalls all others: on two cores that made runs beside other work
+    twenty times slower.
     """
 
     num_iterations: Count = 100
     eval_interval: WholeNumber = 20
-    eval_episodes: WholeNumber = 100
-    stop_when_solved: bool = True
+    eval_episodes: WholeNumber = 100  # one env each; 0 means no evaluation at all
+    stop_when_solved: bool = True  # as soon as an evaluation reaches the task's threshold
     stop_at: Mapping[str, float] | None = None
-    checkpoint_interval: WholeNumber = 20
-    keep_checkpoints: Count = 3
-    log_interval: Count = 1
+    checkpoint_interval: WholeNumber = 20  # the last iteration is always saved
+    keep_checkpoints: Count = 3  # how many of the newest stay
+    log_interval: Count = 1  # between rows of the logs and lines of progress
     overlap: bool | None = None
     # Where threads cannot be made, torch ends the process instead of raising.
     num_threads: Annotated[int, Within(low=1, high=1024)] | None = None
-    matmul_precision: Literal["highest", "high", "medium"] = "high"
-    video: bool = True
+    matmul_precision: Literal["highest", "high", "medium"] = "high"  # of float32 on CUDA; "high" is TF32
+    video: bool = True  # of the final policy
     video_s: Positive = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModulesCfg(Checked):
-    """The networks.
+    """The networks. Where there is a trunk, actor and critic both read its "features".
 
-    Attributes:
-        actor: the policy.
-        critic: the state or action value.
-        trunk: layers that both share. Then both read its "features"; what they read beside them is theirs alone.
-        recurrent_actor, recurrent_critic: memories of actor and critic, each its own; None has none.
+    What they read beside those is theirs alone, as are the recurrent layers of each.
     """
 
     actor: ActorCfg | DeterministicActorCfg | SquashedActorCfg = field(default_factory=ActorCfg)
@@ -107,7 +102,7 @@ class ModulesCfg(Checked):
 
     @property
     def recurrent(self) -> bool:
-        """Whether a network has a memory."""
+        """Whether a network is recurrent."""
         return self.recurrent_actor is not None or self.recurrent_critic is not None
 
     @property
@@ -129,20 +124,11 @@ class ModulesCfg(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingCfg(Checked):
-    """What training needs to know beside the env: what a task recommends, and the larger part of a run's config.
-
-    Attributes:
-        num_envs: E, parallel envs.
-        seed: of all draws.
-        objective: the settings of an algorithm; its class says which one.
-        data: what an update learns from.
-        modules: the networks.
-        collector, trainer: of `RolloutCollector` and `Trainer`.
-    """
+    """What training needs to know beside the env: what a task recommends, and the larger part of a run's config."""
 
     num_envs: Count
-    seed: WholeNumber = 1
-    objective: AlgorithmCfg
+    seed: WholeNumber = 1  # of all draws
+    objective: AlgorithmCfg  # its class says which algorithm learns
     data: DatasetCfg | ReplayCfg
     modules: ModulesCfg = field(default_factory=ModulesCfg)
     collector: CollectorCfg = field(default_factory=lambda: CollectorCfg(stagger_episodes=True))
@@ -151,26 +137,21 @@ class TrainingCfg(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class RunCfg(TrainingCfg):
-    """A training run: what `TrainingCfg` holds, and where and of what it is.
+    """A training run: what `TrainingCfg` holds, and where and of what it is."""
 
-    Attributes:
-        task_name: the registered task that `task` began as; names the run and its threshold.
-        task: the env; its number of envs and its seed are set to the run's.
-        device: "cpu", "cuda", "cuda:<index>", or "auto" for CUDA where there is a GPU.
-        checkpoint: a run folder or a checkpoint whose networks and normalizers this run starts from; None starts
-            anew.
-        logger: where metrics go.
-    """
-
-    task_name: str
-    task: ManagerBasedRlEnvCfg
-    device: str = "auto"
-    checkpoint: str | None = None
+    task_name: str  # the registered task that `task` began as; names the run and its threshold
+    task: ManagerBasedRlEnvCfg  # the env; its number of envs and its seed are set to the run's
+    device: str = "auto"  # "cpu", "cuda", "cuda:<index>", or "auto" for CUDA where there is a GPU
+    checkpoint: str | None = None  # a run folder or a checkpoint: its networks and normalizers are the start
     logger: LoggerCfg = field(default_factory=LoggerCfg)
 
     def __post_init__(self) -> None:
         """Refuse values that no run can have, before any model is compiled."""
         super().__post_init__()
+        if not TASK_NAME.fullmatch(self.task_name):
+            raise ValueError(
+                f"task_name={self.task_name!r}: expected letters, digits and _.+-, as it names a folder"
+            )
         if self.seed > MOST_SEED:
             raise ValueError(f"seed={self.seed}: expected at most {MOST_SEED}")
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):
@@ -191,12 +172,12 @@ class RunCfg(TrainingCfg):
         self._check_sequences()
 
     def _check_sequences(self) -> None:
-        """Refuse sequences where nothing remembers, memories without sequences, and sizes that do not fit."""
+        """Refuse sequences for networks that are not recurrent, recurrent ones without, and sizes that do not fit."""
         if not self.modules.recurrent:
             if isinstance(self.data, DatasetCfg) and (self.data.sequence_length or self.data.burn_in):
                 raise ValueError(
                     f"data.sequence_length={self.data.sequence_length}, data.burn_in={self.data.burn_in}: only "
-                    "networks with a memory learn on sequences; use modules=lstm or modules=gru, or null and 0"
+                    "recurrent networks learn on sequences; use modules=lstm or modules=gru, or null and 0"
                 )
             return
         if not self.objective.learns_on_sequences or not isinstance(self.data, DatasetCfg):
@@ -204,7 +185,7 @@ class RunCfg(TrainingCfg):
                 f"modules.recurrent_actor or recurrent_critic is set, and {type(self.objective).__name__} learns on "
                 "single env states: set both to null, or choose an objective that learns on sequences"
             )
-        self.objective.check_memory()
+        self.objective.check_recurrent()
         sequence_length(
             self.data.rollout_length(self.num_envs),
             self.data.sequence_length,
@@ -214,12 +195,8 @@ class RunCfg(TrainingCfg):
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> "RunCfg":
-        """Build the config from plain data, such as a resolved Hydra config or what an earlier version wrote.
-
-        Raises:
-            ValueError: with the full path of the field that is unknown, missing, of a wrong type or out of range; or
-                with the plug-in that the run needs and nobody named.
-        """
+        """Build the config from plain data, also of an earlier version; a ValueError has the full path of a fault."""
+        check_plain(tree, "config")
         plugins.check_remembered(tree.get(PLUGINS) or ())
         tree = up_to_date({key: value for key, value in tree.items() if key != PLUGINS})
         return from_tree(cls, without_env_size(tree))
@@ -240,12 +217,30 @@ class RunCfg(TrainingCfg):
         return torch.device(self.device)
 
 
-def without_env_size(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the tree of a run without the env's own number of envs and seed, which are the run's.
+def check_run_tree(tree: Mapping[str, Any], where: Path, *, given: Collection[str] = ()) -> None:
+    """Refuse the config of a run folder if it holds more than a run's fields, or says what to write elsewhere.
 
-    Raises:
-        ValueError: if one of them is another than the run's.
+    `given` are the fields, by dotted path, that the user sets himself.
     """
+    known = {*(entry.name for entry in fields(RunCfg)), PLUGINS}
+    for name in tree:
+        if name not in known:
+            raise ValueError(f"{where}: {name!r} is no field of a run's config, and it may hold nothing else")
+    check_plain(tree, str(where))
+    for path in WRITTEN:
+        value: Any = tree
+        for name in path.split("."):
+            value = value.get(name) if isinstance(value, Mapping) else None
+        own = any(f"{path}.".startswith(f"{field}.") for field in given)
+        if value is not None and not own and value != os.environ.get(VOUCHED_BY.get(path, "")):
+            raise ValueError(
+                f"{where}: {path}={value!r} says where to write outside of the run folder: if that is yours, set "
+                f"{path} on the command line, or resume with --trust"
+            )
+
+
+def without_env_size(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a run's tree without the env's own number of envs and seed, which must be the run's if given."""
     task = tree.get("task")
     if not isinstance(task, Mapping) or not isinstance(task.get("scene"), Mapping):
         return dict(tree)

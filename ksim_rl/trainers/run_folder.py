@@ -1,10 +1,10 @@
 """A whole run lies in a folder: config, training, evaluation, learning curves, video."""
 
+import dataclasses
 import json
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from omegaconf import OmegaConf
@@ -18,17 +18,16 @@ from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.trainers import checkpoint, video
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build, build_env
-from ksim_rl.trainers.evaluation import Evaluation
-from ksim_rl.trainers.hooks import Hook
 from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_cfg import RunCfg
-from ksim_rl.trainers.trainer import Outcome, Trainer
+from ksim_rl.trainers.run_lock import locked
+from ksim_rl.trainers.trainer import Hook, Outcome
 from ksim_rl.transforms import observation_columns
 
 CONFIG, EVALUATION, CURVES, VIDEO = "config.yaml", "evaluation.json", "curves.png", "video.mp4"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Policy:
     """A trained policy with the config of its run."""
 
@@ -47,70 +46,70 @@ def run(
 ) -> Outcome:
     """Train, and leave in `run_folder` the config, metrics, checkpoints, evaluation, learning curves and a video.
 
-    What cannot be drawn (no OpenGL) is said in one line of `progress`.
-
-    Raises:
-        ValueError: when the checkpoint to resume or start from belongs to another config, or memory does not suffice
-            for the number of envs.
+    What cannot be drawn (no OpenGL) is said in one line of `progress`. Raises ValueError when another process writes
+    the folder, the checkpoint to resume or start from belongs to another config, or memory does not suffice.
     """
     run_folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with locked(run_folder, note=progress.note):
+            return _run_locked(cfg, run_folder, progress, hooks, resume_from)
+    except BaseException:
+        with suppress(OSError):
+            run_folder.rmdir()  # only where nothing is in it yet
+        raise
+
+
+def _run_locked(
+    cfg: RunCfg,
+    run_folder: Path,
+    progress: RunProgress,
+    hooks: Sequence[Hook],
+    resume_from: checkpoint.Checkpoint | None,
+) -> Outcome:
     for note in loading_notes(cfg.to_tree()):
         progress.note(note)
     checkpoint.remove_leftovers(run_folder / "checkpoint")
     # The graphs that the first iterations record take memory as well.
     with memory_for(cfg.num_envs, cfg.resolved_device()):
-        try:
-            trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
-        except Exception:
-            with suppress(OSError):
-                run_folder.rmdir()  # only where nothing is in it yet
-            raise
+        trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
         (run_folder / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
         outcome = trainer.train(progress)
     if outcome.evaluation is not None:
-        write_evaluation(
-            run_folder, outcome.evaluation, iteration=outcome.iteration, solved_at=trainer.solved_at
-        )
+        figures = {
+            "iteration": outcome.iteration,
+            **dataclasses.asdict(outcome.evaluation),
+            "solved_at": trainer.solved_at,
+        }
+        if trainer.solved_at is not None:
+            figures["solved"] = outcome.solved
+        (run_folder / EVALUATION).write_text(json.dumps(figures, indent=2) + "\n")
     _draw_curves(cfg, run_folder, solved_at=trainer.solved_at, note=progress.note)
     if cfg.trainer.video and outcome.interrupted_by is None:
         record_video(cfg, trainer.update.actor, run_folder / VIDEO, note=progress.note)
-    close(trainer)
+    for owner in (trainer.collector, trainer.evaluator):
+        if owner is not None:
+            owner.env.close(raise_if_closed=False)
     return outcome
 
 
 def load_policy(path: Path, *, device: str = "auto", plugins: Sequence[str] = ()) -> Policy:
     """Rebuild the policy of a checkpoint, or of the newest one in a run folder.
 
-    Args:
-        path: of a run folder or a checkpoint.
-        device: "cpu", "cuda", "cuda:<index>" or "auto".
-        plugins: packages to import first, whose classes the run's config may then name.
-
-    Raises:
-        CheckpointError: when there is none, or it is damaged.
-        ValueError: when its config does not fit this version, or makes other observations.
+    `plugins` are packages to import first, whose classes the run's config may then name. Nothing is written: the run's
+    `nan_guard` is off. Raises CheckpointError when there is none, or it is damaged; ValueError when its config does not
+    fit this version, or makes other observations.
     """
     load_plugins(plugins)
     saved = checkpoint.load(checkpoint.latest(path))
     cfg = RunCfg.from_tree({**saved.config, "device": device})
+    task = dataclasses.replace(cfg.task, sim=dataclasses.replace(cfg.task.sim, nan_guard=None))
+    cfg = dataclasses.replace(cfg, task=task)
     env = build_env(cfg, num_envs=1, seed=cfg.seed)
     checkpoint.check_columns(saved.state["observation_columns"], observation_columns(env))
     actor = make_policy(cfg, env)
     env.close(raise_if_closed=False)
     state_tree.copy_into(actor.state_dict(), saved.state["update"]["actor"], what="actor")
     return Policy(cfg=cfg, actor=actor, iteration=saved.iteration)
-
-
-def write_evaluation(
-    run_folder: Path, evaluation: Evaluation, *, iteration: int, solved_at: float | None
-) -> Path:
-    """Write the figures of an evaluation as JSON."""
-    figures = {"iteration": iteration, **evaluation.as_dict(), "solved_at": solved_at}
-    if solved_at is not None:
-        figures["solved"] = evaluation.return_mean >= solved_at
-    path = run_folder / EVALUATION
-    path.write_text(json.dumps(figures, indent=2) + "\n")
-    return path
 
 
 def record_video(
@@ -127,26 +126,17 @@ def record_video(
     env.eval()
     clock = part(env, EpisodeClock)
     assert clock is not None  # the env of a config is ours
-    step_dt = clock.step_dt
-    steps = max(1, round((seconds or cfg.trainer.video_s) / step_dt))
+    steps = max(1, round((seconds or cfg.trainer.video_s) / clock.step_dt))
     try:
         with warnings.catch_warnings():
             # Each OpenGL platform that fails warns on its own; the error says it once, with the fix.
             warnings.filterwarnings("ignore", module="glfw")
-            written = video.record(env, actor, path, steps=steps, fps=1.0 / step_dt, seed=seed)
+            return video.record(env, actor, path, steps=steps, fps=1.0 / clock.step_dt, seed=seed)
     except video.VideoUnavailableError as error:
         note(f"no video: {error}")
         return None
     finally:
         env.close(raise_if_closed=False)
-    return written
-
-
-def close(trainer: Trainer) -> None:
-    """Free the worlds of a trainer."""
-    trainer.collector.env.close(raise_if_closed=False)
-    if trainer.evaluator is not None:
-        trainer.evaluator.env.close(raise_if_closed=False)
 
 
 def _draw_curves(

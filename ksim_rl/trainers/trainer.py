@@ -1,23 +1,19 @@
-"""The training loop collects and learns in turn, and reports, evaluates and saves beside that."""
+"""The training loop collects and learns in turn; hooks evaluate, save, and do what users add between iterations."""
 
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import UInt8
-from tensordict import TensorDictBase
-from torch import Tensor
 
 from ksim_rl.checks import near
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.envs.contract import EpisodeClock, missing_parts, part
 from ksim_rl.trainers import checkpoint
-from ksim_rl.trainers.algorithm import Update
+from ksim_rl.trainers.algorithm import HasNotes, Update
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
-from ksim_rl.trainers.hooks import CheckpointHook, EvaluationHook, Hook
 from ksim_rl.trainers.interrupt import InterruptRequest
 from ksim_rl.trainers.loggers import MetricLogger
 from ksim_rl.trainers.metrics import (
@@ -36,18 +32,101 @@ from ksim_rl.transforms import observation_columns
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """How a run ended.
-
-    `solved` is None where the task has no threshold or nothing was evaluated, `target_met` where no target was set.
-    """
+    """How a run ended."""
 
     iteration: int
     env_states: int
     seconds: float
     evaluation: Evaluation | None
-    solved: bool | None
-    target_met: bool | None
+    solved: bool | None  # None where the task has no threshold, or nothing was evaluated
+    target_met: bool | None  # None where no target was set
     interrupted_by: signal.Signals | None
+
+
+class Hook:
+    """Something to do between iterations: an evaluation, a schedule of your own, a message to somebody.
+
+    When a hook is called, the run is settled: what the device was asked for is done, `trainer.metrics` are those of the
+    present iteration, and the hook may change whatever it likes. CUDA graphs keep the numbers that they were captured
+    with, so a change reaches them only through the tensors that they read: `copy_` into those. Example:
+
+        class Annealing(Hook):
+            interval = 10
+
+            def __call__(self, trainer):
+                for group in trainer.update.optimizer.param_groups:
+                    group["lr"].mul_(0.9)
+
+    Attributes:
+        interval: iterations between calls; 0 is only at the end. Before a call the host waits for the device, so on a
+            GPU an interval of 1 keeps an iteration from starting while the metrics of the last one are written.
+    """
+
+    interval: int = 1
+
+    def __call__(self, trainer: "Trainer") -> None:
+        """Act after the iterations whose number `interval` divides."""
+
+    def at_end(self, trainer: "Trainer") -> None:
+        """Act once after the last iteration, also of an interrupted run."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what later calls depend on: tensors and plain data, nested; a checkpoint keeps it."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue where `state_dict` was taken."""
+
+
+class EvaluationHook(Hook):
+    """Judges the policy in envs of its own, and logs the figures."""
+
+    def __init__(self, evaluator: Evaluator, *, interval: int) -> None:
+        self.evaluator, self.interval = evaluator, interval
+        self._evaluated_at: int | None = None
+
+    def __call__(self, trainer: "Trainer") -> None:
+        """Evaluate, unless a signal asks to stop meanwhile."""
+        with trainer.clock.paused():
+            evaluation = self.evaluator(stop=trainer.interrupt.__bool__)
+        if evaluation is None:
+            return
+        trainer.evaluation, self._evaluated_at = evaluation, trainer.iteration
+        trainer.log({f"evaluation/{name}": value for name, value in asdict(evaluation).items()})
+
+    def at_end(self, trainer: "Trainer") -> None:
+        """Evaluate the final policy, once."""
+        if not trainer.interrupt and self._evaluated_at != trainer.iteration:
+            self(trainer)
+
+
+class CheckpointHook(Hook):
+    """Saves everything that the next iteration depends on. A full disk costs a checkpoint, not the run."""
+
+    def __init__(self, *, interval: int) -> None:
+        self.interval = interval
+
+    def __call__(self, trainer: "Trainer") -> None:
+        """Save, or say why not."""
+        if trainer.folder is None:
+            return
+        try:
+            trainer.save()
+        except OSError as error:
+            trainer.progress.note(
+                f"warning: no checkpoint at iteration {trainer.iteration}: {error}; the run goes on"
+            )
+
+    def at_end(self, trainer: "Trainer") -> None:
+        """Save the end, which must not fail in silence."""
+        if trainer.folder is not None and trainer.saved_at != trainer.iteration:
+            try:
+                trainer.save()
+            except OSError as error:
+                raise OSError(
+                    f"{trainer.folder}: no checkpoint of the end, iteration {trainer.iteration}: {error}; make room or "
+                    "let it be written, and resume the run from the last one"
+                ) from error
 
 
 class Trainer:
@@ -56,16 +135,8 @@ class Trainer:
     The metrics of an iteration come to the host in one copy. On CUDA they are read while the next iteration runs, so
     that the device never waits for logs; before a hook is called the run is settled first.
 
-    Args:
-        cfg: how long, and how often what.
-        collector: gives the rollouts; its env is the one that is trained in.
-        update: improves the networks with a rollout.
-        evaluator: judges the policy; None never evaluates.
-        solved_at: the mean evaluation return that counts as solved.
-        loggers: take the metrics.
-        hooks: what else to do between iterations; they run after an evaluation and before a checkpoint.
-        folder: of checkpoints; None saves none.
-        config: what a checkpoint says about how the run was configured (plain data).
+    Without an `evaluator` nothing is evaluated; `solved_at` is of its mean return. The `hooks` run after an evaluation
+    and before a checkpoint. A checkpoint in `folder` (None saves none) holds `config`, plain data, as the run's.
     """
 
     def __init__(
@@ -114,37 +185,43 @@ class Trainer:
         """Run until all iterations are done, the task is solved, a target is met, or a signal asks to stop.
 
         The first SIGINT or SIGTERM ends the run after the current iteration, with everything saved.
-
-        Raises:
-            NonFiniteStepsError: if gradient steps stay non-finite.
         """
         self.progress = progress or self.progress
         with self.interrupt, self.progress:
-            for text in missing_parts(self.collector.env):
+            notes = self.update.notes if isinstance(self.update, HasNotes) else ()
+            for text in (*missing_parts(self.collector.env), *notes):
                 self.progress.note(text)
             try:
                 while not self._is_over():
                     self.iterate()
-                    for hook in self._due_hooks():
-                        self.settle()
-                        hook(self)
+                    for hook in self._hooks:
+                        if hook.interval and self.iteration % hook.interval == 0:
+                            self.settle()
+                            hook(self)
                 self.settle()
                 for hook in self._hooks:
                     hook.at_end(self)
             finally:
                 for logger in self.loggers:
                     self._ask(logger, logger.close)
-        return self._outcome()
+        return Outcome(
+            iteration=self.iteration,
+            env_states=self.env_states,
+            seconds=self.clock.total,
+            evaluation=self.evaluation,
+            solved=self.solved,
+            target_met=self._target_met if self.cfg.stop_at else None,
+            interrupted_by=self.interrupt.signal,
+        )
 
     def iterate(self) -> None:
-        """Run one iteration: collect a rollout, learn from it, and report what happened.
-
-        Where iterations overlap, what is reported is the iteration before.
-        """
+        """Collect a rollout, learn from it, and report what happened: where iterations overlap, in the one before."""
         rollout_ET = self.collector.collect()
         self.update(rollout_ET)
         self.iteration += 1
-        self._unread.append((self.iteration, self._start_reading(rollout_ET)))
+        env = self.collector.env
+        metrics = read_episode_sums(env, rollout_ET) | read_physics(env) | self.update.metrics()
+        self._unread.append((self.iteration, start_copy(metrics, device=self.update.device)))
         self._report(all_but=1 if self._overlaps else 0)
 
     def settle(self) -> None:
@@ -158,21 +235,8 @@ class Trainer:
         self._look_at_target()
 
     def _is_over(self) -> bool:
-        stop = self.cfg.stop_when_solved and self.solved
-        return (
-            self.iteration >= self.cfg.num_iterations
-            or bool(stop)
-            or self._target_met
-            or bool(self.interrupt)
-        )
-
-    def _due_hooks(self) -> list[Hook]:
-        return [hook for hook in self._hooks if hook.interval and self.iteration % hook.interval == 0]
-
-    def _start_reading(self, rollout_ET: TensorDictBase) -> PendingMetrics:
-        env = self.collector.env
-        metrics = read_episode_sums(env, rollout_ET) | read_physics(env) | self.update.metrics()
-        return start_copy(metrics, device=self.update.device)
+        ended = self._target_met or bool(self.interrupt) or bool(self.cfg.stop_when_solved and self.solved)
+        return ended or self.iteration >= self.cfg.num_iterations
 
     def _report(self, *, all_but: int) -> None:
         while len(self._unread) > all_but:
@@ -252,25 +316,8 @@ class Trainer:
                 self._warned.add(kind)
                 self.progress.note(f"warning: {text} (iteration {iteration}; said once)")
 
-    def _outcome(self) -> Outcome:
-        return Outcome(
-            iteration=self.iteration,
-            env_states=self.env_states,
-            seconds=self.clock.total,
-            evaluation=self.evaluation,
-            solved=self.solved,
-            target_met=self._target_met if self.cfg.stop_at else None,
-            interrupted_by=self.interrupt.signal,
-        )
-
-    # -- state ---------------------------------------------------------------------------------------------------
-
     def save(self) -> Path:
-        """Write a checkpoint of everything that the next iteration depends on.
-
-        Raises:
-            OSError: when the disk is full or not writable; earlier checkpoints stay as they are.
-        """
+        """Write a checkpoint of everything that the next iteration depends on; see `checkpoint.save`."""
         assert self.folder is not None
         with self.clock.paused():
             path = checkpoint.save(
@@ -284,21 +331,11 @@ class Trainer:
         return path
 
     def load(self, path: Path) -> None:
-        """Continue from a checkpoint: a run folder (its newest), a checkpoint folder, or one checkpoint.
-
-        Raises:
-            CheckpointError: when it is absent or damaged.
-            ValueError: when it belongs to a run with other networks or another env.
-        """
+        """Continue from a checkpoint: a run folder (its newest), a checkpoint folder, or one checkpoint."""
         self.load_state_dict(checkpoint.load(checkpoint.latest(path)).state)
 
     def load_weights(self, path: Path) -> None:
-        """Start from the networks and normalizers of a checkpoint, whatever its task was; all else stays new.
-
-        Raises:
-            CheckpointError: when it is absent or damaged.
-            ValueError: when its networks or the observations that they read are others.
-        """
+        """Start from the networks and normalizers of a checkpoint of any task, if they fit here; all else stays new."""
         state = checkpoint.load(checkpoint.latest(path)).state
         checkpoint.check_columns(state["observation_columns"], observation_columns(self.collector.env))
         try:
@@ -313,6 +350,9 @@ class Trainer:
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next iteration depends on: tensors and plain data, nested."""
+        device, random = self.update.device, {"cpu": torch.get_rng_state()}
+        if device.type == "cuda":
+            random["cuda"] = torch.cuda.get_rng_state(device)
         return {
             "iteration": self.iteration,
             "seconds": self.clock.total,
@@ -320,16 +360,12 @@ class Trainer:
             "collector": self.collector.state_dict(),
             "env": dict(self.collector.env.state_dict()),
             "observation_columns": observation_columns(self.collector.env),
-            "random": random_state(self.update.device),
+            "random": random,
             "hooks": {str(index): hook.state_dict() for index, hook in enumerate(self._own_hooks)},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue where `state_dict` was taken.
-
-        Raises:
-            ValueError: if it is of a run whose networks or observations are others.
-        """
+        """Continue where `state_dict` was taken; a ValueError where networks, observations or env are others."""
         checkpoint.check_columns(state["observation_columns"], observation_columns(self.collector.env))
         if len(state["hooks"]) != len(self._own_hooks):
             raise ValueError(
@@ -351,19 +387,7 @@ class Trainer:
             hook.load_state_dict(state["hooks"][str(index)])
         self.iteration = self.saved_at = state["iteration"]
         self.clock.total = state["seconds"]
-        load_random_state(state["random"], self.update.device)
-
-
-def random_state(device: torch.device) -> dict[str, UInt8[Tensor, "?L"]]:
-    """Return the state of the default generators of the host and of `device`."""
-    state = {"cpu": torch.get_rng_state()}
-    if device.type == "cuda":
-        state["cuda"] = torch.cuda.get_rng_state(device)
-    return state
-
-
-def load_random_state(state: Mapping[str, UInt8[Tensor, "?L"]], device: torch.device) -> None:
-    """Continue the default generators; a run that moves to another kind of device keeps that one's present state."""
-    torch.set_rng_state(state["cpu"])
-    if device.type == "cuda" and "cuda" in state:
-        torch.cuda.set_rng_state(state["cuda"], device)
+        # A run that moves to another kind of device keeps that one's present state.
+        torch.set_rng_state(state["random"]["cpu"])
+        if self.update.device.type == "cuda" and "cuda" in state["random"]:
+            torch.cuda.set_rng_state(state["random"]["cuda"], self.update.device)

@@ -24,20 +24,11 @@ class VideoUnavailableError(RuntimeError):
 def record(
     env: EnvBase, policy: TensorDictModuleBase, path: Path, *, steps: int, fps: float, seed: int = 0
 ) -> Path:
-    """Let the policy act, deterministically, and write what a camera sees.
+    """Let the policy act, deterministically, and write what a camera sees; return the file written.
 
-    Args:
-        env: has the part `Pictures`.
-        policy: writes the action.
-        path: an `.mp4` file; without a video encoder a `.gif` beside it is written instead.
-        steps: env steps to show.
-        fps: pictures per second at real speed; more than 50 are thinned out.
-
-    Returns:
-        The file written.
-
-    Raises:
-        VideoUnavailableError: when nothing can be rendered, with the reason and the fix.
+    The env has the part `Pictures`, and `path` ends in `.mp4`; without a video encoder a `.gif` beside it is written
+    instead. There are `fps` pictures per second at real speed; more than 50 are thinned out. A VideoUnavailableError
+    says why nothing can be rendered, and the fix.
     """
     if _failed:
         raise VideoUnavailableError(_failed[0])
@@ -80,13 +71,10 @@ def _frames(
         current_E = env.reset()
         for step in range(steps):
             if step % every == 0:
-                yield _picture(env)
+                frame = None if (pictures := part(env, Pictures)) is None else pictures.render()
+                if frame is None:
+                    raise VideoUnavailableError(
+                        "the env has no render mode: build it with render_mode='rgb_array'"
+                    )
+                yield frame
             _, current_E = env.step_and_maybe_reset(policy(current_E))
-
-
-def _picture(env: EnvBase) -> np.ndarray:
-    pictures = part(env, Pictures)
-    frame = None if pictures is None else pictures.render()
-    if frame is None:
-        raise VideoUnavailableError("the env has no render mode: build it with render_mode='rgb_array'")
-    return frame

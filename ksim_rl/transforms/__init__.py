@@ -1,8 +1,21 @@
-"""This room holds transforms for any TorchRL env: noise, delay, history, limits, units, statistics, mirrors, groups."""
+"""This room holds transforms for any TorchRL env: noise, delay, history, limits, units, statistics, mirrors, groups.
 
-from ksim_rl.transforms.clip import ActionClip, ObservationClip, RewardClip
+A transform is public once it is imported here.
+"""
+# ruff: noqa: F401
+
+from types import ModuleType
+
 from ksim_rl.transforms.command_curriculum import RandomCommandCurriculum
 from ksim_rl.transforms.delay import ActionDelay, DelayCfg, ObservationDelay
+from ksim_rl.transforms.elementwise import (
+    ActionClip,
+    ActionScale,
+    ObservationClip,
+    ObservationScale,
+    RewardClip,
+    RewardScale,
+)
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg, compile_groups
 from ksim_rl.transforms.groups.groups import GroupSpec, ObservationGroups, group_specs, observation_columns
 from ksim_rl.transforms.history import HistoryCfg, ObservationHistory
@@ -21,53 +34,11 @@ from ksim_rl.transforms.noise.cfg import ConstantNoise, GaussianNoise, NoiseCfg,
 from ksim_rl.transforms.noise.observation_noise import ObservationNoise
 from ksim_rl.transforms.normalization import ObservationNormalization
 from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, follow_level
-from ksim_rl.transforms.scale import ActionScale, ObservationScale, RewardScale
 from ksim_rl.transforms.trackers import EpisodeTracker, SuccessTracker, TimeAwareObservation
 from ksim_rl.transforms.transform_cfg import TransformCfg
 
-__all__ = [
-    "AXIAL",
-    "ActionClip",
-    "ActionDelay",
-    "ActionLowPass",
-    "ActionScale",
-    "ConstantNoise",
-    "DelayCfg",
-    "EpisodeTracker",
-    "FollowsLevel",
-    "GaussianNoise",
-    "GroupSpec",
-    "HistoryCfg",
-    "KeyedTransform",
-    "Mirror",
-    "MirrorMap",
-    "NoiseCfg",
-    "ObservationClip",
-    "ObservationDelay",
-    "ObservationGroupCfg",
-    "ObservationGroups",
-    "ObservationHistory",
-    "ObservationNoise",
-    "ObservationNormalization",
-    "ObservationScale",
-    "ObservationTermCfg",
-    "PLANAR_VELOCITY",
-    "POLAR",
-    "QUATERNION",
-    "RandomCommandCurriculum",
-    "RewardClip",
-    "RewardScale",
-    "SuccessTracker",
-    "TimeAwareObservation",
-    "TransformCfg",
-    "UniformNoise",
-    "compile_groups",
-    "follow_level",
-    "group_specs",
-    "mirror_by_name",
-    "mirror_group",
-    "mirror_joints",
-    "mirror_name",
-    "mirrored",
-    "observation_columns",
-]
+__all__ = sorted(
+    name
+    for name, value in globals().items()
+    if name[0] != "_" and value is not ModuleType and not isinstance(value, ModuleType)
+)  # pyright: ignore

@@ -14,7 +14,10 @@ def side_by_side(values: Sequence[Shaped[Tensor, "*?leaf"]], num_rows: int) -> S
 
     So what one transform has split, the next one need not join. The result may share memory with the values.
     """
-    vectors = [value if value.ndim == 2 else value.reshape(num_rows, -1) for value in values]
+    vectors = [
+        value if value.ndim == 2 and value.shape[0] == num_rows else value.reshape(num_rows, -1)
+        for value in values
+    ]
     if len(vectors) == 1:
         return vectors[0]
     # Memory is not there to be looked at while code is traced.

@@ -10,7 +10,7 @@ from torchrl.data import Bounded, Composite
 
 from ksim_rl import checks
 from ksim_rl.device import random
-from ksim_rl.transforms.row_transform import KeyedTransform, Keys, as_keys
+from ksim_rl.transforms.row_transform import KeyedTransform, Keys, as_keys, by_level, moved_level
 from ksim_rl.transforms.specs import bounded, leaf_spec, set_leaf_spec
 
 Ranges = Sequence[tuple[float, float]]
@@ -19,20 +19,11 @@ Ranges = Sequence[tuple[float, float]]
 class RandomCommandCurriculum(KeyedTransform):
     """A random command per env, float32 [E, K], from ranges that widen with the level of the env, [E, 1].
 
-    At the end of an episode the level of its env rises by `step` if the mean of the score over the episode's steps
-    exceeds `raise_above`, and falls by it below `lower_below`; it stays in [0, 1]. `set_level_` drives it from outside
-    instead.
-
-    Args:
-        in_keys: the one reward or observation that is the score; [] leaves the levels to `set_level_`.
-        out_keys: two keys, for the command and for the level.
-        start: (low, high) per column of the command at level 0.
-        end: the same at level 1, and linear in between.
-        raise_above, lower_below: mean scores; None never raises, or lowers.
-        step: by which a level moves.
-        initial_level: of each env at first.
-        resample_every: env steps after which a command is drawn anew within an episode; 0 keeps it.
-        seed, stream: see `KeyedTransform`.
+    At the end of an episode the level of its env rises by `step` if the mean of the score (the in key, a reward or
+    observation) over the episode's steps exceeds `raise_above`, and falls by it below `lower_below`, within [0, 1].
+    `set_level_` drives it from outside instead, without in keys. Out keys are those of command and level. `start` and
+    `end` are (low, high) per column of the command at level 0 and 1, linear in between. Within an episode a command is
+    drawn anew after `resample_every` env steps; 0 keeps it.
 
     Example:
         >>> commands = RandomCommandCurriculum(start=[(0.0, 0.5)], end=[(-1.0, 2.0)], raise_above=0.8)
@@ -58,7 +49,7 @@ class RandomCommandCurriculum(KeyedTransform):
         step: float = 0.1,
         initial_level: float = 0.0,
         resample_every: int = 0,
-        seed: int = 0,
+        seed: int | None = None,
         stream: str | None = None,
     ) -> None:
         keys, outs = as_keys(in_keys), as_keys(list(out_keys))
@@ -81,19 +72,15 @@ class RandomCommandCurriculum(KeyedTransform):
         checks.check_in_range("step", step, low=0.0, high=1.0, low_open=True)
         checks.check_in_range("initial_level", initial_level, low=0.0, high=1.0)
         checks.check_count("resample_every", resample_every, low=0)
-        names = ["level_E", "score_E", "age_E", "command_EL"]
-        super().__init__(keys, outs, row_buffers=names, seed=seed, stream=stream)
+        super().__init__(keys, outs, is_paired=False, seed=seed, stream=stream)
+        self._register_rows("level_E", "score_E", "age_E", "command_EL")
         self.raise_above, self.lower_below, self.step = raise_above, lower_below, step
         self.initial_level, self.resample_every = initial_level, resample_every
         ends = [[[pair[side] for pair in ranges] for side in (0, 1)] for ranges in (start, end)]
         self.register_buffer("ends_22L", torch.tensor(ends, dtype=torch.float32), persistent=False)
 
     def set_level_(self, level: float | Num[Tensor, "*rows"]) -> None:
-        """Set the level of all envs, or of each, [E]; commands follow at their next draw.
-
-        Raises:
-            RuntimeError: if no env has asked for its specs yet.
-        """
+        """Set the level of all envs, or of each, [E]; commands follow at their next draw."""
         if self._buffers["level_E"] is None:
             raise RuntimeError("levels are there once an env holds the transform and has made its specs")
         if not isinstance(level, Tensor):
@@ -103,7 +90,6 @@ class RandomCommandCurriculum(KeyedTransform):
             self.level_E.copy_(level.clamp(0.0, 1.0))
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Add the command, bounded by its widest ranges, and the level to the observations."""
         output_spec = output_spec.clone()
         observations = output_spec["full_observation_spec"]
         for key in self.in_keys:
@@ -124,34 +110,26 @@ class RandomCommandCurriculum(KeyedTransform):
         return output_spec
 
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
-        self._move_levels(mask_E)
+        mean_E = self.score_E / self.age_E.clamp_min(1)
+        moved_E = moved_level(self.level_E, mean_E, self.step, self.raise_above, self.lower_below)
+        self.level_E.copy_(torch.where(mask_E & (self.age_E > 0), moved_E, self.level_E))
         self.score_E.masked_fill_(mask_E, 0.0)
         self.age_E.masked_fill_(mask_E, 0)
         self._draw(self._reset_keys("reset/command"), mask_E)
         return self._write(tensordict_reset)
-
-    def _move_levels(self, mask_E: Tensor) -> None:
-        lived_E = mask_E & (self.age_E > 0)
-        mean_E = self.score_E / self.age_E.clamp_min(1)
-        level_E = self.level_E
-        if self.raise_above is not None:
-            level_E = torch.where(lived_E & (mean_E > self.raise_above), level_E + self.step, level_E)
-        if self.lower_below is not None:
-            level_E = torch.where(lived_E & (mean_E < self.lower_below), level_E - self.step, level_E)
-        self.level_E.copy_(level_E.clamp(0.0, 1.0))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._sized()
         self.step_count.add_(1)
         self.age_E.add_(1)
         for key in self.in_keys:
-            self.score_E.add_(next_tensordict.get(key).reshape(self.num_rows, -1).mean(-1))
+            self.score_E.add_(next_tensordict.get(key).reshape(self.num_rows, -1).float().mean(-1))
         if self.resample_every:
             self._draw(self._step_keys("step/command"), self.age_E % self.resample_every == 0)
         return self._write(next_tensordict)
 
     def _draw(self, keys: random.RowKeys, mask_E: Tensor) -> None:
-        low_EL, high_EL = torch.lerp(
+        low_EL, high_EL = by_level(
             self.ends_22L[0, :, None], self.ends_22L[1, :, None], self.level_E[:, None]
         )
         drawn_EL = random.uniform(keys, low_EL.shape[1], low_EL, high_EL)

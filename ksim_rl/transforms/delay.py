@@ -1,7 +1,7 @@
 """Observations and actions arrive some env steps late by the transforms of this module."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import torch
 from tensordict import TensorDictBase
@@ -17,26 +17,18 @@ from ksim_rl.transforms.row_transform import (
     KeyedTransform,
     Keys,
     RowTransform,
-    as_keys,
     checked_action,
-    checked_out_keys,
 )
-from ksim_rl.transforms.specs import replace_leaves
 
 
 @dataclass(frozen=True, kw_only=True)
 class DelayCfg(Checked):
-    """A lag in env steps, drawn uniformly from {min_lag, ..., max_lag}.
+    """A lag in env steps, drawn uniformly from {min_lag, ..., max_lag}, per env when that env resets.
 
-    Args:
-        min_lag, max_lag: env steps, both included.
-        per_env: True draws a lag per env when that env resets. False draws one lag for all envs; it changes when all
-            envs reset at once, not when some do.
-        resample_every: env steps after which a new lag is drawn within an episode; 0 keeps it. Counted per env since
-            its reset, or since all envs last reset together.
-        hold_probability: chance that such a draw leaves the lag as it is.
-        by_level: whether the transform's level (see `FollowsLevel`) sets the reach: lags are drawn from
-            {min_lag, ..., min_lag + round(level * (max_lag - min_lag))}.
+    Without `per_env` all envs share one, which changes when all reset at once, not when some do. Within an episode a
+    new lag is drawn every `resample_every` env steps (0 keeps it) since the env's reset, or since all envs last reset
+    together; with `hold_probability` such a draw leaves the lag as it is. `by_level` draws from
+    {min_lag, ..., min_lag + round(level * (max_lag - min_lag))} (see `FollowsLevel`).
     """
 
     min_lag: WholeNumber = 0
@@ -57,13 +49,7 @@ class DelayCfg(Checked):
 
 
 class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
-    """Holds the last `max_lag + 1` values per key in ring buffers, and a lag per env.
-
-    Args:
-        delay: how lags are drawn.
-        num_signals: number of ring buffers.
-        **others: see `KeyedTransform`.
-    """
+    """Holds the last `max_lag + 1` values per key in ring buffers, and a lag per env."""
 
     purposes = ("step/lag", "step/hold", "reset/lag")
 
@@ -71,11 +57,10 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
     shared_count: Tensor
     shared_age: Tensor
 
-    def __init__(
-        self, delay: DelayCfg, num_signals: int, *, seed: int = 0, stream: str | None = None, **keys: Keys
-    ) -> None:
-        rings = [f"ring_{index}" for index in range(num_signals)]
-        super().__init__(**keys, row_buffers=["lag_E", "age_E", *rings], seed=seed, stream=stream)
+    def __init__(self, delay: DelayCfg, seed: int | None, stream: str | None, **keys: Keys | None) -> None:
+        super().__init__(**keys, seed=seed, stream=stream)  # pyright: ignore[reportArgumentType]
+        self._register_rows("lag_E")
+        self._register_rings()
         self.delay = delay
         self.num_slots = delay.max_lag + 1
         # Unlike the count of steps that keys the draws, no seed turns the ages back: they show where the rings stand.
@@ -83,7 +68,7 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
             self.register_buffer(name, torch.zeros((), dtype=torch.int64))
         self._register_level(is_used=delay.by_level)
 
-    def seed_(self, seed: int) -> "LaggedTransform":
+    def seed_(self, seed: int) -> Self:
         """Set the seed and start the counters of draws anew, in place."""
         self.shared_count.zero_()
         return super().seed_(seed)
@@ -165,12 +150,6 @@ class ObservationDelay(LaggedTransform):
     some. With `by_level` the range of the lag follows `follow_level_`. Delays in physics substeps are those of
     `ksim_rl.scene.actuators.DelayedActuator`.
 
-    Args:
-        in_keys: observations, of any shape and dtype; nested keys as tuples.
-        out_keys: where the delayed ones go. Default: in place of the prompt ones.
-        delay: how lags are drawn, in env steps.
-        seed, stream: see `KeyedTransform`.
-
     Example:
         >>> delay = ObservationDelay(["imu"], delay=DelayCfg(min_lag=1, max_lag=3, resample_every=50))
     """
@@ -181,40 +160,21 @@ class ObservationDelay(LaggedTransform):
         out_keys: Keys | None = None,
         *,
         delay: DelayCfg,
-        seed: int = 0,
+        seed: int | None = None,
         stream: str | None = None,
     ) -> None:
-        in_keys = as_keys(in_keys)
-        out_keys = checked_out_keys(in_keys, out_keys)
-        super().__init__(delay, len(in_keys), in_keys=in_keys, out_keys=out_keys, seed=seed, stream=stream)
+        super().__init__(delay, seed, stream, in_keys=in_keys, out_keys=out_keys)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Give the delayed observations the specs of the prompt ones."""
-        leaves = replace_leaves(observation_spec, self.in_keys, self.out_keys, type(self).__name__)
-        self._size_rings(observation_spec, leaves)
+        self._size_rings(observation_spec, self._replace_leaves(observation_spec))
         return observation_spec
-
-    def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
-        return self._pass(tensordict_reset, [tensordict_reset.get(key) for key in self.in_keys], mask_E)
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self._sized()
-        self._advance()
-        return self._pass(next_tensordict, [next_tensordict.get(key) for key in self.in_keys], None)
 
 
 class ActionDelay(LaggedTransform):
     """The env receives the action of some env steps ago; the tensordict keeps the one that the policy chose.
 
-    Until the first action of an episode arrives, the env receives `initial`. With `by_level` the range of the lag
+    Until the first action of an episode arrives, all its elements are `initial`. With `by_level` the range of the lag
     follows `follow_level_`. A delay of the targets in physics substeps is `ksim_rl.scene.actuators.DelayedActuator`.
-
-    Args:
-        in_keys_inv: the actions that the env reads.
-        out_keys_inv: where the policy writes them. Default: the same keys.
-        delay: how lags are drawn, in env steps.
-        initial: what every element of the action is before the first one arrives.
-        seed, stream: see `KeyedTransform`.
 
     Example:
         >>> delay = ActionDelay(delay=DelayCfg(min_lag=0, max_lag=2))
@@ -227,19 +187,14 @@ class ActionDelay(LaggedTransform):
         *,
         delay: DelayCfg,
         initial: float = 0.0,
-        seed: int = 0,
+        seed: int | None = None,
         stream: str | None = None,
     ) -> None:
-        keys = as_keys(in_keys_inv)
-        out_keys = checked_out_keys(keys, out_keys_inv)
-        super().__init__(delay, len(keys), in_keys_inv=keys, out_keys_inv=out_keys, seed=seed, stream=stream)
+        super().__init__(delay, seed, stream, in_keys_inv=in_keys_inv, out_keys_inv=out_keys_inv)
         self.initial = initial
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
-        """Move the specs to where the policy writes."""
-        owner = type(self).__name__
-        leaves = replace_leaves(action_spec, self.in_keys_inv, self.out_keys_inv, owner, moves=True)
-        self._size_rings(action_spec, leaves, joins=False)
+        self._size_rings(action_spec, self._replace_leaves(action_spec, is_inverse=True), joins=False)
         return action_spec
 
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
@@ -247,6 +202,9 @@ class ActionDelay(LaggedTransform):
             ring_EM: Tensor = getattr(self, f"ring_{index}")
             self._through(index, torch.full_like(ring_EM[:, 0], self.initial), mask_E)
         return tensordict_reset
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         rings = [self._sized()[f"ring_{index}"] for index in range(len(self.in_keys_inv))]

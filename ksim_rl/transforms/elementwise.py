@@ -1,18 +1,39 @@
-"""This module holds the bases of transforms that replace each value by a function of it alone, such as its clip."""
+"""Each value becomes a function of it alone, its clip or its scale, by the transforms of this module."""
 
 from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 
+import torch
 from jaxtyping import Num
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec
-from torchrl.envs.transforms import Transform
+from torchrl.data import Composite, TensorSpec, Unbounded
 
-from ksim_rl.transforms.row_transform import Keys, as_keys, checked_out_keys
-from ksim_rl.transforms.specs import replace_leaves
+from ksim_rl import checks
+from ksim_rl.transforms.noise.cfg import PerDim
+from ksim_rl.transforms.row_transform import CheckedKeys, FollowsLevel, Keys, by_level, one_per_key
+from ksim_rl.transforms.specs import add_bounds, bounded, bounds, multiply_bounds
+
+Range = tuple[float | None, float | None]
 
 
-class _Map(Transform):
+def clipped(value: Num[Tensor, "*leaf"], clip: Range) -> Num[Tensor, "*leaf"]:
+    """Return a value within [low, high], of which one may be None; NaN stays NaN."""
+    return torch.clamp(value, *clip)
+
+
+def scaled(
+    value: Num[Tensor, "*leaf"],
+    scale: float | Num[Tensor, "*scale"],
+    offset: Num[Tensor, "*offset"] | None = None,
+) -> Num[Tensor, "*leaf"]:
+    """Return `scale * value + offset`."""
+    if offset is None or not isinstance(scale, Tensor):
+        return value * scale
+    return torch.addcmul(offset, value, scale)
+
+
+class _Map(CheckedKeys):
     @abstractmethod
     def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
         """Return the spec of what becomes of the leaf of the in key with this index (for actions: was before)."""
@@ -25,15 +46,6 @@ class _Map(Transform):
 class _Outward(_Map):
     """Base for what the env emits: floating-point leaves, replaced on batches of samples as in an env."""
 
-    def __init__(self, in_keys: Keys, out_keys: Keys | None) -> None:
-        keys = as_keys(in_keys)
-        super().__init__(keys, checked_out_keys(keys, out_keys))
-
-    def _new_specs(self, specs: Composite) -> Composite:
-        owner = type(self).__name__
-        replace_leaves(specs, self.in_keys, self.out_keys, owner, self.new_spec, is_floating=True)
-        return specs
-
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         for index, (key, out_key) in enumerate(zip(self.in_keys, self.out_keys, strict=True)):
             next_tensordict.set(out_key, self.new_value(index, next_tensordict.get(key)))
@@ -41,6 +53,7 @@ class _Outward(_Map):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Do the same to a batch of samples."""
+        self._check_samples(tensordict)
         return self._call(tensordict)
 
 
@@ -48,8 +61,8 @@ class ObservationMap(_Outward):
     """Base of those that replace observations, at resets too."""
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Replace the specs."""
-        return self._new_specs(observation_spec)
+        self._replace_leaves(observation_spec, self.new_spec, is_floating=True)
+        return observation_spec
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)
@@ -59,24 +72,20 @@ class RewardMap(_Outward):
     """Base of those that replace rewards."""
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """Replace the specs."""
-        return self._new_specs(reward_spec)
+        self._replace_leaves(reward_spec, self.new_spec, is_floating=True)
+        return reward_spec
 
 
 class ActionMap(_Map):
     """Base of those that replace the action on its way to the env; the tensordict keeps what the policy chose."""
 
-    def __init__(self, in_keys_inv: Keys, out_keys_inv: Keys | None) -> None:
-        keys = as_keys(in_keys_inv)
-        super().__init__(in_keys_inv=keys, out_keys_inv=checked_out_keys(keys, out_keys_inv))
-
     def transform_action_spec(self, action_spec: Composite) -> Composite:
-        """Replace the specs, and move them to where the policy writes."""
-        owner = type(self).__name__
-        replace_leaves(action_spec, self.in_keys_inv, self.out_keys_inv, owner, self.new_spec, moves=True)
+        self._replace_leaves(action_spec, self.new_spec, is_inverse=True, is_floating=True)
         return action_spec
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self._is_for_samples:
+            return tensordict
         for index, (key, out_key) in enumerate(zip(self.in_keys_inv, self.out_keys_inv, strict=True)):
             tensordict.set(key, self.new_value(index, tensordict.get(out_key)))
         return tensordict
@@ -84,3 +93,224 @@ class ActionMap(_Map):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Leave a batch of samples as it is: they hold the actions that the policy chose."""
         return tensordict
+
+
+class _Clip:
+    """The limits of each key, (low, high) of which one may be None, and what they do to values and specs."""
+
+    ranges: Sequence[Range]
+
+    def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
+        low, high = (clipped(end, self.ranges[index]) for end in bounds(spec))
+        return bounded(low, high, dtype=spec.dtype, device=spec.device)
+
+    def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
+        return clipped(value, self.ranges[index])
+
+
+class ObservationClip(_Clip, ObservationMap):
+    """Clip observations of floating point: `clip` is for all keys, or a mapping with one per key.
+
+    Example:
+        >>> clip = ObservationClip(["joint_vel"], clip=(-10.0, 10.0))
+    """
+
+    def __init__(
+        self, in_keys: Keys, out_keys: Keys | None = None, *, clip: Range | Mapping[NestedKey, Range]
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+        self.ranges = one_per_key("clip", clip, self.in_keys)
+        for key, ends in zip(self.in_keys, self.ranges, strict=True):
+            check_clip(f"clip of {key!r}", ends)
+
+
+class RewardClip(_Clip, RewardMap):
+    """Clip rewards.
+
+    Example:
+        >>> clip = RewardClip(clip=(0.0, None))
+    """
+
+    def __init__(self, in_keys: Keys = "reward", out_keys: Keys | None = None, *, clip: Range) -> None:
+        super().__init__(in_keys, out_keys)
+        check_clip("clip", clip)
+        self.ranges = [clip] * len(self.in_keys)
+
+
+class ActionClip(_Clip, ActionMap):
+    """The env receives the clipped action; the policy may ask for any number.
+
+    Example:
+        >>> clip = ActionClip(clip=(-1.0, 1.0))
+    """
+
+    def __init__(
+        self, in_keys_inv: Keys = "action", out_keys_inv: Keys | None = None, *, clip: Range
+    ) -> None:
+        super().__init__(in_keys_inv=in_keys_inv, out_keys_inv=out_keys_inv)
+        check_clip("clip", clip)
+        self.ranges = [clip] * len(self.in_keys_inv)
+
+    def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
+        return Unbounded(spec.shape, dtype=spec.dtype, device=spec.device)
+
+
+def check_clip(field: str, ends: Range) -> None:
+    """Refuse what is no pair (low, high) with low < high and at least one limit."""
+    if not isinstance(ends, tuple | list) or len(ends) != 2 or ends[0] is None and ends[1] is None:
+        raise ValueError(f"{field}={ends!r}: expected a pair (low, high), of which one may be None")
+    for end in ends:
+        if end is not None:
+            checks.check_in_range(field, end)
+    if ends[0] is not None and ends[1] is not None and ends[0] >= ends[1]:
+        raise ValueError(f"{field}={ends!r}: expected low < high")
+
+
+class ObservationScale(ObservationMap):
+    """Multiply observations by `scale`, a number or one per element of the last dim, or a mapping with one per key.
+
+    Example:
+        >>> scale = ObservationScale(["joint_vel"], scale=0.05)
+    """
+
+    def __init__(
+        self, in_keys: Keys, out_keys: Keys | None = None, *, scale: PerDim | Mapping[NestedKey, PerDim]
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+        factors = one_per_key("scale", scale, self.in_keys)
+        for index, (key, factor) in enumerate(zip(self.in_keys, factors, strict=True)):
+            check_scale(f"scale of {key!r}", factor)
+            held = torch.tensor(factor, dtype=torch.float32)
+            self.register_buffer(f"factor_{index}", held, persistent=False)
+
+    def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
+        factor: Tensor = getattr(self, f"factor_{index}").to(spec.device)
+        if factor.ndim:
+            leaf = spec.shape[self.batch_dims[index] :]
+            _check_per_dim(f"scale of {self.in_keys[index]!r}", factor.shape[0], "observation", leaf)
+        factors = factor.expand(spec.shape), factor.expand(spec.shape)
+        low, high = multiply_bounds(bounds(spec), factors)
+        return bounded(low, high, dtype=spec.dtype, device=spec.device)
+
+    def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
+        return scaled(value, getattr(self, f"factor_{index}")).to(value.dtype)
+
+
+class RewardScale(FollowsLevel, RewardMap):
+    """Rewards as `scale * reward + offset`.
+
+    With `first_scale`, that is the scale at level 0 of `follow_level_`, linear from there to `scale` at level 1.
+
+    Example:
+        >>> scale = RewardScale(scale=0.02)
+    """
+
+    def __init__(
+        self,
+        in_keys: Keys = "reward",
+        out_keys: Keys | None = None,
+        *,
+        scale: float,
+        offset: float = 0.0,
+        first_scale: float | None = None,
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+        for name, value in (("scale", scale), ("offset", offset), ("first_scale", first_scale)):
+            if value is not None:
+                checks.check_in_range(name, value)
+        self.scale, self.offset, self.first_scale = scale, offset, first_scale
+        self._register_level(is_used=first_scale is not None)
+
+    def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
+        low, high = bounds(spec)
+        scales = self.scale, self.scale if self.first_scale is None else self.first_scale
+        factors = torch.full_like(low, min(scales)), torch.full_like(low, max(scales))
+        shift = torch.full_like(low, self.offset)
+        low, high = add_bounds(multiply_bounds((low, high), factors), (shift, shift))
+        return bounded(low, high, dtype=spec.dtype, device=spec.device)
+
+    def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
+        scale = self.scale if self.first_scale is None else by_level(self.first_scale, self.scale, self.level)
+        reward = scaled(value, scale)
+        return reward + self.offset if self.offset else reward
+
+
+class ActionScale(ActionMap):
+    """The env receives `scale * action + offset`: numbers, or one per element of the last dim.
+
+    A scale is not 0; None maps [-1, 1] to the bounds of the env.
+
+    Example:
+        >>> scale = ActionScale(scale=(0.25, 0.5), offset=0.1)
+    """
+
+    def __init__(
+        self,
+        in_keys_inv: Keys = "action",
+        out_keys_inv: Keys | None = None,
+        *,
+        scale: PerDim | None = None,
+        offset: PerDim = 0.0,
+    ) -> None:
+        super().__init__(in_keys_inv=in_keys_inv, out_keys_inv=out_keys_inv)
+        if scale is None and offset != 0.0:
+            raise ValueError(f"offset={offset!r} without scale: the bounds of the env give both")
+        if scale is not None:
+            check_scale("scale", scale)
+            if 0 in (scale if isinstance(scale, Sequence) else [scale]):
+                raise ValueError(f"scale={scale!r}: expected numbers other than 0")
+        check_scale("offset", offset)
+        self.scale, self.offset = scale, offset
+        for index in range(len(self.in_keys_inv)):
+            self.register_buffer(f"scale_{index}", None, persistent=False)
+            self.register_buffer(f"offset_{index}", None, persistent=False)
+
+    def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
+        scale, offset = self._affine(index, spec)
+        if self._buffers[f"scale_{index}"] is None:
+            self._buffers[f"scale_{index}"], self._buffers[f"offset_{index}"] = scale, offset
+        ends = [(end - offset) / scale for end in bounds(spec)]
+        low, high = torch.minimum(*ends), torch.maximum(*ends)
+        return bounded(low, high, dtype=spec.dtype, device=spec.device)
+
+    def _affine(self, index: int, spec: TensorSpec) -> tuple[Tensor, Tensor]:
+        """Return scale and offset, one per element of the last dim, or per element of all dims from bounds."""
+        key, leaf = self.in_keys_inv[index], spec.shape[self.batch_dims_inv[index] :]
+        if self.scale is None:
+            low, high = bounds(spec)
+            if not bool((torch.isfinite(low) & torch.isfinite(high) & (low < high)).all()):
+                raise ValueError(f"ActionScale: {key!r} has no finite bounds: give scale")
+            return (high - low) / 2, (high + low) / 2
+        for name, value in (("scale", self.scale), ("offset", self.offset)):
+            if isinstance(value, Sequence):
+                _check_per_dim(name, len(value), f"action {key!r}", leaf)
+        scale, offset = (
+            torch.tensor(value, dtype=spec.dtype, device=spec.device) for value in (self.scale, self.offset)
+        )
+        return scale, offset
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if self._buffers["scale_0"] is None:
+            # The action's bounds are in the specs only.
+            assert self.container is not None and self.container.input_spec is not None
+        return tensordict_reset
+
+    def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
+        scale, offset = self._buffers[f"scale_{index}"], self._buffers[f"offset_{index}"]
+        if scale is None or offset is None:
+            raise RuntimeError("ActionScale knows its numbers once an env holds it and has made its specs")
+        return scaled(value, scale, offset)
+
+
+def check_scale(field: str, scale: PerDim) -> None:
+    """Refuse what is neither a finite number nor a tuple of them."""
+    for index, factor in enumerate(scale if isinstance(scale, tuple | list) else [scale]):
+        checks.check_in_range(f"{field}[{index}]" if isinstance(scale, tuple | list) else field, factor)
+
+
+def _check_per_dim(field: str, count: int, owner: str, leaf: torch.Size) -> None:
+    if leaf[-1:] != (count,):
+        raise ValueError(
+            f"{field} has {count} numbers, but the {owner} has shape {tuple(leaf)} in each env: give 1 or one per "
+            "element of the last dim"
+        )

@@ -12,24 +12,35 @@ from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from ksim_rl.checked import Checked, Count
 from ksim_rl.transforms import ring
 from ksim_rl.transforms.columns import side_by_side
-from ksim_rl.transforms.row_transform import Keys, RowTransform, as_keys, checked_out_keys
-from ksim_rl.transforms.specs import bounded, bounds, replace_leaves
+from ksim_rl.transforms.row_transform import Keys, RowTransform
+from ksim_rl.transforms.specs import bounded, bounds
 
 
 class RingTransform(RowTransform):
-    """Base of transforms that pass signals through rings of slots, see `ring`.
-
-    Attributes:
-        num_slots: values that a ring holds per env.
-        num_frames: values that come out of it at each step.
-    """
+    """Base of transforms that pass signals through rings of slots (see `ring`), observations unless overridden."""
 
     num_slots = 1
+    """Values that a ring holds per env."""
     num_frames = 1
+    """Values that come out of it at each step."""
     _is_joined = False
     _num_rings = 0
 
     age_E: Tensor
+
+    def _register_rings(self) -> None:
+        self._register_rows("age_E", *self._per_key("ring"))
+
+    def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
+        return self._pass(tensordict_reset, mask_E)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._sized()
+        self._advance()
+        return self._pass(next_tensordict, None)
+
+    def _advance(self) -> None:
+        """Prepare for the env step to come."""
 
     def _size_rings(self, specs: Composite, leaves: Sequence[TensorSpec], *, joins: bool = True) -> None:
         """Make one ring [E, M, ...] per signal, or with `joins` one for all signals where they are of one dtype."""
@@ -47,53 +58,41 @@ class RingTransform(RowTransform):
         for index, (shape, dtype) in enumerate(zip(shapes, dtypes, strict=True)):
             self._size_buffer(f"ring_{index}", dtype, (self.num_slots, *shape))
 
-    def _pass(
-        self, tensordict: TensorDictBase, values: list[Tensor], mask_E: Tensor | None
-    ) -> TensorDictBase:
+    def _pass(self, tensordict: TensorDictBase, mask_E: Tensor | None) -> TensorDictBase:
         """Send the values through the rings, and write what comes out; a mask says which rows begin with them."""
+        values = [tensordict.get(key) for key in self.in_keys]
         if self._is_joined:
             joined_EL = self._through(0, side_by_side(values, self.num_rows), mask_E)
             sizes = [self.num_frames * value.numel() // self.num_rows for value in values]
             found = joined_EL.split(sizes, dim=1)
         else:
             found = [self._through(index, value, mask_E) for index, value in enumerate(values)]
-        for out_key, value, found_EL in zip(self.out_keys, values, found):  # noqa: B905 (strict takes time in every step)
-            tensordict.set(out_key, self._shaped(found_EL, value, tensordict.batch_size))
+        for index, out_key in enumerate(self.out_keys):
+            tensordict.set(out_key, self._shaped(index, found[index], values[index], tensordict.batch_size))
         return tensordict
 
     def _through(self, index: int, value: Tensor, mask_E: Tensor | None) -> Tensor:
         """Write this step's value [E, ...] and return what is due, [E, N * L]; masked rows begin with it."""
         raise NotImplementedError
 
-    def _shaped(self, found_EL: Tensor, value: Tensor, batch_size: torch.Size) -> Tensor:
+    def _shaped(self, index: int, found_EL: Tensor, value: Tensor, batch_size: torch.Size) -> Tensor:
         """Return what comes out in the shape that the env emits."""
         return found_EL if found_EL.shape == value.shape else found_EL.reshape(value.shape)
 
 
 @dataclass(frozen=True, kw_only=True)
 class HistoryCfg(Checked):
-    """The last `length` frames, oldest first.
-
-    Args:
-        length: number of frames.
-        stride: env steps from one frame to the next.
-        flat: True puts frame after frame into one vector; False stacks them along a dim of their own.
-    """
+    """The last `length` frames, oldest first."""
 
     length: Count
     stride: Count = 1
+    """Env steps from one frame to the next."""
     flat: bool = True
+    """True puts frame after frame into one vector [E, N * L]; False stacks them to [E, N, ...]."""
 
 
 class ObservationHistory(RingTransform):
-    """The last N frames, oldest first; frames from before a reset are the reset observation.
-
-    Args:
-        in_keys: observations, of any shape and dtype; nested keys as tuples.
-        out_keys: where the histories go. Default: in place of the frames.
-        length: N.
-        stride: env steps from one frame to the next; 1 takes every one.
-        flat: True gives one vector [E, N * L], frame after frame; False stacks to [E, N, ...].
+    """The last frames of observations (see `HistoryCfg`); those from before a reset are the reset observation.
 
     Example:
         >>> history = ObservationHistory(["joint_pos"], ["joint_pos_history"], length=10)
@@ -103,9 +102,8 @@ class ObservationHistory(RingTransform):
         self, in_keys: Keys, out_keys: Keys | None = None, *, length: int, stride: int = 1, flat: bool = True
     ) -> None:
         HistoryCfg(length=length, stride=stride, flat=flat)
-        in_keys = as_keys(in_keys)
-        rings = [f"ring_{index}" for index in range(len(in_keys))]
-        super().__init__(in_keys, checked_out_keys(in_keys, out_keys), row_buffers=["age_E", *rings])
+        super().__init__(in_keys, out_keys)
+        self._register_rings()
         self.num_frames = self.length = length
         self.stride, self.flat = stride, flat
         self.num_slots = (length - 1) * stride + 1
@@ -113,13 +111,8 @@ class ObservationHistory(RingTransform):
         self.register_buffer("part_bytes", None, persistent=False)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Repeat the specs N times."""
-        leaves = replace_leaves(
-            observation_spec,
-            self.in_keys,
-            self.out_keys,
-            type(self).__name__,
-            lambda _index, spec: self._repeated(spec, observation_spec.ndim),
+        leaves = self._replace_leaves(
+            observation_spec, lambda index, spec: self._repeated(spec, self.batch_dims[index])
         )
         self._size_rings(observation_spec, leaves)
         return observation_spec
@@ -135,13 +128,6 @@ class ObservationHistory(RingTransform):
         low, high = (end.reshape(shape) for end in bounds(stacked))
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
-    def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
-        return self._pass(tensordict_reset, [tensordict_reset.get(key) for key in self.in_keys], mask_E)
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self._sized()
-        return self._pass(next_tensordict, [next_tensordict.get(key) for key in self.in_keys], None)
-
     def _through(self, index: int, value: Tensor, mask_E: Tensor | None) -> Tensor:
         buffers: dict[str, Any] = self._buffers
         ring_EM, age_E, parts = buffers[f"ring_{index}"], buffers["age_E"], buffers["part_bytes"]
@@ -151,7 +137,11 @@ class ObservationHistory(RingTransform):
         layout = {"num_frames": self.num_frames, "stride": self.stride, "parts_C": parts}
         return ring.push(ring_EM, age_E, value_E, counts=index == self._num_rings - 1, **layout)
 
-    def _shaped(self, found_EL: Tensor, value: Tensor, batch_size: torch.Size) -> Tensor:
-        if not self.flat:
-            return found_EL.reshape(*batch_size, self.num_frames, *value.shape[len(batch_size) :])
-        return found_EL if len(batch_size) == 1 else found_EL.reshape(*batch_size, -1)
+    def _shaped(self, index: int, found_EL: Tensor, value: Tensor, batch_size: torch.Size) -> Tensor:
+        outer, inner = len(batch_size), self.batch_dims[index]
+        if self.flat and outer == inner == 1:
+            return found_EL
+        stacked = found_EL.reshape(*batch_size, self.num_frames, *value.shape[outer:])
+        if inner > outer:  # each frame of the env has one of each agent, say
+            stacked = stacked.movedim(outer, inner)
+        return stacked.flatten(inner) if self.flat else stacked

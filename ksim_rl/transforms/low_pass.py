@@ -1,32 +1,33 @@
-"""Actions are smoothed by the transform of this module."""
+"""Actions are smoothed by the filter of this module."""
+
+import math
 
 import torch
+from jaxtyping import Float
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
 from ksim_rl import checks
-from ksim_rl.transforms.row_transform import (
-    Keys,
-    RowTransform,
-    as_keys,
-    checked_action,
-    checked_out_keys,
-)
-from ksim_rl.transforms.specs import replace_leaves
+from ksim_rl.transforms.row_transform import Keys, RowTransform, checked_action
+
+
+def smoothing(cutoff_hz: float, step_s: float) -> float:
+    """Return alpha, what a filter of that cut-off takes of the way to a constant input in a step of `step_s`."""
+    return 1.0 - math.exp(-2.0 * math.pi * cutoff_hz * step_s)
+
+
+def low_pass_(
+    filtered_E: Float[Tensor, " E *leaf"], action_E: Float[Tensor, " E *leaf"], alpha: float
+) -> Float[Tensor, " E *leaf"]:
+    """Move `filtered_E`, in place, by the share alpha of the way to the action."""
+    return filtered_E.lerp_(action_E, alpha)
 
 
 class ActionLowPass(RowTransform):
-    """The env receives `y = y + alpha * (action - y)`, a first-order low-pass filter of the actions.
+    """The env receives `y = y + alpha * (action - y)`, a first-order low-pass filter (see `smoothing`).
 
-    The tensordict keeps the action that the policy chose. A cut-off of f Hz at steps of dt s is
-    `alpha = 1 - exp(-2 pi f dt)`.
-
-    Args:
-        in_keys_inv: the actions that the env reads.
-        out_keys_inv: where the policy writes them. Default: the same keys.
-        alpha: in (0, 1]; 1 filters nothing.
-        initial: y before the first action of an episode; None passes that action unfiltered.
+    `initial` is y before the first action of an episode; None passes that action unfiltered.
 
     Example:
         >>> low_pass = ActionLowPass(alpha=0.3)
@@ -42,21 +43,15 @@ class ActionLowPass(RowTransform):
         alpha: float,
         initial: float | None = None,
     ) -> None:
-        keys = as_keys(in_keys_inv)
         checks.check_in_range("alpha", alpha, low=0.0, high=1.0, low_open=True)
         if initial is not None:
             checks.check_in_range("initial", initial)
-        super().__init__(
-            in_keys_inv=keys,
-            out_keys_inv=checked_out_keys(keys, out_keys_inv),
-            row_buffers=["fresh_E", *(f"filtered_{index}" for index in range(len(keys)))],
-        )
+        super().__init__(in_keys_inv=in_keys_inv, out_keys_inv=out_keys_inv)
+        self._register_rows("fresh_E", *self._per_key("filtered"))
         self.alpha, self.initial = alpha, initial
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
-        """Move the specs to where the policy writes."""
-        owner = type(self).__name__
-        leaves = replace_leaves(action_spec, self.in_keys_inv, self.out_keys_inv, owner, moves=True)
+        leaves = self._replace_leaves(action_spec, is_inverse=True, is_floating=True)
         self._size_rows(action_spec)
         self._size_buffer("fresh_E", torch.bool)
         self._size_leaves("filtered", action_spec, leaves)
@@ -73,8 +68,8 @@ class ActionLowPass(RowTransform):
             action = checked_action(tensordict, out_key, filtered_E.shape[1:], filtered_E.dtype)
             action_E = action.reshape(filtered_E.shape)
             fresh_E = self.fresh_E.reshape(-1, *[1] * (action_E.ndim - 1))
-            before_E = torch.where(fresh_E, action_E if self.initial is None else self.initial, filtered_E)
-            filtered_E.copy_(torch.lerp(before_E, action_E, self.alpha))
+            before_E = action_E if self.initial is None else self.initial
+            low_pass_(filtered_E.copy_(torch.where(fresh_E, before_E, filtered_E)), action_E, self.alpha)
             # In memory of its own: the kept one changes in place.
             tensordict.set(key, filtered_E.clone().reshape(action.shape))
         self.fresh_E.zero_()

@@ -1,5 +1,6 @@
 """Observations are normalized by what has been observed so far by the transform of this module."""
 
+from copy import deepcopy
 from typing import Self
 
 import torch
@@ -10,8 +11,8 @@ from torchrl.data import Composite, Unbounded
 from ksim_rl import checks
 from ksim_rl.device.running_moments import RunningMoments, has_ranks
 from ksim_rl.transforms import upstream
-from ksim_rl.transforms.row_transform import Keys, RowTransform, as_keys, checked_out_keys
-from ksim_rl.transforms.specs import Device, replace_leaves
+from ksim_rl.transforms.row_transform import Keys, RowTransform
+from ksim_rl.transforms.specs import Device
 
 
 class ObservationNormalization(RowTransform):
@@ -19,6 +20,7 @@ class ObservationNormalization(RowTransform):
 
     Each env state counts once: the one that a step reaches at that step, and a reset observation at its reset, for the
     rows that reset. Statistics are per element and float64 (`RunningMoments`); states that are not finite do not count.
+    After `until` env states (on each rank) they stay. The default `eps` bounds the standard deviation below by 0.01.
 
     `env.eval()` freezes the statistics and `env.train()` goes on, `enable_` does the same for one transform; both write
     a device flag, so a captured or compiled step follows. With `torch.distributed`, the ranks merge their statistics in
@@ -26,13 +28,6 @@ class ObservationNormalization(RowTransform):
     step's.
 
     Prefer `obs_normalization` of actor and critic where they fit: those go into the checkpoint by themselves.
-
-    Args:
-        in_keys: floating-point observations, of any shape; nested keys as tuples.
-        out_keys: where the normalized ones go. Default: in place.
-        eps: added to the variance. The default bounds the standard deviation below by 0.01.
-        until: stop updating once so many env states are counted (on each rank); None never stops.
-        enabled: whether statistics are updated from the start.
 
     Example:
         >>> normalization = ObservationNormalization(["joint_pos", "joint_vel"])
@@ -52,8 +47,7 @@ class ObservationNormalization(RowTransform):
         checks.check_in_range("eps", eps, low=0.0, low_open=True)
         if until is not None:
             checks.check_in_range("until", until, low=1)
-        in_keys = as_keys(in_keys)
-        super().__init__(in_keys, checked_out_keys(in_keys, out_keys))
+        super().__init__(in_keys, out_keys)
         self.eps, self.until = eps, until
         self._wanted = self._collective = enabled
         self.moments = nn.ModuleList()
@@ -76,16 +70,12 @@ class ObservationNormalization(RowTransform):
     def clone(self) -> Self:
         """Copy with statistics of its own."""
         copy = super().clone()
-        copy._modules = {**self._modules, "moments": nn.ModuleList(_copied(m) for m in self._each_moments())}
+        copy._modules = {**self._modules, "moments": deepcopy(self.moments)}
         return copy
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Remove the bounds."""
-        leaves = replace_leaves(
+        leaves = self._replace_leaves(
             observation_spec,
-            self.in_keys,
-            self.out_keys,
-            type(self).__name__,
             lambda _index, spec: Unbounded(spec.shape, dtype=spec.dtype, device=spec.device),
             is_floating=True,
         )
@@ -121,6 +111,7 @@ class ObservationNormalization(RowTransform):
         """Normalize a batch of samples by the statistics as they are."""
         if not len(self.moments):
             raise RuntimeError("there are no statistics yet: an env, or `load_state_dict`, gives them")
+        self._check_samples(tensordict)
         return self._normalize(tensordict)
 
     def _flat(self, tensordict: TensorDictBase, num_rows: int) -> list[tuple[Tensor, RunningMoments]]:
@@ -132,8 +123,8 @@ class ObservationNormalization(RowTransform):
         for out_key, key, (values_EL, moments) in zip(
             self.out_keys, self.in_keys, self._flat(tensordict, num_rows), strict=True
         ):
-            normalized_EL = (values_EL - moments.mean).mul_(torch.rsqrt(moments.var + self.eps))
             value = tensordict.get(key)
+            normalized_EL = moments.normalized(values_EL, self.eps)
             tensordict.set(out_key, normalized_EL.reshape(value.shape).to(value.dtype))
         return tensordict
 
@@ -145,9 +136,3 @@ class ObservationNormalization(RowTransform):
         if sizes and not len(self.moments):
             self._size_moments(sizes, self.updating.device)
         super()._load_from_state_dict(state_dict, prefix, *args)
-
-
-def _copied(moments: RunningMoments) -> RunningMoments:
-    copy = RunningMoments(moments.dim, until=moments.until, device=moments.mean.device)
-    copy.load_state_dict(moments.state_dict())
-    return copy

@@ -138,12 +138,7 @@ _LANES, _MANY_LANES = 32, 256
 class Lags(NamedTuple):
     """Lags that rows draw as they begin: those of `ksim_rl.device.random.integers` at the counts that they reach.
 
-    Attributes:
-        lag_E: int64; changed in place.
-        seed: int64 [].
-        count_E: resets of each row, int64; changed in place.
-        stream: the id of the stream of draws.
-        lowest, highest: env steps, both included.
+    All tensors are int64; `lag_E` and `count_E`, the resets of each row, are changed in place.
     """
 
     lag_E: Tensor | None
@@ -168,21 +163,12 @@ def push(
     parts_C: Int32[Tensor, " C"] | None = None,
     counts: bool = True,
 ) -> Shaped[Tensor, "E L"]:
-    """Go on by one step: write its values, and return those of some steps ago.
+    """Go on by one step: write its values, and return those of some steps ago, N frames of L elements per env.
 
-    Args:
-        ring_EM: M slots per env, [E, M, ...].
-        age_E: steps since each env's reset, int64; changed in place.
-        value_E: [E, ...], in the dtype of the ring.
-        lag_E: of the newest frame, int64; None for 0. All lags have to be below M.
-        num_frames: N, of each env; the newest is the last.
-        stride: steps from one frame to the next.
-        parts_C: int32 sizes in bytes of what a value consists of; what is returned has all frames of the first part,
-            then all of the second one, and so on. None for one part.
-        counts: whether the age goes on; of several rings with one age only the last one may do that.
-
-    Returns:
-        [E, N * L] for L elements per env. A lag that reaches back beyond the reset gives the value of that.
+    The ring has M slots per env. `lag_E` is that of the newest frame, which is the last, below M; one that reaches back
+    beyond the reset gives the value of that. The age, the steps since each env's reset, is changed in place; of several
+    rings with one age only the last one `counts` it on. `parts_C` are sizes in bytes of what a value consists of: all
+    frames of the first part are returned, then all of the second one, and so on.
     """
     return _run(ring_EM, age_E, value_E, lag_E, None, num_frames, stride, parts_C, counts, *_NO_LAGS[1:])
 

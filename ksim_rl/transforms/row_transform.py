@@ -1,6 +1,6 @@
 """This module holds the bases of transforms with state per env: buffers, draws of their own, a level to follow."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NoReturn, Self
 
 import torch
@@ -8,25 +8,29 @@ from jaxtyping import Float32, Shaped
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 
+from ksim_rl import checks
 from ksim_rl.device import random
-from ksim_rl.transforms.specs import Device
+from ksim_rl.transforms import upstream
+from ksim_rl.transforms.specs import Device, batch_dims_of, drop_leaf_spec, leaf_spec, set_leaf_spec, spell
 
 Keys = Sequence[NestedKey] | NestedKey
+_NO_SEED = -(1 << 63)
 
 
-class RowTransform(Transform):
-    """Base of transforms with state per env row.
+class CheckedKeys(Transform):
+    """Base of the transforms of this room: they read in keys, and write as many out keys, by default the same ones.
 
-    All state lives in buffers that are changed in place. Those sized by the env are made when the env first asks for
-    its specs or resets, never later, so a captured step keeps its addresses. Subclasses make them as they transform the
-    specs, by `_size_rows` and `_size_buffer`, and begin episodes in `_begin`.
-
-    Args:
-        in_keys, out_keys, in_keys_inv, out_keys_inv: as in `torchrl.envs.transforms.Transform`.
-        row_buffers: names of the buffers that the env sizes.
+    A key is a name, or a tuple for a nested one. Transforms of actions have `in_keys_inv`, what the env reads, and
+    `out_keys_inv`, where the policy writes. An out key that is missing (if `is_paired`) or repeats is refused.
     """
+
+    batch_dims: Sequence[int] = ()
+    """Batch dims of the TensorDict in which each in key lies."""
+    batch_dims_inv: Sequence[int] = ()
+    _is_for_samples = False
 
     def __init__(
         self,
@@ -35,13 +39,83 @@ class RowTransform(Transform):
         in_keys_inv: Keys | None = None,
         out_keys_inv: Keys | None = None,
         *,
-        row_buffers: Sequence[str] = (),
+        is_paired: bool = True,
     ) -> None:
-        super().__init__(in_keys, out_keys, in_keys_inv, out_keys_inv)  # pyright: ignore[reportArgumentType]
-        self.num_rows = 0
-        self._row_device: Device = None
-        for name in row_buffers:
+        keys, keys_inv = as_keys(in_keys or []), as_keys(in_keys_inv or [])
+        out = _checked_out_keys(keys, out_keys, is_paired)
+        super().__init__(keys, out, keys_inv, _checked_out_keys(keys_inv, out_keys_inv, is_paired))
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        super().set_container(container)
+        # Replay buffers hold a chain that no env holds, and call its inverse on what they are given to store.
+        self._is_for_samples = upstream.env_of(self) is None
+
+    def _check_samples(self, tensordict: TensorDictBase, *, is_floating: bool = True) -> None:
+        for key in self.in_keys:
+            value = tensordict.get(key, None)
+            if value is None:
+                near = checks.near(spell(key), map(spell, tensordict.keys(True, True)))
+                raise KeyError(f"{type(self).__name__}: the samples have no {key!r}: {near}")
+            if is_floating:
+                self._check_floating(key, value.dtype)
+
+    def _check_floating(self, key: NestedKey, dtype: torch.dtype) -> None:
+        if not dtype.is_floating_point:
+            raise ValueError(f"{type(self).__name__}: {key!r} is {dtype}: expected floating-point values")
+
+    def _replace_leaves(
+        self,
+        specs: Composite,
+        new_spec: Callable[[int, TensorSpec], TensorSpec] = lambda _index, spec: spec.clone(),
+        *,
+        is_inverse: bool = False,
+        is_floating: bool = False,
+    ) -> list[TensorSpec]:
+        """Set the spec of each out key, in place, and return those of the in keys as they were.
+
+        `new_spec` takes the index of a key and its spec. The specs of actions (`is_inverse`) move to where the policy
+        writes. Raises ValueError where `is_floating` and a spec is of another dtype.
+        """
+        in_keys, out_keys = self.in_keys, self.out_keys
+        if is_inverse:
+            in_keys, out_keys = self.in_keys_inv, self.out_keys_inv
+        found = [leaf_spec(specs, key, type(self).__name__) for key in in_keys]
+        for key, spec in zip(in_keys, found, strict=True):
+            if is_floating:
+                self._check_floating(key, spec.dtype)
+        batch_dims = [batch_dims_of(specs, key) for key in in_keys]
+        if is_inverse:
+            self.batch_dims_inv = batch_dims
+        else:
+            self.batch_dims = batch_dims
+        replaced = [new_spec(index, spec) for index, spec in enumerate(found)]
+        for key, out_key in zip(in_keys, out_keys, strict=True):
+            if is_inverse and key != out_key:
+                drop_leaf_spec(specs, key)
+        for out_key, spec in zip(out_keys, replaced, strict=True):
+            set_leaf_spec(specs, out_key, spec)
+        return found
+
+
+class RowTransform(CheckedKeys):
+    """Base of transforms with state per env row.
+
+    All state lives in buffers that are changed in place. Those sized by the env are made when the env first asks for
+    its specs or resets, never later, so a captured step keeps its addresses. Subclasses name them by `_register_rows`,
+    make them as they transform the specs, by `_size_rows` and `_size_buffer`, and begin episodes in `_begin`.
+    """
+
+    num_rows = 0
+    _row_device: Device = None
+
+    def _register_rows(self, *names: str) -> None:
+        """Name buffers that the env will size."""
+        for name in names:
             self.register_buffer(name, None)
+
+    def _per_key(self, name: str) -> list[str]:
+        """Return the names of buffers of which there is one per key."""
+        return [f"{name}_{index}" for index in range(len(self.in_keys or self.in_keys_inv))]
 
     def _size_rows(self, specs: Composite) -> None:
         """Take note of the number of rows; bases make their buffers here."""
@@ -65,8 +139,8 @@ class RowTransform(Transform):
 
         TorchRL may reset or resume an env before it asks for them.
         """
-        if not self.num_rows:
-            env = self.container
+        if not self.num_rows or self._is_for_samples:
+            env = upstream.env_of(self)
             if env is None:
                 self._refuse_samples()
             assert env.output_spec is not None and env.input_spec is not None
@@ -103,6 +177,11 @@ class RowTransform(Transform):
         """Refuse: without an env there are no steps and no resets to follow."""
         self._refuse_samples()
 
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self._is_for_samples and type(self).forward is RowTransform.forward:
+            self._refuse_samples()
+        return tensordict
+
     def _refuse_samples(self) -> NoReturn:
         raise RuntimeError(
             f"{type(self).__name__} has state per env: use it in an env, not on a batch of samples"
@@ -130,18 +209,13 @@ def _per_row(mask: Tensor, num_rows: int) -> Tensor:
 
 
 class KeyedTransform(RowTransform):
-    """Base of transforms with draws of their own.
+    """Base of transforms with draws of their own, from a named `stream`; a config names it, else class and keys do.
 
     Draws in a step are keyed by `step_count`, which counts env steps; draws at a reset by `reset_count_E`, which counts
     each row's own resets. So a reset of one row never changes another row's numbers, and TorchRL's reset of the rows
-    that are done equals a masked reset at every step.
-
-    Args:
-        in_keys, out_keys, in_keys_inv, out_keys_inv: as in `torchrl.envs.transforms.Transform`.
-        row_buffers: names of the buffers that the env sizes.
-        seed: until `seed_` or the env's `set_seed` gives another one.
-        stream: name of the stream of draws. Default: the name that a config gives the transform, else its class and
-            keys.
+    that are done equals a masked reset at every step. `seed` holds until `seed_` or the env's `set_seed` gives another;
+    None draws one from torch's generator at the first reset, another in each worker process. The `stream` of draws is
+    named after the transform in a config, else after its class and keys.
     """
 
     purposes: ClassVar[tuple[str, ...]] = ()
@@ -153,32 +227,47 @@ class KeyedTransform(RowTransform):
 
     def __init__(
         self,
-        in_keys: Keys | None = None,
-        out_keys: Keys | None = None,
-        in_keys_inv: Keys | None = None,
-        out_keys_inv: Keys | None = None,
-        *,
-        row_buffers: Sequence[str] = (),
-        seed: int = 0,
+        *keys: Keys | None,
+        seed: int | None = None,
         stream: str | None = None,
+        **others: Keys | bool | None,
     ) -> None:
-        names = ("reset_count_E", *row_buffers)
-        super().__init__(in_keys, out_keys, in_keys_inv, out_keys_inv, row_buffers=names)
-        keys = (self.in_keys, self.out_keys, self.in_keys_inv, self.out_keys_inv)
-        self.stream = type(self).__name__ + "".join(map(str, keys)) if stream is None else stream
+        super().__init__(*keys, **others)  # pyright: ignore[reportArgumentType]
+        self._register_rows("reset_count_E")
+        every = (self.in_keys, self.out_keys, self.in_keys_inv, self.out_keys_inv)
+        self.stream = type(self).__name__ + "".join(map(str, every)) if stream is None else stream
         self._stream_ids = {
             purpose: random.stream_id(f"{self.stream}/{purpose}") for purpose in self.purposes
         }
-        self.register_buffer("seed_value", torch.tensor(seed, dtype=torch.int64))
+        self._is_seeded = seed is not None
+        self.register_buffer("seed_value", torch.tensor(_NO_SEED if seed is None else seed))
         self.register_buffer("step_count", torch.zeros((), dtype=torch.int64))
 
     def seed_(self, seed: int) -> Self:
         """Set the seed and start the counters anew, in place."""
+        self._is_seeded = True
         self.seed_value.fill_(seed)
         self.step_count.zero_()
         if self._buffers["reset_count_E"] is not None:
             self.reset_count_E.zero_()
         return self
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        super().set_container(container)
+        upstream.hear_seeds(upstream.env_of(self), seed_transforms)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        self._take_seed()
+        return super()._reset(tensordict, tensordict_reset)
+
+    def _take_seed(self) -> None:
+        """Draw a seed where nobody has given one."""
+        if not self._is_seeded:
+            self.seed_(upstream.fresh_seed())
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        self._is_seeded = bool(self.seed_value != _NO_SEED)
 
     def _size_rows(self, specs: Composite) -> None:
         super()._size_rows(specs)
@@ -197,6 +286,22 @@ class KeyedTransform(RowTransform):
         return random.row_keys(self.seed_value, self._stream_ids[purpose], self.reset_count_E, self.num_rows)
 
 
+def keyed_transforms(env: EnvBase) -> Iterator[KeyedTransform]:
+    """Yield each transform with draws or counters of its own, also those of a `TransformedEnv` further inside."""
+    inner: Any = env
+    while isinstance(inner, TransformedEnv):
+        for module in inner.transform.modules():
+            if isinstance(module, KeyedTransform):
+                yield module
+        inner = inner.base_env
+
+
+def seed_transforms(env: EnvBase, seed: int) -> None:
+    """Seed all `keyed_transforms` of an env."""
+    for transform in keyed_transforms(env):
+        transform.seed_(seed)
+
+
 class FollowsLevel(Transform):
     """Mixin of transforms that a curriculum can drive: the buffer `level`, float32 [], 1 until somebody changes it."""
 
@@ -208,8 +313,7 @@ class FollowsLevel(Transform):
     def follow_level_(self, level: Shaped[Tensor, "*any"] | float) -> Self:
         """Follow a level: a number is copied; a tensor is read anew at every step, wherever it is changed in place.
 
-        Raises:
-            ValueError: if a tensor is not float32 of shape [], or a number is outside [0, 1].
+        Raises ValueError if a tensor is not float32 of shape [], or a number is outside [0, 1].
         """
         if isinstance(level, Tensor):
             if level.shape != () or level.dtype != torch.float32:
@@ -232,20 +336,42 @@ def follow_level(transforms: Iterable[Transform], level: Float32[Tensor, ""] | f
                 module.follow_level_(level)
 
 
+def by_level(
+    start: float | Float32[Tensor, "*shape"],
+    end: float | Float32[Tensor, "*shape"],
+    level: Float32[Tensor, "*level"],
+) -> Float32[Tensor, "*found"]:
+    """Return what is `start` at level 0, `end` at level 1, and linear in between."""
+    if isinstance(start, Tensor) and isinstance(end, Tensor):
+        return torch.lerp(start, end, level)
+    return start + (end - start) * level
+
+
+def moved_level(
+    level: Float32[Tensor, "*envs"],
+    score: Float32[Tensor, "*envs"],
+    step: float,
+    raise_above: float | None,
+    lower_below: float | None,
+) -> Float32[Tensor, "*envs"]:
+    """Return the level in [0, 1] after a mean score: a step up above one bound, a step down below the other."""
+    moved = level
+    if raise_above is not None:
+        moved = torch.where(score > raise_above, moved + step, moved)
+    if lower_below is not None:
+        moved = torch.where(score < lower_below, moved - step, moved)
+    return moved.clamp(0.0, 1.0)
+
+
 def as_keys(keys: Keys) -> list[NestedKey]:
     """Return a list of keys from one key or a list of them; a tuple is one key, and ("a",) is "a"."""
     listed: list[NestedKey] = [keys] if isinstance(keys, str | tuple) else list(keys)
     return [key[0] if isinstance(key, tuple) and len(key) == 1 else key for key in listed]
 
 
-def checked_out_keys(in_keys: list[NestedKey], out_keys: Keys | None) -> list[NestedKey]:
-    """Return the out keys, by default the in keys.
-
-    Raises:
-        ValueError: if their numbers differ, or an out key repeats.
-    """
+def _checked_out_keys(in_keys: list[NestedKey], out_keys: Keys | None, is_paired: bool) -> list[NestedKey]:
     out = list(in_keys) if out_keys is None else as_keys(out_keys)
-    if len(out) != len(in_keys):
+    if is_paired and len(out) != len(in_keys):
         raise ValueError(f"out_keys={out} has {len(out)} keys for the {len(in_keys)} of in_keys={in_keys}")
     if len(set(out)) != len(out):
         raise ValueError(f"out_keys={out} repeats a key: each needs its own place")
@@ -253,11 +379,7 @@ def checked_out_keys(in_keys: list[NestedKey], out_keys: Keys | None) -> list[Ne
 
 
 def one_per_key(name: str, value: Any, keys: Sequence[NestedKey]) -> list[Any]:
-    """Return what a value is for each key: the same for all, or the entries of a mapping.
-
-    Raises:
-        ValueError: if a mapping has other keys.
-    """
+    """Return what a value is for each key: the same for all, or the entries of a mapping, which has to name all."""
     if not isinstance(value, Mapping):
         return [value] * len(keys)
     if set(value) != set(keys):
@@ -268,15 +390,12 @@ def one_per_key(name: str, value: Any, keys: Sequence[NestedKey]) -> list[Any]:
 def checked_action(
     tensordict: TensorDictBase, key: NestedKey, leaf: Sequence[int], dtype: torch.dtype
 ) -> Shaped[Tensor, "*leaf"]:
-    """Return the action, refused before it reaches a buffer: the env sees only what comes out of that.
-
-    Raises:
-        ValueError: with both shapes and dtypes.
-    """
+    """Return the action, refused before it reaches a buffer: the env sees only what comes out of that."""
     action = tensordict.get(key)
     expected = (*tensordict.batch_size, *leaf)
     if tuple(action.shape) != expected or action.dtype != dtype:
         raise ValueError(
             f"action {key!r} has shape {tuple(action.shape)} and dtype {action.dtype}: expected {expected} and {dtype}"
         )
-    return action
+    # Buffers change in place: no gradient of the policy may reach them.
+    return action.detach()

@@ -60,7 +60,7 @@ _BY_REASON = {
     "it runs in another process": "RayTransform",
     "it needs torchvision, which is no part of this library": "Resize",
     _NAMELESS: "SelectTransform",
-    "it takes specs; networks with a memory add the primers that they need": "TensorDictPrimer",
+    "it takes specs; recurrent networks add the primers that they need": "TensorDictPrimer",
     f"{_FUNCTION}, or a termination term": "TerminateTransform",
     "it reads the host's clock, which a captured step cannot": "Timer",
     "it shares its statistics by a lock; use `ksim_rl.envs.transforms.ObservationNormalization`": "VecNorm VecNormV2",
@@ -71,11 +71,7 @@ REFUSED = {name: reason for reason, names in _BY_REASON.items() for name in name
 
 
 def check(transform: type[Transform]) -> None:
-    """Refuse what is TorchRL's and not in `DATA`.
-
-    Raises:
-        ValueError: with the reason.
-    """
+    """Refuse what is TorchRL's and not in `DATA`, with the reason."""
     name = transform.__name__
     if transform.__module__.split(".")[0] == PACKAGE and name not in DATA:
         reason = REFUSED.get(name, "it is not in the list of those that are data")

@@ -81,6 +81,11 @@ _quick_count_down = QuickLaunch(_count_down_kernel, _CountDown)
 _quick_tally = QuickLaunch(_tally_kernel, _Tally)
 
 
+def time_left(horizon: int, step_E: Int64[Tensor, " E"]) -> Float32[Tensor, " E"]:
+    """Return how many env steps of an episode are left after `step_E`; `count_down` keeps that where nobody counts."""
+    return (horizon - step_E).to(torch.float32)
+
+
 def count_down(
     left_E: Float32[Tensor, " E"], mask_E: Bool[Tensor, " E"] | None, horizon: float, divisor: float
 ) -> Float32[Tensor, " E"]:

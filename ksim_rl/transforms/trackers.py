@@ -12,7 +12,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from ksim_rl import checks
 from ksim_rl.transforms import upstream
 from ksim_rl.transforms.innermost import EpisodeLimit, innermost
-from ksim_rl.transforms.row_transform import Keys, RowTransform, as_keys, checked_out_keys
+from ksim_rl.transforms.row_transform import Keys, RowTransform, as_keys
 from ksim_rl.transforms.specs import leaf_spec, set_leaf_spec
 from ksim_rl.transforms.tally import count_down, tally
 
@@ -32,21 +32,16 @@ class _Tracker(RowTransform):
     def _write(self, tensordict: TensorDictBase, copies: Sequence[Tensor] | None = None) -> TensorDictBase:
         batch = tensordict.batch_size
         for key, copy in zip(self.out_keys, copies or [kept_E.clone() for kept_E in self._kept()]):  # noqa: B905 (the length may have no key)
-            tensordict.set(key, copy if len(batch) == 1 else copy.reshape(*batch, *copy.shape[1:]))
+            tensordict.set(key, copy if len(batch) == 1 else copy.reshape((*batch, *copy.shape[1:])))
         return tensordict
 
 
 class EpisodeTracker(_Tracker):
     """The sum of rewards and the number of steps since the reset; where `done` is True, those of the whole episode.
 
-    Both are part of `next`, and 0 at a reset. Nothing is read by the host: take the rows that are done after a rollout,
-    `rollout["next", "episode_return"][rollout["next", "done"]]`.
-
-    Args:
-        in_keys: rewards; nested keys as tuples.
-        out_keys: where their sums go, in the rewards' shapes and dtypes. Default: "episode_return", which needs one
-            reward.
-        length_key: where the number of steps goes, int64 [E, 1]; None leaves it out.
+    Both are part of `next`, and 0 at a reset; sums have the rewards' shapes and dtypes, the number of steps (left out
+    by a `length_key` of None) is int64 [E, 1]. Nothing is read by the host: take the rows that are done after a
+    rollout, `rollout["next", "episode_return"][rollout["next", "done"]]`.
 
     Example:
         >>> tracker = EpisodeTracker()
@@ -72,16 +67,18 @@ class EpisodeTracker(_Tracker):
             raise ValueError(
                 f"out_keys={returns} and length_key={length_key!r} repeat a key: each needs its own place"
             )
-        buffers = ["step_E", *(f"return_{index}" for index in range(len(in_keys)))]
-        super().__init__(in_keys, returns + lengths, row_buffers=buffers)
+        super().__init__(in_keys, returns + lengths, is_paired=False)
+        self._register_rows("step_E", *self._per_key("return"))
         self.length_key = length_key
         self._is_usual = False
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Add the returns, shaped as the rewards, and the lengths to the observations."""
         output_spec = output_spec.clone()
         rewards, observations = output_spec["full_reward_spec"], output_spec["full_observation_spec"]
         leaves = [leaf_spec(rewards, key, type(self).__name__) for key in self.in_keys]
+        for key, spec in zip(self.in_keys, leaves, strict=True):
+            if spec.dtype == torch.bool:
+                raise ValueError(f"EpisodeTracker: {key!r} is {spec.dtype}: expected numbers")
         for key, spec in zip(self.out_keys, leaves, strict=False):
             set_leaf_spec(observations, key, Unbounded(spec.shape, dtype=spec.dtype, device=spec.device))
         if self.length_key is not None:
@@ -97,11 +94,9 @@ class EpisodeTracker(_Tracker):
         return output_spec
 
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
-        return (
-            self._tally(tensordict_reset, None, mask_E)
-            if self._is_usual
-            else super()._begin(tensordict_reset, mask_E)
-        )
+        if self._is_usual:
+            return self._tally(tensordict_reset, None, mask_E)
+        return super()._begin(tensordict_reset, mask_E)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._sized()
@@ -122,18 +117,14 @@ class EpisodeTracker(_Tracker):
         return self._write(tensordict, (total_E, step_E.unsqueeze(1)))
 
     def _kept(self) -> list[Tensor]:
-        totals = [getattr(self, f"return_{index}") for index in range(len(self.in_keys))]
-        return [*totals, self.step_E.unsqueeze(1)]
+        return [*(getattr(self, name) for name in self._per_key("return")), self.step_E.unsqueeze(1)]
 
 
 class SuccessTracker(_Tracker):
     """Whether an episode has succeeded, bool; where `done` is True, that of the whole episode.
 
-    Args:
-        in_keys: what tells success, at each step: an observation, reward or done flag; nested keys as tuples.
-        out_keys: where the outcomes go, in the shapes of in_keys. Default: "episode_success", which needs one in key.
-        threshold: a number above it is success; 0.5 suits flags too.
-        reduce: "any" for success once, "last" for success now.
+    In keys are observations, rewards or done flags: above the threshold is success, once in the episode ("any") or now
+    ("last").
 
     Example:
         >>> tracker = SuccessTracker("reached_goal")
@@ -147,15 +138,13 @@ class SuccessTracker(_Tracker):
         threshold: float = 0.5,
         reduce: Literal["any", "last"] = "any",
     ) -> None:
-        in_keys = as_keys(in_keys)
         checks.check_in_range("threshold", threshold)
         checks.check_choice("reduce", reduce, ("any", "last"))
-        buffers = [f"success_{index}" for index in range(len(in_keys))]
-        super().__init__(in_keys, checked_out_keys(in_keys, out_keys), row_buffers=buffers)
+        super().__init__(in_keys, out_keys)
+        self._register_rows(*self._per_key("success"))
         self.threshold, self.reduce = threshold, reduce
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Add the outcomes to the observations."""
         output_spec = output_spec.clone()
         observations = output_spec["full_observation_spec"]
         everything = output_spec["full_done_spec"].clone()
@@ -163,8 +152,7 @@ class SuccessTracker(_Tracker):
             everything.update(output_spec[part].clone())
         leaves = [leaf_spec(everything, key, type(self).__name__) for key in self.in_keys]
         for out_key, spec in zip(self.out_keys, leaves, strict=True):
-            size = spec.shape[-1] if len(spec.shape) else 1
-            outcome = Binary(size, shape=spec.shape, dtype=torch.bool, device=observations.device)
+            outcome = Binary(shape=spec.shape, dtype=torch.bool, device=observations.device)
             set_leaf_spec(observations, out_key, outcome)
         self._size_rows(observations)
         self._size_leaves("success", observations, leaves, torch.bool)
@@ -178,20 +166,15 @@ class SuccessTracker(_Tracker):
         return self._write(next_tensordict)
 
     def _kept(self) -> list[Tensor]:
-        return [getattr(self, f"success_{index}") for index in range(len(self.in_keys))]
+        return [getattr(self, name) for name in self._per_key("success")]
 
 
 class TimeAwareObservation(RowTransform):
     """The time that is left of an episode, float32 [E, 1]: without it the value of a state is ambiguous.
 
-    Counted in env steps from the reset that this transform saw; 0 from the horizon on. See Pardo et al., "Time Limits
-    in Reinforcement Learning" (2018).
-
-    Args:
-        out_keys: the one key to write.
-        horizon: env steps of an episode. None takes `max_episode_length` of the env, or Gymnasium's
-            `spec.max_episode_steps`.
-        normalize: True gives the share that is left, from 1 to 0; False gives env steps.
+    Counted in env steps from the reset that this transform saw; 0 from the horizon on. `normalize` gives the share that
+    is left, from 1 to 0. See Pardo et al., "Time Limits in Reinforcement Learning" (2018). A `horizon` of None takes
+    `max_episode_length` of the env, or Gymnasium's `spec.max_episode_steps`.
 
     Example:
         >>> clock = TimeAwareObservation(horizon=500)
@@ -211,11 +194,11 @@ class TimeAwareObservation(RowTransform):
             raise ValueError(f"out_keys={keys}: expected one key")
         if horizon is not None:
             checks.check_count("horizon", horizon)
-        super().__init__([], keys, row_buffers=["left_E"])
+        super().__init__([], keys, is_paired=False)
+        self._register_rows("left_E")
         self.horizon, self.normalize = horizon, normalize
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the clock, between 0 and 1, or 0 and the horizon."""
         high = 1.0 if self.normalize else float(self._horizon())
         shape = torch.Size([*observation_spec.shape, 1])
         spec = Bounded(0.0, high, shape, device=observation_spec.device, dtype=torch.float32)

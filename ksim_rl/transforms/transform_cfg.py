@@ -25,14 +25,8 @@ _NAMED = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONL
 class TransformCfg(OwnTree):
     """A class of transforms with the arguments to build it by, which are data.
 
-    In a config it is a node with `_target_`, the path of the class, and the arguments by name.
-
-    Args:
-        transform: one of ours, of a plug-in, or of TorchRL's that are data (see `ksim_rl.transforms.stock`).
-        **arguments: by the names of the class's signature; those left out have its defaults.
-
-    Raises:
-        ValueError: if the class takes no such argument, or refuses its value.
+    In a config it is a node with `_target_`, the path of the class (one of ours, of a plug-in, or of TorchRL's that are
+    data, see `ksim_rl.transforms.stock`), and the arguments by the names of its signature.
 
     Example:
         >>> lag = TransformCfg(ActionDelay, delay=DelayCfg(min_lag=1, max_lag=2))
@@ -44,10 +38,7 @@ class TransformCfg(OwnTree):
         stock.check(transform)
         parameters = _parameters(transform)
         for name in arguments:
-            if name not in parameters:
-                raise ValueError(
-                    f"unknown argument {name!r} of {transform.__name__}: {near(name, parameters)}"
-                )
+            _annotation(transform, name, name)
         missing = [
             name for name, (_, default) in parameters.items()
             if default is inspect.Parameter.empty and name not in arguments
@@ -65,11 +56,7 @@ class TransformCfg(OwnTree):
         self.build()
 
     def build(self, name: str | None = None) -> Transform:
-        """Return a new transform; with a name it draws from a stream of that name, unless its arguments give one.
-
-        Raises:
-            ValueError: if the class refuses an argument.
-        """
+        """Return a new transform; with a name it draws from a stream of that name, unless its arguments give one."""
         arguments = self.arguments
         if name is not None and "stream" in arguments and arguments["stream"] is None:
             arguments = {**arguments, "stream": f"transforms.{name}"}
@@ -86,12 +73,7 @@ class TransformCfg(OwnTree):
 
     @classmethod
     def from_tree(cls, tree: Any, path: str) -> Self:
-        """Build the description of a node.
-
-        Raises:
-            ValueError: with the full path of what is wrong: a class that is none of the allowed ones, an argument that
-                is unknown, missing, of a wrong type or out of range.
-        """
+        """Build the description of a node; a ValueError names the full path of what is wrong."""
         if isinstance(tree, cls):
             return tree
         if not isinstance(tree, Mapping) or TARGET not in tree:
@@ -103,16 +85,11 @@ class TransformCfg(OwnTree):
             stock.check(transform)
         except ValueError as error:
             raise ValueError(f"{path}.{TARGET}: {error}") from None
-        parameters = _parameters(transform)
         arguments = {}
         for name, value in tree.items():
-            if name == TARGET:
-                continue
-            if name not in parameters:
-                raise ValueError(
-                    f"unknown field '{path}.{name}' of {transform.__name__}: {near(str(name), parameters)}"
-                )
-            arguments[name] = build_value(parameters[name][0], value, f"{path}.{name}")
+            if name != TARGET:
+                where = f"{path}.{name}"
+                arguments[name] = build_value(_annotation(transform, name, where), value, where)
         try:
             return cls(transform, **arguments)
         except ValueError as error:
@@ -152,6 +129,13 @@ def _parameters(transform: type[Transform]) -> dict[str, tuple[Any, Any]]:
         for parameter in parameters
         if parameter.kind in _NAMED
     }
+
+
+def _annotation(transform: type[Transform], name: str, where: str) -> Any:
+    parameters = _parameters(transform)
+    if name not in parameters:
+        raise ValueError(f"unknown field {where!r} of {transform.__name__}: {near(str(name), parameters)}")
+    return parameters[name][0]
 
 
 def _as_data(annotation: Any) -> Any:

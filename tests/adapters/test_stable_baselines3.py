@@ -5,7 +5,7 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecMonitor
-from torchrl.data import Bounded
+from torchrl.data import Bounded, Unbounded
 
 from ksim_rl import envs
 from ksim_rl.adapters.stable_baselines3 import StableBaselines3VecEnv
@@ -39,10 +39,14 @@ def test_one_observation_is_a_box_and_several_are_a_dict() -> None:
 
 
 def test_unbounded_actions_get_the_limit_and_others_keep_theirs() -> None:
-    env = StableBaselines3VecEnv(
+    unbounded = CounterEnv(LENGTHS)
+    unbounded.action_spec = Unbounded(unbounded.action_spec.shape)
+    env = StableBaselines3VecEnv(unbounded, keys=["count"], action_limit=2.0)
+    assert env.action_space.low.tolist() == [-2.0, -2.0] and env.action_space.high.tolist() == [2.0, 2.0]
+    cartpole = StableBaselines3VecEnv(
         envs.make("cartpole_balance", num_envs=2, seed=0), keys=["actor"], action_limit=2.0
     )
-    assert (env.action_space.low, env.action_space.high) == (-2.0, 2.0)
+    assert (cartpole.action_space.low, cartpole.action_space.high) == (-1.0, 1.0)
     bounded = CounterEnv(LENGTHS)
     bounded.action_spec = Bounded(-3.0, 5.0, bounded.action_spec.shape)
     space = StableBaselines3VecEnv(bounded, keys=["count"]).action_space

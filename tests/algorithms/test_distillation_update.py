@@ -216,5 +216,5 @@ def test_a_teacher_with_a_memory_is_refused(tmp_path):
     trainer.folder = tmp_path / "checkpoint"
     trainer.iterate()
     trainer.save()
-    with pytest.raises(ValueError, match="the teacher has a memory"):
+    with pytest.raises(ValueError, match="the teacher is recurrent"):
         build(compose(tmp_path, "objective.num_epochs=1"))

@@ -1,6 +1,7 @@
 """The fused kernels, run by Triton's interpreter, make the same of a rollout as torch does."""
 
 import copy
+import importlib
 
 import pytest
 import torch
@@ -14,7 +15,8 @@ from ksim_rl.objectives import PPOCfg
 from ksim_rl.objectives.fused_ppo import FusedLayout, Tuning, why_not_fused
 
 ENVS, STEPS, ACTIONS, ACTOR_OBS, CRITIC_OBS = 8, 6, 3, 20, 24
-DATA = DatasetCfg(num_env_states_per_minibatch=24, num_minibatches=2)
+SIZES = {"num_env_states_per_minibatch": 24, "num_minibatches": 2}
+DATA = DatasetCfg(**SIZES)
 HIDDEN = (32, 32, 16)
 # Blocks that do not divide the 24 rows of a minibatch or the layers; few, since the interpreter is slow.
 TUNING = Tuning(block=16, chunk=16, stages=1, depth=16, tile=32, tile_stages=1, splits=2, size=1024)
@@ -33,12 +35,12 @@ def fused_ppo():
     return FusedPPO
 
 
-def networks(**actor_options):
+def networks(*, action_dim=ACTIONS, **actor_options):
     torch.manual_seed(3)
-    actor = make_actor(
-        ActorCfg(hidden_dims=HIDDEN, output_gain=0.5, **actor_options), obs_dim=ACTOR_OBS, action_dim=ACTIONS
-    )
-    return actor, make_critic(CriticCfg(hidden_dims=HIDDEN), obs_dim=CRITIC_OBS)
+    activation = actor_options.pop("activation", "elu")
+    cfg = ActorCfg(hidden_dims=HIDDEN, activation=activation, output_gain=0.5, **actor_options)
+    actor = make_actor(cfg, obs_dim=ACTOR_OBS, action_dim=action_dim)
+    return actor, make_critic(CriticCfg(hidden_dims=HIDDEN, activation=activation), obs_dim=CRITIC_OBS)
 
 
 def rollout(actor, *, seed=0):
@@ -109,6 +111,7 @@ def assert_equal_states(one, other, *, atol=1e-4):
         ({}, {}),
         (
             {
+                "clip_epsilon": 1.0,
                 "clip_value": False,
                 "schedule": "fixed",
                 "max_grad_norm": None,
@@ -119,6 +122,8 @@ def assert_equal_states(one, other, *, atol=1e-4):
             },
             {"std_type": "log", "init_std": 0.6, "obs_normalization": False},
         ),
+        ({}, {"activation": "relu"}),
+        ({}, {"activation": "tanh"}),
     ],
 )
 def test_updates_equal_those_of_torch(fused_ppo, options, actor_options):
@@ -133,7 +138,7 @@ def test_updates_equal_those_of_torch(fused_ppo, options, actor_options):
     ours, theirs = fused.metrics(), torch_s.metrics()
     assert ours.keys() == theirs.keys()
     assert ours["update/non_finite_env_states"] == 4
-    assert 0.0 < ours["update/clip_fraction"] < 1.0
+    assert 0.0 <= ours["update/clip_fraction"] < 1.0
     # Torch's has other numbers in the place of the env states that are left out, and takes their variance too.
     for name in theirs.keys() - {"update/explained_variance"}:
         torch.testing.assert_close(
@@ -143,6 +148,44 @@ def test_updates_equal_those_of_torch(fused_ppo, options, actor_options):
             rtol=1e-3,
             msg=lambda text, name=name: f"{name}: {text}",
         )
+
+
+@needs_interpreter
+@pytest.mark.filterwarnings("error")
+def test_what_takes_no_part_may_be_anything_and_no_part_at_all_is_a_loss_of_zero(fused_ppo):
+    """Padding acts with zeros on an observation of zeros: the density of 16 such narrow gaussians is infinite."""
+    actor, critic = networks(action_dim=16, init_std=1e-3, obs_normalization=False)
+    data = rollout(actor)
+    fused = update(PPOCfg(num_epochs=1), actor, critic, fused_ppo)
+    fused(data.clone())
+    assert fused.metrics()["update/skipped_steps"] == 0
+    data["next", "reward"].fill_(float("nan"))
+    fused(data)
+    metrics = fused.metrics()
+    assert metrics["update/skipped_steps"] == 0
+    assert metrics["update/non_finite_env_states"] == 2 + ENVS * STEPS
+    for name in ("loss/policy", "loss/value", "loss/entropy", "update/kl", "update/grad_norm"):
+        assert metrics[name] == 0.0, name
+    summary = importlib.import_module("ksim_rl.objectives.fused_ppo.step_kernels").SUMMARY
+    assert (fused.fused._summary[:, summary.index("loss")] == 0.0).all()
+
+
+@needs_interpreter
+def test_explained_variance_of_targets_far_from_zero(fused_ppo):
+    actor, critic = networks()
+    cfg = PPOCfg(num_epochs=1, learning_rate=1e-9, schedule="fixed", normalize_advantage="none")
+    data = rollout(actor).apply(
+        lambda leaf: leaf if leaf.dtype == torch.bool else leaf.nan_to_num(0.0, 0.0, 0.0)
+    )
+    data["next", "done"].fill_(True)
+    data["next", "terminated"].fill_(True)
+    data["next", "reward"].add_(1e4)
+    torch_s, fused = update(cfg, actor, critic), update(cfg, actor, critic, fused_ppo)
+    torch_s(data.clone())
+    fused(data)
+    name = "update/explained_variance"
+    torch.testing.assert_close(fused.metrics()[name], torch_s.metrics()[name], atol=1e-3, rtol=0.0)
+    assert fused.metrics()[name].abs() < 1.0
 
 
 @needs_interpreter
@@ -198,8 +241,8 @@ def test_layout_places_every_parameter_once():
 def test_what_the_kernels_cannot_do_is_said():
     actor, critic = networks()
     made = fused_networks(actor, critic)
-    assert why_not_fused(PPOCfg(precision="bfloat16"), made, data=DATA) is None
-    assert "float32" in why_not_fused(PPOCfg(), made, data=DATA)
+    assert why_not_fused(PPOCfg(precision="bfloat16"), made, **SIZES) is None
+    assert "float32" in why_not_fused(PPOCfg(), made, **SIZES)
     for option in (
         {"kernels": "torch"},
         {"advantage": "vtrace"},
@@ -208,12 +251,12 @@ def test_what_the_kernels_cannot_do_is_said():
         {"normalize_advantage": "minibatch"},
     ):
         cfg = PPOCfg(precision="bfloat16", **option)
-        assert next(iter(option)) in why_not_fused(cfg, made, data=DATA)
-    assert "ELU" in fused_networks(*networks(activation="tanh"))
+        assert next(iter(option)) in why_not_fused(cfg, made, **SIZES)
+    assert "['GELU'], and not all one of" in fused_networks(*networks(activation="gelu"))
     assert "std" in fused_networks(*networks(state_dependent_std=True))
     other = make_actor(ActorCfg(hidden_dims=(32, 32)), obs_dim=ACTOR_OBS, action_dim=ACTIONS)
     assert "hidden layers" in why_not_fused(
-        PPOCfg(precision="bfloat16"), fused_networks(other, critic), data=DATA
+        PPOCfg(precision="bfloat16"), fused_networks(other, critic), **SIZES
     )
     assert isinstance(fused_networks(actor, torch.nn.Identity()), str)
     assert update(PPOCfg(), actor, critic).metrics()["update/fused"] == 0.0
@@ -232,6 +275,9 @@ def test_on_the_cpu_torch_makes_the_steps():
         device=torch.device("cpu"),
     )
     assert reason == made.fused == "they need CUDA and Triton"
+    assert made.notes == []
+    made.device = torch.device("cuda")
+    assert made.notes == ["torch makes the gradient steps, not the fused kernels: they need CUDA and Triton"]
 
 
 def test_bfloat16_products_change_a_gradient_step_a_little():

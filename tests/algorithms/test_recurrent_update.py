@@ -1,4 +1,4 @@
-"""PPO with memories: probabilities and values as in the rollout, a critic's own state, bit-exact resume."""
+"""PPO with recurrent networks: probabilities and values as in the rollout, a critic's own state, bit-exact resume."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from torchrl.modules import set_recurrent_mode
 
 from ksim_rl import conf
 from ksim_rl.device import state_tree
-from ksim_rl.modules import memories
+from ksim_rl.modules import recurrent_modules
 from ksim_rl.testing import count_syncs
 from ksim_rl.trainers import build, load_policy
 
@@ -77,8 +77,8 @@ def test_sequences_have_the_probabilities_that_the_rollout_had(trainer):
 @torch.no_grad()
 def test_values_are_those_of_a_critic_that_walks_along_with_the_env(trainer):
     update, collector = trainer.update, trainer.collector
-    (memory,) = memories(update.critic)
-    state_E = {key: update._carried._state_E[key].clone() for key in memory.state_keys}
+    (recurrent,) = recurrent_modules(update.critic)
+    state_E = {key: update._carried._state_E[key].clone() for key in recurrent.state_keys}
     rollout_ET = collector.collect()
     update._carried.begin_(rollout_ET)
     update.advantage(rollout_ET)
@@ -89,7 +89,7 @@ def test_values_are_those_of_a_critic_that_walks_along_with_the_env(trainer):
         torch.testing.assert_close(
             walked_E["state_value"], rollout_ET["state_value"][:, t], atol=1e-5, rtol=1e-5
         )
-        state_E = {key: walked_E[("next", *key)] for key in memory.state_keys}
+        state_E = {key: walked_E[("next", *key)] for key in recurrent.state_keys}
         # The value after the step sees the true next observation, and the state that the step left.
         after_E = rollout_ET["next"][:, t].select("critic").update(_nested(state_E))
         torch.testing.assert_close(
@@ -139,13 +139,15 @@ def test_a_resumed_run_is_bit_identical(networks, tmp_path):
 def test_only_the_critic_may_remember():
     trainer = make("modules=lstm", "~modules.recurrent_actor.hidden_dim", "modules.recurrent_actor=null")
     trainer.train()
-    assert memories(trainer.update.actor) == [] and len(memories(trainer.update.critic)) == 1
+    assert (
+        recurrent_modules(trainer.update.actor) == [] and len(recurrent_modules(trainer.update.critic)) == 1
+    )
 
 
-def test_memories_above_a_shared_trunk_with_targets_that_follow_the_policy():
-    memory = "{kind: gru, hidden_dim: 6, num_layers: 1}"
-    overrides = ["modules=shared_trunk", f"modules.recurrent_actor={memory}"]
-    overrides += [f"modules.recurrent_critic={memory}", "objective.advantage=vtrace"]
+def test_recurrent_layers_above_a_shared_trunk_with_targets_that_follow_the_policy():
+    recurrent = "{kind: gru, hidden_dim: 6, num_layers: 1}"
+    overrides = ["modules=shared_trunk", f"modules.recurrent_actor={recurrent}"]
+    overrides += [f"modules.recurrent_critic={recurrent}", "objective.advantage=vtrace"]
     cfg = conf.compose([*(o for o in SMALL if "hidden_dim=" not in o), *overrides])
     trainer = build(cfg)
     for _ in range(2):

@@ -145,9 +145,9 @@ def test_a_state_of_other_shapes_or_names_is_refused():
     collector.reset()
     state = collector.state_dict()
     with pytest.raises(
-        ValueError, match=r"'actor' is torch.float32 of shape \(1, .*but this env has .*\(4, "
+        ValueError, match=r"same num_envs.*'actor' is float32\[1, .*in the checkpoint and float32\[4, "
     ):
         collector.load_state_dict(state | {"actor": state["actor"][:1] + 1.0})
-    with pytest.raises(ValueError, match="unknown \\['other'\\]"):
+    with pytest.raises(ValueError, match="'other' is unknown"):
         collector.load_state_dict(state | {"other": state["actor"]})
     assert torch.equal(collector.state_dict()["actor"], state["actor"])

@@ -55,3 +55,25 @@ def test_it_trains(folder: Path) -> None:
 def test_it_is_explained(folder: Path) -> None:
     (command,) = commands("ksim-rl envs")
     assert "foot_clearance" in run(folder, "-m", "ksim_rl.cli.main", "envs", *command.split())
+
+
+def test_the_report_is_what_the_guide_says(folder: Path) -> None:
+    (command,) = commands("ksim-rl robot")
+    out = run(folder, "-m", "ksim_rl.cli.main", "robot", *command.split())
+    assert "stool: 5.70 kg" in out and "zero actions: stands 5 s" in out and "no armature" in out
+    assert Image.open(folder / "stance.png").size == (640, 480)
+
+
+def test_a_velocity_task_takes_at_most_40_lines() -> None:
+    files = guide.files(GUIDE)
+    assert (
+        sum(files[name].count("\n") for name in ("stool/tasks.py", "stool/__init__.py", "pyproject.toml"))
+        <= 40
+    )
+
+
+def test_the_robot_made_by_hand_weighs_what_its_model_does(folder: Path) -> None:
+    script = (
+        "from stool.by_hand import TASK, ROBOT; TASK.cfg(); print(ROBOT.spec().compile().body_subtreemass[0])"
+    )
+    assert float(run(folder, "-c", script)) == pytest.approx(5.7)

@@ -313,7 +313,6 @@ def test_rewards_are_scaled_by_the_step_and_time_outs_marked_by_the_horizon():
     ("fields", "message"),
     [
         ({"decimation": 0}, "decimation=0"),
-        ({"actions": {}}, r"actions=\{\}"),
         ({"seed": -2}, "seed=-2"),
         ({"episode_length_s": -1.0}, r"episode_length_s=-1\.0"),
     ],

@@ -7,9 +7,10 @@ from torchrl.envs.transforms import Compose, RewardSum, StepCounter
 from torchrl.envs.utils import check_env_specs
 
 from ksim_rl.envs.masked_reset import MaskedReset
-from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv, keyed_transforms
+from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
 from ksim_rl.testing import CounterEnv, assert_dims, check_env, count_syncs
 from ksim_rl.transforms import GaussianNoise, ObservationNoise
+from ksim_rl.transforms.row_transform import keyed_transforms
 from tests.transforms.chains import (
     actions,
     assert_same,

@@ -1,13 +1,14 @@
 """Off-policy updates as CUDA graphs. Skipped where there is no GPU."""
 
 import dataclasses
+from contextlib import nullcontext
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Unbounded
 
-from ksim_rl.objectives import SACCfg, TD3Cfg
+from ksim_rl.objectives import SACCfg, TD3Cfg, frozen, project_distribution
 from tests.algorithms.off_policy_problem import make_update
 from tests.gpu.no_syncs import no_syncs
 
@@ -17,6 +18,9 @@ OBJECTIVES = {
     "sac": SACCfg(alpha_init=0.1),
     "fast_sac": SACCfg(value_reduction="mean", policy_delay=4, weight_decay=1e-3),
     "fast_td3": TD3Cfg(weight_decay=0.1),
+    "fast_sac_compiled": SACCfg(
+        value_reduction="mean", policy_delay=2, weight_decay=1e-3, compile=True, autocast=True
+    ),
 }
 
 
@@ -112,3 +116,29 @@ def test_bfloat16_learns_like_float32():
         assert all(parameter.dtype == torch.float32 for parameter in update.loss.parameters())
         losses[autocast] = metrics["loss/value"].item()
     assert losses[True] == pytest.approx(losses[False], rel=0.1)
+
+
+def test_compiled_losses_are_those_of_eager_ones():
+    objective = TD3Cfg(target_noise=0.0, compile=True)
+    torch.manual_seed(0)
+    update = make_update("fast_td3", _Env(), objective=objective, device="cuda", learning_starts=1)
+    update(_rollout())
+    minibatch_B = next(update.replay.minibatches(1))
+    for compiled, eager in (
+        (update._critic_loss, update.loss.critic_loss),
+        (update._actor_losses, update.loss.actor_losses),
+    ):
+        with frozen(update.critic) if eager == update.loss.actor_losses else nullcontext():
+            found, expected = compiled(minibatch_B)[0], eager(minibatch_B)[0]
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_projected_distributions_are_those_of_the_cpu_and_the_same_each_time():
+    support = torch.linspace(-2.0, 6.0, 101)
+    probs = torch.randn(512, 2, 101).softmax(-1)
+    reward, discount = torch.randn(512, 1, 1) * 3, torch.where(torch.rand(512, 1, 1) < 0.1, 0.0, 0.97)
+    expected = project_distribution(probs, reward, discount, support)
+    moved = [tensor.cuda() for tensor in (probs, reward, discount, support)]
+    found = project_distribution(*moved)
+    torch.testing.assert_close(found.cpu(), expected, rtol=1e-4, atol=1e-5)
+    assert torch.equal(found, project_distribution(*moved))

@@ -1,12 +1,13 @@
 """Randomization in a CUDA graph."""
 
+import mujoco_warp as mjw
 import numpy as np
 import pytest
 import torch
 
 from ksim_rl.physics import Captured
 from tests.gpu.no_syncs import no_syncs
-from tests.mdp.randomization.randomize_bench import INERTIAL, Runners
+from tests.mdp.randomization.randomize_bench import Runners
 from tests.mdp.randomization.test_randomize_physics import EVENTS, SUBSTEPS
 
 E = 64
@@ -64,6 +65,6 @@ def test_masked_constants_equal_those_of_all_rows(replayed):
     replayed.restart()
     replayed.fire(EVENTS["pseudo_inertia"])
     masked = {name: replayed.world.field(name).clone() for name in CONSTANTS}
-    replayed.world.set_const(INERTIAL)
+    mjw.set_const(replayed.world.warp_model, replayed.world.warp_data_E)
     for name, values in masked.items():
         torch.testing.assert_close(values, replayed.world.field(name), rtol=1e-5, atol=1e-6)

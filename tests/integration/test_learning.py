@@ -31,6 +31,7 @@ def reward_after(task, iterations, *overrides):
     return sum(rewards[-3:]) / 3
 
 
+@pytest.mark.full
 def test_a_pendulum_is_swung_up_and_held():
     # Upright and at rest pays 1 per step. An untrained policy gets 0.23 at first, and 0.07 after some steps; five seeds
     # of this one got 0.74 to 0.94.

@@ -184,3 +184,24 @@ def test_scale_must_name_each_joint(arms):
 def test_numbers_are_checked(fields, message):
     with pytest.raises(ValueError, match=message):
         mdp.JointPositionAction(joints="elbow", **fields)
+
+
+def bounds(bench, term):
+    with bench.driver.scope("actions/bounds"):
+        found_K2 = term.bounds(bench.view)
+    return None if found_K2 is None else found_K2.tolist()
+
+
+def test_bounds_are_the_actions_that_reach_the_control_range(arms):
+    effort = mdp.JointEffortAction(joints="grip")
+    assert bounds(arms, effort) == [[-2.0, 3.0]]
+    assert bounds(arms, mdp.JointEffortAction(joints="grip", scale=-2.0, offset=1.0)) == [[-1.0, 1.5]]
+    assert bounds(arms, mdp.JointEffortAction(joints="grip", clip=(-1.0, 5.0))) == [[-1.0, 3.0]]
+    assert bounds(arms, mdp.JointEffortAction(joints="grip", tanh=True)) is None
+    assert bounds(arms, mdp.ActuatorAction(actuators=("grip", "wrist"), scale=0.5)) == [
+        [-4.0, 6.0],
+        [-math.inf, math.inf],
+    ]
+    servos = mdp.JointPositionVelocityAction(joints="elbow", clip=(-1.0, 2.0))
+    assert bounds(arms, servos) == [[-1.0, 2.0]] * 2
+    assert bounds(arms, mdp.JointPositionAction(joints="elbow")) is None

@@ -134,7 +134,7 @@ def test_they_never_make_the_host_wait_and_are_part_of_the_state():
     ("make", "message"),
     [
         (lambda: mdp.RewardWeightByStage(reward="position", stages={}), r"stages=\{\}"),
-        (lambda: mdp.RewardWeightByStage(reward="position", stages={-1: 1.0}), "the env step of one"),
+        (lambda: mdp.RewardWeightByStage(reward="position", stages={-1: 1.0}), "stages key -1"),
         (lambda: mdp.CommandRangesByStage(command="h", stages={1: {"x": (1.0, 0.0)}}), r"stages\.1\.x"),
         (
             lambda: mdp.CommandRangesByLevel(command="h", start={"x": (0.0, 1.0)}, end={"y": (0.0, 1.0)}),

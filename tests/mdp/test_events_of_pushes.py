@@ -160,7 +160,7 @@ def test_a_jump_adds_to_the_velocity_of_its_rows(free_body):
     [
         (
             lambda: press(1.0, every=1, lasts=1, yaww=(0, 1)),
-            "axis in wrench_range 'yaww': did you mean 'yaw'",
+            "wrench_range key 'yaww'.* did you mean 'yaw'",
         ),
         (
             lambda: mdp.PushByForce(body="b", wrench_range={}, duration_s=(1.0, 1.0), mode="reset"),

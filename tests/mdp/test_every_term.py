@@ -51,6 +51,8 @@ def example(annotation: Any) -> Any:
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
         return example(arguments[0])
+    if origin is typing.Literal:
+        return arguments[0]
     if origin is tuple:
         return (0.1, 0.5) if arguments == (float, float) else (example(arguments[0]),)
     if origin is Mapping:

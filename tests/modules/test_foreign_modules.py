@@ -21,7 +21,7 @@ from torchrl.modules import (
 
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.data import DatasetCfg, ReplayCfg
-from ksim_rl.modules import ExploringPolicy, memories
+from ksim_rl.modules import ExploringPolicy, recurrent_modules
 from ksim_rl.objectives import PPOCfg, TD3Cfg, TD3Loss
 from ksim_rl.trainers import Evaluator, OffPolicyUpdate, PPOUpdate
 from tests.trainers.target_env import BEST_RETURN, LENGTH, make_env
@@ -32,12 +32,12 @@ RECURRENT = {"lstm": LSTMModule, "gru": GRUModule}
 def recurrent_problem(kind):
     """Return an env that carries the state of TorchRL's recurrent module, and a policy behind it."""
     env = make_env()
-    memory = RECURRENT[kind](input_size=1, hidden_size=8, in_key="actor", out_key="features")
+    recurrent = RECURRENT[kind](input_size=1, hidden_size=8, in_key="actor", out_key="features")
     env.append_transform(InitTracker())
-    env.append_transform(memory.make_tensordict_primer())
+    env.append_transform(recurrent.make_tensordict_primer())
     head = nn.Sequential(nn.Linear(8, 2), NormalParamExtractor())
     actor = ProbabilisticTensorDictSequential(
-        memory,
+        recurrent,
         TensorDictModule(head, in_keys=["features"], out_keys=["loc", "scale"]),
         ProbabilisticTensorDictModule(
             in_keys=["loc", "scale"],
@@ -48,7 +48,7 @@ def recurrent_problem(kind):
             default_interaction_type="random",
         ),
     )
-    return env, memory, actor
+    return env, recurrent, actor
 
 
 def ppo_update(actor, critic, **data):
@@ -63,11 +63,11 @@ def value():
 
 @pytest.mark.parametrize("kind", RECURRENT)
 @pytest.mark.parametrize("data", [{}, {"sequence_length": 4, "burn_in": 4}], ids=["rollouts", "sequences"])
-def test_torchrls_memories_learn_on_sequences(kind, data):
+def test_torchrls_recurrent_modules_learn_on_sequences(kind, data):
     torch.manual_seed(0)
-    env, memory, actor = recurrent_problem(kind)
+    env, recurrent, actor = recurrent_problem(kind)
     update = ppo_update(actor, value(), **data)
-    assert memories(actor) == [memory]
+    assert recurrent_modules(actor) == [recurrent]
     collector = RolloutCollector(env, actor, rollout_length=16, keys=update.rollout_keys)
     rollout_ET = collector.collect()
     update.advantage(rollout_ET)
@@ -84,10 +84,10 @@ def test_torchrls_memories_learn_on_sequences(kind, data):
 
 
 def test_a_critic_needs_the_state_after_each_step():
-    _, memory, actor = recurrent_problem("lstm")
+    _, recurrent, actor = recurrent_problem("lstm")
     critic = ValueOperator(nn.Linear(8, 1), in_keys=["features"])
     with pytest.raises(ValueError, match="critic=LSTMModule.*use a RecurrentModule"):
-        ppo_update(actor, TensorDictSequential(memory, critic))
+        ppo_update(actor, TensorDictSequential(recurrent, critic))
 
 
 class ActionValue(nn.Module):

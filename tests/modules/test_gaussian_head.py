@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from ksim_rl.modules import ActorCfg
-from ksim_rl.modules.heads import MIN_STD, GaussianHead
+from ksim_rl.modules.actor import MIN_STD, GaussianHead
 
 
 def _head(**kwargs):

@@ -17,12 +17,12 @@ from ksim_rl.modules import (
     RecurrentCfg,
     RecurrentModule,
     RecurrentNetwork,
+    behind,
     make_recurrent_actor,
     make_recurrent_critic,
-    memories,
+    recurrent_modules,
     recurrent_transforms,
     update_normalizers,
-    with_memory,
 )
 from ksim_rl.modules.recurrent_cells import gru_layer, lstm_layer
 from ksim_rl.testing import count_syncs
@@ -175,19 +175,19 @@ def test_initial_weights_are_orthogonal_per_gate_and_the_forget_gate_is_open():
 
 
 def policy(kind="lstm", *, in_keys=("drawn", "row")):
-    """Return a policy of both observations, and its memory. Each episode draws another observation."""
+    """Return a policy of both observations, and its recurrent. Each episode draws another observation."""
     torch.manual_seed(0)
-    memory = RecurrentModule(
+    recurrent = RecurrentModule(
         RecurrentCfg(kind=kind, hidden_dim=H, num_layers=2), obs_dim=2, in_keys=in_keys, name="actor"
     )
     head = TensorDictModule(
-        nn.Sequential(nn.Linear(H, 2), nn.Tanh()), in_keys=[memory.feature_key], out_keys=["action"]
+        nn.Sequential(nn.Linear(H, 2), nn.Tanh()), in_keys=[recurrent.feature_key], out_keys=["action"]
     )
-    return with_memory(memory, head), memory
+    return behind(recurrent, head), recurrent
 
 
-def primed(env, memory):
-    for transform in recurrent_transforms(env, memory.make_tensordict_primer()):
+def primed(env, recurrent):
+    for transform in recurrent_transforms(env, recurrent.make_tensordict_primer()):
         env.append_transform(transform)
     env.set_seed(1)
     return env
@@ -200,9 +200,9 @@ def rolled_out(env, actor, steps=12):
 
 @kinds
 def test_a_rollout_equals_that_of_torchrls_module_in_torchrls_env(kind):
-    actor, memory = policy(kind, in_keys=("obs_2",))
+    actor, recurrent = policy(kind, in_keys=("obs_2",))
     cls, attribute = {"lstm": (LSTMModule, "lstm"), "gru": (GRUModule, "gru")}[kind]
-    states = ["h", "c"][: len(memory.state_keys)]
+    states = ["h", "c"][: len(recurrent.state_keys)]
     stock = cls(
         2,
         H,
@@ -210,7 +210,7 @@ def test_a_rollout_equals_that_of_torchrls_module_in_torchrls_env(kind):
         in_keys=["obs_2", *states],
         out_keys=["features", *(("next", s) for s in states)],
     )
-    getattr(stock, attribute).load_state_dict(memory.module.state_dict())
+    getattr(stock, attribute).load_state_dict(recurrent.module.state_dict())
     head = TensorDictModule(actor[1].module, in_keys=["features"], out_keys=["action"])
     stock_actor = TensorDictSequential(stock, head)
     stock_env = TransformedEnv(TwoObservations(), InitTracker())
@@ -219,9 +219,9 @@ def test_a_rollout_equals_that_of_torchrls_module_in_torchrls_env(kind):
 
     expected_ET = rolled_out(stock_env, stock_actor)
     for env_class in (MaskedTransformedEnv, TransformedEnv):
-        rollout_ET = rolled_out(primed(env_class(TwoObservations()), memory), actor)
+        rollout_ET = rolled_out(primed(env_class(TwoObservations()), recurrent), actor)
         torch.testing.assert_close(rollout_ET["action"], expected_ET["action"], atol=1e-6, rtol=1e-6)
-        for key, stock_key in zip(memory.state_keys, states, strict=True):
+        for key, stock_key in zip(recurrent.state_keys, states, strict=True):
             torch.testing.assert_close(rollout_ET[key], expected_ET[stock_key], atol=1e-6, rtol=1e-6)
             torch.testing.assert_close(
                 rollout_ET[("next", *key)], expected_ET["next", stock_key], atol=1e-6, rtol=1e-6
@@ -244,12 +244,12 @@ class TwoObservations(CounterEnv):
 
 @kinds
 def test_state_begins_at_zero_and_never_leaks_over_a_reset(kind):
-    actor, memory = policy(kind)
-    check_env_specs(primed(MaskedTransformedEnv(CounterEnv([3, 5, 4])), memory))
-    rollout_ET = rolled_out(primed(MaskedTransformedEnv(CounterEnv([3, 5, 4])), memory), actor)
+    actor, recurrent = policy(kind)
+    check_env_specs(primed(MaskedTransformedEnv(CounterEnv([3, 5, 4])), recurrent))
+    rollout_ET = rolled_out(primed(MaskedTransformedEnv(CounterEnv([3, 5, 4])), recurrent), actor)
     is_init_ET, ends_ET = rollout_ET["is_init"][..., 0], rollout_ET["next", "done"][..., 0]
     assert torch.equal(is_init_ET[:, 1:], ends_ET[:, :-1]) and is_init_ET[:, 1:].any()
-    for key in memory.state_keys:
+    for key in recurrent.state_keys:
         states_ET = rollout_ET[key].flatten(2)
         assert (states_ET[is_init_ET] == 0.0).all() and (states_ET[~is_init_ET] != 0.0).all()
         # What a step writes is what the next one reads, but for resets.
@@ -258,9 +258,9 @@ def test_state_begins_at_zero_and_never_leaks_over_a_reset(kind):
             states_ET[:, 1:][carried_ET], rollout_ET[("next", *key)].flatten(2)[:, :-1][carried_ET]
         )
     # Another past of the envs changes nothing after their first reset.
-    other = primed(MaskedTransformedEnv(CounterEnv([3, 5, 4])), memory)
+    other = primed(MaskedTransformedEnv(CounterEnv([3, 5, 4])), recurrent)
     root_E = other.reset()
-    for key in memory.state_keys:
+    for key in recurrent.state_keys:
         root_E.set(key, torch.full_like(root_E[key], 9.0))
     root_E["is_init"].zero_()
     with torch.no_grad():
@@ -272,8 +272,8 @@ def test_state_begins_at_zero_and_never_leaks_over_a_reset(kind):
 
 @kinds
 def test_sequences_give_what_the_steps_gave(kind):
-    actor, memory = policy(kind)
-    rollout_ET = rolled_out(primed(MaskedTransformedEnv(CounterEnv([3, 5, 4])), memory), actor)
+    actor, recurrent = policy(kind)
+    rollout_ET = rolled_out(primed(MaskedTransformedEnv(CounterEnv([3, 5, 4])), recurrent), actor)
     read_ET = rollout_ET.select(*actor.in_keys)
     for start in (0, 4):
         with torch.no_grad(), set_recurrent_mode(True):
@@ -289,8 +289,8 @@ def test_sequences_give_what_the_steps_gave(kind):
 
 
 def test_a_step_makes_no_host_sync():
-    actor, memory = policy()
-    env = primed(MaskedTransformedEnv(CounterEnv([3, 5, 4])), memory)
+    actor, recurrent = policy()
+    env = primed(MaskedTransformedEnv(CounterEnv([3, 5, 4])), recurrent)
     with torch.no_grad():
         _, root_E = env.step_and_maybe_reset(actor(env.reset()))  # the first one checks specs
     with count_syncs() as syncs, torch.no_grad():
@@ -300,26 +300,26 @@ def test_a_step_makes_no_host_sync():
 
 
 def test_a_partial_reset_clears_the_state_of_its_rows_only():
-    actor, memory = policy()
-    env = primed(MaskedTransformedEnv(CounterEnv([9, 9, 9])), memory)
+    actor, recurrent = policy()
+    env = primed(MaskedTransformedEnv(CounterEnv([9, 9, 9])), recurrent)
     with torch.no_grad():
         _, root_E = env.step_and_maybe_reset(actor(env.reset()))
-        before = root_E[memory.state_keys[0]].clone()
+        before = root_E[recurrent.state_keys[0]].clone()
         root_E = env.reset(env_ids=[1])
-    after = root_E[memory.state_keys[0]]
+    after = root_E[recurrent.state_keys[0]]
     assert (after[1] == 0.0).all() and torch.equal(after[[0, 2]], before[[0, 2]])
     assert root_E["is_init"].flatten().tolist() == [False, True, False]
 
 
 def test_torchrl_finds_the_primer():
-    actor, memory = policy()
+    actor, recurrent = policy()
     primer = get_primers_from_module(actor)
-    assert list(primer.primers.keys(True, True)) == memory.state_keys
+    assert list(primer.primers.keys(True, True)) == recurrent.state_keys
 
 
 def test_sequences_without_marks_or_time_are_refused():
-    actor, memory = policy()
-    td = rolled_out(primed(MaskedTransformedEnv(CounterEnv([3, 5, 4])), memory), actor)
+    actor, recurrent = policy()
+    td = rolled_out(primed(MaskedTransformedEnv(CounterEnv([3, 5, 4])), recurrent), actor)
     with set_recurrent_mode(True):
         with pytest.raises(ValueError, match=r"the batch has the dims \(3,\)"):
             actor(td[:, 0].select(*actor.in_keys))
@@ -338,15 +338,15 @@ def test_values_out_of_range_are_refused(field):
 # -- actors and critics ------------------------------------------------------------------------------------------------
 
 
-def test_actor_and_critic_have_memories_of_their_own_which_normalize():
+def test_actor_and_critic_have_recurrent_layers_of_their_own_which_normalize():
     cfg = RecurrentCfg(hidden_dim=H)
     actor = make_recurrent_actor(cfg, ActorCfg(hidden_dims=(8,)), obs_dim=3, action_dim=2)
     critic = make_recurrent_critic(cfg, CriticCfg(in_keys=("critic", "actor"), hidden_dims=(8,)), obs_dim=5)
-    (of_actor,), (of_critic,) = memories(actor), memories(critic)
+    (of_actor,), (of_critic,) = recurrent_modules(actor), recurrent_modules(critic)
     assert not set(of_actor.state_keys) & set(of_critic.state_keys)
     td = TensorDict({"actor": torch.randn(7, 3) + 4.0, "critic": torch.randn(7, 2)}, batch_size=[7])
-    for memory in (of_actor, of_critic):
-        td.update(memory.make_tensordict_primer().primers.expand(7).zero())
+    for recurrent in (of_actor, of_critic):
+        td.update(recurrent.make_tensordict_primer().primers.expand(7).zero())
     td = critic(actor(td))
     assert td["action"].shape == (7, 2) and td["action_log_prob"].shape == (7,)
     assert td["state_value"].shape == (7, 1)

@@ -1,5 +1,6 @@
 """The projection of C51 against the paper's algorithm, written as loops."""
 
+import importlib
 import math
 
 import pytest
@@ -30,15 +31,22 @@ def _slow(probs, reward, discount):
     return out
 
 
+# tests/conftest.py turns Triton's interpreter on where there is no CUDA.
+@pytest.mark.parametrize("by_kernel", [False, True])
 @pytest.mark.parametrize("scale", [0.1, 1.0, 20.0])
-def test_projection_is_that_of_the_paper(scale):
+def test_projection_is_that_of_the_paper(scale, by_kernel):
+    project, device = project_distribution, "cpu"
+    if by_kernel:
+        pytest.importorskip("triton", reason="Triton is not installed")
+        project = importlib.import_module("ksim_rl.objectives.projection_kernel").project_by_kernel
+        device = "cuda" if torch.cuda.is_available() else "cpu"
     torch.manual_seed(0)
     probs = torch.rand(200, 11).softmax(-1)
     reward = torch.randn(200, 1) * scale
     discount = torch.where(torch.rand(200, 1) < 0.3, 0.0, torch.rand(200, 1))
     # Rewards that fall on atoms exactly, and on the ends.
     reward[:11, 0], discount[:11] = SUPPORT, 0.0
-    projected = project_distribution(probs, reward, discount, SUPPORT)
+    projected = project(*(tensor.to(device) for tensor in (probs, reward, discount, SUPPORT))).cpu()
     torch.testing.assert_close(projected, _slow(probs, reward, discount), rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(projected.sum(-1), torch.ones(200))
     assert (projected >= 0.0).all()

@@ -1,5 +1,7 @@
 """SAC's losses against TorchRL's own, with the same networks, numbers and draws."""
 
+from functools import partial
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -10,7 +12,7 @@ from torchrl.data import Unbounded
 
 from ksim_rl.data import MASK_KEY
 from ksim_rl.modules import QNetworkCfg, SquashedActorCfg, make_q_network, make_squashed_actor
-from ksim_rl.objectives import SACLoss, TD3Loss
+from ksim_rl.objectives import SACLoss, TD3Loss, frozen
 from ksim_rl.testing import count_syncs
 
 BATCH, OBS, ACTION = 64, 5, 3
@@ -204,3 +206,23 @@ def test_keys_can_be_renamed():
     result = loss(renamed)
     assert (result == expected).all()
     assert "error" in renamed.keys() and ("next", "gain") in loss.in_keys
+
+
+@pytest.mark.parametrize("num_atoms", [1, 11])
+def test_the_compiler_follows_the_losses_in_one_graph(num_atoms):
+    actor, critic = networks(num_atoms)
+    loss = SACLoss(actor, critic, target_entropy=-3.0, support_A=critic.module.support)
+    compiled = partial(torch.compile, backend="eager", fullgraph=True)
+    torch.manual_seed(5)
+    found = compiled(loss.critic_loss)(minibatch())[0]
+    torch.manual_seed(5)
+    torch.testing.assert_close(found, loss.critic_loss(minibatch())[0])
+    torch.manual_seed(5)
+    with frozen(critic):
+        found = compiled(loss.actor_losses)(minibatch())[0]
+    torch.manual_seed(5)
+    expected = loss.actor_losses(minibatch())[0]
+    torch.testing.assert_close(found, expected)
+    found["loss_actor"].backward()
+    assert all(parameter.grad is None for parameter in critic.parameters())
+    assert all(parameter.grad is not None for parameter in actor.parameters())

@@ -229,3 +229,30 @@ def test_refusals():
             make_symmetric(PPOCfg(symmetry="augment"), loss, maps)
     with pytest.raises(ValueError, match="'action' among them"):
         SymmetricAugmentation({"actor": MAPS["actor"]})
+
+
+def test_every_second_transition_is_reflected_with_what_follows_it():
+    mirror = SymmetricAugmentation(MAPS)
+
+    def observed():
+        return {"actor": torch.randn(6, 5), "critic": torch.randn(6, 7)}
+
+    before_B = TensorDict(
+        {**observed(), "action": torch.randn(6, 2), "next": {**observed(), "reward": torch.randn(6, 1)}}, [6]
+    )
+    after_B = before_B.clone()
+    mirror.reflect_every_second_(after_B)
+    image_B = mirror.image(before_B)
+    image_B["next"] = mirror.image(before_B["next"])
+    assert (after_B[0::2] == before_B[0::2]).all()
+    assert (after_B[1::2] == image_B[1::2]).all()
+    assert not (image_B["next", "critic"] == before_B["next", "critic"]).all()
+    assert (after_B["next", "reward"] == before_B["next", "reward"]).all()
+    mirror.reflect_every_second_(after_B)
+    torch.testing.assert_close(after_B["action"], before_B["action"])
+
+
+@pytest.mark.parametrize("maps", [None, {"action": FLIP["action"]}])
+def test_networks_whose_mirror_image_is_missing_are_refused(maps):
+    with pytest.raises(ValueError, match="mirror image of .*'actor'"):
+        SymmetricAugmentation.of(maps, read=["actor"])

@@ -1,11 +1,14 @@
 import copy
 
 import mujoco
+import mujoco_warp as mjw
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 from ksim_rl.physics import SimCfg, World, load_model, prepare_spec
+from ksim_rl.physics.fields import const_groups
 from tests.physics.models import cartpole, quadruped, standing_quadrupeds
 
 SIM = SimCfg(njmax=80, nconmax=40)
@@ -177,7 +180,7 @@ def test_masked_constants_equal_those_of_all_rows():
     world = every_joint(INERTIAL)
     world.set_const(INERTIAL, torch.ones(3, dtype=torch.bool))
     masked = {name: world.field(name).clone() for name in CONSTANTS}
-    world.set_const(INERTIAL)
+    mjw.set_const(world.warp_model, world.warp_data_E)
     for name, values in masked.items():
         torch.testing.assert_close(values, world.field(name), rtol=5e-6, atol=1e-6)
 
@@ -217,3 +220,40 @@ def test_set_const_of_what_cannot_have_changed_is_refused():
             world.set_const(("body_mass",), mask_E)
         with pytest.raises(ValueError, match="unknown per-world model field 'body_mas'"):
             world.set_const(("body_mas",), mask_E)
+
+
+SLIDES = """<mujoco><worldbody>
+  <body name="cart"><joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/>
+    <body name="lift" pos=".3 0 0"><joint name="z" type="slide" axis="0 1 .5"/><geom size=".1" mass="2"/>
+      <body name="bolted" pos="0 .1 0"><geom size=".05" mass=".3"/></body>
+      <body name="arm"><joint name="turn" axis="0 1 0"/><geom size=".1" pos=".1 0 0" mass="1"/></body></body></body>
+  <body name="wheel" pos="0 2 1"><joint name="axle" axis="1 0 0"/><geom size=".1" mass="1"/></body>
+  <body name="wall" pos="0 3 1"><geom size=".1" mass="1"/></body>
+</worldbody>TENDON</mujoco>"""
+STRAP = '<tendon><fixed name="strap"><joint joint="x" coef="1"/><joint joint="z" coef="-1"/></fixed></tendon>'
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("tendon", ["", STRAP], ids=("", "with a tendon"))
+def test_bodies_that_only_slide_or_only_turn_weigh_as_in_the_c_engine(tendon, masked):
+    """C leaves 0 where a body cannot move in that way; MuJoCo Warp puts the other figure there."""
+    world = World(load_model(SLIDES.replace("TENDON", tendon)), num_envs=2, per_world_fields=("body_mass",))
+    world.field("body_mass")[1] *= 2.0
+    world.set_const(("body_mass",), torch.tensor([False, True]) if masked else None)
+    sliding = [world.mj_model.body(name).id for name in ("cart", "lift", "bolted")]
+    for row in range(2):
+        expected = with_constants(world.mj_model, row, world, ("body_mass",)).body_invweight0
+        assert not expected[sliding, 1].any() and expected[sliding, 0].all()
+        # A wheel on its axle is one that only turns: of that MuJoCo Warp's own code, for tendons, knows nothing.
+        rows = slice(None) if not tendon else sliding
+        np.testing.assert_allclose(
+            world.field("body_invweight0")[row, rows], expected[rows], rtol=2e-5, atol=1e-6
+        )
+
+
+def test_rows_are_recomputed_in_one_launch(monkeypatch):
+    """At resets few rows need it, so that launches cost more than the work."""
+    world, launched = every_joint(INERTIAL), []
+    monkeypatch.setattr(wp, "launch", lambda kernel, **_: launched.append(kernel.key))
+    world._masked_constants.launch(const_groups(INERTIAL))
+    assert launched == ["constants_at_qpos0"]

@@ -225,6 +225,36 @@ def test_an_edge_of_the_ground_presses_into_faces_and_between_the_ends_of_rods()
             )
 
 
+@pytest.mark.parametrize(("roll", "touching"), [(0.0, (-0.15, 0.15)), (0.2, (-0.15,)), (-0.2, (0.15,))])
+@pytest.mark.parametrize("turned", [False, True])
+def test_edges_of_a_box_touch_a_ridge_between_points_of_the_lattice(roll, touching, turned):
+    """A ridge with one point per metre: edges that cross it touch it, both where the box lies flat, else one."""
+    heights = np.zeros((5, 5))
+    heights[2 if turned else slice(None), slice(None) if turned else 2] = 1.0
+    mj_model = model(heights, top=0.5)
+    pose_EL = poses()[:1]
+    # The lower edges are at +-0.15 along the ridge, 0.1 below the middle.
+    half_turn = [math.cos(roll / 2), math.sin(roll / 2), 0.0, 0.0]
+    if turned:
+        quat = np.zeros(4)
+        mujoco.mju_mulQuat(quat, np.array([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]), np.array(half_turn))
+        half_turn = quat.tolist()
+    lowest = 0.15 * abs(math.sin(roll)) + 0.1 * math.cos(roll)
+    along = 0.5
+    place = [-along, 0.03] if turned else [0.03, along]
+    pose_EL[0, 14:21] = torch.tensor([*place, 0.5 + lowest - 0.004, *half_turn])
+    mine = Contacts(mj_model, pose_EL).of(0, "box")
+    assert len(mine["dist"]) == len(touching)
+    assert np.allclose(mine["dist"], -0.004, atol=1e-5) and np.allclose(
+        mine["frame"][:, 0], [0, 0, 1], atol=1e-4
+    )
+    assert np.allclose(mine["pos"][:, 1 if turned else 0], 0.0, atol=1e-5)
+    found = np.sort(mine["pos"][:, 0 if turned else 1])
+    expected = [y * math.cos(roll) + 0.1 * math.sin(roll) for y in touching]
+    expected = [-along - y for y in expected] if turned else [along + y for y in expected]
+    assert np.allclose(found, np.sort(expected), atol=1e-4)
+
+
 def test_a_ball_in_a_corner_touches_floor_and_wall():
     heights = np.zeros((41, 41))
     heights[:, 21:] = 1.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.agreement_models import CARTPOLE, QUADRUPED
-from ksim_rl.physics import load_model, load_spec
+from ksim_rl.physics import SimCfg, load_model, load_spec
 from tests.physics.malformed_models import MALFORMED
 
 needs_menagerie = pytest.mark.skipif(
@@ -142,3 +142,14 @@ def test_menagerie_robots_load(name: str):
     mj_model = load_model(name)
     assert mj_model.nkey >= 1
     assert np.isfinite(mj_model.qpos0).all()
+
+
+def test_a_solver_that_warp_lacks_is_refused_with_the_override_that_makes_it_run():
+    gymnasium = pytest.importorskip("gymnasium")
+    path = Path(gymnasium.__file__).parent / "envs/mujoco/assets/humanoid.xml"
+    with pytest.raises(
+        ValueError, match=r"mjSOL_PGS.*sim=SimCfg\(solver='newton'\).*task\.sim\.solver=newton"
+    ):
+        load_model(path)
+    mj_model = load_model(path, sim=SimCfg(solver="newton"))
+    assert mj_model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON

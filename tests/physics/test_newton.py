@@ -90,7 +90,7 @@ def test_accelerations_and_forces_are_those_of_the_c_engine(cone):
         mj_data = mujoco.MjData(world.mj_model)
         mj_data.qpos[:], mj_data.qvel[:] = world.qpos_EL[row], world.qvel_EL[row]
         mujoco.mj_forward(world.mj_model, mj_data)
-        assert mj_data.nefc == world.view("nefc")[row]
+        assert mj_data.nefc == world.last_substep("nefc")[row]
         seen |= set(mj_data.efc_type.tolist())
         scale = 1.0 + np.abs(mj_data.qacc).max()
         np.testing.assert_allclose(world.qacc_EL[row] / scale, mj_data.qacc / scale, atol=2e-4)
@@ -123,7 +123,7 @@ def test_iterations_and_overflow_are_those_of_mujoco_warp(cone, iterations):
             world.view("overflow").zero_()
             solve()
             names = ("qacc", "qfrc_constraint", "efc.Ma", "efc.state", "solver_niter", "overflow")
-            found.append({name: world.view(name).clone() for name in names})
+            found.append({name: world.last_substep(name).clone() for name in names})
     theirs, ours = found
     # In its last steps an iteration is decided by rounding.
     assert (theirs["solver_niter"] - ours["solver_niter"]).abs().max() <= (2 if iterations == 100 else 0)
@@ -132,7 +132,7 @@ def test_iterations_and_overflow_are_those_of_mujoco_warp(cone, iterations):
         torch.testing.assert_close(ours[name] / scale, theirs[name] / scale, atol=2e-4, rtol=0, msg=name)
     if iterations == 2:
         assert torch.equal(ours["overflow"], theirs["overflow"]) and ours["overflow"].any()
-    for row, count in enumerate(world.view("nefc").tolist()):
+    for row, count in enumerate(world.last_substep("nefc").tolist()):
         assert torch.equal(ours["efc.state"][row, :count], theirs["efc.state"][row, :count])
 
 
@@ -144,8 +144,7 @@ def test_rows_that_find_no_room_on_chip_solve_alike(cone):
     with wp.ScopedDevice("cpu"):
         for rows_on_chip in (world.njmax, 10, 0):
             world.qacc_EL.zero_()
-            place = newton.Placement(rows_on_chip=rows_on_chip)
-            newton.solver(world.warp_model, world.warp_data_E, place=place)()
+            newton.solver(world.warp_model, world.warp_data_E, rows_on_chip=rows_on_chip)()
             found.append(world.qacc_EL.clone())
     assert found[0].any()
     for other in found[1:]:
@@ -257,3 +256,71 @@ def test_a_step_calls_the_control_callback_as_mujoco_warp_does():
         world.step(1)
         reached.append(world.qvel_EL.item())
     assert reached[0] == pytest.approx(2.0 * model.opt.timestep) and reached[0] == pytest.approx(reached[1])
+
+
+@pytest.mark.parametrize("with_rows", [False, True])
+@pytest.mark.parametrize("far", [0.0, 1e6])
+def test_a_far_warm_start_leaves_no_trace(with_rows, far):
+    world = worlds("elliptic")
+    if not with_rows:
+        model = load_model(
+            "<mujoco><option timestep='0.004'/><worldbody><body pos='0 0 1'><freejoint/><geom size='0.1'/>"
+            "<body><joint/><geom size='0.1' pos='0.2 0 0'/></body></body></worldbody></mujoco>"
+        )
+        world = World(model, num_envs=1, sim=SimCfg(njmax=8, nconmax=8))
+        world.qvel_EL[:] = 1.0
+    rows_of(world)
+    world.view("qacc_warmstart").fill_(far)
+    with wp.ScopedDevice("cpu"):
+        newton.solver(world.warp_model, world.warp_data_E)()
+    for row in range(world.num_envs):
+        mj_data = mujoco.MjData(world.mj_model)
+        mj_data.qpos[:], mj_data.qvel[:] = world.qpos_EL[row], world.qvel_EL[row]
+        mujoco.mj_forward(world.mj_model, mj_data)
+        assert (mj_data.nefc > 0) == with_rows
+        scale = 1.0 + np.abs(mj_data.qacc).max()
+        atol = 2e-4 if with_rows else 2e-6
+        np.testing.assert_allclose(world.qacc_EL[row] / scale, mj_data.qacc / scale, atol=atol)
+
+
+TWO_BALLS = """
+<mujoco>
+  <option cone="elliptic" iterations="100"/>
+  <worldbody>
+    <geom type="plane" size="5 5 1"/>
+    <body pos="0 0 0.099"><freejoint/><geom size="0.1" condim="{condim}"/></body>
+    <body pos="1 0 0.099"><freejoint/><geom size="0.1" condim="{condim}"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(("condim", "njmax"), [(3, 5), (3, 4), (4, 5)])
+def test_a_cone_that_njmax_cuts_off_pushes_nothing_as_with_mujoco_warp(condim, njmax):
+    model = load_model(TWO_BALLS.format(condim=condim))
+    world = World(model, num_envs=1, sim=SimCfg(njmax=njmax, nconmax=8, tolerance=1e-8))
+    world.qvel_EL[0, [0, 6]] = 0.5
+    rows_of(world)
+    assert world.last_substep("nefc").item() == 2 * condim > njmax
+    found = []
+    with wp.ScopedDevice("cpu"):
+        for solve in (partial(mjw.solve, world.warp_model, world.warp_data_E), None):
+            world.last_substep("efc.force").zero_()
+            world.last_substep("efc.state").zero_()
+            (solve or newton.solver(world.warp_model, world.warp_data_E))()
+            found.append([world.last_substep(name)[0].clone() for name in ("qacc", "efc.force", "efc.state")])
+    theirs, ours = found
+    assert ours[0][8] == pytest.approx(-9.81)
+    for mine, expected in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(mine, expected, atol=1e-3, rtol=1e-4)
+
+
+def test_forces_after_constraints_are_computed_where_the_option_asks_for_them():
+    found = []
+    for one_kernel_solver in (True, False):
+        world = worlds("elliptic", one_kernel_solver=one_kernel_solver)
+        world.warp_model.opt.run_rne_postconstraint = True
+        world.step(2)
+        found.append(world.view("cfrc_int").clone())
+    assert found[0].abs().max() > 1.0
+    torch.testing.assert_close(found[0], found[1], atol=1e-2, rtol=1e-3)

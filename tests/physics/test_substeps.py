@@ -5,6 +5,7 @@ import functools
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
+import pytest
 import torch
 import warp as wp
 
@@ -97,3 +98,34 @@ def test_a_delayed_sensor_samples_every_substep():
     late, present = sensor(world, "late"), sensor(world, "present")
     assert torch.equal(world.sensordata_EL[:, late], wp.to_torch(d.sensordata)[:, late])
     assert not torch.equal(world.sensordata_EL[:, late], world.sensordata_EL[:, present])
+
+
+SPINNING_TIES = """
+<mujoco>
+  <option timestep="0.002" gravity="0 0 -9.81"/>
+  <worldbody>
+    <body name="one"><joint axis="0 1 0"/><geom type="capsule" size="0.02" fromto="0 0 0 0.5 0 0" contype="0"/></body>
+    <body name="two" pos="0.5 0 0">
+      <freejoint/><geom type="capsule" size="0.02" fromto="0 0 0 0.5 0.1 0" contype="0"/>
+    </body>
+  </worldbody>
+  <equality><{tie}/></equality>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    "tie", ['connect body1="one" body2="two" anchor="0.5 0 0"', 'weld body1="one" body2="two"']
+)
+@pytest.mark.parametrize("one_kernel_solver", [True, False])
+def test_ties_of_fast_bodies_follow_the_c_engine(tie, one_kernel_solver):
+    mj_model = load_model(SPINNING_TIES.format(tie=tie))
+    world = World(mj_model, num_envs=1, sim=SimCfg(one_kernel_solver=one_kernel_solver, tolerance=1e-8))
+    mj_data = mujoco.MjData(mj_model)
+    qvel = np.array([8.0, 0.0, 0.0, -4.0, 0.0, 8.0, 1.0])
+    mj_data.qvel[:] = qvel
+    world.qvel_EL[0] = torch.from_numpy(qvel)
+    world.step(20)
+    for _ in range(20):
+        mujoco.mj_step(mj_model, mj_data)
+    np.testing.assert_allclose(world.qpos_EL[0], mj_data.qpos, atol=2e-5)

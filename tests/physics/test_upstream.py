@@ -38,6 +38,8 @@ def warp_model() -> mjw.Model:
     [
         ("bvh.build_hfield_bvh", "mjm hfieldid constructor leaf_size"),
         ("math.make_frame", "a"),
+        ("smooth.tendon_armature", "m d"),
+        ("smooth.tendon_bias", "m d qfrc"),
         (
             "collision_core.contact_params",
             "geom_condim geom_priority geom_solmix geom_solref geom_solimp geom_friction geom_margin geom_gap "
@@ -102,6 +104,16 @@ def test_a_model_says_which_of_its_fields_may_differ_between_worlds(warp_model: 
     with wp.ScopedDevice("cpu"):
         mjw.put_model(mujoco.MjModel.from_xml_string(MODEL), batch_sizes=dict.fromkeys(names, 2))
     assert getattr(warp_model.opt.gravity, "_is_batched", False), "MuJoCo Warp marks batched arrays otherwise"
+
+
+def test_the_flag_that_lets_boxes_collide_as_in_c_does_nothing_else() -> None:
+    folder = Path(import_module("mujoco_warp").__file__ or "").parent / "_src"
+    heed = {
+        path.stem
+        for path in folder.glob("*.py")
+        if re.search(r"^[^#]*DisableBit\.NATIVECCD", path.read_text(), re.M)
+    }
+    assert {name for name in heed if not name.endswith("_test")} == {"collision_driver"}
 
 
 def test_pairs_are_numbered_as_before(warp_model: mjw.Model) -> None:

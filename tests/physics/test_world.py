@@ -1,12 +1,13 @@
 import threading
 
+import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import pytest
 import torch
 import warp as wp
 
-from ksim_rl.physics import SimCfg, World, load_model
+from ksim_rl.physics import SimCfg, World, load_model, views
 from tests.physics.models import NUM_ENVS, cartpole, forwarded, quadruped, sensor, standing_quadrupeds
 
 ACCELERATION_SENSORS = ("acceleration", "knee_force", "touch", "front_left_contact")
@@ -143,7 +144,7 @@ def test_views_share_memory_with_warp_and_have_mujocos_shapes():
     assert world.warp_data_E.qpos.numpy()[2, 0] == 7.0
     world.step(1)
     assert world.qpos_EL.data_ptr() == address == world.warp_data_E.qpos.ptr
-    assert world.view("efc.force").shape == (NUM_ENVS, world.njmax)
+    assert world.last_substep("efc.force").shape == (NUM_ENVS, world.njmax)
     with pytest.raises(ValueError, match="did you mean 'qfrc_constraint'"):
         world.view("qfrc_constrain")
 
@@ -217,3 +218,41 @@ def test_memory_is_counted_and_given_back():
     assert 500 < large.bytes_per_world() <= small.bytes_per_world() < 50_000
     large.close()
     assert not hasattr(large, "warp_data_E")
+
+
+def test_what_is_read_directly_is_current_or_refused():
+    world = standing_quadrupeds()
+    bias_EL, mass = world.view("qfrc_bias"), world.view("M")
+    world.step(3)
+    world.qvel_EL.uniform_(-2.0, 2.0)
+    world.refresh()
+    mj_data = mujoco.MjData(world.mj_model)
+    for row in range(NUM_ENVS):
+        mj_data.qpos[:], mj_data.qvel[:] = world.qpos_EL[row], world.qvel_EL[row]
+        mujoco.mj_forward(world.mj_model, mj_data)
+        np.testing.assert_allclose(bias_EL[row], mj_data.qfrc_bias, atol=2e-4)
+        np.testing.assert_allclose(np.sort(mass[row].ravel()), np.sort(mj_data.M), atol=1e-5)
+    for name in ("efc.force", "contact.dist", "nefc", "qfrc_smooth", "qLD", "actuator_moment"):
+        with pytest.raises(ValueError, match=f"{name}.*last_substep"):
+            world.view(name)
+        assert world.last_substep(name).shape[0] > 0
+    world.is_frozen = True
+    assert world.view("M") is mass
+    with pytest.raises(RuntimeError, match="ten_velocity is not computed"):
+        world.view("ten_velocity")
+
+
+def test_every_array_that_may_be_read_is_current_after_a_refresh():
+    """Two refreshes after a step: what the second changes, or a fresh forward pass finds otherwise, is not current."""
+    world = standing_quadrupeds()
+    for name in sorted(views.ON_DEMAND):
+        world.view(name)
+    world.step(5)
+    world.refresh()
+    names = {*views.READABLE} - {*views.STATE} - {"wrap_obj", "ten_wrapadr", "ten_wrapnum"}
+    found = {name: world.view(name).clone() for name in names if world.view(name).numel()}
+    with wp.ScopedDevice("cpu"):
+        mjw.forward(world.warp_model, world.warp_data_E)
+    assert len(found) >= 20
+    for name, tensor in found.items():
+        torch.testing.assert_close(tensor, world.view(name), atol=1e-5, rtol=1e-4, msg=name)

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from ksim_rl.scene.rendering.visualizer import SceneVisualizer, add_geoms, visible_groups
+from ksim_rl.scene.rendering.visualizer import DebugVisualizer, add_geoms, visible_groups
 from tests.envs.probe_env import PUCK_XML
 
 RED = (1.0, 0.0, 0.0, 1.0)
@@ -17,7 +17,7 @@ def empty_scene(capacity=20):
 
 def drawn(draw, offset=(0.0, 0.0, 0.0)):
     scene = empty_scene()
-    draw(SceneVisualizer(MODEL, scene, offset))
+    draw(DebugVisualizer(MODEL, scene, offset))
     return [scene.geoms[i] for i in range(scene.ngeom)]
 
 
@@ -84,7 +84,7 @@ def test_an_offset_moves_all_that_is_drawn():
 
 def test_what_does_not_fit_is_refused_not_dropped(recwarn):
     scene = empty_scene(capacity=2)
-    visualizer = SceneVisualizer(MODEL, scene)
+    visualizer = DebugVisualizer(MODEL, scene)
     visualizer.line((0, 0, 0), (1, 0, 0), rgba=RED)
     visualizer.ghost(np.array([0.0]), rgba=RED)
     for draw in (

@@ -6,7 +6,7 @@ import mujoco
 import pytest
 import torch
 
-from ksim_rl.tasks import pendulum_swingup, planar, reacher
+from ksim_rl.tasks import control_suite, planar
 from tests.tasks.placed import Placed
 
 
@@ -17,7 +17,7 @@ def close(actual, expected):
 def test_pendulum():
     bench = Placed("pendulum_swingup", 5)
     bench.set({"hinge": [0.0, 0.1, math.pi, math.pi / 2, 0.0]}, {"hinge": [0.0, 0.0, 0.0, 0.0, 5.0]})
-    rated = bench.reward(pendulum_swingup.PendulumReward())
+    rated = bench.reward(control_suite.PendulumReward())
     # Level with the axle the cosine is 0, about half-way from hanging to 8 degrees from upright.
     # At 5 rad/s "slow" is 0.1.
     cosine = math.cos(math.radians(8.0))
@@ -35,7 +35,7 @@ def test_reacher():
     # Straight along x, the finger is 0.25 m from the hub; targets on it, at its margin, and beyond the tolerated 15 mm.
     bench.set({"shoulder": 0.0, "wrist": 0.0})
     bench.driver.readings.commands["target"] = torch.tensor([[0.25, 0.0], [0.25, 0.115], [0.25, 0.0149]])
-    close(bench.reward(reacher.ReacherReward()), [1.0, 0.1, 1.0])
+    close(bench.reward(control_suite.ReacherReward()), [1.0, 0.1, 1.0])
 
 
 def test_reacher_targets_are_spread_evenly_over_the_ring():

@@ -4,6 +4,10 @@ import pytest
 import torch
 
 from ksim_rl import envs
+from ksim_rl.envs import ViewerCfg
+from ksim_rl.scene.robots.own_robots import Humanoid
+from ksim_rl.scene.sensors import ContactSensor
+from ksim_rl.tasks import velocity
 from tests.scene.robots.reference import loaded_spec
 
 OWN = ("quadruped_velocity_flat", "humanoid_velocity_flat")
@@ -131,3 +135,14 @@ def test_actions_of_the_delayed_quadruped_arrive_up_to_two_steps_late():
     assert set(lags[-1].tolist()) == {0.0, 1.0, 2.0}
     assert torch.equal(lags[-1], lags[-2]), "a lag stays for the episode"
     env.close()
+
+
+def test_feet_of_several_geoms_are_refused_before_anything_is_built():
+    robot = Humanoid()
+    parts = {"sim": velocity.sim(), "viewer": ViewerCfg(), "rewards": {}, "events": {}, "observations": {}}
+    with pytest.raises(
+        ValueError, match=r"feet: 4 geom elements .* for 2 foot_sites: .*ContactSensor\(bodies=...\)"
+    ):
+        velocity.velocity_cfg(robot, feet=ContactSensor(geoms=robot.foot_geoms), **parts)
+    for feet in (ContactSensor(bodies=robot.foot_bodies), ContactSensor(geoms=(".*_foot_inner",))):
+        assert velocity.velocity_cfg(robot, feet=feet, **parts).scene.sensors["feet_ground_contact"] is feet

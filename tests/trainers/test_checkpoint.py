@@ -154,7 +154,7 @@ def damage_empty(path):
         (damage_missing_manifest, "manifest.json: missing"),
         (damage_extra_file, "unexpected file 'extra.pt'"),
         (damage_link, "cannot be read"),
-        (damage_fifo, "damaged: 0 bytes"),
+        (damage_fifo, "cannot be read: it is no regular file"),
         (damage_longer, "longer than the"),
         (damage_empty, "damaged: 0 bytes, the manifest says"),
     ],

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
-from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv, keyed_transforms
+from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
 from ksim_rl.testing import CounterEnv
 from ksim_rl.transforms import (
     ActionDelay,
@@ -22,6 +22,7 @@ from ksim_rl.transforms import (
     ObservationScale,
     UniformNoise,
 )
+from ksim_rl.transforms.row_transform import keyed_transforms
 
 VECTOR = ("obs", "vector")
 NOISY, COUNT, DRAWN = (("actor_terms", name) for name in ("vector", "count", "drawn"))

@@ -256,6 +256,7 @@ def test_noise_is_drawn_afresh_when_it_is_switched_on_again():
     on, switched = (
         counter(ObservationNoise("count", "noisy", noise=UniformNoise(low=1.0, high=2.0))) for _ in "ab"
     )
+    on.set_seed(0), switched.set_seed(0)
     expected = fixed_rollout(on, 6)
     root = switched.reset()
     switched.eval()

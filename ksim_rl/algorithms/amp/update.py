@@ -24,13 +24,7 @@ from ksim_rl.data import ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.mdp.motion_observations import observe_motion
 from ksim_rl.modules import Discriminator
-from ksim_rl.objectives import (
-    AMPCfg,
-    descend,
-    discriminator_loss,
-    make_optimizer,
-    style_reward,
-)
+from ksim_rl.objectives import AMPCfg, descend, discriminator_loss, make_optimizer, style_reward
 from ksim_rl.trainers.run_cfg import RunCfg
 
 # Names of the logged means, by the names that `discriminator_loss` gives them.
@@ -48,33 +42,18 @@ _SIGNALS = [("next", "reward"), ("next", "done"), ("next", "terminated")]
 def make_amp_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> "AMPUpdate":
     """Build PPO and the discriminator of a run, and observe its reference motions."""
     objective: Any = cfg.objective
-    assert isinstance(objective, AMPCfg)
     ppo = make_ppo_update(cfg, env)
-    group = objective.style_group
-    motions = [observe_motion(env, group=group, file=file) for file in objective.motions]
-    return AMPUpdate(
-        objective,
-        ppo=ppo,
-        reference_N2L=torch.cat([torch.stack((seen_FL[:-1], seen_FL[1:]), 1) for seen_FL in motions]),
-        num_envs=cfg.num_envs,
-    )
+    motions = [observe_motion(env, group=objective.style_group, file=file) for file in objective.motions]
+    reference_N2L = torch.cat([torch.stack((seen_FL[:-1], seen_FL[1:]), 1) for seen_FL in motions])
+    return AMPUpdate(objective, ppo=ppo, reference_N2L=reference_N2L, num_envs=cfg.num_envs)
 
 
 class AMPUpdate(RolloutUpdate):
     """Rewards a rollout's transitions for looking like the reference motions, and improves the policy with that.
 
     In turn: the discriminator scores the rollout, PPO learns from it with both rewards, and the discriminator learns
-    from the motions and the policy's last rollouts. See `RolloutUpdate`.
-
-    Args:
-        cfg: of the objective.
-        ppo: improves the policy; its networks are the policy's.
-        reference_N2L: transitions of the motions: the features before and after an env step, float32 [N, 2, L].
-        num_envs: E.
-
-    Attributes:
-        discriminator: tells transitions of the motions from those of the policy.
-        replay: the policy's transitions of the last rollouts.
+    from the motions and the policy's last rollouts, in `replay`. A reference transition is the features before and
+    after an env step.
     """
 
     def __init__(
@@ -84,7 +63,7 @@ class AMPUpdate(RolloutUpdate):
             raise ValueError(
                 f"motions={cfg.motions!r}: group {cfg.style_group!r} is not finite in their states"
             )
-        self.cfg, self.ppo = cfg, ppo
+        self.cfg, self.ppo, self.notes = cfg, ppo, ppo.notes
         self.actor = self.behavior = ppo.actor
         self.num_env_states = ppo.num_env_states
         self.reference_N2L = reference_N2L.to(ppo.device)
@@ -105,17 +84,13 @@ class AMPUpdate(RolloutUpdate):
         }
         self.optimizer = make_optimizer(dataclasses.replace(cfg, **own), self.discriminator)
         num_steps = ppo.num_env_states // num_envs
-        self.replay = ReplayRing(
-            ReplayCfg(
-                num_env_states_per_minibatch=cfg.num_transitions_per_step,
-                num_minibatches=cfg.num_discriminator_steps,
-                num_steps=num_steps,
-                capacity=cfg.replay_rollouts * num_steps,
-            ),
-            num_envs=num_envs,
-            observations=[cfg.style_group],
-            device=self.device,
+        kept = ReplayCfg(
+            num_env_states_per_minibatch=cfg.num_transitions_per_step,
+            num_minibatches=cfg.num_discriminator_steps,
+            num_steps=num_steps,
+            capacity=cfg.replay_rollouts * num_steps,
         )
+        self.replay = ReplayRing(kept, num_envs=num_envs, observations=[cfg.style_group], device=self.device)
         self._means = StepMeans(LOGGED)
         self._style = torch.zeros((), device=self.device)
 
@@ -137,15 +112,13 @@ class AMPUpdate(RolloutUpdate):
         """
         metrics = self.ppo.metrics()
         in_a_row = torch.maximum(metrics["update/skipped_in_a_row"], self._longest_skip)
-        return (
-            metrics
-            | self._means
-            | {
-                "style/reward": self._style,
-                "update/skipped_steps": metrics["update/skipped_steps"] + self.guard.skipped,
-                "update/skipped_in_a_row": in_a_row,
-            }
-        )
+        return {
+            **metrics,
+            **self._means,
+            "style/reward": self._style,
+            "update/skipped_steps": metrics["update/skipped_steps"] + self.guard.skipped,
+            "update/skipped_in_a_row": in_a_row,
+        }
 
     def _update(self) -> None:
         self.ppo(self._rewarded(self.rollout_ET))

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ksim_rl.device import state_tree
-from ksim_rl.modules import memories
+from ksim_rl.modules import recurrent_modules
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.run_cfg import RunCfg
@@ -19,14 +19,10 @@ from ksim_rl.transforms import observation_columns
 
 @dataclass(frozen=True, kw_only=True)
 class Teacher:
-    """A policy that does not change.
-
-    Attributes:
-        policy: the network, its normalizers included.
-        description: the config of its run and the columns of what it reads, as JSON: enough to build it once more.
-    """
+    """A policy that does not change, its normalizers included."""
 
     policy: TensorDictModuleBase
+    # The config of its run and the columns of what it reads, as JSON: enough to build it once more.
     description: Mapping[str, str] = field(default_factory=dict)
 
     def state_dict(self) -> state_tree.State:
@@ -34,25 +30,14 @@ class Teacher:
         return {"actor": self.policy.state_dict(), **self.description}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take the weights of a `state_dict`; tensors keep their addresses.
-
-        Raises:
-            ValueError: naming the tensor that does not fit.
-        """
+        """Take the weights of a `state_dict`; tensors keep their addresses."""
         state_tree.copy_into(self.policy.state_dict(), state["actor"], what="teacher")
 
 
 def load_teacher(path: Path, env: EnvBase, *, cfg: RunCfg) -> Teacher:
-    """Read the policy of a run folder or a checkpoint, for the env of a student.
+    """Read the policy of a run folder or a checkpoint, for the env of a student, whose config gives the device.
 
-    Args:
-        path: the folder, or one of its checkpoints.
-        env: that the student acts in, and that shows what the teacher reads.
-        cfg: of the student's run, for the device.
-
-    Raises:
-        ValueError: when there is none, or it is damaged; naming the observations or the tensor that this env does not
-            have, or has otherwise.
+    A ValueError says what is absent or damaged, or which observation or tensor this env has not, or has otherwise.
     """
     try:
         saved = checkpoint.load(checkpoint.latest(path))
@@ -84,8 +69,8 @@ def restored_teacher(state: Mapping[str, Any], env: EnvBase, *, cfg: RunCfg) -> 
         *({group: columns[group] for group in groups if group in columns} for columns in (theirs, ours))
     )
     policy = make_policy(teacher_cfg, env)
-    if memories(policy):
-        raise ValueError("the teacher has a memory, and has to label single env states: take one without")
+    if recurrent_modules(policy):
+        raise ValueError("the teacher is recurrent, and has to label single env states: take one without")
     state_tree.copy_into(policy.state_dict(), state["actor"], what="teacher")
     description = {name: state[name] for name in ("config", "columns")}
     return Teacher(policy=policy.requires_grad_(False).eval(), description=description)

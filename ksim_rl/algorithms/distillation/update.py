@@ -34,7 +34,6 @@ def make_distillation_update(
 ) -> "DistillationUpdate":
     """Build the distillation of a run; the teacher is in `resumed`, or else the policy of `objective.teacher`."""
     objective: Any = cfg.objective
-    assert isinstance(objective, DistillationCfg)
     if not isinstance(cfg.data, DatasetCfg):
         raise ValueError(
             f"data is a {type(cfg.data).__name__}, and distillation needs a DatasetCfg: use data=on_policy"
@@ -50,18 +49,10 @@ def make_distillation_update(
 
 
 class DistillationUpdate(DatasetUpdate):
-    """Lets a student learn, from one rollout at a time, what its teacher would do there; see `RolloutUpdate`.
+    """Lets a student learn, from one rollout at a time, what its teacher would do there; see `DatasetUpdate`.
 
-    Args:
-        cfg: of the objective.
-        actor: the student, any probabilistic module; with a memory it learns on sequences.
-        teacher: whose policy labels env states, and helps to collect where `teacher_share` says so.
-        data: sizes of dataset and minibatch.
-        seed: of the order of the env states in the minibatches.
-        device: where all of it lives.
-
-    Raises:
-        ValueError: if the teacher's actions are not those of the student.
+    The student is any probabilistic module; a recurrent one learns on sequences. The teacher's actions must be those of
+    the student; its policy labels env states, and helps to collect where `teacher_share` says so.
     """
 
     def __init__(
@@ -118,10 +109,8 @@ class DistillationUpdate(DatasetUpdate):
         labelled_ET = self.loss.label(self.rollout_ET)
         self._action_error.copy_(self.loss.action_error(labelled_ET))
         self.dataset.extend(labelled_ET)
-        made: list[dict[str, Tensor]] = []
-        for _ in range(self.cfg.num_epochs):
-            made += self._epoch(self.loss)
-        self._measure_(in_columns(made))
+        epochs = [self._epoch(self.loss) for _ in range(self.cfg.num_epochs)]
+        self._measure_(in_columns([step for epoch in epochs for step in epoch]))
         self.teacher_share.mul_(self.cfg.teacher_share_decay)
         # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
         update_normalizers(self.rollout_ET, self.actor)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from ksim_rl.algorithms.off_policy import MANY_ENVS
-from ksim_rl.algorithms.sac import make_sac_policy, make_sac_update
+from ksim_rl.algorithms.off_policy.wiring import make_off_policy_policy, make_off_policy_update
 from ksim_rl.modules import QNetworkCfg, SquashedActorCfg
 from ksim_rl.objectives import SACCfg
 from ksim_rl.trainers.algorithm import Algorithm
@@ -36,8 +36,8 @@ CRITIC = QNetworkCfg(
 FAST_SAC = Algorithm(
     name="fast_sac",
     cfg=FastSACCfg,
-    update=make_sac_update,
-    policy=make_sac_policy,
+    update=make_off_policy_update,
+    policy=make_off_policy_policy,
     data=MANY_ENVS,
     modules=ModulesCfg(actor=ACTOR, critic=CRITIC),
 )

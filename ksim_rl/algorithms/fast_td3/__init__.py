@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from ksim_rl.algorithms.off_policy import MANY_ENVS
-from ksim_rl.algorithms.td3 import make_td3_policy, make_td3_update
+from ksim_rl.algorithms.off_policy.wiring import make_off_policy_policy, make_off_policy_update
 from ksim_rl.modules import DeterministicActorCfg, QNetworkCfg
 from ksim_rl.objectives import TD3Cfg
 from ksim_rl.trainers.algorithm import Algorithm
@@ -27,8 +27,8 @@ CRITIC = QNetworkCfg(hidden_dims=(1024, 512, 256), num_atoms=101)
 FAST_TD3 = Algorithm(
     name="fast_td3",
     cfg=FastTD3Cfg,
-    update=make_td3_update,
-    policy=make_td3_policy,
+    update=make_off_policy_update,
+    policy=make_off_policy_policy,
     data=MANY_ENVS,
     modules=ModulesCfg(actor=ACTOR, critic=CRITIC),
 )

@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
+from functools import partial
 from typing import Any
 
 import torch
 from jaxtyping import Num
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from ksim_rl.algorithms.gradient_steps import RolloutUpdate, load_optimizer_state, optimizer_state
@@ -15,7 +17,17 @@ from ksim_rl.data import ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
 from ksim_rl.modules import ExploringPolicy, update_normalizers
-from ksim_rl.objectives import OffPolicyCfg, OffPolicyLoss, SACCfg, SACLoss, descend, make_adamw
+from ksim_rl.objectives import (
+    OffPolicyCfg,
+    OffPolicyLoss,
+    SACCfg,
+    SACLoss,
+    SymmetricAugmentation,
+    descend_together,
+    frozen,
+    make_adamw,
+)
+from ksim_rl.transforms import MirrorMap
 
 # Names of the logged means, by the names that the losses give them.
 OF_CRITIC_STEPS = {
@@ -33,18 +45,8 @@ class OffPolicyUpdate(RolloutUpdate):
 
     Until each env has made `learning_starts` steps, rollouts have random actions and there are no gradient steps. From
     then on an update is `num_minibatches` gradient steps of the critics, each followed by one of the target networks,
-    and by one of the actor (and the temperature) every `policy_delay`. See `RolloutUpdate`.
-
-    Args:
-        cfg: of the objective.
-        loss: of actor and critics; the networks are its own.
-        behavior: the policy that collects, around the loss's actor.
-        data: sizes of rollout, replay and minibatch.
-        num_envs: E.
-        device: where all of it lives.
-
-    Raises:
-        ValueError: if `num_minibatches` is no multiple of `policy_delay`.
+    and by one of the actor (and the temperature) every `policy_delay`, which divides that number. For `cfg.symmetry`,
+    `mirror` has the mirror images of what the networks read and of the action. See `RolloutUpdate`.
     """
 
     def __init__(
@@ -56,6 +58,7 @@ class OffPolicyUpdate(RolloutUpdate):
         data: ReplayCfg,
         num_envs: int,
         device: torch.device | str = "cpu",
+        mirror: Mapping[NestedKey, MirrorMap] | None = None,
     ) -> None:
         if data.num_minibatches % cfg.policy_delay:
             raise ValueError(
@@ -72,25 +75,31 @@ class OffPolicyUpdate(RolloutUpdate):
         self.actor: TensorDictModuleBase = loss.actor_network
         self.critic = loss.critic_network
         self.behavior, self.num_env_states = behavior, num_envs * data.num_steps
-        observations = [key for key in (*self.actor.in_keys, *self.critic.in_keys) if key != "action"]
-        self._observations: list[Any] = list(dict.fromkeys(observations))
+        self._observations: list[Any] = loss.observation_keys
+        self._reflect_ = None
+        if cfg.symmetry == "augment":
+            images = SymmetricAugmentation.of(mirror, read=self._observations, device=self.device)
+            self._reflect_ = images.reflect_every_second_
+        compiles = cfg.compile and self.device.type == "cuda"
+        compiled = partial(torch.compile, fullgraph=True, dynamic=False) if compiles else (lambda loss: loss)
+        self._critic_loss, self._actor_losses = compiled(loss.critic_loss), compiled(loss.actor_losses)
         self.replay = ReplayRing(
             data, num_envs=num_envs, observations=self._observations, gamma=cfg.gamma, device=self.device
         )
-        decay = {"weight_decay": cfg.weight_decay}
+        rates = {"critic": cfg.critic_learning_rate, "actor": cfg.actor_learning_rate}
         self.optimizers = {
-            "critic": make_adamw(
-                cfg, self.critic.parameters(), learning_rate=cfg.critic_learning_rate, **decay
-            ),
-            "actor": make_adamw(cfg, self.actor.parameters(), learning_rate=cfg.actor_learning_rate, **decay),
+            name: make_adamw(
+                cfg, networks[name].parameters(), learning_rate=rate, weight_decay=cfg.weight_decay
+            )
+            for name, rate in rates.items()
         }
         if isinstance(cfg, SACCfg) and isinstance(loss, SACLoss) and loss.log_alpha.requires_grad:
             rate = cfg.alpha_learning_rate
             self.optimizers["alpha"] = make_adamw(cfg, [loss.log_alpha], learning_rate=rate, weight_decay=0.0)
         self.steps_made = 0
         logged = OF_CRITIC_STEPS | OF_ACTOR_STEPS | (OF_TEMPERATURE if isinstance(loss, SACLoss) else {})
-        self._sums = {name: self._zero() for name in logged.values()}
-        self._counts = {name: self._zero() for name in ("critic", "actor")}
+        self._sums = {name: torch.zeros((), device=self.device) for name in logged.values()}
+        self._counts = {name: torch.zeros((), device=self.device) for name in ("critic", "actor")}
         self._store_only = Captured(self._store, device=self.device)
 
     @property
@@ -113,14 +122,12 @@ class OffPolicyUpdate(RolloutUpdate):
             name: total / self._counts["critic" if name in OF_CRITIC_STEPS.values() else "actor"].clamp_min(1)
             for name, total in self._sums.items()
         }
-        return (
-            means
-            | self._skipped()
-            | {
-                "replay/env_states": self.replay.num_stored,
-                "update/non_finite_env_states": self.replay.non_finite_count,
-            }
-        )
+        return {
+            **means,
+            **self._skipped(),
+            "replay/env_states": self.replay.num_stored,
+            "update/non_finite_env_states": self.replay.non_finite_count,
+        }
 
     def _store(self) -> None:
         rollout_ET = self.rollout_ET
@@ -133,7 +140,8 @@ class OffPolicyUpdate(RolloutUpdate):
         self._store()
         for tensor in (*self._sums.values(), *self._counts.values(), self._longest_skip):
             tensor.zero_()
-        for step, minibatch_B in enumerate(self.replay.minibatches(self.data.num_minibatches), start=1):
+        minibatches = self.replay.minibatches(self.data.num_minibatches, change_=self._reflect_)
+        for step, minibatch_B in enumerate(minibatches, start=1):
             skipped = self._improve_critic(minibatch_B)
             if step % self.cfg.policy_delay == 0:
                 skipped = torch.maximum(skipped, self._improve_actor(minibatch_B))
@@ -144,8 +152,8 @@ class OffPolicyUpdate(RolloutUpdate):
     def _improve_critic(self, minibatch_B: TensorDictBase) -> Tensor:
         """Make one gradient step of the critics, and return 1 if it was skipped, else 0."""
         with self._precision():
-            loss, logged = self.loss.critic_loss(minibatch_B)
-        norm, skipped = self._descend(loss, "critic")
+            loss, logged = self._critic_loss(minibatch_B)
+        norm, skipped = self._descend({"critic": loss})["critic"]
         if self.data.prioritized:
             self.replay.update_priority(minibatch_B.get("index"), minibatch_B.get("td_error"))
         logged = logged | {"loss_qvalue": loss, "critic_grad_norm": norm}
@@ -154,17 +162,20 @@ class OffPolicyUpdate(RolloutUpdate):
 
     def _improve_actor(self, minibatch_B: TensorDictBase) -> Tensor:
         """Make one gradient step of the actor and the temperature, and return 1 if it was skipped, else 0."""
-        with self._precision():
-            losses, logged = self.loss.actor_losses(minibatch_B)
-        norm, skipped = self._descend(losses["loss_actor"], "actor")
-        if "alpha" in self.optimizers:
-            skipped = torch.maximum(skipped, self._descend(losses["loss_alpha"], "alpha")[1])
+        # Frozen here as well, where the compiler does not follow.
+        with self._precision(), frozen(self.critic):
+            losses, logged = self._actor_losses(minibatch_B)
+        learning = [name for name in ("actor", "alpha") if name in self.optimizers]
+        steps = self._descend({name: losses[f"loss_{name}"] for name in learning})
+        norm, skipped = steps["actor"]
+        if "alpha" in steps:
+            skipped = torch.maximum(skipped, steps["alpha"][1])
         logged = logged | {"loss_actor": losses["loss_actor"], "actor_grad_norm": norm}
         self._measure("actor", logged, OF_ACTOR_STEPS | OF_TEMPERATURE, skipped)
         return skipped
 
-    def _descend(self, loss: Tensor, which: str) -> tuple[Tensor, Tensor]:
-        return descend(loss, self.optimizers[which], max_grad_norm=self.cfg.max_grad_norm)
+    def _descend(self, losses: Mapping[str, Tensor]) -> dict[str, tuple[Tensor, Tensor]]:
+        return descend_together(losses, self.optimizers, max_grad_norm=self.cfg.max_grad_norm)
 
     def _measure(
         self, which: str, measured: Mapping[str, Tensor], names: Mapping[str, str], skipped: Tensor
@@ -181,9 +192,6 @@ class OffPolicyUpdate(RolloutUpdate):
             self.device.type, torch.bfloat16, enabled=self.cfg.autocast, cache_enabled=False
         )
 
-    def _zero(self) -> Tensor:
-        return torch.zeros((), device=self.device)
-
     def state_dict(self) -> state_tree.State:
         """Return networks, optimizers, replay, exploration and counters."""
         state = super().state_dict() | {
@@ -197,10 +205,7 @@ class OffPolicyUpdate(RolloutUpdate):
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue where `state_dict` was taken; tensors keep their addresses.
-
-        Without a replay in it the run begins with random actions again, until there is one.
-        """
+        """Continue where `state_dict` was taken; where it has no replay, with random actions until there is one."""
         super().load_state_dict(state)
         for name, optimizer in self.optimizers.items():
             load_optimizer_state(optimizer, state["optimizers"][name], what=f"{name} optimizer")
@@ -210,12 +215,7 @@ class OffPolicyUpdate(RolloutUpdate):
         self.behavior.random.fill_(self.steps_made < self.data.learning_starts)
 
     def load_weights(self, state: Mapping[str, Any]) -> None:
-        """Take only the networks and the temperature of a `state_dict`.
-
-        Raises:
-            ValueError: naming the tensor that is missing, unknown or of another shape or type, or the bound of actions
-                that is another.
-        """
+        """Take networks and temperature of a `state_dict`; a ValueError names a tensor or action bound that differs."""
         self._check_action_bounds(state["actor"])
         super().load_weights(state)
         if isinstance(self.loss, SACLoss):

@@ -1,61 +1,91 @@
-"""This module builds what the off-policy algorithms share: critics, the update, and checks of the config's parts."""
+"""This module builds SAC, TD3 and their fast variants for a run: networks, loss, exploration and update."""
 
+from collections.abc import Mapping
 from typing import Any
 
-from jaxtyping import Float
-from tensordict.nn import TensorDictModule
-from torch import Tensor
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ksim_rl.algorithms.off_policy.update import OffPolicyUpdate
 from ksim_rl.data import ReplayCfg
-from ksim_rl.modules import ExploringPolicy, QNetworkCfg, make_q_network
-from ksim_rl.objectives import OffPolicyLoss
+from ksim_rl.mdp.mirror_maps import mirror_maps
+from ksim_rl.modules import (
+    DeterministicActorCfg,
+    ExploringPolicy,
+    QNetworkCfg,
+    SquashedActorCfg,
+    make_deterministic_actor,
+    make_q_network,
+    make_squashed_actor,
+)
+from ksim_rl.modules.bounded_actors import BoundedActor
+from ksim_rl.objectives import OffPolicyLoss, SACCfg, SACLoss, TD3Loss
 from ksim_rl.trainers.run_cfg import RunCfg
 
 
-def make_off_policy_update(cfg: RunCfg, loss: OffPolicyLoss, behavior: ExploringPolicy) -> OffPolicyUpdate:
-    """Build the update of a run around its loss and the policy that collects."""
+def make_off_policy_update(
+    cfg: RunCfg, env: EnvBase, resumed: Mapping[str, Any] | None = None
+) -> OffPolicyUpdate:
+    """Build the update of a run; one that is resumed is built like a new one."""
     objective: Any = cfg.objective
-    data = of_kind(cfg.data, ReplayCfg, "data", cfg)
-    return OffPolicyUpdate(
-        objective,
-        loss=loss,
-        behavior=behavior,
-        data=data,
-        num_envs=cfg.num_envs,
-        device=cfg.resolved_device(),
-    )
-
-
-def make_critic(cfg: RunCfg, env: EnvBase) -> TensorDictModule:
-    """Build the action value networks of a run."""
+    actor: Any = make_off_policy_policy(cfg, env)
     spec: Any = env.observation_spec
-    return make_q_network(
-        of_kind(cfg.modules.critic, QNetworkCfg, "modules.critic", cfg),
+    critic = make_q_network(
+        _of_kind(cfg.modules.critic, QNetworkCfg, "modules.critic", cfg),
         obs_dim=spec["critic"].shape[-1],
         action_dim=env.action_spec.shape[-1],
         device=cfg.resolved_device(),
     )
-
-
-def actor_sizes(cfg: RunCfg, env: EnvBase) -> dict[str, Any]:
-    """Return what an actor of a run has to know of its env, as keyword arguments."""
-    spec: Any = env.observation_spec
-    return {
-        "obs_dim": spec["actor"].shape[-1],
-        "action_spec": env.action_spec,
-        "device": cfg.resolved_device(),
+    bounded = next(module for module in actor.modules() if isinstance(module, BoundedActor))
+    bounds: dict[str, Any] = {"low_L": bounded.low, "high_L": bounded.high}
+    learned: dict[str, Any] = {
+        "support_A": critic.module.support,
+        "gamma": objective.gamma,
+        "value_reduction": objective.value_reduction,
     }
+    noise = {}
+    loss: OffPolicyLoss
+    if isinstance(objective, SACCfg):
+        # The entropy of actions that are scaled from [-1, 1] differs by the logarithm of that scale.
+        scale = float(((bounded.high - bounded.low) / 2).log().sum())
+        loss = SACLoss(
+            actor,
+            critic,
+            target_entropy=len(bounded.low) * objective.target_entropy_per_action + scale,
+            alpha_init=objective.alpha_init,
+            learn_alpha=objective.alpha_learning_rate > 0.0,
+            **learned,
+        )
+    else:
+        target = {name: getattr(objective, name) for name in ("target_noise", "target_noise_clip")}
+        loss = TD3Loss(actor, critic, **bounds, **target, **learned)
+        noise = {"noise_min": objective.exploration_noise_min, "noise_max": objective.exploration_noise_max}
+    return OffPolicyUpdate(
+        objective,
+        loss=loss,
+        behavior=ExploringPolicy(actor, **bounds, num_envs=cfg.num_envs, **noise),
+        data=_of_kind(cfg.data, ReplayCfg, "data", cfg),
+        num_envs=cfg.num_envs,
+        device=cfg.resolved_device(),
+        mirror=mirror_maps(env, loss.observation_keys) if objective.symmetry != "none" else None,
+    )
 
 
-def action_bounds(actor: Any) -> tuple[Float[Tensor, " A"], Float[Tensor, " A"]]:
-    """Return the lowest and highest action of a policy, the tensors that it uses itself."""
-    policy = next(module for module in actor.modules() if hasattr(module, "low"))
-    return policy.low, policy.high
+def make_off_policy_policy(cfg: RunCfg, env: EnvBase) -> TensorDictModuleBase:
+    """Build the policy of a run: with SAC's settings one that draws its actions, with TD3's one that does not."""
+    spec: Any = env.observation_spec
+    kind, make = DeterministicActorCfg, make_deterministic_actor
+    if isinstance(cfg.objective, SACCfg):
+        kind, make = SquashedActorCfg, make_squashed_actor
+    return make(
+        _of_kind(cfg.modules.actor, kind, "modules.actor", cfg),
+        obs_dim=spec["actor"].shape[-1],
+        action_spec=env.action_spec,
+        device=cfg.resolved_device(),
+    )
 
 
-def of_kind(value: Any, kind: type[Any], where: str, cfg: RunCfg) -> Any:
+def _of_kind(value: Any, kind: type[Any], where: str, cfg: RunCfg) -> Any:
     """Return `value`, a part of the config, or refuse one of another class than the algorithm needs."""
     if not isinstance(value, kind):
         raise ValueError(

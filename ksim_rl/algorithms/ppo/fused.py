@@ -13,10 +13,10 @@ from torch import Tensor, nn
 from ksim_rl.data import DatasetBuffer, EpochSampler
 from ksim_rl.device.running_moments import has_ranks
 from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, ValueNetwork
-from ksim_rl.modules.heads import MIN_STD, GaussianHead
+from ksim_rl.modules.actor import MIN_STD, GaussianHead
 from ksim_rl.modules.network import side_by_side
 from ksim_rl.objectives import PPOCfg, StepGuard
-from ksim_rl.objectives.fused_ppo import FusedNetworks, why_not_fused
+from ksim_rl.objectives.fused_ppo import ACTIVATIONS, FusedNetworks, why_not_fused
 
 if TYPE_CHECKING:
     from ksim_rl.objectives.fused_ppo.fused_ppo import FusedPPO
@@ -40,7 +40,10 @@ def make_fused_ppo(
     if type(dataset.sampler) is not EpochSampler:
         return f"minibatches come from a {type(dataset.sampler).__name__}"
     networks = fused_networks(actor, critic)
-    reason = networks if isinstance(networks, str) else why_not_fused(cfg, networks, data=dataset.cfg)
+    sizes: Any = {
+        name: getattr(dataset.cfg, name) for name in ("num_env_states_per_minibatch", "num_minibatches")
+    }
+    reason = networks if isinstance(networks, str) else why_not_fused(cfg, networks, **sizes)
     if reason is not None:
         return reason
     assert isinstance(networks, FusedNetworks)
@@ -54,8 +57,7 @@ def make_fused_ppo(
         observe_critic=observer(critic),
         optimizer=optimizer,
         guard=guard,
-        num_env_states_per_minibatch=dataset.cfg.num_env_states_per_minibatch,
-        num_minibatches=dataset.cfg.num_minibatches,
+        **sizes,
     )
 
 
@@ -71,11 +73,12 @@ def fused_networks(
         return f"the policy is not a {DiagonalGaussian.__name__} whose std is the same in every state"
     layers = [*_layers(policy.trunk), head.loc], _layers(value.layers)
     activations = {type(part) for part in (*policy.trunk, *value.layers)} - {nn.Linear}
-    if activations != {nn.ELU}:
-        return f"the activations are {sorted(kind.__name__ for kind in activations)}, and not all ELU"
-    return FusedNetworks(
-        actor=layers[0], critic=layers[1], std_A=head.std, log_std=head.std_type == "log", min_std=MIN_STD
-    )
+    if len(activations) != 1 or not activations <= {*ACTIVATIONS}:
+        names = [sorted(kind.__name__ for kind in kinds) for kinds in (activations, ACTIVATIONS)]
+        return f"the activations are {names[0]}, and not all one of {names[1]}"
+    (activation,) = activations
+    std = {"std_A": head.std, "log_std": head.std_type == "log", "min_std": MIN_STD}
+    return FusedNetworks(actor=layers[0], critic=layers[1], activation=activation, **std)
 
 
 def _layers(network: nn.Sequential) -> list[nn.Linear]:

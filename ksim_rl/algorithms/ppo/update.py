@@ -14,6 +14,7 @@ from ksim_rl.algorithms.gradient_steps import DatasetUpdate, in_columns
 from ksim_rl.algorithms.ppo.fused import make_fused_ppo
 from ksim_rl.data import DatasetCfg
 from ksim_rl.device import state_tree
+from ksim_rl.envs.signal_keys import STANDARD, SignalKeys
 from ksim_rl.modules import CarriedState, update_normalizers
 from ksim_rl.objectives import (
     PPOCfg,
@@ -41,19 +42,11 @@ LOGGED = {
 
 
 class PPOUpdate(DatasetUpdate):
-    """Improves actor and critic with one rollout at a time; see `RolloutUpdate`.
+    """Improves actor and critic with one rollout at a time; see `DatasetUpdate`.
 
-    Args:
-        cfg: of the objective.
-        actor: any probabilistic module; writes actions, their log-probabilities and parameters of the distribution.
-        critic: writes `state_value`.
-        data: sizes of dataset and minibatch.
-        seed: of the order of the env states in the minibatches.
-        device: where all of it lives.
-        mirror: the mirror images of what the networks read and of the action, for `cfg.symmetry`.
-
-    Attributes:
-        fused: the kernels that make the gradient steps, or why torch makes them.
+    The actor is any probabilistic module, which writes actions, their log-probabilities and parameters of the
+    distribution; the critic writes `state_value`. For `cfg.symmetry`, `mirror` has the mirror images of what they read
+    and of the action. The env's own keys of reward and flags are `signals`; see `signal_keys`.
     """
 
     def __init__(
@@ -66,10 +59,11 @@ class PPOUpdate(DatasetUpdate):
         seed: int = 0,
         device: torch.device | str = "cpu",
         mirror: Mapping[Any, MirrorMap] | None = None,
+        signals: SignalKeys = STANDARD,
     ) -> None:
         cfg = with_precision_of(cfg, device)
         self.actor = self.behavior = actor
-        self.critic = critic
+        self.critic, self.signals = critic, signals
         self.advantage = make_advantage(cfg, actor, critic)
         loss = make_loss(cfg, actor, critic)
         networks = {"actor": actor, "critic": critic}
@@ -78,8 +72,9 @@ class PPOUpdate(DatasetUpdate):
         )
         losses = make_symmetric(cfg, loss, mirror, device=self.device)
         self._losses = in_precision(losses, cfg.precision, device=self.device)
-        # The rollouts hold the states of the actor's memory, and not those of the critic's.
+        # The rollouts hold the recurrent states of the actor, and not those of the critic.
         self._carried = CarriedState(critic, acting=actor)
+        # The kernels that make the gradient steps, or why torch makes them.
         self.fused = make_fused_ppo(
             cfg,
             actor=actor,
@@ -99,8 +94,14 @@ class PPOUpdate(DatasetUpdate):
         actor = self.actor
         written = [*actor.dist_sample_keys, *actor.log_prob_keys, *distribution_keys(actor)]
         valued = [key for key in self.critic.in_keys if key not in self._carried.keys]
-        following = [unravel_key(("next", key)) for key in (*valued, "reward", "done", "terminated")]
+        following = [unravel_key(("next", key)) for key in (*valued, *self.signals[:3])]
         return list(dict.fromkeys([*observation_keys(actor), *valued, *written, *following]))
+
+    @property
+    def notes(self) -> list[str]:
+        """Why torch makes the gradient steps where there is a GPU, said at the start of a run."""
+        slower = isinstance(self.fused, str) and self.device.type == "cuda"
+        return [f"torch makes the gradient steps, not the fused kernels: {self.fused}"] if slower else []
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
@@ -108,7 +109,10 @@ class PPOUpdate(DatasetUpdate):
         return super().metrics() | std | {"update/fused": self._is_fused}
 
     def _update(self) -> None:
-        rollout_ET = self.rollout_ET
+        # A copy of the tree, not of the tensors: what computes advantages knows the signals by TorchRL's names.
+        rollout_ET = self.rollout_ET.copy()
+        for name, key in zip(SignalKeys._fields[:3], self.signals, strict=False):
+            rollout_ET.set(("next", name), rollout_ET.get(unravel_key(("next", key))))
         if isinstance(self.fused, str):
             steps = self._torch_steps(rollout_ET)
         else:

@@ -9,6 +9,7 @@ from torchrl.modules import ActorValueOperator
 
 from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.data import DatasetCfg
+from ksim_rl.envs.signal_keys import signal_keys
 from ksim_rl.mdp.mirror_maps import mirror_maps
 from ksim_rl.modules import (
     FEATURES,
@@ -43,21 +44,17 @@ def make_ppo_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> PPOUpd
         seed=cfg.seed,
         device=cfg.resolved_device(),
         mirror=mirror_maps(env, read) if cfg.objective.symmetry != "none" else None,
+        signals=signal_keys(env),
     )
 
 
 def make_ppo_policy(cfg: RunCfg, env: EnvBase) -> ProbabilisticTensorDictSequential:
     """Build the policy of a run."""
-    actor, _ = build_networks(cfg, env)
-    return actor
+    return build_networks(cfg, env)[0]
 
 
 def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
-    """Build actor and critic for the observation groups and actions of an env.
-
-    Raises:
-        ValueError: if the networks are those of an off-policy method.
-    """
+    """Build actor and critic for what an env observes and does; a ValueError refuses those of an off-policy method."""
     device, modules = cfg.resolved_device(), cfg.modules
     if not isinstance(modules.actor, ActorCfg) or not isinstance(modules.critic, CriticCfg):
         raise ValueError(
@@ -66,25 +63,21 @@ def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSe
         )
     spec: Any = env.observation_spec
 
-    def width(keys: tuple[ObservationKey, ...]) -> int:
-        own = [key for key in keys if key != FEATURES]
-        shared = modules.trunk.hidden_dims[-1] if modules.trunk is not None else 0
-        return observation_dim(spec, own) + shared
-
-    trunk = None
+    trunk, shared = None, 0
     if modules.trunk is not None:
+        shared = modules.trunk.hidden_dims[-1]
         trunk = make_shared_trunk(
             modules.trunk, obs_dim=observation_dim(spec, modules.trunk.in_keys), device=device
         )
-    # Behind a memory, where there is one.
+
+    def width(keys: tuple[ObservationKey, ...]) -> int:
+        return observation_dim(spec, [key for key in keys if key != FEATURES]) + shared
+
+    # Behind a recurrent module, where there is one.
     new_actor = partial(make_recurrent_actor, m) if (m := modules.recurrent_actor) else make_actor
     new_critic = partial(make_recurrent_critic, m) if (m := modules.recurrent_critic) else make_critic
-    actor = new_actor(
-        modules.actor,
-        obs_dim=width(modules.actor.in_keys),
-        action_spec=env.full_action_spec,
-        device=device,
-    )
+    action_spec, obs_dim = env.full_action_spec, width(modules.actor.in_keys)
+    actor = new_actor(modules.actor, obs_dim=obs_dim, action_spec=action_spec, device=device)
     critic = new_critic(modules.critic, obs_dim=width(modules.critic.in_keys), device=device)
     if trunk is None:
         return actor, critic

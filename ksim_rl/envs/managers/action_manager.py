@@ -1,5 +1,6 @@
-"""Splits the action among its terms and remembers it."""
+"""This module splits the action among its terms and remembers it."""
 
+import warnings
 from collections.abc import Mapping
 
 import torch
@@ -11,39 +12,61 @@ from ksim_rl.envs.term import ActionTerm
 
 
 class ActionManager:
-    """Gives each action term its columns, in the order of the config."""
+    """Gives each action term its columns, in the order of the config.
+
+    `bounds_L2` is the range of each column, (low, high), or None where a column has none.
+    """
 
     def __init__(self, terms: Mapping[str, ActionTerm], driver: EnvDriver) -> None:
-        self._driver, self._view = driver, driver.view
-        view = driver.view
+        self._driver = driver
+        self._view = view = driver.view
         self.sizes: dict[str, int] = {}
+        bounds: list[Tensor | None] = []
         self._parts: list[tuple[str, ActionTerm, slice]] = []
         start = 0
         for name, term in terms.items():
             with self._driver.scope(f"actions/{name}"):
                 self.sizes[name] = term.size(view)
+                bounds.append(term.bounds(view))
             stop = start + self.sizes[name]
             self._parts.append((f"actions/{name}", term, slice(start, stop)))
             start = stop
         self.size = start
-        self._action_EL = driver.readings.action_EL = driver.buffers.get("actions.action_EL", start)
-        self._last_action_EL = driver.readings.last_action_EL = driver.buffers.get(
-            "actions.last_action_EL", start
-        )
+        given = [part_K2 for part_K2 in bounds if part_K2 is not None and torch.isfinite(part_K2).all()]
+        self.bounds_L2 = torch.cat(given) if len(given) == len(terms) > 0 else None
+        # Pinned, and read as an array: looking at what has arrived there never waits for the device.
+        pinned = torch.device(view.device).type == "cuda"
+        self._accepts_any = torch.ones(1, dtype=torch.bool, pin_memory=pinned)
+        self._arrived = self._accepts_any.numpy()
+        self._has_warned = False
+        buffers, readings = driver.buffers, driver.readings
+        self._action_EL = readings.action_EL = buffers.get("actions.action_EL", start)
+        self._last_action_EL = readings.last_action_EL = buffers.get("actions.last_action_EL", start)
         self._run_terms(self._action_EL)
 
     def apply(self, action_EL: Float[Tensor, "E L"]) -> Bool[Tensor, " E"]:
-        """Write the controls of `action_EL` [E, L]; rows with a non-finite entry repeat their last action.
-
-        Returns:
-            Which rows were finite, bool [E].
-        """
+        """Write the controls of the action, and return which rows were finite; the others repeat their last action."""
         # Also false for NaN, and in fewer kernels than `torch.isfinite`.
         finite_E = action_EL.sum(-1).abs() < torch.inf
         self._last_action_EL.copy_(self._action_EL)
         self._action_EL.copy_(torch.where(finite_E[:, None], action_EL, self._last_action_EL))
         self._run_terms(self._action_EL)
+        self._watch(finite_E)
         return finite_E
+
+    def _watch(self, finite_E: Tensor) -> None:
+        """Say once that no row's action was finite; on a GPU a few steps late, and not from within a graph."""
+        if self._has_warned or (finite_E.is_cuda and torch.cuda.is_current_stream_capturing()):
+            return
+        self._accepts_any.copy_(finite_E.any()[None], non_blocking=True)
+        if not self._arrived[0]:
+            self._has_warned = True
+            warnings.warn(
+                "no env's action is finite: all repeat their last one and end as non_finite (said once). A usual cause "
+                "is a policy with NaN weights, or a distribution with the infinite bounds of an unbounded action spec",
+                RuntimeWarning,
+                stacklevel=2,
+            )
 
     def _run_terms(self, action_EL: Float[Tensor, "E L"]) -> None:
         for scope, term, columns in self._parts:

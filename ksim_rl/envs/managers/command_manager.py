@@ -1,4 +1,4 @@
-"""Keeps the commands: clocks, resampling, and the vectors that policy and rewards see."""
+"""This module keeps the commands: clocks, resampling, and the vectors that policy and rewards see."""
 
 from collections.abc import Mapping, Sequence
 
@@ -13,17 +13,14 @@ from ksim_rl.envs.term import CommandTerm
 
 
 class CommandManager:
-    """Holds one command vector per term, [E, K], and one resampling clock per env and term.
+    """Holds one command vector per term, [E, K], in `values`, and one resampling clock per env and term.
 
     Clocks count down in seconds and run out at the env step that is nearest.
-
-    Attributes:
-        values: the current commands by name, [E, K].
     """
 
     def __init__(self, terms: Mapping[str, CommandTerm], driver: EnvDriver) -> None:
-        self._driver, self._view = driver, driver.view
-        view = driver.view
+        self._driver = driver
+        self._view = view = driver.view
         self._terms = dict(terms)
         self.values = driver.readings.commands
         self._clocks = {
@@ -61,15 +58,9 @@ class CommandManager:
     ) -> None:
         """Set a command that takes values from outside (`JoystickCommand`); call it between two steps.
 
-        The next observation shows them. Values are written in place, so that a captured step sees them too.
-
-        Args:
-            name: of the command.
-            values: [K], or a row for each env [E, K].
-            env_ids: the envs that take them; None for all.
-
-        Raises:
-            ValueError: for an unknown name, a command that is drawn, values that do not fit, or envs that do not exist.
+        The next observation shows them. Values, [K] or a row for each env [E, K], are written in place, so that a
+        captured step sees them too. A ValueError for an unknown name, a command that is drawn, values that do not fit,
+        or envs that do not exist.
         """
         if name not in self._terms:
             raise unknown_name("command", name, self._terms)

@@ -1,4 +1,4 @@
-"""Runs events: at startup, for rows that reset, by per-env clocks, and at every step."""
+"""This module runs events: at startup, for rows that reset, by per-env clocks, and at every step."""
 
 from collections.abc import Mapping
 
@@ -18,9 +18,8 @@ class EventManager:
     """
 
     def __init__(self, terms: Mapping[str, EventTerm], driver: EnvDriver) -> None:
-        self._driver, self._view = driver, driver.view
-        view = driver.view
-        self.terms = dict(terms)
+        self._driver, self.terms = driver, dict(terms)
+        self._view = view = driver.view
         self._by_mode: dict[str, list[tuple[str, EventTerm]]] = {}
         for name, term in terms.items():
             self._by_mode.setdefault(term.mode, []).append((f"events/{name}", term))
@@ -28,9 +27,8 @@ class EventManager:
             mode: tuple(dict.fromkeys(field for _, term in parts for field in term.per_world_fields))
             for mode, parts in self._by_mode.items()
         }
-        self._clocks: dict[str, Tensor] = {}
-        for scope, _ in self._by_mode.get("interval", []):
-            self._clocks[scope] = view.buffers.get(f"{scope}.time_left_E")
+        clocked = self._by_mode.get("interval", [])
+        self._clocks = {scope: view.buffers.get(f"{scope}.time_left_E") for scope, _ in clocked}
         nobody_E = torch.zeros(view.num_envs, dtype=torch.bool, device=view.device)
         for name, term in terms.items():
             with self._driver.scope(f"events/{name}"):

@@ -16,8 +16,8 @@ class ObservationManager:
     """Computes the union of the groups' terms; what groups add to them is done by transforms."""
 
     def __init__(self, groups: Mapping[str, ObservationGroupCfg], driver: EnvDriver) -> None:
-        self._driver, self._view = driver, driver.view
-        view = driver.view
+        self._driver = driver
+        self._view = view = driver.view
         self.terms = {name: cfg.term for group in groups.values() for name, cfg in group.terms.items()}
         for name, reading in self.read().items():
             image = getattr(self.terms[name], "is_image", False)
@@ -27,9 +27,8 @@ class ObservationManager:
             if not fits or reading.shape[0] != view.num_envs:
                 expected = f"torch.float32 [{view.num_envs}, L], one row per env"
                 if image:
-                    expected = (
-                        f"[{view.num_envs}, H, W] or [{view.num_envs}, H, W, C], float32, int32 or uint8"
-                    )
+                    whole = f"{view.num_envs}, H, W"
+                    expected = f"[{whole}] or [{whole}, C], float32, int32 or uint8"
                 raise ValueError(
                     f"observation term {name!r} returns {reading.dtype} {tuple(reading.shape)}: expected {expected}"
                 )

@@ -14,19 +14,15 @@ from torch import Tensor
 from ksim_rl.checked import NonNegative
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.fields import FramedObservation, OfContacts
-from ksim_rl.mdp.quantities import contact_force
+from ksim_rl.mdp.commands import OfTarget
+from ksim_rl.mdp.fields import FramedObservation, OfContacts, SiteAndBody, contact_force
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
 
 
 @dataclass(frozen=True, kw_only=True)
 class BodyObservation(FramedObservation):
-    """What the terms of this file share.
-
-    Attributes:
-        bodies: names or regular expressions.
-    """
+    """An observation of bodies by names or regular expressions."""
 
     bodies: Patterns
 
@@ -53,10 +49,7 @@ class BodyQuat(BodyObservation):
 
 @dataclass(frozen=True, kw_only=True)
 class BodyRotation6d(BodyObservation):
-    """The x axis, then the y axis, of each body, [E, 6N]; position stage.
-
-    Orientations without jumps (Zhou et al. 2019).
-    """
+    """The x axis, then the y axis, of each body, without jumps (Zhou et al. 2019), [E, 6N]; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         axes_EN23 = view.bodies(self.bodies).axes_EN33[:, :, :2]
@@ -96,6 +89,22 @@ class CenterOfMassVel(BodyObservation):
 
 
 @dataclass(frozen=True, kw_only=True)
+class OffsetToBody(SiteAndBody, ObservationTerm):
+    """Origin of a body minus a site, world frame, m, [E, 3]; position stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E 3"]:
+        return self.offset(view)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffsetToCommand(OfTarget, ObservationTerm):
+    """A commanded position minus where a body or site is, world frame, m, [E, 3]; position stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E 3"]:
+        return self.offset(view)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Contact(OfContacts, ObservationTerm):
     """1 where the net contact force exceeds a threshold, else 0, [E, N]; acceleration stage."""
 
@@ -107,11 +116,7 @@ class Contact(OfContacts, ObservationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class ContactForce(FramedObservation):
-    """Net contact forces, N, [E, 3N]; acceleration stage. MuJoCo's sign: what weighs on the ground reads negative z.
-
-    Attributes:
-        sensor: a contact sensor of `scene.sensors`.
-    """
+    """Net contact forces, N, [E, 3N]; acceleration stage. MuJoCo's sign: what weighs on the ground reads negative z."""
 
     sensor: str
     frame: Literal["root", "world"] = "world"

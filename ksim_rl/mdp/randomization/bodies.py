@@ -1,15 +1,15 @@
-"""These events draw gravity, and mass, centre of mass and inertia of bodies, all of them ones that can exist."""
+"""These events draw gravity, mass and inertia of bodies that can exist, sizes of geoms, and friction."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from ksim_rl.checks import check_choice
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant, index_constant
 from ksim_rl.mdp.randomization.randomize import Operation, Pair, Randomize, RandomizeModelField, write_entries
@@ -23,39 +23,26 @@ _LEAST_MASS = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeBodyField(RandomizeModelField):
-    """Draw entries of a field of bodies per world.
-
-    Attributes:
-        bodies: names or patterns.
-    """
+    """Draw entries of a field of bodies (names or patterns) per world."""
 
     bodies: Patterns
-
-    kind: ClassVar[str] = "body"
-
-    @property
-    def elements(self) -> Patterns:
-        return self.bodies
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeBodyMass(RandomizeBodyField):
-    """Mass of bodies, kg, at constant shape: the inertia about the centre of mass grows in proportion.
-
-    Let `RandomizeBodyInertia` of the same bodies run after it, in the same mode.
-    """
+    """Mass of bodies, kg, at constant shape: the inertia about the centre of mass grows in proportion."""
 
     field: ClassVar[str] = "body_mass"
     lowest: ClassVar[float | None] = _LEAST_MASS
-    operation: Operation = "scale"
-
     per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_inertia")
+    operation: Operation = "scale"
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         super().__call__(view, mask_E)
         ids = self.ids(view)
-        own_N3 = array_constant(view.world.mj_model.body_inertia[list(ids)], view.device)
-        inertia_EN3 = own_N3 * _mass_ratio(view, ids)[..., None]
+        masses, moments = _masses(view, ids), view.world.mj_model.body_inertia[list(ids)]
+        per_mass_N3 = array_constant(moments / masses[:, None], view.device)
+        inertia_EN3 = per_mass_N3 * view.field("body_mass")[:, index_constant(ids, view.device), None]
         write_entries(view.field("body_inertia"), ids, range(3), mask_E, inertia_EN3)
 
 
@@ -79,23 +66,19 @@ class RandomizeBodyInertia(RandomizeBodyField):
     field: ClassVar[str] = "body_inertia"
     columns: ClassVar[int] = 3
     lowest: ClassVar[float | None] = 0.0
-    operation: Operation = "scale"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_choice("operation", self.operation, ("scale",))
-
     per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_inertia")
+    operation: Literal["scale"] = "scale"
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        ids, pairs = self.ids(view), self.pairs()
+        ids, pairs = self.ids(view), self.ranges_by_column()
         self._check_reach(view, np.ones((len(ids), 3)), pairs)
         factor_EN3 = torch.ones(view.num_envs, 1 if self.shared else len(ids), 3, device=view.device)
-        factor_EN3[..., index_constant(tuple(pairs), view.device)] = self.draw(
-            view, len(ids), list(pairs.values())
-        )
+        drawn_ENC = self.draw(view, len(ids), list(pairs.values()))
+        factor_EN3[..., index_constant(tuple(pairs), view.device)] = drawn_ENC
         own_N3 = array_constant(second_moments(view, ids), view.device)
-        spread_EN3 = own_N3 * factor_EN3 * _mass_ratio(view, ids)[..., None]
+        own_mass_N, mass_EN = array_constant(_masses(view, ids), view.device), view.field("body_mass")
+        ratio_EN = mass_EN[:, index_constant(ids, view.device)] / own_mass_N
+        spread_EN3 = own_N3 * factor_EN3 * ratio_EN[..., None]
         inertia_EN3 = spread_EN3.sum(-1, keepdim=True) - spread_EN3
         write_entries(view.field("body_inertia"), ids, range(3), mask_E, inertia_EN3)
 
@@ -107,17 +90,13 @@ def second_moments(view: EnvView, ids: tuple[int, ...]) -> np.ndarray:
     return np.maximum(0.5 * moments.sum(-1, keepdims=True) - moments, 0.0)
 
 
-def _mass_ratio(view: EnvView, ids: tuple[int, ...]) -> Tensor:
-    """Return the present masses over the model's own, [E, N].
-
-    Raises:
-        ValueError: naming a body without mass.
-    """
+def _masses(view: EnvView, ids: tuple[int, ...]) -> np.ndarray:
+    """Return the model's own masses, kg, [N]; a body without mass is refused."""
     masses = view.world.mj_model.body_mass[list(ids)]
     if np.any(masses <= 0.0):
         name = view.world.mj_model.body(ids[int(masses.argmin())]).name
         raise ValueError(f"body {name!r} has no mass: leave it out")
-    return view.field("body_mass")[:, index_constant(ids, view.device)] / array_constant(masses, view.device)
+    return masses
 
 
 _NOTHING = (0.0, 0.0)
@@ -131,20 +110,13 @@ class RandomizePseudoInertia(Randomize):
     its principal axes, with U = exp(alpha) [[exp(d1), s12, s13, t1], [0, exp(d2), s23, t2], [0, 0, exp(d3), t3],
     [0, 0, 0, 1]]. J stays positive definite for any parameters, which is what makes an inertia physical (Rucker and
     Wensing, "Smooth Parameterization of Rigid-Body Inertia", IEEE RA-L 7(2), 2022). All zero changes nothing.
-
-    Attributes:
-        bodies: names or patterns.
-        alpha: half the logarithm of the mass's factor.
-        stretch: d1, d2, d3: logarithms of how far the mass stretches along each principal axis.
-        shear: s12, s13, s23.
-        shift: t1, t2, t3: how far the centre of mass moves along each principal axis, m.
     """
 
     bodies: Patterns
-    alpha: Pair = _NOTHING
-    stretch: Pair = _NOTHING
-    shear: Pair = _NOTHING
-    shift: Pair = _NOTHING
+    alpha: Pair = _NOTHING  # half the logarithm of the mass's factor
+    stretch: Pair = _NOTHING  # d1, d2, d3: logarithms of the mass's stretch along each principal axis
+    shear: Pair = _NOTHING  # s12, s13, s23
+    shift: Pair = _NOTHING  # t1, t2, t3: m that the centre of mass moves along each principal axis
     operation: Literal["add"] = "add"
     distribution: Literal["uniform", "gaussian"] = "uniform"
 
@@ -196,29 +168,72 @@ def _upper_triangle(diagonal: Tensor, shear: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGravity(Randomize):
-    """Gravity of each world, m/s^2. Projected gravity, a direction, stays that of the world's -z axis.
+class RandomizeGravity(RandomizeModelField):
+    """Gravity of each world, m/s^2, by axis x, y, z. Projected gravity, a direction, stays that of the -z axis."""
 
-    Attributes:
-        ranges: what to draw from, by axis of the world: 0 x, 1 y, 2 z.
-    """
-
-    ranges: Mapping[int, Pair]
+    field: ClassVar[str] = "gravity"
+    columns: ClassVar[int] = 3
     operation: Operation = "add"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for axis, pair in self.ranges.items():
-            check_choice("ranges", axis, range(3))
-            self.check_range(f"ranges[{axis}]", pair)
+    def ids(self, view: EnvView) -> tuple[int, ...]:
+        return (0,)
 
-    per_world_fields: ClassVar[tuple[str, ...]] = ("gravity",)
+    def nominal(self, view: EnvView) -> np.ndarray:
+        return view.world.mj_model.opt.gravity[None]
 
-    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        if not self.ranges:
-            return
-        axes = tuple(sorted(self.ranges))
-        own = view.world.mj_model.opt.gravity[list(axes)]
-        drawn_E1C = self.draw(view, 1, [self.ranges[axis] for axis in axes])
-        value_E1C = self.combine(array_constant(own, view.device), drawn_E1C)
-        write_entries(view.field("gravity")[:, None], (0,), axes, mask_E, value_E1C)
+
+# How many of its three sizes a geom of each kind has; those of other kinds cannot differ between worlds.
+NUM_SIZES = {
+    mujoco.mjtGeom.mjGEOM_SPHERE: 1,
+    mujoco.mjtGeom.mjGEOM_CAPSULE: 2,
+    mujoco.mjtGeom.mjGEOM_CYLINDER: 2,
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: 3,
+    mujoco.mjtGeom.mjGEOM_BOX: 3,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeGeomFriction(RandomizeModelField):
+    """Friction of geoms; columns: 0 sliding, 1 torsional (m), 2 rolling (m)."""
+
+    geoms: Patterns
+    field: ClassVar[str] = "geom_friction"
+    columns: ClassVar[int] = 3
+    lowest: ClassVar[float | None] = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizePairFriction(RandomizeModelField):
+    """Friction of contact pairs (`<pair name=...>`); columns: 0, 1 sliding, 2 torsional (m), 3, 4 rolling (m)."""
+
+    pairs: Patterns
+    field: ClassVar[str] = "pair_friction"
+    columns: ClassVar[int] = 5
+    lowest: ClassVar[float | None] = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeGeomSize(RandomizeModelField):
+    """Sizes of primitive geoms by MuJoCo's columns, m; bounding boxes and spheres follow, mass and inertia do not."""
+
+    geoms: Patterns
+    field: ClassVar[str] = "geom_size"
+    columns: ClassVar[int] = 3
+
+    def _check_reach(self, view: EnvView, nominal: np.ndarray, pairs: Mapping[int, Pair]) -> None:
+        model = view.world.mj_model
+        for row, geom in enumerate(self.ids(view)):
+            kind = mujoco.mjtGeom(int(model.geom_type[geom]))
+            count = NUM_SIZES.get(kind, 0)
+            if not count or (isinstance(self.ranges, Mapping) and max(pairs) >= count):
+                raise ValueError(
+                    f"RandomizeGeomSize.ranges={self.ranges!r}: geom {model.geom(geom).name!r}, a "
+                    f"{kind.name.removeprefix('mjGEOM_').lower()}, has {count} sizes that may differ between worlds"
+                )
+            for column, pair in pairs.items():
+                low, _ = self.reach(nominal[row, column], pair)
+                if column < count and low <= 0.0:
+                    raise ValueError(
+                        f"RandomizeGeomSize.ranges={self.ranges!r}: size {column} of geom {model.geom(geom).name!r} "
+                        f"would reach {float(low):g} m; expected more than 0"
+                    )

@@ -1,23 +1,25 @@
-"""These events draw what hinges and slides are made of, where they stand, and how they are read."""
+"""These events draw what joints, tendons and actuators are made of, where joints stand, and how they are read."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
+import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from ksim_rl.checks import check_choice
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.constants import array_constant
+from ksim_rl.mdp.constants import array_constant, constant, index_constant
 from ksim_rl.mdp.fields import OfJoints
 from ksim_rl.mdp.randomization.randomize import (
     Operation,
     Pair,
+    Randomize,
     RandomizeModelField,
     RandomizeNumber,
+    write_entries,
 )
 from ksim_rl.scene.names import Patterns, scalar_joint_ids
 
@@ -26,14 +28,10 @@ from ksim_rl.scene.names import Patterns, scalar_joint_ids
 class RandomizeJointField(OfJoints, RandomizeModelField):
     """Draw entries of a field of hinges and slides per world."""
 
-    kind: ClassVar[str] = "joint"
-
-    @property
-    def elements(self) -> Patterns:
-        return self.joints
+    lowest: ClassVar[float | None] = 0.0
 
     def ids(self, view: EnvView) -> tuple[int, ...]:
-        """Return the rows of the field: by joint, degree of freedom or generalized position, as its name says."""
+        """Return rows by joint, degree of freedom or generalized position, as the field's name says."""
         model = view.world.mj_model
         places = {"jnt": np.arange(model.njnt), "dof": model.jnt_dofadr, "qpos0": model.jnt_qposadr}
         scalar = scalar_joint_ids(model)
@@ -46,7 +44,6 @@ class RandomizeJointDamping(RandomizeJointField):
     """Viscous damping of joints, N m s / rad or N s / m."""
 
     field: ClassVar[str] = "dof_damping"
-    lowest: ClassVar[float | None] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +51,6 @@ class RandomizeJointArmature(RandomizeJointField):
     """Inertia that joints feel of their motors, kg m^2 or kg."""
 
     field: ClassVar[str] = "dof_armature"
-    lowest: ClassVar[float | None] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +58,6 @@ class RandomizeJointFrictionLoss(RandomizeJointField):
     """Dry friction of joints, N m or N."""
 
     field: ClassVar[str] = "dof_frictionloss"
-    lowest: ClassVar[float | None] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,15 +65,11 @@ class RandomizeJointStiffness(RandomizeJointField):
     """Stiffness of the springs in joints, N m / rad or N / m; they pull towards the model's `springref`."""
 
     field: ClassVar[str] = "jnt_stiffness"
-    lowest: ClassVar[float | None] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeJointRange(RandomizeJointField):
-    """Limits of joints that have any, rad or m; columns: 0 lower, 1 upper.
-
-    Soft limits, which rewards and resets use, stay those of the model's own range.
-    """
+    """Limits of joints that have any, rad or m; columns: 0 lower, 1 upper. Soft limits stay those of the model."""
 
     field: ClassVar[str] = "jnt_range"
     columns: ClassVar[int] = 2
@@ -100,13 +91,47 @@ class RandomizeJointRange(RandomizeJointField):
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeJointZero(RandomizeJointField):
-    """Where joints read zero displacement (MuJoCo's `qpos0`), rad or m: an error of assembly or calibration.
-
-    At the same joint position the body stands elsewhere, by minus the change.
-    """
+    """Where joints read zero (MuJoCo's `qpos0`), rad or m, by errors of assembly; bodies move by minus the change."""
 
     field: ClassVar[str] = "qpos0"
+    lowest: ClassVar[float | None] = None
     operation: Operation = "add"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeTendonField(RandomizeModelField):
+    """Draw a field of tendons (names or patterns) per world."""
+
+    tendons: Patterns
+    lowest: ClassVar[float | None] = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeTendonStiffness(RandomizeTendonField):
+    """Stiffness of tendons, N / m, or N m / rad of fixed tendons of hinges; they pull to the model's spring length."""
+
+    field: ClassVar[str] = "tendon_stiffness"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeTendonDamping(RandomizeTendonField):
+    """Viscous damping of tendons, N s / m or N m s / rad."""
+
+    field: ClassVar[str] = "tendon_damping"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeTendonFrictionLoss(RandomizeTendonField):
+    """Dry friction of tendons, N or N m."""
+
+    field: ClassVar[str] = "tendon_frictionloss"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeTendonArmature(RandomizeTendonField):
+    """Inertia against a change of tendons' lengths, kg or kg m^2."""
+
+    field: ClassVar[str] = "tendon_armature"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,8 +145,7 @@ class RandomizeDefaultJointPos(OfJoints, RandomizeNumber):
     operation: Operation = "add"
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        joints = view.joints(self.joints).index
-        model = view.world.mj_model
+        joints, model = view.joints(self.joints).index, view.world.mj_model
         pose = model.key_qpos[0] if model.nkey else model.qpos0
         own = pose[model.jnt_qposadr[scalar_joint_ids(model)]]
         ids = view.resolver.ids("joint", self.joints)
@@ -133,17 +157,166 @@ class RandomizeDefaultJointPos(OfJoints, RandomizeNumber):
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeEncoderBias(OfJoints, RandomizeNumber):
-    """Offset between a joint's position and what its encoder reads, rad or m.
+    """Offset between a joint's position and what its encoder reads, rad or m; see `JointPosRel(biased=True)`."""
 
-    Observations show it where they ask for it (`JointPosRel(biased=True)`); nothing else feels it.
-    """
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_choice("operation", self.operation, ("abs",))
+    operation: Literal["abs"] = "abs"
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         joints = view.joints(self.joints).index
         held_EN = view.encoder_bias_EL[:, joints]
         drawn_EN = self.draw(view, held_EN.shape[1], [self.ranges])[..., 0]
         view.encoder_bias_EL[:, joints] = torch.where(mask_E[:, None], drawn_EN, held_EN)
+
+
+_JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeActuator(OfJoints, Randomize):
+    """What the events of this file share; `joints` are those that are driven."""
+
+    operation: Operation = "scale"
+
+    def _draw_explicit(
+        self, view: EnvView, mask_E: Tensor, name: str, pair: Pair, finite: bool = False
+    ) -> tuple[Tensor, list[int]]:
+        """Draw a number for each joint, and write it where an explicit actuator has it; return the other places too."""
+        joints, owners = (
+            view.resolver.ids("joint", self.joints),
+            view.actuator_params.joints(name, finite=finite),
+        )
+        drawn_EN = self.draw(view, len(joints), [pair])[..., 0].expand(-1, len(joints))
+        explicit = [i for i, joint in enumerate(joints) if joint in owners]
+        if explicit:
+            columns = index_constant([joints[i] for i in explicit], view.device)
+            own_N = view.nominal_actuator_param(name)[columns]
+            explicit_EN = drawn_EN[:, index_constant(explicit, view.device)]
+            value_EN, held_EL = self.combine(own_N, explicit_EN).clamp(min=0.0), view.actuator_param(name)
+            held_EL[:, columns] = torch.where(mask_E[:, None], value_EN, held_EL[:, columns])
+        return drawn_EN, [i for i, joint in enumerate(joints) if joint not in owners]
+
+    def _check_not_negative(self, field: str, names: Sequence[str], own: np.ndarray, pair: Pair) -> None:
+        low, _ = self.reach(own, pair)
+        if np.any(low < 0.0):
+            row = int(low.reshape(len(names), -1).min(-1).argmin())
+            raise ValueError(
+                f"{type(self).__name__}.{field}={pair!r}: that of joint {names[row]!r} would reach {low.min():g}; "
+                "expected at least 0"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeActuatorGains(RandomizeActuator):
+    """Gains of the servos that drive joints: stiffness, N m / rad or N / m; damping, N m s / rad or N s / m.
+
+    MuJoCo's position servo keeps one stiffness in its gain and its bias, and its velocity servo one damping; both
+    places are written. Explicit actuators keep theirs in `EnvView.actuator_param`, never below 0. None leaves a gain
+    alone.
+    """
+
+    stiffness: Pair | None = None
+    damping: Pair | None = None
+    per_world_fields: ClassVar[tuple[str, ...]] = ("actuator_gainprm", "actuator_biasprm")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("stiffness", "damping"):
+            if getattr(self, name) is not None:
+                self.check_range(name, getattr(self, name))
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        for name in ("stiffness", "damping"):
+            if getattr(self, name) is not None:
+                self._write(view, mask_E, name, getattr(self, name))
+
+    def _write(self, view: EnvView, mask_E: Tensor, name: str, pair: Pair) -> None:
+        drawn_EN, builtin = self._draw_explicit(view, mask_E, name, pair)
+        if not builtin:
+            return
+        model, names = view.world.mj_model, [view.joints(self.joints).names[i] for i in builtin]
+        places = [_servo(model, model.joint(joint).id, name) for joint in names]
+        servos = [actuator for actuator, _ in places]
+        column = 1 if name == "stiffness" else 2
+        own = -model.actuator_biasprm[servos, column]
+        self._check_not_negative(name, names, own, pair)
+        drawn_EN = drawn_EN[:, index_constant(builtin, view.device)]
+        value_EN1 = self.combine(array_constant(own, view.device), drawn_EN)[..., None]
+        write_entries(view.field("actuator_biasprm"), servos, (column,), mask_E, -value_EN1)
+        in_gain = [i for i, (_, also_gain) in enumerate(places) if also_gain]
+        if in_gain:
+            gains_EN1 = value_EN1[:, index_constant(in_gain, view.device)]
+            rows = [servos[i] for i in in_gain]
+            write_entries(view.field("actuator_gainprm"), rows, (0,), mask_E, gains_EN1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeEffortLimit(RandomizeActuator, RandomizeNumber):
+    """Largest effort of the actuators of joints, N m or N: one draw for both directions.
+
+    It changes what holds the effort: the actuator's force range, the joint's, both, or an explicit actuator's
+    `effort_limit`, which stays at 0 or above.
+    """
+
+    per_world_fields: ClassVar[tuple[str, ...]] = ("actuator_forcerange", "jnt_actfrcrange")
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        # A factor or an offset cannot limit what has no limit: there, the limit of the joint itself may be meant.
+        finite = self.operation != "abs"
+        drawn_EN, builtin = self._draw_explicit(view, mask_E, "effort_limit", self.ranges, finite)
+        model, names = view.world.mj_model, view.joints(self.joints).names
+        ranges: dict[str, dict[int, int]] = {"actuator_forcerange": {}, "jnt_actfrcrange": {}}
+        for i in builtin:
+            joint = model.joint(names[i]).id
+            limited = [a for a in _actuators(model, joint) if model.actuator_forcelimited[a]]
+            ranges["actuator_forcerange"] |= dict.fromkeys(limited, i)
+            if model.jnt_actfrclimited[joint]:
+                ranges["jnt_actfrcrange"][joint] = i
+            elif not limited:
+                raise ValueError(
+                    f"RandomizeEffortLimit: nothing limits the effort on joint {names[i]!r}: give its "
+                    "actuator an effort_limit (forcerange), or leave the joint out"
+                )
+        for field, place_of in ranges.items():
+            if not place_of:
+                continue
+            rows, places = list(place_of), list(place_of.values())
+            # The lower bound as a size, like the upper one.
+            own = getattr(model, field)[rows] * np.array((-1.0, 1.0))
+            self._check_not_negative("ranges", [names[i] for i in places], own, self.ranges)
+            limit_EN1 = drawn_EN[:, index_constant(places, view.device)][..., None]
+            size_EN2 = self.combine(array_constant(own, view.device), limit_EN1).expand(-1, -1, 2)
+            signs_2 = constant((-1.0, 1.0), view.device)
+            write_entries(view.field(field), rows, (0, 1), mask_E, size_EN2 * signs_2)
+
+
+def _actuators(mj_model: mujoco.MjModel, joint: int) -> list[int]:
+    on_joints = np.isin(mj_model.actuator_trntype, _JOINT_TRANSMISSIONS)
+    return [int(a) for a in np.flatnonzero(on_joints & (mj_model.actuator_trnid[:, 0] == joint))]
+
+
+def _servo(mj_model: mujoco.MjModel, joint: int, gain: str) -> tuple[int, bool]:
+    """Return the servo that has this gain, and whether the number is also its `gainprm[0]`.
+
+    A position servo's bias is (0, -stiffness, -damping) with the gain stiffness, a velocity servo's (0, 0, -damping)
+    with the gain damping.
+    """
+    position, velocity = None, None
+    for actuator in _actuators(mj_model, joint):
+        if (
+            mj_model.actuator_gaintype[actuator] != mujoco.mjtGain.mjGAIN_FIXED
+            or mj_model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE
+        ):
+            continue
+        force, bias = mj_model.actuator_gainprm[actuator, 0], mj_model.actuator_biasprm[actuator]
+        if bias[1] == -force:
+            position = actuator
+        elif bias[1] == 0.0 and bias[2] == -force:
+            velocity = actuator
+    if gain == "damping" and velocity is not None:
+        return velocity, True
+    if position is not None:
+        return position, gain == "stiffness"
+    raise ValueError(
+        f"RandomizeActuatorGains.{gain}: joint {mj_model.joint(joint).name!r} has no servo with this gain; expected a "
+        "position or velocity actuator, or an explicit actuator"
+    )

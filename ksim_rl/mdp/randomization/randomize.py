@@ -4,7 +4,6 @@ Each draw starts from the model's own values, so that neither the order of reset
 """
 
 import math
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -26,6 +25,7 @@ Operation = Literal["abs", "add", "scale"]
 Distribution = Literal["uniform", "log_uniform", "gaussian"]
 # Where a gaussian draw is cut, in standard deviations, so that its reach can be checked.
 CUT = 3.0
+_KINDS = {"cam": "camera", "mat": "material", **dict.fromkeys(("jnt", "dof", "qpos0"), "joint")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,11 +45,7 @@ class Randomize(EventTerm):
     mode: Mode = "startup"
 
     def check_range(self, name: str, pair: object) -> None:
-        """Refuse a range that the distribution cannot draw from.
-
-        Raises:
-            ValueError: naming the field, the value and what would be valid.
-        """
+        """Raise a ValueError for a range that the distribution cannot draw from."""
         if self.distribution == "gaussian":
             check_pair(name, (0.0, 0.0) if _is_pair(pair) else pair)
             mean, deviation = pair  # pyright: ignore[reportGeneralTypeIssues]
@@ -97,18 +93,10 @@ class Randomize(EventTerm):
             return np.minimum(nominal * low, nominal * high), np.maximum(nominal * low, nominal * high)
         return np.full_like(nominal, low), np.full_like(nominal, high)
 
-    @abstractmethod
-    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        """Draw for the rows of `mask_E`."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeNumber(Randomize):
-    """Draw one number per element and world.
-
-    Attributes:
-        ranges: what to draw from.
-    """
+    """Draw one number per element and world from `ranges`."""
 
     ranges: Pair
 
@@ -118,38 +106,25 @@ class RandomizeNumber(Randomize):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeModelField(Randomize):
-    """Draw entries of a model field per world. Subclasses name the field; its rows are elements of one kind.
-
-    Attributes:
-        ranges: what to draw from, by column of the field; one pair is drawn from for every column.
-    """
-
-    ranges: Pair | Mapping[int, Pair]
+class RandomizeField(Randomize):
+    """Draw a model field per world, whose rows are elements of one kind: a subclass names its `bodies`, `geoms` ..."""
 
     field: ClassVar[str]
-    kind: ClassVar[str]
     columns: ClassVar[int] = 1
-    lowest: ClassVar[float | None] = None
-    """What a value must exceed or equal to make sense, if anything."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not isinstance(self.ranges, Mapping):
-            self.check_range("ranges", self.ranges)
-            return
-        for column, pair in self.ranges.items():
-            check_choice("ranges", column, range(self.columns))
-            self.check_range(f"ranges[{column}]", pair)
 
     @property
-    @abstractmethod
+    def kind(self) -> str:
+        """The kind of element, as `NameResolver` calls it."""
+        prefix = self.field.split("_")[0]
+        return _KINDS.get(prefix, prefix)
+
+    @property
     def elements(self) -> Patterns:
         """Names or patterns of what is randomized."""
+        return getattr(self, {"body": "bodies"}.get(self.kind, f"{self.kind}s"))
 
     @property
     def per_world_fields(self) -> tuple[str, ...]:
-        """The one field that this event writes."""
         return (self.field,)
 
     def ids(self, view: EnvView) -> tuple[int, ...]:
@@ -161,34 +136,56 @@ class RandomizeModelField(Randomize):
         values = np.asarray(getattr(view.world.mj_model, self.field), dtype=np.float64)
         return values.reshape(-1, self.columns)[list(self.ids(view))]
 
-    def pairs(self) -> dict[int, Pair]:
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeModelField(RandomizeField):
+    """Draw entries of a model field per world from `ranges`, by its columns, or one pair for every column."""
+
+    ranges: Pair | Mapping[int, Pair]
+
+    lowest: ClassVar[float | None] = None  # what a value must at least be to make sense
+    highest: ClassVar[float | None] = None  # and at most
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.ranges, Mapping):
+            self.check_range("ranges", self.ranges)
+            return
+        for column, pair in self.ranges.items():
+            check_choice("ranges", column, range(self.columns))
+            self.check_range(f"ranges[{column}]", pair)
+
+    def ranges_by_column(self) -> dict[int, Pair]:
         """Return the ranges by column, in the order of the columns."""
         if isinstance(self.ranges, Mapping):
             return dict(sorted(self.ranges.items()))
         return dict.fromkeys(range(self.columns), self.ranges)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        ids, pairs, nominal = self.ids(view), self.pairs(), self.nominal(view)
+        ids, pairs, nominal = self.ids(view), self.ranges_by_column(), self.nominal(view)
         if not pairs:
             return
         self._check_reach(view, nominal, pairs)
         columns = tuple(pairs)
         own_NC = array_constant(nominal[:, list(columns)], view.device)
         value_ENC = self.combine(own_NC, self.draw(view, len(ids), list(pairs.values())))
-        write_entries(view.field(self.field), ids, columns, mask_E, value_ENC)
+        held_ENC = view.field(self.field).view(view.num_envs, -1, self.columns)
+        write_entries(held_ENC, ids, columns, mask_E, value_ENC)
 
     def _check_reach(self, view: EnvView, nominal: np.ndarray, pairs: Mapping[int, Pair]) -> None:
-        if self.lowest is None:
-            return
         for column, pair in pairs.items():
-            low, _ = self.reach(nominal[:, column], pair)
-            if np.any(low < self.lowest):
-                names = view.resolver.names(self.kind)
-                name = names[view.resolver.ids(self.kind, self.elements)[int(low.argmin())]]
-                raise ValueError(
-                    f"{type(self).__name__}.ranges={self.ranges!r}: {self.field} of {self.kind} {name!r} would reach "
-                    f"{low.min():g}; expected at least {self.lowest:g}"
-                )
+            low, high = self.reach(nominal[:, column], pair)
+            for values, place, bound, beyond, word in (
+                (low, low.argmin(), self.lowest, -1.0, "least"),
+                (high, high.argmax(), self.highest, 1.0, "most"),
+            ):
+                if bound is not None and (values[place] - bound) * beyond > 0.0:
+                    rows = view.resolver.ids(self.kind, self.elements)
+                    name = view.resolver.names(self.kind)[rows[int(place)]]
+                    raise ValueError(
+                        f"{type(self).__name__}.ranges={self.ranges!r}: {self.field} of {self.kind} {name!r} would "
+                        f"reach {values[place]:g}; expected at {word} {bound:g}"
+                    )
 
 
 def write_entries(
@@ -201,10 +198,13 @@ def write_entries(
     """Write entries of a per-world field, [E, rows] or [E, rows, columns], in the worlds of `mask_E`."""
     entries_ERC = field_E.unsqueeze(-1) if field_E.ndim == 2 else field_E
     rows, across = index_constant(ids, field_E.device), index_constant(columns, field_E.device)
-    new_ENC = torch.where(mask_E[:, None, None], value_ENC, entries_ERC[:, rows][..., across])
+    held_ENC = entries_ERC[:, rows][..., across]
+    if isinstance(rows, slice) and isinstance(across, slice):
+        torch.where(mask_E[:, None, None], value_ENC, held_ENC, out=held_ENC)
+        return
     if isinstance(rows, Tensor) and isinstance(across, Tensor):
         rows = rows[:, None]
-    entries_ERC[:, rows, across] = new_ENC
+    entries_ERC[:, rows, across] = torch.where(mask_E[:, None, None], value_ENC, held_ENC)
 
 
 def _is_pair(value: object) -> bool:

@@ -1,7 +1,6 @@
 """These rewards rate contacts and how feet move; `active` is 1 while the commanded speed exceeds a threshold, else 0.
 
-Foot poses and velocities are of the current state (position and velocity stage); contacts and forces belong to the
-last physics substep (acceleration stage).
+Poses and velocities are of the current state, contacts and forces of the last physics substep (acceleration stage).
 """
 
 from dataclasses import dataclass
@@ -14,8 +13,7 @@ from ksim_rl.checked import NonNegative, Positive
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.fields import OfContacts, OfFeet, RewardWhileCommanded
-from ksim_rl.mdp.quantities import contact_force
+from ksim_rl.mdp.fields import OfContacts, OfFeet, RewardWhileCommanded, contact_force
 from ksim_rl.scene.names import Patterns
 
 
@@ -55,12 +53,7 @@ class SelfCollision(OfContacts, RewardTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class FootClearance(RewardWhileCommanded):
-    """active * sum_f |height_f - target_height| * |v_xy,f|, m^2/s, [E]: a foot that moves should be at that height.
-
-    Attributes:
-        sites: the feet; heights are above the ground right below them, velocities in the world frame.
-        target_height: m.
-    """
+    """active * sum_f |height_f - target_height| * |v_xy,f|, m^2/s, [E]: above the ground, and in the world's axes."""
 
     sites: Patterns
     target_height: float
@@ -74,13 +67,7 @@ class FootClearance(RewardWhileCommanded):
 
 @dataclass(frozen=True, kw_only=True)
 class FootSwingHeight(OfFeet, RewardWhileCommanded):
-    """active * sum_f landed_f * (peak_f / target_height - 1)^2, [E]; `peak` is the swing's greatest height.
-
-    The peak starts at 0 after each landing and each reset.
-
-    Attributes:
-        target_height: m, above the ground right below a foot.
-    """
+    """active * sum_f landed_f * (peak_f / target_height - 1)^2, [E]; `peak` is the greatest height of the swing, m."""
 
     target_height: Positive
 
@@ -135,12 +122,7 @@ class FeetAirTime(RewardWhileCommanded):
 
 @dataclass(frozen=True, kw_only=True)
 class GaitPhase(RewardWhileCommanded):
-    """Fraction of the feet that do what the rhythm asks for: swing where their sine is positive, else stand; [E].
-
-    Attributes:
-        gait: a `SinusoidalGaitCommand`, one offset per foot in the order of `sensor`.
-        sensor: contact sensor, one element per foot.
-    """
+    """Fraction of feet that swing where the sine of `gait`, a `SinusoidalGaitCommand`, is positive, else stand; [E]."""
 
     gait: str
     sensor: str

@@ -19,16 +19,10 @@ Evaluate = Callable[[Float[Tensor, "D L"], Float[Tensor, " D"]], None]
 
 
 class FusedDataset:
-    """Normalized observations, and one record for each env state, in the order of a collector's memory: step by step.
+    """Normalized observations, and one record for each env state, in the order of a collector's rollout: step by step.
 
-    Attributes:
-        obs: [2, D, L], for actor and critic, padded with zeros, in the dtype of the products.
-        records: [D, columns]; see `loss_kernels`.
-
-    Args:
-        observe_actor, observe_critic: from a TensorDict to what the first layers of actor and critic take, [..., L].
-        size: D.
-        dtype: of the products.
+    `obs` [2, D, L] is for actor and critic, padded with zeros, in the `dtype` of the products; `records` [D, columns]
+    are described in `loss_kernels`. `observe_actor` and `observe_critic` give what the first layers take, [..., L].
     """
 
     def __init__(
@@ -55,12 +49,9 @@ class FusedDataset:
 
     @torch.no_grad()
     def read(self, rollout_ET: TensorDictBase, *, evaluate: Evaluate) -> Int64[Tensor, ""]:
-        """Take over a rollout `["E","T"]`, whose advantages are estimated here.
+        """Take over a rollout `["E","T"]`, whose advantages are estimated here with the values that `evaluate` writes.
 
         An env state with an element that is not finite takes no part, as in `DatasetStorage`; returned is how many.
-
-        Args:
-            evaluate: writes the values of observations of the critic into its second argument.
         """
         following = rollout_ET.get("next")
         for obs_DL, observe, dim in zip(self.obs, self._observe, self.layout.obs_dims, strict=True):

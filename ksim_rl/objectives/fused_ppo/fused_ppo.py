@@ -19,6 +19,7 @@ from torch import Tensor
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
 from ksim_rl.objectives.fused_ppo.dataset import FusedDataset, Observe
 from ksim_rl.objectives.fused_ppo.layout import (
+    ACTIVATIONS,
     FusedLayout,
     FusedNetworks,
     Tuning,
@@ -39,17 +40,6 @@ class FusedParameters:
 
     Between updates the modules and the optimizer hold the state, so that checkpoints, evaluation and collection see
     what they always see.
-
-    Attributes:
-        flat: parameters, and the optimizer's means and variances, each [N].
-        exact: the parameters in padded form, [2, P] float32.
-        weights: the same in the dtype of the products.
-        steps: the optimizer's number of steps before the first gradient step of the update and after each, [steps + 1].
-
-    Args:
-        optimizer: Adam; moments that it does not have yet are made.
-        dtype: of the products.
-        num_steps: gradient steps of an update.
     """
 
     def __init__(
@@ -63,11 +53,14 @@ class FusedParameters:
     ) -> None:
         self._parameters, self._optimizer = networks.parameters, optimizer
         device = self._parameters[0].device
+        # Parameters, and the optimizer's means and variances, each [N].
         self.flat = [torch.zeros(layout.num_flat, device=device) for _ in range(3)]
         self._views = [layout.flat_views(flat, networks) for flat in self.flat]
         self.places = layout.padded_index(networks).to(device)
+        # The parameters in padded form, in float32 and in the dtype of the products.
         self.exact = torch.zeros(2, layout.num_padded, device=device)
         self.weights = torch.zeros(2, layout.num_padded, dtype=dtype, device=device)
+        # The optimizer's number of steps before the first gradient step of the update, and after each.
         self.steps = torch.zeros(num_steps + 1, device=device)
         for parameter in self._parameters:
             if parameter not in optimizer.state:
@@ -110,12 +103,8 @@ class FusedParameters:
 class FusedPPO:
     """Makes the gradient steps of one update after another; all memory is allocated once, and nothing syncs.
 
-    Args:
-        cfg: of the objective, for which `why_not_fused` has no reason.
-        observe_actor, observe_critic: from a TensorDict to what the first layers of actor and critic take, [..., L].
-        optimizer: Adam from `make_optimizer`; its moments, step counts and learning rate are used and kept.
-        num_env_states_per_minibatch, num_minibatches: B, and how many there are in an epoch.
-        tuning: sizes of blocks; None takes those that suit the networks.
+    `why_not_fused` has no reason against its config. The first layers take what `observe_actor` and `observe_critic`
+    give, [..., L]. Moments, step counts and learning rate are those of `optimizer`, from `make_optimizer`.
     """
 
     def __init__(
@@ -169,13 +158,9 @@ class FusedPPO:
     ) -> tuple[dict[str, Float[Tensor, " steps"]], Int64[Tensor, ""]]:
         """Make all gradient steps of an update.
 
-        Args:
-            rollout_ET: `["E","T"]`; its memory may be time-major, as that of a collector.
-            orders: of each epoch, the env states in the order of the minibatches, counted env by env.
-
-        Returns:
-            What each gradient step measured, by the names of `SUMMARY`; and how many env states took no part because an
-            element was not finite.
+        `rollout_ET`, `["E","T"]`, may be time-major in memory, as that of a collector. `orders` has for each epoch the
+        env states in the order of the minibatches, counted env by env. Returned are what each gradient step measured,
+        by the names of `SUMMARY`, and how many env states took no part because an element was not finite.
         """
         num_envs, length = rollout_ET.batch_size
         self.parameters.load()
@@ -208,7 +193,7 @@ class FusedPPO:
             self._block_partials,
             self.batch,
             self.dataset.records.shape[0],
-            math.log1p(-cfg.clip_epsilon),
+            math.log1p(-cfg.clip_epsilon) if cfg.clip_epsilon < 1.0 else -math.inf,
             math.log1p(cfg.clip_epsilon),
             clip_value,
             cfg.entropy_coeff,
@@ -323,7 +308,11 @@ class FusedPPO:
         layout, tuning = self.layout, self.tuning
         first, second, third = layout.hidden
         widths = {"H1": first, "H2": second, "H3": third}
-        widths |= {"OBS": layout.obs_width, "OUT": layout.out_width}
+        widths |= {
+            "ACTIVATION": ACTIVATIONS.index(self.networks.activation),
+            "OBS": layout.obs_width,
+            "OUT": layout.out_width,
+        }
         return widths | {"BLOCK": tuning.block, "CHUNK": tuning.chunk, "STAGES": tuning.stages}
 
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int32
@@ -13,24 +13,23 @@ from ksim_rl.objectives.algorithm_cfg import PPOCfg
 
 # The smallest dim that a tensor core multiplies.
 MIN_WIDTH = 16
+# In the order in which the kernels number them.
+ACTIVATIONS = (nn.ELU, nn.ReLU, nn.Tanh)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FusedNetworks:
     """What the kernels need to know of an actor and a critic: two MLPs of the same hidden widths, and a gaussian.
 
-    Attributes:
-        actor, critic: their linear layers, the first to the last; an ELU follows each but the last.
-        std_A: the parameter of the standard deviations.
-        log_std: whether that is their logarithm.
-        min_std: bound of the standard deviations from below, which the gradient passes.
+    The activation follows each linear layer but the last. The gradient passes the bound `min_std`.
     """
 
     actor: Sequence[nn.Linear]
     critic: Sequence[nn.Linear]
-    std_A: Float[Tensor, " A"]
+    std_A: Float[Tensor, " A"]  # the parameter of the standard deviations, or their logarithms
     log_std: bool
     min_std: float
+    activation: type[nn.Module] = nn.ELU
 
     @property
     def parameters(self) -> list[Float[Tensor, "*?shape"]]:
@@ -119,37 +118,24 @@ def power_of_two(number: int) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class Tuning:
-    """How the work is cut. The defaults were the fastest on an H200 for layers of 512, 256 and 128.
+    """How the work is cut. The defaults were the fastest on an H200 for layers of 512, 256 and 128."""
 
-    Attributes:
-        block: rows of a minibatch that one program takes through a network.
-        chunk: columns of the widest layer that exist at a time.
-        stages: how far loads of weights run ahead.
-        warps: of such a program.
-        tile: rows and columns of the weights whose gradient one program computes.
-        depth: rows of a minibatch that it multiplies at a time.
-        tile_stages, tile_warps: as `stages` and `warps`.
-        splits: programs that share a tile, each with a part of the minibatch.
-        size: elements per program in sums and Adam.
-        columns, rows: of the blocks in which sums over programs are taken.
-    """
-
-    block: int = 64
-    chunk: int = 32
-    stages: int = 3
+    block: int = 64  # rows of a minibatch that one program takes through a network
+    chunk: int = 32  # columns of the widest layer that exist at a time
+    stages: int = 3  # how far loads of weights run ahead
     warps: int = 4
-    tile: int = 128
-    depth: int = 64
+    tile: int = 128  # rows and columns of the weights whose gradient one program computes
+    depth: int = 64  # rows of a minibatch that it multiplies at a time
     tile_stages: int = 3
     tile_warps: int = 8
-    splits: int = 8
-    size: int = 1024
-    columns: int = 32
+    splits: int = 8  # programs that share a tile, each with a part of the minibatch
+    size: int = 1024  # elements per program in sums and Adam
+    columns: int = 32  # of the blocks in which sums over programs are taken, as are the rows
     rows: int = 64
 
     @classmethod
     def of(cls, layout: FusedLayout) -> "Tuning":
-        """Return what suits networks of a layout: the first and the third width must be whole numbers of chunks."""
+        """Return what suits a layout: the first and the third width must be whole numbers of chunks."""
         return cls(chunk=math.gcd(cls.chunk, layout.hidden[0], layout.hidden[2]))
 
 
@@ -161,21 +147,9 @@ WIDTH_STEP = 16
 MAX_PLACES = 2**31
 
 
-class MinibatchSizes(Protocol):
-    """Sizes of dataset and minibatch, as `DatasetCfg` has them."""
-
-    @property
-    def num_env_states_per_minibatch(self) -> int:
-        """B."""
-        ...
-
-    @property
-    def num_env_states(self) -> int:
-        """D."""
-        ...
-
-
-def why_not_fused(cfg: PPOCfg, networks: FusedNetworks, *, data: MinibatchSizes) -> str | None:
+def why_not_fused(
+    cfg: PPOCfg, networks: FusedNetworks, *, num_env_states_per_minibatch: int, num_minibatches: int
+) -> str | None:
     """Return why the kernels cannot make the gradient steps of `cfg`, or None if they can."""
     if cfg.kernels == "torch":
         return "kernels='torch'"
@@ -192,8 +166,8 @@ def why_not_fused(cfg: PPOCfg, networks: FusedNetworks, *, data: MinibatchSizes)
         if is_set:
             return f"{field}={getattr(cfg, field)!r}"
     columns = sum(layer.out_features for layer in networks.actor) + MAX_OBS
-    places = max(data.num_env_states_per_minibatch * columns, data.num_env_states * MAX_OBS)
-    too_many = f"{data.num_env_states_per_minibatch} env states in a minibatch are too many"
+    places = num_env_states_per_minibatch * max(columns, num_minibatches * MAX_OBS)
+    too_many = f"{num_env_states_per_minibatch} env states in a minibatch are too many"
     return _shape_reason(networks) or (too_many if places >= MAX_PLACES else None)
 
 

@@ -55,7 +55,9 @@ def policy_gradient(
     log_scale = tl.log(bounded)
     error = (action - loc) * inverse
     log_prob = tl.sum(tl.where(action_dims, -0.5 * error * error - log_scale - HALF_LOG_2_PI, 0.0), 1)
-    log_ratio = log_prob - log_prob_old
+    # Padding and rows that take no part may be anything, and zero times infinity is NaN.
+    counts = mask > 0.0
+    log_ratio = tl.where(counts, log_prob - log_prob_old, 0.0)
     clipped = tl.minimum(tl.maximum(log_ratio, log_ratio_low), log_ratio_high)
     gain = tl.exp(log_ratio) * advantage
     clipped_gain = tl.exp(clipped) * advantage
@@ -63,19 +65,28 @@ def policy_gradient(
     # Of the smaller of the two gains; the clipped one is constant where it is another.
     slope = tl.where(inside | (gain < clipped_gain), -gain, 0.0) * mask
 
+    error = tl.where(counts[:, None], error, 0.0)
     d_std = (slope[:, None] * (error * error - 1.0) - entropy_coeff * mask[:, None]) * inverse
     if LOG_STD:
         d_std = d_std * std[None, :]
     tl.store(d_std_at + tl.arange(0, OUT), tl.sum(tl.where(action_dims, d_std, 0.0), 0))
 
-    log_std_ratio = tl.log(scale_old) - log_scale
-    drift = (loc_old - loc) * inverse
+    log_std_ratio = tl.where(counts[:, None], tl.log(scale_old) - log_scale, 0.0)
+    drift = tl.where(counts[:, None], (loc_old - loc) * inverse, 0.0)
     divergence = 0.5 * (tl.exp(2.0 * log_std_ratio) + drift * drift - 1.0) - log_std_ratio
     tl.store(statistics, tl.sum(mask))
     tl.store(statistics + 1, -tl.sum(tl.minimum(gain, clipped_gain) * mask))
     tl.store(statistics + 2, tl.sum(tl.sum(tl.where(action_dims, divergence, 0.0), 1) * mask))
     tl.store(statistics + 3, tl.sum(tl.where(inside, 0.0, mask)))
     return tl.where(action_dims, slope[:, None] * error * inverse, 0.0)
+
+
+@triton.jit
+def _store_moments(at, values, mask, count):
+    total = tl.sum(values * mask)
+    gap = (values - total / tl.maximum(count, 1.0)) * mask
+    tl.store(at, total)
+    tl.store(at + 1, tl.sum(gap * gap))
 
 
 @triton.jit
@@ -91,30 +102,30 @@ def value_gradient(
 ):
     """Return the gradient of the value loss at `out` [rows, OUT], whose first column is the value.
 
-    Writes to `statistics` the sums of mask, value loss (without `critic_coeff`), target, its square, error, its square.
+    Writes to `statistics` the sums of mask and value loss (without `critic_coeff`), and of targets and errors their sum
+    and that of squares about their mean, which does not cancel as that about zero does.
     """
     output = tl.arange(0, OUT)[None, :]
     value = tl.sum(tl.where(output == 0, out, 0.0), 1)
     target = tl.load(record + (3 * OUT + TARGET), mask=valid, other=0.0)
     mask = tl.load(record + (3 * OUT + MASK), mask=valid, other=0.0)
-    error = value - target
+    error = tl.where(mask > 0.0, value - target, 0.0)
     loss = error * error
     slope = 2.0 * error
     if CLIP_VALUE:
         value_old = tl.load(record + (3 * OUT + VALUE), mask=valid, other=0.0)
-        change = value - value_old
+        change = tl.where(mask > 0.0, value - value_old, 0.0)
         held = tl.minimum(tl.maximum(change, -clip_value), clip_value)
         held_error = value_old + held - target
         held_loss = held_error * held_error
         slope = tl.where((held == change) | (loss > held_loss), slope, 0.0)
         loss = tl.maximum(loss, held_loss)
     slope = slope * mask * critic_coeff
-    tl.store(statistics, tl.sum(mask))
+    count = tl.sum(mask)
+    tl.store(statistics, count)
     tl.store(statistics + 1, tl.sum(loss * mask))
-    tl.store(statistics + 2, tl.sum(target * mask))
-    tl.store(statistics + 3, tl.sum(target * target * mask))
-    tl.store(statistics + 4, tl.sum(error * mask))
-    tl.store(statistics + 5, tl.sum(error * error * mask))
+    _store_moments(statistics + 2, target, mask, count)
+    _store_moments(statistics + 4, error, mask, count)
     return tl.where(output == 0, slope[:, None], 0.0)
 
 
@@ -135,11 +146,8 @@ def estimate_advantages(
 ):
     """Write advantages and value targets of BLOCK envs; all signals are time-major, [STEPS, num_envs].
 
-    As `GAE`: a step whose delta is not finite gets a NaN advantage, and the recursion starts anew before it.
-
-    Args:
-        gamma: discount.
-        decay: gamma * lambda.
+    As `GAE`: a step whose delta is not finite gets a NaN advantage, and the recursion starts anew before it. `decay` is
+    gamma * lambda.
     """
     env = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = env < num_envs

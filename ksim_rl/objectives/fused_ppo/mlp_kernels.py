@@ -15,14 +15,26 @@ from ksim_rl.objectives.fused_ppo.loss_kernels import policy_gradient, value_gra
 
 
 @triton.jit
-def _elu(value):
-    return tl.where(value > 0.0, value, tl.exp(value) - 1.0)
+def _activate(value, ACTIVATION: tl.constexpr):
+    if ACTIVATION == 0:
+        value = tl.where(value > 0.0, value, tl.exp(value) - 1.0)
+    elif ACTIVATION == 1:
+        value = tl.maximum(value, 0.0)
+    else:
+        value = 2.0 * tl.sigmoid(2.0 * value) - 1.0
+    return value
 
 
 @triton.jit
-def _elu_slope(value):
-    # From the output alone, so that the input of the ELU is never stored.
-    return tl.where(value > 0.0, 1.0, value + 1.0)
+def _slope(value, ACTIVATION: tl.constexpr):
+    # From the output alone, so that the input of an activation is never stored.
+    if ACTIVATION == 0:
+        slope = tl.where(value > 0.0, 1.0, value + 1.0)
+    elif ACTIVATION == 1:
+        slope = tl.where(value > 0.0, 1.0, 0.0)
+    else:
+        slope = 1.0 - value * value
+    return slope
 
 
 @triton.jit
@@ -41,6 +53,7 @@ def _outputs(
     BLOCK: tl.constexpr,
     CHUNK: tl.constexpr,
     STAGES: tl.constexpr,
+    ACTIVATION: tl.constexpr,
     STORE: tl.constexpr,
 ):
     """Return the outputs [BLOCK, OUT] for `observed` [BLOCK, OBS]; STORE keeps the hidden layers in `inputs`."""
@@ -55,22 +68,20 @@ def _outputs(
     for first in tl.range(0, H1, CHUNK, num_stages=STAGES):
         weight1 = tl.load(weights + ((first + column)[None, :] * OBS + obs_column[:, None]))
         weight2 = tl.load(weights + (SECOND_AT + column2[None, :] * H1 + (first + column)[:, None]))
-        hidden = _elu(tl.dot(observed, weight1) + tl.load(biases + first + column)[None, :]).to(
-            observed.dtype
-        )
+        hidden = tl.dot(observed, weight1) + tl.load(biases + first + column)[None, :]
+        hidden = _activate(hidden, ACTIVATION).to(observed.dtype)
         if STORE:
             tl.store(inputs + (input_rows + (OBS + first + column[None, :])), hidden, mask=keep)
         acc = tl.dot(hidden, weight2, acc)
-    second = _elu(acc + tl.load(biases + H1 + column2)[None, :]).to(observed.dtype)
+    second = _activate(acc + tl.load(biases + H1 + column2)[None, :], ACTIVATION).to(observed.dtype)
     if STORE:
         tl.store(inputs + (input_rows + (OBS + H1 + column2[None, :])), second, mask=keep)
     out = tl.zeros((BLOCK, OUT), dtype=tl.float32)
     for first in tl.range(0, H3, CHUNK, num_stages=STAGES):
         weight3 = tl.load(weights + (THIRD_AT + (first + column)[None, :] * H2 + column2[:, None]))
         weight4 = tl.load(weights + (OUT_AT + output[None, :] * H3 + (first + column)[:, None]))
-        hidden = _elu(tl.dot(second, weight3) + tl.load(biases + H1 + H2 + first + column)[None, :]).to(
-            observed.dtype
-        )
+        hidden = tl.dot(second, weight3) + tl.load(biases + H1 + H2 + first + column)[None, :]
+        hidden = _activate(hidden, ACTIVATION).to(observed.dtype)
         if STORE:
             tl.store(inputs + (input_rows + (OBS + H1 + H2 + first + column[None, :])), hidden, mask=keep)
         out = tl.dot(hidden, weight4, out)
@@ -92,6 +103,7 @@ def state_values(
     BLOCK: tl.constexpr,
     CHUNK: tl.constexpr,
     STAGES: tl.constexpr,
+    ACTIVATION: tl.constexpr,
 ):
     """Write the first output of a network for each row of `obs` [D, OBS] to `values` [D]."""
     rows = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -99,7 +111,22 @@ def state_values(
     keep = valid[:, None]
     observed = tl.load(obs + (rows[:, None] * OBS + tl.arange(0, OBS)[None, :]), mask=keep, other=0.0)
     out = _outputs(
-        observed, weights, biases, values, rows, keep, OBS, H1, H2, H3, OUT, BLOCK, CHUNK, STAGES, False
+        observed,
+        weights,
+        biases,
+        values,
+        rows,
+        keep,
+        OBS,
+        H1,
+        H2,
+        H3,
+        OUT,
+        BLOCK,
+        CHUNK,
+        STAGES,
+        ACTIVATION,
+        False,
     )
     tl.store(values + rows, tl.sum(tl.where(tl.arange(0, OUT)[None, :] == 0, out, 0.0), 1), mask=valid)
 
@@ -139,19 +166,14 @@ def minibatch_gradients(
     BLOCK: tl.constexpr,
     CHUNK: tl.constexpr,
     STAGES: tl.constexpr,
+    ACTIVATION: tl.constexpr,
 ):
     """Run a block of a minibatch through one network, its loss, and back: all but the products for the weights.
 
-    Program (i, n) takes BLOCK rows of the minibatch through network n (0: actor, 1: critic). It leaves the inputs of
-    all layers [2, B, INPUTS], the gradients of the sum of the losses at all layer outputs [2, B, GRADIENTS], and what
-    the block adds to the gradients of biases and std and to the statistics of the loss: [blocks, 2, NUM_BIASES +
-    NUM_STATISTICS].
-
-    Args:
-        obs: normalized observations [2, D, OBS].
-        records: [D, RECORD]; see `loss_kernels`.
-        order: the env states of the minibatch, [B].
-        weights, biases: padded form, [2, NUM_PADDED].
+    Program (i, n) takes BLOCK rows of the minibatch, the env states `order` [B], through network n (0: actor, 1:
+    critic). It leaves the inputs of all layers [2, B, INPUTS], the gradients of the sum of the losses at all layer
+    outputs [2, B, GRADIENTS], and what the block adds to the gradients of biases and std and to the statistics of the
+    loss: [blocks, 2, NUM_BIASES + NUM_STATISTICS]. Weights and biases are in padded form, [2, NUM_PADDED].
     """
     block = tl.program_id(0)
     network = tl.program_id(1)
@@ -180,7 +202,22 @@ def minibatch_gradients(
     observed = tl.load(obs + (index[:, None] * OBS + obs_column[None, :]), mask=keep, other=0.0)
     tl.store(inputs + (input_rows + obs_column[None, :]), observed, mask=keep)
     out = _outputs(
-        observed, weights, biases, inputs, input_rows, keep, OBS, H1, H2, H3, OUT, BLOCK, CHUNK, STAGES, True
+        observed,
+        weights,
+        biases,
+        inputs,
+        input_rows,
+        keep,
+        OBS,
+        H1,
+        H2,
+        H3,
+        OUT,
+        BLOCK,
+        CHUNK,
+        STAGES,
+        ACTIVATION,
+        True,
     )
 
     record = records + index.to(tl.int64) * RECORD
@@ -210,20 +247,20 @@ def minibatch_gradients(
         hidden = tl.load(
             inputs + (input_rows + (OBS + H1 + H2 + first + column[None, :])), mask=keep, other=0.0
         )
-        slope = tl.dot(d_out, weight4) * _elu_slope(hidden.to(tl.float32))
+        slope = tl.dot(d_out, weight4) * _slope(hidden.to(tl.float32), ACTIVATION)
         tl.store(partials + H1 + H2 + first + column, tl.sum(slope, 0))
         slope = slope.to(observed.dtype)
         tl.store(gradients + (gradient_rows + (H1 + H2 + first + column[None, :])), slope, mask=keep)
         acc = tl.dot(slope, weight3, acc)
     middle = tl.load(inputs + (input_rows + (OBS + H1 + column2[None, :])), mask=keep, other=0.0)
-    second = acc * _elu_slope(middle.to(tl.float32))
+    second = acc * _slope(middle.to(tl.float32), ACTIVATION)
     tl.store(partials + H1 + column2, tl.sum(second, 0))
     second = second.to(observed.dtype)
     tl.store(gradients + (gradient_rows + (H1 + column2[None, :])), second, mask=keep)
     for first in tl.range(0, H1, CHUNK, num_stages=STAGES):
         weight2 = tl.load(weights + (SECOND_AT + column2[:, None] * H1 + (first + column)[None, :]))
         hidden = tl.load(inputs + (input_rows + (OBS + first + column[None, :])), mask=keep, other=0.0)
-        slope = tl.dot(second, weight2) * _elu_slope(hidden.to(tl.float32))
+        slope = tl.dot(second, weight2) * _slope(hidden.to(tl.float32), ACTIVATION)
         tl.store(partials + first + column, tl.sum(slope, 0))
         tl.store(gradients + (gradient_rows + (first + column[None, :])), slope.to(observed.dtype), mask=keep)
 
@@ -243,13 +280,10 @@ def weight_gradients(
     DEPTH: tl.constexpr,
     STAGES: tl.constexpr,
 ):
-    """Multiply gradients by layer inputs: program (i, s) computes tile i of the weight gradients over split s.
+    """Multiply gradients by layer inputs: program (i, s) computes tile i of `FusedLayout.weight_tiles` over split s.
 
-    A split has ROWS rows of the minibatch. Of several splits each writes its own sum, [splits, 2, NUM_WEIGHTS], so
-    that the result does not depend on who is first.
-
-    Args:
-        tiles: `FusedLayout.weight_tiles`.
+    A split has ROWS rows of the minibatch. Of several splits each writes its own sum, [splits, 2, NUM_WEIGHTS], so that
+    the result does not depend on who is first.
     """
     tile = tiles + tl.program_id(0) * 8
     split = tl.program_id(1)

@@ -29,30 +29,6 @@ EPS = tl.constexpr(1.1920929e-07)
 
 
 @triton.jit
-def _sum_weights(
-    program,
-    partials,
-    gradients,
-    squares,
-    count,
-    network,
-    first,
-    SPLITS: tl.constexpr,
-    NUM_WEIGHTS: tl.constexpr,
-    NUM_PADDED: tl.constexpr,
-    SIZE: tl.constexpr,
-):
-    at = first + tl.arange(0, SIZE)
-    inside = at < NUM_WEIGHTS
-    total = tl.zeros((SIZE,), dtype=tl.float32)
-    for split in tl.static_range(SPLITS):
-        total += tl.load(partials + ((split * 2 + network) * NUM_WEIGHTS + at), mask=inside, other=0.0)
-    total = total / count
-    tl.store(gradients + (network * NUM_PADDED + at), total, mask=inside)
-    tl.store(squares + program, tl.sum(total * total))
-
-
-@triton.jit
 def _block_sums(
     partials,
     column,
@@ -68,6 +44,22 @@ def _block_sums(
         keep = (block < BLOCKS) & inside[None, :]
         sums += tl.load(partials + (block * 2 * WIDTH + column[None, :]), mask=keep, other=0.0)
     return tl.sum(sums, 0)
+
+
+@triton.jit
+def _variance(
+    partials, sum_at, count_at, mean, count, WIDTH: tl.constexpr, BLOCKS: tl.constexpr, ROWS: tl.constexpr
+):
+    # Of each block: how many, their sum, and their sum of squares about its own mean (Chan et al., 1979).
+    squares = tl.zeros((ROWS,), dtype=tl.float32)
+    for first in range(0, BLOCKS, ROWS):
+        block = first + tl.arange(0, ROWS)
+        keep = block < BLOCKS
+        row = partials + block * 2 * WIDTH
+        size = tl.load(row + count_at, mask=keep, other=0.0)
+        gap = tl.load(row + sum_at, mask=keep, other=0.0) / tl.maximum(size, 1.0) - mean
+        squares += tl.load(row + (sum_at + 1), mask=keep, other=0.0) + size * gap * gap
+    return tl.sum(squares) / count
 
 
 @triton.jit
@@ -121,10 +113,15 @@ def sum_gradients(
     count = tl.maximum(_column(sums, 0, NUM_STATISTICS), 1.0)
     if program < 2 * WEIGHT_PROGRAMS:
         network = program // WEIGHT_PROGRAMS
-        _sum_weights(
-            program, weight_partials, gradients, squares, count, network, (program % WEIGHT_PROGRAMS) * SIZE,
-            SPLITS, NUM_WEIGHTS, NUM_PADDED, SIZE,
-        )  # fmt: skip
+        at = (program % WEIGHT_PROGRAMS) * SIZE + tl.arange(0, SIZE)
+        kept = at < NUM_WEIGHTS
+        weight = tl.zeros((SIZE,), dtype=tl.float32)
+        for split in tl.static_range(SPLITS):
+            place = (split * 2 + network) * NUM_WEIGHTS + at
+            weight += tl.load(weight_partials + place, mask=kept, other=0.0)
+        weight = weight / count
+        tl.store(gradients + (network * NUM_PADDED + at), weight, mask=kept)
+        tl.store(squares + program, tl.sum(weight * weight))
     elif program < 2 * (WEIGHT_PROGRAMS + BIAS_PROGRAMS):
         network = (program - 2 * WEIGHT_PROGRAMS) // BIAS_PROGRAMS
         bias = ((program - 2 * WEIGHT_PROGRAMS) % BIAS_PROGRAMS) * COLUMNS + tl.arange(0, COLUMNS)
@@ -136,31 +133,27 @@ def sum_gradients(
         tl.store(squares + program, tl.sum(total * total))
     else:
         policy = sums / count
-        value = (
-            _block_sums(
-                block_partials + WIDTH,
-                NUM_BIASES + statistic,
-                statistic < 6,
-                WIDTH,
-                BLOCKS,
-                ROWS,
-                NUM_STATISTICS,
-            )
-            / count
+        of_value = statistic < 6
+        value_sums = _block_sums(
+            block_partials + WIDTH, NUM_BIASES + statistic, of_value, WIDTH, BLOCKS, ROWS, NUM_STATISTICS
         )
+        value = value_sums / count
         objective = _column(policy, 1, NUM_STATISTICS)
         kl = _column(policy, 2, NUM_STATISTICS)
         critic = critic_coeff * _column(value, 1, NUM_STATISTICS)
         target = _column(value, 2, NUM_STATISTICS)
-        target_variance = _column(value, 3, NUM_STATISTICS) - target * target
         error = _column(value, 4, NUM_STATISTICS)
-        error_variance = _column(value, 5, NUM_STATISTICS) - error * error
+        of_values = block_partials + WIDTH
+        target_variance = _variance(of_values, NUM_BIASES + 2, NUM_BIASES, target, count, WIDTH, BLOCKS, ROWS)
+        error_variance = _variance(of_values, NUM_BIASES + 4, NUM_BIASES, error, count, WIDTH, BLOCKS, ROWS)
         output = tl.arange(0, OUT)
         raw = tl.load(
             biases + (NUM_BIASES - OUT + output), mask=output < ACTIONS, other=0.0 if LOG_STD else 1.0
         )
         std = tl.maximum(tl.exp(raw) if LOG_STD else raw, MIN_STD)
         entropy = tl.sum(tl.where(output < ACTIONS, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0))
+        # The mean over no env state is zero, as that of all losses.
+        entropy = tl.where(_column(sums, 0, NUM_STATISTICS) > 0.0, entropy, 0.0)
         rate = tl.load(learning_rate)
         if ADAPTIVE:
             # As `adapt_learning_rate_`; comparisons with NaN are False.
@@ -208,17 +201,11 @@ def adam_step(
 ):
     """Make one step of Adam (Kingma and Ba, arXiv 1412.6980), as torch's, on the clipped gradient.
 
-    If the norm of the gradient or the loss is not finite, nothing changes but the counters of skipped steps.
-
-    Args:
-        parameters, means, variances: flat form, [SIZE], changed in place.
-        places: of the flat form's elements in the padded one.
-        gradients: padded form.
-        weights, exact_weights: padded form, in the dtype of the products and in float32; both follow the parameters.
-        squares: sums of squares that together give the norm of the gradient, [NUM_SQUARES].
-        summary: the row of this step; the norm and whether it was skipped are added.
-        steps: number of steps made before this one; the number after it is written beside it.
-        skipped, skipped_in_a_row: int64 counters.
+    If the norm of the gradient, from its NUM_SQUARES partial `squares`, or the loss is not finite, nothing changes but
+    the counters of skipped steps. Parameters, means and variances are in flat form, [SIZE]; `places` leads from it to
+    the padded form of gradients and of the weights, in the dtype of the products and exact, which follow the
+    parameters. The norm and whether the step was skipped are added to the `summary` of this step, and the number of
+    steps made after it is written behind that before it.
     """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = at < SIZE

@@ -13,6 +13,8 @@ kernel is exact, and cheaper.
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false
 # pyright: reportAttributeAccessIssue=false, reportReturnType=false, reportInvalidTypeForm=false
 
+from collections.abc import Callable
+
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
@@ -23,10 +25,13 @@ from ksim_rl.physics.height_field.geometry import (
     PEAK,
     Field,
     closest_ground,
+    closest_of_segments,
     closest_ridge,
     field_point,
     ground_at,
     is_over,
+    is_ridge,
+    ridge_normal,
 )
 from ksim_rl.physics.structs import filled, struct_with
 from ksim_rl.physics.upstream import contact_params, make_frame, write_contact
@@ -34,6 +39,9 @@ from ksim_rl.physics.upstream import contact_params, make_frame, write_contact
 SPHERE, CAPSULE, BOX, HEIGHT_FIELD = (
     int(mjw.GeomType[name]) for name in ("SPHERE", "CAPSULE", "BOX", "HFIELD")
 )
+
+# The cosine up to which a face of a box lies on a ridge, so that both of its edges touch it.
+FLAT = wp.constant(0.1)
 
 mat43 = wp.types.matrix(shape=(4, 3), dtype=float)
 
@@ -143,7 +151,7 @@ def capsule_touches(
 def box_touches(
     field: Field, data: wp.array[float], center: wp.vec3, turn: wp.mat33, half: wp.vec3, margin: float
 ) -> Touches:
-    """Return the deepest four contacts of a box: its corners on the ground, and peaks of the ground in its faces."""
+    """Return the deepest four contacts of a box: its corners on the ground, peaks in its faces, edges on ridges."""
     touches = Touches()
     for corner in range(8):
         signs = wp.vec3(
@@ -194,6 +202,70 @@ def box_touches(
             sign = wp.where(inside[face] < 0.0, 1.0, -1.0)
             normal = sign * wp.vec3(turn[0, face], turn[1, face], turn[2, face])
             touches = add_touch(touches, -depth, point - depth * normal, normal)
+    return edge_touches(touches, field, data, center, turn, half, reach, margin)
+
+
+@wp.func
+def edge_touches(
+    touches: Touches,
+    field: Field,
+    data: wp.array[float],
+    center: wp.vec3,
+    turn: wp.mat33,
+    half: wp.vec3,
+    reach: wp.vec3,
+    margin: float,
+) -> Touches:
+    """Add the contacts of a box's edges with ridges that they cross."""
+    low_column = wp.max(int(wp.floor((center[0] - reach[0] + field.half_x) / field.dx)), 0)
+    low_row = wp.max(int(wp.floor((center[1] - reach[1] + field.half_y) / field.dy)), 0)
+    high_column = wp.min(int(wp.floor((center[0] + reach[0] + field.half_x) / field.dx)), field.columns - 2)
+    high_row = wp.min(int(wp.floor((center[1] + reach[1] + field.half_y) / field.dy)), field.rows - 2)
+    for row in range(low_row, high_row + 1):
+        for column in range(low_column, high_column + 1):
+            a = field_point(field, data, row, column)
+            for kind in range(3):
+                to_end = (
+                    field_point(
+                        field, data, row + wp.where(kind == 0, 0, 1), column + wp.where(kind == 1, 0, 1)
+                    )
+                    - a
+                )
+                if a[2] + wp.max(to_end[2], 0.0) < center[2] - reach[2] - margin:
+                    continue
+                if not is_ridge(field, data, row, column, kind):
+                    continue
+                for axis in range(3):
+                    along = wp.vec3(turn[0, axis], turn[1, axis], turn[2, axis])
+                    normal = ridge_normal(field, data, row, column, kind, along)
+                    out = wp.transpose(turn) @ normal
+                    # The edges along this axis that are lowest along the normal: two where a face lies on the ridge.
+                    for edge in range(4):
+                        one, other = (axis + 1) % 3, (axis + 2) % 3
+                        corner = wp.vec3()
+                        corner[axis] = -half[axis]
+                        corner[one] = wp.where((edge & 1) == 0, half[one], -half[one])
+                        corner[other] = wp.where((edge & 2) == 0, half[other], -half[other])
+                        if (
+                            corner[one] * out[one] > FLAT * half[one]
+                            or corner[other] * out[other] > FLAT * half[other]
+                        ):
+                            continue
+                        start = center + turn @ corner
+                        s, t = closest_of_segments(start, 2.0 * half[axis] * along, a, to_end)
+                        point, ridge = start + 2.0 * s * half[axis] * along, a + t * to_end
+                        distance = wp.dot(point - ridge, normal)
+                        inside = wp.transpose(turn) @ (ridge - center)
+                        beyond = wp.max(wp.abs(inside[0]) - half[0], wp.abs(inside[1]) - half[1])
+                        beyond = wp.max(beyond, wp.abs(inside[2]) - half[2])
+                        crosses = s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
+                        if (
+                            crosses
+                            and wp.length(normal) > 0.5
+                            and beyond <= margin + PEAK
+                            and distance < margin
+                        ):
+                            touches = add_touch(touches, distance, point, normal)
     return touches
 
 
@@ -297,11 +369,11 @@ def height_field_contacts(c: Collisions):
         )
 
 
-def take_over_height_fields(warp_model: mjw.Model) -> None:
-    """Let our kernel find the contacts of height fields with spheres, capsules and boxes, in place.
+def take_over_height_fields(warp_model: mjw.Model) -> Callable[[mjw.Model, mjw.Data], None] | None:
+    """Take the pairs of height fields with spheres, capsules and boxes away from MuJoCo Warp, in place.
 
-    Pairs with other geoms (cylinders, ellipsoids, meshes), and pairs that a distance sensor measures, stay with MuJoCo
-    Warp. Call it before anything copies the model.
+    Returns what appends their contacts instead after its collision pass, or None where there are no such pairs. Pairs
+    with other geoms (cylinders, ellipsoids, meshes), and pairs that a distance sensor measures, stay with MuJoCo Warp.
     """
     geom_type = warp_model.geom_type.numpy()
     pairs, pair_ids = upstream.geom_pairs(warp_model)
@@ -310,22 +382,16 @@ def take_over_height_fields(warp_model: mjw.Model) -> None:
     taken = (types == HEIGHT_FIELD).any(-1) & np.isin(geom_type[height_first[:, 1]], (SPHERE, CAPSULE, BOX))
     taken &= (pair_ids[:, 0] > upstream.NO_CONTACT) & (pair_ids[:, 1] == upstream.NO_SENSOR)
     if not taken.any() or warp_model.flg_surfacevel:
-        return
-    contacts = _Contacts(height_first[taken], pair_ids[taken])
+        return None
     upstream.drop_pairs(warp_model, taken)
-    warp_model.callback.contactfilter = contacts
+    own = {
+        "pairs": wp.array(height_first[taken], dtype=wp.vec2i),
+        "pair_ids": wp.array(pair_ids[taken], dtype=wp.vec2i),
+    }
 
-
-class _Contacts:
-    """The hook that MuJoCo Warp calls after its own collision pass."""
-
-    def __init__(self, pairs: np.ndarray, pair_ids: np.ndarray) -> None:
-        self._pairs = wp.array(pairs, dtype=wp.vec2i)
-        self._pair_ids = wp.array(pair_ids, dtype=wp.vec2i)
-
-    def __call__(self, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
-        """Append the contacts of all worlds."""
-        own = {"pairs": self._pairs, "pair_ids": self._pair_ids}
+    def append(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
         contacts = {f"contact_{name}": array for name, array in vars(warp_data_E.contact).items()}
         collisions = filled(Collisions, own, contacts, warp_model, warp_data_E)
-        wp.launch(height_field_contacts, dim=(warp_data_E.nworld, len(self._pairs)), inputs=[collisions])
+        wp.launch(height_field_contacts, dim=(warp_data_E.nworld, int(taken.sum())), inputs=[collisions])
+
+    return append

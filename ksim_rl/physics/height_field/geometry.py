@@ -21,6 +21,8 @@ TINY = wp.constant(1.0e-9)
 SAME_NORMAL = wp.constant(0.95)
 # The cosine from which on a point is said to be straight above a face.
 STRAIGHT = wp.constant(0.9999)
+# The sine below which a ridge and an edge of a box are parallel, and have no point in common.
+PARALLEL = wp.constant(1.0e-2)
 # How much a point or an edge of the ground has to stand out above its neighbours to be a peak or a ridge, m.
 PEAK = wp.constant(1.0e-4)
 
@@ -203,6 +205,28 @@ def is_ridge(field: Field, data: wp.array[float], row: int, column: int, kind: i
     if column == 0:
         return False
     return wp.dot(face_normal(a, d, c), field_point(field, data, row, column - 1) - a) < -PEAK
+
+
+@wp.func
+def ridge_normal(
+    field: Field, data: wp.array[float], row: int, column: int, kind: int, direction: wp.vec3
+) -> wp.vec3:
+    """Return the upward normal of the plane through a ridge and along a direction; zero where the plane cuts ground."""
+    a = field_point(field, data, row, column)
+    end = field_point(field, data, row + wp.where(kind == 0, 0, 1), column + wp.where(kind == 1, 0, 1))
+    # What the triangles on both sides have besides the ridge.
+    left = field_point(
+        field, data, row + wp.where(kind == 0, -1, 0), column + wp.where(kind == 1, -1, kind // 2)
+    )
+    right = field_point(field, data, row + 1, column + wp.where(kind == 2, 0, 1))
+    normal = wp.cross(end - a, direction)
+    if wp.length(normal) < PARALLEL * wp.length(end - a):
+        return wp.vec3(0.0)
+    normal = wp.normalize(normal)
+    normal = wp.where(normal[2] < 0.0, -normal, normal)
+    if wp.dot(normal, left - a) > PEAK or wp.dot(normal, right - a) > PEAK:
+        return wp.vec3(0.0)
+    return normal
 
 
 @wp.func

@@ -20,22 +20,9 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from ksim_rl.checked import Checked, Count
-from ksim_rl.physics.load import model_bytes
-from ksim_rl.physics.views import float_rows
+from ksim_rl.physics.model_checks import model_bytes
+from ksim_rl.physics.views import SUBSTEP_INPUTS, float_rows
 
-# What a substep depends on; empty arrays are left out.
-BEFORE = (
-    "time",
-    "qpos",
-    "qvel",
-    "act",
-    "ctrl",
-    "qfrc_applied",
-    "xfrc_applied",
-    "mocap_pos",
-    "mocap_quat",
-    "qacc_warmstart",
-)
 FORMAT = "ksim_rl.nan_guard/1"
 _MODEL, _STATE, _FIELD, _REACHED = "model", "state/", "field/", "reached/"
 _WATCHED, _FAILED, _KEPT = 0, 1, 2
@@ -43,13 +30,10 @@ _WATCHED, _FAILED, _KEPT = 0, 1, 2
 
 @dataclass(frozen=True, kw_only=True)
 class NanGuardCfg(Checked):
-    """Keep the last substeps of each world, and save those of a world whose state became non-finite.
+    """Keep the last `history` substeps of each world, and save those of a world whose state became non-finite.
 
-    Args:
-        folder: where the files go; it is created with the world.
-        history: substeps that are kept, on the device: 4 bytes for each number of a world's state, controls and
-            applied forces (Go1: 0.7 kB per world and substep).
-        max_files: most files that one world batch writes; further failures are only counted.
+    That takes, on the device, 4 bytes for each number of a world's state, controls and applied forces (Go1: 0.7 kB per
+    world and substep). Of one world batch at most `max_files` failures are saved; further ones are only counted.
     """
 
     folder: str
@@ -64,13 +48,7 @@ class NanGuardCfg(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class NanReport:
-    """Which worlds became non-finite since the last report.
-
-    Args:
-        worlds: their numbers.
-        files: what was written, for `python -m ksim_rl.physics.nan_guard.replay FILE`.
-        messages: one line for each file, and one where a file could not be written; none beyond `max_files`.
-    """
+    """Which worlds became non-finite since the last report, the files of up to `max_files` of them, and a line each."""
 
     worlds: tuple[int, ...] = ()
     files: tuple[Path, ...] = ()
@@ -83,12 +61,7 @@ class NanReport:
 
 
 @wp.kernel(enable_backward=False)
-def keep_rows(
-    rows: wp.array2d[float],
-    failed: wp.array[int],
-    count: wp.array[int],
-    ring: wp.array3d[float],
-):
+def keep_rows(rows: wp.array2d[float], failed: wp.array[int], count: wp.array[int], ring: wp.array3d[float]):
     """Write each world's row into the next place of its ring, unless the world has failed."""
     world, i = wp.tid()
     if failed[world] == 0:
@@ -122,11 +95,7 @@ def mark_failed(
 
 
 class NanGuard:
-    """Rings of the last substeps. A world's ring stops when its state becomes non-finite, until `report` reads it.
-
-    Raises:
-        OSError: if the folder cannot be made.
-    """
+    """Rings of the last substeps. A world's ring stops when its state becomes non-finite, until `report` reads it."""
 
     def __init__(
         self,
@@ -140,7 +109,7 @@ class NanGuard:
         self._folder.mkdir(parents=True, exist_ok=True)
         self._written = 0
         num_envs = warp_data_E.nworld
-        self._names = [name for name in BEFORE if getattr(warp_data_E, name).size]
+        self._names = [name for name in SUBSTEP_INPUTS if getattr(warp_data_E, name).size]
         self._rows = float_rows(warp_data_E, tuple(self._names))
         self._rings = [wp.zeros((num_envs, cfg.history, rows.shape[1]), dtype=float) for rows in self._rows]
         self._failed, self._count = wp.zeros(num_envs, dtype=int), wp.zeros(num_envs, dtype=int)
@@ -152,12 +121,7 @@ class NanGuard:
     def before_substep(self) -> None:
         """Launch the copies of the state that the substep starts from."""
         for rows, ring in zip(self._rows, self._rings, strict=True):
-            wp.launch(
-                keep_rows,
-                dim=rows.shape,
-                inputs=[rows, self._failed, self._count],
-                outputs=[ring],
-            )
+            wp.launch(keep_rows, dim=rows.shape, inputs=[rows, self._failed, self._count], outputs=[ring])
 
     def after_substep(self) -> None:
         """Launch the search for worlds that failed in this substep."""
@@ -224,13 +188,9 @@ class NanGuard:
 class Failure:
     """The last substeps of a world whose state became non-finite in the last of them.
 
-    Args:
-        mj_model: the model, before `fields` are written into it.
-        world: which of the worlds it was.
-        substep: how many substeps the world had done, with the last one, since the guard began to watch it.
-        states: state, controls and applied forces before each substep, oldest first, [H, W] each, by MuJoCo's names.
-        reached: "qpos" and "qvel" after the last substep: not finite.
-        fields: model fields of this world that may differ between worlds.
+    `states` are before each substep, oldest first, [H, W] each; `reached` is the "qpos" and "qvel" after the last one.
+    `fields`, this world's per-world model fields, are not written into `mj_model` yet. `substep` counts all substeps
+    since the guard began to watch the world.
     """
 
     mj_model: mujoco.MjModel
@@ -246,12 +206,8 @@ def write(path: Path, failure: Failure) -> None:
     tensors = {_MODEL: model_bytes(failure.mj_model)}
     for prefix, arrays in ((_STATE, failure.states), (_REACHED, failure.reached), (_FIELD, failure.fields)):
         tensors |= {f"{prefix}{name}": np.ascontiguousarray(array) for name, array in arrays.items()}
-    about = {
-        "format": FORMAT,
-        "mujoco": mujoco.__version__,
-        "world": failure.world,
-        "substep": failure.substep,
-    }
+    about = {"format": FORMAT, "mujoco": mujoco.__version__}
+    about |= {"world": failure.world, "substep": failure.substep}
     data = safetensors.numpy.save(tensors, metadata={"about": json.dumps(about)})
     part = path.with_name(f".{path.name}.part")
     with open(part, "wb") as file:
@@ -262,13 +218,9 @@ def write(path: Path, failure: Failure) -> None:
 
 
 def read(path: Path) -> Failure:
-    """Read a failure back.
+    """Read a failure back. The model inside is MuJoCo's binary format, which MuJoCo trusts: read your own files only.
 
-    The model inside is MuJoCo's binary format, which MuJoCo trusts: read files of your own only.
-
-    Raises:
-        ValueError: if the file is none of ours, is damaged, or its model is of another MuJoCo.
-        FileNotFoundError: if there is no such file.
+    Raises ValueError where the file is none of ours, is damaged, or was written with another MuJoCo.
     """
     try:
         with safe_open(path, framework="numpy") as file:

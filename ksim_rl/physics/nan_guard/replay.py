@@ -36,17 +36,11 @@ _WARNINGS = {
 class Substep:
     """One substep on the C engine, from the state that Warp had before it.
 
-    Args:
-        time: s, before the substep.
-        energy: kinetic and potential, J, before the substep.
-        speed: largest |qvel| before the substep, and its dof.
-        acceleration: largest |qacc| that the C engine finds, and its dof. Controls beyond 1e9 count as 1e9 here, since
-            the C engine would drop all of them.
-        control: largest |ctrl|, and its actuator; 0 and -1 without actuators.
-        contacts: how many the C engine finds.
-        warnings: what the C engine warns of.
-        deviation: largest difference between the velocities that the C engine and Warp reach. Large also where an event
-            or a reset changed the state between two substeps.
+    `time` (s), `energy` (kinetic and potential, J) and `speed` are those before it. Speed, acceleration and control are
+    the largest |qvel|, |qacc| and |ctrl|, each with its dof or actuator (0 and -1 where there is none); for the
+    acceleration, controls beyond 1e9 count as 1e9, since the C engine would drop all of them. `deviation` is the
+    largest difference between the velocities that both engines reach: large also where an event or a reset changed the
+    state between two substeps.
     """
 
     time: float
@@ -61,16 +55,13 @@ class Substep:
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """What the C engine makes of a failure.
+    """What the C engine makes of a failure; the last of `substeps` is the one that broke on Warp.
 
-    Args:
-        substeps: oldest first; the last one is the one that broke on Warp.
-        dofs: whose velocities or positions are not finite after it.
-        first: the dof that broke first. Warp's solver spreads a non-finite number over all dofs of a world within one
-            substep; then it is the one with the largest acceleration on the C engine, which does not. So it is where
-            all numbers are finite, but too large to be added up.
-        was_broken_before: whether the state before it was already not finite: something wrote it there.
-        breaks_on_c: whether the C engine warns of a bad state in that substep, or leaves it with non-finite numbers.
+    `dofs` are those whose velocities or positions are not finite after it. `first` is the dof that broke first: Warp's
+    solver spreads a non-finite number over all dofs of a world within one substep, so it is then the one with the
+    largest acceleration on the C engine, which does not, as it is where all numbers are finite, but too large to be
+    added up. `was_broken_before` says that something wrote a non-finite number into the state before it, `breaks_on_c`
+    that the C engine warns of a bad state in that substep too, or leaves it with non-finite numbers.
     """
 
     substeps: tuple[Substep, ...]
@@ -114,17 +105,9 @@ def describe(failure: Failure, result: Replay, *, limit: int = 10) -> str:
     """Return the replay as a table, with the verdict below it."""
     mj_model = failure.mj_model
     heads = (
-        "substep",
-        "time s",
-        "energy J",
-        "max |qvel|",
-        "of dof",
-        "max |qacc|",
-        "of dof",
-        "max |ctrl|",
-        "contacts",
+        "substep,time s,energy J,max |qvel|,of dof,max |qacc|,of dof,max |ctrl|,contacts,off Warp,C engine"
     )
-    rows: list[tuple[str, ...]] = [(*heads, "off Warp", "C engine")]
+    rows: list[tuple[str, ...]] = [tuple(heads.split(","))]
     last = len(result.substeps) - 1
     for k, substep in enumerate(result.substeps):
         (speed, fast), (acceleration, pushed) = substep.speed, substep.acceleration

@@ -57,6 +57,13 @@ each_row(lane, LANES, Singly {}, [&](int row, float* jacobian) {
                 ++before;
             while (is_of_cone(row + after))
                 ++after;
+            if (before + after < problem.contact_dim.data[contacts[row]]) {
+                // Of a cone that njmax cuts off, no row pushes, as in mujoco_warp's solver.py (_eval_constraint).
+                for (int entry = begin; entry < end; ++entry)
+                    jacobian[dofs[entry]] = 0.0f;
+                residual[row] = efc_D[row] = 0.0f;
+                return;
+            }
             kinds[row] = before > 0 ? CONE_TANGENT : CONE_HEAD + (after << 8);
             bound[row] = before > 0 ? friction[before - 1] : friction[0] * impratio;
             require(before + after >= 3 && before + after <= 6 && bound[row] > 0.0f, CONES_ARE_WHOLE);

@@ -15,6 +15,28 @@ auto cone_Dm = [&](int head) {
     const float mu = bound[head];
     return ratio(efc_D[head], mu * mu * (1.0f + mu * mu));
 };
+// What a row costs where at(row) is its residual; the head of a cone stands for all of it.
+auto cost_of = [&](int row, auto at) {
+    const int kind = kinds[row] & 255;
+    const float here = at(row), quadratic = 0.5f * efc_D[row] * here * here;
+    if (kind == CONE_TANGENT || (kind == ONE_SIDED && here >= 0.0f))
+        return 0.0f;
+    if (kind == FRICTION) {
+        const float reach = ratio(bound[row], efc_D[row]);
+        return fabsf(here) < reach ? quadratic : bound[row] * (fabsf(here) - 0.5f * reach);
+    }
+    if (!ELLIPTIC || kind != CONE_HEAD)
+        return quadratic;
+    float tangent2 = 0.0f, of_all = quadratic;
+#pragma unroll 1
+    for (int mate = row + 1; mate < row + (kinds[row] >> 8); ++mate) {
+        tangent2 += at(mate) * bound[mate] * at(mate) * bound[mate];
+        of_all += 0.5f * efc_D[mate] * at(mate) * at(mate);
+    }
+    const float mu = bound[row], tangent = sqrtf(tangent2), gap = here * mu - mu * tangent;
+    const int state = cone_zone(here * mu, tangent, mu);
+    return state == SATISFIED ? 0.0f : state == QUADRATIC ? of_all : 0.5f * cone_Dm(row) * gap * gap;
+};
 // Sets the force, the stiffness and the state of a row, and those of a whole cone at its head. In the curved zone,
 // where the Hessian is no diagonal, the head has -Dm in the place of its stiffness, and `cones` has the spring
 // force[0] / T that the tangents share (part 4).

@@ -16,7 +16,6 @@ search and tests of convergence: mujoco_warp/_src/solver.py.
 
 import enum
 import functools
-from dataclasses import dataclass
 from importlib.resources import files
 
 import mujoco
@@ -52,7 +51,7 @@ class Invariant(enum.IntFlag):
     ("", mjw.Model, "M_hinit_i M_colind"),
     ("", mjw.Option, "tolerance ls_tolerance impratio_invsqrt iterations"),
     ("", mjw.Data, "ne nf nefc M qacc qacc_warmstart qfrc_smooth qfrc_constraint solver_niter overflow"),
-    ("contact_", mjw.Contact, "friction"),
+    ("contact_", mjw.Contact, "friction dim"),
     ("efc_", mjw.Constraint, "type id J_rownnz J_rowadr D aref frictionloss Ma force state"),
 )
 class Problem:
@@ -68,11 +67,8 @@ class Problem:
 
 
 def row_stride(nv: int) -> int:
-    """Return the floats from a row of J or M to the next.
-
-    Whole groups of four, which are loaded at once, and an odd number of groups, so that the lanes' rows lie in
-    different banks.
-    """
+    """Return the floats from a row of J or M to the next."""
+    # Whole groups of four, which are loaded at once; an odd number of them, so that the lanes' rows lie in other banks.
     return 4 * (-(-nv // 4) | 1)
 
 
@@ -92,31 +88,14 @@ def _column(nv: int) -> int:
     return _padded(nv + 1 + (CUDA_LANES if nv >= CUDA_LANES else 0))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Placement:
-    """How the worlds lie on a CUDA device; the CPU, which has no chip to fill, heeds `rows_on_chip` alone.
-
-    Args:
-        rows_on_chip: rows that the shared memory of a world holds; those beyond are in device memory.
-        worlds_per_block: worlds that share a block.
-        min_blocks: blocks that a multiprocessor is to hold at once, which bounds the registers; 0 does not.
-        longest_first: whether the worlds that will take longest start first.
-    """
-
-    rows_on_chip: int
-    worlds_per_block: int = 1
-    min_blocks: int = 0
-    longest_first: bool = True
-
-
 @functools.cache
 def newton_kernel(
-    nv: int, njmax: int, elliptic: bool, ls_iterations: int, lanes: int, place: Placement, checked: bool
+    nv: int, njmax: int, elliptic: bool, ls_iterations: int, lanes: int, rows_on_chip: int, checked: bool
 ) -> wp.Kernel:
     """Return the kernel of a `Problem` with `nv` degrees of freedom; launch it over (worlds, lanes).
 
-    There are 32 lanes on CUDA and 1 on the CPU. Rows that find no room on the chip are in the scratch. A `checked`
-    (debug) build writes each world's broken `Invariant`s.
+    There are 32 lanes on CUDA and 1 on the CPU. Rows beyond those on the chip (in shared memory) are in the scratch. A
+    `checked` (debug) build writes each world's broken `Invariant`s.
     """
     states, rows = mujoco.mjtConstraintState, mujoco.mjtConstraint
     constants = {
@@ -125,10 +104,9 @@ def newton_kernel(
         "PADDED_ROWS": _padded(njmax),
         "STRIDE": row_stride(nv),
         "COLUMN": _column(nv),
-        "ROWS_ON_CHIP": place.rows_on_chip,
+        "ROWS_ON_CHIP": rows_on_chip,
         "LANES": lanes,
-        "WORLDS_PER_BLOCK": place.worlds_per_block,
-        "FLOATS": floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=place.rows_on_chip),
+        "FLOATS": floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=rows_on_chip),
         "MOST_TRIALS": ls_iterations,
         "ELLIPTIC": elliptic,
         "ELLIPTIC_CONTACT": rows.mjCNSTR_CONTACT_ELLIPTIC,
@@ -149,15 +127,11 @@ def newton_kernel(
     @wp.func_native(snippet)
     def solve_world(world: int, lane: int, problem: Problem) -> None: ...
 
-    block = place.worlds_per_block * lanes
-    bounds = {"launch_bounds": (block, place.min_blocks)} if place.min_blocks else {}
-
     @wp.kernel(
         module="unique",
         enable_backward=False,
         grid_stride=False,
-        module_options={"block_dim": block, "fast_math": True},
-        **bounds,
+        module_options={"block_dim": lanes, "fast_math": True},
     )
     def kernel(problem: Problem):
         world, lane = wp.tid()
@@ -199,10 +173,7 @@ def sort_by_counting(problem: Problem) -> None:
 
 
 @wp.kernel(
-    module="unique",
-    enable_backward=False,
-    grid_stride=False,
-    module_options={"block_dim": SORTING_THREADS},
+    module="unique", enable_backward=False, grid_stride=False, module_options={"block_dim": SORTING_THREADS}
 )
 def sort_worlds(problem: Problem):
     """Write the order of the worlds, by one block."""

@@ -26,8 +26,7 @@ constexpr float NOISE = 8.0f * 1.1920929e-07f;  // rounding of a sum of some flo
 constexpr int BLOCKS = (NV + LANES - 1) / LANES;
 
 #if defined(__CUDA_ARCH__)
-__shared__ __align__(16) float floats[WORLDS_PER_BLOCK * FLOATS];
-float* const memory = floats + (threadIdx.x / LANES) * FLOATS;
+__shared__ __align__(16) float memory[FLOATS];
 #else
 static float memory[FLOATS];
 #endif
@@ -85,6 +84,8 @@ auto total = [](float value) {
 UNROLL
     for (int distance = LANES / 2; distance > 0; distance >>= 1)
         value += __shfl_xor_sync(0xffffffffu, value, distance);
+    // A fused multiply-add may round the first sum otherwise in each lane: one of them speaks for all.
+    value = __shfl_sync(0xffffffffu, value, 0);
 #endif
     return value;
 };

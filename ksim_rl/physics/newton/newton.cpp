@@ -1,8 +1,34 @@
-// Part 6: Newton's method, from the warm start to the accelerations and forces (computation chapter, "Algorithms").
+// Part 6: Newton's method, from its start to the accelerations and forces (computation chapter, "Algorithms").
 // It ends, as mujoco_warp's solver.py (_solve_done) does, once the scaled gradient, Newton decrement or improvement
 // is below the tolerance, or a line search finds nothing better.
 
 times_mass(M_qacc, qacc);
+// The start is the warm start, or zero where that is cheaper; C compares with the unconstrained acceleration, which
+// nothing here computes. Without rows it is zero: the one step from there rounds by what it finds, not by how far away
+// the warm start is.
+float excess = 0.0f;
+UNROLL
+for (int block = 0; block < BLOCKS; ++block)
+    excess += is_dof(block) ? qacc[block] * (0.5f * M_qacc[block] - qfrc_smooth[block]) : 0.0f;
+#pragma unroll 1
+for (int row = lane; row < rows; row += LANES)
+#pragma unroll 1
+    for (int at_zero = 0; at_zero < 2; ++at_zero) {
+        const float cost = cost_of(row, [&](int mate) {
+            return at_zero ? -row_of(problem.efc_aref)[mate] : residual[mate];
+        });
+        excess += at_zero ? -cost : cost;
+    }
+if (rows == 0 || total(excess) > 0.0f) {
+UNROLL
+    for (int block = 0; block < BLOCKS; ++block)
+        qacc[block] = M_qacc[block] = 0.0f;
+    sync();
+#pragma unroll 1
+    for (int row = lane; row < rows; row += LANES)
+        residual[row] = efc_D[row] > 0.0f ? -row_of(problem.efc_aref)[row] : 0.0f;
+    sync();
+}
 float trace = 0.0f;
 UNROLL
 for (int block = 0; block < BLOCKS; ++block)

@@ -8,7 +8,6 @@ import warp as wp
 
 from ksim_rl.physics.newton.kernel import (
     CUDA_LANES,
-    Placement,
     Problem,
     floats_per_world,
     newton_kernel,
@@ -70,53 +69,46 @@ def takes_conditional_nodes(warp_model: mjw.Model, *, supported: bool) -> bool:
     return supported and int(warp_model.opt.iterations) > MOST_UNCONDITIONAL_ITERATIONS
 
 
-def placement(*, nv: int, njmax: int, elliptic: bool) -> Placement:
-    """Return where the worlds go on CUDA: half of the rows, which few worlds exceed, on chip where that fits."""
-    room = FLOATS_PER_WORLD - floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=0)
-    return Placement(rows_on_chip=min(-(-njmax // 2), max(0, room // row_stride(nv))))
-
-
 def solver(
     warp_model: mjw.Model,
     warp_data_E: mjw.Data,
     *,
-    place: Placement | None = None,
+    rows_on_chip: int | None = None,
     broken: wp.array | None = None,
 ) -> Callable[[], None]:
     """Return what launches the solver: accelerations and forces from the constraint rows, which must be sparse.
 
     Args:
         warp_model, warp_data_E: a model that is not `unsuited`, and its worlds, with arrays in their final place.
-        place: how they lie on a CUDA device; None is what was measured to be best.
+        rows_on_chip: None is what was measured to be best: half of the rows, which few worlds exceed, where they fit.
         broken: int32 [E], makes a debug build, which adds to each world's number the `Invariant`s that do not hold.
     """
     m, d, efc = warp_model, warp_data_E, warp_data_E.efc
     elliptic = bool(m.opt.cone == mjw.ConeType.ELLIPTIC)
     on_cuda = d.qpos.device.is_cuda
     lanes = CUDA_LANES if on_cuda else 1
-    if place is None and on_cuda:
-        place = placement(nv=m.nv, njmax=d.njmax, elliptic=elliptic)
-    place = place or Placement(rows_on_chip=d.njmax)
+    if rows_on_chip is None:
+        room = FLOATS_PER_WORLD - floats_per_world(m.nv, d.njmax, elliptic=elliptic, rows_on_chip=0)
+        rows_on_chip = min(-(-d.njmax // 2), max(0, room // row_stride(m.nv))) if on_cuda else d.njmax
     ls_iterations, checked = int(m.opt.ls_iterations), broken is not None
-    kernel = newton_kernel(m.nv, d.njmax, elliptic, ls_iterations, lanes, place, checked)
-    far_floats = (d.njmax - place.rows_on_chip) * row_stride(m.nv)
+    kernel = newton_kernel(m.nv, d.njmax, elliptic, ls_iterations, lanes, rows_on_chip, checked)
+    far_floats = (d.njmax - rows_on_chip) * row_stride(m.nv)
     device = d.qpos.device
     own = {
         "efc_J_colind": efc.J_colind.reshape((d.nworld, -1)),
         "efc_J": efc.J.reshape((d.nworld, -1)),
-        "contact_friction": d.contact.friction,
         "scratch": wp.empty((d.nworld, far_floats), dtype=float, device=device),
         "order": wp.array(list(range(d.nworld)), dtype=int, device=device),
         "broken": wp.empty(0, dtype=int, device=device) if broken is None else broken,
     }
     rows = {f"efc_{name}": array for name, array in vars(efc).items()}
-    problem = filled(Problem, own, rows, m, m.opt, d)
-    dim, block_dim = (d.nworld, lanes), place.worlds_per_block * lanes
+    contacts = {f"contact_{name}": array for name, array in vars(d.contact).items()}
+    problem = filled(Problem, own, rows, contacts, m, m.opt, d)
 
     def launch() -> None:
-        if on_cuda and place.longest_first:
+        if on_cuda:
             put_longest_first(problem)
-        wp.launch(kernel, dim=dim, inputs=[problem], block_dim=block_dim)
+        wp.launch(kernel, dim=(d.nworld, lanes), inputs=[problem], block_dim=lanes)
 
     return launch
 
@@ -140,9 +132,9 @@ def step(warp_model: mjw.Model, warp_data_E: mjw.Data, solve: Callable[[], None]
     mjw.fwd_actuation(m, d)
     mjw.fwd_acceleration(m, d, factorize=True)
     solve()
+    if m.opt.run_rne_postconstraint or (sensors and m.sensor_rne_postconstraint):
+        mjw.rne_postconstraint(m, d)
     if sensors:
-        if m.sensor_rne_postconstraint:
-            mjw.rne_postconstraint(m, d)
         mjw.sensor_acc(m, d, skip_rne_postconstraint=True)
     if m.opt.integrator == mjw.IntegratorType.EULER:
         mjw.euler(m, d)

@@ -21,11 +21,7 @@ Law = Callable[[JointState, JointTarget], Float[Tensor, "E N"]]
 
 
 class Drive:
-    """The N joints of one law, in the model's order.
-
-    Attributes:
-        num_envs, num_joints, device: E, N, and where the buffers live.
-    """
+    """The N joints of one law, in the model's order."""
 
     def __init__(self, name: str, simulation: Simulation, view: WorldView, joint_ids: Sequence[int]) -> None:
         model = view.world.mj_model
@@ -39,21 +35,21 @@ class Drive:
         self._at_reset: list[Callable[[Bool[Tensor, " E"]], None]] = []
 
     def param(self, name: str) -> Float[Tensor, "E N"]:
-        """Return the present values of a number of `Actuator.params`, [E, N]."""
+        """Return the present values of a number of `Actuator.params`."""
         return self._view.actuator_param(name)[:, self._joints]
 
     def buffer(
         self, name: str, *shape: int, dtype: torch.dtype = torch.float32, keep: bool = False
     ) -> Shaped[Tensor, " E *shape"]:
-        """Return a buffer [E, *shape] of the law; rows that reset are zeroed unless `keep`."""
+        """Return a buffer of the law; rows that reset are zeroed unless `keep`."""
         return self._view.buffers.get(f"{self._name}.{name}", *shape, dtype=dtype, keep=keep)
 
     def on_reset(self, draw: Callable[[Bool[Tensor, " E"]], None]) -> None:
-        """Call `draw` with the mask of the rows that reset, bool [E]; it may draw by `integers`."""
+        """Call `draw` with the mask of the rows that reset; it may draw by `integers`."""
         self._at_reset.append(draw)
 
     def integers(self, n: int, low: int, high: int) -> Int64[Tensor, "E L"]:
-        """Draw int64 [E, n] from {low, ..., high}; the numbers depend on seed, law, env and count of resets only."""
+        """Draw from {low, ..., high}; the numbers depend on seed, law, env and count of resets only."""
         return self._view.integers(n, low, high)
 
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
@@ -79,7 +75,7 @@ class Drive:
 
 
 class SubstepRing:
-    """The last `depth` values [E, L] of a signal, the newest first; before an episode's first value lies that value."""
+    """The last `depth` values of a signal, the newest first; before an episode's first value lies that value."""
 
     def __init__(self, drive: Drive, name: str, depth: int, width: int) -> None:
         # Of a row that resets, what lies there is never read again, so there is no need to clear it.
@@ -94,11 +90,11 @@ class SubstepRing:
         self._started_E.fill_(True)
 
     def at(self, lag: int) -> Float[Tensor, "E L"]:
-        """Return the value of `lag` substeps ago, [E, L]."""
+        """Return the value of `lag` substeps ago."""
         return self._ring_EKL[:, lag]
 
     def at_rows(self, lag_E: Int64[Tensor, " E"]) -> Float[Tensor, "E L"]:
-        """Return the value of each row's own number of substeps ago (int64 [E]), [E, L]."""
+        """Return the value of each row's own number of substeps ago."""
         index_E1L = lag_E[:, None, None].expand(-1, 1, self._ring_EKL.shape[2])
         return self._ring_EKL.gather(1, index_E1L)[:, 0]
 
@@ -145,14 +141,10 @@ class Actuator(Checked, ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class JointActuator(Actuator):
-    """What all actuators of joints have.
+    """What all actuators of joints have; each hinge or slide that `joints` matches gets an actuator of its name.
 
-    Attributes:
-        joints: names or patterns; each hinge or slide that matches gets an actuator of its name.
-        effort_limit: bound of the effort, N m or N, symmetric; it takes the place of the joint's own limit in the MJCF.
-            None keeps that one.
-        armature: inertia of the motor as the joint feels it, kg m^2 or kg; None keeps the model's.
-        frictionloss: dry friction, N m or N; None keeps the model's.
+    `effort_limit` (N m or N, symmetric), `armature` (inertia of the motor as the joint feels it, kg m^2 or kg) and
+    `frictionloss` (N m or N) take the place of the model's; None keeps those.
     """
 
     joints: Patterns
@@ -162,11 +154,9 @@ class JointActuator(Actuator):
 
     @property
     def driven(self) -> Patterns:
-        """The names or patterns of the joints."""
         return self.joints
 
     def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
-        """Set the limit of the force, and the joint's passive properties."""
         # Each attribute is written: the model's default class may hold others.
         actuator.gear = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
         actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
@@ -193,7 +183,6 @@ class ExplicitActuator(JointActuator):
 
     @property
     def params(self) -> Mapping[str, float]:
-        """The limit, which each world may change; infinite for None."""
         return {"effort_limit": float("inf") if self.effort_limit is None else self.effort_limit}
 
     def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:

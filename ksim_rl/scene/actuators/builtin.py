@@ -1,4 +1,4 @@
-"""The actuators that MuJoCo computes itself. Their numbers are model fields, which may differ between worlds.
+"""This module has the actuators that MuJoCo computes itself; their numbers are model fields, which worlds may vary.
 
 MuJoCo's effort is `gain * ctrl + bias`, clamped to `forcerange`, times the gear. A position servo has
 `actuator_gainprm[0] = stiffness` and `actuator_biasprm[1:3] = (-stiffness, -damping)`, a velocity servo
@@ -8,7 +8,7 @@ MuJoCo's effort is `gain * ctrl + bias`, clamped to `forcerange`, times the gear
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import mujoco
 from torch import Tensor
@@ -18,23 +18,6 @@ from ksim_rl.scene.actuators.actuator import Drive, JointActuator, Law
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKind, control_kind
 
-GAINS = {
-    "fixed": mujoco.mjtGain.mjGAIN_FIXED,
-    "affine": mujoco.mjtGain.mjGAIN_AFFINE,
-    "muscle": mujoco.mjtGain.mjGAIN_MUSCLE,
-}
-BIASES = {
-    "none": mujoco.mjtBias.mjBIAS_NONE,
-    "affine": mujoco.mjtBias.mjBIAS_AFFINE,
-    "muscle": mujoco.mjtBias.mjBIAS_MUSCLE,
-}
-DYNAMICS = {
-    "none": mujoco.mjtDyn.mjDYN_NONE,
-    "integrator": mujoco.mjtDyn.mjDYN_INTEGRATOR,
-    "filter": mujoco.mjtDyn.mjDYN_FILTER,
-    "filterexact": mujoco.mjtDyn.mjDYN_FILTEREXACT,
-    "muscle": mujoco.mjtDyn.mjDYN_MUSCLE,
-}
 _NUM_PARAMETERS = 10
 
 
@@ -43,7 +26,6 @@ class BuiltinActuator(JointActuator):
     """An actuator that MuJoCo computes from one kind of target."""
 
     def law(self, drive: Drive) -> Law:
-        """Return the target itself, which is the control."""
         (kind,) = self.takes
 
         def control_EN(state: JointState, target: JointTarget) -> Tensor:
@@ -54,14 +36,10 @@ class BuiltinActuator(JointActuator):
 
 @dataclass(frozen=True, kw_only=True)
 class PositionActuator(BuiltinActuator):
-    """MuJoCo's position servo: effort = stiffness * (target - position) - damping * velocity.
+    """MuJoCo's position servo: effort = stiffness * (target - position) - damping * velocity; SI units.
 
     The control range that it writes is what can still change the effort at a joint limit, and does not clip: a clipped
     target would hide from the policy what it asked for.
-
-    Attributes:
-        stiffness: N m / rad or N / m.
-        damping: N m s / rad or N s / m.
     """
 
     stiffness: Positive
@@ -92,7 +70,6 @@ class PositionActuator(BuiltinActuator):
     _takes: ClassVar[frozenset[TargetKind]] = frozenset({"pos"})
 
     def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
-        """Make the servo."""
         super().configure(actuator, joint)
         actuator.set_to_position(kp=self.stiffness, kv=self.damping)
         if self.effort_limit is not None:
@@ -102,30 +79,24 @@ class PositionActuator(BuiltinActuator):
 
 @dataclass(frozen=True, kw_only=True)
 class VelocityActuator(BuiltinActuator):
-    """MuJoCo's velocity servo: effort = damping * (target - velocity).
-
-    Attributes:
-        damping: N m s / rad or N s / m.
-    """
+    """MuJoCo's velocity servo: effort = damping * (target - velocity), with damping in N m s / rad or N s / m."""
 
     damping: Positive
 
     _takes: ClassVar[frozenset[TargetKind]] = frozenset({"vel"})
 
     def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
-        """Make the servo."""
         super().configure(actuator, joint)
         actuator.set_to_velocity(kv=self.damping)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotorActuator(BuiltinActuator):
-    """MuJoCo's motor: effort = target."""
+    """MuJoCo's motor: effort = target; its control range is its effort limit."""
 
     _takes: ClassVar[frozenset[TargetKind]] = frozenset({"effort"})
 
     def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
-        """Make the motor; its control range is its effort limit."""
         super().configure(actuator, joint)
         actuator.set_to_motor()
         if self.effort_limit is not None:
@@ -135,14 +106,7 @@ class MotorActuator(BuiltinActuator):
 
 @dataclass(frozen=True, kw_only=True)
 class GeneralActuator(BuiltinActuator):
-    """MuJoCo's general actuator; the fields mean what MJCF's attributes of these names mean.
-
-    Attributes:
-        gaintype, biastype, dyntype: how effort depends on the control or activation.
-        gainprm, biasprm, dynprm: up to ten numbers each; the others are 0.
-        gear: the first number of MJCF's gear.
-        ctrlrange, actrange: clamp the control and the activation; None: no clamp.
-    """
+    """MuJoCo's general actuator, as in MJCF: up to ten numbers each, others 0; the first of `gear`; ranges clamp."""
 
     gaintype: Literal["fixed", "affine", "muscle"] = "fixed"
     gainprm: tuple[float, ...] = (1.0,)
@@ -162,16 +126,24 @@ class GeneralActuator(BuiltinActuator):
                 raise ValueError(f"{name} has {len(numbers)} numbers: expected at most {_NUM_PARAMETERS}")
 
     @property
+    def _enums(self) -> dict[str, Any]:
+        """The members of MuJoCo's mjtGain, mjtBias and mjtDyn that the types name."""
+        types = {"gain": self.gaintype, "bias": self.biastype, "dyn": self.dyntype}
+        return {
+            kind: getattr(getattr(mujoco, f"mjt{kind.title()}"), f"mj{kind.upper()}_{name.upper()}")
+            for kind, name in types.items()
+        }
+
+    @property
     def takes(self) -> frozenset[TargetKind]:
-        """What the bias makes the control a target for."""
-        return frozenset({control_kind(BIASES[self.biastype], _padded(self.biasprm), DYNAMICS[self.dyntype])})
+        return frozenset({control_kind(self._enums["bias"], _padded(self.biasprm), self._enums["dyn"])})
 
     def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
-        """Write all attributes."""
         super().configure(actuator, joint)
-        actuator.gaintype, actuator.gainprm = GAINS[self.gaintype], _padded(self.gainprm)
-        actuator.biastype, actuator.biasprm = BIASES[self.biastype], _padded(self.biasprm)
-        actuator.dyntype, actuator.dynprm = DYNAMICS[self.dyntype], _padded(self.dynprm)
+        kinds = self._enums
+        actuator.gaintype, actuator.gainprm = kinds["gain"], _padded(self.gainprm)
+        actuator.biastype, actuator.biasprm = kinds["bias"], _padded(self.biasprm)
+        actuator.dyntype, actuator.dynprm = kinds["dyn"], _padded(self.dynprm)
         actuator.gear = [self.gear, 0.0, 0.0, 0.0, 0.0, 0.0]
         if self.ctrlrange is not None:
             actuator.ctrllimited, actuator.ctrlrange = mujoco.mjtLimited.mjLIMITED_TRUE, self.ctrlrange

@@ -20,9 +20,6 @@ def set_actuators(spec: mujoco.MjSpec, actuators: Sequence[Actuator]) -> None:
 
     Actuators of the model that drive the same joints are replaced, and their sensors read the new ones; the model's
     other actuators stay, in front.
-
-    Raises:
-        ValueError: naming the pattern that matches no joint, or the joint that two entries drive.
     """
     joints = {joint.name: joint for joint in spec.joints if joint.type in _SCALAR}
     driven = driven_joints(actuators, list(joints))
@@ -44,11 +41,7 @@ def set_actuators(spec: mujoco.MjSpec, actuators: Sequence[Actuator]) -> None:
 def driven_joints(
     actuators: Sequence[Actuator], joint_names: Sequence[str]
 ) -> list[tuple[Actuator, list[str]]]:
-    """Return which of the joints each entry drives, in the order of `joint_names`.
-
-    Raises:
-        ValueError: naming the pattern that matches no joint, or the joint that two entries drive.
-    """
+    """Return which of the joints each entry drives, in the order of `joint_names`; a ValueError if two drive one."""
     driven: list[tuple[Actuator, list[str]]] = []
     entry_of: dict[str, int] = {}
     for number, actuator in enumerate(actuators):
@@ -67,15 +60,8 @@ def driven_joints(
 class JointDrives:
     """Turns targets into the controls of motors before each physics substep.
 
-    Only explicit actuators have work here; without any, no hook is set and substeps stay one launch.
-
-    Args:
-        actuators: the `actuators` of each robot, by the prefix of its names.
-        simulation: what is driven.
-        view: whose targets are read, and whose controls are written.
-
-    Raises:
-        ValueError: naming the pattern that matches no joint, or the joint that two entries drive or that has no motor.
+    Only explicit actuators have work here; without any, no hook is set and substeps stay one launch. `actuators` are
+    those of each robot, by the prefix of its names.
     """
 
     def __init__(
@@ -102,7 +88,7 @@ class JointDrives:
             simulation.before_substep.append(self._apply)
 
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
-        """Draw the lags of the rows of `mask_E`, bool [E]."""
+        """Draw the lags of the rows of `mask_E`."""
         for drive, _ in self._drives:
             drive.reset(mask_E)
 

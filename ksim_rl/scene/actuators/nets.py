@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ksim_rl.checks import check_choice, check_in_range, near
+from ksim_rl.config.plain_data import MOST_DATA_BYTES, read_bytes
 from ksim_rl.scene.actuators.actuator import Drive, ExplicitActuator, Law, SubstepRing
 from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKind
 
@@ -29,28 +30,16 @@ Predictor = Callable[[Float[Tensor, "E N"], Float[Tensor, "E N"]], Float[Tensor,
 
 
 class NetFile:
-    """What a safetensors file holds; nothing in it is ever executed.
+    """The `tensors` (float32) and `metadata` (text) of a safetensors file, by name; nothing in it is ever executed.
 
-    Args:
-        file: its path; `~` is the home folder.
-        sha256: what its bytes must hash to (hexadecimal), or None.
-
-    Attributes:
-        where: path and SHA-256, for errors.
-        tensors: float32, by name.
-        metadata: text by name.
-
-    Raises:
-        ValueError: in one line with the path and the hash, if the file is missing, damaged or another one.
+    A ValueError with path and SHA-256 (`where`) if it is missing, damaged, or its bytes hash to anything but `sha256`.
     """
 
     def __init__(self, file: str, sha256: str | None) -> None:
         try:
-            data = Path(file).expanduser().read_bytes()
-        except OSError as error:
-            raise ValueError(
-                f"file={file!r}: {error.strerror or error}: expected a safetensors file"
-            ) from None
+            data = read_bytes(Path(file).expanduser(), limit=MOST_DATA_BYTES, follows_links=True)
+        except ValueError as error:
+            raise ValueError(f"file={file!r}: {error}: expected a safetensors file") from None
         digest = hashlib.sha256(data).hexdigest()
         self.where = f"file={file!r} (SHA-256 {digest})"
         if sha256 is not None and digest != sha256.lower():
@@ -65,11 +54,7 @@ class NetFile:
         self.metadata: dict[str, str] = header.get("__metadata__", {})
 
     def tensor(self, name: str, *shape: int) -> Float[Tensor, "*shape"]:
-        """Return a tensor of this shape, where -1 fits any size.
-
-        Raises:
-            ValueError: in one line, if it is missing, of another shape, or not finite.
-        """
+        """Return a tensor of finite numbers and of this shape, where -1 fits any size."""
         if name not in self.tensors:
             raise ValueError(f"{self.where}: no tensor {name!r}: {near(name, self.tensors)}")
         tensor = self.tensors[name]
@@ -98,11 +83,10 @@ class NetActuator(ExplicitActuator):
     legged robots", Science Robotics 4 (2019). Its effort is kept inside the effort limit.
 
     Attributes:
-        file: path of a safetensors file with the weights.
-        sha256: what the file must hash to (hexadecimal); None takes any.
+        file: path of a safetensors file with the weights, whose bytes hash to `sha256` (hexadecimal) unless that is
+            None.
         position_scale, velocity_scale: multiply position errors (target - position, rad or m) and velocities (rad/s or
-            m/s) on their way in. None: the file's metadata of that name, else 1.
-        effort_scale: multiplies the output, which gives N m or N. None: likewise.
+            m/s) on their way in, `effort_scale` the output, which gives N m or N. None: the file's metadata, else 1.
     """
 
     _takes: ClassVar[frozenset[TargetKind]] = frozenset({"pos"})
@@ -118,7 +102,6 @@ class NetActuator(ExplicitActuator):
         """Return the network of a file, with the buffers that it needs; inputs and output are scaled already."""
 
     def law(self, drive: Drive) -> Law:
-        """Load the network, and return it between its scales."""
         net = NetFile(self.file, self.sha256)
         position_scale, velocity_scale, effort_scale = (
             float(self.setting(net, name, 1.0)) for name in _SCALES
@@ -134,11 +117,7 @@ class NetActuator(ExplicitActuator):
         return effort_EN
 
     def setting(self, net: NetFile, name: str, default: Any = None) -> Any:
-        """Return a field or, if that is None, the metadata of its name, as text, or the default.
-
-        Raises:
-            ValueError: if none of them has it, or the metadata is no number where the field is one.
-        """
+        """Return a field or, if that is None, the metadata of its name, as text, or the default."""
         value = getattr(self, name)
         if value is not None:
             return value
@@ -161,13 +140,10 @@ class NetActuator(ExplicitActuator):
 class MLPActuator(NetActuator):
     """A feed-forward network of the position errors and velocities at some past substeps.
 
-    The file holds what `nn.Sequential(Linear, activation, Linear, ...).state_dict()` gives: `0.weight` [H, F],
-    `0.bias` [H], `2.weight`, ... The F inputs are the position errors at `input_lags`, in that order, then the
-    velocities; the output is one number. After a reset the first state counts as having been there before.
-
-    Attributes:
-        activation: None: the file's metadata `activation`.
-        input_lags: physics substeps, 0 is the present. None: the file's metadata `input_lags`, such as "[0, 2, 4]".
+    The file holds what `nn.Sequential(Linear, activation, Linear, ...).state_dict()` gives: `0.weight` [H, F], `0.bias`
+    [H], `2.weight`, ... The F inputs are the position errors at `input_lags` (physics substeps, 0 is the present), in
+    that order, then the velocities; the output is one number. After a reset the first state counts as having been there
+    before. A field that is None is read from the file's metadata, such as `input_lags` "[0, 2, 4]".
     """
 
     activation: Literal["elu", "relu", "softsign", "tanh"] | None = None
@@ -179,7 +155,6 @@ class MLPActuator(NetActuator):
             _check_lags("input_lags", self.input_lags)
 
     def load(self, net: NetFile, drive: Drive) -> Predictor:
-        """Return the network with its history."""
         lags = self._lags(net)
         activation = self.setting(net, "activation")
         check_choice(f"{net.where}: activation", activation, ACTIVATIONS)
@@ -245,7 +220,6 @@ class LSTMActuator(NetActuator):
     """
 
     def load(self, net: NetFile, drive: Drive) -> Predictor:
-        """Return the network with its state."""
         found = [re.fullmatch(r"lstm\.weight_ih_l(\d+)", name) for name in net.tensors]
         num_layers = max(1, sum(match is not None for match in found))
         size = net.tensor("lstm.weight_hh_l0", -1, -1).shape[1]

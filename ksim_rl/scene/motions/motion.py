@@ -1,7 +1,6 @@
-"""Reference motions: recorded states of a scene, at any time between their frames."""
+"""This module reads reference motions: recorded states of a scene, at any time between their frames."""
 
-from __future__ import annotations
-
+import io
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from ksim_rl.checks import near
-from ksim_rl.scene.motions import motion_names, motion_path
+from ksim_rl.config.plain_data import MOST_DATA_BYTES, read_bytes
 from ksim_rl.scene.names import Index, scalar_joint_ids
 
 KEYS = ("fps", "qpos", "qvel")
@@ -26,12 +25,9 @@ class ReferenceMotion:
     """F frames of generalized positions and velocities in MuJoCo's layout, `fps` of them per second.
 
     Attributes:
-        fps: frames per s.
-        qpos_FL, qvel_FL: float32 [F, nq] and [F, nv], on the env's device.
         quats: the columns of qpos at which unit quaternions (w, x, y, z) begin.
         joint_pos_FL, joint_vel_FL: the columns of hinges and slides, as in `view.joint_pos_EL`.
-        body_pos_FN3, body_quat_FN4: the poses of all bodies (N, the world first) in these states, world frame, m and
-            (w, x, y, z).
+        body_pos_FN3, body_quat_FN4: the poses of all bodies (the world first), world frame, m and (w, x, y, z).
     """
 
     fps: float
@@ -49,7 +45,7 @@ class ReferenceMotion:
         return (self.qpos_FL.shape[0] - 1) / self.fps
 
     def sample(self, time_E: Float[Tensor, " E"]) -> tuple[Float[Tensor, "E L"], Float[Tensor, "E M"]]:
-        """Return qpos [E, nq] and qvel [E, nv] at times, s, [E]; before the first and after the last frame those stay.
+        """Return qpos and qvel at times, s; before the first and after the last frame those stay.
 
         Between frames both are interpolated linearly, quaternions along the shorter arc and normalized.
         """
@@ -64,7 +60,7 @@ class ReferenceMotion:
     def sample_joints(
         self, time_E: Float[Tensor, " E"], joints: Index
     ) -> tuple[Float[Tensor, "E N"], Float[Tensor, "E N"]]:
-        """Return positions and velocities of hinges and slides, [E, N] each, at times, s, [E]."""
+        """Return positions and velocities of hinges and slides at times, s."""
         low_E, share_E1 = self._between(time_E)
         pos_EL, vel_EL = (
             torch.lerp(_entries(table_FL, low_E, joints), _entries(table_FL, low_E + 1, joints), share_E1)
@@ -75,7 +71,7 @@ class ReferenceMotion:
     def sample_bodies(
         self, time_E: Float[Tensor, " E"], bodies: Index
     ) -> tuple[Float[Tensor, "E N 3"], Float[Tensor, "E N 4"]]:
-        """Return the poses of bodies, [E, N, 3] and [E, N, 4], at times, s, [E]; between frames as in `sample`."""
+        """Return the poses of bodies at times, s; between frames as in `sample`."""
         low_E, share_E1 = self._between(time_E)
         (pos_EN3, next_pos_EN3), (quat_EN4, next_quat_EN4) = (
             (_entries(table, low_E, bodies), _entries(table, low_E + 1, bodies))
@@ -92,13 +88,16 @@ class ReferenceMotion:
         return low_E, (frame_E - low_E)[:, None]
 
 
+def motion_path(file: str) -> Path:
+    """Return where a motion of this name lies in the package or, if there is none of this name, `file` as a path."""
+    shipped = Path(__file__).parent / f"{file}.npz"
+    return shipped if shipped.is_file() and shipped.parent == Path(__file__).parent else Path(file)
+
+
 def load_motion(file: str | Path, mj_model: mujoco.MjModel, device: torch.device) -> ReferenceMotion:
     """Read an .npz file of the model: `fps`, `qpos` [F, nq], `qvel` [F, nv] and, if it has them, `joint_names`.
 
     The file may be the name of a motion that comes with the package (`ksim_rl.scene.motions`).
-
-    Raises:
-        ValueError: naming the file and what does not fit the model, with the near names.
     """
     arrays = _read(motion_path(str(file)))
     fps = arrays["fps"]
@@ -118,9 +117,17 @@ def load_motion(file: str | Path, mj_model: mujoco.MjModel, device: torch.device
         raise ValueError(
             f"motion {file}: qpos has {arrays['qpos'].shape[0]} frames and qvel {arrays['qvel'].shape[0]}"
         )
-    if "joint_names" in arrays:
-        _check_joints(file, [str(name) for name in arrays["joint_names"]], mj_model)
-    quats = _quaternion_columns(mj_model)
+    names, own = arrays.get("joint_names"), [mj_model.joint(i).name for i in range(mj_model.njnt)]
+    for name in () if names is None else names:
+        if name not in own:
+            raise ValueError(f"motion {file}: the model has no joint {str(name)!r}: {near(str(name), own)}")
+    if names is not None and [str(name) for name in names] != own:
+        raise ValueError(
+            f"motion {file}: joint_names={names.tolist()}: expected the model's joints in their order, {own}"
+        )
+    starts = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
+    places = zip(mj_model.jnt_type.tolist(), mj_model.jnt_qposadr.tolist(), strict=True)
+    quats = tuple(address + starts[kind] for kind, address in places if kind in starts)
     for start in quats:
         norms = np.linalg.norm(arrays["qpos"][:, start : start + 4], axis=-1)
         if np.abs(norms - 1.0).max() > 1e-3:
@@ -148,11 +155,19 @@ def load_motion(file: str | Path, mj_model: mujoco.MjModel, device: torch.device
 
 def _read(path: Path) -> Mapping[str, np.ndarray]:
     if not path.exists():
+        shipped = ", ".join(sorted(own.stem for own in Path(__file__).parent.glob("*.npz")))
         raise ValueError(
-            f"motion {path}: no such file, and none of that name comes with the package: {', '.join(motion_names())}"
+            f"motion {path}: no such file, and none of that name comes with the package: {shipped}"
         )
     try:
-        archive = np.load(path, allow_pickle=False)
+        data = io.BytesIO(read_bytes(path, limit=MOST_DATA_BYTES, follows_links=True))
+        if (
+            zipfile.is_zipfile(data)
+            and sum(entry.file_size for entry in zipfile.ZipFile(data).filelist) > MOST_DATA_BYTES
+        ):
+            raise ValueError(f"its arrays are larger than {MOST_DATA_BYTES} bytes")
+        data.seek(0)
+        archive = np.load(data, allow_pickle=False)
         if not isinstance(archive, np.lib.npyio.NpzFile):
             raise ValueError("it holds one array, not an archive of arrays")
         with archive:
@@ -168,17 +183,6 @@ def _read(path: Path) -> Mapping[str, np.ndarray]:
             f"motion {path}: unknown array {unknown[0]!r}: {near(unknown[0], (*KEYS, *_OPTIONAL))}"
         )
     return arrays
-
-
-def _check_joints(file: str | Path, names: list[str], mj_model: mujoco.MjModel) -> None:
-    own = [mj_model.joint(i).name for i in range(mj_model.njnt)]
-    for name in names:
-        if name not in own:
-            raise ValueError(f"motion {file}: the model has no joint {name!r}: {near(name, own)}")
-    if names != own:
-        raise ValueError(
-            f"motion {file}: joint_names={names}: expected the model's joints in their order, {own}"
-        )
 
 
 def _entries(table: Tensor, frame_E: Int64[Tensor, " E"], columns: Index) -> Tensor:
@@ -203,9 +207,3 @@ def _body_poses(mj_model: mujoco.MjModel, qpos_FL: np.ndarray) -> tuple[np.ndarr
         pos_FN3.append(data.xpos.copy())
         quat_FN4.append(data.xquat.copy())
     return np.stack(pos_FN3), np.stack(quat_FN4)
-
-
-def _quaternion_columns(mj_model: mujoco.MjModel) -> tuple[int, ...]:
-    kinds = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
-    joints = zip(mj_model.jnt_type, mj_model.jnt_qposadr, strict=True)
-    return tuple(int(address) + kinds[int(kind)] for kind, address in joints if int(kind) in kinds)

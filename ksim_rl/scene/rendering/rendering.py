@@ -1,7 +1,5 @@
 """This module draws pictures of an env off screen, by MuJoCo's renderer on an OpenGL platform that works here."""
 
-from __future__ import annotations
-
 import copy
 import importlib
 import os
@@ -18,7 +16,6 @@ from ksim_rl.physics import World
 from ksim_rl.physics.fields import write_fields
 from ksim_rl.scene.rendering.visualizer import (
     DebugVisualizer,
-    SceneVisualizer,
     add_geoms,
     place,
     visible_groups,
@@ -35,13 +32,10 @@ _FIXES = (
 
 @cache
 def choose_gl_platform() -> str:
-    """Make MuJoCo draw with a platform that works, and return its name.
+    """Make MuJoCo draw with a platform that works, and return its name; a RuntimeError tells how to get one.
 
     The environment variable MUJOCO_GL has the last word. Without it each candidate is tried in a process of its own,
     because a platform that fails cannot be exchanged for another in the same process.
-
-    Raises:
-        RuntimeError: if none works, with the ways to get one.
     """
     if os.environ.get("MUJOCO_GL"):
         return os.environ["MUJOCO_GL"]
@@ -69,9 +63,6 @@ class OffscreenRenderer:
     """Draws one env, or several side by side, with the camera of a `ViewerCfg`.
 
     The OpenGL context is opened at the first picture, so that an env with a render mode can be built anywhere.
-
-    Raises:
-        ValueError: if the camera tracks a body that the model does not have.
     """
 
     def __init__(self, mj_model: mujoco.MjModel, cfg: ViewerCfg, *, spacing: float) -> None:
@@ -90,18 +81,14 @@ class OffscreenRenderer:
             self._body = names.index(cfg.body)
 
     def render(self, world: World, *, draw: Callable[[DebugVisualizer, int], None]) -> np.ndarray:
-        """Return a picture of the current state, uint8 [H, W, 3]; `draw` adds the debug drawing of one env.
-
-        Raises:
-            RuntimeError: if no OpenGL platform works, with the ways to get one.
-        """
+        """Return a picture of the current state, uint8 [H, W, 3]; `draw` adds the debug drawing of one env."""
         renderer = self._open()
         first, last = self._cfg.env_index, min(self._cfg.env_index + self._cfg.num_envs, world.num_envs)
         self._pose(world, first)
         target = self._cfg.lookat if self._body is None else self._data.xpos[self._body]
         self._camera.lookat[:] = target
         renderer.update_scene(self._data, self._camera, visible_groups(self._mj_model))
-        draw(SceneVisualizer(self._mj_model, renderer.scene), first)
+        draw(DebugVisualizer(self._mj_model, renderer.scene), first)
         columns = int(np.ceil(np.sqrt(last - first)))
         for index in range(1, last - first):
             self._pose(world, first + index)
@@ -111,7 +98,7 @@ class OffscreenRenderer:
             if self._mj_model.nhfield:
                 static = mujoco.mjtCatBit.mjCAT_STATIC
                 add_geoms(self._mj_model, self._data, renderer.scene, offset, category=static)
-            draw(SceneVisualizer(self._mj_model, renderer.scene, offset), first + index)
+            draw(DebugVisualizer(self._mj_model, renderer.scene, offset), first + index)
         return renderer.render()
 
     def close(self) -> None:

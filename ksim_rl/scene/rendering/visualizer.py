@@ -1,9 +1,6 @@
 """This module says what terms may draw for debugging, and draws it into a MuJoCo scene."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -14,30 +11,11 @@ Vector = Sequence[float] | np.ndarray
 Rgba = tuple[float, float, float, float]
 
 
-class DebugVisualizer(Protocol):
-    """What commands, rewards and sensors draw with. Positions in m, world frame; colors in [0, 1]."""
+class DebugVisualizer:
+    """What commands, rewards and sensors draw with: m, world frame; colors in [0, 1].
 
-    def arrow(self, start: Vector, end: Vector, *, rgba: Rgba, width: float = 0.02) -> None:
-        """Draw an arrow from `start` to `end`."""
-
-    def sphere(self, center: Vector, *, radius: float, rgba: Rgba) -> None:
-        """Draw a ball."""
-
-    def frame(self, origin: Vector, rotation: np.ndarray, *, scale: float = 0.1) -> None:
-        """Draw the axes of a rotation matrix [3, 3] in red, green and blue."""
-
-    def line(self, start: Vector, end: Vector, *, rgba: Rgba, width: float = 2.0) -> None:
-        """Draw a line; `width` in pixels."""
-
-    def ghost(self, qpos: np.ndarray, *, rgba: Rgba) -> None:
-        """Draw the robot in another pose, transparently."""
-
-    def text(self, position: Vector, content: str) -> None:
-        """Write a label."""
-
-
-class SceneVisualizer:
-    """Draws into a `mujoco.MjvScene`; what exceeds the scene's capacity is refused, not dropped."""
+    It draws into a `mujoco.MjvScene`; what exceeds the scene's capacity is refused, not dropped.
+    """
 
     def __init__(
         self, mj_model: mujoco.MjModel, scene: mujoco.MjvScene, offset: Vector = (0.0, 0.0, 0.0)
@@ -123,11 +101,7 @@ def add_geoms(
     *,
     category: mujoco.mjtCatBit = mujoco.mjtCatBit.mjCAT_DYNAMIC,
 ) -> None:
-    """Add the geoms of a category (those that move, by default) of `data` to the scene, shifted by `offset` (m).
-
-    Raises:
-        RuntimeError: if they do not all fit.
-    """
+    """Add the geoms of a category (those that move, by default) of `data` to the scene, shifted by `offset` (m)."""
     first = scene.ngeom
     with caught_warnings():
         mujoco.mjv_addGeoms(

@@ -83,10 +83,7 @@ def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class BoosterT1(MenagerieRobot):
-    """The facts of the robot, and `spec()`, the model that they describe; fields as of `MenagerieRobot`.
-
-    It stands with bent knees and hanging arms.
-    """
+    """The facts of the robot, and `spec()`, the model that they describe, with bent knees and hanging arms."""
 
     init_pos: tuple[float, float, float] = (0.0, 0.0, 0.665)
     default_joint_pos: Mapping[str, float] = field(

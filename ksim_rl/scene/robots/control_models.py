@@ -1,4 +1,4 @@
-"""The small models of the control tasks, each in an MJCF file beside this one; none needs a download.
+"""This module has the small models of the control tasks, each in an MJCF file beside it; none needs a download.
 
 Hopper, cheetah and walker move in the xz plane: "root_x" (m), "root_z" (m, the torso's height) and "root_y" (rad,
 positive nose down); their sensor "com_velocity" reads the velocity of the centre of mass, world frame.
@@ -26,9 +26,9 @@ class ShippedModel:
 
 @dataclass(frozen=True, kw_only=True)
 class Cartpole(ShippedModel):
-    """A 1 kg cart on a 3.6 m rail with a 0.1 kg pole of 1 m.
+    """A 1 kg cart on a 3.6 m rail with a 0.1 kg pole of 1 m, and one motor "slide" of 10 N.
 
-    Joints "slider" (m) and "hinge" (rad from upright), one motor "slide" of 10 N.
+    Its joints are "slider" (m) and "hinge" (rad from upright).
     """
 
     name: ClassVar[str] = "cartpole"
@@ -36,10 +36,9 @@ class Cartpole(ShippedModel):
 
 @dataclass(frozen=True, kw_only=True)
 class Pendulum(ShippedModel):
-    """A 0.5 m rod with 0.9 kg at its end, on a fixed axle.
+    """A 0.5 m rod with 0.9 kg at its end, on a fixed axle: joint "hinge" (rad from upright), motor "torque" of 1.5 N m.
 
-    Joint "hinge" (rad from upright), one motor "torque" of 1.5 N m. Gravity's torque on the rod when it lies is
-    4.7 N m, so that swinging it up takes several swings.
+    Gravity's torque on the rod when it lies is 4.7 N m, so that swinging it up takes several swings.
     """
 
     name: ClassVar[str] = "pendulum"
@@ -82,11 +81,7 @@ WALKER_SERVOS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Walker(ShippedModel):
-    """22 kg on two legs, 1.7 m tall; the torso's middle is 1.23 m up when it stands.
-
-    Attributes:
-        actuators: what drives joints, in place of their motors; such as `WALKER_SERVOS`.
-    """
+    """22 kg on two legs, 1.7 m tall, torso at 1.23 m; `actuators`, such as `WALKER_SERVOS`, replace the motors."""
 
     actuators: tuple[Actuator, ...] = ()
 
@@ -104,9 +99,8 @@ class Walker(ShippedModel):
 class Arm(ShippedModel):
     """Four joints on a fixed base at the origin, with position servos, and a rod as pusher with the site "tip".
 
-    Its weight is compensated, as that of many small arms is by their controllers. The tip reaches 0.6 m from the
-    shoulder, 0.16 m above the table; in the ready pose it points straight down. Only the pusher collides, with
-    whatever has `contype` 1.
+    Its weight is compensated, as that of many small arms is. The tip reaches 0.6 m from the shoulder, 0.16 m above the
+    table, and points straight down in the ready pose. Only the pusher collides, with whatever has `contype` 1.
     """
 
     name: ClassVar[str] = "arm"

@@ -1,16 +1,14 @@
-"""This module edits a robot's `MjSpec`: one general function per kind, fed with the facts of the robot's own file.
+"""This module edits a robot's `MjSpec`: one general function per kind, fed with the tables of the robot's own file."""
 
-A robot file holds tables of the small dataclasses below; adding a robot adds tables, no code here.
-"""
-
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
 
 import mujoco
 
 from ksim_rl.checks import unknown_name
-from ksim_rl.scene.actuators import Actuator, set_actuators
+from ksim_rl.physics.load import caught_warnings
 from ksim_rl.scene.names import match_names
 from ksim_rl.scene.state.joint_targets import control_kind
 
@@ -19,15 +17,17 @@ Vector = tuple[float, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class CollisionGeom:
-    """A primitive that collides. Fields mean what MJCF's `geom` attributes mean, with MuJoCo's own defaults."""
+    """A primitive that collides and weighs nothing; fields are MJCF's `geom` attributes, with MuJoCo's defaults."""
 
     name: str
     body: str
-    type: mujoco.mjtGeom
+    type: int
+    """One of `mujoco.mjtGeom`."""
     size: Vector
     pos: Vector = (0.0, 0.0, 0.0)
+    quat: Vector = (1.0, 0.0, 0.0, 0.0)
     fromto: Vector | None = None
-    """The two ends of a capsule or cylinder, in place of `pos`."""
+    """The two ends of a capsule or cylinder, in place of `pos` and `quat`."""
     friction: Vector = (1.0, 0.005, 0.0001)
     condim: int = 3
     priority: int = 0
@@ -36,17 +36,29 @@ class CollisionGeom:
     margin: float = 0.0
     group: int = 3
 
+    def __rich_repr__(self) -> Iterator[tuple[str, Any, Any]]:
+        """Yield name, value and default of each field, so that code shows what differs."""
+        yield from ((field.name, getattr(self, field.name), field.default) for field in fields(self))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "type", int(self.type))  # so that it can stand in a config file
+        if self.fromto is not None and (any(self.pos) or tuple(self.quat) != (1.0, 0.0, 0.0, 0.0)):
+            raise ValueError(
+                f"geom {self.name!r}: fromto={self.fromto} with pos={self.pos}, quat={self.quat}: give fromto alone, "
+                "or pos and quat with half the length in size"
+            )
+
 
 def capsule(name: str, body: str, radius: float, fromto: Vector, **attributes: Any) -> CollisionGeom:
     """Return a capsule between two points; `attributes` are fields of `CollisionGeom`."""
     kind = mujoco.mjtGeom.mjGEOM_CAPSULE
-    return CollisionGeom(name=name, body=body, type=kind, size=(radius,), fromto=fromto, **attributes)
+    return CollisionGeom(name=name, body=body, type=int(kind), size=(radius,), fromto=fromto, **attributes)
 
 
 def sphere(name: str, body: str, radius: float, pos: Vector, **attributes: Any) -> CollisionGeom:
     """Return a sphere; `attributes` are fields of `CollisionGeom`."""
     kind = mujoco.mjtGeom.mjGEOM_SPHERE
-    return CollisionGeom(name=name, body=body, type=kind, size=(radius,), pos=pos, **attributes)
+    return CollisionGeom(name=name, body=body, type=int(kind), size=(radius,), pos=pos, **attributes)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,70 +83,8 @@ class Site:
     radius: float = 0.005
 
 
-class RobotFacts(Protocol):
-    """The facts of a robot that `rebuild` puts into its model."""
-
-    root_body: ClassVar[str]
-
-    @property
-    def actuators(self) -> Sequence[Actuator]:
-        """What drives the joints."""
-        ...
-
-    @property
-    def init_pos(self) -> Vector:
-        """Position of the root in the default pose, m."""
-        ...
-
-    @property
-    def init_quat(self) -> Vector:
-        """Orientation of the root in the default pose, (w, x, y, z)."""
-        ...
-
-    @property
-    def default_joint_pos(self) -> Mapping[str, float]:
-        """The default pose, rad or m by joint name."""
-        ...
-
-
-def rebuild(
-    spec: mujoco.MjSpec,
-    robot: RobotFacts,
-    *,
-    geoms: Sequence[CollisionGeom],
-    sites: Sequence[Site],
-    imu: str,
-) -> None:
-    """Turn the menagerie's model of a legged robot into that of its facts.
-
-    Options, actuators, collision geoms, sensors (`root_sensors`) and keyframes (one, `init_state`) are replaced, sites
-    moved and added, and the joints' own damping and friction removed; bodies, joints and visual geoms stay.
-
-    Args:
-        imu: the site of the IMU, one of the model or of `sites`.
-    """
-    reset_options(spec)
-    set_passive_joints(spec)
-    set_actuators(spec, robot.actuators)
-    replace_collision_geoms(spec, geoms)
-    set_sites(spec, sites)
-    replace_sensors(spec, root_sensors(imu=imu, root=robot.root_body))
-    set_keyframe(
-        spec,
-        "init_state",
-        init_pos=robot.init_pos,
-        init_quat=robot.init_quat,
-        joint_pos=robot.default_joint_pos,
-    )
-
-
 def reflected_inertia(inertias: Sequence[float], ratios: Sequence[float]) -> float:
-    """Return what a joint feels of a gear train, kg m^2.
-
-    Args:
-        inertias: of the rotor and of what turns with each stage's output, kg m^2.
-        ratios: of the stages, one fewer than inertias.
-    """
+    """Return what a joint feels of a gear train, kg m^2: of its rotor, and what turns with each stage's output."""
     total = 0.0
     for inertia, ratio in zip(inertias, (*ratios, 1.0), strict=True):
         total = (total + inertia) * ratio**2
@@ -144,17 +94,16 @@ def reflected_inertia(inertias: Sequence[float], ratios: Sequence[float]) -> flo
 def spread(
     table: Mapping[str, float], names: Sequence[str], *, default: float | None = None
 ) -> dict[str, float]:
-    """Return one value per name: that of the pattern in `table` that fully matches it, else `default`.
-
-    Raises:
-        ValueError: if a name matches several patterns, or none and there is no default, or a pattern matches no name.
-    """
+    """Return one value per name: that of the one pattern in `table` that fully matches it, else `default`."""
     owners = {pattern: match_names("name", (pattern,), names) for pattern in table}
     values = {}
     for index, name in enumerate(names):
         found = [table[pattern] for pattern, matches in owners.items() if index in matches]
         if len(found) > 1 or (not found and default is None):
-            raise ValueError(f"{name!r} matches {len(found)} of the patterns {list(table)}: expected one")
+            hint = "" if found else ", or a default=, as in spread(table, names, default=0.0)"
+            raise ValueError(
+                f"{name!r} matches {len(found)} of the patterns {list(table)}: expected one{hint}"
+            )
         values[name] = found[0] if found else default
     return values
 
@@ -163,18 +112,15 @@ def root_sensors(*, imu: str, root: str) -> tuple[Sensor, ...]:
     """Return what walking tasks read: an IMU at a site, and the angular momentum of all that hangs on the root."""
     site, body = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY
     kinds = mujoco.mjtSensor
+    at_imu = {
+        "imu_ang_vel": kinds.mjSENS_GYRO,
+        "imu_lin_vel": kinds.mjSENS_VELOCIMETER,
+        "imu_lin_acc": kinds.mjSENS_ACCELEROMETER,
+    }
+    up: dict[str, Any] = {"objtype": body, "objname": "world", "reftype": site, "refname": imu}
     return (
-        Sensor(name="imu_ang_vel", type=kinds.mjSENS_GYRO, objtype=site, objname=imu),
-        Sensor(name="imu_lin_vel", type=kinds.mjSENS_VELOCIMETER, objtype=site, objname=imu),
-        Sensor(name="imu_lin_acc", type=kinds.mjSENS_ACCELEROMETER, objtype=site, objname=imu),
-        Sensor(
-            name="imu_upvector",
-            type=kinds.mjSENS_FRAMEZAXIS,
-            objtype=body,
-            objname="world",
-            reftype=site,
-            refname=imu,
-        ),
+        *(Sensor(name=name, type=kind, objtype=site, objname=imu) for name, kind in at_imu.items()),
+        Sensor(name="imu_upvector", type=kinds.mjSENS_FRAMEZAXIS, **up),
         Sensor(name="root_angmom", type=kinds.mjSENS_SUBTREEANGMOM, objtype=body, objname=root),
     )
 
@@ -192,32 +138,46 @@ def set_passive_joints(spec: mujoco.MjSpec, *, damping: float = 0.0, frictionlos
 
 
 def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom]) -> None:
-    """Delete every geom that can collide and add `geoms`. Visual geoms stay."""
-    for geom in list(spec.geoms):
-        if geom.contype or geom.conaffinity:
-            spec.delete(geom)
+    """Delete all geoms that can collide and add `geoms`; visual geoms, masses and inertias of all bodies stay."""
     bodies = {body.name: body for body in spec.bodies}
     for geom in geoms:
         if geom.body not in bodies:
             raise unknown_name("body", geom.body, bodies)
+    deleted = [geom for geom in spec.geoms if geom.contype or geom.conaffinity]
+    _keep_inertia(spec, [geom.parent for geom in deleted])
+    for geom in deleted:
+        spec.delete(geom)
+    for geom in geoms:
         # Each attribute is written: the body's default class may hold others.
-        placed = bodies[geom.body].add_geom(
-            name=geom.name,
-            type=geom.type,
-            size=[*geom.size, 0.0, 0.0, 0.0][:3],
-            pos=geom.pos,
-            friction=geom.friction,
-            condim=geom.condim,
-            priority=geom.priority,
-            solref=geom.solref,
-            solimp=geom.solimp,
-            margin=geom.margin,
-            contype=1,
-            conaffinity=1,
-            group=geom.group,
-        )
+        attributes = {name: value for name, value in vars(geom).items() if name not in ("body", "fromto")}
+        attributes["size"] = [*geom.size, 0.0, 0.0, 0.0][:3]
+        placed = bodies[geom.body].add_geom(contype=1, conaffinity=1, mass=0.0, **attributes)
         if geom.fromto is not None:
             placed.fromto = geom.fromto
+
+
+def _keep_inertia(spec: mujoco.MjSpec, bodies: Sequence[mujoco.MjsBody]) -> None:
+    """Write down the inertia of those of the bodies that have it from their geoms."""
+    from_geoms = spec.compiler.inertiafromgeom
+    if not bodies or from_geoms == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE:
+        return
+    # Then explicit inertias are ignored, those of bodies whose geoms stay too.
+    all_inferred = from_geoms == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    present = list(spec.bodies)[1:]
+    inferred = [all_inferred or (body in bodies and not body.explicitinertial) for body in present]
+    if not any(inferred):
+        return
+    twin = spec.copy()
+    # Fused bodies have no inertia of their own, and the compiler scales what is written here once more.
+    twin.compiler.fusestatic, twin.compiler.settotalmass = False, -1
+    with caught_warnings():
+        mj_model = twin.compile()
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    for body, is_inferred, twin_body in zip(present, inferred, list(twin.bodies)[1:], strict=True):
+        if is_inferred and mj_model.body_mass[twin_body.id] > 0.0:
+            body.explicitinertial, body.fullinertia = True, [math.nan] + [0.0] * 5
+            body.mass, body.inertia = mj_model.body_mass[twin_body.id], mj_model.body_inertia[twin_body.id]
+            body.ipos, body.iquat = mj_model.body_ipos[twin_body.id], mj_model.body_iquat[twin_body.id]
 
 
 def replace_sensors(spec: mujoco.MjSpec, sensors: Iterable[Sensor]) -> None:
@@ -225,24 +185,21 @@ def replace_sensors(spec: mujoco.MjSpec, sensors: Iterable[Sensor]) -> None:
     for sensor in list(spec.sensors):
         spec.delete(sensor)
     for sensor in sensors:
-        spec.add_sensor(
-            name=sensor.name,
-            type=sensor.type,
-            objtype=sensor.objtype,
-            objname=sensor.objname,
-            reftype=sensor.reftype,
-            refname=sensor.refname,
-        )
+        spec.add_sensor(**vars(sensor))
 
 
 def set_sites(spec: mujoco.MjSpec, sites: Iterable[Site], *, group: int = 5) -> None:
-    """Move the sites that exist and add the others."""
+    """Move the sites that exist, to another body too (whose axes they then have), and add the others."""
     present = {site.name: site for site in spec.sites}
     bodies = {body.name: body for body in spec.bodies}
     for site in sites:
         if site.body not in bodies:
             raise unknown_name("body", site.body, bodies)
-        placed = present.get(site.name) or bodies[site.body].add_site(name=site.name)
+        placed = present.get(site.name)
+        if placed is not None and placed.parent != bodies[site.body]:
+            spec.delete(placed)
+            placed = None
+        placed = placed or bodies[site.body].add_site(name=site.name)
         placed.pos, placed.size, placed.group = site.pos, [site.radius] * 3, group
 
 

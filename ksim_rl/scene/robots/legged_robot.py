@@ -1,4 +1,4 @@
-"""Walking tasks read these facts of a robot, beyond its model; robots of the menagerie share how they are built."""
+"""This module says what walking tasks read of a robot beyond its model; menagerie robots share how they are built."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,8 +7,8 @@ from typing import ClassVar, Protocol
 import mujoco
 
 from ksim_rl.physics import load_spec
-from ksim_rl.scene.actuators import Actuator
-from ksim_rl.scene.robots.edit import CollisionGeom, Site, exclude_contacts, rebuild
+from ksim_rl.scene.actuators import Actuator, set_actuators
+from ksim_rl.scene.robots import edit
 
 
 class LeggedRobot(Protocol):
@@ -16,20 +16,13 @@ class LeggedRobot(Protocol):
 
     Its model has a keyframe, its default pose, and the sensors `imu_lin_vel` (velocimeter), `imu_ang_vel` (gyro) and
     `root_angmom` (subtreeangmom).
-
-    Attributes:
-        name: how a scene calls it.
-        root_body: the body with the free joint.
-        joint_names: the actuated joints in policy order (that of actions and joint observations).
-        foot_geoms: what treads on the ground; their friction is drawn.
-        foot_sites: one site per foot, near its sole.
     """
 
     name: ClassVar[str]
-    root_body: ClassVar[str]
-    joint_names: ClassVar[tuple[str, ...]]
-    foot_geoms: ClassVar[tuple[str, ...]]
-    foot_sites: ClassVar[tuple[str, ...]]
+    root_body: ClassVar[str]  # the body with the free joint
+    joint_names: ClassVar[tuple[str, ...]]  # in policy order: that of actions and joint observations
+    foot_geoms: ClassVar[tuple[str, ...]]  # what treads on the ground; their friction is drawn
+    foot_sites: ClassVar[tuple[str, ...]]  # one per foot, near its sole
 
     @property
     def action_scale(self) -> Mapping[str, float]:
@@ -48,25 +41,11 @@ class LeggedRobot(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class MenagerieRobot:
-    """A `LeggedRobot` made from a model of MuJoCo Menagerie and the tables of facts in its own file.
+    """A `LeggedRobot` made from a model of MuJoCo Menagerie and the tables of facts in its own file."""
 
-    Attributes:
-        init_pos, init_quat: the root's pose in the stance: m, and a quaternion (w, x, y, z).
-        default_joint_pos: the stance, rad, by joint name.
-        action_scale: rad per unit action, by joint name.
-        actuators: what drives the joints.
-        soft_joint_pos_limit_factor: the part of each joint's range, about its middle, that is free of penalty.
-        joint_names: the actuated joints in policy order (that of actions and joint observations).
-        model: the menagerie's name of the model.
-        collision_geoms: what collides, in place of the model's own geoms.
-        sites: sites to move or to add.
-        imu: the site of the IMU.
-        overlaps: pairs of bodies that pass through each other.
-    """
-
-    init_pos: tuple[float, float, float]
-    init_quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    default_joint_pos: Mapping[str, float]
+    init_pos: tuple[float, float, float]  # of the root in the stance, m
+    init_quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  # (w, x, y, z)
+    default_joint_pos: Mapping[str, float]  # the stance, rad, by joint name
     action_scale: Mapping[str, float]
     actuators: tuple[Actuator, ...]
     soft_joint_pos_limit_factor: float = 0.9
@@ -76,19 +55,42 @@ class MenagerieRobot:
     joint_names: ClassVar[tuple[str, ...]]
     foot_geoms: ClassVar[tuple[str, ...]]
     foot_sites: ClassVar[tuple[str, ...]]
-    model: ClassVar[str]
-    collision_geoms: ClassVar[tuple[CollisionGeom, ...]]
-    sites: ClassVar[tuple[Site, ...]]
-    imu: ClassVar[str] = "imu"
-    overlaps: ClassVar[tuple[tuple[str, str], ...]] = ()
+    model: ClassVar[str]  # the menagerie's name of it
+    collision_geoms: ClassVar[tuple[edit.CollisionGeom, ...]]  # in place of the model's own
+    sites: ClassVar[tuple[edit.Site, ...]]  # to move or to add
+    imu: ClassVar[str] = "imu"  # one of the sites or of the model's
+    overlaps: ClassVar[tuple[tuple[str, str], ...]] = ()  # bodies that pass through each other
 
     def spec(self) -> mujoco.MjSpec:
         """Return a fresh, editable model of the robot alone, with keyframe `init_state`.
 
-        Raises:
-            ValueError: in one line, how to get the menagerie's model, if it is not at hand.
+        Options, actuators, collision geoms, sensors and keyframes are replaced, and the joints' own damping and
+        friction removed; bodies, joints and visual geoms stay.
         """
         spec = load_spec(self.model)
-        rebuild(spec, self, geoms=self.collision_geoms, sites=self.sites, imu=self.imu)
-        exclude_contacts(spec, self.overlaps)
+        edit.reset_options(spec)
+        edit.set_passive_joints(spec)
+        set_actuators(spec, self.actuators)
+        edit.replace_collision_geoms(spec, self.collision_geoms)
+        edit.set_sites(spec, self.sites)
+        edit.replace_sensors(spec, edit.root_sensors(imu=self.imu, root=self.root_body))
+        pose = {"init_pos": self.init_pos, "init_quat": self.init_quat, "joint_pos": self.default_joint_pos}
+        edit.set_keyframe(spec, "init_state", **pose)
+        edit.exclude_contacts(spec, self.overlaps)
         return spec
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelRobot(MenagerieRobot):
+    """The same with all facts as fields, such as `analyse` proposes them; `model` is what `load_spec` takes."""
+
+    name: str
+    root_body: str
+    joint_names: tuple[str, ...]
+    foot_geoms: tuple[str, ...]
+    foot_sites: tuple[str, ...]
+    model: str
+    collision_geoms: tuple[edit.CollisionGeom, ...]
+    sites: tuple[edit.Site, ...]
+    imu: str = "imu"
+    overlaps: tuple[tuple[str, str], ...] = ()

@@ -18,10 +18,7 @@ _LEG = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")
 
 @dataclass(frozen=True, kw_only=True)
 class Quadruped(ShippedModel):
-    """12 kg on four legs with three joints each, called `<front|rear>_<left|right>_<roll|hip|knee>`.
-
-    Fields are those of `LeggedRobot`.
-    """
+    """12 kg on four legs with three joints each, called `<front|rear>_<left|right>_<roll|hip|knee>`."""
 
     action_scale: Mapping[str, float] = field(default_factory=lambda: {".*_roll": 0.2, ".*_(hip|knee)": 0.3})
     soft_joint_pos_limit_factor: float = 0.9

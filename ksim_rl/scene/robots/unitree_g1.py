@@ -89,49 +89,33 @@ def _foot_geoms(side: str) -> tuple[CollisionGeom, ...]:
 
 def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:
     y = 1.0 if side == "left" else -1.0
-    knee = f"{side}_knee_link"
-    return (
-        capsule(
-            f"{side}_hip_collision", f"{side}_hip_roll_link", 0.06, (0.02, 0, 0, 0.02, 0, -0.08), condim=1
-        ),
-        capsule(
-            f"{side}_thigh_collision", f"{side}_hip_yaw_link", 0.055, (0, 0, -0.03, -0.06, 0, -0.17), condim=1
-        ),
-        capsule(f"{side}_shin_collision", knee, 0.045, (0.01, 0, 0, 0.01, 0, -0.15), condim=1),
-        capsule(f"{side}_linkage_brace_collision", knee, 0.03, (0.01, 0, -0.2, 0.01, 0, -0.28), condim=1),
-        *_foot_geoms(side),
-        capsule(
-            f"{side}_shoulder_yaw_collision",
-            f"{side}_shoulder_yaw_link",
-            0.035,
-            (0, 0, -0.08, 0, 0, 0.05),
-            condim=1,
-        ),
-        capsule(
-            f"{side}_elbow_yaw_collision",
-            f"{side}_elbow_link",
-            0.035,
-            (-0.01, 0, -0.01, 0.08, 0, -0.01),
-            condim=1,
-        ),
-        capsule(
-            f"{side}_wrist_collision", f"{side}_wrist_pitch_link", 0.035, (-0.01, 0, 0, 0.06, 0, 0), condim=1
-        ),
-        capsule(
-            f"{side}_hand_collision",
-            f"{side}_wrist_yaw_link",
-            0.035,
-            (0.07, 0, 0, 0.15, -0.02 * y, 0),
-            condim=1,
-        ),
+    legs = (
+        ("hip", "hip_roll", 0.06, (0.02, 0, 0, 0.02, 0, -0.08)),
+        ("thigh", "hip_yaw", 0.055, (0, 0, -0.03, -0.06, 0, -0.17)),
+        ("shin", "knee", 0.045, (0.01, 0, 0, 0.01, 0, -0.15)),
+        ("linkage_brace", "knee", 0.03, (0.01, 0, -0.2, 0.01, 0, -0.28)),
     )
+    arms = (
+        ("shoulder_yaw", "shoulder_yaw", 0.035, (0, 0, -0.08, 0, 0, 0.05)),
+        ("elbow_yaw", "elbow", 0.035, (-0.01, 0, -0.01, 0.08, 0, -0.01)),
+        ("wrist", "wrist_pitch", 0.035, (-0.01, 0, 0, 0.06, 0, 0)),
+        ("hand", "wrist_yaw", 0.035, (0.07, 0, 0, 0.15, -0.02 * y, 0)),
+    )
+    leg_geoms, arm_geoms = (
+        tuple(
+            capsule(f"{side}_{name}_collision", f"{side}_{link}_link", radius, ends, condim=1)
+            for name, link, radius, ends in limbs
+        )
+        for limbs in (legs, arms)
+    )
+    return (*leg_geoms, *_foot_geoms(side), *arm_geoms)
 
 
 @dataclass(frozen=True, kw_only=True)
 class UnitreeG1(MenagerieRobot):
-    """The facts of the robot, and `spec()`, the model that they describe; fields as of `MenagerieRobot`.
+    """The facts of the robot, and `spec()`, the model that they describe; it stands with bent knees.
 
-    It stands with bent knees. Contacts of the robot with itself are frictionless: fewer dimensions cost less.
+    Contacts of the robot with itself are frictionless: fewer dimensions cost less.
     """
 
     init_pos: tuple[float, float, float] = (0.0, 0.0, 0.76)

@@ -1,4 +1,5 @@
 """This package has the sensors of a scene, one file each; terms read them by name through the view."""
+# ruff: noqa: F401
 
 from ksim_rl.scene.sensors.camera import CameraSensor, CameraTracker
 from ksim_rl.scene.sensors.contact import ContactSensor, ContactState, ContactTracker
@@ -14,21 +15,4 @@ from ksim_rl.scene.sensors.rays import (
 )
 from ksim_rl.scene.sensors.sensor import Sensor, SensorTracker
 
-__all__ = [
-    "CameraSensor",
-    "CameraTracker",
-    "ContactSensor",
-    "ContactState",
-    "ContactTracker",
-    "GridPattern",
-    "ImuSensor",
-    "ImuTracker",
-    "PinholePattern",
-    "RayCaster",
-    "RayPattern",
-    "RayState",
-    "RayTracker",
-    "RingPattern",
-    "Sensor",
-    "SensorTracker",
-]
+__all__ = sorted(name for name, value in vars().items() if isinstance(value, type))  # pyright: ignore

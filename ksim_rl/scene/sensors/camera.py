@@ -1,7 +1,5 @@
 """This module draws cameras for all worlds at once, on the device."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -28,10 +26,8 @@ class CameraSensor(Sensor):
         camera: a camera of the model; None puts a new one on `body`, such as "world", at `pos`, m, with the picture's
             right and up along `xyaxes`, all in the body's frame, and a vertical field of view of `fovy` degrees.
         width, height: pixels.
-        rgb, depth, segmentation: what is drawn.
         max_depth: m; what is farther, or not there at all, has this depth.
-        geom_groups: which of MuJoCo's geom groups are visible.
-        textures, shadows: whether they are drawn; the model's sky counts as a texture.
+        geom_groups, textures: what is visible; the model's sky counts as a texture.
     """
 
     camera: str | None = None
@@ -55,11 +51,7 @@ class CameraSensor(Sensor):
             raise ValueError("rgb=False, depth=False, segmentation=False: draw at least one of them")
 
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
-        """Add the camera `<name>` to its body, unless the model has it.
-
-        Raises:
-            ValueError: if the model has no such camera or body.
-        """
+        """Add the camera `<name>` to its body, unless the model has it."""
         if self.camera is not None:
             check_present(name, "camera", self.camera, spec.cameras)
             return
@@ -68,8 +60,7 @@ class CameraSensor(Sensor):
             name=name, pos=list(self.pos), xyaxes=list(self.xyaxes), fovy=self.fovy
         )
 
-    def track(self, name: str, view: WorldView) -> CameraTracker:
-        """Return the reader of this sensor in the worlds of `view`."""
+    def track(self, name: str, view: WorldView) -> "CameraTracker":
         return CameraTracker(name, self, view)
 
 
@@ -84,17 +75,17 @@ class CameraTracker(SensorTracker):
 
     @property
     def rgb_EHW3(self) -> UInt8[Tensor, "E H W 3"]:
-        """Colors, uint8 [E, H, W, 3]; the first row is the top of the picture."""
+        """Colors; the first row is the top of the picture."""
         return self._read("rgb")
 
     @property
     def depth_EHW(self) -> Float[Tensor, "E H W"]:
-        """Distance along the camera's axis, m, at most `max_depth`, float32 [E, H, W]."""
+        """Distance along the camera's axis, m, at most `max_depth`."""
         return self._read("depth")
 
     @property
     def segmentation_EHW(self) -> Int32[Tensor, "E H W"]:
-        """Ids of the geoms that are seen, -1 for none, int32 [E, H, W]."""
+        """Ids of the geoms that are seen, -1 for none."""
         return self._read("segmentation")
 
     def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:

@@ -1,7 +1,5 @@
 """This module senses contact: what geoms, bodies or whole limbs touch, how hard, and since when."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -28,15 +26,6 @@ _TABLES = {"geom": "geom", "body": "body", "subtree": "body"}
 # Bits of MuJoCo's contact sensor (mjtConDataField) and its reductions.
 _FOUND, _FORCE, _POSITION, _NORMAL, _TANGENT = 1 << 0, 1 << 1, 1 << 4, 1 << 5, 1 << 6
 _STRONGEST, _NET = 2, 3
-_CLOCKS = (
-    "found",
-    "air_time",
-    "last_air_time",
-    "contact_time",
-    "last_contact_time",
-    "first_contact",
-    "first_air",
-)
 _RGBA = (1.0, 0.55, 0.1, 1.0)
 
 
@@ -44,15 +33,12 @@ _RGBA = (1.0, 0.55, 0.1, 1.0)
 class ContactSensor(Sensor):
     """Contact of N elements of the scene with another element, or with anything.
 
-    Exactly one of `geoms`, `bodies` and `subtrees` says what the elements are: names, or regular expressions that must
-    match in full. Each pattern's matches come in the model's order, and give the N dim.
+    Exactly one of `geoms`, `bodies` (with all their geoms) and `subtrees` (bodies with all their descendants: a limb,
+    or a whole robot) says what the elements are: names, or regular expressions that must match in full. Each pattern's
+    matches come in the model's order, and give the N dim.
 
     Attributes:
-        geoms: single geoms.
-        bodies: bodies with all their geoms.
-        subtrees: bodies with all their descendants: a limb, or a whole robot.
         against: the name of what they touch; None for anything, also for parts of their own robot.
-        against_kind: what `against` names: a "geom", a "body", or a "subtree".
         reduce: of several contacts, their "net" force, or the force of the "strongest" one. Within one subtree, as in
             self-collisions, each contact's direction is arbitrary, so only "strongest" has a meaning.
         every_substep: read at each physics substep, not only at the last one of an env step: the clocks run in physics
@@ -68,6 +54,11 @@ class ContactSensor(Sensor):
     every_substep: bool = False
 
     def __post_init__(self) -> None:
+        if isinstance(self.against, (list, tuple)):
+            raise ValueError(
+                f"against={self.against!r}: a contact sensor takes one {self.against_kind} there, not several: name a "
+                "body or subtree that holds them (against_kind), None for anything, or give one sensor each"
+            )
         super().__post_init__()
         given = [field for field in ("geoms", "bodies", "subtrees") if getattr(self, field)]
         if len(given) != 1:
@@ -87,20 +78,12 @@ class ContactSensor(Sensor):
         return "geom" if self.geoms else "body" if self.bodies else "subtree"
 
     def elements(self, present: Sequence[str]) -> list[str]:
-        """Return the elements among the `present` ones of their kind, in the order of the N dim.
-
-        Raises:
-            ValueError: if a pattern matches nothing.
-        """
+        """Return the elements among the `present` ones of their kind, in the order of the N dim."""
         patterns = self.geoms or self.bodies or self.subtrees
         return [present[i] for i in match_names(_TABLES[self.kind], patterns, present)]
 
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
-        """Add one MJCF contact sensor `<name>_<element>` per element.
-
-        Raises:
-            ValueError: if the model has no such element.
-        """
+        """Add one MJCF contact sensor `<name>_<element>` per element."""
         parts = {"geom": spec.geoms, "body": spec.bodies}
         try:
             elements = self.elements([part.name for part in parts[_TABLES[self.kind]]])
@@ -126,16 +109,12 @@ class ContactSensor(Sensor):
                 **other,
             )
 
-    def track(self, name: str, view: WorldView) -> ContactTracker:
-        """Return the reader of this sensor in the worlds of `view`."""
+    def track(self, name: str, view: WorldView) -> "ContactTracker":
         return ContactTracker(name, self, view)
 
 
 class ContactState(NamedTuple):
-    """Contact of the N elements of a sensor, at the end of the last physics substep (acceleration stage).
-
-    All are float32, and rows that were just reset read zero.
-    """
+    """Contact of a sensor's N elements, float32, after the last substep (acceleration stage); 0 in rows just reset."""
 
     found_EN: Float[Tensor, "E N"]
     """1 where the element touches, else 0, [E, N]."""
@@ -158,6 +137,9 @@ class ContactState(NamedTuple):
     """1 in the env step in which the element left the ground, else 0, [E, N]."""
     force_history_ESN3: Float[Tensor, "E S N 3"]
     """`force_EN3` of each substep of the env step, oldest first, [E, S, N, 3]; S is 1 without `every_substep`."""
+
+
+_CLOCKS = tuple(name.removesuffix("_EN") for name in ContactState._fields if name.endswith("_EN"))
 
 
 class ContactTracker(SensorTracker):
@@ -240,7 +222,7 @@ class ContactTracker(SensorTracker):
             clock[event].copy_(happens if starts else torch.where(happens, 1.0, clock[event]))
 
     def _readings(self) -> Tensor:
-        """Return found, force, position and (for the strongest) the contact's first two axes, [E, N, 7 or 13]."""
+        """Return found, force, position and (for the strongest) the contact's first two axes: 7 or 13 numbers."""
         return self._world.sensordata_EL[:, self._columns].unflatten(1, (self._count, -1))
 
     def _force(self, readings: Tensor) -> Tensor:

@@ -1,7 +1,5 @@
 """This module has inertial measurement units: gyroscope, accelerometer and orientation at a place on a body."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import mujoco
@@ -26,11 +24,7 @@ class ImuSensor(MountedSensor):
     """An inertial measurement unit. Noise, bias and lag are transforms of the observations that read it."""
 
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
-        """Add the MJCF sensors `<name>_gyro`, `<name>_accelerometer` and `<name>_orientation`, and a site if needed.
-
-        Raises:
-            ValueError: if the model has no such site or body.
-        """
+        """Add the MJCF sensors `<name>_gyro`, `<name>_accelerometer` and `<name>_orientation`, and a site if needed."""
         super().add_to(spec, name)
         for suffix, kind in _SENSORS.items():
             spec.add_sensor(
@@ -40,8 +34,7 @@ class ImuSensor(MountedSensor):
                 objname=self.mounting_site(name),
             )
 
-    def track(self, name: str, view: WorldView) -> ImuTracker:
-        """Return the reader of this sensor in the worlds of `view`."""
+    def track(self, name: str, view: WorldView) -> "ImuTracker":
         return ImuTracker(name, view, self.mounting_site(name))
 
 
@@ -54,25 +47,22 @@ class ImuTracker(SensorTracker):
 
     @property
     def ang_vel_EL(self) -> Float[Tensor, "E 3"]:
-        """Angular velocity, rad/s, [E, 3]; velocity stage."""
+        """Angular velocity, rad/s; velocity stage."""
         return self._view.sensor(f"{self._name}_gyro")
 
     @property
     def lin_acc_EL(self) -> Float[Tensor, "E 3"]:
-        """Acceleration minus gravity, m/s^2, [E, 3]: at rest it points up and is 9.81, in free fall it is zero.
-
-        Acceleration stage: of the last physics substep, and zero in rows that were just reset.
-        """
+        """Acceleration minus gravity, m/s^2: at rest it points up and is 9.81, in free fall 0; acceleration stage."""
         return self._view.sensor(f"{self._name}_accelerometer")
 
     @property
     def quat_EL(self) -> Float[Tensor, "E 4"]:
-        """Orientation, from the unit's axes to the world's, (w, x, y, z), [E, 4]; position stage."""
+        """Orientation, from the unit's axes to the world's, (w, x, y, z); position stage."""
         return self._view.sensor(f"{self._name}_orientation")
 
     @property
     def projected_gravity_EL(self) -> Float[Tensor, "E 3"]:
-        """Unit vector of world -z, [E, 3]; position stage."""
+        """Unit vector of world -z; position stage."""
         cache, key = self._view.cache, f"imu/{self._name}.projected_gravity"
         if key not in cache:
             cache[key] = quaternion.rotate_inverse(self.quat_EL, self._down.expand(self._view.num_envs, 3))

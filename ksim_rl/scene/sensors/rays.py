@@ -3,8 +3,6 @@
 Patterns are in the sensor's own axes: x forward, y left, z up.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -34,15 +32,11 @@ class RayPattern(Checked, ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class GridPattern(RayPattern):
-    """Parallel rays that start at the points of a grid, parallel to the sensor's xy plane.
+    """Parallel rays that start at the points of a grid, parallel to the sensor's xy plane and `height` (m) above it.
 
-    Points run along x (forward) first, from back to front, and these rows along y, from right to left.
-
-    Attributes:
-        size: edges of the grid along x and y, m.
-        resolution: m between neighbouring points.
-        height: m of the grid above the sensor: rays that start low do not see what is higher.
-        direction: of the rays; its length does not matter.
+    Points run along x (forward) first, from back to front, and these rows along y, from right to left; `size` are the
+    edges along x and y, and `resolution` is the distance of neighbours, m. Rays that start low do not see what is
+    higher.
     """
 
     size: Annotated[tuple[float, float], Within(low=0.0)] = (1.6, 1.0)
@@ -56,7 +50,6 @@ class GridPattern(RayPattern):
             raise ValueError(f"direction={self.direction!r}: expected a vector that is not zero")
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rays."""
         start_N3 = grid_points(self.size, self.resolution) + np.array([0.0, 0.0, self.height])
         direction = np.asarray(self.direction) / np.linalg.norm(self.direction)
         return start_N3, np.broadcast_to(direction, start_N3.shape)
@@ -66,9 +59,7 @@ class GridPattern(RayPattern):
 class PinholePattern(RayPattern):
     """The rays of a camera that looks along x: one through the middle of each pixel, row by row from the top left.
 
-    Attributes:
-        width, height: pixels.
-        fovy: vertical field of view, degrees; pixels are square.
+    `fovy` is the vertical field of view, degrees; pixels are square.
     """
 
     width: Count = 16
@@ -76,7 +67,6 @@ class PinholePattern(RayPattern):
     fovy: Annotated[float, Within(low=0.0, high=179.0, low_open=True)] = 60.0
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rays."""
         pixel = 2.0 * math.tan(math.radians(self.fovy) / 2) / self.height
         left = ((self.width - 1) / 2 - np.arange(self.width)) * pixel
         up = ((self.height - 1) / 2 - np.arange(self.height)) * pixel
@@ -88,9 +78,7 @@ class PinholePattern(RayPattern):
 class RingPattern(RayPattern):
     """The rays of a turning lidar: rings about z, one after the other, each from +x to the left all around.
 
-    Attributes:
-        num_rays: of one ring.
-        elevations: degrees above the xy plane, one ring each.
+    Each ring has `num_rays`, and one of the `elevations`, degrees above the xy plane.
     """
 
     num_rays: Count = 36
@@ -102,7 +90,6 @@ class RingPattern(RayPattern):
             raise ValueError("elevations=(): give at least one ring, such as (0.0,)")
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rays."""
         around = 2 * np.pi * np.arange(self.num_rays) / self.num_rays
         up_N, around_N = (
             table.ravel() for table in np.meshgrid(np.radians(self.elevations), around, indexing="ij")
@@ -143,17 +130,11 @@ class RayState(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class RayCaster(MountedSensor):
-    """Rays against all geoms of some groups.
+    """Rays against all geoms of some groups (2 are by custom robots' visual geoms, 3 their collision geoms).
 
-    They hit whatever is there, moving things too, and cost accordingly: for the shape of the terrain alone,
-    `mdp.HeightScan` is much cheaper.
-
-    Attributes:
-        pattern: the rays in the sensor's axes.
-        alignment: how the pattern turns: with the "site", with its "yaw" only, or not at all ("world").
-        max_distance: m.
-        geom_groups: which of MuJoCo's geom groups are hit; 2 are by custom robots' visual, 3 their collision geoms.
-        exclude_body: rays do not hit geoms of the body that carries the sensor.
+    They hit whatever is there within `max_distance` (m), moving things too, and cost accordingly: for the shape of the
+    terrain alone, `mdp.HeightScan` is much cheaper. The pattern turns with the "site", with its "yaw" only, or not at
+    all ("world"); `exclude_body` leaves out geoms of the body that carries the sensor.
     """
 
     pattern: RayPattern
@@ -162,8 +143,7 @@ class RayCaster(MountedSensor):
     geom_groups: tuple[GeomGroup, ...] = (0, 1)
     exclude_body: bool = True
 
-    def track(self, name: str, view: WorldView) -> RayTracker:
-        """Return the reader of this sensor in the worlds of `view`."""
+    def track(self, name: str, view: WorldView) -> "RayTracker":
         return RayTracker(name, self, view)
 
 
@@ -195,7 +175,7 @@ class RayTracker(SensorTracker):
 
     @property
     def origin_E3(self) -> Float[Tensor, "E 3"]:
-        """Place of the sensor, world frame, m, [E, 3]."""
+        """Place of the sensor, world frame, m."""
         return self._view.derived().site_xpos_EL[:, self._site]
 
     def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:

@@ -1,7 +1,9 @@
 """This module has the bases of sensors: a config that edits the model, perhaps mounted on a body, and a reader."""
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -19,9 +21,8 @@ GeomGroup = Annotated[int, Within(low=0, high=mujoco.mjNGROUP - 1)]
 class SensorTracker:
     """Reads one sensor. What it reads on demand belongs in `view.cache`, so that it is read once per state.
 
-    Attributes:
-        every_substep: whether `update_substep` runs after each physics substep; the worlds then compute their sensors
-            at each.
+    With `every_substep`, `update_substep` runs after each physics substep, at which the worlds then compute their
+    sensors.
     """
 
     every_substep: bool = False
@@ -42,11 +43,7 @@ class Sensor(Checked, ABC):
 
     @abstractmethod
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
-        """Add what the sensor needs to the scene's spec.
-
-        Raises:
-            ValueError: if the model lacks what the sensor names.
-        """
+        """Add what the sensor needs to the scene's spec; a ValueError if the model lacks what the sensor names."""
 
     @abstractmethod
     def track(self, name: str, view: WorldView) -> SensorTracker:
@@ -57,6 +54,14 @@ def check_present(name: str, kind: str, wanted: str | None, elements: Sequence[A
     """Refuse a sensor `name` that wants an element which is not among these of the spec, by a ValueError."""
     present = [element.name for element in elements]
     if wanted not in present:
+        several: list[str] = []
+        with suppress(re.error):
+            several = [other for other in present if other and re.fullmatch(str(wanted), other)]
+        if several:
+            raise ValueError(
+                f"scene.sensors.{name}: {wanted!r} matches {several}, but the sensor takes the name of one {kind} "
+                "there: name one of them, or a body or subtree that holds them, or give one sensor each"
+            )
         raise ValueError(
             f"scene.sensors.{name}: no {kind} {wanted!r}: {near(str(wanted), filter(None, present))}"
         )
@@ -70,13 +75,7 @@ def sensor_columns(mj_model: mujoco.MjModel, name: str) -> range:
 
 @dataclass(frozen=True, kw_only=True)
 class MountedSensor(Sensor, ABC):
-    """A sensor at a site of the model, or at a place on a body, whose axes it then has.
-
-    Attributes:
-        site: a site of the model, or None.
-        body: a body of the model, or None; exactly one of the two is given.
-        pos: with `body`, where on it, in its frame, m.
-    """
+    """A sensor at a `site` of the model, or on a `body` at `pos` (m, in its frame, whose axes the sensor then has)."""
 
     site: str | None = None
     body: str | None = None
@@ -96,11 +95,7 @@ class MountedSensor(Sensor, ABC):
         return self.site or f"{name}_mount"
 
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
-        """Add the site `<name>_mount`, if the sensor is on a body.
-
-        Raises:
-            ValueError: if the model has no such site or body.
-        """
+        """Add the site `<name>_mount`, if the sensor is on a body."""
         if self.body is None:
             check_present(name, "site", self.site, spec.sites)
         else:

@@ -1,11 +1,13 @@
 """This module holds what terms keep from step to step: buffers with a row per env, and values that all envs share."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
+
+from ksim_rl.checks import unknown_name
 
 # Numbers per env that an arena has room for; a wider buffer has one of its own.
 ARENA_WIDTH = 128
@@ -34,17 +36,16 @@ class Arena:
         return self.values[start : self._used].view(self._num_envs, *shape)
 
     def clear(self, mask_E: Bool[Tensor, " E"]) -> None:
-        """Zero the rows of `mask_E`, bool [E], in all buffers."""
+        """Zero the rows of `mask_E` in all buffers."""
         self.values[: self._used].masked_fill_(mask_E.index_select(0, self._row_N), 0)
 
 
 class Buffers:
     """Named buffers of shape [E, ...], allocated once, cleared by mask, saved with the env.
 
-    Buffers come into being while the env is constructed (each term runs once then). Afterwards the set is frozen:
-    an allocation inside a captured step would give another tensor to each replay.
-
-    Buffers that start at zero lie in few large tensors, so that a reset clears all of them at once.
+    They come into being while the env is constructed (each term runs once then). Afterwards the set is frozen: an
+    allocation inside a captured step would give another tensor to each replay. Those that start at zero lie in few
+    large tensors, so that a reset clears all of them at once.
     """
 
     def __init__(self, num_envs: int, device: torch.device) -> None:
@@ -54,7 +55,7 @@ class Buffers:
         self._initial: dict[str, Tensor] = {}
         self._kept: set[str] = set()
         self._arenas: list[Arena] = []
-        self._frozen = False
+        self.is_frozen = False
 
     def get(
         self,
@@ -64,22 +65,14 @@ class Buffers:
         keep: bool = False,
         initial: Shaped[Tensor, "*initial"] | None = None,
     ) -> Shaped[Tensor, " E *shape"]:
-        """Return the buffer `name`, [E, *shape].
+        """Return the buffer `name`; the first call makes it, later ones must agree in shape and dtype.
 
-        Args:
-            name: its name; the buffer is made at the first call.
-            shape: beyond the env dim.
-            dtype: of its elements.
-            keep: leaves it alone when rows reset.
-            initial: what it holds at first and after a reset, broadcast to its shape; None means zeros. The tensor is
-                read each time, so it may change.
-
-        Raises:
-            ValueError: if the buffer exists with another shape or dtype, or is new after construction.
+        `keep` leaves it alone when rows reset; `initial` (read each time, so it may change) is what it holds at first
+        and after a reset, else zeros. A ValueError where it differs from what exists, or is new after construction.
         """
         buffer = self._buffers.get(name)
         if buffer is None:
-            if self._frozen:
+            if self.is_frozen:
                 raise ValueError(
                     f"buffer {name!r} is new after construction: create it on every path of the term"
                 )
@@ -99,21 +92,16 @@ class Buffers:
             )
         return buffer
 
-    @property
-    def is_frozen(self) -> bool:
-        """Whether new buffers are refused."""
-        return self._frozen
-
     def freeze(self) -> None:
         """Refuse new buffers from now on, and let the existing ones start anew."""
-        self._frozen = True
+        self.is_frozen = True
         for name, buffer in self._buffers.items():
             buffer.zero_()
             if name in self._initial:
                 buffer.copy_(self._initial[name].expand_as(buffer))
 
     def clear(self, mask_E: Bool[Tensor, " E"]) -> None:
-        """Let the rows of `mask_E`, bool [E], start anew in each buffer that is not kept."""
+        """Let the rows of `mask_E` start anew in each buffer that is not kept."""
         for arena in self._arenas:
             arena.clear(mask_E)
         for name, initial in self._initial.items():
@@ -128,20 +116,13 @@ class Buffers:
 
     def _arena(self, width: int, dtype: torch.dtype) -> Arena:
         """Return an arena with room for so many numbers per env."""
-        for arena in self._arenas:
-            if arena.has_room(width, dtype):
-                return arena
-        made = Arena(self._num_envs, max(width, ARENA_WIDTH), dtype, self._device)
-        self._arenas.append(made)
-        return made
+        if not any(arena.has_room(width, dtype) for arena in self._arenas):
+            self._arenas.append(Arena(self._num_envs, max(width, ARENA_WIDTH), dtype, self._device))
+        return next(arena for arena in self._arenas if arena.has_room(width, dtype))
 
 
 class SharedValues:
-    """Named float32 tensors without an env dim, saved with the env.
-
-    Like `Buffers` they come into being while the env is constructed; unlike those they keep
-    what they start with, and no reset touches them.
-    """
+    """Named float32 tensors without an env dim, saved with the env; as `Buffers`, but no reset touches them."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
@@ -151,11 +132,7 @@ class SharedValues:
     def get(
         self, name: str, initial: float | Sequence[float] | Sequence[Sequence[float]]
     ) -> Float[Tensor, "*shape"]:
-        """Return the tensor `name`, which starts at `initial` and has its shape; the same tensor at each call.
-
-        Raises:
-            ValueError: if it is new after construction.
-        """
+        """Return the tensor `name`, always the same, which starts at `initial`; a ValueError if it is new too late."""
         tensor = self._tensors.get(name)
         if tensor is None:
             if self._frozen:
@@ -172,3 +149,54 @@ class SharedValues:
     def by_name(self) -> dict[str, Float[Tensor, "*?shape"]]:
         """Return the tensors by name."""
         return dict(self._tensors)
+
+
+class ActuatorParams:
+    """Buffers by name (`stiffness`, `effort_limit`, ...), float32 [E, L], in the order of `joint_pos_EL`.
+
+    They start at the numbers of the config, are read at each substep, are saved with the env, and stay when rows reset;
+    so an event may write them in place, for some rows, at any moment. Joints without such a number have 0 there,
+    unread.
+    """
+
+    def __init__(self, buffers: Buffers, joint_names: Sequence[str], device: torch.device) -> None:
+        self._all_buffers, self._joint_names, self._device = buffers, list(joint_names), device
+        self._buffers: dict[str, Tensor] = {}
+        self._nominal: dict[str, Tensor] = {}
+        self._owners: dict[str, dict[int, float]] = {}
+
+    def add(self, name: str, joints: Sequence[int], value: float) -> None:
+        """Give some joints a number; during construction only."""
+        if name not in self._buffers:
+            nominal_L = self._nominal[name] = torch.zeros(len(self._joint_names), device=self._device)
+            self._buffers[name] = self._all_buffers.get(
+                f"actuators.{name}_EL", len(self._joint_names), keep=True, initial=nominal_L
+            )
+        self._nominal[name][list(joints)] = value
+        self._buffers[name].copy_(self._nominal[name].expand_as(self._buffers[name]))
+        self._owners.setdefault(name, {}).update(dict.fromkeys(joints, value))
+
+    def get(self, name: str, joints: Collection[int] = ()) -> Float[Tensor, "E L"]:
+        """Return the present numbers, [E, L]; an error if one of `joints` has none."""
+        self._check(name, joints)
+        return self._buffers[name]
+
+    def nominal(self, name: str) -> Float[Tensor, " L"]:
+        """Return the numbers of the config, [L]."""
+        self._check(name, ())
+        return self._nominal[name]
+
+    def joints(self, name: str, *, finite: bool = False) -> frozenset[int]:
+        """Return the joints that have this number; with `finite`, those whose number in the config is finite."""
+        owners = self._owners.get(name, {})
+        return frozenset(joint for joint, value in owners.items() if not finite or math.isfinite(value))
+
+    def _check(self, name: str, joints: Collection[int]) -> None:
+        if name not in self._buffers:
+            raise unknown_name("parameter of explicit actuators", name, self._buffers)
+        for joint in joints:
+            if joint not in self._owners[name]:
+                raise ValueError(
+                    f"the actuator of joint {self._joint_names[joint]!r} has no parameter {name!r}: those of built-in "
+                    "actuators are the model fields actuator_gainprm, actuator_biasprm and actuator_forcerange"
+                )

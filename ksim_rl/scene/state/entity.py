@@ -1,7 +1,5 @@
 """This module reads and moves one robot or object of a scene: its root, its joints, and where it starts."""
 
-from __future__ import annotations
-
 import mujoco
 import torch
 from jaxtyping import Bool, Float
@@ -9,31 +7,23 @@ from torch import Tensor
 
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import scalar_joint_ids
-from ksim_rl.scene.state.bodies_and_sites import Bodies, Body
-from ksim_rl.scene.state.guarded_state import GuardedState
-from ksim_rl.scene.state.joints import Joints
+from ksim_rl.scene.state.elements import Bodies, Body, Joints
 from ksim_rl.scene.state.quantity import quantity
+from ksim_rl.scene.state.simulation import Simulation
 
 
 class Entity:
     """A robot or object, addressed by name: `view.entity("cube").root_pos_EL`.
 
-    The root is the body of the entity's first joint if that is free, else its first body. Poses and velocities are
-    those of the current state (position and velocity stage), float32 on the env's device.
-
-    Attributes:
-        name: the key in `scene.robots` or `scene.objects`.
-        prefix: what stands before the names of its elements; empty if it is alone in the scene.
-        root: the root body.
-        free_root: whether the root floats freely.
-        joints: its hinges and slides, in the model's order.
-        root_qpos, root_qvel: columns of the free joint in qpos (7) and qvel (6); empty if the root is fixed.
-        default_root_pos_L, default_root_quat_L: pose of the root at reset, m [3] and (w, x, y, z) [4], world frame.
+    The root is the body of the entity's first joint if that is free (`free_root`), else its first body; `root_qpos` and
+    `root_qvel` are columns of the free joint, empty if the root is fixed. `prefix` stands before the names of its
+    elements, and is empty if it is alone in the scene; `joints` are its hinges and slides. `default_root_pos_L` (m) and
+    `default_root_quat_L` are the pose at reset, world frame.
     """
 
     def __init__(
         self,
-        state: GuardedState,
+        state: Simulation,
         *,
         name: str,
         prefix: str,
@@ -44,13 +34,11 @@ class Entity:
         self._state = state
         model, device = state.world.mj_model, state.world.device
         self.name, self.prefix = name, prefix
-        bodies = [
-            b for b in range(1, model.nbody) if model.body(model.body_rootid[b]).name.startswith(prefix)
-        ]
+        roots = {r for r in model.body_rootid[1:].tolist() if model.body(r).name.startswith(prefix)}
+        bodies = [b for b in range(1, model.nbody) if model.body_rootid[b] in roots]
         if prefix and not bodies:
             raise ValueError(f"scene: {name!r} has no body: give it one, or put its geoms into the terrain")
-        own_bodies = frozenset(bodies)
-        joints = [j for j in range(model.njnt) if model.jnt_bodyid[j] in own_bodies]
+        joints = [j for j in range(model.njnt) if model.body_rootid[model.jnt_bodyid[j]] in roots]
         self.free_root = bool(joints) and model.jnt_type[joints[0]] == mujoco.mjtJoint.mjJNT_FREE
         root = int(model.jnt_bodyid[joints[0]]) if self.free_root else (bodies or [0])[0]
         self.root = Body(Bodies(state, [root], [model.body(root).name]))
@@ -61,61 +49,55 @@ class Entity:
             self.root_qpos, self.root_qvel = slice(qpos, qpos + 7), slice(qvel, qvel + 6)
             pose = default_qpos_L[self.root_qpos]
         self.default_root_pos_L, self.default_root_quat_L = pose.to(torch.float32).split((3, 4))
-
         self._down = torch.tensor([0.0, 0.0, -1.0], device=device)
-
-        every, own_joints = scalar_joint_ids(model), frozenset(joints)
-        own = [position for position, joint in enumerate(every) if joint in own_joints]
-        self.joints = every_joint.some(own)
+        self.joints = every_joint.some([i for i, j in enumerate(scalar_joint_ids(model)) if j in joints])
 
     # -- pose ----------------------------------------------------------------------------------------------------
 
     @quantity
     def root_pos_EL(self) -> Float[Tensor, "E 3"]:
-        """Position of the root body's frame in the world, m, [E, 3]."""
-        return self._free_qpos(0, 3) if self.free_root else self.root.pos_EL
+        """Position of the root body's frame in the world, m."""
+        return self._free_qpos_EL[:, :3] if self.free_root else self.root.pos_EL
 
     @quantity
     def root_quat_EL(self) -> Float[Tensor, "E 4"]:
-        """Orientation of the root body, body to world, (w, x, y, z), [E, 4]."""
-        return self._free_qpos(3, 7) if self.free_root else self.root.quat_EL
+        """Orientation of the root body, body to world, (w, x, y, z)."""
+        return self._free_qpos_EL[:, 3:] if self.free_root else self.root.quat_EL
 
     @quantity
     def projected_gravity_EL(self) -> Float[Tensor, "E 3"]:
-        """Unit vector of gravity (world -z) in the root body's frame, [E, 3]."""
+        """Unit vector of gravity (world -z) in the root body's frame."""
         return quaternion.rotate_inverse(self.root_quat_EL, self._down.expand(self._state.world.num_envs, 3))
 
     @quantity
     def heading_E(self) -> Float[Tensor, " E"]:
-        """Yaw of the root body, rad in [-pi, pi], [E]."""
+        """Yaw of the root body, rad in [-pi, pi]."""
         return quaternion.yaw(self.root_quat_EL)
 
     # -- velocity ------------------------------------------------------------------------------------------------
 
     @quantity
     def root_lin_vel_w_EL(self) -> Float[Tensor, "E 3"]:
-        """Linear velocity of the root body's frame origin, world frame, m/s, [E, 3]."""
-        if self.free_root:
-            return self._free_qvel(0, 3)
-        return self.root.lin_vel_EL
+        """Linear velocity of the root body's frame origin, world frame, m/s."""
+        return self._free_qvel_EL[:, :3] if self.free_root else self.root.lin_vel_EL
 
     @quantity
     def root_lin_vel_b_EL(self) -> Float[Tensor, "E 3"]:
-        """Linear velocity of the root body's frame origin, body frame, m/s, [E, 3]."""
+        """Linear velocity of the root body's frame origin, body frame, m/s."""
         return quaternion.rotate_inverse(self.root_quat_EL, self.root_lin_vel_w_EL)
 
     @quantity
     def root_ang_vel_w_EL(self) -> Float[Tensor, "E 3"]:
-        """Angular velocity of the root body, world frame, rad/s, [E, 3]."""
+        """Angular velocity of the root body, world frame, rad/s."""
         if self.free_root:
             return quaternion.rotate(self.root_quat_EL, self.root_ang_vel_b_EL)
         return self.root.ang_vel_EL
 
     @quantity
     def root_ang_vel_b_EL(self) -> Float[Tensor, "E 3"]:
-        """Angular velocity of the root body, body frame, rad/s, [E, 3]."""
+        """Angular velocity of the root body, body frame, rad/s."""
         if self.free_root:  # MuJoCo keeps a free joint's angular velocity in the body frame
-            return self._free_qvel(3, 6)
+            return self._free_qvel_EL[:, 3:]
         return quaternion.rotate_inverse(self.root_quat_EL, self.root_ang_vel_w_EL)
 
     # -- writes --------------------------------------------------------------------------------------------------
@@ -123,14 +105,10 @@ class Entity:
     def write_root_pose(
         self, mask_E: Bool[Tensor, " E"], pos_EL: Float[Tensor, "E 3"], quat_EL: Float[Tensor, "E 4"]
     ) -> None:
-        """Set position (m) and orientation (w, x, y, z) of the free root body in the rows of `mask_E`.
-
-        Raises:
-            ValueError: if the root is fixed.
-        """
+        """Set position (m) and orientation (w, x, y, z) of the free root body in the rows of `mask_E`."""
         self._require_free_root("write_root_pose")
         pose_EL = torch.cat((pos_EL, quat_EL), dim=-1)
-        self._state.write(self._state.world.qpos_EL[:, self.root_qpos], mask_E, pose_EL)
+        self._state.write(self._state.world.qpos_EL, self.root_qpos, mask_E, pose_EL)
 
     def write_root_velocity(
         self,
@@ -138,25 +116,19 @@ class Entity:
         lin_vel_w_EL: Float[Tensor, "E 3"],
         ang_vel_w_EL: Float[Tensor, "E 3"],
     ) -> None:
-        """Set the velocities (m/s, rad/s, world frame) of the free root body in the rows of `mask_E`.
-
-        Raises:
-            ValueError: if the root is fixed.
-        """
+        """Set the velocities (m/s, rad/s, world frame) of the free root body in the rows of `mask_E`."""
         self._require_free_root("write_root_velocity")
-        ang_vel_b_EL = quaternion.rotate_inverse(self._free_qpos(3, 7), ang_vel_w_EL)
+        ang_vel_b_EL = quaternion.rotate_inverse(self._free_qpos_EL[:, 3:], ang_vel_w_EL)
         velocity_EL = torch.cat((lin_vel_w_EL, ang_vel_b_EL), dim=-1)
-        self._state.write(self._state.world.qvel_EL[:, self.root_qvel], mask_E, velocity_EL)
+        self._state.write(self._state.world.qvel_EL, self.root_qvel, mask_E, velocity_EL)
 
-    # -- internals -----------------------------------------------------------------------------------------------
+    @property
+    def _free_qpos_EL(self) -> Tensor:
+        return self._state.world.qpos_EL[:, self.root_qpos]
 
-    def _free_qpos(self, start: int, stop: int) -> Tensor:
-        first = self.root_qpos.start
-        return self._state.world.qpos_EL[:, first + start : first + stop]
-
-    def _free_qvel(self, start: int, stop: int) -> Tensor:
-        first = self.root_qvel.start
-        return self._state.world.qvel_EL[:, first + start : first + stop]
+    @property
+    def _free_qvel_EL(self) -> Tensor:
+        return self._state.world.qvel_EL[:, self.root_qvel]
 
     def _require_free_root(self, what: str) -> None:
         if not self.free_root:

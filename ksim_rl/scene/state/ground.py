@@ -1,7 +1,5 @@
 """This module is the ground of E worlds as terms read it: where envs start, and how high it is at any place."""
 
-from __future__ import annotations
-
 import math
 
 import torch
@@ -25,35 +23,28 @@ class Ground:
 
     @property
     def origins_E3(self) -> Float[Tensor, "E 3"]:
-        """Where each env starts: a point on the ground, world frame, m, [E, 3]."""
+        """Where each env starts: a point on the ground, world frame, m."""
         return self._origins_E3
 
     @property
     def levels_E(self) -> Int64[Tensor, " E"]:
-        """The level of difficulty of each env, int64 [E] in [0, num_levels)."""
+        """The level of difficulty of each env, in [0, num_levels)."""
         return self._zeros_E
 
     @property
     def types_E(self) -> Int64[Tensor, " E"]:
-        """The kind of ground of each env, as an index into the terrain's kinds, int64 [E]."""
+        """The kind of ground of each env, as an index into the terrain's kinds."""
         return self._zeros_E
 
     def heights(self, points_EN2: Float[Tensor, "E N 2"]) -> Float[Tensor, "E N"]:
-        """Return the height of the ground at x, y (world frame, m, [E, N, 2]), m, [E, N].
-
-        Beyond the edge it is that of the nearest point within.
-        """
+        """Return the height of the ground at x, y (world frame, m), m; beyond the edge that of the nearest point."""
         return torch.zeros_like(points_EN2[..., 0])
 
     def clearance(self, points_EN3: Float[Tensor, "E N 3"]) -> Float[Tensor, "E N"]:
-        """Return how high points [E, N, 3] (world frame, m) are above the ground right below them, m, [E, N]."""
+        """Return how high points (world frame, m) are above the ground right below them, m."""
         height_EN = points_EN3[..., 2]
         return height_EN if self.is_flat else height_EN - self.heights(points_EN3[..., :2])
 
     def set_levels(self, mask_E: Bool[Tensor, " E"], levels_E: Int64[Tensor, " E"]) -> None:
-        """Move the rows of `mask_E` (bool [E]) to other levels (int64 [E]), before their reset.
-
-        Raises:
-            ValueError: if the terrain has no levels.
-        """
+        """Move the rows of `mask_E` to other levels, before their reset; a ValueError where the terrain has none."""
         raise ValueError("the scene's terrain has no levels: use a TerrainGrid in scene.terrain")

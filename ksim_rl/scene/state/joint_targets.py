@@ -1,6 +1,4 @@
-"""What joints are asked for, and the way from there to the controls of actuators that take it as it is."""
-
-from __future__ import annotations
+"""This module holds what joints are asked for, and writes it to the controls of actuators that take it as it is."""
 
 from collections.abc import Collection, Sequence
 from typing import Literal, NamedTuple
@@ -26,14 +24,14 @@ TargetKind = Literal["pos", "vel", "effort"]
 
 
 class JointState(NamedTuple):
-    """Where N joints are before a substep: rad or m, and rad/s or m/s, [E, N]."""
+    """Where N joints are before a substep: rad or m, and rad/s or m/s."""
 
     pos_EN: Float[Tensor, "E N"]
     vel_EN: Float[Tensor, "E N"]
 
 
 class JointTarget(NamedTuple):
-    """What N joints are asked for: position, velocity, and effort (N m or N) to add, [E, N]."""
+    """What N joints are asked for: position, velocity, and effort (N m or N) to add."""
 
     pos_EN: Float[Tensor, "E N"]
     vel_EN: Float[Tensor, "E N"]
@@ -70,12 +68,7 @@ class JointTargets:
 
     A target of a built-in actuator is its control and is written there too; a motor model reads it before each substep.
     An actuator takes the kind of target that its gains make of its control (see `control_kind`), so that a position
-    never ends up as the torque of a plain motor.
-
-    Attributes:
-        pos_EL: rad or m.
-        vel_EL: rad/s or m/s.
-        effort_EL: N m or N; of a motor from the MJCF, its control, which its gear and gain multiply.
+    never ends up as the torque of a plain motor. Efforts of the MJCF's motors are their controls, before gear and gain.
     """
 
     def __init__(
@@ -111,11 +104,7 @@ class JointTargets:
         self._find_servos()
 
     def motor(self, joint: int) -> int:
-        """Return the only actuator of a joint.
-
-        Raises:
-            ValueError: if it has none, or several.
-        """
+        """Return the only actuator of a joint."""
         found = self._actuators.get(joint, [])
         if len(found) != 1:
             name = self._resolver.names("joint")[joint]
@@ -132,27 +121,20 @@ class JointTargets:
         self._find_servos()
 
     def write(self, kind: TargetKind, patterns: Patterns, value_EK: Float[Tensor, "E K"]) -> None:
-        """Set the targets of the joints of `patterns`, in their order, in all rows.
-
-        Raises:
-            ValueError: if a joint has no actuator that takes this kind of target.
-        """
-        key = (kind, as_patterns(patterns))
-        route = self._routes.get(key)
-        if route is None:
-            route = self._routes[key] = self._route(kind, key[1])
+        """Set targets of joints in all rows, one column each in their order; a ValueError where one takes no such."""
+        route = self._route_of(kind, patterns)
         if route.limits_K2 is not None:
             value_EK = torch.clamp(value_EK, route.limits_K2[:, 0], route.limits_K2[:, 1])
         self._buffers[kind][:, route.joints] = value_EK
         if route.ctrl is not None:
             self._world.ctrl_EL[:, route.ctrl] = value_EK[:, route.columns]
 
-    def check_no_law(self, actuators: Sequence[int]) -> None:
-        """Refuse actuators whose controls a law writes.
+    def limits(self, kind: TargetKind, patterns: Patterns) -> Float[Tensor, "K 2"] | None:
+        """Return what targets of joints are clamped to, (low, high); None if nothing limits them."""
+        return self._route_of(kind, patterns).limits_K2
 
-        Raises:
-            ValueError: naming the joint of the first one.
-        """
+    def check_no_law(self, actuators: Sequence[int]) -> None:
+        """Refuse actuators whose controls a law writes, by a ValueError that names the joint."""
         for joint in self._driven_by_law:
             if self.motor(joint) in actuators:
                 raise ValueError(
@@ -178,6 +160,12 @@ class JointTargets:
         self._servo_ctrl = as_index([actuator for actuator, _ in servos], device) if servos else None
         self._servo_joints = as_index([joint for _, joint in servos], device)
 
+    def _route_of(self, kind: TargetKind, patterns: Patterns) -> _Route:
+        key = (kind, as_patterns(patterns))
+        if key not in self._routes:
+            self._routes[key] = self._route(kind, key[1])
+        return self._routes[key]
+
     def _route(self, kind: TargetKind, patterns: tuple[str, ...]) -> _Route:
         joints = self._resolver.ids("joint", patterns)
         ctrl, columns = [], []
@@ -192,26 +180,19 @@ class JointTargets:
                 raise self._refusal(kind, joint, {of_kind for _, of_kind in found})
             ctrl.append(fitting[0])
             columns.append(column)
-        device = self._world.device
+        model, device = self._world.mj_model, self._world.device
+        limits_K2 = None
+        if kind == "effort" and any(model.actuator_ctrllimited[actuator] for actuator in ctrl):
+            limits_K2 = torch.tensor([-torch.inf, torch.inf], device=device).repeat(len(joints), 1)
+            for column, actuator in zip(columns, ctrl, strict=True):
+                if model.actuator_ctrllimited[actuator]:
+                    limits_K2[column] = torch.tensor(model.actuator_ctrlrange[actuator], device=device)
         return _Route(
             joints=self._resolver.index("joint", patterns),
             ctrl=as_index(ctrl, device) if ctrl else None,
             columns=as_index(columns, device),
-            limits_K2=self._limits(dict(zip(columns, ctrl, strict=True)), len(joints))
-            if kind == "effort"
-            else None,
+            limits_K2=limits_K2,
         )
-
-    def _limits(self, ctrl_of_column: dict[int, int], num_columns: int) -> Tensor | None:
-        """Return the control ranges of motors, [K, 2], infinite where there is none; None if none has one."""
-        model = self._world.mj_model
-        limited = {c: a for c, a in ctrl_of_column.items() if model.actuator_ctrllimited[a]}
-        if not limited:
-            return None
-        limits_K2 = torch.tensor([-torch.inf, torch.inf], device=self._world.device).repeat(num_columns, 1)
-        for column, actuator in limited.items():
-            limits_K2[column] = torch.tensor(model.actuator_ctrlrange[actuator], device=self._world.device)
-        return limits_K2
 
     def _refusal(self, kind: TargetKind, joint: int, takes: Collection[TargetKind]) -> ValueError:
         name = self._resolver.names("joint")[joint]

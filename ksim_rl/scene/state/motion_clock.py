@@ -1,7 +1,5 @@
 """This module follows a reference motion through an episode: when in the motion each env is, and what it shows then."""
 
-from __future__ import annotations
-
 from jaxtyping import Float
 from torch import Tensor
 
@@ -10,19 +8,19 @@ from ksim_rl.scene.state.world_view import WorldView
 
 
 def motion_start_time(view: WorldView, file: str) -> Float[Tensor, " E"]:
-    """Return the buffer of when in the motion each episode began, s, [E]; `ResetToMotion` writes it."""
+    """Return the buffer of when in the motion each episode began, s; `ResetToMotion` writes it."""
     return view.buffers.get(f"motion/{file}.start_s_E")
 
 
 def motion_time(view: WorldView, file: str) -> Float[Tensor, " E"]:
-    """Return the present time in a motion that episodes follow from where `ResetToMotion` began them, s, [E]."""
+    """Return the present time in a motion that episodes follow from where `ResetToMotion` began them, s."""
     return motion_start_time(view, file) + view.episode_time_E
 
 
 def motion_joints(
     view: WorldView, file: str, joints: Patterns
 ) -> tuple[Float[Tensor, "E L"], Float[Tensor, "E L"]]:
-    """Return positions and velocities that joints have in the motion now, [E, L] each; computed once per state."""
+    """Return positions and velocities that joints have in the motion now; computed once per state."""
     keys = [f"motion/{file}.{part} of {joints}" for part in ("joint_pos", "joint_vel")]
     if keys[0] not in view.cache:
         sampled = view.motion(file).sample_joints(motion_time(view, file), view.joints(joints).index)
@@ -33,10 +31,7 @@ def motion_joints(
 def motion_bodies(
     view: WorldView, file: str, bodies: Patterns
 ) -> tuple[Float[Tensor, "E N 3"], Float[Tensor, "E N 4"]]:
-    """Return the poses that bodies have in the motion now, world frame, [E, N, 3] and [E, N, 4]; once per state.
-
-    On a terrain they are moved as `motion_shift` says.
-    """
+    """Return the poses that bodies have in the motion now, world frame, moved by `motion_shift`; once per state."""
     keys = [f"motion/{file}.{part} of {bodies}" for part in ("body_pos", "body_quat")]
     if keys[0] not in view.cache:
         pos_EN3, quat_EN4 = view.motion(file).sample_bodies(
@@ -49,5 +44,5 @@ def motion_bodies(
 
 
 def motion_shift(view: WorldView) -> Float[Tensor, "E 3"] | None:
-    """Return how far motions are moved in each env, m, [E, 3]: to its origin, if the robot's root can go there."""
+    """Return how far motions are moved in each env, m: to its origin, if the robot's root can go there."""
     return None if view.terrain.is_flat or not view.robot.free_root else view.terrain.origins_E3

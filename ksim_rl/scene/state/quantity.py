@@ -1,28 +1,30 @@
-"""Named quantities of the current state, each computed at most once per step."""
-
-from __future__ import annotations
+"""This module makes named quantities of the current state, each computed at most once per step."""
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 from jaxtyping import Shaped
 from torch import Tensor
 
 
-class HasCache(Protocol):
-    """What owns quantities: a dict that is emptied whenever the state changes."""
-
-    cache: dict[str, Tensor]
-
-
 def quantity(compute: Callable[[Any], Shaped[Tensor, "*shape"]]) -> property:
-    """Make a property that is computed at most once between two changes of the state."""
+    """Make a property that is computed once between two changes of the state, which empty its owner's `cache`."""
     name = compute.__name__
 
-    def read(owner: HasCache) -> Tensor:
+    def read(owner: Any) -> Tensor:
         value = owner.cache.get(name)
         if value is None:
             value = owner.cache[name] = compute(owner)
         return value
 
     return property(read, doc=compute.__doc__)
+
+
+def quantity_of(part: str, whole: property) -> property:
+    """Make a property that is the quantity `whole` of the object in the attribute `part`."""
+    return property(lambda owner: whole.__get__(getattr(owner, part)), doc=whole.__doc__)
+
+
+def first_of(part: str, whole: property) -> property:
+    """Make a property that is the first of the N elements whose quantity [E, N, ...] the object in `part` has."""
+    return property(lambda owner: whole.__get__(getattr(owner, part))[:, 0], doc=whole.__doc__)

@@ -1,44 +1,45 @@
 """This module drives the worlds of an env: it knows when the state changes, whose turn it is, and what is kept."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Literal
 
 import torch
-from jaxtyping import Int64, Shaped
+from jaxtyping import Bool, Float, Int64, Shaped
 from torch import Tensor
 
 from ksim_rl.device import random
 from ksim_rl.physics import World
+from ksim_rl.scene.names import Index
 from ksim_rl.scene.state.buffers import Buffers, SharedValues
-from ksim_rl.scene.state.guarded_state import GuardedState
+from ksim_rl.scene.state.ground import Ground
 
 
-class Simulation(GuardedState):
+class Simulation:
     """The worlds with their clocks, buffers and draws, for whoever drives them; terms read a `WorldView` of it.
 
-    A moment has two phases: state is written (`changed`), then the world refreshes what derives from it (`refreshed`).
-    A term runs inside `scope`, which names its buffers and its draws.
+    A moment has two phases: state is written through masks (`changed`), then the world refreshes what derives from it
+    (`refreshed`); what derives cannot be read in between. A term runs inside `scope`, which names its buffers.
 
     Attributes:
+        ground: what heights are measured from.
+        reader: who reads at the moment, for the error about stale quantities.
+        is_frozen: whether construction has ended.
         physics_dt, step_dt: s, of a substep and of an env step.
         max_episode_length: env steps; 0 for no limit.
         buffers, shared_values: what is kept from step to step, with and without a row per env.
         seed, step_count: int64 []; of all draws, and how many env steps have begun.
         reset_count_E, episode_step_E: int64 [E]; how often each env was reset, and env steps since then.
         time_out_offset_E: int64 [E]; env steps by which a staggered episode times out earlier.
-        before_substep, after_substep: called around each physics substep (see `World.step`); they read the world, whose
-            state is on its way.
+        before_substep, after_substep: called around each physics substep (see `World.step`), amid its changes of state.
         substep_sensors: at which substeps the world computes its sensors.
     """
 
     def __init__(self, world: World, *, step_dt: float, max_episode_length: int = 0) -> None:
-        super().__init__(world)
-        self.num_envs, self.device = world.num_envs, world.device
+        self.world, self.num_envs, self.device = world, world.num_envs, world.device
         self.physics_dt, self.step_dt = float(world.mj_model.opt.timestep), step_dt
         self.max_episode_length = max_episode_length
+        self.ground = Ground(self.num_envs, self.device)
         self.buffers = Buffers(self.num_envs, self.device)
         self.shared_values = SharedValues(self.device)
         self.seed = torch.zeros((), dtype=torch.int64, device=self.device)
@@ -50,21 +51,73 @@ class Simulation(GuardedState):
         self.after_substep: list[Callable[[], None]] = []
         self.substep_sensors: Literal["last", "every"] = "last"
         self.startup_counter = torch.zeros_like(self.seed)
+        self.reader, self.is_frozen, self._is_stale = "", False, False
+        self._caches: list[dict[str, Tensor]] = []
+        self._body_root = torch.tensor(world.mj_model.body_rootid, device=self.device, dtype=torch.int64)
         self._counter = self.startup_counter
         self._scope, self._draw_scope, self._draws = "", "", 0
         self._lasting: set[int] = set()
+
+    # -- state and what derives from it ----------------------------------------------------------------------------
+
+    def new_cache(self) -> dict[str, Shaped[Tensor, "*?shape"]]:
+        """Return a dict for quantities that is emptied whenever the state changes."""
+        self._caches.append({})
+        return self._caches[-1]
+
+    def derived(self) -> World:
+        """Return the world for reading what derives from the state; a RuntimeError if a write has made that stale."""
+        if self._is_stale:
+            raise RuntimeError(
+                f"{self.reader or 'a term'} reads a derived quantity (pose of a body or site, sensor) after state was "
+                "written in the same moment: read it before writing, or from the joint state"
+            )
+        return self.world
+
+    def forget(self) -> None:
+        """Forget computed quantities, whether or not what derives from the state is current."""
+        for cache in self._caches:
+            cache.clear()
+
+    def refreshed(self) -> None:
+        """Forget computed quantities: the state has changed, and the world has refreshed what derives from it."""
+        self.forget()
+        self._is_stale = False
+
+    def changed(self) -> None:
+        """Forget computed quantities: the state has changed, and what derives from it has not followed yet."""
+        self.forget()
+        self._is_stale = True
+
+    def write(
+        self,
+        state_EL: Float[Tensor, "E L"],
+        columns: Index,
+        mask_E: Bool[Tensor, " E"],
+        value_EN: Float[Tensor, "E N"],
+    ) -> None:
+        """Copy the rows of `mask_E` into some columns of the state."""
+        state_EL[:, columns] = torch.where(mask_E[:, None], value_EN, state_EL[:, columns])
+        self.changed()
+
+    def point_velocity(self, point_EN3: Float[Tensor, "E N 3"], body: Index) -> Float[Tensor, "E N 3"]:
+        """Return the velocities of points fixed to bodies, world frame, m/s."""
+        # MuJoCo's cvel is (angular, linear) about the centre of mass of the body's kinematic tree.
+        world = self.derived()
+        cvel_EN6 = world.cvel_EL[:, body]
+        lever_EN3 = point_EN3 - world.subtree_com_EL[:, self._body_root[body]]
+        return cvel_EN6[..., 3:] + torch.linalg.cross(cvel_EN6[..., :3], lever_EN3)
+
+    # -- terms -------------------------------------------------------------------------------------------------------
 
     @contextmanager
     def scope(
         self, name: str, counter: Int64[Tensor, "*envs"] | None = None, *, draws: str = ""
     ) -> Iterator[None]:
-        """Run a term under a name, which separates its buffers and its random draws from all others'.
+        """Run a term under a name, which separates its buffers and draws from others' and stands before its errors.
 
         `counter` keys the draws (the step count unless given), and `draws` tells apart the moments of one term whose
         counters may coincide.
-
-        Raises:
-            ValueError: what the term raises, with its name before it.
         """
         self._scope, self._draw_scope, self._draws = name, f"{name}@{draws}", 0
         self.reader = name
@@ -89,15 +142,12 @@ class Simulation(GuardedState):
 
     def freeze(self) -> None:
         """End construction: no new buffers, and all that lives on is known to `detached`."""
-        self.is_frozen = True
+        self.is_frozen = self.world.is_frozen = True
         self.buffers.freeze()
         self.shared_values.freeze()
-        lasting = [
-            *self.buffers.by_name().values(),
-            *self.world.views().values(),
-            self.episode_step_E,
-        ]
-        lasting += [*self.shared_values.by_name().values(), *self.world.per_world_fields().values()]
+        groups = (self.buffers.by_name(), self.world.views(), self.shared_values.by_name())
+        lasting = [tensor for group in groups for tensor in group.values()]
+        lasting += [self.episode_step_E, *self.world.per_world_fields().values()]
         self._lasting = {tensor.untyped_storage().data_ptr() for tensor in lasting}
 
     def detached(self, value: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*shape"]:

@@ -1,7 +1,5 @@
 """This module is what the parts of a scene and the terms of an env read: named quantities of the current state."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
@@ -15,33 +13,29 @@ from ksim_rl.device import random
 from ksim_rl.physics import World
 from ksim_rl.scene.motions.motion import ReferenceMotion, load_motion
 from ksim_rl.scene.names import Index, NameResolver, Patterns, as_index, as_patterns, scalar_joint_ids
-from ksim_rl.scene.state.actuator_params import ActuatorParams
-from ksim_rl.scene.state.bodies_and_sites import Bodies, Body, Site, Sites
+from ksim_rl.scene.state.buffers import ActuatorParams
+from ksim_rl.scene.state.elements import Bodies, Body, Joints, JointTables, Site, Sites
 from ksim_rl.scene.state.entity import Entity
-from ksim_rl.scene.state.first_robot import FirstRobot
 from ksim_rl.scene.state.ground import Ground
 from ksim_rl.scene.state.joint_targets import JointTargets
-from ksim_rl.scene.state.joints import Joints, JointTables
-from ksim_rl.scene.state.quantity import quantity
+from ksim_rl.scene.state.quantity import quantity, quantity_of
 from ksim_rl.scene.state.simulation import Simulation
 
 Points = TypeVar("Points", Bodies, Sites)
 
 
-class WorldView(FirstRobot):
+class WorldView:
     """A typed view of the worlds: names, joints, bodies, sites, entities, clocks, buffers, keyed draws and writes.
 
     Position- and velocity-stage quantities (poses, velocities, most sensors) are those of the current state.
     Acceleration-stage ones (contact sensors, accelerometers, actuator forces) belong to the last physics substep, and
     read zero in rows that were just reset. Each is computed at most once per state. All values are float32 on the env's
-    device unless stated otherwise.
+    device unless stated otherwise. Clocks are described in `Simulation`.
 
     Attributes:
-        world: the worlds themselves.
         cache: a dict for quantities of one's own; it is emptied whenever the state changes.
-        seed, step_count, reset_count_E, episode_step_E, time_out_offset_E: the clocks (see `Simulation`).
-        targets, actuator_params: what joints are asked for, and the numbers of motor models.
-        entities: robots and objects by name; `robot` is the first.
+        entities: robots and objects by name; `robot` is the first, whose quantities and writes the view has too.
+        joint_pos_target_EL, joint_vel_target_EL, joint_effort_target_EL: what joints are asked for; SI units.
     """
 
     def __init__(
@@ -84,6 +78,8 @@ class WorldView(FirstRobot):
         self.targets = JointTargets(
             self.world, self.resolver, self.buffers, default_joint_pos_EL=self.default_joint_pos_EL
         )
+        self.joint_pos_target_EL, self.joint_vel_target_EL = self.targets.pos_EL, self.targets.vel_EL
+        self.joint_effort_target_EL = self.targets.effort_EL
         self.actuator_params = ActuatorParams(self.buffers, self.resolver.names("joint"), self.device)
         ctrl_range = torch.tensor(model.actuator_ctrlrange, device=self.device, dtype=torch.float32)
         self.ctrl_limits_L2 = self._limited(ctrl_range.view(-1, 2), model.actuator_ctrllimited)
@@ -107,6 +103,11 @@ class WorldView(FirstRobot):
             for name in entities or ("robot",)
         }
         self.robot = next(iter(self.entities.values()))
+        self.free_root = self.robot.free_root
+        self.write_root_pose, self.write_root_velocity = (
+            self.robot.write_root_pose,
+            self.robot.write_root_velocity,
+        )
 
     # -- names ---------------------------------------------------------------------------------------------------
 
@@ -124,11 +125,7 @@ class WorldView(FirstRobot):
         return self._points(Bodies, "body", patterns)
 
     def body(self, name: str) -> Body:
-        """Return the one body of this name (or pattern): `view.body("torso").lin_vel_EL`.
-
-        Raises:
-            ValueError: if several match.
-        """
+        """Return the one body of this name (or pattern): `view.body("torso").lin_vel_EL`."""
         self.resolver.one("body", name)
         return Body(self.bodies(name))
 
@@ -137,11 +134,7 @@ class WorldView(FirstRobot):
         return self._points(Sites, "site", patterns)
 
     def site(self, name: str) -> Site:
-        """Return the one site of this name (or pattern): `view.site("finger").pos_EL`.
-
-        Raises:
-            ValueError: if several match.
-        """
+        """Return the one site of this name (or pattern): `view.site("finger").pos_EL`."""
         self.resolver.one("site", name)
         return Site(self.sites(name))
 
@@ -152,32 +145,21 @@ class WorldView(FirstRobot):
             self._named[key] = kind(self._simulation, ids, [names[i] for i in ids])
         return self._named[key]
 
-    # -- joints --------------------------------------------------------------------------------------------------
+    # -- joints, and the first robot ------------------------------------------------------------------------------
 
-    @property
-    def joint_pos_EL(self) -> Float[Tensor, "E L"]:
-        """Positions of all hinges (rad) and slides (m), in the model's order, [E, L]."""
-        return self._every_joint.pos_EL
-
-    @property
-    def joint_vel_EL(self) -> Float[Tensor, "E L"]:
-        """Velocities of all hinges (rad/s) and slides (m/s), in the model's order, [E, L]."""
-        return self._every_joint.vel_EL
-
-    @property
-    def joint_acc_EL(self) -> Float[Tensor, "E L"]:
-        """Accelerations of all hinges (rad/s^2) and slides (m/s^2); acceleration stage, [E, L]."""
-        return self._every_joint.acc_EL
-
-    @property
-    def joint_effort_EL(self) -> Float[Tensor, "E L"]:
-        """What actuators exert on all hinges (N m) and slides (N), behind the gears; acceleration stage, [E, L]."""
-        return self._every_joint.effort_EL
-
-    @property
-    def joint_pos_rel_EL(self) -> Float[Tensor, "E L"]:
-        """Joint positions minus the default pose, [E, L]."""
-        return self._every_joint.pos_rel_EL
+    joint_pos_EL = quantity_of("_every_joint", Joints.pos_EL)
+    joint_vel_EL = quantity_of("_every_joint", Joints.vel_EL)
+    joint_acc_EL = quantity_of("_every_joint", Joints.acc_EL)
+    joint_effort_EL = quantity_of("_every_joint", Joints.effort_EL)
+    joint_pos_rel_EL = quantity_of("_every_joint", Joints.pos_rel_EL)
+    root_pos_EL = quantity_of("robot", Entity.root_pos_EL)
+    root_quat_EL = quantity_of("robot", Entity.root_quat_EL)
+    root_lin_vel_w_EL = quantity_of("robot", Entity.root_lin_vel_w_EL)
+    root_ang_vel_w_EL = quantity_of("robot", Entity.root_ang_vel_w_EL)
+    root_lin_vel_b_EL = quantity_of("robot", Entity.root_lin_vel_b_EL)
+    root_ang_vel_b_EL = quantity_of("robot", Entity.root_ang_vel_b_EL)
+    projected_gravity_EL = quantity_of("robot", Entity.projected_gravity_EL)
+    heading_E = quantity_of("robot", Entity.heading_E)
 
     @property
     def terrain(self) -> Ground:
@@ -187,11 +169,7 @@ class WorldView(FirstRobot):
     # -- entities -------------------------------------------------------------------------------------------------
 
     def entity(self, name: str = "") -> Entity:
-        """Return a robot or object of the scene by name; "" is the first robot.
-
-        Raises:
-            ValueError: if there is none of this name, with the near names.
-        """
+        """Return a robot or object of the scene by name; "" is the first robot."""
         if not name:
             return self.robot
         if name not in self.entities:
@@ -203,17 +181,13 @@ class WorldView(FirstRobot):
     # -- sensors, motions, time -------------------------------------------------------------------------------------
 
     def sensor(self, name: str) -> Float[Tensor, "E L"]:
-        """Return the reading of an MJCF sensor, [E, dim]."""
+        """Return the reading of an MJCF sensor."""
         if name not in self._sensor_slices:
             raise ValueError(f"no sensor {name!r}: {near(name, self._sensor_slices)}")
         return self._simulation.derived().sensordata_EL[:, self._sensor_slices[name]]
 
     def derived(self) -> World:
-        """Return the world for reading what derives from the state.
-
-        Raises:
-            RuntimeError: if state was written in the same moment, which has made that stale.
-        """
+        """Return the world for reading what derives from the state: `Simulation.derived`."""
         return self._simulation.derived()
 
     def motion(self, file: str) -> ReferenceMotion:
@@ -224,39 +198,22 @@ class WorldView(FirstRobot):
 
     @quantity
     def episode_time_E(self) -> Float[Tensor, " E"]:
-        """Time since the episode's start, s, [E]."""
+        """Time since the episode's start, s."""
         return self.episode_step_E.to(torch.float32) * self.step_dt
 
     # -- actuators -----------------------------------------------------------------------------------------------
 
-    @property
-    def joint_pos_target_EL(self) -> Float[Tensor, "E L"]:
-        """Positions that joints are asked for, rad or m, [E, L]; the default pose until an action asks otherwise."""
-        return self.targets.pos_EL
-
-    @property
-    def joint_vel_target_EL(self) -> Float[Tensor, "E L"]:
-        """Velocities that joints are asked for, rad/s or m/s, [E, L]."""
-        return self.targets.vel_EL
-
-    @property
-    def joint_effort_target_EL(self) -> Float[Tensor, "E L"]:
-        """Efforts that joints are asked for, N m or N, [E, L]."""
-        return self.targets.effort_EL
-
     def actuator_param(self, name: str, joints: Patterns | None = None) -> Float[Tensor, "E L"]:
-        """Return a number of explicit actuators, [E, L], such as "stiffness", to be read or written in place.
+        """Return a number of explicit actuators, such as "stiffness", which all of `joints` must have, to read or
+        write.
 
-        `joints` names those that must have it. What an event writes holds from the next substep on, and until it is
-        written again: resets leave it alone. Built-in actuators have model fields instead (`actuators.builtin`).
-
-        Raises:
-            ValueError: if there is no such number, or one of `joints` does not have it.
+        What an event writes holds from the next substep on, and until it is written again: resets leave it alone.
+        Built-in actuators have model fields instead (`actuators.builtin`).
         """
         return self.actuator_params.get(name, () if joints is None else self.resolver.ids("joint", joints))
 
     def nominal_actuator_param(self, name: str) -> Float[Tensor, " L"]:
-        """Return the numbers of `actuator_param` as the config gives them, [L]."""
+        """Return the numbers of `actuator_param` as the config gives them."""
         return self.actuator_params.nominal(name)
 
     # -- what terms keep and draw --------------------------------------------------------------------------------
@@ -264,7 +221,7 @@ class WorldView(FirstRobot):
     def buffer(
         self, name: str, *shape: int, dtype: torch.dtype = torch.float32, keep: bool = False
     ) -> Shaped[Tensor, " E *shape"]:
-        """Return a buffer [E, *shape] that belongs to the calling term; rows that reset are zeroed unless `keep`."""
+        """Return a buffer that belongs to the calling term; rows that reset are zeroed unless `keep`."""
         return self.buffers.get(self._simulation.scoped(name), *shape, dtype=dtype, keep=keep)
 
     def shared(
@@ -279,51 +236,37 @@ class WorldView(FirstRobot):
         low: float | Float[Tensor, "*low"] = 0.0,
         high: float | Float[Tensor, "*high"] = 1.0,
     ) -> Float[Tensor, "E L"]:
-        """Draw float32 [E, n] from [low, high); the numbers depend on seed, term, env and moment only."""
+        """Draw float32 from [low, high); the numbers depend on seed, term, env and moment only."""
         return random.uniform(self._simulation.next_keys(), n, low, high)
 
     def normal(self, n: int) -> Float[Tensor, "E L"]:
-        """Draw float32 [E, n] from the standard normal distribution."""
+        """Draw float32 from the standard normal distribution."""
         return random.normal(self._simulation.next_keys(), n)
 
     def integers(self, n: int, low: int, high: int) -> Int64[Tensor, "E L"]:
-        """Draw int64 [E, n] from {low, ..., high}, both included."""
+        """Draw from {low, ..., high}, both included."""
         return random.integers(self._simulation.next_keys(), n, low, high)
 
     # -- writes --------------------------------------------------------------------------------------------------
 
     def write_qpos(self, mask_E: Bool[Tensor, " E"], qpos_EL: Float[Tensor, "E L"]) -> None:
         """Set all generalized positions, MuJoCo's layout, in the rows of `mask_E`."""
-        self._simulation.write(self.world.qpos_EL, mask_E, qpos_EL)
+        self._simulation.write(self.world.qpos_EL, slice(None), mask_E, qpos_EL)
 
     def write_qvel(self, mask_E: Bool[Tensor, " E"], qvel_EL: Float[Tensor, "E L"]) -> None:
         """Set all generalized velocities, MuJoCo's layout, in the rows of `mask_E`."""
-        self._simulation.write(self.world.qvel_EL, mask_E, qvel_EL)
+        self._simulation.write(self.world.qvel_EL, slice(None), mask_E, qvel_EL)
 
     def write_joint_pos_target(self, joints: Patterns, target_EK: Float[Tensor, "E K"]) -> None:
-        """Ask joints for positions, rad or m, in all rows; one column per joint, in the order of `joints`.
-
-        Raises:
-            ValueError: if a joint has no actuator that takes positions.
-        """
+        """Ask joints for positions, rad or m, in all rows: `JointTargets.write`."""
         self.targets.write("pos", joints, target_EK)
 
     def write_joint_vel_target(self, joints: Patterns, target_EK: Float[Tensor, "E K"]) -> None:
-        """Ask joints for velocities, rad/s or m/s, in all rows; one column per joint, in the order of `joints`.
-
-        Raises:
-            ValueError: if a joint has no actuator that takes velocities.
-        """
+        """Ask joints for velocities, rad/s or m/s, in all rows: `JointTargets.write`."""
         self.targets.write("vel", joints, target_EK)
 
     def write_joint_effort_target(self, joints: Patterns, target_EK: Float[Tensor, "E K"]) -> None:
-        """Ask joints for efforts, N m or N, in all rows; one column per joint, in the order of `joints`.
-
-        The control ranges of motors clamp them. A motor of the MJCF multiplies them by its gear and gain.
-
-        Raises:
-            ValueError: if a joint has no actuator that takes efforts.
-        """
+        """Ask joints for efforts, N m or N, in all rows; those of the MJCF's motors are clamped, then geared."""
         self.targets.write("effort", joints, target_EK)
 
     def write_ctrl(self, actuators: Index, ctrl_EN: Float[Tensor, "E N"]) -> None:

@@ -1,7 +1,8 @@
 """Terrains are what a scene stands on: an endless plane, or a grid of patches of several kinds."""
+# ruff: noqa: F401
 
 from ksim_rl.scene.state.ground import Ground
-from ksim_rl.scene.terrains.grid import TerrainGrid
+from ksim_rl.scene.terrains.grid import PatchedGround, TerrainGrid
 from ksim_rl.scene.terrains.kinds import (
     DiscreteObstacles,
     FlatPatch,
@@ -13,23 +14,6 @@ from ksim_rl.scene.terrains.kinds import (
     Waves,
 )
 from ksim_rl.scene.terrains.patch import Lattice, TerrainPatch
-from ksim_rl.scene.terrains.patched_ground import PatchedGround
 from ksim_rl.scene.terrains.terrain import PlaneTerrain, Terrain
 
-__all__ = [
-    "DiscreteObstacles",
-    "FlatPatch",
-    "Gaps",
-    "Ground",
-    "Lattice",
-    "PatchedGround",
-    "PlaneTerrain",
-    "PyramidSlope",
-    "PyramidStairs",
-    "RoughGround",
-    "SteppingStones",
-    "Terrain",
-    "TerrainGrid",
-    "TerrainPatch",
-    "Waves",
-]
+__all__ = sorted(name for name, value in vars().items() if isinstance(value, type))  # pyright: ignore

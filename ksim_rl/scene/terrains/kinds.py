@@ -1,4 +1,4 @@
-"""Each class is a kind of ground: a rule that gives the heights of a square patch at a difficulty in [0, 1]."""
+"""This module has the kinds of ground: each is a rule that gives the heights of a square patch at a difficulty."""
 
 import math
 from dataclasses import dataclass
@@ -17,34 +17,23 @@ class FlatPatch(TerrainPatch):
     cell: Cell = 1.0
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
-        """Return zeros, [R, C]."""
         return np.zeros_like(lattice.x_RC)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RoughGround(TerrainPatch):
-    """Heights drawn independently and uniformly from [-amplitude, amplitude] at points `cell` apart.
-
-    Attributes:
-        amplitude: m, at difficulty 0 and 1.
-    """
+    """Heights drawn independently and uniformly from [-amplitude, amplitude] at points `cell` apart."""
 
     amplitude: EasyToHard = (0.01, 0.06)
     cell: Cell = 0.15
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
-        """Return the heights, m, [R, C]."""
         return between(self.amplitude, difficulty) * rng.uniform(-1.0, 1.0, lattice.x_RC.shape)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Waves(TerrainPatch):
-    """Two crossed standing waves: amplitude / 2 * (cos(2 pi x / length) + cos(2 pi y / length)).
-
-    Attributes:
-        amplitude: m, at difficulty 0 and 1; crests are 2 amplitudes above the deepest troughs.
-        wave_length: m.
-    """
+    """Two crossed standing waves: amplitude / 2 * (cos(2 pi x / length) + cos(2 pi y / length))."""
 
     amplitude: EasyToHard = (0.02, 0.2)
     wave_length: float = 2.0
@@ -55,7 +44,6 @@ class Waves(TerrainPatch):
         check_in_range("wave_length", self.wave_length, low=4 * self.cell)
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
-        """Return the heights, m, [R, C]."""
         per_metre = 2 * math.pi / self.wave_length
         crests_RC = np.cos(per_metre * lattice.x_RC) + np.cos(per_metre * lattice.y_RC)
         return between(self.amplitude, difficulty) / 2 * crests_RC
@@ -63,14 +51,10 @@ class Waves(TerrainPatch):
 
 @dataclass(frozen=True, kw_only=True)
 class PyramidSlope(TerrainPatch):
-    """A square pyramid with a platform on top; inverted, a pit with the platform at its bottom.
+    """A square pyramid with a platform on top; `inverted`, a pit with the platform at its bottom.
 
-    Envs start on the platform: they walk down a pyramid, and up out of a pit.
-
-    Attributes:
-        gradient: rise over run (the tangent of the slope's angle), at difficulty 0 and 1.
-        platform_width: edge of the platform, m.
-        inverted: a pit instead of a pyramid.
+    Envs start on the platform: they walk down a pyramid, and up out of a pit. The `gradient` is rise over run (the
+    tangent of the slope's angle).
     """
 
     gradient: EasyToHard = (0.0, 0.5)
@@ -79,22 +63,16 @@ class PyramidSlope(TerrainPatch):
     cell: Cell = 0.25
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
-        """Return the heights, m, [R, C]."""
         run_RC = np.maximum(lattice.ring_RC - self.platform_width / 2, 0.0)
         return between(self.gradient, difficulty) * (run_RC if self.inverted else -run_RC)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PyramidStairs(TerrainPatch):
-    """A square pyramid of steps with a platform on top; inverted, a pit with the platform at its bottom.
+    """A square pyramid of steps with a platform on top; `inverted`, a pit with the platform at its bottom.
 
-    Envs start on the platform: they walk down a pyramid, and up out of a pit. Each riser is one `cell` wide.
-
-    Attributes:
-        step_height: m, at difficulty 0 and 1.
-        step_width: m from one riser to the next.
-        platform_width: edge of the platform, m.
-        inverted: a pit instead of a pyramid.
+    Envs start on the platform: they walk down a pyramid, and up out of a pit. Each riser is one `cell` wide, and
+    `step_width` reaches from one to the next; there are as many steps as fit.
     """
 
     step_height: EasyToHard = (0.02, 0.2)
@@ -108,7 +86,6 @@ class PyramidStairs(TerrainPatch):
         check_in_range("step_width", self.step_width, low=2 * self.cell)
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
-        """Return the heights, m, [R, C]; as many steps as fit."""
         from_platform_RC = (lattice.ring_RC - self.platform_width / 2 - TIE) / self.step_width
         num_steps = int((lattice.size - self.platform_width) / 2 / self.step_width)
         step_RC = np.clip(np.ceil(from_platform_RC), 0, num_steps)
@@ -117,14 +94,7 @@ class PyramidStairs(TerrainPatch):
 
 @dataclass(frozen=True, kw_only=True)
 class DiscreteObstacles(TerrainPatch):
-    """Rectangular blocks and pits at random places, around an even platform; later ones cover earlier ones.
-
-    Attributes:
-        height: m of blocks, and depth of pits, at difficulty 0 and 1.
-        width: edges are drawn from this range, m.
-        num_obstacles: how many there are.
-        platform_width: edge of the platform, m.
-    """
+    """Blocks and pits of `height`, edges drawn from `width`, around an even platform; later ones cover earlier ones."""
 
     height: EasyToHard = (0.02, 0.2)
     width: NonNegativeRange = (0.3, 1.0)
@@ -132,7 +102,6 @@ class DiscreteObstacles(TerrainPatch):
     platform_width: NonNegative = 1.5
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
-        """Return the heights, m, [R, C]."""
         height, reach = between(self.height, difficulty), lattice.size / 2
         ground_RC = np.zeros_like(lattice.x_RC)
         for _ in range(self.num_obstacles):
@@ -148,14 +117,8 @@ class DiscreteObstacles(TerrainPatch):
 class SteppingStones(TerrainPatch):
     """Square stones in rows and columns around a platform, with holes between them.
 
-    The flanks of stones are one `cell` wide, within the gaps, and all lengths are whole cells.
-
-    Attributes:
-        stone_width: edge of a stone's top, m, at difficulty 0 and 1.
-        gap: m between the tops of neighbouring stones, at difficulty 0 and 1.
-        unevenness: tops are drawn from [-unevenness, unevenness], m, at difficulty 0 and 1.
-        depth: m of the holes.
-        platform_width: edge of the platform, m.
+    The flanks of stones are one `cell` wide, within the gaps, and all lengths are whole cells. Widths and gaps are
+    those of the stones' tops, whose heights are drawn from [-unevenness, unevenness].
     """
 
     stone_width: EasyToHard = (0.8, 0.35)
@@ -171,7 +134,6 @@ class SteppingStones(TerrainPatch):
         Within(low=2 * self.cell).check("gap", self.gap)
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
-        """Return the heights, m, [R, C]."""
         cell = lattice.spacing
         width = max(1, round(between(self.stone_width, difficulty) / cell))
         gap = max(2, round(between(self.gap, difficulty) / cell))
@@ -191,13 +153,8 @@ class SteppingStones(TerrainPatch):
 class Gaps(TerrainPatch):
     """Square trenches around a platform, one after the other, with even ground between them.
 
-    The flanks of a trench are one `cell` wide, and all lengths are whole cells.
-
-    Attributes:
-        width: m from brink to brink, at difficulty 0 and 1.
-        spacing: m of ground between two trenches.
-        depth: m.
-        platform_width: edge of the platform, m.
+    The flanks of a trench are one `cell` wide, and all lengths are whole cells; `width` reaches from brink to brink,
+    `spacing` from one trench to the next.
     """
 
     width: EasyToHard = (0.1, 0.6)
@@ -212,7 +169,6 @@ class Gaps(TerrainPatch):
         check_in_range("spacing", self.spacing, low=self.cell)
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
-        """Return the heights, m, [R, C]."""
         cell = lattice.spacing
         width = max(2, round(between(self.width, difficulty) / cell)) * cell
         ground = max(1, round(self.spacing / cell)) * cell

@@ -1,7 +1,5 @@
 """This module has the base of all kinds of ground: a rule gives the heights of a square patch at a difficulty."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,9 +23,7 @@ EasyToHard = Annotated[tuple[float, float], Within(low=0.0)]
 class Lattice:
     """The points of a square patch at which heights are given; between them the ground is made of triangles.
 
-    Attributes:
-        size: edge of the patch, m; its centre is the origin.
-        cell: wanted distance between neighbouring points, m; the nearest that divides `size` is taken.
+    The patch has edges of `size`, m, about the origin; points are `cell` apart, or the nearest that divides `size`.
     """
 
     size: float
@@ -45,7 +41,7 @@ class Lattice:
 
     @cached_property
     def x_RC(self) -> np.ndarray:
-        """Return x of each point, m, [R, C]; columns run along x."""
+        """X of each point, m; columns run along x."""
         line = np.linspace(-self.size / 2, self.size / 2, self.num_cells + 1)
         return np.broadcast_to(line, (line.size, line.size))
 
@@ -64,10 +60,9 @@ class Lattice:
 class TerrainPatch(Checked, ABC):
     """A kind of ground. Pairs are values at difficulty 0 and at difficulty 1, with a straight line between them.
 
-    Attributes:
-        proportion: share of the envs on this kind, relative to the other kinds.
-        cell: m between the points at which heights are given. What costs is the number of triangles under a foot, so
-            take the coarsest that shows the shape.
+    Lengths are in m; `platform_width` is the edge of the even square about the centre, `proportion` the share of envs
+    relative to other kinds, `cell` the distance of points at which heights are given. What costs is the number of
+    triangles under a foot, so take the coarsest that shows the shape.
     """
 
     proportion: Positive = 1.0

@@ -1,7 +1,5 @@
 """This module has the base of all terrains: a config edits the model, and makes the ground that terms read."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,18 +12,14 @@ from ksim_rl.scene.state.ground import Ground
 from ksim_rl.scene.state.world_view import WorldView
 
 Friction = tuple[NonNegative, NonNegative, NonNegative]
+"""Sliding (1), torsional (m) and rolling (m) coefficients, as in MJCF."""
 MATERIAL = "terrain"
 BODY = "terrain"
 """Name of the body, and of the geom, that a terrain adds to the world."""
 
 
 def add_look(spec: mujoco.MjSpec, *, repeat: float) -> None:
-    """Add sky, light and the material `MATERIAL`.
-
-    Args:
-        spec: the scene's spec; its own sky stays if it has one.
-        repeat: repetitions of the pattern (two tiles) per metre.
-    """
+    """Add sky (unless there is one), light and the material `MATERIAL`, whose pattern repeats so often per metre."""
     if not any(texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
         spec.add_texture(
             name="terrain_sky",
@@ -86,15 +80,10 @@ class Terrain(Checked, ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class PlaneTerrain(Terrain):
-    """An infinite plane at z = 0: body and geom are both called "terrain".
-
-    Attributes:
-        friction: sliding (1), torsional (m) and rolling (m) coefficients, as in MJCF.
-    """
+    """An infinite plane at z = 0: body and geom are both called "terrain"."""
 
     friction: Friction = (1.0, 0.005, 0.0001)
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
-        """Add the plane to the world body, with a checker pattern and a sky for rendering."""
         add_look(spec, repeat=2)
         add_ground(spec, friction=self.friction, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.01])

@@ -11,14 +11,13 @@ from torch import Tensor
 from torchrl.envs.transforms import RenameTransform, Transform
 
 from ksim_rl.checked import Checked
-from ksim_rl.transforms.clip import ObservationClip, check_clip
 from ksim_rl.transforms.delay import DelayCfg, ObservationDelay
+from ksim_rl.transforms.elementwise import ObservationClip, ObservationScale, check_clip, check_scale
 from ksim_rl.transforms.groups.groups import ObservationGroups
 from ksim_rl.transforms.history import HistoryCfg, ObservationHistory
 from ksim_rl.transforms.noise.cfg import NoiseCfg, PerDim
 from ksim_rl.transforms.noise.observation_noise import ObservationNoise
 from ksim_rl.transforms.row_transform import follow_level
-from ksim_rl.transforms.scale import ObservationScale, check_scale
 
 
 class Reading(Protocol):
@@ -31,16 +30,7 @@ class Reading(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationTermCfg(Checked):
-    """One term of a group; its chain runs in the order of the fields.
-
-    Args:
-        term: what reads the clean observation.
-        noise: sensor noise.
-        clip: (low, high); None is no limit on that side.
-        scale: factor, or one per element.
-        delay: sensor latency in env steps.
-        history: number of frames, or these with a stride; 1 and None are the present one alone.
-    """
+    """One term of a group; its chain runs in the order of the fields, each as the transform of that name."""
 
     term: Reading
     noise: NoiseCfg | None = None
@@ -72,13 +62,9 @@ class ObservationTermCfg(Checked):
 class ObservationGroupCfg(Checked):
     """A vector made of terms, concatenated in order; or one image, which stays one.
 
-    Args:
-        terms: by name; the env writes the clean reading to `("obs", name)`.
-        keep_terms: whether each term, as it stands in the vector, is also written to `("<group>_terms", name)`.
-        enable_noise: False leaves all noise of the group out.
-        delay: sensor latency of the terms that have none of their own; these share one lag.
-        history: frames of the terms that have none of their own. With `flat=False` it is the last vectors instead,
-            stacked to [E, N, L].
+    The env writes the clean reading to `("obs", name)`; `keep_terms` also writes each term, as it stands in the vector,
+    to `("<group>_terms", name)`. `delay` and `history` are for the terms that have none of their own; those share one
+    lag. A history with `flat=False` stacks the last vectors to [E, N, L]. `enable_noise=False` leaves out all noise.
     """
 
     terms: Mapping[str, ObservationTermCfg]
@@ -110,11 +96,7 @@ class ObservationGroupCfg(Checked):
 
 
 def history_cfg(history: int | HistoryCfg | None) -> HistoryCfg | None:
-    """Return what a history is in full, or None where it is the present frame alone.
-
-    Raises:
-        ValueError: if a number of frames is not valid.
-    """
+    """Return what a history is in full, or None where it is the present frame alone."""
     if history is None:
         return None
     try:
@@ -131,11 +113,7 @@ def compile_groups(
 
     Per group: noise -> clip -> scale -> delay -> history -> concatenate. A term without any of these goes straight
     from `("obs", name)` into the vector; the others pass through `("<group>_terms", name)`, which only groups with
-    `keep_terms` keep.
-
-    Args:
-        groups: by name.
-        level: what transforms with `by_level` follow, float32 []; None leaves them at 1.
+    `keep_terms` keep. Transforms with `by_level` follow `level`, where it is given.
     """
     transforms: list[Transform] = []
     vectors: dict[NestedKey, list[NestedKey]] = {}

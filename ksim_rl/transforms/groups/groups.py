@@ -8,11 +8,10 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.envs.transforms import Transform
 
 from ksim_rl import checks
 from ksim_rl.transforms.columns import side_by_side
-from ksim_rl.transforms.row_transform import as_keys
+from ksim_rl.transforms.row_transform import CheckedKeys, as_keys
 from ksim_rl.transforms.specs import (
     Device,
     bounded,
@@ -20,34 +19,25 @@ from ksim_rl.transforms.specs import (
     drop_leaf_spec,
     leaf_spec,
     set_leaf_spec,
+    spell,
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class GroupSpec:
-    """The map from terms to columns of one group vector.
-
-    Args:
-        name: the key of the vector.
-        terms: keys of the terms, in order.
-        sizes: their numbers of columns.
-    """
+    """The map from terms, in order, to columns of one group vector, whose key is `name`."""
 
     name: NestedKey
     terms: tuple[NestedKey, ...]
     sizes: tuple[int, ...]
+    """Numbers of columns."""
 
     @property
     def size(self) -> int:
-        """Number of columns of the vector."""
         return sum(self.sizes)
 
     def slice(self, term: NestedKey) -> slice:
-        """Return the columns of `term`, given by its key or by the last part of it.
-
-        Raises:
-            ValueError: if no term has that name, or more than one.
-        """
+        """Return the columns of `term`, given by its key or by the last part of it."""
         found = [i for i, key in enumerate(self.terms) if key == term] or [
             i for i, key in enumerate(self.terms) if last_name(key) == term
         ]
@@ -69,17 +59,10 @@ def last_name(key: NestedKey) -> str:
     return key if isinstance(key, str) else str(key[-1])
 
 
-def spell(key: NestedKey) -> str:
-    """Return a key as one string."""
-    return key if isinstance(key, str) else "/".join(map(str, key))
+class ObservationGroups(CheckedKeys):
+    """Concatenate observations, each flattened per env, into one vector [E, L] per group, in the order of its terms.
 
-
-class ObservationGroups(Transform):
-    """Concatenate observations, each flattened per env, into one vector [E, L] per group.
-
-    Args:
-        groups: group name -> keys of its terms, in the order of the columns.
-        drop: keys to remove afterwards (all the terms for True), in the data and in the specs.
+    `drop` are keys to remove afterwards (all the terms for True), in the data and in the specs.
 
     Example:
         >>> groups = ObservationGroups({"actor": ["joint_pos", "joint_vel"], "critic": ["joint_pos", "height"]})
@@ -96,7 +79,7 @@ class ObservationGroups(Transform):
             if not terms or len(set(terms)) != len(terms):
                 raise ValueError(f"groups[{name!r}]={terms}: expected one or more distinct terms")
         every = list(dict.fromkeys(term for terms in self.groups.values() for term in terms))
-        super().__init__(in_keys=every, out_keys=list(self.groups))
+        super().__init__(every, list(self.groups), is_paired=False)
         self.drop = [] if drop is False else every if drop is True else as_keys(drop)
         self.group_specs: dict[NestedKey, GroupSpec] = {}
         # Groups whose terms are known to be vectors [E, L] already.
@@ -110,12 +93,7 @@ class ObservationGroups(Transform):
         }
 
     def slice(self, group: NestedKey, term: NestedKey) -> slice:
-        """Return the columns of a term in the vector of a group.
-
-        Raises:
-            ValueError: if there is no such group or term; it lists the near names.
-            RuntimeError: if no env has asked for its specs yet.
-        """
+        """Return the columns of a term in the vector of a group, once an env has asked for its specs."""
         if group not in self.groups:
             raise checks.unknown_name("group", str(group), map(str, self.groups))
         if group not in self.group_specs:
@@ -123,7 +101,6 @@ class ObservationGroups(Transform):
         return self.group_specs[group].slice(term)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the vectors' specs and remove the dropped ones."""
         batch_size = observation_spec.shape
         vectors = {}
         for name, terms in self.groups.items():
@@ -180,6 +157,7 @@ class ObservationGroups(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Do the same to a batch of samples."""
+        self._check_samples(tensordict, is_floating=False)
         return self._call(tensordict)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:

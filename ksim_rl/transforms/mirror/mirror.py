@@ -12,21 +12,17 @@ from torchrl.data import Composite, TensorSpec
 
 from ksim_rl import checks
 from ksim_rl.device import random
-from ksim_rl.transforms.row_transform import KeyedTransform, Keys, as_keys, checked_out_keys
-from ksim_rl.transforms.specs import Device, bounded, bounds, replace_leaves
+from ksim_rl.transforms.row_transform import KeyedTransform, Keys
+from ksim_rl.transforms.specs import Device, bounded, bounds
 
 Bounds = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True, kw_only=True)
 class MirrorMap:
-    """The mirror image of a vector: `mirrored[i] = signs[i] * vector[source[i]]`.
+    """The mirror image of a vector: `mirrored[i] = signs[i] * vector[source[i]]`; signs that are not given are 1.
 
-    The mirror image of a mirror image is the vector itself; maps for which it is not are refused.
-
-    Args:
-        source: column that each column of the image shows.
-        signs: 1 or -1 per column; those of None are 1.
+    Maps whose image of the image is not the vector itself are refused.
     """
 
     source: tuple[int, ...]
@@ -111,16 +107,8 @@ class Mirror(KeyedTransform):
 
     For a robot that is its own mirror image these are episodes of the same task, so a policy that learns from them
     becomes symmetric. Whether an episode is mirrored is drawn per env at its reset. On a batch of samples, where it
-    mirrors everything, use `mirrored`.
-
-    Args:
-        in_keys: observations [E, L]; nested keys as tuples.
-        out_keys: where the mirrored ones go. Default: in place.
-        in_keys_inv: the actions that the env reads; [] mirrors none.
-        out_keys_inv: where the policy writes them. Default: the same keys.
-        maps: by key of in_keys and in_keys_inv; see `mirror_joints`, `mirror_by_name`, `mirror_group`.
-        probability: share of episodes that are mirrored.
-        seed, stream: see `KeyedTransform`.
+    mirrors everything, use `mirrored`. `maps` are by key of in_keys and in_keys_inv (see `mirror_joints`,
+    `mirror_by_name`, `mirror_group`); in_keys_inv of [] mirrors no actions.
 
     Example:
         >>> mirror = Mirror(["imu"], maps={"imu": AXIAL, "action": MirrorMap(source=(1, 0))}, probability=0.5)
@@ -139,22 +127,15 @@ class Mirror(KeyedTransform):
         *,
         maps: Mapping[NestedKey, MirrorMap],
         probability: float = 0.5,
-        seed: int = 0,
+        seed: int | None = None,
         stream: str | None = None,
     ) -> None:
-        keys, keys_inv = as_keys(in_keys), as_keys(in_keys_inv)
+        super().__init__(in_keys, out_keys, in_keys_inv, out_keys_inv, seed=seed, stream=stream)
+        keys, keys_inv = self.in_keys, self.in_keys_inv
         if set(maps) != {*keys, *keys_inv}:
             raise ValueError(f"maps has the keys {list(maps)}: expected those of {keys} and {keys_inv}")
         checks.check_in_range("probability", probability, low=0.0, high=1.0)
-        super().__init__(
-            keys,
-            checked_out_keys(keys, out_keys),
-            keys_inv,
-            checked_out_keys(keys_inv, out_keys_inv),
-            row_buffers=["mirrored_E"],
-            seed=seed,
-            stream=stream,
-        )
+        self._register_rows("mirrored_E")
         self.maps, self.probability = dict(maps), probability
         # Buffers rather than the maps' own tensors: compiled code would make those anew in each step.
         for index, key in enumerate([*keys, *keys_inv]):
@@ -163,27 +144,23 @@ class Mirror(KeyedTransform):
                 self.register_buffer(f"{name}_{index}", held, persistent=False)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Widen the bounds to those of both images."""
-        owner = type(self).__name__
-        replace_leaves(observation_spec, self.in_keys, self.out_keys, owner, self._widened)
+        self._replace_leaves(observation_spec, self._widened)
         self._size_rows(observation_spec)
         self._size_buffer("mirrored_E", torch.bool)
         return observation_spec
 
     def _widened(self, index: int, spec: TensorSpec) -> TensorSpec:
-        plain, other = bounds(spec), self._image(self.in_keys[index], bounds(spec))
+        plain, other = bounds(spec), self._image(self.in_keys[index], bounds(spec), self.batch_dims[index])
         low, high = torch.minimum(plain[0], other[0]), torch.maximum(plain[1], other[1])
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
-        """Narrow the bounds to those that both images have in common."""
-        owner = type(self).__name__
-        replace_leaves(action_spec, self.in_keys_inv, self.out_keys_inv, owner, self._narrowed, moves=True)
+        self._replace_leaves(action_spec, self._narrowed, is_inverse=True)
         return action_spec
 
     def _narrowed(self, index: int, spec: TensorSpec) -> TensorSpec:
         key = self.in_keys_inv[index]
-        plain, other = bounds(spec), self._image(key, bounds(spec))
+        plain, other = bounds(spec), self._image(key, bounds(spec), self.batch_dims_inv[index])
         low, high = torch.maximum(plain[0], other[0]), torch.minimum(plain[1], other[1])
         if bool((low > high).any()):
             raise ValueError(
@@ -191,11 +168,10 @@ class Mirror(KeyedTransform):
             )
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
-    def _image(self, key: NestedKey, ends: Bounds) -> Bounds:
-        if ends[0].shape[-1:] != (self.maps[key].size,):
-            raise ValueError(
-                f"the map of {key!r} has {self.maps[key].size} columns for shape {tuple(ends[0].shape)}"
-            )
+    def _image(self, key: NestedKey, ends: Bounds, batch_dims: int) -> Bounds:
+        leaf = ends[0].shape[batch_dims:]
+        if leaf[-1:] != (self.maps[key].size,):
+            raise ValueError(f"the map of {key!r} has {self.maps[key].size} columns for shape {tuple(leaf)}")
         images = [self.maps[key](end) for end in ends]
         return torch.minimum(*images), torch.maximum(*images)
 
@@ -207,18 +183,20 @@ class Mirror(KeyedTransform):
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._sized()
         for index, (key, out_key) in enumerate(zip(self.in_keys, self.out_keys, strict=True)):
-            next_tensordict.set(out_key, self._seen(index, next_tensordict.get(key)))
+            next_tensordict.set(
+                out_key, self._seen(index, next_tensordict.get(key), next_tensordict.batch_size)
+            )
         return next_tensordict
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._sized()
         pairs = zip(self.in_keys_inv, self.out_keys_inv, strict=True)
         for index, (key, out_key) in enumerate(pairs, start=len(self.in_keys)):
-            tensordict.set(key, self._seen(index, tensordict.get(out_key)))
+            tensordict.set(key, self._seen(index, tensordict.get(out_key), tensordict.batch_size))
         return tensordict
 
-    def _seen(self, index: int, value: Tensor) -> Tensor:
-        mirrored_E = self.mirrored_E.reshape(*value.shape[: value.ndim - 1], 1)
+    def _seen(self, index: int, value: Tensor, batch_size: torch.Size) -> Tensor:
+        mirrored_E = self.mirrored_E.reshape(*batch_size, *[1] * (value.ndim - len(batch_size)))
         source_L, signs_L = getattr(self, f"source_{index}"), getattr(self, f"signs_{index}")
         return torch.where(mirrored_E, image(value, source_L, signs_L), value)
 
@@ -230,9 +208,6 @@ def mirrored(tensordict: TensorDictBase, maps: Mapping[NestedKey, MirrorMap]) ->
 
     Example:
         >>> augmented_B = torch.cat((batch_B, mirrored(batch_B, maps)))
-
-    Raises:
-        KeyError: if the batch has none of the keys of an entry.
     """
     reflected = tensordict.clone(recurse=False)
     for key, mirror in maps.items():

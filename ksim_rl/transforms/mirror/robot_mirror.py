@@ -25,10 +25,8 @@ def mirror_name(name: str, names: Sequence[str]) -> str:
     """Return which of `names` is the mirror image of `name`; itself if the name has no side.
 
     Sides are words of a name: left and right, l and r, and FL, FR, RL, RR, LF, RH and the like, in any case; and two
-    capitals of which the second is L or R, where that gives another of `names`.
-
-    Raises:
-        ValueError: if a name has a side and `names` has no counterpart, or more than one.
+    capitals of which the second is L or R, where that gives another of `names`. Raises ValueError where a name has a
+    side and `names` has no counterpart, or more than one.
     """
     words = _WORDS.findall(name)
     images = [
@@ -60,9 +58,6 @@ def mirror_by_name(names: Sequence[str], each: MirrorMap | None = None) -> Mirro
 
     Example:
         >>> mirror_by_name(["FL", "FR"], POLAR)  # two forces, one after another
-
-    Raises:
-        ValueError: if a name has no counterpart.
     """
     each = MirrorMap(source=(0,)) if each is None else each
     blocks = [list(names).index(mirror_name(name, names)) for name in names]
@@ -77,14 +72,8 @@ def mirror_joints(mj_model: mujoco.MjModel, joints: Sequence[str] | None = None)
 
     The mirror is the plane y = 0 of the world, with the robot at `qpos0`. A hinge's sign is 1 if its counterpart
     turns the mirrored way about its own axis, else -1; a slide's likewise. Positions have to be absolute or relative to
-    a pose that is its own mirror image.
-
-    Args:
-        model: the robot's mj_model.
-        joints: hinges and slides, in the order of the columns; None for all of the mj_model.
-
-    Raises:
-        ValueError: if a joint has no counterpart, or the two are not mirror images of each other.
+    a pose that is its own mirror image. `joints` are hinges and slides in the order of the columns, None for all.
+    Raises ValueError where a joint has no counterpart, or the two are no mirror images of each other.
     """
     data = mujoco.MjData(mj_model)
     data.qpos[:] = mj_model.qpos0
@@ -123,14 +112,9 @@ def _sign(mj_model: mujoco.MjModel, data: mujoco.MjData, joint: int, other: int)
 
 
 def mirror_group(group: GroupSpec, terms: Mapping[NestedKey, MirrorMap]) -> MirrorMap:
-    """Return the map of a group vector from those of its terms; a flat history repeats its term's.
+    """Return the map of a group vector from those of its terms, by key of the term or by the last part of it.
 
-    Args:
-        group: the columns of each term, as `ObservationGroups.group_specs` gives them.
-        terms: by key of the term, or by the last part of it.
-
-    Raises:
-        ValueError: if a term has no map, or one whose size does not divide the term's.
+    A flat history repeats its term's. Raises ValueError where a term has no map, or one whose size does not divide it.
     """
     maps = []
     for key, size in zip(group.terms, group.sizes, strict=True):

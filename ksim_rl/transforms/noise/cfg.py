@@ -23,21 +23,19 @@ class Draw(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseCfg(Checked, ABC):
-    """What all noise has in common: a sample is offset + spread * draw.
+    """What all noise has in common: a sample is offset + spread * draw, which is added or multiplies the observation.
 
-    A reading goes through it in this order: bias, walk, the noise itself, resolution, dropout.
+    A reading goes through it in this order: bias, walk, the noise itself, resolution, dropout. With `by_level` the
+    transform's level (see `FollowsLevel`) scales all of it: a sample s becomes level * s ("multiply": 1 + level *
+    (s - 1)), and walk, resolution and dropout are multiplied by the level.
 
     Args:
-        operation: "add" (observation + sample) or "multiply" (observation * sample).
         bias: a further noise, drawn at each reset and held for the episode (an encoder's offset), with an operation of
             its own; it has none of the fields below.
-        walk_std: std of the steps of a random walk that is added (an IMU's drift), one step per env step. It begins
-            at 0 at each reset.
+        walk_std: std of the steps of a random walk that is added (an IMU's drift), one per env step from 0 at a reset.
         resolution: the reading is rounded to a multiple of this; 0 does not round.
         dropout: chance per env step that the reading is lost, all its elements at once; that of a reset never is.
         lost: what stands in for a lost reading: "last" is the one of the step before, "zero" is 0.
-        by_level: whether the transform's level (see `FollowsLevel`) scales all of it: a sample s becomes
-            level * s ("multiply": 1 + level * (s - 1)), and walk, resolution and dropout are multiplied by the level.
     """
 
     draw: ClassVar[Draw]
@@ -60,11 +58,7 @@ class NoiseCfg(Checked, ABC):
 
     @abstractmethod
     def affine(self, size: int) -> tuple[list[float], list[float]]:
-        """Return offset and spread for each of `size` elements.
-
-        Raises:
-            ValueError: if a parameter has neither one number nor `size`.
-        """
+        """Return offset and spread for each of `size` elements."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +80,6 @@ class UniformNoise(NoiseCfg):
             raise ValueError(f"low={self.low!r} exceeds high={self.high!r}")
 
     def affine(self, size: int) -> tuple[list[float], list[float]]:
-        """Offset low, spread high - low."""
         low, high = per_dim("low", self.low, size), per_dim("high", self.high, size)
         return low, [b - a for a, b in zip(low, high, strict=True)]
 
@@ -101,7 +94,6 @@ class GaussianNoise(NoiseCfg):
     mean: PerDim = 0.0
 
     def affine(self, size: int) -> tuple[list[float], list[float]]:
-        """Offset mean, spread std."""
         return per_dim("mean", self.mean, size), per_dim("std", self.std, size)
 
 
@@ -114,16 +106,11 @@ class ConstantNoise(NoiseCfg):
     value: PerDim = 0.0
 
     def affine(self, size: int) -> tuple[list[float], list[float]]:
-        """Offset value, spread 0."""
         return per_dim("value", self.value, size), [0.0] * size
 
 
 def per_dim(field: str, value: PerDim, size: int) -> list[float]:
-    """Return one number for each of `size` elements.
-
-    Raises:
-        ValueError: if there is neither one number nor `size`.
-    """
+    """Return one number for each of `size` elements; a ValueError refuses other lengths than 1 and `size`."""
     numbers = [float(number) for number in _numbers(value)]
     if len(numbers) not in (1, size):
         raise ValueError(

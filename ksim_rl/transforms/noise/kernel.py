@@ -24,7 +24,7 @@ OFFSET, SPREAD, BIAS_OFFSET, BIAS_SPREAD, WALK_STD, RESOLUTION, DROPOUT = range(
 """The rows of the table of parameters."""
 NUM_PARAMETERS = 7
 
-_PLAIN, _STEP, _RESET = range(3)
+_MODES = {"forward": 0, "step": 1, "reset": 2}
 
 
 @wp.struct
@@ -152,13 +152,9 @@ _quick = QuickLaunch(_apply_noise, _Noise)
 class NoiseState(NamedTuple):
     """What the noise of a transform depends on, beside the readings.
 
-    Attributes:
-        table_PL: parameters of each column, float32; its rows are `OFFSET`, `SPREAD`, ...
-        flags_L: what kind of noise a column has, int32.
-        enabled: bool [].
-        level: float32 []; the strength of the columns with `BY_LEVEL`.
-        seed: int64 [].
-        bias_EL, walk_EL, last_EL: what lasts from step to step, float32; None where no column has it.
+    `table_PL` has the rows `OFFSET`, `SPREAD`, ..., float32; `flags_L` tells the kind of noise of each column, int32.
+    `enabled` is bool [], `seed` int64 []; `level`, float32 [], is the strength of the columns with `BY_LEVEL`. The last
+    three are what lasts from step to step, float32; None where no column has it.
     """
 
     table_PL: Tensor
@@ -175,45 +171,21 @@ def add_noise(
     clean_EL: Float32[Tensor, "*leaf"],
     state: NoiseState,
     features: int,
+    moment: str,
     *,
     stream: int,
-    counter: Int64[Tensor, ""],
+    counter: Int64[Tensor, "*rows"],
+    mask_E: Bool[Tensor, " E"] | None = None,
 ) -> Float32[Tensor, "*leaf"]:
-    """Return the noisy readings of samples, which belong to no episode: no bias, drift or dropout."""
-    return _run(clean_EL, *state, features & (HAS_GAUSSIAN | HAS_RESOLUTION), _PLAIN, None, stream, counter)
+    """Return the noisy readings of E * L clean ones in any shape, drawn at the counts that the counter reaches.
 
-
-def step_noise(
-    clean_EL: Float32[Tensor, "*leaf"],
-    state: NoiseState,
-    features: int,
-    *,
-    stream: int,
-    counter_E: Int64[Tensor, " E"],
-) -> Float32[Tensor, "*leaf"]:
-    """Go on by one env step, which adds 1 to the counter of each row, and return the noisy readings.
-
-    Args:
-        clean_EL: E * L readings in any shape; the result is like it.
-        state: its `bias_EL`, `walk_EL` and `last_EL` change.
-        features: what any column has.
-        stream: the id of the stream of draws.
-        counter_E: the draws are those of the count that it reaches.
+    A "step" adds 1 to the counter of each row [E], and changes what lasts in `state`. A "reset" begins the episodes of
+    the masked rows, counts them, and returns the others' clean readings. In a "forward", readings are samples, which
+    belong to no episode: the counter [] stays, and there is no bias, drift or dropout.
     """
-    return _run(clean_EL, *state, features, _STEP, None, stream, counter_E)
-
-
-def reset_noise(
-    clean_EL: Float32[Tensor, "*leaf"],
-    state: NoiseState,
-    features: int,
-    mask_E: Bool[Tensor, " E"],
-    *,
-    stream: int,
-    counter_E: Int64[Tensor, " E"],
-) -> Float32[Tensor, "*leaf"]:
-    """Begin the episodes of the masked rows, and count them; return their noisy readings and the others' clean ones."""
-    return _run(clean_EL, *state, features, _RESET, mask_E, stream, counter_E)
+    if moment == "forward":
+        features &= HAS_GAUSSIAN | HAS_RESOLUTION
+    return _run(clean_EL, *state, features, _MODES[moment], mask_E, stream, counter)
 
 
 def _launch(

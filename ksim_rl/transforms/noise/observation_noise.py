@@ -13,25 +13,15 @@ from ksim_rl.transforms import upstream
 from ksim_rl.transforms.columns import side_by_side, split
 from ksim_rl.transforms.noise import kernel as noise_kernel
 from ksim_rl.transforms.noise.cfg import Draw, NoiseCfg, per_dim
-from ksim_rl.transforms.noise.kernel import (
-    HAS_BIAS,
-    HAS_DROPOUT,
-    HAS_WALK,
-    NoiseState,
-    add_noise,
-    reset_noise,
-    step_noise,
-)
+from ksim_rl.transforms.noise.kernel import HAS_BIAS, HAS_DROPOUT, HAS_WALK, NoiseState, add_noise
 from ksim_rl.transforms.row_transform import (
     FollowsLevel,
     KeyedTransform,
     Keys,
     RowTransform,
-    as_keys,
-    checked_out_keys,
     one_per_key,
 )
-from ksim_rl.transforms.specs import Device, add_bounds, bounded, bounds, multiply_bounds, replace_leaves
+from ksim_rl.transforms.specs import Device, add_bounds, bounded, bounds, multiply_bounds
 
 
 class ObservationNoise(FollowsLevel, KeyedTransform):
@@ -42,13 +32,7 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
 
     `env.eval()` turns it off and `env.train()` on again, `enable_` does the same for one transform; both write a device
     flag, so a captured or compiled step follows. Noise with `by_level` follows `follow_level_`.
-
-    Args:
-        in_keys: observations, of any shape; nested keys as tuples.
-        out_keys: where the noisy ones go. Default: in place of the clean ones.
-        noise: one for all keys, or a sequence or mapping with one per key.
-        enabled: whether noise is on from the start.
-        seed, stream: see `KeyedTransform`.
+    `noise` is one for all keys, or a sequence or mapping with one per key.
 
     Example:
         >>> noise = ObservationNoise(["imu"], noise=GaussianNoise(std=0.1, bias=UniformNoise(low=-0.2, high=0.2)))
@@ -69,13 +53,11 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         *,
         noise: NoiseCfg | Sequence[NoiseCfg] | Mapping[NestedKey, NoiseCfg],
         enabled: bool = True,
-        seed: int = 0,
+        seed: int | None = None,
         stream: str | None = None,
     ) -> None:
-        in_keys = as_keys(in_keys)
-        out_keys = checked_out_keys(in_keys, out_keys)
-        names = ("step_count_E", "bias_EL", "walk_EL", "last_EL")
-        super().__init__(in_keys, out_keys, row_buffers=names, seed=seed, stream=stream)
+        super().__init__(in_keys, out_keys, seed=seed, stream=stream)
+        self._register_rows("step_count_E", "bias_EL", "walk_EL", "last_EL")
         self.noise = _one_per_key(noise, self.in_keys)
         self._wanted = enabled
         self._layout: tuple[int, list[torch.Size]] | None = None
@@ -103,17 +85,13 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         return self
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Widen the bounds by the reach of the noise."""
         batch_dims = observation_spec.ndim
 
         def widened(index: int, spec: TensorSpec) -> TensorSpec:
             low, high = widen(self.noise[index], self.in_keys[index], *bounds(spec), batch_dims)
             return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
-        owner = type(self).__name__
-        leaves = replace_leaves(
-            observation_spec, self.in_keys, self.out_keys, owner, widened, is_floating=True
-        )
+        leaves = self._replace_leaves(observation_spec, widened, is_floating=True)
         self._size_rows(observation_spec)
         self._size_buffer("step_count_E", torch.int64)
         self._size_columns([leaf.shape[batch_dims:] for leaf in leaves], observation_spec.device)
@@ -139,32 +117,37 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         return RowTransform._rows_that_reset(self, tensordict, tensordict_reset)
 
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
-        values = [tensordict_reset.get(key) for key in self.in_keys]
-        state, features = self._state()
-        stream, counter_E = self._stream_ids["reset"], self.reset_count_E
-        clean_EL = self._joined(values)
-        noisy_EL = reset_noise(clean_EL, state, features, mask_E, stream=stream, counter_E=counter_E)
-        return self._write(tensordict_reset, noisy_EL, values)
+        return self._emit(tensordict_reset, "reset", self.reset_count_E, mask_E)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        buffers = self._sized()
-        values = [next_tensordict.get(key) for key in self.in_keys]
-        state, features = self._state()
-        stream, counter_E = self._stream_ids["step"], buffers["step_count_E"]
-        noisy_EL = step_noise(self._joined(values), state, features, stream=stream, counter_E=counter_E)
-        return self._write(next_tensordict, noisy_EL, values)
+        return self._emit(next_tensordict, "step", self._sized()["step_count_E"])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add fresh noise to a batch of samples; they belong to no episode, so there is no bias, walk or dropout."""
-        values = [tensordict.get(key) for key in self.in_keys]
-        shapes = [value.shape[tensordict.ndim :] for value in values]
+        self._check_samples(tensordict)
+        self._take_seed()
+        shapes = [tensordict.get(key).shape[tensordict.ndim :] for key in self.in_keys]
         self._size_columns(shapes, self.step_count.device)
-        state, features = self._state()
-        stream, counter = self._stream_ids["forward"], self.step_count
-        clean_EL = self._joined(values, tensordict.numel())
-        noisy_EL = add_noise(clean_EL, state, features, stream=stream, counter=counter)
+        noisy = self._emit(tensordict, "forward", self.step_count)
         self.step_count.add_(1)
-        return self._write(tensordict, noisy_EL, values)
+        return noisy
+
+    def _emit(
+        self, tensordict: TensorDictBase, moment: str, counter: Tensor, mask_E: Tensor | None = None
+    ) -> TensorDictBase:
+        values = [tensordict.get(key) for key in self.in_keys]
+        clean_EL = values[0]
+        if len(values) > 1:
+            clean_EL = side_by_side(values, tensordict.numel() if moment == "forward" else self.num_rows)
+        if clean_EL.dtype != torch.float32:
+            clean_EL = clean_EL.float()
+        state, features = self._state()
+        stream = self._stream_ids[moment]
+        noisy_EL = add_noise(clean_EL, state, features, moment, stream=stream, counter=counter, mask_E=mask_E)
+        found = [noisy_EL] if len(values) == 1 else split(noisy_EL, values)
+        for out_key, noisy, value in zip(self.out_keys, found, values):  # noqa: B905 (takes time in every step)
+            tensordict.set(out_key, noisy if noisy.dtype == value.dtype else noisy.to(value.dtype))
+        return tensordict
 
     def _state(self) -> tuple[NoiseState, int]:
         """Return what the kernel reads and changes, and what any column has."""
@@ -176,19 +159,6 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         changed = buffers["bias_EL"], buffers["walk_EL"], buffers["last_EL"]
         state = NoiseState(*read, buffers["seed_value"], *changed)
         return state, columns.features
-
-    def _joined(self, values: list[Tensor], num_rows: int | None = None) -> Tensor:
-        """Return the clean readings, float32: those of one observation as they are, several side by side [E, L]."""
-        clean_EL = values[0]
-        if len(values) > 1:
-            clean_EL = side_by_side(values, self.num_rows if num_rows is None else num_rows)
-        return clean_EL if clean_EL.dtype == torch.float32 else clean_EL.float()
-
-    def _write(self, tensordict: TensorDictBase, noisy_EL: Tensor, values: list[Tensor]) -> TensorDictBase:
-        found = [noisy_EL] if len(values) == 1 else split(noisy_EL, values)
-        for out_key, noisy, value in zip(self.out_keys, found, values):  # noqa: B905 (takes time in every step)
-            tensordict.set(out_key, noisy if noisy.dtype == value.dtype else noisy.to(value.dtype))
-        return tensordict
 
 
 def _one_per_key(
@@ -202,15 +172,9 @@ def _one_per_key(
 
 
 class NoiseColumns(nn.Module):
-    """Parameters of the noise, column by column, as `noise_kernel` reads them.
+    """Parameters of the noise, column by column, as `noise_kernel` reads them; `features` is what any column has.
 
-    Attributes:
-        features: which of bias, walk, resolution, dropout and normal draws any column has.
-
-    Args:
-        cfgs: one per observation.
-        keys: their names, for errors.
-        sizes: their numbers of columns.
+    There are as many `cfgs`, `keys` (for errors) and `sizes` (numbers of columns) as observations.
     """
 
     table_PL: Tensor

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ksim_rl.envs import EnvView, ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.envs.term import CommandTerm, ObservationTerm, RewardTerm
-from ksim_rl.mdp.quantities import commanded_speed, is_commanded
+from ksim_rl.mdp.fields import commanded_speed, is_commanded
 from tests.envs.probe_env import DT, puck_env, push
 
 

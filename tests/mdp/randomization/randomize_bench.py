@@ -51,9 +51,40 @@ RUNNER = """
 """
 """A sliding trunk: a sprung, limited leg with a servo; a free leg with a motor; a tail with a velocity servo."""
 
+RICH = (
+    RUNNER.replace(
+        "<worldbody>",
+        """<asset><material name="paint" rgba="0.8 0.2 0.1 1"/></asset>
+        <worldbody>
+          <light name="lamp" pos="0.5 0 2" dir="0.1 0 -1"/>
+          <camera name="onlooker" pos="0 -2 1" mode="targetbody" target="trunk"/>""",
+    )
+    .replace(
+        '<geom name="belly" type="box"',
+        """<site name="nozzle" pos="0.1 0.02 0.05" euler="0.1 0.2 0"/>
+        <camera name="eye" pos="0.2 0 0.1" euler="0.3 0 0" fovy="60"/>
+        <camera name="lens" pos="-0.2 0 0.1" sensorsize="0.004 0.003" focal="0.003 0.003" resolution="8 8"/>
+        <light name="torch" pos="0.1 0.1 0" dir="1 0 -0.5" diffuse="0.5 0.5 0.5"/>
+        <geom name="belly" type="box" material="paint\"""",
+    )
+    .replace('<body name="tail" pos="-0.25 0 0">', '<body name="tail" pos="-0.25 0 0" euler="0.1 0 0.2">')
+    .replace(
+        "<actuator>",
+        """<contact><pair name="sole" geom1="floor" geom2="right_foot" condim="6" friction="0.5 0.5 0.01 0.001 0.001"/>
+        </contact>
+        <tendon>
+          <fixed name="strap" stiffness="20" springlength="0.1" damping="0.5" frictionloss="0.1" armature="0.01">
+            <joint joint="left_hip" coef="1"/><joint joint="right_hip" coef="-0.7"/>
+          </fixed>
+        </tendon>
+        <actuator><general name="thruster" site="nozzle" gear="3 0 2 0 0.5 0"/>""",
+    )
+)
+"""The same with a tendon between the hips, a contact pair, a thruster on a site, cameras, lights and paint."""
+
 START_QPOS = (0, 0, 0.29, 1, 0.02, 0.03, 0.1, 0.05, 0.1, 0.02)
 START_QVEL = (0.8, 0.3, -0.3, 0.2, 0.4, 1.0, 0.5, -1.0, 0.3)
-CTRL = (0.25, 0.5, 0.4)
+CTRL = (2.0, 0.25, 0.5, 0.4)
 INERTIAL = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
 GEOMS = ("geom_friction", "geom_size", "geom_pos", "geom_quat")
 JOINTS = (
@@ -67,19 +98,26 @@ JOINTS = (
 )
 ACTUATORS = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
 FIELDS = (*GEOMS, *INERTIAL, *JOINTS, *ACTUATORS, "gravity")
+RICH_FIELDS = (
+    *("body_pos", "body_quat", "site_pos", "site_quat", "pair_friction"),
+    *("tendon_stiffness", "tendon_damping", "tendon_frictionloss", "tendon_armature"),
+    *("cam_pos", "cam_quat", "cam_fovy", "cam_intrinsic", "light_pos", "light_dir"),
+    *("light_ambient", "light_diffuse", "light_specular", "geom_rgba"),
+    *("mat_rgba", "mat_emission", "mat_specular", "mat_shininess"),
+)
 
 
 class Runners:
-    """Worlds of RUNNER whose fields an event may change; `restart` gives them back the model's own."""
+    """Worlds of RUNNER or RICH whose fields an event may change; `restart` gives them back the model's own."""
 
-    def __init__(self, num_envs: int, device: str = "cpu") -> None:
-        spec = mujoco.MjSpec.from_string(RUNNER)
-        prepare_spec(spec, FIELDS)
+    def __init__(self, num_envs: int, device: str = "cpu", *, rich: bool = False) -> None:
+        spec, fields = mujoco.MjSpec.from_string(RICH if rich else RUNNER), RICH_FIELDS if rich else FIELDS
+        prepare_spec(spec, fields)
         self.world = World(
             load_model(spec),
             num_envs=num_envs,
             device=device,
-            per_world_fields=FIELDS,
+            per_world_fields=fields,
             sim=SimCfg(njmax=60, nconmax=20),
         )
         self.driver = EnvDriver(self.world, step_dt=0.02)
@@ -100,12 +138,16 @@ class Runners:
             event(self.view, mask_E)
         self.world.set_const(event.per_world_fields, mask_E)
 
-    def run(self, substeps: int) -> np.ndarray:
-        """Start all worlds alike and return where they end, qpos and qvel, [E, nq + nv]."""
+    def place(self) -> None:
+        """Start all worlds alike."""
         self.world.qpos_EL.copy_(torch.tensor(START_QPOS).expand_as(self.world.qpos_EL))
         self.world.qpos_EL[:, 3:7] /= self.world.qpos_EL[:, 3:7].norm(dim=-1, keepdim=True)
         self.world.qvel_EL.copy_(torch.tensor(START_QVEL).expand_as(self.world.qvel_EL))
-        self.world.ctrl_EL.copy_(torch.tensor(CTRL).expand_as(self.world.ctrl_EL))
+        self.world.ctrl_EL.copy_(torch.tensor(CTRL[-self.world.mj_model.nu :]).expand_as(self.world.ctrl_EL))
+
+    def run(self, substeps: int) -> np.ndarray:
+        """Start all worlds alike and return where they end, qpos and qvel, [E, nq + nv]."""
+        self.place()
         self.world.step(substeps)
         return torch.cat((self.world.qpos_EL, self.world.qvel_EL), dim=-1).cpu().numpy()
 
@@ -118,10 +160,19 @@ class Runners:
         mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
 
+    def c_placed(self, model: mujoco.MjModel) -> mujoco.MjData:
+        """The C engine's data at the start, with cameras and lights."""
+        data = mujoco.MjData(model)
+        data.qpos[:] = START_QPOS
+        data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
+        for place in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):
+            place(model, data)
+        return data
+
     def c_run(self, model: mujoco.MjModel, substeps: int) -> np.ndarray:
         """The C engine's answer to `run`, [nq + nv]."""
         data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:], data.ctrl[:] = START_QPOS, START_QVEL, CTRL
+        data.qpos[:], data.qvel[:], data.ctrl[:] = START_QPOS, START_QVEL, CTRL[-model.nu :]
         data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
         mujoco.mj_step(model, data, substeps)
         return np.concatenate((data.qpos, data.qvel))

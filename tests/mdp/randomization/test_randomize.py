@@ -5,13 +5,14 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from ksim_rl import mdp
 from ksim_rl.config.config_tree import from_tree, to_tree
 from ksim_rl.envs.term import EventTerm
 from tests.mdp.bench import BOXES, FREE_BODY
 from tests.mdp.randomization.randomize_bench import Runners
-from tests.mdp.randomization.test_randomize_physics import EVENTS
+from tests.mdp.randomization.test_randomize_physics import ALL, EVENTS
 
 E = 1000
 
@@ -227,9 +228,9 @@ def test_seeds_reproduce_and_differ(herd):
     assert not torch.equal(drawn[0], drawn[1])
 
 
-@pytest.mark.parametrize("name", EVENTS)
+@pytest.mark.parametrize("name", ALL)
 def test_config_round_trip(name):
-    event = EVENTS[name]
+    event = ALL[name]
     assert from_tree(EventTerm, to_tree(event, EventTerm)) == event
 
 
@@ -262,6 +263,9 @@ def test_bad_figures_are_refused():
         (mdp.RandomizeJointRange(joints="left_hip", ranges={1: (-1.0, 0.0)}), "not below its upper limit -0.7"),
         (mdp.RandomizeActuatorGains(joints="right_hip", stiffness=(0.5, 2.0)), "'right_hip' has no servo with"),
         (mdp.RandomizeActuatorGains(joints="left_hip", stiffness=(-0.5, 2.0)), "'left_hip' would reach -10"),
+        (mdp.RandomizeBodyPos(bodies="trunk", ranges=(0.0, 0.1)), "'trunk' moves freely, so that its pose is state"),
+        (mdp.RandomizeGeomColor(geoms="left_foot", ranges=(0.5, 2.0)), "'left_foot' would reach 2; expected at most 1"),
+        (mdp.RandomizeTendonDamping(tendons="strap", ranges=(0.5, 2.0)), "no tendon matches 'strap'"),
         (mdp.RandomizeEffortLimit(joints="tail", ranges=(0.5, 2.0)), "nothing limits the effort on joint 'tail'"),
     ],
 )  # fmt: skip
@@ -269,3 +273,33 @@ def test_what_a_model_cannot_have_is_refused(herd, event, message):
     herd.restart()
     with pytest.raises(ValueError, match=message):
         herd.fire(event)
+
+
+class Kernels(TorchDispatchMode):
+    """Counts what torch computes, that is all operations but views and allocations."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: list[str] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        is_view = func._schema.name == "aten::empty" or func.is_view
+        self.names += [] if is_view else [func._schema.name]
+        return result
+
+
+@pytest.mark.parametrize(
+    ("event", "most"),
+    [
+        (mdp.RandomizeBodyMass(bodies=("trunk", ".*_leg", "tail"), ranges=(0.8, 1.2)), 5),
+        (mdp.RandomizeBodyCom(bodies=("trunk", ".*_leg", "tail"), ranges=(-0.1, 0.1), operation="add"), 3),
+    ],
+)
+def test_draws_of_all_bodies_take_few_kernels(herd, event, most):
+    """They run at every step, for the rows that reset, and each kernel costs about 2 us on a GPU."""
+    herd.restart()
+    herd.fire(event)
+    with herd.driver.scope("events/x", herd.view.reset_count_E), Kernels() as kernels:
+        event(herd.view, herd.everybody_E)
+    assert len(kernels.names) <= most, kernels.names

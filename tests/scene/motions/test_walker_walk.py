@@ -4,8 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from ksim_rl.scene.motions import motion_path, walker_walk
+from ksim_rl.scene.motions import motion_path
 from ksim_rl.scene.robots.control_models import Walker
+from tests.scene.motions import walker_walk
 
 
 @pytest.fixture(scope="module")

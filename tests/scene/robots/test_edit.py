@@ -64,6 +64,61 @@ def test_replaced_geoms_ignore_default_classes_and_keep_looks_and_mass(spec):
     assert model.geom("rod").pos[2] == pytest.approx(0.2)
 
 
+STOOL = """
+<mujoco>
+  <compiler angle="radian" {compiler}/>
+  <worldbody>
+    <body name="seat">
+      <freejoint/>
+      <inertial pos="0 0 0.1" mass="9" fullinertia="0.3 0.2 0.25 0.01 0 0.02"/>
+      <geom type="cylinder" size="0.2 0.03" {looks}/>
+      <body name="leg" pos="0.1 0 0">
+        <joint name="hip" axis="0 1 0"/>
+        <geom type="capsule" size="0.02" fromto="0 0 0 0.01 0 -0.15" mass="0.4" {looks}/>
+        <geom type="box" size="0.03 0.02 0.01" pos="0 0.01 -0.15" euler="0.3 0 0" mass="0.2"/>
+        <body name="toe" pos="0 0 -0.15"><geom size="0.02"/></body>
+        <body name="bare"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
+@pytest.mark.parametrize("looks", ["", 'contype="0" conaffinity="0"'], ids=["collides", "visual"])
+@pytest.mark.parametrize("infer", ["true", "auto", "false"])
+@pytest.mark.parametrize("others", ["", 'settotalmass="7" balanceinertia="true"', 'fusestatic="true"'])
+def test_no_body_gains_or_loses_mass_by_its_hulls(infer, looks, others):
+    xml = STOOL.format(looks=looks, compiler=f'inertiafromgeom="{infer}" {others}')
+    if infer == "false":  # then every body that moves needs an inertia of its own
+        xml = xml.replace(
+            '<joint name="hip"', '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><joint name="hip"'
+        )
+    spec = mujoco.MjSpec.from_string(xml)
+    before = mujoco.MjSpec.from_string(xml).compile()
+    hulls = [
+        edit.sphere(f"{body}_hull", body, 0.05, (0.0, 0.0, 0.1)) for body in ("seat", "leg", "toe", "bare")
+    ]
+    edit.replace_collision_geoms(spec, hulls)
+    after = spec.compile()
+    assert before.nbody == after.nbody and {"seat_hull", "leg_hull"} <= {g.name for g in spec.geoms}
+    for field in ("body_mass", "body_ipos", "body_inertia", "body_subtreemass"):
+        np.testing.assert_allclose(getattr(after, field), getattr(before, field), rtol=1e-9, atol=1e-12)
+    turned = np.abs((after.body_iquat * before.body_iquat).sum(-1))
+    np.testing.assert_allclose(turned[before.body_mass > 0], 1.0, rtol=1e-9)
+
+
+def test_hulls_may_be_turned(spec):
+    box = edit.CollisionGeom(
+        name="box", body="arm", type=mujoco.mjtGeom.mjGEOM_BOX, size=(1, 2, 3), quat=(0.0, 1.0, 0.0, 0.0)
+    )
+    edit.replace_collision_geoms(spec, (box,))
+    np.testing.assert_allclose(spec.compile().geom("box").quat, (0, 1, 0, 0))
+    with pytest.raises(ValueError, match=r"'rod': fromto=.* quat=.*: give fromto alone"):
+        edit.capsule("rod", "arm", 0.1, (0, 0, 0, 1, 0, 0), quat=(0.0, 1.0, 0.0, 0.0))
+
+
 def test_geom_on_unknown_body_names_the_near_one(spec):
     geom = edit.CollisionGeom(name="x", body="bse", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(0.1,))
     with pytest.raises(ValueError, match=r"bse.*base"):
@@ -100,7 +155,7 @@ def test_values_spread_over_names():
     names = ["a_hip", "a_knee", "b_hip"]
     assert edit.spread({".*_hip": 0.5, "a_knee": 1.0}, names) == {"a_hip": 0.5, "a_knee": 1.0, "b_hip": 0.5}
     assert edit.spread({"b_.*": 2.0}, names, default=0.0) == {"a_hip": 0.0, "a_knee": 0.0, "b_hip": 2.0}
-    with pytest.raises(ValueError, match="'a_knee' matches 0 of the patterns"):
+    with pytest.raises(ValueError, match=r"'a_knee' matches 0 of the patterns.*default=0\.0"):
         edit.spread({".*_hip": 0.5}, names)
     with pytest.raises(ValueError, match="'a_hip' matches 2 of the patterns"):
         edit.spread({".*_hip": 0.5, "a_.*": 1.0}, names, default=0.0)
@@ -127,6 +182,21 @@ def test_sites_are_moved_or_added_and_sensors_replaced(spec):
     assert model.nsensor == 5
     with pytest.raises(ValueError, match=r"bse.*base"):
         edit.set_sites(spec, (edit.Site(name="x", body="bse"),))
+
+
+def test_a_site_moves_to_the_body_that_it_is_given(spec):
+    spec.body("base").add_site(name="imu", pos=[9.0, 9.0, 9.0], quat=[0.0, 1.0, 0.0, 0.0])
+    spec.add_sensor(
+        name="gyro", type=mujoco.mjtSensor.mjSENS_GYRO, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu"
+    )
+    edit.set_sites(spec, (edit.Site(name="imu", body="base", pos=(0.2, 0.0, 0.0)),))
+    model = spec.copy().compile()
+    assert list(model.site("imu").quat) == [0, 1, 0, 0] and list(model.site("imu").pos) == [0.2, 0, 0]
+    edit.set_sites(spec, (edit.Site(name="imu", body="arm", pos=(0.1, 0.0, 0.0)),))
+    model = spec.compile()
+    assert model.body(model.site_bodyid[model.site("imu").id]).name == "arm"
+    assert list(model.site("imu").pos) == [0.1, 0, 0] and model.nsite == 1
+    assert model.sensor("gyro").objid[0] == model.site("imu").id
 
 
 def test_excluded_pairs_reach_the_model(spec):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ksim_rl.scene.robots.unitree_g1 import UnitreeG1
-from ksim_rl.scene.robots.unitree_go1 import UnitreeGo1
+from ksim_rl.scene.robots.unitree_go import UnitreeGo1
 from ksim_rl.scene.scene import SceneCfg, build_spec
 from ksim_rl.scene.terrains import PlaneTerrain
 from tests.scene.robots.reference import loaded_spec, reference_figures, reference_file

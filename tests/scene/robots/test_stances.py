@@ -7,8 +7,7 @@ import pytest
 from ksim_rl.scene.robots.booster_t1 import BoosterT1
 from ksim_rl.scene.robots.own_robots import Humanoid, Quadruped
 from ksim_rl.scene.robots.unitree_g1 import UnitreeG1
-from ksim_rl.scene.robots.unitree_go1 import UnitreeGo1
-from ksim_rl.scene.robots.unitree_go2 import UnitreeGo2
+from ksim_rl.scene.robots.unitree_go import UnitreeGo1, UnitreeGo2
 from tests.scene.robots.standing import on_a_plane, stand, uprightness
 
 # G1's reference gains are too soft to stand on for long without balancing: it tips over after a second.

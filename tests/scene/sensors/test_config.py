@@ -1,5 +1,6 @@
 """Sensors and the NaN guard as config trees."""
 
+import mujoco
 import pytest
 
 from ksim_rl.envs import CameraSensor, ContactSensor, ImuSensor, SceneCfg, from_tree, to_tree
@@ -40,3 +41,20 @@ def test_the_nan_guard_is_a_part_of_the_simulation_settings():
     assert from_tree(SimCfg, to_tree(SimCfg())).nan_guard is None
     with pytest.raises(ValueError, match=r"sim\.nan_guard\.history=0"):
         from_tree(SimCfg, {"nan_guard": {"folder": "failures", "history": 0}}, "sim")
+
+
+def test_a_sensor_that_takes_one_element_refuses_several_before_anything_is_built():
+    with pytest.raises(ValueError, match=r"against=\('a', 'b'\): a contact sensor takes one geom there"):
+        ContactSensor(geoms=("foot",), against=("a", "b"), against_kind="geom")  # pyright: ignore
+    spec = mujoco.MjSpec()
+    for name in ("left_foot", "right_foot"):
+        spec.worldbody.add_body(name=name).add_geom(name=f"{name}_sole", size=[0.1, 0, 0])
+    several = r"scene\.sensors\.s: '.*' matches \['left_foot.*', 'right_foot.*'\].* name of one (geom|body)"
+    for sensor in (
+        ContactSensor(geoms=("left_foot_sole",), against=".*_foot_sole", against_kind="geom"),
+        ContactSensor(geoms=(".*_sole",), against=".*_foot"),
+        ImuSensor(body=".*_foot"),
+        CameraSensor(body="(left|right)_foot"),
+    ):
+        with pytest.raises(ValueError, match=several):
+            sensor.add_to(spec, "s")

@@ -1,0 +1,121 @@
+"""This module checks and composes a `ksim-rl train` command line as a whole, before anything is built or written."""
+
+import itertools
+from collections.abc import Iterator, Sequence
+
+import hydra
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from ksim_rl.checks import unknown_name
+from ksim_rl.conf.registration import MODULE, NAME, RUN_AGAIN, register
+from ksim_rl.config.overrides import check_parsed
+from ksim_rl.trainers import RunCfg
+
+# A sweep over more combinations than this is checked in part here; each job checks its own config again.
+MAX_CHECKED_JOBS = 50
+
+
+def compose(overrides: Sequence[str] = ()) -> RunCfg:
+    """Compose a run's config, as `ksim-rl train <overrides>` does; a ValueError lists the near names."""
+    register()
+    return check_command_line(overrides, name=NAME, multirun=False, values=True)[0]
+
+
+def check_command_line(texts: Sequence[str], *, name: str, multirun: bool, values: bool) -> list[RunCfg]:
+    """Refuse overrides that name an unknown group, choice or field, or (with `values`) give a field a bad value.
+
+    The primary config is `name`; sweeps such as `seed=1,2` need `multirun`. With `values` it returns the config, of
+    each job of a sweep. The ValueError is one line that names what is wrong, and the near names or the valid values.
+    """
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_module(MODULE, version_base="1.3"):
+            loader = GlobalHydra.instance().config_loader()
+            overrides = [_parse(text, loader) for text in texts]
+            sweeps = [override.input_line for override in overrides if override.is_sweep_override()]
+            if sweeps and not multirun:
+                raise ValueError(
+                    f"override {sweeps[0]!r} has several values: add --multirun to run one job for each"
+                )
+            _check_names(overrides, loader, name)
+            jobs = itertools.islice(_jobs(overrides), MAX_CHECKED_JOBS if values else 0)
+            return [_compose(job, name) for job in jobs]
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ValueError(f"the overrides do not compose: {' '.join(str(error).split())}") from error
+
+
+def _compose(overrides: list[str], name: str) -> RunCfg:
+    plain = OmegaConf.to_container(hydra.compose(name, overrides=overrides), resolve=True)
+    assert isinstance(plain, dict)
+    return RunCfg.from_tree({str(key): value for key, value in plain.items()})
+
+
+def _parse(text: str, loader: ConfigLoader) -> Override:
+    try:
+        return OverridesParser.create(config_loader=loader).parse_override(text)
+    except HydraException as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(
+            f"override {text!r} does not parse (expected group=name or field=value): {reason}"
+        ) from error
+
+
+def _check_names(overrides: Sequence[Override], loader: ConfigLoader, name: str) -> None:
+    groups = _groups(loader)
+    choices, fields = [], []
+    for override in overrides:
+        if override.key_or_group == "task_name":
+            raise ValueError(
+                f"override {override.input_line!r}: the name comes with the task; choose that with task=name"
+            )
+        if override.key_or_group in groups:
+            if name == RUN_AGAIN:
+                raise ValueError(
+                    f"override {override.input_line!r}: a run's config has no groups; override its fields, or compose "
+                    "a new config without --config-dir"
+                )
+            options = loader.get_group_options(override.key_or_group)
+            if override.is_delete():
+                raise ValueError(
+                    f"override {override.input_line!r}: a run needs each group; choose another with "
+                    f"{override.key_or_group}=name: {', '.join(options)}"
+                )
+            for choice in _values(override):
+                if choice not in options:
+                    raise unknown_name(override.key_or_group, choice, options)
+            # A group that is not in the defaults list, such as another package's, is added with "+".
+            added = "+" if override.is_add() else ""
+            choices.append(f"{added}{override.key_or_group}={_values(override)[0]}")
+        elif not override.is_hydra_override():
+            fields.append(override)
+    tree = OmegaConf.to_container(hydra.compose(name, overrides=choices))
+    assert isinstance(tree, dict)
+    check_parsed({**dict.fromkeys(groups), **{str(key): value for key, value in tree.items()}}, fields)
+
+
+def _groups(loader: ConfigLoader) -> list[str]:
+    top = [group for group in loader.list_groups("") if group != "hydra"]
+    return [*top, *(f"{group}/{child}" for group in top for child in loader.list_groups(group))]
+
+
+def _jobs(overrides: Sequence[Override]) -> Iterator[list[str]]:
+    """Yield the overrides of each job, as Hydra's sweeper would."""
+    axes = [
+        [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()]
+        if override.is_discrete_sweep()
+        else [override.input_line or ""]
+        for override in overrides
+    ]
+    return (list(job) for job in itertools.product(*axes))
+
+
+def _values(override: Override) -> list[str]:
+    if override.is_discrete_sweep():
+        return list(override.sweep_string_iterator())
+    return [str(override.value())]

@@ -1,0 +1,102 @@
+"""This module registers with Hydra what configs are composed of, and the config of a run that is made once more."""
+
+import os
+from collections.abc import Collection
+from functools import cache, partial
+from pathlib import Path
+
+import yaml
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+from ksim_rl import algorithms, envs
+from ksim_rl.conf import choices
+from ksim_rl.config import plain_data, plugins, upstream
+from ksim_rl.trainers.run_cfg import check_run_tree, without_env_size
+
+MODULE, NAME = "ksim_rl.conf", "train"
+RUN_AGAIN, RUN_CONFIG = "run_again", "config.yaml"
+WRITTEN_BY_LOGGERS = ("wandb", "mlflow")
+
+
+def register() -> None:
+    """Let Hydra find other packages' configs, and store the groups' choices, the tasks and their training defaults.
+
+    The last go to the groups `task`, `task/training` (what holds for any objective) and `task/objective_training`.
+    """
+    _register(plugins.named())
+
+
+@cache
+def _register(_named: tuple[str, ...]) -> None:
+    Plugins.instance().register(DeclaredConfigs)
+    envs.register_configs()
+    store = partial(upstream.store_config, package="_global_")
+    choices.store_choices()
+    for name in envs.names():
+        store("task/training", name, partial(choices.training_defaults, name))
+        for objective in algorithms.names():
+            make = partial(choices.objective_defaults, name, objective)
+            store("task/objective_training", f"{name}_{objective}", make)
+    upstream.quicken()
+
+
+def register_run(folder: Path, given: Collection[str] = ()) -> None:
+    """Store the config that a run left in its folder, which is data, as the primary config `RUN_AGAIN`.
+
+    A ValueError names what is more than that, in the config or beside it; see `check_run_tree`.
+    """
+    path = folder / RUN_CONFIG
+    tree = plain_data.read_yaml(path)
+    if not isinstance(tree, dict) or not {"task_name", "task"} <= tree.keys():
+        raise ValueError(
+            f"--config-dir {folder}: expected a run folder, whose {RUN_CONFIG} has a task and its name"
+        )
+    for beside in config_files(folder):
+        if beside.parts[0] not in (RUN_CONFIG, *WRITTEN_BY_LOGGERS):
+            raise ValueError(f"{folder / beside}: a run folder has no configs but its {RUN_CONFIG}")
+    check_run_tree(tree, path, given=given)
+    task = tree["task"]
+    if not isinstance(task, dict) or not isinstance(task.get("scene"), dict):
+        raise ValueError(f"{path}: task={task!r}: expected the config of an env, as a run writes it")
+    plain = without_env_size(tree)
+    ConfigStore.instance().store(name=RUN_AGAIN, node={**plain, "defaults": ["launch", "_self_"]})
+
+
+def config_files(folder: Path) -> list[Path]:
+    """Return the YAML files in a folder, relative to it."""
+    names = (os.path.join(root, name) for root, _, files in os.walk(folder) for name in files)
+    return sorted(Path(name).relative_to(folder) for name in names if name.endswith((".yaml", ".yml")))
+
+
+def check_groups(folder: Path) -> None:
+    """Refuse a folder of config groups that says how Hydra launches, logs or calls back, or replaces our own parts."""
+    found = config_files(folder)
+    if not any(len(path.parts) > 1 and path.name != RUN_CONFIG for path in found):
+        # Hydra would go on as if the folder had not been named.
+        raise ValueError(
+            f"--config-dir {folder}: expected a run folder, which has the {RUN_CONFIG} of a run, or a folder with "
+            "config groups of yours"
+        )
+    for path in found:
+        text = plain_data.read_bytes(folder / path, limit=plain_data.MOST_YAML_BYTES).decode(errors="replace")
+        try:
+            tree = yaml.safe_load(text)  # as well as the text, in which a name may be spelled with escapes
+        except yaml.YAMLError as error:
+            raise ValueError(f"{folder / path}: cannot be read: {' '.join(str(error).split())}") from error
+        if len(path.parts) == 1 or "hydra" in f"{path} {text} {tree}".lower():
+            raise ValueError(
+                f"{folder / path}: a folder of config groups holds choices of groups only, which do not name Hydra; "
+                "a config of your own that may do all that a program can is named with --config-name"
+            )
+
+
+class DeclaredConfigs(SearchPathPlugin):
+    """Lets Hydra find the configs that other packages declare (see `ksim_rl.config.plugins`); ours come first."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Append them."""
+        for origin, package in plugins.conf_packages():
+            search_path.append(provider=f"ksim_rl.conf:{origin}", path=f"pkg://{package}")

@@ -1,0 +1,88 @@
+"""This module reads files that a stranger may have written as plain data: nothing in them executes or leads on."""
+
+import os
+import stat
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+MOST_YAML_BYTES, MOST_DATA_BYTES, MOST_DEPTH = 4 * 2**20, 2**30, 50
+
+
+def read_bytes(path: Path, *, limit: int, follows_links: bool = False) -> bytes:
+    """Read a regular file of at most `limit` bytes, and refuse pipes, devices and, unless it follows them, links."""
+    link = 0 if follows_links else os.O_NOFOLLOW
+    try:
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | link), "rb") as file:
+            about = os.fstat(file.fileno())
+            if not stat.S_ISREG(about.st_mode):
+                raise ValueError(f"{path}: cannot be read: it is no regular file")
+            if about.st_size > limit:
+                raise ValueError(f"{path}: damaged: longer than the {limit} bytes it may have")
+            return file.read(limit)
+    except FileNotFoundError as error:
+        raise ValueError(f"{path}: missing: {error.strerror}") from error
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def read_yaml(path: Path) -> Any:
+    """Return the tree of a YAML file that holds scalars, lists and mappings, and no anchors, tags or interpolations."""
+    try:
+        text = read_bytes(path, limit=MOST_YAML_BYTES).decode()
+        check_events(path, text)
+        tree: Any = OmegaConf.to_container(OmegaConf.create(text))
+    except (yaml.YAMLError, OmegaConfBaseException, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
+    check_plain(tree, str(path))
+    return tree
+
+
+def check_events(path: Path, text: str) -> None:
+    """Refuse a YAML text that names classes by tags, repeats parts by anchors, or is nested without end."""
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        found = None
+        if isinstance(event, yaml.NodeEvent) and event.anchor is not None:
+            found = f"the anchor {event.anchor!r}, and"
+        elif isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent) and event.tag is not None:
+            found = f"the tag {event.tag!r}, and"
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MOST_DEPTH:
+            found = f"more than {MOST_DEPTH} levels, and"
+        if found is not None:
+            line = event.start_mark.line + 1
+            raise ValueError(f"{path}, line {line}: {found} a config of others holds plain values only")
+
+
+def check_plain(tree: Any, where: str) -> None:
+    """Refuse interpolations, such as `${oc.env:HOME}`, anywhere in a tree: a run's config has values in their place."""
+    if isinstance(tree, Mapping):
+        for key, entry in tree.items():
+            check_plain(key, where)
+            check_plain(entry, f"{where}: {key}" if ": " not in where else f"{where}.{key}")
+    elif isinstance(tree, (list, tuple)):
+        for index, entry in enumerate(tree):
+            check_plain(entry, f"{where}[{index}]")
+    elif isinstance(tree, str) and "${" in tree:
+        raise ValueError(f"{where}={tree[:80]!r}: an interpolation, and a run's config holds values only")
+
+
+def check_links(folder: Path, *, below: Sequence[str]) -> None:
+    """Refuse a folder in which a link, at its top or in the folders `below`, leads out: a run writes there."""
+    inside = folder.resolve()
+    walked = (
+        os.path.join(root, name)
+        for own in below
+        for root, *names in os.walk(folder / own)
+        for name in sum(names, [])
+    )
+    for path in map(Path, (*folder.iterdir(), *walked)):
+        if path.is_symlink() and not path.resolve().is_relative_to(inside):
+            raise ValueError(
+                f"{path}: a link that leads out of the run folder, and a run writes only into its own"
+            )

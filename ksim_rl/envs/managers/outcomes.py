@@ -1,0 +1,232 @@
+"""These managers work out what a step comes to: rewards, ends, metrics and levels, and their sums over episodes."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ksim_rl.checks import near
+from ksim_rl.envs.driver import EnvDriver
+from ksim_rl.envs.term import CurriculumTerm, MetricTerm, RewardTerm, TerminationTerm
+from ksim_rl.envs.view import EnvView
+
+
+class _OutcomeManager:
+    """Calls terms that return one value per env; each runs in its scope, and what it returns is checked."""
+
+    kind: ClassVar[str]
+
+    def __init__(self, terms: Mapping[str, Any], driver: EnvDriver) -> None:
+        self._driver, self._view = driver, driver.view
+        self._terms, self.names = dict(terms), tuple(terms)
+
+    def _everybody_E(self) -> Tensor:
+        return torch.ones(self._view.num_envs, dtype=torch.bool, device=self._view.device)
+
+    def _values(self) -> list[Tensor]:
+        """Return what each term says of the current state, [E] each."""
+        values = []
+        for name, term in self._terms.items():
+            with self._driver.scope(f"{self.kind}s/{name}"):
+                value_E = term(self._view)
+            if value_E.shape != (self._view.num_envs,):
+                raise ValueError(
+                    f"{self.kind} term {name!r} returns shape {tuple(value_E.shape)}: expected ({self._view.num_envs},)"
+                )
+            values.append(value_E)
+        return values
+
+
+class RewardManager(_OutcomeManager):
+    """Computes the weighted terms and their sums over the episode.
+
+    Weights live on the device, so that a curriculum can change them inside a captured step. A term of weight 0 is not
+    computed, unless a curriculum names it in `adapted`.
+    """
+
+    kind = "reward"
+
+    def __init__(
+        self, terms: Mapping[str, RewardTerm], driver: EnvDriver, *, scale: float, adapted: frozenset[str]
+    ) -> None:
+        unknown = sorted(adapted - terms.keys())
+        if unknown:
+            raise ValueError(
+                f"a curriculum adapts the unknown reward {unknown[0]!r}: {near(unknown[0], terms)}"
+            )
+        computed = {name: term for name, term in terms.items() if term.weight != 0.0 or name in adapted}
+        super().__init__(computed, driver)
+        self._scale = scale
+        self.weights_R = torch.tensor([term.weight for term in computed.values()], device=driver.view.device)
+        self.episode_sums_ER = driver.view.buffers.get("rewards.episode_sums_ER", len(self.names))
+        driver.readings.reward_weights.update(zip(self.names, self.weights_R.unbind(), strict=True))
+        driver.readings.episode_rewards.update(zip(self.names, self.episode_sums_ER.unbind(-1), strict=True))
+        self.step(self._everybody_E())
+
+    def step(self, finite_E: Bool[Tensor, " E"]) -> Float[Tensor, " E"]:
+        """Return the reward of the current state, float32 [E]; rows whose physics failed get 0."""
+        values = self._values()
+        if not values:
+            return torch.zeros(self._view.num_envs, device=self._view.device)
+        weighted_ER = torch.stack(values, dim=-1) * (self.weights_R * self._scale)
+        weighted_ER = torch.where(finite_E[:, None], weighted_ER, 0.0)
+        self.episode_sums_ER.add_(weighted_ER)
+        return weighted_ER.sum(-1)
+
+
+class TerminationManager(_OutcomeManager):
+    """Combines the termination terms with the guard against non-finite physics."""
+
+    kind = "termination"
+
+    def __init__(
+        self, terms: Mapping[str, TerminationTerm], driver: EnvDriver, *, is_finite_horizon: bool
+    ) -> None:
+        super().__init__(terms, driver)
+        num_envs, device = driver.view.num_envs, driver.view.device
+        self._is_finite_horizon = is_finite_horizon
+        self.names = (*terms, "non_finite")
+        self.flags_EK = torch.zeros(num_envs, len(self.names), dtype=torch.bool, device=device)
+        driver.readings.terminations.update(zip(self.names, self.flags_EK.unbind(-1), strict=True))
+        self._time_out_K = torch.tensor([term.time_out for term in terms.values()] + [False], device=device)
+        self._failure_K = ~self._time_out_K
+        self.step(self._everybody_E())
+
+    def step(self, finite_E: Bool[Tensor, " E"]) -> tuple[Bool[Tensor, " E"], Bool[Tensor, " E"]]:
+        """Return `terminated` and `truncated` of the current state; a row may be both, and the first ends the return.
+
+        Rows whose physics failed are terminated.
+        """
+        flags = []
+        for name, term in self._terms.items():
+            with self._driver.scope(f"terminations/{name}"):
+                flag_E = term(self._view)
+            if flag_E.shape != finite_E.shape or flag_E.dtype != torch.bool:
+                raise ValueError(
+                    f"termination term {name!r} returns {flag_E.dtype} {tuple(flag_E.shape)}: expected torch.bool "
+                    f"{tuple(finite_E.shape)}"
+                )
+            flags.append(flag_E)
+        self.flags_EK.copy_(torch.stack((*flags, ~finite_E), dim=-1))
+        timed_out_E = (self.flags_EK & self._time_out_K).any(-1)
+        failed_E = (self.flags_EK & self._failure_K).any(-1)
+        self._driver.readings.terminated_E.copy_(failed_E)
+        self._driver.readings.truncated_E.copy_(timed_out_E)
+        if self._is_finite_horizon:
+            return failed_E | timed_out_E, torch.zeros_like(timed_out_E)
+        return failed_E, timed_out_E
+
+
+class MetricManager(_OutcomeManager):
+    """Accumulates each metric over the running episodes as its term asks: mean, last, max or sum.
+
+    Which of these occur is known at construction, and the others cost nothing in a step.
+    """
+
+    kind = "metric"
+
+    def __init__(self, terms: Mapping[str, MetricTerm], driver: EnvDriver) -> None:
+        super().__init__(terms, driver)
+        self._held_EM = driver.view.buffers.get("metrics.held_EM", len(self.names))
+        reductions = [term.reduce for term in terms.values()]
+        self._occurring = frozenset(reductions)
+        self._is_mean_M, self._is_last_M, self._is_max_M = (
+            torch.tensor([given == kind for given in reductions], dtype=torch.bool, device=driver.view.device)
+            for kind in ("mean", "last", "max")
+        )
+        self.step(self._everybody_E())
+
+    def step(self, finite_E: Bool[Tensor, " E"]) -> None:
+        """Take in the values of the current state; rows whose physics failed add nothing."""
+        values = self._values()
+        if not values:
+            return
+        value_EM = torch.where(finite_E[:, None], torch.stack(values, dim=-1), 0.0)
+        held_EM = self._held_EM
+        next_EM = held_EM + value_EM
+        if "last" in self._occurring:
+            next_EM = torch.where(self._is_last_M, value_EM, next_EM)
+        if "max" in self._occurring:
+            is_first_E1 = self._view.episode_step_E[:, None] <= 1
+            peak_EM = torch.where(is_first_E1, value_EM, torch.maximum(held_EM, value_EM))
+            next_EM = torch.where(self._is_max_M, peak_EM, next_EM)
+        held_EM.copy_(next_EM)
+
+    @property
+    def reduced_EM(self) -> Float[Tensor, "E M"]:
+        """The reduced values of the episodes so far, float32 [E, M]."""
+        if "mean" not in self._occurring:
+            return self._held_EM
+        mean_EM = self._held_EM / self._view.episode_step_E[:, None].clamp(min=1)
+        return torch.where(self._is_mean_M, mean_EM, self._held_EM)
+
+
+class CurriculumManager(_OutcomeManager):
+    """Keeps the latest level of each curriculum on the device; two that drive `view.level` are refused."""
+
+    kind = "curriculum"
+
+    def __init__(self, terms: Mapping[str, CurriculumTerm], driver: EnvDriver) -> None:
+        super().__init__(terms, driver)
+        drivers = {name: term.first_level for name, term in terms.items() if term.first_level is not None}
+        if len(drivers) > 1:
+            raise ValueError(f"curriculum: {' and '.join(drivers)} all drive the one level: keep one of them")
+        for level in drivers.values():
+            driver.readings.level.fill_(level)
+        self.levels_C = torch.zeros(len(self.names), device=driver.view.device)
+        self.reset(~self._everybody_E())
+
+    def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
+        """Adapt to the episodes that just ended in the rows of `mask_E`."""
+        for index, (name, term) in enumerate(self._terms.items()):
+            with self._driver.scope(f"curriculum/{name}", self._view.reset_count_E):
+                level = term(self._view, mask_E)
+            if level.shape != ():
+                raise ValueError(
+                    f"curriculum term {name!r} returns shape {tuple(level.shape)}: expected (), one level for all envs"
+                )
+            self.levels_C[index].copy_(level)
+
+
+class EpisodeLog:
+    """One vector of sums over the episodes that ended since the last `clear`, kept on the device until it is read.
+
+    Entries: `episodes` (count), `length_sum` (env steps), `return_sum`, `reward/<term>` (weighted sums over the
+    episode), `termination/<term>` (counts), `metric/<term>` (reduced values).
+    """
+
+    def __init__(
+        self, view: EnvView, rewards: RewardManager, terminations: TerminationManager, metrics: MetricManager
+    ) -> None:
+        self._view, self._rewards, self._terminations, self._metrics = view, rewards, terminations, metrics
+        parts = {"reward": rewards.names, "termination": terminations.names, "metric": metrics.names}
+        of_terms = [f"{kind}/{name}" for kind, names in parts.items() for name in names]
+        self.names = ("episodes", "length_sum", "return_sum", *of_terms)
+        self.totals_N = torch.zeros(len(self.names), device=view.device)
+
+    def step(self, done_E: Bool[Tensor, " E"]) -> None:
+        """Add the episodes that end now, bool [E]."""
+        done_E1 = done_E[:, None]
+        sums_ER = self._rewards.episode_sums_ER
+        rows_EN = torch.cat(
+            (
+                torch.ones_like(done_E1, dtype=torch.float32),
+                self._view.episode_step_E[:, None],
+                sums_ER.sum(-1, keepdim=True),
+                sums_ER,
+                self._terminations.flags_EK,
+                self._metrics.reduced_EM,
+            ),
+            dim=-1,
+        )
+        self.totals_N.add_(torch.where(done_E1, rows_EN, 0.0).sum(0))
+
+    def read(self) -> dict[str, Float[Tensor, ""]]:
+        """Return the sums by name, float32 [] each, still on the device."""
+        return dict(zip(self.names, self.totals_N.unbind(), strict=True))
+
+    def clear(self) -> None:
+        """Start anew."""
+        self.totals_N.zero_()

@@ -1,0 +1,41 @@
+"""This module finds the keys under which an env says what a step was worth and whether the episode ended."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from tensordict.utils import NestedKey
+from torchrl.envs import EnvBase
+
+
+class SignalKeys(NamedTuple):
+    """Keys of an env's signals below "next"; an env that never truncates has no such key."""
+
+    reward: NestedKey = "reward"
+    done: NestedKey = "done"
+    terminated: NestedKey = "terminated"
+    truncated: NestedKey | None = "truncated"
+
+
+STANDARD = SignalKeys()
+
+
+def signal_keys(env: EnvBase) -> SignalKeys:
+    """Return an env's own keys, nested ones too: of those with one name, the one that lies highest.
+
+    Raises ValueError where the env has several rewards, or none.
+    """
+    if len(env.reward_keys) != 1:
+        raise ValueError(
+            f"{type(env).__name__} has the rewards {env.reward_keys}: expected one; add them up, e.g. by TorchRL's "
+            "LineariseRewards"
+        )
+    done, terminated, truncated = (
+        _named(env.done_keys, name) for name in ("done", "terminated", "truncated")
+    )
+    ended = done or terminated
+    assert ended is not None, "TorchRL completes the flags of every env"
+    return SignalKeys(env.reward_keys[0], ended, terminated or ended, truncated)
+
+
+def _named(keys: Sequence[NestedKey], name: str) -> NestedKey | None:
+    return next((key for key in keys if key == name or key[-1] == name), None)

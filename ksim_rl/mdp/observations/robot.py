@@ -1,0 +1,310 @@
+"""These observations read what a robot knows: joints, actuators, its root, sensors, the last action, commands and time.
+
+Joints and actuators have one column each in the order of the term's patterns.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from typing import Annotated, ClassVar, Literal
+
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor
+
+from ksim_rl.checked import NonNegative, Positive, Range, Within
+from ksim_rl.envs.term import ObservationTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.constants import constant
+from ksim_rl.mdp.fields import InFrame, OfEntity, OfJoints
+from ksim_rl.scene.names import Patterns
+from ksim_rl.scene.sensors.rays import grid_points
+from ksim_rl.transforms.tally import time_left
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncodedJoints(OfJoints, ObservationTerm):
+    """A reading of joint positions, with the encoders' bias (`RandomizeEncoderBias`), as a robot reads them, or not."""
+
+    biased: bool = False
+
+    def read(self, view: EnvView, pos_EL: Float[Tensor, "E L"]) -> Float[Tensor, "E L"]:
+        """Return what encoders read at these positions of the joints."""
+        return pos_EL + view.joints(self.joints).encoder_bias_EL if self.biased else pos_EL
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointPos(EncodedJoints):
+    """Positions of joints, rad or m; position stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return self.read(view, view.joints(self.joints).pos_EL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointPosRel(EncodedJoints):
+    """Positions of joints minus the default pose, rad or m; position stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return self.read(view, view.joints(self.joints).pos_rel_EL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointVel(OfJoints, ObservationTerm):
+    """Velocities of joints, rad/s or m/s, [E, L]; velocity stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.joints(self.joints).vel_EL
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointAcc(OfJoints, ObservationTerm):
+    """Accelerations of joints, rad/s^2 or m/s^2, [E, L]; acceleration stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.joints(self.joints).acc_EL
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointEffort(OfJoints, ObservationTerm):
+    """What the actuators exert on joints, behind their gears, N m or N, [E, L]; acceleration stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.joints(self.joints).effort_EL
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActuatorForce(ObservationTerm):
+    """Forces of actuators, before their gears, N or N m, [E, L]; acceleration stage."""
+
+    actuators: Patterns = ".*"
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.world.actuator_force_EL[:, view.resolver.index("actuator", self.actuators)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RootPos(OfEntity, ObservationTerm):
+    """Position of the root body's frame in the world, m, [E, 3]; position stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.entity(self.entity).root_pos_EL
+
+
+@dataclass(frozen=True, kw_only=True)
+class RootQuat(OfEntity, ObservationTerm):
+    """Orientation of the root body, body to world, (w, x, y, z), [E, 4]; position stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.entity(self.entity).root_quat_EL
+
+
+@dataclass(frozen=True, kw_only=True)
+class RootRotation6d(OfEntity, ObservationTerm):
+    """The root's x axis, then its y axis, in the world, without jumps (Zhou et al. 2019), [E, 6]; position stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.entity(self.entity).root.axes_E33[:, :2].flatten(start_dim=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RootLinVel(InFrame, ObservationTerm):
+    """Linear velocity of the root body's frame origin, in the axes of `frame`, m/s, [E, 3]; velocity stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        entity = view.entity(self.entity)
+        return entity.root_lin_vel_b_EL if self.frame == "root" else entity.root_lin_vel_w_EL
+
+
+@dataclass(frozen=True, kw_only=True)
+class RootAngVel(InFrame, ObservationTerm):
+    """Angular velocity of the root body, in the axes of `frame`, rad/s, [E, 3]; velocity stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        entity = view.entity(self.entity)
+        return entity.root_ang_vel_b_EL if self.frame == "root" else entity.root_ang_vel_w_EL
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectedGravity(OfEntity, ObservationTerm):
+    """Direction of gravity (world -z) in the root's frame, a unit vector, [E, 3]; (0, 0, -1) when upright.
+
+    Position stage. `time_constant` (s) is that of a first-order lag, as the attitude filter of an IMU has; a reset
+    fills it with the new orientation. Dead time, as of a bus, is the business of the group's delay.
+    """
+
+    time_constant: NonNegative = 0.0
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        gravity_E3 = view.entity(self.entity).projected_gravity_EL
+        if self.time_constant == 0.0:
+            return gravity_E3
+        # Readings are also taken when other rows reset: the filter moves on only if an env step has passed.
+        steps_E, filtered_E3 = view.buffer("steps_E", dtype=torch.int64), view.buffer("filtered_E3", 3)
+        now_E = view.episode_step_E + 1
+        gain = 1.0 - math.exp(-view.step_dt / self.time_constant)
+        gain_E = torch.where(steps_E == 0, 1.0, torch.where(steps_E == now_E, 0.0, gain))
+        filtered_E3.lerp_(gravity_E3, gain_E[:, None])
+        steps_E.copy_(now_E)
+        return torch.nn.functional.normalize(filtered_E3, dim=-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorReading(ObservationTerm):
+    """The reading of an MJCF sensor by name, [E, dim]; a gyro's is in its site's frame, at the velocity stage."""
+
+    sensor: str
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.sensor(self.sensor)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LastAction(ObservationTerm):
+    """The action that led to the current state, as the policy gave it, [E, K]; 0 at first; `history` keeps more."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.action_EL
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command(ObservationTerm):
+    """A command by name, [E, K]."""
+
+    command: str
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.command(self.command)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeTime(ObservationTerm):
+    """Time since the start of the episode, s, [E, 1]."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.episode_time_E[:, None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RemainingTime(ObservationTerm):
+    """Time until the episode times out (`TimeOut`), s, [E, 1]; `TimeAwareObservation` counts it in any env."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        if view.max_episode_length == 0:
+            raise ValueError(
+                "RemainingTime with episode_length_s=0: episodes never time out; set episode_length_s"
+            )
+        passed_E = view.episode_step_E + view.time_out_offset_E
+        return time_left(view.max_episode_length, passed_E)[:, None] * view.step_dt
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clock(ObservationTerm):
+    """sin, then cos, of 2 pi (frequency t + phase), `t` the episode's time, [E, 2P]; Hz, and cycles, one per foot."""
+
+    frequency: Positive
+    phases: tuple[float, ...] = (0.0,)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.phases:
+            raise ValueError("phases=(): give at least one, such as (0.0,)")
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        offsets_P = constant([2.0 * math.pi * phase for phase in self.phases], view.device)
+        angle_EP = view.episode_time_E[:, None] * (2.0 * math.pi * self.frequency) + offsets_P
+        return torch.cat((angle_EP.sin(), angle_EP.cos()), dim=-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuReading(ObservationTerm):
+    """One quantity of an `ImuSensor` of `scene.sensors`, in its own axes, float32 [E, 3], or [E, 4] for "quat".
+
+    "ang_vel" (rad/s; velocity stage), "lin_acc" (m/s^2, +9.81 upwards at rest; acceleration stage), "quat" ((w, x, y,
+    z), to the world; position stage) or "projected_gravity" (unit vector; position stage).
+    """
+
+    sensor: str
+    quantity: Literal["ang_vel", "lin_acc", "quat", "projected_gravity"] = "ang_vel"
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return getattr(view.imu(self.sensor), f"{self.quantity}_EL")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraImage(ObservationTerm):
+    """What a `CameraSensor` sees of the current state (position stage); the only term of its observation group.
+
+    "rgb" (uint8 [E, H, W, 3]), "depth" (m, float32 [E, H, W]) or "segmentation" (ids of geoms, -1 for none, int32
+    [E, H, W]).
+    """
+
+    is_image: ClassVar[bool] = True
+
+    sensor: str
+    output: Literal["rgb", "depth", "segmentation"] = "rgb"
+
+    def __call__(self, view: EnvView) -> Shaped[Tensor, " E *image"]:
+        camera = view.camera(self.sensor)
+        return camera.rgb_EHW3 if self.output == "rgb" else getattr(camera, f"{self.output}_EHW")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RayDistance(ObservationTerm):
+    """Distances to what the rays hit, m, the sensor's `max_distance` where they hit nothing, [E, N]; position stage."""
+
+    sensor: str
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.rays(self.sensor).state.distance_EN
+
+
+@dataclass(frozen=True, kw_only=True)
+class RayHeight(ObservationTerm):
+    """How far the ends of the rays are below the sensor, minus `offset`, clipped, m, [E, N]; position stage.
+
+    With a `GridPattern` that starts well above the robot it is a height scan that sees everything, not only terrain.
+    """
+
+    sensor: str
+    offset: float = 0.0
+    clip: Range = (-1.0, 1.0)
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        tracker = view.rays(self.sensor)
+        below_EN = tracker.origin_E3[:, 2:] - tracker.state.point_EN3[..., 2] - self.offset
+        return below_EN.clamp(*self.clip)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeightScan(OfEntity, ObservationTerm):
+    """How far the ground is below the root at the points of a grid, minus `offset`, clipped, m, [E, L]; position stage.
+
+    The grid is centred on the root and turns with its yaw only. Points run along x (forward) first, from back to front,
+    and these rows along y, from right to left. Heights are those of the terrain itself, exactly and without casting
+    rays: of what else stands there nothing is seen (`scene.sensors` with a `RayCaster` does). Ground that is higher
+    reads lower; on flat ground all points read root height - offset. `size` has the grid's edges along x and y, m.
+    """
+
+    size: Annotated[tuple[float, float], Within(low=0.0)] = (1.6, 1.0)
+    resolution: Positive = 0.1
+    offset: float = 0.5
+    clip: Range = (-1.0, 1.0)
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        body = view.entity(self.entity)
+        x_N, y_N = _grid(tuple(self.size), self.resolution, view.device)
+        sin_E1, cos_E1 = torch.sin(body.heading_E)[:, None], torch.cos(body.heading_E)[:, None]
+        root_E3 = body.root_pos_EL
+        points_EN2 = root_E3[:, None, :2] + torch.stack(
+            (cos_E1 * x_N - sin_E1 * y_N, sin_E1 * x_N + cos_E1 * y_N), dim=-1
+        )
+        below_EN = root_E3[:, 2:] - view.terrain.heights(points_EN2) - self.offset
+        return below_EN.clamp(*self.clip)
+
+
+@cache
+def _grid(size: tuple[float, float], resolution: float, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return x and y of the points about the root, m, [N] each, on the device; made once."""
+    x_N, y_N, _ = grid_points(size, resolution).T.tolist()
+    return constant(x_N, device), constant(y_N, device)

@@ -1,0 +1,166 @@
+"""These events draw where bodies, geoms, sites, cameras and lights stand in their frames, and how they are turned."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from dataclasses import field as default
+from typing import ClassVar, Literal, get_args
+
+import mujoco
+from jaxtyping import Bool
+from torch import Tensor
+
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.constants import array_constant
+from ksim_rl.mdp.randomization.randomize import (
+    Operation,
+    Pair,
+    RandomizeField,
+    RandomizeModelField,
+    write_entries,
+)
+from ksim_rl.scene import quaternion
+from ksim_rl.scene.names import Patterns
+
+Angle = Literal["roll", "pitch", "yaw"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizePos(RandomizeModelField):
+    """Position of elements in the frame of their body, m; columns x, y, z."""
+
+    columns: ClassVar[int] = 3
+    operation: Operation = "add"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeTurn(RandomizeField):
+    """Orientation of elements in the frame of their body: turned about their own axes by `ranges`, rad.
+
+    The turn is Rz(yaw) Ry(pitch) Rx(roll), after the model's own orientation ("add"), or in its place ("abs").
+    """
+
+    ranges: Mapping[Angle, Pair] = default(default_factory=dict)
+    operation: Literal["abs", "add"] = "add"
+
+    columns: ClassVar[int] = 4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for angle, pair in self.ranges.items():
+            self.check_range(f"ranges.{angle}", pair)
+        missing = [angle for angle in get_args(Angle) if angle not in self.ranges]
+        if self.distribution == "log_uniform" and missing:
+            raise ValueError(
+                f"distribution='log_uniform': ranges needs all of {get_args(Angle)}, {missing[0]!r} is missing"
+            )
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        ids, own_NC = self.ids(view), array_constant(self.nominal(view), view.device)
+        pairs = [self.ranges.get(angle, (0.0, 0.0)) for angle in get_args(Angle)]
+        turn_EN4 = quaternion.from_euler_xyz(*self.draw(view, len(ids), pairs).unbind(-1))
+        value_ENC = self._turned(own_NC[None], turn_EN4)
+        write_entries(view.field(self.field), ids, range(self.columns), mask_E, value_ENC)
+
+    def _turned(self, own_1NC: Tensor, turn_EN4: Tensor) -> Tensor:
+        return turn_EN4 if self.operation == "abs" else quaternion.multiply(own_1NC, turn_EN4)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfBodies(RandomizeField):
+    """Draw a pose of bodies, in the frame of their parents, with all that hangs on them."""
+
+    bodies: Patterns
+
+    def ids(self, view: EnvView) -> tuple[int, ...]:
+        model, ids = view.world.mj_model, super().ids(view)
+        for body in ids:
+            free = model.jnt_type[model.body_jntadr[body]] == mujoco.mjtJoint.mjJNT_FREE
+            if model.body_mocapid[body] >= 0 or (model.body_jntnum[body] and free):
+                raise ValueError(
+                    f"{type(self).__name__}.bodies: {model.body(body).name!r} moves freely, so that its pose is state: "
+                    "draw it at resets (ResetRootUniform)"
+                )
+        return ids
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeBodyPos(OfBodies, RandomizePos):
+    """Position of bodies in the frame of their parents, m; columns x, y, z. What hangs on them moves along."""
+
+    field: ClassVar[str] = "body_pos"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeBodyQuat(OfBodies, RandomizeTurn):
+    """Orientation of bodies in their parents, rad by angle, about their own axes. What hangs on them turns along."""
+
+    field: ClassVar[str] = "body_quat"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeGeomPos(RandomizePos):
+    """Position of geoms in the frame of their body, m; columns x, y, z. The body's inertia does not change."""
+
+    geoms: Patterns
+    field: ClassVar[str] = "geom_pos"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeGeomQuat(RandomizeTurn):
+    """Orientation of geoms in their body, rad by angle, about their own axes. The body's inertia does not change."""
+
+    geoms: Patterns
+    field: ClassVar[str] = "geom_quat"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeSitePos(RandomizePos):
+    """Position of sites in the frame of their body, m; columns x, y, z. Their sensors and forces move along."""
+
+    sites: Patterns
+    field: ClassVar[str] = "site_pos"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeSiteQuat(RandomizeTurn):
+    """Orientation of sites in their body, rad by angle, about their own axes: an IMU that is mounted askew, say."""
+
+    sites: Patterns
+    field: ClassVar[str] = "site_quat"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeCameraPos(RandomizePos):
+    """Position of the model's cameras in the frame of their body, m; columns x, y, z."""
+
+    cameras: Patterns
+    field: ClassVar[str] = "cam_pos"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeCameraQuat(RandomizeTurn):
+    """Orientation of the model's cameras in their body, rad by angle, about their own axes; they look along -z."""
+
+    cameras: Patterns
+    field: ClassVar[str] = "cam_quat"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeLightPos(RandomizePos):
+    """Position of lights in the frame of their body, m; columns x, y, z."""
+
+    lights: Patterns
+    field: ClassVar[str] = "light_pos"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizeLightDir(RandomizeTurn):
+    """Direction of lights in the frame of their body, turned about its axes, rad by angle."""
+
+    lights: Patterns
+    operation: Literal["add"] = "add"
+    field: ClassVar[str] = "light_dir"
+    columns: ClassVar[int] = 3
+
+    def _turned(self, own_1NC: Tensor, turn_EN4: Tensor) -> Tensor:
+        return quaternion.rotate(turn_EN4, own_1NC)

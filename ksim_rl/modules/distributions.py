@@ -1,0 +1,401 @@
+"""This module has the distributions of actions, free of host syncs: gaussians, with and without bounds, and choices."""
+
+import math
+from collections.abc import Iterable, Sequence
+from functools import reduce
+from operator import add
+from typing import Any
+
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor
+from torch.distributions import Distribution, constraints, kl_divergence, register_kl
+from torch.nn import functional
+from torch.special import log_ndtr, ndtri
+
+_HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
+# Below it exp() underflows in float32, and the inverse of the distribution function is found in another way.
+_LOG_TINY = -80.0
+
+
+class VectorDistribution(Distribution):
+    """The base of distributions over vectors that never read a value on the host, so that they can be captured.
+
+    Samples come from torch's default generator of the device. The `scale` is positive, and broadcastable with `loc`.
+    """
+
+    arg_constraints = {"loc": constraints.real_vector, "scale": constraints.positive}  # type: ignore[assignment]
+    has_rsample = True
+    _bounds: tuple[Any, ...] = ()
+
+    def __init__(self, loc: Float[Tensor, "#*batch #L"], scale: Float[Tensor, "#*batch #L"]) -> None:
+        self.loc, self.scale = torch.broadcast_tensors(loc, scale)
+        # Argument checks compare all values and read the answer on the host.
+        super().__init__(self.loc.shape[:-1], self.loc.shape[-1:], validate_args=False)
+
+    @property
+    def deterministic_sample(self) -> Float[Tensor, "*batch L"]:
+        """What TorchRL takes under `ExplorationType.DETERMINISTIC`: the mode."""
+        return self.mode
+
+    def expand(self, batch_shape: Any, _instance: Any = None) -> "VectorDistribution":
+        """Return the distribution with a larger batch shape."""
+        shape = torch.Size(batch_shape) + self.event_shape
+        return type(self)(self.loc.expand(shape), self.scale.expand(shape), *self._bounds)
+
+    def sample(self, sample_shape: Any = ()) -> Float[Tensor, "*shape L"]:
+        """Draw [*sample_shape, ..., L] without gradients."""
+        with torch.no_grad():
+            return self.rsample(sample_shape)
+
+
+class BoundedDistribution(VectorDistribution):
+    """The base of those whose components lie in [low, high], both numbers or both tensors [L]."""
+
+    def __init__(
+        self,
+        loc: Float[Tensor, "#*batch #L"],
+        scale: Float[Tensor, "#*batch #L"],
+        low: Float[Tensor, "#L"] | float = -1.0,
+        high: Float[Tensor, "#L"] | float = 1.0,
+    ) -> None:
+        super().__init__(loc, scale)
+        self.low, self.high = self._bounds = low, high
+        self._prepare(low, high)
+
+    @property
+    def support(self) -> constraints.Constraint:  # type: ignore[override]
+        """The box [low, high]."""
+        return constraints.independent(constraints.interval(self.low, self.high), 1)
+
+    def _prepare(self, low: Any, high: Any) -> None:
+        """Compute once what several quantities need."""
+        raise NotImplementedError
+
+    def _clamp(self, value: Tensor) -> Tensor:
+        return value.clamp(self.low, self.high)  # type: ignore[arg-type]
+
+
+class DiagonalGaussian(VectorDistribution):
+    """Normal distribution of a vector with independent components, one event per batch element.
+
+    It equals `Independent(Normal(loc, scale), 1)`, whose `sample` (through `torch.normal`) and argument checks read
+    tensor values on the host.
+    """
+
+    support = constraints.real_vector  # type: ignore[assignment]
+
+    @property
+    def mean(self) -> Float[Tensor, "*batch L"]:
+        """The mean."""
+        return self.loc
+
+    mode = mean
+
+    @property
+    def stddev(self) -> Float[Tensor, "*batch L"]:
+        """The standard deviation."""
+        return self.scale
+
+    @property
+    def variance(self) -> Float[Tensor, "*batch L"]:
+        """The variance."""
+        return self.scale.square()
+
+    def rsample(self, sample_shape: Any = ()) -> Float[Tensor, "*shape L"]:
+        """Draw by reparametrization: gradients reach `loc` and `scale`."""
+        shape = torch.Size(sample_shape) + self.loc.shape
+        noise = torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device)
+        return self.loc + self.scale * noise
+
+    def log_prob(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*shape"]:
+        """Return the log density of `value` in nats."""
+        error = (value - self.loc) / self.scale
+        return (-0.5 * error.square() - self.scale.log() - _HALF_LOG_2_PI).sum(-1)
+
+    def entropy(self) -> Float[Tensor, "*batch"]:
+        """Return the differential entropy in nats."""
+        return (self.scale.log() + (0.5 + _HALF_LOG_2_PI)).sum(-1)
+
+
+@register_kl(DiagonalGaussian, DiagonalGaussian)
+def _kl_diagonal(p: DiagonalGaussian, q: DiagonalGaussian) -> Tensor:
+    variance_ratio = (p.scale / q.scale).square()
+    error = ((p.loc - q.loc) / q.scale).square()
+    return 0.5 * (variance_ratio + error - 1.0 - variance_ratio.log()).sum(-1)
+
+
+class TanhGaussian(BoundedDistribution):
+    """`center + half_range * tanh(u)` with `u` from `DiagonalGaussian(loc, scale)`, component by component.
+
+    The density includes the change of variables, log|dy/du| = log(half_range) + 2 (log 2 - u - softplus(-2 u)), exact
+    for every `u`; the usual log(1 - tanh(u)^2) underflows (Haarnoja et al., arXiv 1812.05905, appendix C). Without it
+    the entropy grows with `scale` for ever, while the true one has a maximum and falls to minus infinity.
+
+    The entropy has no closed form, so there is no `entropy`: TorchRL's losses then take `-rsample_and_log_prob()[1]`,
+    an unbiased estimate whose gradient is reparametrized.
+    """
+
+    def _prepare(self, low: Any, high: Any) -> None:
+        self.base = DiagonalGaussian(self.loc, self.scale)
+        self._center, self._half_range = (high + low) / 2, (high - low) / 2
+
+    @property
+    def median(self) -> Float[Tensor, "*batch L"]:
+        """The median of each component."""
+        return self._squash(self.loc)
+
+    @property
+    def deterministic_sample(self) -> Float[Tensor, "*batch L"]:
+        """The median; the mode would lie on a bound as soon as `scale` is large."""
+        return self.median
+
+    def rsample(self, sample_shape: Any = ()) -> Float[Tensor, "*shape L"]:
+        """Draw by reparametrization: gradients reach `loc` and `scale`."""
+        return self._squash(self.base.rsample(sample_shape))
+
+    def rsample_and_log_prob(
+        self, sample_shape: Any = ()
+    ) -> tuple[Float[Tensor, "*shape L"], Float[Tensor, "*shape"]]:
+        """Draw as `rsample`, and return the log density without inverting the squashing."""
+        latent = self.base.rsample(sample_shape)
+        return self._squash(latent), self._log_density(latent)
+
+    def sample_and_log_prob(
+        self, sample_shape: Any = ()
+    ) -> tuple[Float[Tensor, "*shape L"], Float[Tensor, "*shape"]]:
+        """Do the same without gradients through the sample; the log density has gradients."""
+        latent = self.base.sample(sample_shape)
+        return self._squash(latent), self._log_density(latent)
+
+    def log_prob(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*shape"]:
+        """Return the log density in nats, of a value beyond the bounds that of the last value inside."""
+        inside = 1.0 - torch.finfo(self.loc.dtype).eps
+        unit = ((value - self._center) / self._half_range).clamp(-inside, inside)
+        return self._log_density(torch.atanh(unit))
+
+    def _squash(self, latent: Tensor) -> Tensor:
+        # Rounding can carry the sum past a bound, which specs would refuse.
+        return self._clamp(self._center + self._half_range * latent.tanh())
+
+    def _log_density(self, latent: Tensor) -> Tensor:
+        log_slope = 2.0 * (math.log(2.0) - latent - functional.softplus(-2.0 * latent))
+        half_range = self._half_range
+        log_half_range = half_range.log() if isinstance(half_range, Tensor) else math.log(half_range)
+        return self.base.log_prob(latent) - (log_slope + log_half_range).sum(-1)
+
+
+@register_kl(TanhGaussian, TanhGaussian)
+def _kl_tanh(p: TanhGaussian, q: TanhGaussian) -> Tensor:
+    # One map squashes both, and a divergence does not change under such a map. The bounds have to be the same.
+    return kl_divergence(p.base, q.base)
+
+
+class TruncatedGaussian(BoundedDistribution):
+    """A `DiagonalGaussian` given that each component lies in [low, high]; `loc` and `scale` are those before.
+
+    Every quantity is computed for the mirror image whose interval lies left of `loc`, from logarithms of the
+    distribution function, which neither underflow nor cancel where `loc` is far from the interval; in float32 the log
+    density is then good to 0.03 nats at 40 standard deviations. Entropy, moments and divergence are exact (Johnson,
+    Kotz and Balakrishnan, "Continuous univariate distributions", vol. 1, 1994, ch. 13.10.1).
+    """
+
+    def _prepare(self, low: Any, high: Any) -> None:
+        left, right = (low - self.loc) / self.scale, (high - self.loc) / self.scale
+        mirrored = left + right > 0.0
+        self._sign = torch.where(mirrored, -1.0, 1.0).to(self.loc.dtype)
+        # The bounds in standard deviations from loc, in the mirror image where that is taken.
+        self._a, self._b = torch.where(mirrored, -right, left), torch.where(mirrored, -left, right)
+        self._log_cdf_a, self._log_cdf_b = log_ndtr(self._a), log_ndtr(self._b)
+        self._log_mass = self._log_cdf_b + (-torch.expm1(self._log_cdf_a - self._log_cdf_b)).log()
+
+    @property
+    def mode(self) -> Float[Tensor, "*batch L"]:
+        """The most likely value: `loc`, or the bound next to it."""
+        return self._clamp(self.loc)
+
+    @property
+    def mean(self) -> Float[Tensor, "*batch L"]:
+        """The mean."""
+        density_a, density_b = self._bound_densities()
+        return self.loc + self._sign * self.scale * (density_a - density_b)
+
+    @property
+    def variance(self) -> Float[Tensor, "*batch L"]:
+        """The variance."""
+        density_a, density_b = self._bound_densities()
+        second = 1.0 + self._a * density_a - self._b * density_b
+        return self.scale.square() * (second - (density_a - density_b).square())
+
+    def rsample(self, sample_shape: Any = ()) -> Float[Tensor, "*shape L"]:
+        """Draw; the gradients are those of the value at a fixed probability (Figurnov et al., arXiv 1805.08498)."""
+        shape = torch.Size(sample_shape) + self.loc.shape
+        with torch.no_grad():
+            a, b = self._a, self._b
+            eps = torch.finfo(self.loc.dtype).eps
+            share = torch.rand(shape, dtype=self.loc.dtype, device=self.loc.device).clamp_min(eps)
+            cdf_ratio = (self._log_cdf_a - self._log_cdf_b).exp()
+            log_cdf = self._log_cdf_b + (share + (1.0 - share) * cdf_ratio).log()
+            z = torch.minimum(torch.maximum(_inverse_log_ndtr(log_cdf), a), b)
+            value = self._clamp(self.loc + self._sign * self.scale * z)
+            weight_a = (1.0 - share) * (0.5 * (z.square() - a.square())).exp()
+            weight_b = share * (0.5 * (z.square() - b.square())).exp()
+            by_loc = 1.0 - weight_a - weight_b
+            by_scale = self._sign * (z - a * weight_a - b * weight_b)
+        return value + (self.loc - self.loc.detach()) * by_loc + (self.scale - self.scale.detach()) * by_scale
+
+    def log_prob(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*shape"]:
+        """Return the log density of `value` in nats; minus infinity outside of the bounds."""
+        error = (value - self.loc) / self.scale
+        log_density = -0.5 * error.square() - self.scale.log() - _HALF_LOG_2_PI - self._log_mass
+        inside = (value >= self.low) & (value <= self.high)
+        return torch.where(inside, log_density, -torch.inf).sum(-1)
+
+    def entropy(self) -> Float[Tensor, "*batch"]:
+        """Return the differential entropy in nats."""
+        density_a, density_b = self._bound_densities()
+        spread = 1.0 + self._a * density_a - self._b * density_b
+        return (self.scale.log() + _HALF_LOG_2_PI + self._log_mass + 0.5 * spread).sum(-1)
+
+    def _bound_densities(self) -> tuple[Tensor, Tensor]:
+        """Return the density of the standardized variable at its two bounds."""
+        log_densities = (
+            -0.5 * bound.square() - _HALF_LOG_2_PI - self._log_mass for bound in (self._a, self._b)
+        )
+        density_a, density_b = (log_density.exp() for log_density in log_densities)
+        return density_a, density_b
+
+
+def _inverse_log_ndtr(log_cdf: Tensor) -> Tensor:
+    """Return z with log Phi(z) = `log_cdf`, also where Phi(z) underflows."""
+    near = ndtri(log_cdf.clamp_min(_LOG_TINY).exp())
+    # Newton's steps from the leading term of the tail; |z| + 1 / |z| is the slope of log Phi there.
+    tail = log_cdf.clamp_max(_LOG_TINY)
+    far = (-2.0 * tail).sqrt()
+    far = (-2.0 * (tail + _HALF_LOG_2_PI + far.log())).sqrt()
+    for _ in range(2):
+        far = far + (log_ndtr(-far) - tail) / (far + 1.0 / far)
+    return torch.where(log_cdf > _LOG_TINY, near, -far)
+
+
+@register_kl(TruncatedGaussian, TruncatedGaussian)
+def _kl_truncated(p: TruncatedGaussian, q: TruncatedGaussian) -> Tensor:
+    # The bounds have to be the same: what p can give and q cannot would make it infinite.
+    density_a, density_b = p._bound_densities()
+    first = p._sign * (density_a - density_b)
+    second = 1.0 + p._a * density_a - p._b * density_b
+    gap, ratio = (p.loc - q.loc) / q.scale, p.scale / q.scale
+    error = gap.square() + 2.0 * gap * ratio * first + ratio.square() * second
+    return (q._log_mass - p._log_mass - ratio.log() + 0.5 * (error - second)).sum(-1)
+
+
+class Categorical(Distribution):
+    """One choice among N, or several independent ones, as indices or one-hot.
+
+    It equals `torch.distributions.Categorical`, whose argument checks and sampling through `torch.multinomial` can wait
+    for the device. Samples are drawn by the largest of the logits plus Gumbel noise (Maddison et al., arXiv 1411.0030)
+    from torch's default generator of the device. Logits of several choices, [..., N], stand side by side, in K parts of
+    the given `sizes`: samples are [..., K], or [...] for one choice. With `one_hot` they mark the options instead,
+    [..., N]. Their `dtype` is that of the action spec.
+    """
+
+    arg_constraints = {"logits": constraints.real_vector}  # type: ignore[assignment]
+    has_rsample = False
+
+    def __init__(
+        self,
+        logits: Float[Tensor, "*batch N"],
+        sizes: Sequence[int] | None = None,
+        one_hot: bool = False,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        if sizes is not None and sum(sizes) != logits.shape[-1]:
+            raise ValueError(f"sizes={tuple(sizes)}: they must sum to the {logits.shape[-1]} logits")
+        self.logits = logits
+        self.sizes = None if sizes is None else tuple(sizes)
+        self.one_hot = one_hot
+        self.dtype = dtype or (torch.bool if one_hot else torch.int64)
+        parts = logits.split(list(self.sizes or logits.shape[-1:]), -1)
+        smallest = torch.finfo(logits.dtype).min
+        # An option that a logit of minus infinity rules out has probability zero: a finite logarithm keeps it no NaN.
+        self._log_probs = [functional.log_softmax(part, -1).clamp_min(smallest) for part in parts]
+        event = logits.shape[-1:] if one_hot else torch.Size(() if self.sizes is None else (len(parts),))
+        # Argument checks compare all values and read the answer on the host.
+        super().__init__(logits.shape[:-1], event, validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint:  # type: ignore[override]
+        """Indices below the number of options, or marks of 0 and 1."""
+        if self.one_hot:
+            return constraints.independent(constraints.boolean, 1)
+        if self.sizes is None:
+            return constraints.integer_interval(0, self.logits.shape[-1] - 1)
+        return constraints.independent(constraints.integer_interval(0, max(self.sizes) - 1), 1)
+
+    @property
+    def probs(self) -> Float[Tensor, "*batch N"]:
+        """The probabilities; those of each choice sum to 1."""
+        return torch.cat([log_probs.exp() for log_probs in self._log_probs], -1)
+
+    @property
+    def mode(self) -> Shaped[Tensor, "*value"]:
+        """The most likely option of each choice."""
+        return self._as_value([log_probs.argmax(-1) for log_probs in self._log_probs])
+
+    @property
+    def deterministic_sample(self) -> Shaped[Tensor, "*value"]:
+        """What TorchRL takes under `ExplorationType.DETERMINISTIC`: the mode."""
+        return self.mode
+
+    def expand(self, batch_shape: Any, _instance: Any = None) -> "Categorical":
+        """Return the distribution with a larger batch shape."""
+        logits = self.logits.expand(torch.Size(batch_shape) + self.logits.shape[-1:])
+        return Categorical(logits, self.sizes, self.one_hot, self.dtype)
+
+    def sample(self, sample_shape: Any = ()) -> Shaped[Tensor, "*value"]:
+        """Draw the options, sample_shape + batch shape + event shape."""
+        chosen = []
+        with torch.no_grad():
+            for log_probs in self._log_probs:
+                shape = torch.Size(sample_shape) + log_probs.shape
+                waiting = torch.empty(shape, dtype=log_probs.dtype, device=log_probs.device).exponential_()
+                chosen.append((log_probs - waiting.log()).argmax(-1))
+        return self._as_value(chosen)
+
+    def log_prob(self, value: Shaped[Tensor, "*value"]) -> Float[Tensor, "*shape"]:
+        """Return the log probability of `value`, summed over the choices."""
+        return _sum(
+            log_probs.expand(*index.shape, -1).gather(-1, index.unsqueeze(-1)).squeeze(-1)
+            for log_probs, index in zip(self._log_probs, self._as_indices(value), strict=True)
+        )
+
+    def entropy(self) -> Float[Tensor, "*batch"]:
+        """Return the entropy in nats, summed over the choices."""
+        return _sum(-(log_probs.exp() * log_probs).sum(-1) for log_probs in self._log_probs)
+
+    def _as_value(self, indices: Sequence[Tensor]) -> Tensor:
+        if self.one_hot:
+            # torch's one_hot() asks the host whether all indices are in range.
+            marks = [
+                index.unsqueeze(-1) == torch.arange(log_probs.shape[-1], device=index.device)
+                for index, log_probs in zip(indices, self._log_probs, strict=True)
+            ]
+            return torch.cat(marks, -1).to(self.dtype)
+        value = indices[0] if self.sizes is None else torch.stack(tuple(indices), -1)
+        return value.to(self.dtype)
+
+    def _as_indices(self, value: Tensor) -> list[Tensor]:
+        if self.one_hot:
+            widths = [log_probs.shape[-1] for log_probs in self._log_probs]
+            return [marks.to(torch.uint8).argmax(-1) for marks in value.split(widths, -1)]
+        return [value.long()] if self.sizes is None else list(value.long().unbind(-1))
+
+
+@register_kl(Categorical, Categorical)
+def _kl(p: Categorical, q: Categorical) -> Tensor:
+    pairs = zip(p._log_probs, q._log_probs, strict=True)
+    return _sum((log_p.exp() * (log_p - log_q)).sum(-1) for log_p, log_q in pairs)
+
+
+def _sum(terms: Iterable[Tensor]) -> Tensor:
+    return reduce(add, terms)

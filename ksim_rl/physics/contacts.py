@@ -1,0 +1,38 @@
+"""This module mends the contacts that MuJoCo Warp finds otherwise than the C engine; docs/upstream.md shows each."""
+
+from collections.abc import Callable
+
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+
+from ksim_rl.physics import kernels, upstream
+from ksim_rl.physics.height_field.contacts import take_over_height_fields
+
+
+def follow_the_c_engine(warp_model: mjw.Model) -> None:
+    """Mend contacts of height fields, of boxes with boxes and of steep capsules with planes, in place.
+
+    Call it before anything copies the model.
+    """
+    upstream.collide_boxes_exactly(warp_model)
+    hooks: list[Callable[[mjw.Model, mjw.Data], None]] = []
+    if height_fields := take_over_height_fields(warp_model):
+        hooks.append(height_fields)
+    types = warp_model.geom_type.numpy()[upstream.geom_pairs(warp_model)[0]]
+    if (np.sort(types) == (kernels.PLANE, kernels.CAPSULE)).all(-1).any():
+        hooks.append(_align_steep_capsules)
+
+    def mend(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+        for hook in hooks:
+            hook(warp_model, warp_data_E)
+
+    if hooks:
+        # MuJoCo Warp calls it after its own collision pass.
+        warp_model.callback.contactfilter = mend
+
+
+def _align_steep_capsules(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+    contact = warp_data_E.contact
+    inputs = [warp_model.geom_type, warp_data_E.geom_xmat, contact.geom, contact.worldid, warp_data_E.nacon]
+    wp.launch(kernels.align_steep_capsules, dim=warp_data_E.naconmax, inputs=inputs, outputs=[contact.frame])

@@ -1,0 +1,134 @@
+"""This module has motors with a proportional-derivative controller, and targets of any actuator that arrive late."""
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import mujoco
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ksim_rl.checked import NonNegative, Positive, WholeNumber
+from ksim_rl.scene.actuators.actuator import Actuator, Drive, ExplicitActuator, Law, SubstepRing
+from ksim_rl.scene.names import Patterns
+from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKind
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdealPDActuator(ExplicitActuator):
+    """Effort = stiffness * (position error) + damping * (velocity error) + effort target, within the effort limit.
+
+    `stiffness` is in N m / rad or N / m, `damping` in N m s / rad or N s / m.
+    """
+
+    stiffness: NonNegative
+    damping: NonNegative
+
+    _takes: ClassVar[frozenset[TargetKind]] = frozenset({"pos", "vel", "effort"})
+
+    @property
+    def params(self) -> Mapping[str, float]:
+        return {**super().params, "stiffness": self.stiffness, "damping": self.damping}
+
+    @property
+    def law_key(self) -> Hashable:
+        """All joints with this kind of motor are computed at once."""
+        return type(self)
+
+    def law(self, drive: Drive) -> Law:
+        def effort_EN(state: JointState, target: JointTarget) -> Float[Tensor, "E N"]:
+            limit_EN = drive.param("effort_limit")
+            return pd_effort(drive, state, target).clamp(-limit_EN, limit_EN)
+
+        return effort_EN
+
+
+def pd_effort(drive: Drive, state: JointState, target: JointTarget) -> Float[Tensor, "E N"]:
+    """Return what a proportional-derivative controller asks its motors for, without limits."""
+    asked_EN = torch.addcmul(target.effort_EN, drive.param("stiffness"), target.pos_EN - state.pos_EN)
+    return torch.addcmul(asked_EN, drive.param("damping"), target.vel_EN - state.vel_EN)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DCMotorActuator(IdealPDActuator):
+    """A proportional-derivative controller on a motor with a limited voltage.
+
+    At velocity v the voltage allows efforts between `saturation_effort * (-1 - v / velocity_limit)` and
+    `saturation_effort * (1 - v / velocity_limit)`: the straight speed-torque line of a brushed or field-oriented motor
+    (Lynch and Park, Modern Robotics, 2017, section 8.9.1), from the stall effort (N m or N) to the no-load velocity
+    (rad/s or m/s). The current allows `effort_limit` in both directions. Beyond the velocity limit the motor can only
+    brake.
+    """
+
+    saturation_effort: Positive
+    velocity_limit: Positive
+
+    @property
+    def params(self) -> Mapping[str, float]:
+        ends = {"saturation_effort": self.saturation_effort, "velocity_limit": self.velocity_limit}
+        return {**super().params, **ends}
+
+    def law(self, drive: Drive) -> Law:
+        def effort_EN(state: JointState, target: JointTarget) -> Tensor:
+            stall_EN, limit_EN = drive.param("saturation_effort"), drive.param("effort_limit")
+            lost_EN = stall_EN * state.vel_EN / drive.param("velocity_limit")
+            highest_EN = (stall_EN - lost_EN).clamp(-limit_EN, limit_EN)
+            lowest_EN = (-stall_EN - lost_EN).clamp(-limit_EN, limit_EN)
+            return torch.clamp(pd_effort(drive, state, target), lowest_EN, highest_EN)
+
+        return effort_EN
+
+
+@dataclass(frozen=True, kw_only=True)
+class DelayedActuator(Actuator):
+    """Another actuator, built-in or explicit, that sees its targets some physics substeps late.
+
+    The lag is drawn for each env when that env resets, uniformly from {min_lag, ..., max_lag}, one for all joints of
+    this entry. With lag k the first k substeps after a change of the target still see the old one; until an episode's
+    first target arrives, it counts as having been there before.
+    """
+
+    is_explicit: ClassVar[bool] = True  # built-in actuators too get their control before each substep
+
+    actuator: Actuator
+    min_lag: WholeNumber = 0
+    max_lag: WholeNumber
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.min_lag > self.max_lag:
+            raise ValueError(f"min_lag={self.min_lag} exceeds max_lag={self.max_lag}")
+
+    @property
+    def driven(self) -> Patterns:
+        return self.actuator.driven
+
+    @property
+    def takes(self) -> frozenset[TargetKind]:
+        return self.actuator.takes
+
+    @property
+    def params(self) -> Mapping[str, float]:
+        return self.actuator.params
+
+    def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
+        self.actuator.configure(actuator, joint)
+
+    def law(self, drive: Drive) -> Law:
+        inner = self.actuator.law(drive)
+        lag_E = drive.buffer("lag_E", dtype=torch.int64, keep=True)
+        fields = [f"{kind}_EN" for kind in sorted(self.takes)]
+        ring = SubstepRing(drive, "targets", self.max_lag + 1, len(fields) * drive.num_joints)
+
+        def draw(mask_E: Bool[Tensor, " E"]) -> None:
+            drawn_E = drive.integers(1, self.min_lag, self.max_lag)[:, 0]
+            lag_E.copy_(torch.where(mask_E, drawn_E, lag_E))
+
+        def late_EN(state: JointState, target: JointTarget) -> Tensor:
+            ring.push(torch.cat([getattr(target, field) for field in fields], dim=1))
+            arrived = ring.at_rows(lag_E).chunk(len(fields), dim=1)
+            return inner(state, target._replace(**dict(zip(fields, arrived, strict=True))))
+
+        drive.on_reset(draw)
+        return late_EN

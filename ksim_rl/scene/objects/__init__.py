@@ -1,5 +1,0 @@
-"""Passive things for `SceneCfg.objects`."""
-
-from ksim_rl.scene.objects.box import Box
-
-__all__ = ["Box"]

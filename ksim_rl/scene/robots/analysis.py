@@ -1,0 +1,342 @@
+"""This module analyses a robot that nobody here has seen: what its model says, and all that a walking task needs."""
+
+import dataclasses
+import io
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from PIL import Image
+from rich.console import Console
+from rich.pretty import pretty_repr
+from rich.table import Table
+
+from ksim_rl.physics import load_model, load_spec
+from ksim_rl.physics.capacity import probe
+from ksim_rl.physics.load import Source
+from ksim_rl.scene.actuators import PositionActuator
+from ksim_rl.scene.names import scalar_joint_ids
+from ksim_rl.scene.rendering.rendering import choose_gl_platform
+from ksim_rl.scene.rendering.visualizer import visible_groups
+from ksim_rl.scene.robots.anatomy import Anatomy, dissect, posed, rounded
+from ksim_rl.scene.robots.edit import Site
+from ksim_rl.scene.robots.legged_robot import ModelRobot
+from ksim_rl.scene.robots.stance import find_stance, on_plane, stand
+from ksim_rl.scene.state.joint_targets import control_kind
+
+FREQUENCY, DAMPING_RATIO = 10.0, 2.0
+"""Of a joint's motor alone under its servo, Hz; as in BeyondMimic (Liao et al., 2025)."""
+ARMATURE_PER_EFFORT = 2e-4
+"""kg m^2 per N m for a model without armature: that of Go1's and G1's geared motors is 1.1e-4 to 2.5e-4."""
+SOFTEST, MOST_SAG = 0.25, 0.1
+"""rad: from which error on a servo may saturate whatever its armature, and what the load in the stance may bend it."""
+LEAST_SCALE, MOST_SCALE = 0.15, 0.5
+"""rad per unit action: stiff servos saturate within less than a step, soft ones only beyond what legs can do."""
+TRIAL_S, TRIALS, STIFFER = 5.0, 6, 1.5
+"""The legs' stiffness is multiplied until the robot stands that long and straight, so often at most."""
+GRAVITY = 9.81
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointAnalysis:
+    """One joint as it is in the model, and from `stance` on what is proposed for it; rad, N m and kg m^2 (or m, N, kg).
+
+    `gains` are stiffness and damping of the model's own `actuator`, `load` is the torque that holds the joint in the
+    stance, and `sag` how far it is from its target after standing.
+    """
+
+    name: str
+    actuator: str
+    limits: tuple[float, float] | None
+    gains: tuple[float, float]
+    effort_limit: float
+    armature: float
+    damping: float
+    frictionloss: float
+    load: float
+    stance: float
+    stiffness: float
+    servo_damping: float
+    action_scale: float
+    sag: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotAnalysis:
+    """What `analyse` found: the joints as they are, and `robot`, a `LeggedRobot` of all that is proposed.
+
+    Attributes:
+        mass, height: kg, and m from the lowest point to the highest in the model's own pose.
+        com_height: m of the centre of mass above the soles in the stance.
+        pitch_joints: those of the legs that turn about y.
+        ankle_stiffness_ratio: of all ankles about y, over m g h; a biped needs more than 1 to stand without a policy.
+        knee_sag: rad, the most that a pitch joint gives way.
+        stands_s, drift: s until it falls with zero actions in MuJoCo's C engine (at most 5), and m that it moves.
+        notes: what was assumed.
+    """
+
+    robot: ModelRobot
+    mass: float
+    height: float
+    com_height: float
+    joints: tuple[JointAnalysis, ...]
+    foot_bodies: tuple[str, ...]
+    leg_joints: tuple[str, ...]
+    pitch_joints: tuple[str, ...]
+    ankle_stiffness_ratio: float | None
+    knee_sag: float
+    stands_s: float
+    drift: float
+    njmax: int
+    nconmax: int
+    notes: tuple[str, ...]
+
+    def by_joint(self, pitch: float, legs: float, others: float) -> dict[str, float]:
+        """Return a value by joint pattern: for the legs' joints that turn about y, their others, and all others."""
+        values = dict.fromkeys(self.robot.joint_names, others) | dict.fromkeys(self.leg_joints, legs)
+        return {re.escape(j): pitch if j in self.pitch_joints else value for j, value in values.items()}
+
+    def table(self) -> str:
+        """Return the report as text."""
+        robot, ratio = self.robot, self.ankle_stiffness_ratio
+        ankles = "" if ratio is None else f", ankle stiffness {ratio:.1f} m g h"
+        lines = [
+            f"{robot.name}: {self.mass:.2f} kg, {self.height:.2f} m, root {robot.root_body}",
+            f"feet: {', '.join(self.foot_bodies)}",
+            f"stance: root {robot.init_pos[2]:.3f} m, centre of mass {self.com_height:.3f} m over the soles{ankles}",
+            f"zero actions: stands {self.stands_s:g} s, moves {self.drift:.3f} m, knees sag {self.knee_sag:.3f} rad",
+            f"collisions: {len(robot.collision_geoms)} geoms, njmax={self.njmax}, nconmax={self.nconmax}",
+            *(f"note: {note}" for note in self.notes),
+        ]
+        table = Table(box=None, pad_edge=False, header_style="bold")
+        heads = "joint|actuator|range|kp|kd|effort|armature|damping|friction|load|: stance|kp|kd|scale|sag"
+        for head in heads.split("|"):
+            table.add_column(head, justify="left" if head in ("joint", "actuator") else "right", no_wrap=True)
+        for joint in self.joints:
+            name, actuator, limits, gains, *numbers = dataclasses.astuple(joint)
+            span = "-" if limits is None else f"{limits[0]:.2f} {limits[1]:.2f}"
+            table.add_row(name, actuator, span, *(f"{number:.3g}" for number in (*gains, *numbers)))
+        text = io.StringIO()
+        Console(file=text, width=240, highlight=False).print(table)
+        return "\n".join([*lines, "", text.getvalue()])
+
+    def code(self) -> str:
+        """Return a Python module with `robot`, to be edited, and its velocity task."""
+        name = self.robot.name.upper()
+        return f'''"""{self.robot.name} follows a velocity command."""
+
+from ksim_rl.envs.actuators import PositionActuator
+from ksim_rl.envs.robots import ModelRobot
+from ksim_rl.envs.tasks import velocity
+from ksim_rl.scene.robots.edit import CollisionGeom, Site
+
+{name} = {pretty_repr(self.robot, max_width=140)}
+TASK = velocity.VelocityTask.for_robot({name})
+'''
+
+    def draw(self, file: Path) -> None:
+        """Write a picture of the stance, 640 x 480."""
+        choose_gl_platform()
+        mj_model, camera = on_plane(self.robot.spec()), mujoco.MjvCamera()
+        camera.lookat[2], camera.distance = self.com_height, 2.5 * max(self.height, 0.5)
+        camera.azimuth, camera.elevation = 130.0, -15.0
+        with mujoco.Renderer(mj_model, 480, 640) as renderer:
+            renderer.update_scene(posed(mj_model, mj_model.key_qpos[0]), camera, visible_groups(mj_model))
+            Image.fromarray(renderer.render()).save(file)
+
+
+def analyse(source: Source) -> RobotAnalysis:
+    """Analyse a legged robot from what `physics.load_spec` takes: a file, a menagerie name, XML or a spec.
+
+    Gains follow from armature and `FREQUENCY`, for motors and position servos alike: a `PositionActuator` is a torque
+    motor under PD control. They are raised where the load would bend a joint by more than `MOST_SAG`, to twice what
+    keeps all that a joint carries from toppling over it, and in the legs until the robot stands.
+    """
+    spec = load_spec(source)
+    mj_model = load_model(spec)
+    given = mj_model.key_qpos[0] if mj_model.nkey else mj_model.qpos0
+    anatomy = dissect(mj_model, given)
+    legs, biped = anatomy.legs, len(anatomy.legs) == 2
+    data = posed(mj_model, find_stance(mj_model, legs, given))
+    names = {j: mj_model.joint(j).name for j in scalar_joint_ids(mj_model)}
+    of_legs = list(dict.fromkeys(j for leg in legs for j in leg.joints))
+    dof, com_height = mj_model.jnt_dofadr, float(data.subtree_com[0, 2])
+    weight = float(mj_model.body_subtreemass[0]) * GRAVITY
+    # What holds the pose while all feet carry the same weight.
+    load, jacobian = data.qfrc_bias.copy(), np.zeros((3, mj_model.nv))
+    for leg in legs:
+        mujoco.mj_jac(mj_model, data, jacobian, None, leg.points(data).mean(0), data.body(leg.foot).id)
+        load -= jacobian[2] * weight / len(legs)
+    given_drives = {j: _drive(mj_model, j) for j in names}
+    efforts = {j: limit or round(0.5 * weight * com_height, 1) for j, (_, _, limit) in given_drives.items()}
+    inertias = {j: _short(mj_model.dof_armature[dof[j]] or ARMATURE_PER_EFFORT * efforts[j]) for j in names}
+    gains = {}
+    for j in names:
+        over = mj_model.jnt_bodyid[j] if j not in of_legs else 0
+        share = 1.0 if j not in of_legs else 0.5 if biped else 0.0
+        lever = np.hypot(*data.xaxis[j, :2]) * max(0.0, data.subtree_com[over, 2] - data.xanchor[j, 2])
+        topples = share * mj_model.body_subtreemass[over] * GRAVITY * lever
+        own = min(inertias[j] * (2.0 * math.pi * FREQUENCY) ** 2, efforts[j] / SOFTEST)
+        gains[j] = max(own, abs(load[dof[j]]) / MOST_SAG, 2.0 * topples)
+    for alike in zip(*(leg.joints for leg in legs), strict=False):
+        gains |= dict.fromkeys(alike, max(gains[j] for j in alike))
+
+    pitch, trials = [list(leg.pitch_joints(data)) for leg in legs], []
+    while not trials or (trials[-1][:2] < (TRIAL_S, -1.5 * MOST_SAG) and len(trials) < TRIALS):
+        stiffer = {j: STIFFER ** len(trials) if j in of_legs else 1.0 for j in names}
+        servos = {}
+        for j, kp in gains.items():
+            kp = _short(kp * stiffer[j])
+            kd = _short(2.0 * DAMPING_RATIO * math.sqrt(kp * inertias[j]))
+            servos[j] = {"stiffness": kp, "damping": kd, "effort_limit": efforts[j], "armature": inertias[j]}
+        robot = _robot(spec, source, data, anatomy, servos)
+        mj_stand = on_plane(robot.spec())
+        standing = stand(mj_stand, seconds=TRIAL_S)
+        sag = max((abs(standing.sag[names[j]]) for joints in pitch for j in joints), default=0.0)
+        trials.append((standing.seconds, -sag, standing, robot, servos, mj_stand))
+    _, sag, standing, robot, servos, mj_stand = max(trials, key=lambda trial: trial[:2])
+
+    ankles = sum(servos[joints[-1]]["stiffness"] for joints in pitch if joints)
+    assumed = {
+        "effort limit, half of weight times height": [
+            names[j] for j, (_, _, limit) in given_drives.items() if not limit
+        ],
+        f"armature, {ARMATURE_PER_EFFORT:g} x effort limit": [
+            names[j] for j in names if not mj_model.dof_armature[dof[j]]
+        ],
+    }
+    njmax, nconmax = probe(mj_stand)
+    return RobotAnalysis(
+        robot=robot,
+        mass=weight / GRAVITY,
+        height=anatomy.height,
+        com_height=com_height,
+        joints=tuple(
+            JointAnalysis(
+                name=name,
+                limits=tuple(mj_model.jnt_range[j].tolist()) if mj_model.jnt_limited[j] else None,
+                actuator=given_drives[j][0],
+                gains=given_drives[j][1],
+                effort_limit=efforts[j],
+                armature=float(mj_model.dof_armature[dof[j]]),
+                damping=float(mj_model.dof_damping[dof[j]]),
+                frictionloss=float(mj_model.dof_frictionloss[dof[j]]),
+                load=float(load[dof[j]]),
+                stance=robot.default_joint_pos[name],
+                stiffness=servos[j]["stiffness"],
+                servo_damping=servos[j]["damping"],
+                action_scale=robot.action_scale[name],
+                sag=standing.sag[name],
+            )
+            for j, name in names.items()
+        ),
+        foot_bodies=robot.foot_sites,
+        leg_joints=tuple(names[j] for j in of_legs),
+        pitch_joints=tuple(dict.fromkeys(names[j] for joints in pitch for j in joints)),
+        ankle_stiffness_ratio=ankles / (weight * com_height) if biped else None,
+        knee_sag=-sag,
+        stands_s=standing.seconds,
+        drift=standing.drift,
+        njmax=njmax,
+        nconmax=nconmax,
+        notes=tuple(f"no {what} is assumed: {', '.join(of)}" for what, of in assumed.items() if of),
+    )
+
+
+def robot_name(source: Source) -> str:
+    """Return what a robot is called: its file without the suffix, or what the model calls itself."""
+    is_file = not isinstance(source, mujoco.MjSpec) and not str(source).lstrip().startswith("<")
+    stem = Path(source).stem if is_file else "scene"
+    return re.sub(r"\W+", "_", (load_spec(source).modelname if stem == "scene" else stem).lower()) or "robot"
+
+
+def _robot(
+    spec: mujoco.MjSpec,
+    source: Source,
+    data: mujoco.MjData,
+    anatomy: Anatomy,
+    servos: dict[int, dict[str, float]],
+) -> ModelRobot:
+    """Return the robot in the pose of `data` with servos by joint; what their hulls touch there is left to pass."""
+    mj_model = data.model
+    alike: dict[tuple[float, ...], list[int]] = {}
+    for j, servo in servos.items():
+        alike.setdefault(tuple(servo.values()), []).append(j)
+    names = {j: mj_model.joint(j).name for j in servos}
+    soles = tuple(geom for leg in anatomy.legs for geom in leg.geoms)
+    sites = []
+    for leg in anatomy.legs:
+        foot = data.body(leg.foot)
+        tread = (leg.points(data).mean(0) - foot.xpos) @ foot.xmat.reshape(3, 3)
+        sites.append(Site(name=leg.foot, body=leg.foot, pos=rounded(tread)))
+    if not any(site.name == "imu" for site in spec.sites):
+        sites.append(Site(name="imu", body=anatomy.root))
+    robot = ModelRobot(
+        name=robot_name(source),
+        model=_as_text(spec) if isinstance(source, mujoco.MjSpec) else str(source),
+        root_body=anatomy.root,
+        joint_names=tuple(names.values()),
+        init_pos=(0.0, 0.0, round(float(data.body(anatomy.root).xpos[2]), 4)),
+        default_joint_pos=dict(
+            zip(names.values(), rounded(data.qpos[mj_model.jnt_qposadr[list(names)]]), strict=True)
+        ),
+        action_scale={
+            names[j]: round(
+                float(np.clip(0.25 * s["effort_limit"] / s["stiffness"], LEAST_SCALE, MOST_SCALE)), 3
+            )
+            for j, s in servos.items()
+        },
+        actuators=tuple(
+            PositionActuator(joints=tuple(names[j] for j in group), **servos[group[0]])
+            for group in alike.values()
+        ),
+        foot_geoms=tuple(geom.name for geom in soles),
+        foot_sites=tuple(leg.foot for leg in anatomy.legs),
+        collision_geoms=(*anatomy.hulls, *soles),
+        sites=tuple(sites),
+    )
+    trial = robot.spec().compile()
+    contacts = posed(trial, trial.key_qpos[0]).contact.geom
+    touching = {tuple(trial.body(trial.geom_bodyid[geom]).name for geom in pair) for pair in contacts}
+    return dataclasses.replace(robot, overlaps=tuple(sorted(touching)))
+
+
+def _drive(mj_model: mujoco.MjModel, joint: int) -> tuple[str, tuple[float, float], float | None]:
+    """Return what drives a joint in the model, its stiffness and damping, and the least of all limits of its effort."""
+    kind, gains, limits = "none", (0.0, 0.0), []
+    if mj_model.jnt_actfrclimited[joint]:
+        limits.append(np.abs(mj_model.jnt_actfrcrange[joint]).max())
+    for a in range(mj_model.nu):
+        if (mj_model.actuator_trntype[a], mj_model.actuator_trnid[a, 0]) != (
+            mujoco.mjtTrn.mjTRN_JOINT,
+            joint,
+        ):
+            continue
+        gear, bias = abs(mj_model.actuator_gear[a, 0]), mj_model.actuator_biasprm[a]
+        target = control_kind(mj_model.actuator_biastype[a], bias, mj_model.actuator_dyntype[a])
+        kind = {"pos": "position", "vel": "velocity", "effort": "motor"}[target]
+        if target != "effort":
+            gains = abs(float(bias[1])), abs(float(bias[2]))
+        if mj_model.actuator_forcelimited[a]:
+            limits.append(gear * np.abs(mj_model.actuator_forcerange[a]).max())
+        elif mj_model.actuator_ctrllimited[a] and target == "effort":
+            limits.append(
+                gear * np.abs(mj_model.actuator_gainprm[a, 0] * mj_model.actuator_ctrlrange[a]).max()
+            )
+    return kind, gains, _short(min(limits)) if limits and min(limits) > 0.0 else None
+
+
+def _as_text(spec: mujoco.MjSpec) -> str:
+    """Return the spec as XML whose files are found from anywhere."""
+    spec = spec.copy()
+    spec.compile()
+    folder = Path(spec.modelfiledir or ".").resolve()
+    spec.meshdir, spec.texturedir = str(folder / spec.meshdir), str(folder / spec.texturedir)
+    return spec.to_xml()
+
+
+def _short(number: float) -> float:
+    return float(f"{number:.3g}")

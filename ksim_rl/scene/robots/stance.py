@@ -1,0 +1,100 @@
+"""This module makes robots stand: it finds a pose with the centre of mass over the soles, and holds it in C."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from mujoco import minimize
+
+from ksim_rl.physics import SimCfg
+from ksim_rl.scene.robots.anatomy import Leg, posed
+from ksim_rl.scene.terrains import PlaneTerrain
+
+SIM = SimCfg(timestep=0.005, integrator="implicitfast", solver="newton", iterations=10, ls_iterations=20)
+"""The physics of the velocity tasks."""
+BEND = np.array([-0.4, 0.8, -0.4])
+"""rad about y by which hip, knee and ankle of straight legs are bent at first."""
+
+
+def find_stance(mj_model: mujoco.MjModel, legs: Sequence[Leg], qpos: np.ndarray) -> np.ndarray:
+    """Return the pose near `qpos` in which all soles are flat on z = 0 with the centre of mass above their middle.
+
+    Inverse kinematics: a least-squares problem in the root's height and the joints of the legs, inside 90 % of their
+    ranges. Straight legs are bent, with the knees forward on two legs; others keep their crouch.
+    """
+    data, root = posed(mj_model, qpos), int(mj_model.jnt_type.argmin())
+    first = int(mj_model.jnt_qposadr[root])
+    joints = list(dict.fromkeys(joint for leg in legs for joint in leg.joints))
+    columns = [first + 2, *mj_model.jnt_qposadr[joints]]
+    given = [leg.points(data).mean(0)[:2] for leg in legs]
+    for leg in legs:
+        pitch = leg.pitch_joints(data)
+        angles = data.qpos[mj_model.jnt_qposadr[list(pitch)]]
+        if len(pitch) > 1 and np.abs(angles).max() < 0.2:
+            bend = BEND[: len(pitch)] * (1.0 if len(legs) == 2 else -1.0)
+            for (joint, sign), turn in zip(list(pitch.items())[-3:], bend, strict=False):
+                data.qpos[mj_model.jnt_qposadr[joint]] += sign * turn
+    limits = np.where(mj_model.jnt_limited[joints][:, None], mj_model.jnt_range[joints], [-np.pi, np.pi])
+    low, high = limits @ [0.95, 0.05], limits @ [0.05, 0.95]
+    data.qpos[columns[1:]] = np.clip(data.qpos[columns[1:]], low, high)
+    mujoco.mj_kinematics(mj_model, data)
+    data.qpos[columns[0]] -= min(leg.points(data)[:, 2].min() for leg in legs)
+    wanted = data.qpos[columns].copy()
+
+    def misses(x: np.ndarray) -> np.ndarray:
+        data.qpos[columns] = x
+        mujoco.mj_kinematics(mj_model, data)
+        mujoco.mj_comPos(mj_model, data)
+        soles = [leg.points(data) for leg in legs]
+        middles = np.array([points.mean(0)[:2] for points in soles])
+        parts = (
+            np.concatenate(soles)[:, 2] / 0.001,
+            (data.subtree_com[mj_model.jnt_bodyid[root]][:2] - middles.mean(0)) / 0.002,
+            (middles - given - (middles - given).mean(0)).ravel() / 0.02,
+            (x - wanted) / np.array([0.05, *[0.5] * len(joints)]),
+        )
+        return np.concatenate(parts)
+
+    x, _ = minimize.least_squares(
+        wanted[:, None],
+        lambda x_LK: np.stack([misses(x) for x in x_LK.T], axis=-1),
+        bounds=[np.array([[wanted[0] + reach, *ends]]).T for reach, ends in ((-1.0, low), (1.0, high))],
+        verbose=0,
+    )
+    data.qpos[columns], data.qpos[first : first + 2] = x.ravel(), 0.0
+    return data.qpos.copy()
+
+
+class Standing(NamedTuple):
+    """How a robot stands whose servos hold its keyframe, without a policy."""
+
+    seconds: float
+    """Until it tilts by 45 degrees or sinks to 60 % of its height, or the whole trial."""
+    sag: Mapping[str, float]
+    """How far driven joints are from their targets at the end, rad, by name."""
+    drift: float
+    """Of the root along the ground, m."""
+
+
+def on_plane(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Return the model of a robot on a plane, with the physics of the velocity tasks."""
+    spec = spec.copy()
+    PlaneTerrain().add_to(spec)
+    SIM.apply_to(spec)
+    return spec.compile()
+
+
+def stand(mj_model: mujoco.MjModel, *, seconds: float = 5.0) -> Standing:
+    """Hold the keyframe for some seconds in MuJoCo's C engine."""
+    data = mujoco.MjData(mj_model)
+    mujoco.mj_resetDataKeyframe(mj_model, data, 0)
+    body = mj_model.jnt_bodyid[mj_model.jnt_type.argmin()]
+    height, fallen = data.qpos[2], False
+    while data.time < seconds and not fallen:
+        mujoco.mj_step(mj_model, data)
+        fallen = data.qpos[2] < 0.6 * height or data.xmat[body, 8] < np.sqrt(0.5)
+    driven = mj_model.actuator_trnid[:, 0]
+    off = data.ctrl - data.qpos[mj_model.jnt_qposadr[driven]]
+    sag = {mj_model.joint(joint).name: float(of_joint) for joint, of_joint in zip(driven, off, strict=True)}
+    return Standing(round(float(min(data.time, seconds)), 2), sag, float(np.hypot(*data.qpos[:2])))

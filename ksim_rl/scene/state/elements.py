@@ -1,0 +1,206 @@
+"""This module gives terms the joints, bodies and sites that they name: `view.joints("hip.*").pos_EL`."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ksim_rl.scene.names import as_index, scalar_joint_ids
+from ksim_rl.scene.state.quantity import first_of, quantity
+from ksim_rl.scene.state.simulation import Simulation
+
+
+class _Elements:
+    """N named elements of one kind, in the order of the patterns that match them.
+
+    `ids` are theirs in the model (of joints: among its hinges and slides); `index` (a slice, or int64 on the device) is
+    the same, to index the dim of this kind. Poses and velocities are in the world frame.
+    """
+
+    def __init__(self, state: Simulation, ids: Sequence[int], names: Sequence[str]) -> None:
+        self.ids, self.names = tuple(ids), list(names)
+        self.index = as_index(ids, state.world.device)
+        self.cache = state.new_cache()
+        self._state = state
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+class JointTables(NamedTuple):
+    """Default positions, soft limits (low, high), and what encoders read too much, rad or m; events may write them."""
+
+    default_pos_EL: Float[Tensor, "E L"]
+    soft_limits_L2: Float[Tensor, "L 2"]
+    encoder_bias_EL: Float[Tensor, "E L"]
+
+
+class Joints(_Elements):
+    """The hinges (rad) and slides (m) that some patterns match: `view.joints("hip.*").pos_EL`."""
+
+    def __init__(
+        self,
+        state: Simulation,
+        ids: Sequence[int],
+        names: Sequence[str],
+        tables: JointTables,
+        every_joint: "Joints | None" = None,
+    ) -> None:
+        super().__init__(state, ids, names)
+        model, device = state.world.mj_model, state.world.device
+        scalar = scalar_joint_ids(model)
+        self._tables, self._every_joint = tables, every_joint or self
+        self._qpos = as_index([model.jnt_qposadr[scalar[i]] for i in ids], device)
+        self._qvel = as_index([model.jnt_dofadr[scalar[i]] for i in ids], device)
+
+    def some(self, ids: Sequence[int]) -> "Joints":
+        """Return those at some places among the model's hinges and slides; for all joints only."""
+        assert self is self._every_joint
+        return Joints(self._state, ids, [self.names[i] for i in ids], self._tables, self)
+
+    # -- state ---------------------------------------------------------------------------------------------------
+
+    @quantity
+    def pos_EL(self) -> Float[Tensor, "E L"]:
+        """Positions, rad or m; position stage."""
+        return self._state.world.qpos_EL[:, self._qpos]
+
+    @quantity
+    def vel_EL(self) -> Float[Tensor, "E L"]:
+        """Velocities, rad/s or m/s; velocity stage."""
+        return self._state.world.qvel_EL[:, self._qvel]
+
+    @quantity
+    def acc_EL(self) -> Float[Tensor, "E L"]:
+        """Accelerations, rad/s^2 or m/s^2; acceleration stage."""
+        return self._state.world.qacc_EL[:, self._qvel]
+
+    @quantity
+    def effort_EL(self) -> Float[Tensor, "E L"]:
+        """What actuators exert, N m or N, behind the gears; acceleration stage."""
+        return self._state.world.qfrc_actuator_EL[:, self._qvel]
+
+    @quantity
+    def pos_rel_EL(self) -> Float[Tensor, "E L"]:
+        """Positions minus the default pose."""
+        if self is self._every_joint:
+            return self.pos_EL - self._tables.default_pos_EL
+        return self._every_joint.pos_rel_EL[:, self.index]
+
+    # -- what is known of them -------------------------------------------------------------------------------------
+
+    @property
+    def default_pos_EL(self) -> Float[Tensor, "E L"]:
+        """Positions in the default pose, which events may move."""
+        return self._tables.default_pos_EL[:, self.index]
+
+    @property
+    def soft_limits_L2(self) -> Float[Tensor, "L 2"]:
+        """Low and high end of `scene.soft_joint_pos_limit_factor` of each range, infinite where there is none."""
+        return self._tables.soft_limits_L2[self.index]
+
+    @property
+    def encoder_bias_EL(self) -> Float[Tensor, "E L"]:
+        """What the encoders read beyond the position, rad or m."""
+        return self._tables.encoder_bias_EL[:, self.index]
+
+    # -- writes --------------------------------------------------------------------------------------------------
+
+    def write_pos(self, mask_E: Bool[Tensor, " E"], pos_EL: Float[Tensor, "E L"]) -> None:
+        """Set the positions in the rows of `mask_E`."""
+        self._state.write(self._state.world.qpos_EL, self._qpos, mask_E, pos_EL)
+
+    def write_vel(self, mask_E: Bool[Tensor, " E"], vel_EL: Float[Tensor, "E L"]) -> None:
+        """Set the velocities in the rows of `mask_E`."""
+        self._state.write(self._state.world.qvel_EL, self._qvel, mask_E, vel_EL)
+
+
+class Bodies(_Elements):
+    """The bodies that some patterns match: `view.bodies(".*_foot").pos_EN3`."""
+
+    @quantity
+    def pos_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Positions of the body frames, m."""
+        return self._state.derived().xpos_EL[:, self.index]
+
+    @quantity
+    def quat_EN4(self) -> Float[Tensor, "E N 4"]:
+        """Orientations, body to world, (w, x, y, z)."""
+        return self._state.derived().xquat_EL[:, self.index]
+
+    @quantity
+    def axes_EN33(self) -> Float[Tensor, "E N 3 3"]:
+        """The x, y and z axes of the bodies, a unit vector each."""
+        return self._state.derived().xmat_EL[:, self.index].transpose(-1, -2)
+
+    @quantity
+    def lin_vel_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Linear velocities of the origins of the body frames, m/s."""
+        return self._state.point_velocity(self.pos_EN3, self.index)
+
+    @quantity
+    def ang_vel_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Angular velocities, rad/s."""
+        return self._state.derived().cvel_EL[:, self.index, 0:3]
+
+    @quantity
+    def subtree_com_pos_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Centres of mass of the bodies with all that hangs on them, m."""
+        return self._state.derived().subtree_com_EL[:, self.index]
+
+    @quantity
+    def subtree_com_vel_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Velocities of the centres of mass of bodies with all that hangs on them, m/s; first read in construction."""
+        return self._state.derived().view("subtree_linvel")[:, self.index]
+
+
+class Body:
+    """The body `name` with index `id` in the model: `view.body("torso").lin_vel_EL`; units as in `Bodies`."""
+
+    def __init__(self, bodies: Bodies) -> None:
+        (self.name,), (self.id,) = bodies.names, bodies.ids
+        self._bodies = bodies
+
+    pos_EL = first_of("_bodies", Bodies.pos_EN3)
+    quat_EL = first_of("_bodies", Bodies.quat_EN4)
+    axes_E33 = first_of("_bodies", Bodies.axes_EN33)
+    lin_vel_EL = first_of("_bodies", Bodies.lin_vel_EN3)
+    ang_vel_EL = first_of("_bodies", Bodies.ang_vel_EN3)
+
+
+class Sites(_Elements):
+    """The sites that some patterns match: `view.sites(".*_foot").height_EN`."""
+
+    def __init__(self, state: Simulation, ids: Sequence[int], names: Sequence[str]) -> None:
+        super().__init__(state, ids, names)
+        bodies = [int(state.world.mj_model.site_bodyid[i]) for i in ids]
+        self._bodies = torch.tensor(bodies, device=state.world.device, dtype=torch.int64)
+
+    @quantity
+    def pos_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Positions, m."""
+        return self._state.derived().site_xpos_EL[:, self.index]
+
+    @quantity
+    def height_EN(self) -> Float[Tensor, "E N"]:
+        """Heights above the ground right below, m."""
+        return self._state.ground.clearance(self.pos_EN3)
+
+    @quantity
+    def lin_vel_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Linear velocities, m/s."""
+        return self._state.point_velocity(self.pos_EN3, self._bodies)
+
+
+class Site:
+    """The site `name` with index `id` in the model: `view.site("finger").pos_EL`; units as in `Sites`."""
+
+    def __init__(self, sites: Sites) -> None:
+        (self.name,), (self.id,) = sites.names, sites.ids
+        self._sites = sites
+
+    pos_EL = first_of("_sites", Sites.pos_EN3)
+    height_E = first_of("_sites", Sites.height_EN)
+    lin_vel_EL = first_of("_sites", Sites.lin_vel_EN3)

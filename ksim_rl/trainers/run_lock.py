@@ -1,0 +1,100 @@
+"""This module lets one process at a time write a run folder."""
+
+import errno
+import fcntl
+import itertools
+import json
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import datetime
+from pathlib import Path
+from typing import IO
+
+LOCK, MOST_LETTERS = ".lock", 1000
+# What some file systems of clusters answer.
+WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+
+
+@contextmanager
+def locked(folder: Path, *, note: Callable[[str], None]) -> Iterator[None]:
+    """Hold the lock of a run folder; a ValueError says which process has it, and a note whose it was that has died."""
+    try:
+        file = _take(folder)
+    except OSError as error:
+        if error.errno not in WITHOUT_LOCKS:
+            raise
+        note(f"warning: {folder} cannot be locked ({error.strerror}): see that no other process writes it")
+        yield
+        return
+    try:
+        holder = file.read(MOST_LETTERS)
+        if holder:
+            note(
+                f"{folder}: its lock was left by {_described(holder)}, which has ended; this process takes it over"
+            )
+        me = {
+            "pid": os.getpid(),
+            "host": socket.gethostname(),
+            "since": f"{datetime.now():%Y-%m-%d %H:%M:%S}",
+        }
+        _write(file, json.dumps(me))
+        yield
+    finally:
+        # Removed while it is held, so that nobody takes a file that is no longer there for the lock.
+        with suppress(OSError):
+            (folder / LOCK).unlink()
+        file.close()
+
+
+def is_locked(folder: Path) -> bool:
+    """Whether a living process writes a run folder."""
+    try:
+        with open(folder / LOCK) as file:
+            return not _try_lock(file)
+    except OSError:  # there is none, or there can be none
+        return False
+
+
+def _take(folder: Path) -> IO[str]:
+    for attempt in itertools.count():
+        file = os.fdopen(os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644), "r+")
+        try:
+            if _try_lock(file):
+                with suppress(FileNotFoundError):  # whoever had it may have removed it meanwhile
+                    if os.path.samestat(os.fstat(file.fileno()), os.stat(folder / LOCK)):
+                        return file
+            elif (holder := file.read(MOST_LETTERS)) or attempt == 20:
+                raise ValueError(f"{folder}: {_described(holder)} writes this run: wait for it, or end it")
+            else:
+                time.sleep(0.05)  # another looks whether it is locked, or is about to write its name
+        except BaseException:
+            file.close()
+            raise
+        file.close()
+    raise AssertionError
+
+
+def _try_lock(file: IO[str]) -> bool:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _write(file: IO[str], text: str) -> None:
+    file.seek(0)
+    file.truncate()
+    file.write(text)
+    file.flush()
+
+
+def _described(holder: str) -> str:
+    try:
+        known = json.loads(holder)
+        return f"process {int(known['pid'])} on {known['host']!r}, begun {known['since']!r},"
+    except (ValueError, KeyError, TypeError):
+        return "another process"

@@ -1,0 +1,90 @@
+"""Contacts that MuJoCo Warp alone finds otherwise are those of the C engine."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from ksim_rl.physics import SimCfg, World, load_model
+
+NUM_ENVS = 64
+# The plane is the last geom: contacts order geoms by their type, pairs by their number.
+THINGS = """
+<mujoco>
+  <default><default class="high"><geom type="box" contype="2" conaffinity="2"/></default></default>
+  <worldbody>
+    <body pos="0 0 3"><freejoint/><geom class="high" size="0.1 0.07 0.05"/></body>
+    <body pos="0 0 3"><freejoint/><geom class="high" size="0.06 0.1 0.04"/></body>
+    <body pos="2 0 1"><freejoint/><geom type="capsule" size="0.03 0.1"/></body>
+    <body><geom type="plane" size="5 5 1" {turned}/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def touching(mj_model: mujoco.MjModel, seed: int) -> torch.Tensor:
+    """Draw poses, float32 [E, 21]: a box up to 1 cm deep in another one from any side, a rod in the floor, tilted."""
+    rng, mj_data = np.random.default_rng(seed), mujoco.MjData(mj_model)
+    poses = np.tile(mj_model.qpos0, (NUM_ENVS, 1))
+    for qpos in poses:
+        for body in range(3):
+            quat = rng.normal(size=4) * ([1.0, 1.0, 1.0, 1.0] if body < 2 else [1.0, 0.2, 0.2, 1.0])
+            qpos[7 * body + 3 : 7 * body + 7] = quat / np.linalg.norm(quat)
+        towards = rng.normal(size=3)
+        ways = (
+            (7, {0, 1}, towards / np.linalg.norm(towards), 0.0),
+            (14, {2, 3}, np.array([0.0, 0.0, 1.0]), -2.0),
+        )
+        for place, pair, direction, low in ways:
+            start, high = qpos[place : place + 3].copy(), 0.5
+            for _ in range(25):
+                qpos[place : place + 3] = start + 0.5 * (low + high) * direction
+                mj_data.qpos[:] = qpos
+                mujoco.mj_fwdPosition(mj_model, mj_data)
+                meets = any(set(contact.geom) == pair for contact in mj_data.contact)
+                low, high = (0.5 * (low + high), high) if meets else (low, 0.5 * (low + high))
+            qpos[place : place + 3] = start + (low - rng.uniform(0.0, 0.01)) * direction
+    return torch.tensor(poses, dtype=torch.float32)
+
+
+@pytest.mark.parametrize("turned", ["", 'euler="20 10 0"'])
+def test_boxes_and_steep_rods_touch_as_in_the_c_engine(turned):
+    check_contacts(turned)
+
+
+def check_contacts(turned: str, device: str = "cpu") -> None:
+    """Compare all contacts of a step with those of the C engine from the same poses."""
+    mj_model = load_model(THINGS.format(turned=turned))
+    pose_EL = touching(mj_model, seed=0)
+    world = World(mj_model, num_envs=NUM_ENVS, device=device, sim=SimCfg(njmax=120, nconmax=24))
+    world.qpos_EL.copy_(pose_EL)
+    world.step()
+    contact, count = world.warp_data_E.contact, int(world.warp_data_E.nacon.numpy()[0])
+    fields = ("worldid", "geom", "dist", "pos", "frame")
+    owner, geom, dist, pos, frame = (getattr(contact, name).numpy()[:count] for name in fields)
+    mj_data, several, steep = mujoco.MjData(mj_model), 0, 0
+    for row, qpos in enumerate(pose_EL.double().numpy()):
+        mj_data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(mj_model, mj_data)
+        for pair in ({0, 1}, {2, 3}):
+            theirs = [each for each in mj_data.contact if set(each.geom) == pair]
+            mine = [i for i in np.flatnonzero(owner == row) if set(geom[i]) == pair]
+            assert len(mine) == len(theirs) > 0, (row, pair)
+            for each in theirs:
+                nearest = min(mine, key=lambda i: np.linalg.norm(pos[i] - each.pos))
+                assert np.allclose(pos[nearest], each.pos, atol=1e-5), (row, pair)
+                assert dist[nearest] == pytest.approx(each.dist, abs=1e-5), (row, pair)
+                assert np.allclose(frame[nearest].ravel(), each.frame, atol=1e-4), (row, pair)
+            several += pair == {0, 1} and len(theirs) > 1
+            axis = mj_data.geom_xmat[2].reshape(3, 3)[:, 2]
+            steep += pair == {2, 3} and np.linalg.norm(np.cross(axis, theirs[0].frame[:3])) < 0.5
+    assert several >= 5 and steep >= 5
+
+
+def test_an_upright_rod_keeps_a_frame():
+    mj_model = load_model(THINGS.format(turned=""))
+    world = World(mj_model, num_envs=1, sim=SimCfg(njmax=120, nconmax=24))
+    world.qpos_EL[0, 16] = 0.12
+    world.step()
+    frame = world.last_substep("contact.frame")[0].double()
+    torch.testing.assert_close(frame @ frame.T, torch.eye(3, dtype=torch.float64))
