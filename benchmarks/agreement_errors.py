@@ -5,7 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-CONTACT_LIMIT = 1e-3
+CONTACT_LIMIT, FAR_LIMIT = 1e-3, 1e-2
 COMPARED = ("qpos", "qvel", "xpos", "sensordata", "actuator_force", "qfrc_constraint")
 
 
@@ -17,6 +17,7 @@ class Errors:
     p95: float
     max: float
     share_within_1e_3: float
+    share_within_1e_2: float
     scale: float
     worlds: int
 
@@ -34,6 +35,7 @@ def worst(several: list[Errors]) -> Errors:
         p95=max(found.p95 for found in several),
         max=max(found.max for found in several),
         share_within_1e_3=min(found.share_within_1e_3 for found in several),
+        share_within_1e_2=min(found.share_within_1e_2 for found in several),
         scale=min(found.scale for found in several),
         worlds=several[0].worlds,
     )
@@ -89,6 +91,7 @@ def _errors(relative: np.ndarray, scale: float) -> Errors:
         p95=float(np.percentile(relative, 95)),
         max=float(relative.max()),
         share_within_1e_3=float(np.mean(relative <= CONTACT_LIMIT)),
+        share_within_1e_2=float(np.mean(relative <= FAR_LIMIT)),
         scale=scale,
         worlds=len(relative),
     )

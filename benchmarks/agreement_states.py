@@ -68,6 +68,21 @@ def in_contact(mj_model: mujoco.MjModel, num_worlds: int, *, spread: float, seed
     return _rounded(rows)
 
 
+def thrown(mj_model: mujoco.MjModel, num_worlds: int, *, seed: int) -> States:
+    """Things that tumble and lie: from any pose on the ground, 20 to 200 steps under any control up to 1."""
+    rng = np.random.default_rng(seed)
+    mj_data = mujoco.MjData(mj_model)
+    rows = []
+    for qpos in capacity.random_qpos(mj_model, num_worlds, rng):
+        mujoco.mj_resetData(mj_model, mj_data)
+        mj_data.qpos[:] = qpos
+        capacity.put_in_ground(mj_model, mj_data, depth=0.0)
+        mj_data.ctrl[:] = np.clip(capacity.random_ctrl(mj_model, rng), -1.0, 1.0)
+        mujoco.mj_step(mj_model, mj_data, int(rng.integers(20, 200)))
+        rows.append((mj_data.qpos.copy(), mj_data.qvel.copy(), mj_data.ctrl.copy()))
+    return _rounded(rows)
+
+
 def _tilted(quat: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Turn an orientation by up to 0.5 rad about a random axis."""
     axis = rng.normal(size=3)

@@ -9,7 +9,6 @@ from typing import NoReturn
 
 from ksim_rl import conf
 from ksim_rl.checks import unknown_name
-from ksim_rl.cli.command_line import check_command_line
 from ksim_rl.trainers import RunCfg
 
 
@@ -69,8 +68,6 @@ def compose(overrides: Sequence[str]) -> RunCfg:
     Raises:
         ValueError: in one line, naming the override that is wrong and the near names.
     """
-    conf.register()
-    check_command_line(overrides, name=conf.NAME, multirun=False, values=True)
     return conf.compose(overrides)
 
 

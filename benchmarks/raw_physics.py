@@ -2,8 +2,8 @@
 
 It is `mjw.step` on a model as `mjw.put_model` gives it, with its own choice of Jacobian and its own solver, and with
 the same fields per world. Of what this project changes about physics it has only what all its worlds share and what
-makes this floor faster: capacities that fit, no conditional node around few solver iterations, and on rough ground our
-contacts of height fields.
+makes this floor faster: capacities that fit, no conditional node around few solver iterations, and the contacts that
+follow the C engine (`ksim_rl/physics/contacts.py`).
 """
 
 from __future__ import annotations

@@ -367,7 +367,7 @@ class _Go1:
 
     def contacts_per_env(self) -> float:
         """Return the mean number of contacts now."""
-        return float(self.base.world.view("nacon").item()) / self.base.num_envs
+        return float(self.base.world.last_substep("nacon").item()) / self.base.num_envs
 
 
 def _table(rows: dict[str, Row], num_envs: int, device: torch.device) -> Table:
