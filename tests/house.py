@@ -18,7 +18,17 @@ from pathlib import Path
 from tests import signatures
 
 PACKAGE = "ksim_rl"
+# Lines of the rooms that train; the rooms around them have ceilings of their own, so that neither pays for the other.
 PACKAGE_LINES = 38_000
+ROOMS_AROUND = {
+    "diagnosis": 800,
+    "export": 1_600,
+    "runs": 800,
+    "suites": 1_500,
+    "tables": 600,
+    "viewer": 1_400,
+    "zoo": 300,
+}
 ROOM_SHARE = 0.25
 FILE_LINES = 450
 FOLDER_FILES = 30
@@ -192,9 +202,15 @@ def _strong_components(edges: dict[str, list[str]]) -> list[list[str]]:
 
 
 def package_size(house: House) -> list[str]:
-    """Return the package's size where it is not below the limit."""
-    total = sum(house.lines.values())
+    """Return the size of the rooms that train, if it is too large."""
+    total = sum(room.lines for room in house.rooms() if room.name not in ROOMS_AROUND)
     return [f"{total:,} lines: fewer than {PACKAGE_LINES:,} expected"] if total >= PACKAGE_LINES else []
+
+
+def rooms_around(house: House) -> list[str]:
+    """Return rooms beside training that are above their ceilings."""
+    sizes = {room.name: room.lines for room in house.rooms() if room.name in ROOMS_AROUND}
+    return [f"{name} has {lines:,} lines" for name, lines in sizes.items() if lines > ROOMS_AROUND[name]]
 
 
 def room_shares(house: House) -> list[str]:
@@ -313,7 +329,8 @@ def tests_in_place(house: House) -> list[str]:
 
 
 LIMITS: dict[str, Callable[[House], list[str]]] = {
-    f"the package has fewer than {PACKAGE_LINES:,} lines": package_size,
+    f"the rooms that train have fewer than {PACKAGE_LINES:,} lines": package_size,
+    "the rooms around them keep their ceilings": rooms_around,
     f"no room has more than {ROOM_SHARE:.0%} of the lines": room_shares,
     f"no file has more than {FILE_LINES} lines": file_lengths,
     f"no folder has more than {FOLDER_FILES} files": folder_sizes,

@@ -22,6 +22,8 @@ class Replays:
 
     def __init__(self, env: EnvBase, num_steps: int) -> None:
         self.env, self.num_steps = env, num_steps
+        # Some transforms' states begin with the first reset.
+        env.reset()
         self._state = {key: copy_of(value) for key, value in env.state_dict().items()}
         torch.manual_seed(SEED)
         root = env.reset()
