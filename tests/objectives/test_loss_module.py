@@ -2,17 +2,16 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
-from tensordict.nn import CompositeDistribution, TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl import objectives
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import NormalParamExtractor, ProbabilisticActor, ValueOperator
-from torchrl.modules.value_norm import RunningValueNorm
-from torchrl.objectives import SoftUpdate, ValueEstimators
+from torchrl.objectives import ValueEstimators
 
 from ksim_rl.objectives import GAE, ClipPPOLoss, TDLambda, VTrace
 from tests.objectives.problems import ACTION_DIM, ACTOR_DIM, minibatch, networks, rollout
+from tests.objectives.stock import LOSSES, both, same
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
@@ -26,32 +25,6 @@ KEYS = {
     "done": "done",
     "terminated": "terminated",
 }
-LOSSES = ("loss_objective", "loss_critic", "loss_entropy")
-
-
-def _both(actor, critic, **options):
-    return [cls(actor, critic, **options) for cls in (ClipPPOLoss, objectives.ClipPPOLoss)]
-
-
-def _same(ours, stock, data):
-    """Compare losses and gradients."""
-    outs, gradients = [], []
-    for loss in (ours, stock):
-        out = loss(data.clone())
-        total = sum(out[name].sum() for name in LOSSES if name in out)
-        parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
-        gradients.append(torch.autograd.grad(total, parameters, allow_unused=True))
-        outs.append(out)
-    for name in LOSSES:
-        assert (name in outs[0]) == (name in outs[1])
-        if name in outs[0]:
-            torch.testing.assert_close(outs[0][name], outs[1][name], atol=1e-6, rtol=1e-6)
-    for one, other in zip(*gradients, strict=True):
-        assert (one is None) == (other is None)
-        if one is not None:
-            torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-5)
-    return outs
-
 
 # -- keys ----------------------------------------------------------------------------------------------------------
 
@@ -204,7 +177,7 @@ def test_a_shared_trunk_is_trained_by_the_critic_unless_losses_are_separate(sepa
     data["advantage"], data["value_target"] = torch.randn(16, 1), torch.randn(16, 1)
     options = {"separate_losses": separate_losses, "functional": functional, "loss_critic_type": "l2"}
     trained = []
-    for loss in _both(actor, head, **options):
+    for loss in both(actor, head, **options):
         # The critic reads the trunk's output, which the actor writes.
         out = loss(data.clone())
         parameters = list(trunk.parameters())
@@ -281,7 +254,7 @@ def test_the_exploration_type_around_the_call_does_not_matter():
 def test_reductions_have_their_shapes_and_agree_with_stock(reduction):
     actor, critic = networks()
     data = GAE(gamma=0.9, lmbda=0.9, critic=critic)(rollout(actor))
-    out, _ = _same(*_both(actor, critic, reduction=reduction, loss_critic_type="l2"), data)
+    out, _ = same(*both(actor, critic, reduction=reduction, loss_critic_type="l2"), data)
     for name in LOSSES:
         assert out[name].shape == (data.shape if reduction == "none" else ())
 
@@ -291,14 +264,14 @@ def test_masked_env_states_are_left_out_as_in_stock(reduction):
     actor, critic = networks()
     data = minibatch(actor, critic)
     data["collector", "mask"] = torch.rand(64, 1) < 0.7
-    _same(*_both(actor, critic, reduction=reduction, clip_value=0.2), data)
+    same(*both(actor, critic, reduction=reduction, clip_value=0.2), data)
 
 
 @pytest.mark.parametrize("kind", list(ValueEstimators))
 def test_each_of_torchrls_value_estimators_may_make_the_advantage(kind):
     actor, critic = networks()
     data = rollout(actor)
-    losses = _both(actor, critic, loss_critic_type="l2")
+    losses = both(actor, critic, loss_critic_type="l2")
     for loss in losses:
         loss.make_value_estimator(kind, gamma=0.9)
     seeds = []
@@ -307,151 +280,3 @@ def test_each_of_torchrls_value_estimators_may_make_the_advantage(kind):
         seeds.append(loss(data.clone()))
     for name in LOSSES:
         torch.testing.assert_close(seeds[0][name], seeds[1][name], atol=1e-6, rtol=1e-6)
-
-
-# -- options -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"normalize_advantage": True, "normalize_advantage_exclude_dims": (1,)},
-        {
-            "normalize_advantage": True,
-            "clip_epsilon": (0.1, 0.25),
-            "clip_value": 0.4,
-            "loss_critic_type": "l2",
-        },
-        {"critic_coeff": None, "entropy_coeff": None},
-        {"log_explained_variance": False},
-        {"delay_actor": True, "max_importance_ratio": 1.1},
-        {"samples_mc_entropy": 3},
-        {"clip_value": torch.tensor(0.5)},
-    ],
-    ids=str,
-)
-def test_options_agree_with_stock(options):
-    actor, critic = networks()
-    data = GAE(gamma=0.9, lmbda=0.9, critic=critic)(rollout(actor))
-    with torch.no_grad():
-        for parameter in (*actor.parameters(), *critic.parameters()):
-            parameter.add_(0.1 * torch.randn_like(parameter))
-    _same(*_both(actor, critic, **options), data)
-
-
-def test_a_running_norm_of_the_advantage_agrees_with_stock():
-    actor, critic = networks()
-    data = minibatch(actor, critic)
-    losses = [
-        cls(actor, critic, advantage_norm=RunningValueNorm(shape=1))
-        for cls in (ClipPPOLoss, objectives.ClipPPOLoss)
-    ]
-    _same(*losses, data)
-
-
-def test_a_proximal_policy_that_follows_agrees_with_stock():
-    actor, critic = networks()
-    data = minibatch(actor, critic)
-    losses = _both(actor, critic, delay_actor=True)
-    updaters = [SoftUpdate(loss, eps=0.5) for loss in losses]
-    for _ in range(3):
-        with torch.no_grad():
-            for parameter in actor.parameters():
-                parameter.add_(0.05 * torch.randn_like(parameter))
-        outs = _same(*losses, data)
-        for updater in updaters:
-            updater.step()
-    assert outs[0]["clip_fraction"] > 0
-
-
-def test_entropy_coefficients_by_head_agree_with_stock():
-    _, critic = networks()
-    net = nn.Sequential(nn.Linear(ACTOR_DIM, 4), NormalParamExtractor())
-    keys = [("params", name, kind) for name in ("arm", "leg") for kind in ("loc", "scale")]
-
-    class TwoHeads(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.net = net
-
-        def forward(self, obs):
-            return (*self.net(obs), *self.net(-obs))
-
-    actor = ProbabilisticActor(
-        TensorDictModule(TwoHeads(), in_keys=["actor"], out_keys=keys),
-        in_keys=["params"],
-        distribution_class=CompositeDistribution,
-        distribution_kwargs={
-            "distribution_map": {
-                name: lambda loc, scale: torch.distributions.Independent(
-                    torch.distributions.Normal(loc, scale), 1
-                )
-                for name in ("arm", "leg")
-            }
-        },
-        return_log_prob=True,
-        default_interaction_type="random",
-    )
-    data = minibatch(actor, critic)
-    coefficients = {"arm_entropy": 0.1, "leg_entropy": 0.02}
-    outs = _same(*_both(actor, critic, entropy_coeff=coefficients), data)
-    entropy = outs[0]["composite_entropy"]
-    expected = -sum(weight * entropy[name].mean() for name, weight in coefficients.items())
-    torch.testing.assert_close(outs[0]["loss_entropy"], expected)
-
-
-def test_both_bounds_of_the_ratio_have_their_closed_form_and_can_be_scheduled():
-    actor, critic = networks()
-    data = minibatch(actor, critic)
-    with torch.no_grad():
-        log_prob = actor.get_dist(data.clone()).log_prob(data["action"])
-    data["advantage"].fill_(1.0)
-    for clip_epsilon, ratio, expected in (
-        (0.2, 1.25, 1.2), ((0.2, 0.28), 1.25, 1.25), ((0.2, 0.28), 1.4, 1.28), (0.2, 0.5, 0.5)
-    ):  # fmt: skip
-        data["action_log_prob"] = log_prob - torch.tensor(ratio).log()
-        loss = ClipPPOLoss(actor, critic, clip_epsilon=clip_epsilon)
-        assert loss(data.clone())["loss_objective"].item() == pytest.approx(-expected, rel=1e-5)
-    data["advantage"].fill_(-1.0)
-    for ratio, expected in ((1.25, 1.25), (0.5, 0.8)):
-        data["action_log_prob"] = log_prob - torch.tensor(ratio).log()
-        loss = ClipPPOLoss(actor, critic, clip_epsilon=0.2)
-        assert loss(data.clone())["loss_objective"].item() == pytest.approx(expected, rel=1e-5)
-    loss.clip_epsilon = 0.6
-    assert loss(data.clone())["loss_objective"].item() == pytest.approx(0.5, rel=1e-5)
-
-
-def test_clipping_the_value_needs_the_old_value():
-    actor, critic = networks()
-    data = minibatch(actor, critic).exclude("state_value")
-    with pytest.raises(KeyError, match="state_value"):
-        ClipPPOLoss(actor, critic, clip_value=0.2)(data)
-    with pytest.raises(KeyError, match="action_log_prob"):
-        ClipPPOLoss(actor, critic)(data.exclude("action_log_prob"))
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"clip_epsilon": (0.1, 0.2, 0.3)}, "length 2"),
-        ({"clip_epsilon": (-0.1, 0.2)}, "non-negative"),
-        ({"max_importance_ratio": 0.0}, "max_importance_ratio"),
-        ({"delay_actor": True, "functional": False}, "functional=True"),
-        ({"reduction": "median"}, None),
-    ],
-)
-def test_options_out_of_range_are_refused(options, message):
-    actor, critic = networks()
-    with pytest.raises((ValueError, NotImplementedError), match=message):
-        ClipPPOLoss(actor, critic, **options)(minibatch(actor, critic))
-
-
-def test_a_critic_is_optional():
-    actor, critic = networks()
-    data = minibatch(actor, critic)
-    for loss in (
-        ClipPPOLoss(actor, None, critic_coeff=0.0),
-        objectives.ClipPPOLoss(actor, None, critic_coeff=0.0),
-    ):
-        out = loss(TensorDict(data))
-        assert "loss_critic" not in out and "loss_objective" in out
