@@ -1,4 +1,4 @@
-"""This module counts for trackers, per env, by kernels that are also torch operators: one launch counts and copies."""
+"""This kernel, also a torch operator, counts steps and rewards for trackers, per env: one launch counts and copies."""
 
 import torch
 import warp as wp
@@ -6,34 +6,6 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from ksim_rl.device.quick_launch import QuickLaunch, address, as_operator
-
-
-@wp.struct
-class _CountDown:
-    rows: int
-    horizon: float
-    divisor: float
-    mask: wp.uint64
-    left: wp.uint64
-    out: wp.uint64
-
-
-@wp.func_native(r"""
-    const unsigned char* mask = (const unsigned char*)a.mask;
-    float *left = (float*)a.left, *out = (float*)a.out;
-    for (int row = part * a.rows; row < (part + 1) * a.rows; ++row) {
-        const float less = left[row] - 1.0f;
-        const float next = mask ? (mask[row] ? a.horizon : left[row]) : (less > 0.0f ? less : 0.0f);
-        left[row] = next;
-        out[row] = next / a.divisor;
-    }
-""")
-def _count_down_part(part: int, a: _CountDown): ...
-
-
-@wp.kernel(enable_backward=False, grid_stride=False)
-def _count_down_kernel(a: _CountDown):
-    _count_down_part(wp.tid(), a)
 
 
 @wp.struct
@@ -77,23 +49,7 @@ def _tally_kernel(a: _Tally):
     _tally_part(wp.tid(), a)
 
 
-_quick_count_down = QuickLaunch(_count_down_kernel, _CountDown)
 _quick_tally = QuickLaunch(_tally_kernel, _Tally)
-
-
-def time_left(horizon: int, step_E: Int64[Tensor, " E"]) -> Float32[Tensor, " E"]:
-    """Return how many env steps of an episode are left after `step_E`; `count_down` keeps that where nobody counts."""
-    return (horizon - step_E).to(torch.float32)
-
-
-def count_down(
-    left_E: Float32[Tensor, " E"], mask_E: Bool[Tensor, " E"] | None, horizon: float, divisor: float
-) -> Float32[Tensor, " E"]:
-    """Take one env step off what is left, down to 0, or, given the rows that reset, let those begin with the horizon.
-
-    `left_E`, in env steps, is changed in place; what is returned is that over the divisor. `mask_E` is None for a step.
-    """
-    return _run_count_down(left_E, mask_E, horizon, divisor)
 
 
 def tally(
@@ -110,15 +66,6 @@ def tally(
     return _run_tally(step_E, total_E, reward_E, mask_E)
 
 
-def _count_down_now(left_E: Tensor, mask_E: Tensor | None, horizon: float, divisor: float) -> Tensor:
-    out_E = torch.empty_like(left_E)
-    device, num_rows = left_E.device, left_E.numel()
-    dim, rows = _share(device, num_rows)
-    addresses = address(mask_E), left_E.data_ptr(), out_E.data_ptr()
-    _quick_count_down(device, dim, rows, horizon, divisor, *addresses)
-    return out_E
-
-
 def _tally_now(
     step_E: Tensor, total_E: Tensor, reward_E: Tensor | None, mask_E: Tensor | None
 ) -> tuple[Tensor, Tensor]:
@@ -126,20 +73,13 @@ def _tally_now(
         reward_E = reward_E.contiguous()
     step_out_E, total_out_E = torch.empty_like(step_E), torch.empty_like(total_E)
     device, num_rows = step_E.device, step_E.numel()
-    dim, rows = _share(device, num_rows)
+    # One thread does all on the CPU, in vector instructions.
+    dim, rows = ((1,), num_rows) if device.type == "cpu" else ((num_rows,), 1)
     read = address(mask_E), address(reward_E), total_E.data_ptr(), step_E.data_ptr()
     _quick_tally(device, dim, rows, *read, total_out_E.data_ptr(), step_out_E.data_ptr())
     return step_out_E, total_out_E
 
 
-def _share(device: torch.device, num_rows: int) -> tuple[tuple[int], int]:
-    """Return the number of threads and of rows for each: one thread does all on the CPU, in vector instructions."""
-    return ((1,), num_rows) if device.type == "cpu" else ((num_rows,), 1)
-
-
-_run_count_down = as_operator(
-    "count_down", _count_down_now, lambda left_E, *_: torch.empty_like(left_E), mutates=("left_E",)
-)
 _run_tally = as_operator(
     "tally",
     _tally_now,

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
+from jaxtyping import Float32, Shaped
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
@@ -14,7 +15,21 @@ from ksim_rl.transforms import upstream
 from ksim_rl.transforms.innermost import EpisodeLimit, innermost
 from ksim_rl.transforms.row_transform import Keys, RowTransform, as_keys
 from ksim_rl.transforms.specs import leaf_spec, set_leaf_spec
-from ksim_rl.transforms.tally import count_down, tally
+from ksim_rl.transforms.tally import tally
+
+
+def time_left(horizon: int, step_E: Shaped[Tensor, " E"]) -> Float32[Tensor, " E"]:
+    """Return how many env steps an episode of `horizon` has left after `step_E` of them, 0 from the horizon on."""
+    return (horizon - step_E).clamp_(min=0).to(torch.float32)
+
+
+def kept_value(
+    reduce: str, kept_E: Shaped[Tensor, " E *leaf"], now_E: Shaped[Tensor, " E *leaf"]
+) -> Shaped[Tensor, " E *leaf"]:
+    """Return what is kept of an episode after one more step: the "last" value, the greatest ("max") or the "sum"."""
+    if reduce == "last":
+        return now_E
+    return torch.maximum(kept_E, now_E) if reduce == "max" else kept_E + now_E
 
 
 class _Tracker(RowTransform):
@@ -162,14 +177,14 @@ class SuccessTracker(_Tracker):
         self._sized()
         for key, success_E in zip(self.in_keys, self._kept(), strict=True):
             now_E = (next_tensordict.get(key) > self.threshold).reshape(success_E.shape)
-            success_E.copy_(success_E | now_E if self.reduce == "any" else now_E)
+            success_E.copy_(kept_value("last" if self.reduce == "last" else "max", success_E, now_E))
         return self._write(next_tensordict)
 
     def _kept(self) -> list[Tensor]:
         return [getattr(self, name) for name in self._per_key("success")]
 
 
-class TimeAwareObservation(RowTransform):
+class TimeAwareObservation(_Tracker):
     """The time that is left of an episode, float32 [E, 1]: without it the value of a state is ambiguous.
 
     Counted in env steps from the reset that this transform saw; 0 from the horizon on. `normalize` gives the share that
@@ -180,7 +195,7 @@ class TimeAwareObservation(RowTransform):
         >>> clock = TimeAwareObservation(horizon=500)
     """
 
-    left_E: Tensor
+    step_E: Tensor
 
     def __init__(
         self,
@@ -195,7 +210,7 @@ class TimeAwareObservation(RowTransform):
         if horizon is not None:
             checks.check_count("horizon", horizon)
         super().__init__([], keys, is_paired=False)
-        self._register_rows("left_E")
+        self._register_rows("step_E")
         self.horizon, self.normalize = horizon, normalize
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -204,7 +219,7 @@ class TimeAwareObservation(RowTransform):
         spec = Bounded(0.0, high, shape, device=observation_spec.device, dtype=torch.float32)
         set_leaf_spec(observation_spec, self.out_keys[0], spec)
         self._size_rows(observation_spec)
-        self._size_buffer("left_E", torch.float32)
+        self._size_buffer("step_E", torch.float32)
         return observation_spec
 
     def _horizon(self) -> int:
@@ -221,14 +236,15 @@ class TimeAwareObservation(RowTransform):
             self.horizon = int(found)
         return self.horizon
 
-    def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
-        return self._count(tensordict_reset, mask_E)
-
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._sized()
-        return self._count(next_tensordict, None)
+        self.step_E.add_(1.0)
+        return self._write(next_tensordict)
 
-    def _count(self, tensordict: TensorDictBase, mask_E: Tensor | None) -> TensorDictBase:
-        horizon = float(self._horizon())
-        left_E = count_down(self.left_E, mask_E, horizon, horizon if self.normalize else 1.0)
-        return tensordict.set(self.out_keys[0], left_E.reshape(*tensordict.batch_size, 1))
+    def _write(self, tensordict: TensorDictBase, copies: Sequence[Tensor] | None = None) -> TensorDictBase:
+        horizon = self._horizon()
+        left_E1 = time_left(horizon, self.step_E).unsqueeze(1)
+        return super()._write(tensordict, [left_E1 / horizon if self.normalize else left_E1])
+
+    def _kept(self) -> list[Tensor]:
+        return [self.step_E]

@@ -8,7 +8,7 @@ from ksim_rl.device import random
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
 from ksim_rl.testing import CounterEnv
 from ksim_rl.transforms import ring
-from ksim_rl.transforms.tally import count_down, tally
+from ksim_rl.transforms.tally import tally
 from tests.device.test_random import exact_uniform
 from tests.transforms.chains import actions, full_chain
 from tests.transforms.transform_checks import KINDS
@@ -157,18 +157,12 @@ def test_draws_are_the_hash_that_they_say_they_are():
 
 @pytest.mark.gpu
 def test_tallies():
-    step_E, total_E, left_E = (
-        torch.zeros(999).long().cuda(),
-        torch.zeros(999, 1).cuda(),
-        torch.full((999,), 3.0).cuda(),
-    )
+    step_E, total_E = torch.zeros(999).long().cuda(), torch.zeros(999, 1).cuda()
     reward_E = torch.randn(999, 1).cuda()
     for count in range(1, 5):
         steps, totals = tally(step_E, total_E, reward_E, None)
         assert bool((steps == count).all())
         torch.testing.assert_close(totals, count * reward_E)
-        assert torch.equal(count_down(left_E, None, 3.0, 3.0), torch.full_like(left_E, max(3 - count, 0)) / 3)
     mask_E = torch.arange(999).cuda() % 7 == 0
     steps, totals = tally(step_E, total_E, None, mask_E)
     assert torch.equal(steps == 0, mask_E) and torch.equal(totals[:, 0] == 0, mask_E)
-    assert torch.equal(count_down(left_E, mask_E, 3.0, 1.0) == 3, mask_E)

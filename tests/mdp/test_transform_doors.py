@@ -67,23 +67,30 @@ class Ones(MetricTerm):
 
 def test_time_left_successes_and_lengths_are_counted_alike():
     left = ObservationGroupCfg(terms={"left": ObservationTermCfg(term=mdp.RemainingTime())})
-    puck = puck_env(
-        limit=0.11,
-        episode_length_s=5 * DT,
-        observations={"actor": left},
-        metrics={"success": mdp.Success(terminations=("time_out",)), "length": Ones()},
-    )
-    trackers = [EpisodeTracker(), SuccessTracker("truncated", reduce="last")]
+    metrics = {
+        "success": mdp.Success(terminations=("time_out",)),
+        "ever": mdp.Success(terminations=("time_out",), reduce="max"),
+        "length": Ones(),
+    }
+    puck = puck_env(limit=0.11, episode_length_s=5 * DT, observations={"actor": left}, metrics=metrics)
+    trackers = [
+        EpisodeTracker(),
+        SuccessTracker("truncated", reduce="last"),
+        SuccessTracker("truncated", "episode_ever"),
+        TimeAwareObservation("share_left"),
+    ]
     env = MaskedTransformedEnv(puck, [TimeAwareObservation(normalize=False), *trackers])
     root_E, ended = env.reset(), []
     for _ in range(11):
         assert torch.equal(root_E["obs", "left"], root_E["remaining_time"] * puck.view.step_dt)
+        assert torch.equal(root_E["remaining_time"] / 5, root_E["share_left"])
         data_E, root_E = env.step_and_maybe_reset(root_E.set("action", torch.zeros(3, 1)))
         next_E = data_E["next"]
-        ended.append(next_E.select("episode_success", "episode_length")[next_E["done"][:, 0]])
+        ended.append(next_E.select("episode_success", "episode_ever", "episode_length")[next_E["done"][:, 0]])
     episodes, log = torch.cat(ended), puck.episode_log()
     assert log["episodes"] == len(episodes) > 3
     assert log["metric/success"] == episodes["episode_success"].sum() > 0
+    assert log["metric/ever"] == episodes["episode_ever"].sum() > 0
     assert log["metric/length"] == episodes["episode_length"].sum()
 
 

@@ -11,6 +11,7 @@ from ksim_rl.checks import near
 from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.term import CurriculumTerm, MetricTerm, RewardTerm, TerminationTerm
 from ksim_rl.envs.view import EnvView
+from ksim_rl.transforms.trackers import kept_value
 
 
 class _OutcomeManager:
@@ -145,12 +146,12 @@ class MetricManager(_OutcomeManager):
             return
         value_EM = torch.where(finite_E[:, None], torch.stack(values, dim=-1), 0.0)
         held_EM = self._held_EM
-        next_EM = held_EM + value_EM
+        next_EM = kept_value("sum", held_EM, value_EM)
         if "last" in self._occurring:
-            next_EM = torch.where(self._is_last_M, value_EM, next_EM)
+            next_EM = torch.where(self._is_last_M, kept_value("last", held_EM, value_EM), next_EM)
         if "max" in self._occurring:
             is_first_E1 = self._view.episode_step_E[:, None] <= 1
-            peak_EM = torch.where(is_first_E1, value_EM, torch.maximum(held_EM, value_EM))
+            peak_EM = kept_value("max", torch.where(is_first_E1, value_EM, held_EM), value_EM)
             next_EM = torch.where(self._is_max_M, peak_EM, next_EM)
         held_EM.copy_(next_EM)
 

@@ -19,7 +19,7 @@ from ksim_rl.mdp.constants import constant
 from ksim_rl.mdp.fields import InFrame, OfEntity, OfJoints
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.sensors.rays import grid_points
-from ksim_rl.transforms.tally import time_left
+from ksim_rl.transforms.trackers import time_left
 
 
 @dataclass(frozen=True, kw_only=True)
