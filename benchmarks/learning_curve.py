@@ -27,8 +27,8 @@ from rich.table import Table
 
 from benchmarks import command_line, report
 from benchmarks.learning_picture import draw
+from ksim_rl.runs.csv_table import read_table
 from ksim_rl.trainers import RunCfg, RunProgress, run
-from ksim_rl.trainers.csv_table import read_table
 
 KEPT_POINTS = 60
 KEPT = (

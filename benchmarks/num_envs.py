@@ -32,8 +32,8 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import command_line, report
+from ksim_rl.runs.csv_table import read_table
 from ksim_rl.trainers import RunCfg, RunProgress, run
-from ksim_rl.trainers.csv_table import read_table
 
 OWN_OPTIONS = {"num_envs": "64,256,1024", "seeds": "1,2,3,4,5"}
 SETTING = (

@@ -1,6 +1,7 @@
 """`ksim-rl <command>` starts here: the command is found, and errors of users become one line."""
 
 import gc
+import importlib
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,8 @@ usage: ksim-rl <command> [arguments]
   resume   continue a run:          ksim-rl resume RUN
   eval     evaluate a policy:       ksim-rl eval RUN --episodes 100
   play     record a video:          ksim-rl play RUN --seconds 10
+  runs     list runs, with return and speed:  ksim-rl runs [FOLDER]
+  compare  a table and a picture:   ksim-rl compare RUN1 RUN2
   warmup   compile ahead of time:   ksim-rl warmup task=go1_velocity_flat device=cuda
   envs     list the tasks, or print what one is made of: ksim-rl envs cartpole_swingup
   robot    analyse a robot's model: ksim-rl robot unitree_a1/a1 [--code]
@@ -28,7 +31,18 @@ transforms, networks and algorithms that configs name. KSIM_RL_PLUGINS=PACKAGE,.
 exit codes: 0 done (and solved, or its target met, where there is one), 1 not solved, 2 refused: the command or its
 configuration is wrong, 3 the run failed, 130 / 143 interrupted and saved (SIGINT / SIGTERM)"""
 
-COMMANDS = ("train", "resume", "eval", "play", "warmup", "envs", "robot")
+# Where each is: a module and its function, which takes the arguments and returns the exit code.
+COMMANDS = {
+    "train": "ksim_rl.cli.train:train",
+    "resume": "ksim_rl.cli.run_commands:resume",
+    "eval": "ksim_rl.cli.run_commands:evaluate",
+    "play": "ksim_rl.cli.run_commands:play",
+    "runs": "ksim_rl.cli.runs:runs",
+    "compare": "ksim_rl.cli.runs:compare",
+    "warmup": "ksim_rl.cli.warmup:warmup",
+    "envs": "ksim_rl.cli.run_commands:list_envs",
+    "robot": "ksim_rl.cli.run_commands:robot",
+}
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -60,18 +74,11 @@ def _dispatch(arguments: list[str]) -> int:
         raise unknown_name("command", command, COMMANDS)
     # Imported here, so that usage and mistyped commands answer at once.
     rest, names = _without_plugins(rest)
+    module, _, function = COMMANDS[command].partition(":")
     with gc_disabled():
-        from ksim_rl.cli import run_commands
-        from ksim_rl.cli.train import train
-        from ksim_rl.cli.warmup import warmup
-        from ksim_rl.config import plugins
-
-        plugins.load(names)
-    if command == "train":
-        return train(rest)
-    if command == "warmup":
-        return warmup(rest)
-    return run_commands.run_command(command, rest)
+        run = getattr(importlib.import_module(module), function)
+        importlib.import_module("ksim_rl.config.plugins").load(names)
+    return run(rest)
 
 
 def _without_plugins(arguments: list[str]) -> tuple[list[str], list[str]]:

@@ -5,12 +5,11 @@ import dataclasses
 from pathlib import Path
 
 import torch
-from rich.console import Console
-from rich.table import Table
 
 from ksim_rl import envs
 from ksim_rl.checks import check_in_range
 from ksim_rl.cli.report import run_and_report, shown, verdict
+from ksim_rl.cli.runs import print_table
 from ksim_rl.config.plain_data import check_links
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.envs.contract import part
@@ -25,13 +24,8 @@ VIDEO_SUFFIXES = (".mp4", ".gif")
 FOLDERS = ("checkpoint", "tensorboard", "wandb", "mlflow")
 
 
-def run_command(command: str, arguments: list[str]) -> int:
-    """Run one of the commands and return its exit code."""
-    commands = {"resume": _resume, "eval": _evaluate, "play": _play, "envs": _envs, "robot": _robot}
-    return commands[command](arguments)
-
-
-def _resume(arguments: list[str]) -> int:
+def resume(arguments: list[str]) -> int:
+    """Continue a run from its newest checkpoint."""
     parser = _parser("resume", "Continue a run from its newest checkpoint, in the same folder.")
     parser.add_argument("--num-iterations", type=int, help="of the whole run; default: as it was configured")
     parser.add_argument(
@@ -56,7 +50,8 @@ def _resume(arguments: list[str]) -> int:
     return run_and_report(cfg, folder.resolve(), resume_from=saved)
 
 
-def _evaluate(arguments: list[str]) -> int:
+def evaluate(arguments: list[str]) -> int:
+    """Evaluate a policy and print the verdict."""
     parser = _parser("eval", "Evaluate a policy: deterministic actions, fresh envs, whole episodes.")
     parser.add_argument("--episodes", type=int, help="default: as the run was configured")
     parser.add_argument("--seed", type=int, help="of the initial states; default: the run's evaluation seed")
@@ -74,7 +69,8 @@ def _evaluate(arguments: list[str]) -> int:
     return 0 if threshold is None or evaluation.return_mean >= threshold else 1
 
 
-def _play(arguments: list[str]) -> int:
+def play(arguments: list[str]) -> int:
+    """Record a video of a policy."""
     parser = _parser("play", "Record a video of a policy.")
     parser.add_argument("--seconds", type=float, help="of simulated time; default: as the run was configured")
     parser.add_argument(
@@ -105,7 +101,8 @@ def _play(arguments: list[str]) -> int:
     return 0
 
 
-def _envs(arguments: list[str]) -> int:
+def list_envs(arguments: list[str]) -> int:
+    """List the tasks, or print what one is made of."""
     parser = argparse.ArgumentParser(
         prog="ksim-rl envs", description="List the tasks, or print what one of them is made of."
     )
@@ -119,28 +116,25 @@ def _envs(arguments: list[str]) -> int:
         assert ours is not None
         print(ours.explain(), end="")
         return 0
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for column in ("task", "robot", "episode", "observations", "solved at", "description"):
-        table.add_column(column, no_wrap=column == "task")
+    rows = []
     for name in envs.names():
         task = envs.task(name)
         cfg = task.cfg()
-        groups = ", ".join(f"{group} ({len(spec.terms)} terms)" for group, spec in cfg.observations.items())
-        table.add_row(
-            name,
-            ", ".join(cfg.scene.robots),
-            f"{cfg.episode_length_s:g} s" if cfg.episode_length_s else "no limit",
-            groups,
-            "-" if task.solved_at is None else f"return {task.solved_at:g}",
-            task.description,
+        rows.append(
+            [
+                name,
+                ", ".join(cfg.scene.robots),
+                f"{cfg.episode_length_s:g} s" if cfg.episode_length_s else "no limit",
+                ", ".join(f"{group} ({len(spec.terms)} terms)" for group, spec in cfg.observations.items()),
+                "-" if task.solved_at is None else f"return {task.solved_at:g}",
+                task.description,
+            ]
         )
-    console = Console(highlight=False)
-    # In a pipe nothing is wrapped, so that each task stays one line.
-    Console(highlight=False, width=None if console.is_terminal else 240).print(table)
+    print_table(("task", "robot", "episode", "observations", "solved at", "description"), rows)
     return 0
 
 
-def _robot(arguments: list[str]) -> int:
+def robot(arguments: list[str]) -> int:
     """Analyse a robot; the code is 1 for one that does not stand."""
     parser = argparse.ArgumentParser(
         prog="ksim-rl robot",

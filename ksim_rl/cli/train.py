@@ -18,8 +18,8 @@ from ksim_rl.cli.errors import report
 from ksim_rl.cli.report import run_and_report
 from ksim_rl.cli.upstream import parse_flags
 from ksim_rl.config import plugins
+from ksim_rl.runs.run_lock import is_locked
 from ksim_rl.trainers import RunCfg
-from ksim_rl.trainers.run_lock import is_locked
 
 
 def train(arguments: list[str]) -> int:
@@ -37,10 +37,11 @@ def train(arguments: list[str]) -> int:
         conf.check_command_line(flags.overrides, name=name, multirun=multirun, values=builds)
 
     codes: list[int] = []
-    process = os.getpid()
+    process, own_command = os.getpid(), sys.argv
 
     @hydra.main(config_path=f"pkg://{conf.MODULE}", config_name=name, version_base="1.3")
     def job(config: DictConfig) -> None:
+        sys.argv = own_command  # which the run's folder keeps
         try:
             codes.append(_train_one(config))
         except Exception as error:

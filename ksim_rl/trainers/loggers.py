@@ -16,7 +16,7 @@ from torchrl.record.loggers.wandb import WandbLogger
 
 from ksim_rl.checked import Checked
 from ksim_rl.config import plain_data
-from ksim_rl.trainers.csv_table import CsvTable
+from ksim_rl.runs.csv_table import CsvTable
 
 # What MLflow takes in one request, and how long a value may be.
 _MAX_PARAMS, _MAX_LETTERS = 100, 6000

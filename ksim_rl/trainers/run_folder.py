@@ -15,12 +15,13 @@ from ksim_rl.config.plugins import load as load_plugins
 from ksim_rl.device import state_tree
 from ksim_rl.device.memory import memory_for
 from ksim_rl.envs.contract import EpisodeClock, part
+from ksim_rl.runs.record import recorded
+from ksim_rl.runs.run_lock import locked
 from ksim_rl.trainers import checkpoint, video
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build, build_env
 from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_cfg import RunCfg
-from ksim_rl.trainers.run_lock import locked
 from ksim_rl.trainers.trainer import Hook, Outcome
 from ksim_rl.transforms import observation_columns
 
@@ -44,7 +45,7 @@ def run(
     hooks: Sequence[Hook] = (),
     resume_from: checkpoint.Checkpoint | None = None,
 ) -> Outcome:
-    """Train, and leave in `run_folder` the config, metrics, checkpoints, evaluation, learning curves and a video.
+    """Train, and leave in `run_folder` its record, config, metrics, checkpoints, evaluation, curves and a video.
 
     What cannot be drawn (no OpenGL) is said in one line of `progress`. Raises ValueError when another process writes
     the folder, the checkpoint to resume or start from belongs to another config, or memory does not suffice.
@@ -73,7 +74,9 @@ def _run_locked(
     with memory_for(cfg.num_envs, cfg.resolved_device()):
         trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
         (run_folder / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
-        outcome = trainer.train(progress)
+        with recorded(run_folder, note=progress.note) as ended:
+            outcome = trainer.train(progress)
+            ended("done" if outcome.interrupted_by is None else "interrupted", outcome.why)
     if outcome.evaluation is not None:
         figures = {
             "iteration": outcome.iteration,
@@ -147,7 +150,7 @@ def _draw_curves(
         reason = "which has no rows yet" if cfg.logger.csv else "which needs logger.csv=true"
         note(f"no learning curves: they are drawn from metrics.csv, {reason}")
         return
-    from ksim_rl.trainers import curves  # Matplotlib takes half a second to import
+    from ksim_rl.runs import curves  # Matplotlib takes half a second to import
 
     title = f"{cfg.task_name}: {cfg.num_envs} envs on {cfg.device}, seed {cfg.seed}"
     try:

@@ -41,6 +41,7 @@ class Outcome:
     solved: bool | None  # None where the task has no threshold, or nothing was evaluated
     target_met: bool | None  # None where no target was set
     interrupted_by: signal.Signals | None
+    why: str = ""  # it ended
 
 
 class Hook:
@@ -199,6 +200,11 @@ class Trainer:
                             self.settle()
                             hook(self)
                 self.settle()
+                why = self._why_it_is_over()
+                if self.iteration < self.cfg.num_iterations:
+                    self.progress.note(
+                        f"{why}, stopping after iteration {self.iteration} of {self.cfg.num_iterations}"
+                    )
                 for hook in self._hooks:
                     hook.at_end(self)
             finally:
@@ -212,6 +218,7 @@ class Trainer:
             solved=self.solved,
             target_met=self._target_met if self.cfg.stop_at else None,
             interrupted_by=self.interrupt.signal,
+            why=why,
         )
 
     def iterate(self) -> None:
@@ -237,6 +244,19 @@ class Trainer:
     def _is_over(self) -> bool:
         ended = self._target_met or bool(self.interrupt) or bool(self.cfg.stop_when_solved and self.solved)
         return ended or self.iteration >= self.cfg.num_iterations
+
+    def _why_it_is_over(self) -> str:
+        if self.interrupt.signal is not None:
+            return self.interrupt.signal.name
+        if self._target_met:
+            targets = (
+                f"{name} {self.metrics.get(name, value):.4g}"
+                for name, value in (self.cfg.stop_at or {}).items()
+            )
+            return f"stop_at is met ({', '.join(targets)})"
+        if self.cfg.stop_when_solved and self.solved and self.evaluation is not None:
+            return f"solved (return {self.evaluation.return_mean:.1f}, threshold {self.solved_at:g})"
+        return f"all {self.cfg.num_iterations} iterations are done"
 
     def _report(self, *, all_but: int) -> None:
         while len(self._unread) > all_but:

@@ -10,6 +10,7 @@ import imageio.v2 as imageio
 import pytest
 
 from ksim_rl.cli import main
+from ksim_rl.runs import record
 from ksim_rl.trainers import checkpoint
 
 SMALL = (
@@ -48,15 +49,18 @@ def rows(folder):
 def test_an_unsolved_run_exits_with_1_and_leaves_a_whole_run_folder(trained):
     code, folder = trained
     assert code == 1
-    names = {entry.name for entry in folder.iterdir()} - {"video.mp4", "video.gif"}
+    # The last is there where this checkout has changes.
+    names = {entry.name for entry in folder.iterdir()} - {"video.mp4", "video.gif", "ksim_rl.diff"}
     assert names == {
         "checkpoint",
         "config.yaml",
         "curves.png",
         "evaluation.json",
         "metrics.csv",
+        "run.json",
         "tensorboard",
     }
+    assert record.status(folder) == ("done", "all 2 iterations are done")
     assert [row["iteration"] for row in rows(folder)] == ["1", "2"]
     assert imageio.imread(folder / "curves.png").shape[0] > 300
     figures = json.loads((folder / "evaluation.json").read_text())
@@ -130,3 +134,6 @@ def test_ctrl_c_saves_and_exits_with_130(tmp_path):
     assert process.wait(timeout=60) == 130
     assert "SIGINT: everything is saved; continue with: ksim-rl resume" in rest
     assert checkpoint.load(checkpoint.latest(tmp_path)).iteration >= 2
+    (session,) = record.read(tmp_path)
+    assert (session.status, session.why) == ("interrupted", "SIGINT")
+    assert session.command.endswith(f"hydra.run.dir={tmp_path}") and " train num_envs=16 " in session.command

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ksim_rl import mdp
-from ksim_rl.trainers.csv_table import CsvTable, read_table
+from ksim_rl.runs.csv_table import CsvTable, read_table
 from ksim_rl.trainers.metrics import episode_means, read_episode_sums, start_copy
 from tests.envs.probe_env import DT, Position, puck_env
 

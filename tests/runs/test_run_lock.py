@@ -12,8 +12,9 @@ import time
 import pytest
 
 from ksim_rl.cli import main, run_commands, train
-from ksim_rl.trainers import run_folder, run_lock
-from ksim_rl.trainers.run_lock import LOCK, is_locked, locked
+from ksim_rl.runs import run_lock
+from ksim_rl.runs.run_lock import LOCK, is_locked, locked
+from ksim_rl.trainers import run_folder
 
 
 @pytest.fixture

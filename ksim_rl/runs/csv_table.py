@@ -1,9 +1,12 @@
 """This module keeps all metrics of a run in one CSV file, one row per logged iteration."""
 
 import csv
+import io
 import os
 from collections.abc import Mapping
 from pathlib import Path
+
+from ksim_rl.config.plain_data import MOST_DATA_BYTES, read_bytes
 
 STEP = "env_states"
 
@@ -60,7 +63,8 @@ class CsvTable:
 
 def read_table(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     """Read a table: its columns, and its rows as text by column; a row that a crash cut off is left out."""
-    with open(path, newline="") as file:
-        reader = csv.DictReader(file)
-        rows = [row for row in reader if row.get(STEP) and None not in row.values()]
-        return list(reader.fieldnames or [STEP]), rows
+    reader = csv.DictReader(
+        io.StringIO(read_bytes(path, limit=MOST_DATA_BYTES).decode(errors="replace"), newline="")
+    )
+    rows = [row for row in reader if row.get(STEP) and None not in row.values()]
+    return list(reader.fieldnames or [STEP]), rows

@@ -3,7 +3,7 @@
 import imageio.v2 as imageio
 import pytest
 
-from ksim_rl.trainers.curves import draw
+from ksim_rl.runs.curves import draw
 from ksim_rl.trainers.loggers import CsvTable
 
 

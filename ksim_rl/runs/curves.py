@@ -7,7 +7,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from ksim_rl.trainers.csv_table import STEP, read_table
+from ksim_rl.runs.csv_table import STEP, read_table
 
 # Panels in reading order: title, the metrics drawn in it with their labels.
 PANELS: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
@@ -64,11 +64,16 @@ def _draw_panel(
         axes.axhline(
             solved_at, color="#4e9a06", linestyle="--", linewidth=1.2, label=f"solved at {solved_at:g}"
         )
-    axes.set_title(name, fontsize=10.5)
-    axes.set_xlabel("env states", fontsize=9)
+    dress(axes, name)
+    if len(axes.lines) > 1:
+        axes.legend(fontsize=8, frameon=False)
+
+
+def dress(axes: Axes, title: str, *, over: str = "env states") -> None:
+    """Give a panel its title, the label of what it is drawn over, and a light grid."""
+    axes.set_title(title, fontsize=10.5)
+    axes.set_xlabel(over, fontsize=9)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.tick_params(labelsize=8)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
-    if len(axes.lines) > 1:
-        axes.legend(fontsize=8, frameon=False)

@@ -1,0 +1,69 @@
+"""`ksim-rl runs` lists runs, `ksim-rl compare` sets them side by side; both read run folders as data."""
+
+import argparse
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from ksim_rl.cli.report import shown
+from ksim_rl.runs import comparison, listing
+
+ORDERS = {"began": "began", "return": "evaluation", "speed": "speed"}
+
+
+def runs(arguments: list[str]) -> int:
+    """List the runs in folders."""
+    parser = argparse.ArgumentParser(prog="ksim-rl runs", description="List runs with return and speed.")
+    parser.add_argument("folders", nargs="*", type=Path, default=[Path("runs")], help="default: runs")
+    parser.add_argument("--task", help="only runs of this task")
+    parser.add_argument("--sort", choices=ORDERS, default="began", help="the highest or newest comes last")
+    options = parser.parse_args(arguments)
+    found = [listing.summarize(run) for folder in options.folders for run in listing.find(folder)]
+    chosen = [summary for summary in found if options.task in (None, summary.task)]
+    field = ORDERS[options.sort]
+    ordered = sorted(
+        chosen, key=lambda summary: (getattr(summary, field) is not None, getattr(summary, field) or 0.0)
+    )
+    if not ordered:
+        print(f"no runs in {', '.join(map(str, options.folders))}")
+        return 0
+    print_table(listing.HEADS, (listing.line(summary, name=shown(summary.folder)) for summary in ordered))
+    return 0
+
+
+def compare(arguments: list[str]) -> int:
+    """Print figures and differences of runs, and draw their curves."""
+    parser = argparse.ArgumentParser(
+        prog="ksim-rl compare", description="Compare runs: a table and a picture."
+    )
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folders, two or more")
+    parser.add_argument(
+        "--output", type=Path, default=Path("compare.png"), help="a .png file; default: compare.png"
+    )
+    options = parser.parse_args(arguments)
+    if len(options.runs) < 2:
+        raise ValueError(f"{options.runs[0]}: name at least two runs to compare")
+    if options.output.suffix != ".png":
+        raise ValueError(f"--output {options.output}: expected a file that ends in .png")
+    for folder in options.runs:
+        if not (folder / listing.CONFIG).exists():
+            raise ValueError(f"{folder}: expected a run folder, which has a {listing.CONFIG}")
+    head, *rows = comparison.figures(options.runs)
+    print_table(head, rows)
+    comparison.draw(options.runs, options.output)
+    print(shown(options.output))
+    return 0
+
+
+def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print rows under heads; in a pipe nothing is wrapped, so that each row stays one line."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for index, head in enumerate(heads):
+        table.add_column(Text(head), no_wrap=index == 0)
+    for row in rows:
+        table.add_row(*map(Text, row))
+    console = Console(highlight=False)
+    Console(highlight=False, width=None if console.is_terminal else 400).print(table)

@@ -1,0 +1,99 @@
+"""Runs are compared: their figures, the fields of their configs that differ, and their curves in one picture."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ksim_rl.config.plain_data import read_yaml
+from ksim_rl.runs import curves
+from ksim_rl.runs.csv_table import STEP, read_table
+from ksim_rl.runs.listing import CONFIG, HEADS, METRICS, line, numbers, summarize, written
+from ksim_rl.runs.record import printable
+
+RETURN = ("evaluation/return_mean", "episode/return")
+# Title, the metrics of which the first that a run has is drawn, and over what.
+PANELS = (
+    ("Return", RETURN, STEP),
+    ("Return", RETURN, "seconds"),
+    ("Episode length (env steps)", ("episode/length",), STEP),
+    ("Env states per second", ("throughput/env_states_per_s",), STEP),
+)
+MOST_FIELDS, MOST_LETTERS = 60, 60
+
+
+def names(folders: Sequence[Path]) -> list[str]:
+    """Return short names of run folders: the last parts of their paths that tell them apart."""
+    parts = [folder.resolve().parts for folder in folders]
+    for length in range(1, max(map(len, parts)) + 1):
+        short = ["/".join(own[-length:]) for own in parts]
+        if len(set(short)) == len(short):
+            return short
+    return [str(folder) for folder in folders]
+
+
+def figures(folders: Sequence[Path]) -> list[list[str]]:
+    """Return rows of a table with a column per run: its figures, the best return, and where configs differ.
+
+    A ValueError names a folder that is no run, or whose config cannot be read.
+    """
+    configs = [dict(_flat(_config(folder))) for folder in folders]
+    lines = [line(summarize(folder), name=name) for folder, name in zip(folders, names(folders), strict=True)]
+    rows = [[head, *cells] for head, *cells in zip(HEADS, *lines, strict=True)]
+    returns = [_first(_rows(folder), RETURN)[1] for folder in folders]
+    rows.append(["best return", *(written(max(values, default=None), ".4g") for values in returns)])
+    fields = dict.fromkeys(name for config in configs for name in config)
+    differing = [name for name in fields if len({config.get(name, "-") for config in configs}) > 1]
+    for name in differing[:MOST_FIELDS]:
+        rows.append([name, *(config.get(name, "-") for config in configs)])
+    if len(differing) > MOST_FIELDS:
+        rows.append([f"... and {len(differing) - MOST_FIELDS} more fields", *("" for _ in folders)])
+    return rows
+
+
+def draw(folders: Sequence[Path], picture: Path) -> None:
+    """Draw the curves of runs over each other, into a PNG; a ValueError where none has any."""
+    tables = [_rows(folder) for folder in folders]
+    figure = Figure(figsize=(11, 7.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    drawn = False
+    for index, (title, metrics, over) in enumerate(PANELS):
+        axes = figure.add_subplot(2, 2, index + 1)
+        for name, rows in zip(names(folders), tables, strict=True):
+            metric, values = _first([row for row in rows if numbers([row], over)], metrics)
+            points = [row for row in rows if numbers([row], over) and numbers([row], metric)]
+            label = f"{printable(name)}: {metric}" if len(metrics) > 1 else printable(name)
+            axes.plot(numbers(points, over), values, label=label, linewidth=1.6)
+            drawn |= bool(points)
+        curves.dress(axes, title, over="time (s)" if over == "seconds" else "env states")
+        axes.legend(fontsize=8, frameon=False)
+    if not drawn:
+        raise ValueError(f"{', '.join(map(str, folders))}: no {METRICS} with rows to draw")
+    figure.savefig(picture, dpi=110)
+
+
+def _rows(folder: Path) -> list[dict[str, str]]:
+    return read_table(folder / METRICS)[1] if (folder / METRICS).exists() else []
+
+
+def _first(rows: Sequence[dict[str, str]], metrics: Sequence[str]) -> tuple[str, list[float]]:
+    """Return the first of some metrics that rows have, with its values."""
+    found = {metric: numbers(rows, metric) for metric in metrics}
+    return next(((metric, values) for metric, values in found.items() if values), (metrics[-1], []))
+
+
+def _config(folder: Path) -> Mapping[str, Any]:
+    tree = read_yaml(folder / CONFIG)
+    if not isinstance(tree, dict):
+        raise ValueError(f"{folder / CONFIG}: expected the config of a run")
+    return tree
+
+
+def _flat(tree: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, str]]:
+    for key, value in tree.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flat(value, f"{path}{printable(str(key))}.")
+        else:
+            yield f"{path}{printable(str(key))}", printable(str(value))[:MOST_LETTERS]

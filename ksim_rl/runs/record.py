@@ -1,0 +1,213 @@
+"""A run folder says how its run came about: command line, code, versions, hardware, and how each session ended.
+
+`run.json` has an entry per session: the first one, and one more for each time that the run was resumed. It is data:
+what others wrote is read as text. The environment's variables are never in it.
+"""
+
+import dataclasses
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from ksim_rl.checked import Checked
+from ksim_rl.config import plain_data, plugins
+from ksim_rl.runs.run_lock import is_locked
+
+RECORD = "run.json"
+Status = Literal["running", "done", "interrupted", "failed"]
+PACKAGES = [
+    "ksim_rl",
+    "torch",
+    "torchrl",
+    "tensordict",
+    "mujoco",
+    "mujoco-warp",
+    "warp-lang",
+    "triton",
+    "numpy",
+    "hydra-core",
+    "omegaconf",
+]
+MOST_SESSIONS, MOST_LETTERS, MOST_DIFF_BYTES = 1000, 10_000, 4 * 2**20
+# What a repository's own settings could have git run.
+_GIT = ("git", "-c", "core.fsmonitor=false", "-c", "core.hooksPath=/dev/null", "-c", "core.quotePath=false")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Session(Checked):
+    """One time that a run was started or resumed; `code` has the commit of each package and what was changed in it."""
+
+    began: str
+    command: str
+    code: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+    hardware: Mapping[str, str] = field(default_factory=dict)
+    status: Status = "running"
+    why: str = ""
+    ended: str = ""
+
+
+@contextmanager
+def recorded(
+    folder: Path, *, command: Sequence[str] | None = None, note: Callable[[str], None]
+) -> Iterator[Callable[[Status, str], None]]:
+    """Add a session to the record of a folder while this process writes there, with "failed" where the block raises.
+
+    The block is given a function that says how it ended and why. The command is by default that of this process.
+    """
+    began = f"{datetime.now():%Y-%m-%d %H:%M:%S}"
+    try:
+        earlier = read(folder)[-MOST_SESSIONS + 1 :]
+    except ValueError as error:
+        note(f"warning: {error}; it begins anew")
+        earlier = []
+    session = Session(
+        began=began,
+        command=shlex.join(sys.argv if command is None else command),
+        code=_code(folder, len(earlier) + 1),
+        versions=_versions(),
+        hardware=_hardware(),
+    )
+
+    def ended(status: Status, why: str) -> None:
+        now = f"{datetime.now():%Y-%m-%d %H:%M:%S}"
+        _write(folder, [*earlier, dataclasses.replace(session, status=status, why=why, ended=now)])
+
+    _write(folder, [*earlier, session])
+    try:
+        yield ended
+    except BaseException as error:
+        why = f"{type(error).__name__}: {error}"
+        ended("interrupted" if isinstance(error, KeyboardInterrupt) else "failed", why)
+        raise
+
+
+def read(folder: Path) -> list[Session]:
+    """Return the sessions of a run, none where nothing was recorded; a ValueError where the file holds other things."""
+    path = folder / RECORD
+    if not os.path.lexists(path):
+        return []
+    try:
+        entries = json.loads(plain_data.read_bytes(path, limit=plain_data.MOST_YAML_BYTES))["sessions"]
+        sessions = [Session(**_text(entry)) for entry in entries[:MOST_SESSIONS]]
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path}: no record of a run: {printable(str(error))}") from error
+    return sessions
+
+
+def status(folder: Path) -> tuple[str, str]:
+    """Return how a run stands, a `Status` or "unknown", and why; a process that was killed has failed."""
+    if is_locked(folder):
+        return "running", ""
+    try:
+        sessions = read(folder)
+    except ValueError as error:
+        return "unknown", str(error)
+    if not sessions:
+        return "unknown", "of an earlier version"
+    last = sessions[-1]
+    if last.status == "running":
+        return "failed", "its process ended without a word: killed, or the machine went down"
+    return last.status, last.why
+
+
+def printable(text: str) -> str:
+    """Return a stranger's text as one line that a terminal shows and does not obey."""
+    return "".join(c if c.isprintable() else " " for c in text[:MOST_LETTERS])
+
+
+def _text(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {printable(str(name)): _text(entry) for name, entry in value.items()}
+    return printable(value) if isinstance(value, str) else value
+
+
+def _write(folder: Path, sessions: Sequence[Session]) -> None:
+    temporary = folder / f".{RECORD}.writing"
+    temporary.unlink(missing_ok=True)  # a link that a stranger left is not followed
+    temporary.write_text(json.dumps({"sessions": [dataclasses.asdict(s) for s in sessions]}, indent=2) + "\n")
+    os.replace(temporary, folder / RECORD)
+
+
+def _code(folder: Path, session: int) -> dict[str, dict[str, str]]:
+    """Return the commits of this package, the plug-ins and the program, and write what was changed since beside them.
+
+    Only these are asked: a repository somewhere around the working directory may be anybody's.
+    """
+    found: dict[str, dict[str, str]] = {}
+    seen = set()
+    for name in ("ksim_rl", *sorted(plugins.packages()), "__main__"):
+        file = getattr(sys.modules.get(name), "__file__", None)
+        if file is None or not (repository := _repository(Path(file))) or repository[1] in seen:
+            continue
+        commit, top = repository
+        seen.add(top)
+        found[name] = {"commit": commit}
+        if changes := _git(top, "diff", "--no-ext-diff", "--no-textconv", "--no-color", "HEAD"):
+            kept = f"{name}.diff" if session == 1 else f"{name}.{session}.diff"
+            if len(changes) <= MOST_DIFF_BYTES:
+                (folder / kept).unlink(missing_ok=True)
+                (folder / kept).write_bytes(changes)
+            found[name]["changed"] = kept if len(changes) <= MOST_DIFF_BYTES else "too much to keep"
+        if new := (_git(top, "ls-files", "--others", "--exclude-standard") or b"").decode(errors="replace"):
+            found[name]["not in git"] = ", ".join(new.splitlines()[:20])
+    return found
+
+
+def _repository(file: Path) -> tuple[str, Path] | None:
+    """Return the commit and the top folder of the repository that has a file, and not only lies around it."""
+    if _git(file.parent, "ls-files", "--error-unmatch", "--", file.name) is None:
+        return None
+    answer = _git(file.parent, "rev-parse", "HEAD", "--show-toplevel")
+    if answer is None:  # nothing is committed yet
+        return None
+    commit, top = answer.decode().splitlines()
+    return commit, Path(top)
+
+
+def _git(folder: Path, *arguments: str) -> bytes | None:
+    own = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    try:
+        command = [*_GIT, "-C", str(folder), *arguments]
+        return subprocess.run(command, capture_output=True, check=True, timeout=20, env=own).stdout
+    except (OSError, subprocess.SubprocessError):  # there is no git, or nothing of what was asked for
+        return None
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _hardware() -> dict[str, str]:
+    found = {"host": platform.node(), "system": platform.platform(), "cores": str(os.cpu_count())}
+    found["memory"] = f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB"
+    processors = Path("/proc/cpuinfo")
+    if processors.exists():
+        models = (
+            line.split(":", 1)[1].strip()
+            for line in processors.read_text().splitlines()
+            if "model name" in line
+        )
+        found["processor"] = next(models, platform.machine())
+    for index in range(torch.cuda.device_count()):
+        about = torch.cuda.get_device_properties(index)
+        found[f"gpu {index}"] = f"{about.name}, {about.total_memory / 2**30:.0f} GiB"
+    return found
