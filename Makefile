@@ -10,7 +10,7 @@ ARGS ?=
 # Whole files go to one worker, since their tests share envs and compiled kernels.
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: setup train check lint types imports house test test-full clean
+.PHONY: setup train check lint types imports house docs test test-full clean
 
 setup: $(STAMP)
 
@@ -39,11 +39,15 @@ imports: setup
 house: setup
 	$(BIN)/python -m tests.house
 
-test: setup check
+# Warnings, such as links that lead nowhere, are errors (with --quiet they would not be).
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+
+test: setup check docs
 	$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
 
-test-full: setup check
+test-full: setup check docs
 	$(BIN)/python -m pytest $(PARALLEL) -m "full or not full" --cov --cov-report=term $(ARGS)
 
 clean:
-	rm -rf build dist .coverage .pytest_cache .ruff_cache .import_linter_cache
+	rm -rf build dist site .coverage .pytest_cache .ruff_cache .import_linter_cache
