@@ -119,7 +119,7 @@ def options(words: Sequence[str]) -> Options:
     given = {
         "device": "cuda" if torch.cuda.is_available() else "cpu",
         "num_envs": "4096",
-        "tasks": ",".join(envs.names()),
+        "tasks": ",".join(name for name in envs.names() if not envs.task(name).suite),
         "shard": "0/1",
         "check_device": "",
         "results": str(report.RESULTS),

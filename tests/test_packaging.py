@@ -71,7 +71,8 @@ for path in sorted(here.rglob("*.py")):
 from ksim_rl import conf, envs
 assert len(envs.names()) >= 2
 for name in envs.names():
-    conf.compose([f"task={name}"])
+    if not envs.task(name).suite or name.endswith("_cartpole_balance"):
+        conf.compose([f"task={name}"])
 assert list(here.rglob("*.xml"))
 print(ksim_rl.__version__)
 """

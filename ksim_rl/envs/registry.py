@@ -26,7 +26,7 @@ from ksim_rl.transforms.row_transform import follow_level
 
 _CONFIG = "ksim_rl_env"
 # Imported by name when tasks are first asked for: they stand above this room and import it.
-OWN_TASKS = "ksim_rl.tasks"
+OWN_TASKS = ("ksim_rl.tasks", "ksim_rl.suites")
 
 
 def _tasks() -> dict[str, Task]:
@@ -38,9 +38,8 @@ def _tasks_with(_named: tuple[str, ...]) -> dict[str, Task]:
     """Import all task modules once, ours and those of other packages, and collect their `Task`s."""
     found: dict[str, tuple[str, Task]] = {}
     for origin, module in (*_own_modules(), *plugins.modules(plugins.TASKS)):
-        for value in vars(module).values():
-            if not isinstance(value, Task):
-                continue
+        held = [value for value in vars(module).values() if isinstance(value, Task)]
+        for value in (*held, *vars(module).get("TASKS", ())):
             first, known = found.setdefault(value.name, (origin, value))
             if known is not value:
                 raise ValueError(
@@ -50,9 +49,9 @@ def _tasks_with(_named: tuple[str, ...]) -> dict[str, Task]:
 
 
 def _own_modules() -> Iterator[tuple[str, ModuleType]]:
-    package = importlib.import_module(OWN_TASKS)
-    for module_info in pkgutil.iter_modules(package.__path__, f"{OWN_TASKS}."):
-        yield module_info.name, importlib.import_module(module_info.name)
+    for package in map(importlib.import_module, OWN_TASKS):
+        for module_info in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+            yield module_info.name, importlib.import_module(module_info.name)
 
 
 def names() -> list[str]:

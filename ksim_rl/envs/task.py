@@ -20,6 +20,8 @@ class Training(Protocol):
 class Task:
     """An env config with what is known about training it; at the top level of a module of `ksim_rl/tasks/`.
 
+    A module of many tasks may hold them in a sequence `TASKS` instead.
+
     `name` is as in `task=<name>`, `description` one line for the table of tasks.
 
     Attributes:
@@ -27,6 +29,7 @@ class Task:
             than its `objective`'s take of it what fits them. None leaves all to the defaults.
         other_trainings: the same with the settings of other algorithms.
         solved_at: the mean evaluation return that counts as solved; None if there is no such figure.
+        suite: the suite of another package that the task is of; "" for our own tasks.
     """
 
     name: str
@@ -35,3 +38,4 @@ class Task:
     training: Training | None = None
     other_trainings: tuple[Training, ...] = ()
     solved_at: float | None = None
+    suite: str = ""

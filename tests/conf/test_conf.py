@@ -42,7 +42,15 @@ def test_a_logger_is_chosen_by_name(name, cfg):
     assert conf.compose([f"logger={name}"]).logger == cfg
 
 
-@pytest.mark.parametrize("name", envs.names())
+# The tasks of a suite share their settings but for a few numbers: two of them, and all in full runs.
+QUICK = ("dm_control_ball_in_cup_catch", "playground_humanoid_walk")
+NAMES = [
+    pytest.param(name, marks=pytest.mark.full) if envs.task(name).suite and name not in QUICK else name
+    for name in envs.names()
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_each_task_composes_with_its_training(name):
     cfg, training = conf.compose([f"task={name}"]), envs.task(name).training
     assert isinstance(training, TrainingCfg) and cfg.task_name == name
@@ -51,7 +59,7 @@ def test_each_task_composes_with_its_training(name):
         assert getattr(cfg, field.name) == getattr(training, field.name), field.name
 
 
-@pytest.mark.parametrize("name", [name for name in envs.names() if envs.task(name).other_trainings])
+@pytest.mark.parametrize("name", NAMES)
 def test_each_task_composes_with_its_training_by_other_algorithms(name):
     for training in envs.task(name).other_trainings:
         objective = algorithms.registry.serving(type(training.objective)).name

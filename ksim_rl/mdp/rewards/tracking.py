@@ -36,16 +36,23 @@ def tolerance(
     high: float = math.inf,
     margin: float,
     value_at_margin: float = 0.1,
-    shape: Literal["gaussian", "linear"] = "gaussian",
+    shape: Literal["gaussian", "linear", "quadratic", "long_tail"] = "gaussian",
 ) -> Float[Tensor, "*shape"]:
     """Return 1 inside [low, high], falling to `value_at_margin` at `margin` outside of it and on towards 0.
 
-    Formula: Tassa et al., "DeepMind Control Suite" (2018), section 4. With d the distance to the interval in margins,
-    "gaussian" is `value_at_margin ** (d ** 2)` and "linear" is `max(0, 1 - (1 - value_at_margin) d)`, which may be 0.
+    Formula: Tassa et al., "DeepMind Control Suite" (2018), section 4. With d the distance to the interval in margins
+    and v the value there, "gaussian" is `v ** (d ** 2)`, "long_tail" `1 / (1 + (1 / v - 1) d ** 2)`, and "linear" and
+    "quadratic" are 1 - (1 - v) times d and d ** 2, but not below 0; v may be 0 there. Without a margin it is 0 outside.
     """
-    distance = torch.clamp(torch.maximum(low - value, value - high), min=0.0) / margin
-    if shape == "linear":
-        return torch.clamp(1.0 - (1.0 - value_at_margin) * distance, min=0.0)
+    outside = torch.clamp(torch.maximum(low - value, value - high), min=0.0)
+    if margin == 0.0:
+        return (outside == 0.0).to(value.dtype)
+    distance = outside / margin
+    if shape == "long_tail":
+        return 1.0 / (1.0 + (1.0 / value_at_margin - 1.0) * distance.square())
+    if shape != "gaussian":
+        fall = distance if shape == "linear" else distance.square()
+        return torch.clamp(1.0 - (1.0 - value_at_margin) * fall, min=0.0)
     return torch.exp(distance.square() * math.log(value_at_margin))
 
 

@@ -1,0 +1,102 @@
+"""This module has the models of the DeepMind Control Suite, from the MJCF files of the package `dm_control`."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
+
+import mujoco
+
+from ksim_rl.checked import Checked, NonNegative
+from ksim_rl.checks import unknown_name
+from ksim_rl.physics import load_spec
+
+Variant = Literal["dm_control", "playground"]
+# Geoms and sites of this group are not drawn unless a viewer is asked to.
+HIDDEN_GROUP = 4
+NUM_SWIMMER_LINKS = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class DmControlModel(Checked):
+    """A domain's model, such as "cheetah", as the package `dm_control` has it, or as MuJoCo Playground changes it.
+
+    Both lose the flag "energy", which changes no motion and costs the one-kernel solver. A target that each episode
+    places anew is a command of the task, so that the model's own is hidden. `damping` replaces that of joints.
+
+    Raises:
+        ValueError: where the package is missing, with the command that installs it.
+    """
+
+    domain: str
+    variant: Variant = "dm_control"
+    damping: Mapping[str, NonNegative] = field(default_factory=dict)
+
+    def spec(self) -> mujoco.MjSpec:
+        """Return a new spec of the model."""
+        spec = load_spec(_folder() / f"{self.domain}.xml")
+        spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+        if self.domain == "swimmer":
+            _add_links(spec, NUM_SWIMMER_LINKS)
+        for element in (*spec.geoms, *spec.sites):
+            if element.name == "target" and self.domain in ("finger", "fish", "reacher", "swimmer"):
+                element.group = HIDDEN_GROUP
+        joints = {joint.name: joint for joint in spec.joints}
+        for name, damping in self.damping.items():
+            if name not in joints:
+                raise unknown_name("joint", name, joints)
+            joints[name].damping = [damping, 0.0, 0.0]
+        if self.variant == "playground":
+            _change(spec, self.domain)
+        return spec
+
+
+def _folder() -> Path:
+    found = find_spec("dm_control")
+    if found is None or not found.submodule_search_locations:
+        raise ValueError(
+            "the tasks of the DeepMind Control Suite need the models of the package dm_control: "
+            "pip install 'ksim_rl[dm_control]'"
+        )
+    return Path(found.submodule_search_locations[0]) / "suite"
+
+
+def _add_links(spec: mujoco.MjSpec, count: int) -> None:
+    """Hang the links of a swimmer behind its head, each with a motor and with sensors of its velocities.
+
+    The file has the head alone; dm_control's `swimmer.py` makes the rest, and says what is in it.
+    """
+    parent = spec.body("head")
+    defaults = {name: spec.find_default(name) for name in ("swimmer", "visual", "inertial")}
+    for index in range(count - 1):
+        parent = parent.add_body(name=f"segment_{index}", pos=[0.0, 0.1, 0.0])
+        for kind in ("visual", "inertial"):
+            parent.add_geom(defaults[kind], name=f"{kind}_{index}")
+        site = parent.add_site(defaults["swimmer"], name=f"site_{index}")
+        limit = 2.0 * math.pi / count
+        # Degrees, as in the file, which the compiler turns into radians.
+        limits = [-math.degrees(limit), math.degrees(limit)] if spec.compiler.degree else [-limit, limit]
+        joint = parent.add_joint(defaults["swimmer"], name=f"joint_{index}", range=limits)
+        motor = spec.add_actuator(spec.default, name=f"motor_{index}", target=joint.name)
+        motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
+        for name, kind in (
+            ("velocimeter", mujoco.mjtSensor.mjSENS_VELOCIMETER),
+            ("gyro", mujoco.mjtSensor.mjSENS_GYRO),
+        ):
+            spec.add_sensor(
+                name=f"{name}_{index}", type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site.name
+            )
+
+
+def _change(spec: mujoco.MjSpec, domain: str) -> None:
+    """Change what MuJoCo Playground's own copies of the files have otherwise and no option of `SimCfg` says."""
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    geoms = {geom.name: geom for geom in spec.geoms}
+    if domain == "finger":
+        for name in ("proximal_decoration", "spinner_decoration"):
+            geoms[name].contype = geoms[name].conaffinity = 0
+    if domain == "fish":
+        geoms["torso_massive"].type = mujoco.mjtGeom.mjGEOM_SPHERE
+        geoms["torso_massive"].size = [0.03, 0.0, 0.0]

@@ -1,0 +1,71 @@
+"""This module has the settings that the tasks of the DeepMind Control Suite are trained with: one set by algorithm."""
+
+import dataclasses
+import math
+
+from ksim_rl.algorithms import fast_sac
+from ksim_rl.algorithms.fast_sac import FastSACCfg
+from ksim_rl.algorithms.off_policy import MANY_ENVS
+from ksim_rl.data import DatasetCfg
+from ksim_rl.modules import ActorCfg, CriticCfg
+from ksim_rl.objectives import PPOCfg
+from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg
+
+NUM_ENVS = 2048
+# Env states that MuJoCo Playground gives PPO.
+PPO_STATES = 60e6
+FAST_SAC_STATES = 20e6
+
+
+def ppo(*, gamma: float = 0.995, env_states: float = PPO_STATES) -> TrainingCfg:
+    """Return the settings of PPO: 64 steps of each env and 128 gradient steps in turn.
+
+    Rewards lie in [0, 1] per step, so that values reach 1 / (1 - gamma): clipping their change to 0.2 would stop the
+    critic from learning.
+    """
+    data = DatasetCfg(num_env_states_per_minibatch=8192, num_minibatches=16)
+    return TrainingCfg(
+        num_envs=NUM_ENVS,
+        objective=PPOCfg(
+            gamma=gamma,
+            num_epochs=8,
+            clip_value=False,
+            entropy_coeff=0.005,
+            learning_rate=5e-4,
+            precision="auto",
+        ),
+        data=data,
+        modules=ModulesCfg(
+            actor=ActorCfg(hidden_dims=(256, 128)), critic=CriticCfg(hidden_dims=(256, 256, 128))
+        ),
+        trainer=TrainerCfg(
+            num_iterations=math.ceil(env_states / (8192 * 16)), eval_interval=50, stop_when_solved=False
+        ),
+    )
+
+
+def fast_sac_training(*, env_states: float = FAST_SAC_STATES) -> TrainingCfg:
+    """Return the settings of FastSAC: 4 steps of each env and 16 gradient steps in turn; returns lie in [0, 100]."""
+    num_envs, data = (
+        1024,
+        dataclasses.replace(
+            MANY_ENVS, num_env_states_per_minibatch=4096, num_minibatches=16, num_steps=4, save_replay=False
+        ),
+    )
+    return TrainingCfg(
+        num_envs=num_envs,
+        objective=FastSACCfg(
+            gamma=0.99, target_entropy_per_action=-0.5, policy_delay=2, autocast=True, compile=True
+        ),
+        data=data,
+        modules=ModulesCfg(
+            actor=fast_sac.ACTOR, critic=dataclasses.replace(fast_sac.CRITIC, v_min=-5.0, v_max=105.0)
+        ),
+        trainer=TrainerCfg(
+            num_iterations=math.ceil(env_states / (num_envs * data.num_steps)),
+            eval_interval=500,
+            log_interval=20,
+            checkpoint_interval=500,
+            stop_when_solved=False,
+        ),
+    )
