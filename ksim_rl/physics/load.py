@@ -3,6 +3,7 @@
 import os
 import re
 import warnings
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +13,8 @@ import warp as wp
 
 from ksim_rl.checks import near
 from ksim_rl.device.streams import start_warp
-from ksim_rl.physics.model_checks import check_finite, warp_model_of
+from ksim_rl.physics.model_checks import check_finite, check_meant, warp_model_of
+from ksim_rl.physics.model_size import check_spec, check_text
 from ksim_rl.physics.sim_cfg import SimCfg
 
 SUFFIXES = (".xml", ".mjcf", ".urdf")
@@ -26,6 +28,8 @@ _SINGULAR = re.compile(r"Inertia matrix is too close to singular.* DOF (?P<dof>\
 _NAN_ATTRIBUTE = re.compile(r"=\s*[\"'][^\"']*\b[nN][aA][nN]\b")
 _PREFIXES = re.compile(r"^(XML Error: )?(Error: )?(ParseXML: )?")
 _LINE = re.compile(r"[Ll]ine number=(?P<line>\d+)")
+# Of specs that are edited and compiled later, when only their folder is known to MuJoCo.
+_labels: weakref.WeakKeyDictionary[mujoco.MjSpec, str] = weakref.WeakKeyDictionary()
 
 
 def load_spec(source: Source) -> mujoco.MjSpec:
@@ -36,25 +40,26 @@ def load_spec(source: Source) -> mujoco.MjSpec:
     """
     spec, _, label, caught = _parsed(source)
     _pass_on(caught, label)
+    _labels[spec] = label
     return spec
 
 
 def load_model(source: Source, sim: SimCfg | None = None) -> mujoco.MjModel:
-    """Compile what `load_spec` parses, and check that its numbers are finite and MuJoCo Warp can simulate it.
+    """Compile what `load_spec` parses, and check that its numbers make sense and MuJoCo Warp can simulate it.
 
-    Settings of `sim` are laid over its own first, such as a solver that MuJoCo Warp has.
+    Settings of `sim` are laid over its own first, such as a solver that MuJoCo Warp has. What a few words make enormous
+    is refused unless the environment variable KSIM_RL_LARGEST_MODEL allows it.
     """
     spec, text, label, caught = _parsed(source)
     if sim is not None:
         sim.apply_to(spec)
-    with caught_warnings() as caught_later:
-        try:
-            mj_model = spec.compile()
-        except (ValueError, mujoco.FatalError) as error:
-            raise ValueError(_readable(str(error), label, text)) from None
+    check_spec(spec, label)
+    with caught_warnings() as caught_later, _named(label, text):
+        mj_model = spec.compile()
     check_finite(mj_model, label)
     for message in caught + caught_later:
         _refuse_serious(message, mj_model, label, text)
+    check_meant(mj_model, label)
     _pass_on(caught + caught_later, label)
     start_warp()
     with wp.ScopedDevice("cpu"):
@@ -73,14 +78,21 @@ def _parsed(source: Source) -> tuple[mujoco.MjSpec, str, str, list[str]]:
             raise ValueError(
                 f"model source is {kind}: expected a path, an XML string, a MjSpec or a menagerie name"
             )
-        return source.copy(), "", f"model {source.modelname!r}", []
+        return source.copy(), "", _labels.get(source, f"model {source.modelname!r}"), []
     path, text, label = _read(source)
-    with caught_warnings() as caught:
-        try:
-            spec = mujoco.MjSpec.from_string(text) if path is None else mujoco.MjSpec.from_file(str(path))
-        except (ValueError, mujoco.FatalError) as error:
-            raise ValueError(_readable(str(error), label, text)) from None
+    check_text(text, path.parent if path else Path(), label)
+    with caught_warnings() as caught, _named(label, text):
+        spec = mujoco.MjSpec.from_string(text) if path is None else mujoco.MjSpec.from_file(str(path))
     return spec, text, label, caught
+
+
+@contextmanager
+def _named(label: str, text: str) -> Iterator[None]:
+    """Name the source and the element in whatever MuJoCo raises."""
+    try:
+        yield
+    except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
+        raise ValueError(_readable(str(error), label, text)) from None
 
 
 def _read(source: str | Path) -> tuple[Path | None, str, str]:

@@ -22,6 +22,28 @@ ENUM_FIELDS = {
     "geom_type": mujoco.mjtGeom,
     "sensor_type": mujoco.mjtSensor,
 }
+# What nobody means with a sign.
+MOST_TIMESTEP = 0.1
+NOT_NEGATIVE_OPTIONS = (
+    *(
+        "iterations",
+        "ls_iterations",
+        "ccd_iterations",
+        "noslip_iterations",
+        "sdf_iterations",
+        "sdf_initpoints",
+    ),
+    *("density", "viscosity", "impratio"),
+)
+NOT_NEGATIVE_FIELDS = (
+    *("dof_damping", "dof_frictionloss", "dof_armature", "tendon_damping", "tendon_frictionloss"),
+    *("geom_friction", "pair_friction", "actuator_damping"),
+)
+CALLBACKS = {
+    "dyn": mujoco.get_mjcb_act_dyn,
+    "gain": mujoco.get_mjcb_act_gain,
+    "bias": mujoco.get_mjcb_act_bias,
+}
 
 
 def check_finite(mj_model: mujoco.MjModel, source: str) -> None:
@@ -33,6 +55,40 @@ def check_finite(mj_model: mujoco.MjModel, source: str) -> None:
             where = _element_of(mj_model, field, int(bad[0]), np.shape(values))
             raise ValueError(
                 f"{source}: {field}={flat[bad[0]]} in {where}: every number of a model must be finite and fit float32"
+            )
+
+
+def check_meant(mj_model: mujoco.MjModel, source: str) -> None:
+    """Refuse what MuJoCo takes and nobody means: a time step out of (0, 0.1] s, counts and losses below zero."""
+    step = float(mj_model.opt.timestep)
+    if not 0.0 < step <= MOST_TIMESTEP:
+        raise ValueError(
+            f"{source}: option.timestep={step:g} in <option>: expected (0, {MOST_TIMESTEP}] s; a step of physics, and "
+            "not of control, which is decimation times that"
+        )
+    for name in NOT_NEGATIVE_OPTIONS:
+        if (value := getattr(mj_model.opt, name)) < 0:
+            raise ValueError(f"{source}: option.{name}={value:g} in <option>: expected at least 0")
+    direct = np.isin(
+        mj_model.actuator_gaintype, (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
+    )
+    fields = {name: np.asarray(getattr(mj_model, name)) for name in NOT_NEGATIVE_FIELDS}
+    fields["actuator_gainprm"] = np.where(direct[:, None], mj_model.actuator_gainprm[:, :1], 0.0)
+    for field, values in fields.items():
+        bad = np.flatnonzero(values < 0.0)
+        if bad.size:
+            where = _element_of(mj_model, field, int(bad[0]), values.shape)
+            raise ValueError(f"{source}: {field}={values.flat[bad[0]]:g} in {where}: expected at least 0")
+    for field, callback in CALLBACKS.items():
+        kinds = getattr(mj_model, f"actuator_{field}type")
+        users = np.flatnonzero(
+            kinds == int(ENUM_FIELDS[f"actuator_{field}type"].__members__[f"mj{field.upper()}_USER"])
+        )
+        if users.size and callback() is None:
+            raise ValueError(
+                f"{source}: {field}type='user' in {_element(mj_model, 'actuator', int(users[0]))}: it needs a "
+                f"callback, and there is none: give one to mujoco.set_mjcb_act_{field} and to "
+                f"world.warp_model.callback.act_{field}"
             )
 
 
