@@ -10,7 +10,7 @@ ARGS ?=
 # Whole files go to one worker, since their tests share envs and compiled kernels.
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: setup train check lint types imports house docs test test-full clean
+.PHONY: setup train check lint types imports house docs test test-full dist clean
 
 setup: $(STAMP)
 
@@ -48,6 +48,10 @@ test: setup check docs
 
 test-full: setup check docs
 	$(BIN)/python -m pytest $(PARALLEL) -m "full or not full" --cov --cov-report=term $(ARGS)
+
+# sdist and wheel, under dist/.
+dist: setup
+	$(BIN)/python -m build --no-isolation --outdir dist .
 
 clean:
 	rm -rf build dist site .coverage .pytest_cache .ruff_cache .import_linter_cache

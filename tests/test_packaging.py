@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -115,6 +116,20 @@ def test_each_dependency_is_pinned_for_the_tested_environment():
     pinned = {line.split("==")[0].lower() for line in lines if "==" in line}
     assert names <= pinned
     assert not [line for line in lines if "/" in line or "@" in line or "+" in line]
+
+
+def test_the_citation_is_of_this_version():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == ksim_rl.__version__
+    assert {"cff-version", "title", "message", "authors"} <= citation.keys()
+
+
+@pytest.mark.skipif(shutil.which("hadolint") is None, reason="hadolint has no wheel for this platform")
+def test_the_image_is_written_as_docker_recommends():
+    done = subprocess.run(["hadolint", ROOT / "Dockerfile"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    copied = re.findall(r"^COPY (.*) \S+$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
+    assert all((ROOT / name).exists() for names in copied for name in names.split())
 
 
 def test_the_changelog_begins_with_this_version():

@@ -38,7 +38,7 @@ def explain(
     characters.
     """
     output = io.StringIO()
-    console = Console(file=output, width=width, highlight=False, markup=False, color_system=None)
+    console = Console(file=output, force_jupyter=False, width=width, highlight=False, markup=False, color_system=None)
     console.print(_summary(cfg, driver))
     for table in _tables(cfg, driver, shapes, action_sizes, events, levels):
         console.print(table)

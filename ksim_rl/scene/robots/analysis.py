@@ -120,7 +120,7 @@ class RobotAnalysis:
             span = "-" if limits is None else f"{limits[0]:.2f} {limits[1]:.2f}"
             table.add_row(name, actuator, span, *(f"{number:.3g}" for number in (*gains, *numbers)))
         text = io.StringIO()
-        Console(file=text, width=240, highlight=False).print(table)
+        Console(file=text, force_jupyter=False, width=240, highlight=False).print(table)
         return "\n".join([*lines, "", text.getvalue()])
 
     def code(self) -> str:
