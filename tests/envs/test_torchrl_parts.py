@@ -10,7 +10,14 @@ import torch
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvCreator, SerialEnv, TransformedEnv
-from torchrl.envs.transforms import ActionDiscretizer, DTypeCastTransform
+from torchrl.envs.transforms import (
+    ActionDiscretizer,
+    ActionScaling,
+    DTypeCastTransform,
+    MultiAction,
+    StepCounter,
+    UnsqueezeTransform,
+)
 from torchrl.envs.utils import check_env_specs
 
 from ksim_rl import envs
@@ -83,17 +90,43 @@ def bounded_puck():
 
 
 CASTS = {
-    "cast": (lambda: DTypeCastTransform(torch.float32, torch.float64, in_keys_inv=["action"]), torch.float64),
-    "discrete": (lambda: ActionDiscretizer(num_intervals=3), torch.int64),
+    "cast": (
+        lambda: DTypeCastTransform(torch.float32, torch.float64, in_keys_inv=["action"]),
+        torch.float64,
+        1,
+    ),
+    "discrete": (lambda: ActionDiscretizer(num_intervals=3), torch.int64, 1),
+    "one-hot": (lambda: ActionDiscretizer(num_intervals=3, categorical=False), torch.bool, 3),
+    "scaled": (lambda: ActionScaling(), torch.float32, 1),
+    "unsqueezed": (lambda: UnsqueezeTransform(-1, in_keys_inv=["action"]), torch.float32, 1),
+    "several": (lambda: MultiAction(), torch.float32, 1),
+}
+WRAPS = {
+    "bare": lambda cast: TransformedEnv(bounded_puck(), cast()),
+    "around ours": lambda cast: TransformedEnv(MaskedTransformedEnv(bounded_puck()), cast()),
+    "in ours": lambda cast: MaskedTransformedEnv(bounded_puck(), cast()),
+    "around stock": lambda cast: TransformedEnv(TransformedEnv(bounded_puck(), StepCounter()), cast()),
+    "appended": lambda cast: TransformedEnv(bounded_puck()).append_transform(cast()),
 }
 
 
 @pytest.mark.parametrize("name", CASTS)
-def test_a_stock_env_around_ours_draws_actions_of_its_own_kind(name):
-    transform, dtype = CASTS[name]
-    env = TransformedEnv(MaskedTransformedEnv(bounded_puck()), transform())
-    assert env.rand_action(env.reset())["action"].dtype == dtype
+@pytest.mark.parametrize("wrap", WRAPS)
+def test_a_stock_env_around_ours_draws_actions_of_its_own_kind(name, wrap):
+    make, dtype, width = CASTS[name]
+    env = WRAPS[wrap](make)
+    action = env.rand_action(env.reset())["action"]
+    assert action.dtype == dtype and action.numel() == 3 * width
+    assert env.full_action_spec["action"].is_in(action)
     assert env.rollout(3, break_when_any_done=False).shape == (3, 3)
+
+
+@pytest.mark.parametrize("name", CASTS)
+def test_workers_around_a_cast_draw_actions_of_its_own_kind(name):
+    make, dtype, width = CASTS[name]
+    env = SerialEnv(2, lambda: TransformedEnv(bounded_puck(), make()))
+    assert env.rand_action(env.reset())["action"].dtype == dtype
+    assert env.rollout(3, break_when_any_done=False).shape == (2, 3, 3)
 
 
 class OwnActions(CounterEnv):
