@@ -1,8 +1,12 @@
 """This module turns an error into one line for the user and an exit code."""
 
 import os
+import signal
 import sys
+import threading
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 REFUSED, FAILED = 2, 3
 
@@ -20,6 +24,28 @@ def report(error: Exception, *, about: str = "") -> int:
     text = " ".join(str(error).split())
     say(f"error: {about}{text if explained and text else f'{type(error).__name__}: {text}'}")
     return REFUSED if isinstance(error, ValueError) else FAILED
+
+
+@contextmanager
+def sigterm_interrupts() -> Iterator[None]:
+    """Let SIGTERM raise KeyboardInterrupt as SIGINT does, so that what holds files and folders puts them in order."""
+
+    def interrupt(number: int, _frame: object) -> None:
+        raise KeyboardInterrupt(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+def interruption(stopped: KeyboardInterrupt) -> signal.Signals:
+    """Return which signal it was."""
+    return signal.Signals(stopped.args[0]) if stopped.args else signal.SIGINT
 
 
 def say(text: str) -> None:

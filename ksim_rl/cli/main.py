@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from ksim_rl.cli.errors import REFUSED, report, say
+from ksim_rl.cli.errors import REFUSED, interruption, report, say, sigterm_interrupts
 
 USAGE = """\
 usage: ksim-rl <command> [arguments]
@@ -29,7 +29,7 @@ transforms, networks and algorithms that configs name. KSIM_RL_PLUGINS=PACKAGE,.
 `ksim-rl <command> --help` tells more. KSIM_RL_TRACEBACK=1 shows the traceback of an error.
 
 exit codes: 0 done (and solved, or its target met, where there is one), 1 not solved, 2 refused: the command or its
-configuration is wrong, 3 the run failed, 130 / 143 interrupted and saved (SIGINT / SIGTERM)"""
+configuration is wrong, 3 the run failed, 130 / 143 interrupted by SIGINT / SIGTERM: what is saved is said"""
 
 # Where each is: a module and its function, which takes the arguments and returns the exit code.
 COMMANDS = {
@@ -49,10 +49,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        code = _dispatch(arguments)
-    except KeyboardInterrupt:
-        say("interrupted")
-        code = 130
+        with sigterm_interrupts():
+            code = _dispatch(arguments)
+    except KeyboardInterrupt as stopped:
+        number = interruption(stopped)
+        say(f"{number.name}: interrupted; nothing was being written")
+        code = 128 + int(number)
     except Exception as error:
         code = report(error)
     sys.exit(code)

@@ -3,8 +3,9 @@
 import os
 from pathlib import Path
 
+from ksim_rl.cli.errors import interruption
 from ksim_rl.device.kernel_loading import compile_notice
-from ksim_rl.trainers import Checkpoint, Evaluation, Outcome, RunCfg, RunProgress, run
+from ksim_rl.trainers import Checkpoint, Evaluation, Outcome, RunCfg, RunProgress, checkpoint, run
 from ksim_rl.trainers.build import solved_at
 
 
@@ -17,14 +18,29 @@ def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None 
         f"{cfg.task_name}: {cfg.num_envs} envs x {length} steps = {cfg.num_envs * length} env states per iteration, "
         f"on {cfg.device}; run folder {shown(folder)}"
     )
-    with compile_notice(progress.status):
-        outcome = run(cfg, folder, progress=progress, resume_from=resume_from)
+    try:
+        with compile_notice(progress.status):
+            outcome = run(cfg, folder, progress=progress, resume_from=resume_from)
+    except KeyboardInterrupt as stopped:
+        number = interruption(stopped)
+        progress.note(f"{number.name}: {_what_is_saved(folder)}")
+        return 128 + int(number)
     for line in _summary(cfg, outcome, folder):
         progress.note(line)
     if outcome.interrupted_by is not None:
         return 128 + int(outcome.interrupted_by)
     reached = outcome.solved if outcome.target_met is None else outcome.target_met
     return 1 if reached is False else 0
+
+
+def _what_is_saved(folder: Path) -> str:
+    if saved := checkpoint.saved(folder / "checkpoint"):
+        return (
+            f"saved are the checkpoints up to {saved[-1].name}; continue with: ksim-rl resume {shown(folder)}"
+        )
+    if folder.exists():
+        return f"no checkpoint is saved yet; begin anew with: ksim-rl train --config-dir {shown(folder)}"
+    return "nothing is saved, and no folder is left"
 
 
 def verdict(evaluation: Evaluation, threshold: float | None) -> str:

@@ -8,6 +8,7 @@ import torch
 
 from ksim_rl import envs
 from ksim_rl.checks import check_in_range
+from ksim_rl.cli.errors import say
 from ksim_rl.cli.report import run_and_report, shown, verdict
 from ksim_rl.cli.runs import print_table
 from ksim_rl.config.plain_data import check_links
@@ -32,7 +33,7 @@ def resume(arguments: list[str]) -> int:
         "--trust", action="store_true", help="the folder is yours: it may hold links, and say where to write"
     )
     options = parser.parse_args(arguments)
-    saved = checkpoint.load(checkpoint.latest(options.run))
+    saved = checkpoint.load(checkpoint.latest(options.run, note=say))
     # A checkpoint lies in <run folder>/checkpoint/<iteration>.
     folder = saved.path.absolute().parent.parent
     if not options.trust:
@@ -59,7 +60,7 @@ def evaluate(arguments: list[str]) -> int:
     if options.episodes is not None and options.episodes < 1:
         raise ValueError(f"--episodes {options.episodes}: expected at least 1")
     with compile_notice(RunProgress(1).status):
-        policy = load_policy(options.run, device=options.device)
+        policy = load_policy(checkpoint.latest(options.run, note=say), device=options.device)
         episodes = options.episodes or policy.cfg.trainer.eval_episodes or 100
         evaluate = build_evaluator(policy.cfg, policy.actor, episodes=episodes, seed=options.seed)
         evaluation = evaluate()
@@ -86,10 +87,11 @@ def play(arguments: list[str]) -> int:
         )
     progress = RunProgress(1)
     with compile_notice(progress.status):
-        policy = load_policy(options.run, device=options.device)
+        saved = checkpoint.latest(options.run, note=say)
+        policy = load_policy(saved, device=options.device)
         path = options.output
         if path is None:
-            folder = checkpoint.latest(options.run).absolute().parent.parent
+            folder = saved.absolute().parent.parent
             check_links(folder, below=())
             path = folder / "play.mp4"
         written = record_video(

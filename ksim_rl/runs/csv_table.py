@@ -1,12 +1,11 @@
 """This module keeps all metrics of a run in one CSV file, one row per logged iteration."""
 
 import csv
-import io
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
 from ksim_rl.config.plain_data import MOST_DATA_BYTES, read_bytes
+from ksim_rl.runs.whole_file import whole_file
 
 STEP = "env_states"
 
@@ -21,7 +20,10 @@ class CsvTable:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._columns, self._rows = read_table(path) if path.exists() else ([STEP], [])
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._columns = read_table(path)[0] if path.exists() else [STEP]
+        # The last row, and those before it that are not in the file yet; it alone holds all others.
+        self._rows: list[dict[str, str]] = []
         self._started = False
 
     def log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
@@ -30,8 +32,6 @@ class CsvTable:
         new_columns = [name for name in row if name not in self._columns]
         # False until the row is written, so that after a failure the next row writes the whole table again.
         started, self._started = self._started, False
-        if not started:
-            self._rows = [old for old in self._rows if int(old[STEP]) < step]
         same_row = bool(self._rows) and int(self._rows[-1][STEP]) == step
         if same_row:
             self._rows[-1] |= row
@@ -44,18 +44,18 @@ class CsvTable:
             with open(self.path, "a", newline="") as file:
                 self._writer(file).writerow(row)
         self._started = True
+        del self._rows[:-1]
 
     def close(self) -> None:
         """Do nothing: each row is written when it is logged."""
 
     def _rewrite(self) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = self.path.with_name(f".{self.path.name}.writing")
-        with open(temporary, "w", newline="") as file:
+        saved = read_table(self.path)[1] if self.path.exists() else []
+        earlier = [row for row in saved if int(row[STEP]) < int(self._rows[0][STEP])]
+        with whole_file(self.path) as temporary, open(temporary, "w", newline="") as file:
             writer = self._writer(file)
             writer.writeheader()
-            writer.writerows(self._rows)
-        os.replace(temporary, self.path)
+            writer.writerows([*earlier, *self._rows])
 
     def _writer(self, file) -> csv.DictWriter:
         return csv.DictWriter(file, self._columns, restval="", lineterminator="\n")
@@ -63,8 +63,7 @@ class CsvTable:
 
 def read_table(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     """Read a table: its columns, and its rows as text by column; a row that a crash cut off is left out."""
-    reader = csv.DictReader(
-        io.StringIO(read_bytes(path, limit=MOST_DATA_BYTES).decode(errors="replace"), newline="")
-    )
+    text = read_bytes(path, limit=MOST_DATA_BYTES).decode(errors="replace")
+    reader = csv.DictReader(line for line in text.splitlines(keepends=True) if line.endswith("\n"))
     rows = [row for row in reader if row.get(STEP) and None not in row.values()]
     return list(reader.fieldnames or [STEP]), rows

@@ -12,7 +12,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from importlib import metadata
@@ -24,6 +24,7 @@ import torch
 from ksim_rl.checked import Checked
 from ksim_rl.config import plain_data, plugins
 from ksim_rl.runs.run_lock import is_locked
+from ksim_rl.runs.whole_file import whole_file
 
 RECORD = "run.json"
 Status = Literal["running", "done", "interrupted", "failed"]
@@ -90,7 +91,8 @@ def recorded(
         yield ended
     except BaseException as error:
         why = f"{type(error).__name__}: {error}"
-        ended("interrupted" if isinstance(error, KeyboardInterrupt) else "failed", why)
+        with suppress(OSError):  # a folder that is gone or full; the error says so
+            ended("interrupted" if isinstance(error, KeyboardInterrupt) else "failed", why)
         raise
 
 
@@ -135,10 +137,10 @@ def _text(value: Any) -> Any:
 
 
 def _write(folder: Path, sessions: Sequence[Session]) -> None:
-    temporary = folder / f".{RECORD}.writing"
-    temporary.unlink(missing_ok=True)  # a link that a stranger left is not followed
-    temporary.write_text(json.dumps({"sessions": [dataclasses.asdict(s) for s in sessions]}, indent=2) + "\n")
-    os.replace(temporary, folder / RECORD)
+    with whole_file(folder / RECORD) as temporary:
+        temporary.write_text(
+            json.dumps({"sessions": [dataclasses.asdict(s) for s in sessions]}, indent=2) + "\n"
+        )
 
 
 def _code(folder: Path, session: int) -> dict[str, dict[str, str]]:

@@ -10,7 +10,8 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,16 +21,21 @@ from safetensors import SafetensorError
 
 from ksim_rl.config import plain_data
 from ksim_rl.device import state_tree
+from ksim_rl.runs.whole_file import WRITING
 from ksim_rl.trainers import checkpoint_formats
 
 MANIFEST, TENSORS = "manifest.json", "tensors.safetensors"
-_TEMPORARY, _DISCARDED = ".writing-", ".discarded-"
+_DISCARDED = ".discarded-"
 _MAX_MANIFEST_BYTES = 64 * 2**20
 Columns = Mapping[str, Mapping[str, Sequence[int]]]
 
 
 class CheckpointError(ValueError):
     """A checkpoint that is absent, damaged, or of another format; the message says which, and what to do."""
+
+
+class UnknownFormatError(CheckpointError):
+    """A checkpoint of a format that this version does not read, and which may be whole."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +52,7 @@ def save(
     folder: Path, state: Mapping[str, Any], *, iteration: int, config: Mapping[str, Any], keep: int = 3
 ) -> Path:
     """Write one more checkpoint into `folder`, and drop all but the newest `keep`; an OSError leaves these alone."""
-    folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(exist_ok=True)
     tensors, values = state_tree.split(state)
     tensor_bytes = safetensors.torch.save(tensors)
     manifest_bytes = _seal(
@@ -60,7 +66,7 @@ def save(
     )
 
     name = _unused_name(folder, iteration)
-    temporary = folder / f"{_TEMPORARY}{name}"
+    temporary = folder / f"{WRITING}{name}"
     try:
         temporary.mkdir()
         _write_durably(temporary / TENSORS, tensor_bytes)
@@ -112,24 +118,39 @@ def saved(folder: Path) -> list[Path]:
     return sorted(found, key=lambda entry: _order(entry.name) or (0, 0))
 
 
-def latest(path: Path) -> Path:
-    """Find the newest checkpoint of a run folder or a checkpoint folder; a checkpoint itself is returned as it is."""
+def latest(path: Path, *, note: Callable[[str], None] = warnings.warn) -> Path:
+    """Find the newest whole checkpoint of a run folder or a checkpoint folder; a checkpoint is returned as it is.
+
+    A `note` says which damaged ones are passed over, and which one is taken. Where all are damaged, or the newest is of
+    an unknown format, the error is that of the newest.
+    """
     if (path / MANIFEST).exists():
         return path
-    for folder in (path / "checkpoint", path):
-        if checkpoints := saved(folder):
-            return checkpoints[-1]
+    damage: list[CheckpointError] = []
+    for candidate in reversed(saved(path / "checkpoint") or saved(path)):
+        try:
+            load(candidate)
+        except UnknownFormatError:
+            raise
+        except CheckpointError as error:
+            damage.append(error)
+        else:
+            if damage:
+                passed = "; ".join(map(str, damage))
+                note(f"{passed}: passed over, the checkpoint {candidate.name} is taken instead")
+            return candidate
+    if damage:
+        raise damage[0]
     raise CheckpointError(
         f"{path}: no checkpoint here; expected a run folder, its checkpoint/ or one of those in it"
     )
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what a crash left behind while saving or deleting."""
-    if folder.is_dir():
-        for entry in folder.iterdir():
-            if entry.name.startswith((_TEMPORARY, _DISCARDED)):
-                shutil.rmtree(entry)
+    """Delete what a crash left behind while writing or deleting."""
+    for entry in folder.iterdir() if folder.is_dir() else ():
+        if entry.name.startswith((WRITING, _DISCARDED)):
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
 
 
 def check_columns(saved: Columns, own: Columns) -> None:
@@ -169,7 +190,7 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path / MANIFEST}: damaged: its SHA-256 does not match its content")
     version = manifest.get("format_version") if isinstance(manifest, dict) else None
     if reason := checkpoint_formats.refusal(version):
-        raise CheckpointError(f"{path}: {reason}")
+        raise UnknownFormatError(f"{path}: {reason}")
     well_formed = (
         isinstance(manifest.get("iteration"), int)
         and isinstance(manifest.get("config"), dict)

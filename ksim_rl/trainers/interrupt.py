@@ -1,5 +1,6 @@
 """SIGINT and SIGTERM are turned into a request: the loop ends after the current iteration, with everything saved."""
 
+import os
 import signal
 import threading
 from types import FrameType
@@ -31,5 +32,8 @@ class InterruptRequest:
 
     def _remember(self, number: int, _frame: FrameType | None) -> None:
         if self.signal is not None:
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt(number)
         self.signal = signal.Signals(number)
+        # Not through sys.stderr, which the signal may have found in the middle of a line.
+        text = f"ksim-rl: {self.signal.name}: the run ends after this iteration; once more ends it at once\n"
+        os.write(2, text.encode())

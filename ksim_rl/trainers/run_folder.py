@@ -17,6 +17,8 @@ from ksim_rl.device.memory import memory_for
 from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.runs.record import recorded
 from ksim_rl.runs.run_lock import locked
+from ksim_rl.runs.watch import threads_that_fail, watch
+from ksim_rl.runs.whole_file import whole_file
 from ksim_rl.trainers import checkpoint, video
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build, build_env
@@ -48,11 +50,12 @@ def run(
     """Train, and leave in `run_folder` its record, config, metrics, checkpoints, evaluation, curves and a video.
 
     What cannot be drawn (no OpenGL) is said in one line of `progress`. Raises ValueError when another process writes
-    the folder, the checkpoint to resume or start from belongs to another config, or memory does not suffice.
+    the folder, the checkpoint to resume or start from belongs to another config, or memory does not suffice; OSError
+    when the folder is deleted or moved meanwhile, or the end cannot be saved.
     """
     run_folder.mkdir(parents=True, exist_ok=True)
     try:
-        with locked(run_folder, note=progress.note):
+        with locked(run_folder, note=progress.note), threads_that_fail(progress.note):
             return _run_locked(cfg, run_folder, progress, hooks, resume_from)
     except BaseException:
         with suppress(OSError):
@@ -69,14 +72,17 @@ def _run_locked(
 ) -> Outcome:
     for note in loading_notes(cfg.to_tree()):
         progress.note(note)
-    checkpoint.remove_leftovers(run_folder / "checkpoint")
+    for folder in (run_folder, run_folder / "checkpoint"):
+        checkpoint.remove_leftovers(folder)
     # The graphs that the first iterations record take memory as well.
     with memory_for(cfg.num_envs, cfg.resolved_device()):
         trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
-        (run_folder / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
+        _write(run_folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
+        trainer.watch = watch(run_folder, holds=CONFIG, note=progress.note)
         with recorded(run_folder, note=progress.note) as ended:
             outcome = trainer.train(progress)
             ended("done" if outcome.interrupted_by is None else "interrupted", outcome.why)
+    trainer.watch()
     if outcome.evaluation is not None:
         figures = {
             "iteration": outcome.iteration,
@@ -85,7 +91,7 @@ def _run_locked(
         }
         if trainer.solved_at is not None:
             figures["solved"] = outcome.solved
-        (run_folder / EVALUATION).write_text(json.dumps(figures, indent=2) + "\n")
+        _write(run_folder / EVALUATION, json.dumps(figures, indent=2) + "\n")
     _draw_curves(cfg, run_folder, solved_at=trainer.solved_at, note=progress.note)
     if cfg.trainer.video and outcome.interrupted_by is None:
         record_video(cfg, trainer.update.actor, run_folder / VIDEO, note=progress.note)
@@ -93,6 +99,11 @@ def _run_locked(
         if owner is not None:
             owner.env.close(raise_if_closed=False)
     return outcome
+
+
+def _write(path: Path, text: str) -> None:
+    with whole_file(path) as temporary:
+        temporary.write_text(text)
 
 
 def load_policy(path: Path, *, device: str = "auto", plugins: Sequence[str] = ()) -> Policy:
@@ -154,6 +165,7 @@ def _draw_curves(
 
     title = f"{cfg.task_name}: {cfg.num_envs} envs on {cfg.device}, seed {cfg.seed}"
     try:
-        curves.draw(table, run_folder / CURVES, title=title, solved_at=solved_at)
+        with whole_file(run_folder / CURVES) as temporary:
+            curves.draw(table, temporary, title=title, solved_at=solved_at)
     except (ValueError, OSError) as error:
         note(f"no learning curves: {error}")

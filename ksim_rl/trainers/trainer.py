@@ -162,6 +162,7 @@ class Trainer:
         self.interrupt = InterruptRequest()
         self.clock = RunClock()
         self.progress = RunProgress(cfg.num_iterations, enabled=False)
+        self.watch: Callable[[], None] = lambda: None  # called in each iteration, before anything is written
         self._own_hooks = tuple(hooks)
         judge = [EvaluationHook(evaluator, interval=cfg.eval_interval)] if evaluator is not None else []
         self._hooks = (*judge, *hooks, CheckpointHook(interval=cfg.checkpoint_interval))
@@ -226,6 +227,7 @@ class Trainer:
         rollout_ET = self.collector.collect()
         self.update(rollout_ET)
         self.iteration += 1
+        self.watch()
         env = self.collector.env
         metrics = read_episode_sums(env, rollout_ET) | read_physics(env) | self.update.metrics()
         self._unread.append((self.iteration, start_copy(metrics, device=self.update.device)))

@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl.envs.contract import Pictures, part
+from ksim_rl.runs.whole_file import whole_file
 
 # Why rendering failed in this process, once it did. MuJoCo aborts the process when it tries a second time without a
 # working OpenGL platform.
@@ -51,12 +52,10 @@ def record(
 
 
 def _write(path: Path, first: np.ndarray, rest: Iterator[np.ndarray], *, fps: float) -> Path:
-    if path.suffix == ".gif":
-        writer = imageio.get_writer(path, duration=1000 / fps, loop=0)
-    else:
-        # H.264 wants even sides; with macro_block_size=2 imageio pads only odd ones.
-        writer = imageio.get_writer(path, fps=fps, codec="libx264", quality=7, macro_block_size=2)
-    with writer:
+    # H.264 wants even sides; with macro_block_size=2 imageio pads only odd ones.
+    h264 = {"fps": fps, "codec": "libx264", "quality": 7, "macro_block_size": 2}
+    options = {"duration": 1000 / fps, "loop": 0} if path.suffix == ".gif" else h264
+    with whole_file(path) as temporary, imageio.get_writer(temporary, **options) as writer:
         writer.append_data(first)
         for frame in rest:
             writer.append_data(frame)

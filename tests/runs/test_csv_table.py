@@ -79,3 +79,18 @@ def test_a_row_that_a_crash_cut_off_is_left_out(path):
         file.write("20")
     CsvTable(path).log_metrics({"loss": 3.0}, 300)
     assert [row["env_states"] for row in rows(path)] == ["100", "300"]
+
+
+def test_memory_holds_no_more_than_the_last_row(path):
+    table = CsvTable(path)
+    for step in range(100, 1000, 100):
+        table.log_metrics({"loss": 1.0}, step)
+    assert len(table._rows) == 1 and len(rows(path)) == 9
+
+
+def test_a_row_that_a_crash_cut_off_in_its_last_number_is_left_out(path):
+    CsvTable(path).log_metrics({"loss": 1.0}, 100)
+    with open(path, "a") as file:
+        file.write("200,1.2")
+    CsvTable(path).log_metrics({"loss": 3.0}, 300)
+    assert [row["env_states"] for row in rows(path)] == ["100", "300"]

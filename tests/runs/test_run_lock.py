@@ -71,7 +71,9 @@ def test_a_second_process_is_refused_in_one_line_with_pid_host_and_time(tmp_path
 def test_commands_that_write_exit_with_2(tmp_path, held, command, capsys, monkeypatch):
     monkeypatch.setattr(run_folder, "_run_locked", lambda *_: pytest.fail("both write"))
     monkeypatch.setattr(run_commands.checkpoint, "load", saved)
-    monkeypatch.setattr(run_commands.checkpoint, "latest", lambda path: path / "checkpoint" / "00000001")
+    monkeypatch.setattr(
+        run_commands.checkpoint, "latest", lambda path, note: path / "checkpoint" / "00000001"
+    )
     (tmp_path / "config.yaml").write_text("")
     own = (
         ["resume", str(tmp_path)]

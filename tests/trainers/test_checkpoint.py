@@ -341,3 +341,29 @@ def test_kill_while_saving_loses_nothing(tmp_path):
 @pytest.mark.full
 def test_kill_while_saving_200_times_loses_nothing(tmp_path):
     kill_while_saving(tmp_path, 200)
+
+
+def damage_emptied(path):
+    for entry in path.iterdir():
+        entry.unlink()
+
+
+@pytest.mark.parametrize("damage", [damage_emptied, damage_empty, damage_missing_manifest])
+def test_a_newest_checkpoint_that_is_damaged_is_passed_over_and_said(tmp_path, damage):
+    older = checkpoint.save(tmp_path, STATE, iteration=6, config=CONFIG)
+    damage(checkpoint.save(tmp_path, STATE, iteration=7, config=CONFIG))
+    notes = []
+    assert checkpoint.latest(tmp_path, note=notes.append) == older
+    assert len(notes) == 1 and "00000007" in notes[0] and "00000006 is taken instead" in notes[0]
+    with pytest.warns(UserWarning, match="passed over"):
+        checkpoint.latest(tmp_path)
+    damage(older)
+    with pytest.raises(CheckpointError, match="00000007"):
+        checkpoint.latest(tmp_path)
+
+
+def test_a_newest_checkpoint_of_an_unknown_format_is_not_passed_over(tmp_path):
+    checkpoint.save(tmp_path, STATE, iteration=6, config=CONFIG)
+    with_version(checkpoint.save(tmp_path, STATE, iteration=7, config=CONFIG), 99)
+    with pytest.raises(CheckpointError, match="newer ksim_rl"):
+        checkpoint.latest(tmp_path)
