@@ -7,6 +7,7 @@ not exist is a warning, and so an error, since the site is built with `strict`.
 """
 
 import importlib
+import json
 import logging
 import posixpath
 import re
@@ -86,9 +87,14 @@ def _copied(target: str, config: Any) -> File:
     if path.is_dir():
         names = sorted(item.name for item in path.iterdir() if not item.name.startswith(("_", ".")))
         text = "\n".join(f"* `{name}`" for name in names)
+    elif path.suffix == ".ipynb":
+        cells = json.loads(path.read_text())["cells"]
+        sources = [(cell["cell_type"], "".join(cell["source"])) for cell in cells]
+        text = "\n\n".join(f"```python\n{text}\n```" if kind == "code" else text for kind, text in sources)
     else:
         text = f"````{path.suffix.removeprefix('.') or 'text'}\n{path.read_text()}\n````"
-    return File.generated(config, _page_of(target), content=f"# `{target}`\n\n{text}\n")
+    heading = "" if path.suffix == ".ipynb" else f"# `{target}`\n\n"
+    return File.generated(config, _page_of(target), content=f"{heading}{text}\n")
 
 
 def _reference(module: str) -> str:
