@@ -19,6 +19,8 @@ usage: ksim-rl <command> [arguments]
   play     record a video:          ksim-rl play RUN --seconds 10
   runs     list runs, with return and speed:  ksim-rl runs [FOLDER]
   compare  a table and a picture:   ksim-rl compare RUN1 RUN2
+  export   a folder that runs elsewhere:  ksim-rl export RUN
+  sim2sim  run it on MuJoCo's C engine:   ksim-rl sim2sim RUN/export --episodes 100
   warmup   compile ahead of time:   ksim-rl warmup task=go1_velocity_flat device=cuda
   envs     list the tasks, or print what one is made of: ksim-rl envs cartpole_swingup
   robot    analyse a robot's model: ksim-rl robot unitree_a1/a1 [--code]
@@ -39,6 +41,8 @@ COMMANDS = {
     "play": "ksim_rl.cli.run_commands:play",
     "runs": "ksim_rl.cli.runs:runs",
     "compare": "ksim_rl.cli.runs:compare",
+    "export": "ksim_rl.export.sim2sim:run_export",
+    "sim2sim": "ksim_rl.export.sim2sim:run_sim2sim",
     "warmup": "ksim_rl.cli.warmup:warmup",
     "envs": "ksim_rl.cli.run_commands:list_envs",
     "robot": "ksim_rl.cli.run_commands:robot",

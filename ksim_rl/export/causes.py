@@ -1,0 +1,221 @@
+"""This module finds out why a policy acts differently in another simulator, from single steps that both have taken.
+
+Each recorded step is taken once more there, from the recorded state, with the recorded observation and action. So each
+link of the chain is compared by itself: observation, policy, target, effort, motion. A link that differs hides those
+that follow from it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+Arrays = Mapping[str, np.ndarray]
+SAME, LIKE = 2e-3, 2e-2
+"""Relative errors: of what should be equal, and of what explains a difference."""
+MOST_SHIFT = 4
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A likely cause, what it is about, and what shows it."""
+
+    name: str
+    about: str
+    evidence: str
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.about}: {self.evidence}"
+
+
+def find_causes(meta: Mapping[str, Any], trace: Arrays, replay: Arrays) -> list[Cause]:
+    """Return the likely causes of differences, the first in the chain first.
+
+    `trace` holds recorded steps, `trace/<signal>` [N, T, ...]; `replay` the same from elsewhere, `<lag>/<n>/<signal>`.
+    """
+    found: list[Cause] = []
+    recorded_s = float(trace["trace/dt"]) * int(trace["trace/decimation"])
+    step_s, substep_s = float(replay["dt"]) * int(replay["decimation"]), float(replay["dt"])
+    if abs(step_s / recorded_s - 1.0) > 1e-6 or abs(substep_s / float(trace["trace/dt"]) - 1.0) > 1e-6:
+        evidence = f"{step_s:g} s in steps of {substep_s:g} s, trained with {recorded_s:g} s in steps of "
+        found.append(Cause("rate", "env step", evidence + f"{float(trace['trace/dt']):g} s"))
+
+    def signal(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return _pairs(name, trace, replay)
+
+    frames = _newest(meta, trace["trace/obs"])
+    start, obs_differs = 0, False
+    ours, theirs, episode = _pairs("obs", {**trace, "trace/obs": frames}, replay)
+    for term in meta["observations"]:
+        columns = slice(start, start + term["size"])
+        start += term["size"]
+        causes = _of_observation(term["name"], ours[:, columns], theirs[:, columns], episode)
+        obs_differs = obs_differs or bool(causes)
+        found += causes
+    ours, theirs, _ = signal("action")
+    remembers = trace["trace/obs"].shape[-1] != start
+    if _error(ours, theirs) > SAME and not (remembers and obs_differs):
+        if order := _order(ours, theirs):
+            found.append(Cause("joint order", "policy.onnx", f"its actions match ours in the order {order}"))
+        else:
+            found.append(
+                Cause(
+                    "normalizer", "policy.onnx", f"same observation, actions {_error(ours, theirs):.0%} off"
+                )
+            )
+    if motion := _of_motion(meta, signal, rates=not found or found[0].name != "rate"):
+        found.append(motion)
+    return found
+
+
+def _of_motion(meta: Mapping[str, Any], signal: Any, *, rates: bool) -> Cause | None:
+    """Return the first difference on the way from the action to the next state."""
+    joints = meta["joints"]["names"]
+    ours, theirs, episode = signal("target")
+    if _error(ours, theirs) > SAME:
+        return _of_targets(ours, theirs, episode, joints)
+    if not rates:
+        return None
+    ours, theirs, episode = signal("effort")
+    if _error(ours, theirs) > LIKE:
+        if order := _order(ours, theirs, tolerance=0.2):
+            named = ", ".join(f"{joints[a]} <- {joints[b]}" for a, b in enumerate(order) if a != b)
+            return Cause("joint order", "actuators", named)
+        if shift := _shift(ours, theirs, episode, tolerance=0.2):
+            return Cause("delay", "actuators", f"efforts are those of {shift} steps ago")
+        ratios = _ratios(ours, theirs)
+        worst = int(np.abs(np.log(np.abs(ratios) + 1e-9)).argmax())
+        off = np.abs(ratios - 1.0) > LIKE
+        if off.any() or _error(ours, theirs) > 0.3:
+            evidence = f"same state and target, effort x {ratios[worst]:.2f}; {int(off.sum())} joints differ"
+            return Cause("gain", joints[worst], evidence)
+    ours, theirs, _ = signal("next_qvel")
+    before, _, _ = signal("qvel")
+    error = np.abs(ours - theirs).max(1)
+    # Of what the step itself changed.
+    size = np.abs(ours - before).mean() + 1e-6
+    touches = np.zeros(len(error), bool)
+    for name in meta["contacts"]:
+        touches |= (signal(f"found_{name}")[0] > 0).any(1) | (signal(f"found_{name}")[1] > 0).any(1)
+    on_ground, in_air = (
+        float(np.mean(error[rows])) / size if rows.any() else 0.0 for rows in (touches, ~touches)
+    )
+    if max(on_ground, in_air) <= 3 * SAME:
+        return None
+    evidence = f"velocities {on_ground:.1%} off with contact, {in_air:.1%} without"
+    if on_ground > 5 * in_air:
+        return Cause("contact parameters", "robot.xml", evidence)
+    return Cause("mass or inertia", "robot.xml", evidence)
+
+
+def _of_observation(name: str, ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray) -> list[Cause]:
+    if _error(ours, theirs) <= SAME:
+        return []
+    about = f"observation {name!r}"
+    if shift := _shift(ours, theirs, episode):
+        return [Cause("stale sensor", about, f"it is that of {shift} steps ago")]
+    if order := _order(ours, theirs):
+        return [Cause("joint order", about, f"its columns match ours in the order {order}")]
+    ratios = _ratios(ours, theirs)
+    if _error(ours * ratios, theirs) <= LIKE:
+        return [Cause("scale", about, f"x {np.median(ratios):.3g}")]
+    if ours.shape[1] % 3 == 0:
+        lengths = [np.linalg.norm(x.reshape(-1, 3), axis=1) for x in (ours, theirs)]
+        if _error(*lengths) <= LIKE:
+            return [Cause("frame", about, "lengths agree, directions do not: it is given in other axes")]
+    if _error(ours - ours.mean(0), theirs - theirs.mean(0)) <= LIKE:
+        return [Cause("offset", about, f"shifted by {np.round((theirs - ours).mean(0), 3).tolist()}")]
+    return [Cause("observation", about, f"{_error(ours, theirs):.0%} off, for no reason that is known here")]
+
+
+def _of_targets(ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray, joints: list[str]) -> Cause:
+    if order := _order(ours, theirs):
+        moved = [joints[a % len(joints)] for a, b in enumerate(order) if a != b]
+        return Cause("joint order", "targets", f"{', '.join(moved)} get those of other joints")
+    if shift := _shift(ours, theirs, episode):
+        return Cause("delay", "targets", f"they are those of {shift} steps ago")
+    middle = ours.mean(0), theirs.mean(0)
+    ratios = _ratios(ours - middle[0], theirs - middle[1])
+    if _error((ours - middle[0]) * ratios, theirs - middle[1]) <= LIKE:
+        if np.abs(ratios - 1.0).max() <= LIKE:
+            return Cause("offset", "targets", "they move as ours do about another default pose")
+        return Cause(
+            "scale", "targets", f"x {ratios[np.abs(ratios - 1.0).argmax()]:.3g} about the default pose"
+        )
+    return Cause(
+        "delay", "targets", f"{_error(ours, theirs):.0%} off, and more as actions change: a filter or a lag"
+    )
+
+
+def _pairs(name: str, trace: Arrays, replay: Arrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a signal as recorded and as replayed, [M, L] each, and the episode of each row.
+
+    Of the lags that an episode may have had, the one that fits is taken.
+    """
+    ours, theirs, episode = [], [], []
+    lags = sorted({key.split("/")[0] for key in replay if "/" in key})
+    for number, recorded in enumerate(trace[f"trace/{name}"]):
+        fits = [replay[f"{lag}/{number}/{name}"] for lag in lags if f"{lag}/{number}/{name}" in replay]
+        length = int(np.argmax(np.append(trace["trace/done"][number].ravel() > 0, True))) + 1
+        flat = recorded[:length].reshape(min(length, len(recorded)), -1)
+        found = [fit[: len(flat)].reshape(len(flat), -1) for fit in fits] or [flat]
+        ours.append(flat)
+        theirs.append(min(found, key=lambda fit: _error(flat, fit)))
+        episode.append(np.full(len(flat), number))
+    return np.concatenate(ours), np.concatenate(theirs), np.concatenate(episode)
+
+
+def _newest(meta: Mapping[str, Any], obs: np.ndarray) -> np.ndarray:
+    """Return the newest frame [..., L] of vectors that hold histories."""
+    columns, stop = [], 0
+    for term in meta["observations"]:
+        stop += term["size"] * term["history_length"]
+        columns += range(stop - term["size"], stop)
+    return obs[..., columns]
+
+
+def _error(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """Return the mean difference of the column that differs most, by the size of what is recorded."""
+    if not len(ours):
+        return 0.0
+    ours, theirs = ours.reshape(len(ours), -1), theirs.reshape(len(theirs), -1)
+    size = np.abs(ours).mean() + 1e-6
+    return float(np.abs(ours - theirs).mean(0).max() / size)
+
+
+def _ratios(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """Return the factor of each column, [L], by least squares; 1 where nothing moves."""
+    power = (ours * ours).sum(0)
+    still = power < 1e-9 * max(float(power.max()), 1e-12)
+    return np.where(still, 1.0, (ours * theirs).sum(0) / np.where(still, 1.0, power))
+
+
+def _order(ours: np.ndarray, theirs: np.ndarray, tolerance: float = LIKE) -> list[int] | None:
+    """Return the order of our columns in which they match theirs, or None if there is no other one that does."""
+    if ours.shape[1] < 2:
+        return None
+    apart = np.abs(theirs[:, :, None] - ours[:, None, :]).mean(0)
+    order = apart.argmin(1)
+    # Columns that are equal, such as targets nobody writes, keep their places.
+    own = np.arange(len(order))
+    order = np.where(apart[own, own] <= apart[own, order] + 1e-9, own, order)
+    is_other = sorted(order) == list(own) and (order != own).any()
+    matches = _error(ours[:, order], theirs) <= tolerance
+    return order.tolist() if is_other and matches else None
+
+
+def _shift(ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray, tolerance: float = LIKE) -> int | None:
+    """Return by how many steps theirs is late, negative where it is early; None where no shift explains it."""
+    best, found = _error(ours, theirs), None
+    for shift in (s for k in range(1, MOST_SHIFT + 1) for s in (k, -k)):
+        late, early = (
+            (slice(shift, None), slice(None, -shift))
+            if shift > 0
+            else (slice(None, shift), slice(-shift, None))
+        )
+        whole = episode[late] == episode[early]
+        error = _error(ours[early][whole], theirs[late][whole])
+        if whole.any() and error <= min(tolerance, 0.3 * best):
+            best, found = error, shift
+    return found

@@ -1,0 +1,210 @@
+"""This module says in plain data what an env does to observations and actions: noise, lags, targets, motors."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from ksim_rl import mdp
+from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
+from ksim_rl.envs.view import EnvView
+from ksim_rl.export.describe import NotDescribedError, describe, joint_names, names_of
+from ksim_rl.mdp.actions import per_joint
+from ksim_rl.scene.actuators import (
+    Actuator,
+    DCMotorActuator,
+    DelayedActuator,
+    IdealPDActuator,
+)
+from ksim_rl.scene.actuators.builtin import BuiltinActuator
+from ksim_rl.scene.actuators.joint_drives import driven_joints
+from ksim_rl.transforms import ActionClip, ActionDelay, ActionLowPass, DelayCfg
+from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, history_cfg
+from ksim_rl.transforms.low_pass import smoothing
+from ksim_rl.transforms.noise.cfg import NoiseCfg, per_dim
+
+Plain = dict[str, Any]
+UNITS = {
+    "joint_pos": "rad or m", "joint_pos_rel": "rad or m", "joint_vel": "rad/s or m/s", "root_lin_vel": "m/s",
+    "root_ang_vel": "rad/s", "projected_gravity": "1", "action": "1", "body_pos": "m", "site_height": "m",
+    "height_scan": "m", "time": "s", "joint_effort": "N m or N", "contact": "N, s or 1",
+}  # fmt: skip
+
+
+def noise(cfg: NoiseCfg | None, size: int) -> Plain | None:
+    """Return what a noise adds to `size` numbers; `by_level` counts as full."""
+    if cfg is None:
+        return None
+    offset, spread = cfg.affine(size)
+    found = {"draw": cfg.draw.value, "offset": offset, "spread": spread, "operation": cfg.operation}
+    walk, grain = (per_dim(name, getattr(cfg, name), size) for name in ("walk_std", "resolution"))
+    errors = {"walk_std": walk, "resolution": grain, "dropout": cfg.dropout, "lost": cfg.lost}
+    return {**found, "bias": noise(cfg.bias, size), **errors}
+
+
+def lag(cfg: DelayCfg | None, shared: str | None = None) -> Plain | None:
+    """Return a lag in env steps."""
+    if cfg is None:
+        return None
+    draws = {"resample_every": cfg.resample_every, "hold_probability": cfg.hold_probability}
+    return {"min": cfg.min_lag, "max": cfg.max_lag, **draws, "shared": shared, "initial": None}
+
+
+def observations(env: ManagerBasedRlEnv, groups: Sequence[str]) -> list[Plain]:
+    """Return the terms of groups, in the order in which a policy reads them.
+
+    Raises NotDescribedError, naming the term, where it has no description.
+    """
+    found = []
+    for group in groups:
+        cfg: ObservationGroupCfg = env.cfg.observations[group]
+        for name, term in cfg.terms.items():
+            try:
+                value = describe(term.term, env.view)
+            except NotDescribedError as error:
+                raise NotDescribedError(
+                    f"task.observations.{group}.terms.{name}: {error}; or leave the term out"
+                ) from None
+            size = env.observation_spec["obs", name].shape[-1]
+            low, high = term.clip or (None, None)
+            frames = history_cfg(term.history if term.history is not None else cfg.history)
+            leaf = value if isinstance(value, dict) else {}
+            delay = lag(term.delay) or lag(cfg.delay, shared=group)
+            found.append(
+                {
+                    "name": name,
+                    "size": size,
+                    "value": value,
+                    "units": UNITS.get(leaf.get("quantity", ""), "see value"),
+                    "frame": leaf.get("frame", leaf.get("sensor", "")),
+                    "noise": noise(term.noise if cfg.enable_noise else None, size),
+                    "clip": [low, high],
+                    "scale": per_dim("scale", term.scale, size),
+                    "delay": delay,
+                    "history_length": frames.length if frames else 1,
+                    "history_stride": frames.stride if frames else 1,
+                }
+            )
+    return found
+
+
+def action_chain(cfg: ManagerBasedRlEnvCfg) -> list[Plain]:
+    """Return what happens to an action on its way to the action terms, in this order."""
+    found: list[Plain] = []
+    for name, transform in reversed(list(cfg.transforms.items())):
+        kind, given = transform.transform, transform.arguments
+        if kind is ActionDelay:
+            found.append({"kind": "delay", **(lag(given["delay"]) or {}), "initial": given["initial"]})
+        elif kind is ActionLowPass:
+            found.append({"kind": "low_pass", "alpha": given["alpha"], "initial": given["initial"]})
+        elif kind is ActionClip:
+            low, high = given["clip"]
+            found.append({"kind": "clip", "low": low, "high": high})
+        elif not kind.__name__.startswith("Reward"):
+            raise NotDescribedError(
+                f"task.transforms.{name}: {kind.__name__} has no description: an export takes ActionDelay, "
+                "ActionLowPass and ActionClip; use the fields of observation groups and action terms for the others"
+            )
+    return found
+
+
+def actions(env: ManagerBasedRlEnv) -> list[Plain]:
+    """Return what the columns of an action ask for, by name of the joint or actuator.
+
+    Raises NotDescribedError, naming the term, for one of a kind that this room does not know.
+    """
+    found, start = [], 0
+    for name, term in env.cfg.actions.items():
+        stop = start + env.action_manager.sizes[name]
+        found.append({"name": name, "columns": [start, stop], **_action(term, name, env.view)})
+        start = stop
+    return found
+
+
+def _action(term: Any, name: str, view: EnvView) -> Plain:
+    kinds = {
+        mdp.JointPositionAction: "pos",
+        mdp.JointPositionVelocityAction: "pos",
+        mdp.RelativeJointPositionAction: "pos",
+        mdp.JointVelocityAction: "vel",
+        mdp.JointEffortAction: "effort",
+    }
+    if type(term) is mdp.ActuatorAction:
+        names = names_of(view, "actuator", term.actuators)
+        limits = view.ctrl_limits_L2[view.resolver.index("actuator", term.actuators)].T.tolist()
+        plain = {"clip": None, "tanh": False, "scale": term.scale, "offset": 0.0, "alpha": None}
+        return {"kind": "ctrl", "names": names, "limits": limits, **plain}
+    if type(term) not in kinds:
+        raise NotDescribedError(f"task.actions.{name}: {type(term).__name__} has no description")
+    names, kind = joint_names(view, term.joints), kinds[type(term)]
+    alpha = smoothing(term.cutoff_hz, view.step_dt) if term.cutoff_hz else None
+    shared = {"clip": term.clip, "tanh": term.tanh, "alpha": alpha}
+    offset = _numbers(view, term, "offset")
+    if getattr(term, "use_default_offset", False):
+        default = view.joints(term.joints).default_pos_EL[0].tolist()
+        offset = [a + b for a, b in zip(offset, default, strict=True)]
+    limits_K2 = view.targets.limits("effort", term.joints) if kind == "effort" else None
+    found = {
+        "kind": kind,
+        "names": names,
+        "relative": isinstance(term, mdp.RelativeJointPositionAction),
+        "limits": [-1e30, 1e30] if limits_K2 is None else limits_K2.T.tolist(),
+        **shared,
+        "scale": _numbers(view, term, "scale"),
+        "offset": offset,
+    }
+    if isinstance(term, mdp.JointPositionVelocityAction):
+        found["velocity"] = {**shared, "scale": _numbers(view, term, "velocity_scale"), "offset": 0.0}
+    return found
+
+
+def _numbers(view: EnvView, term: Any, field: str) -> list[float]:
+    value: Any = per_joint(view, field, getattr(term, field), term.joints)
+    return [value] * len(view.joints(term.joints)) if isinstance(value, float) else value.tolist()
+
+
+def actuators(env: ManagerBasedRlEnv) -> list[Plain]:
+    """Return what drives the joints that have targets: laws that run before each substep, or MuJoCo's own."""
+    found, view = [], env.view
+    explicit: set[str] = set()
+    for name, robot in env.cfg.scene.entities.items():
+        prefix = view.entity(name).prefix
+        own = [n.removeprefix(prefix) for n in joint_names(view, None) if n.startswith(prefix)]
+        for actuator, driven in driven_joints(getattr(robot, "actuators", ()), own):
+            joints = [prefix + joint for joint in driven]
+            if actuator.is_explicit:
+                found.append(_law(actuator, joints, view))
+                explicit |= set(joints)
+    for kind in ("pos", "vel", "effort"):
+        joints = [
+            n
+            for spec in actions(env)
+            if spec["kind"] == kind or (kind == "vel" and "velocity" in spec)
+            for n in spec["names"]
+            if n not in explicit
+        ]
+        if joints:
+            plain = {"kind": "builtin", "takes": [kind], "numbers": {}, "delay": None}
+            found.append({"joints": joints, "actuators": [actuator_of(view, n) for n in joints], **plain})
+    return found
+
+
+def _law(actuator: Actuator, joints: list[str], view: EnvView) -> Plain:
+    delay = None
+    if isinstance(actuator, DelayedActuator):
+        delay = lag(DelayCfg(min_lag=actuator.min_lag, max_lag=actuator.max_lag))
+        actuator = actuator.actuator
+    kinds = {IdealPDActuator: "ideal_pd", DCMotorActuator: "dc_motor"}
+    kind = "builtin" if isinstance(actuator, BuiltinActuator) else kinds.get(type(actuator))
+    if kind is None:
+        raise NotDescribedError(
+            f"actuator {type(actuator).__name__} of {joints[0]!r} has no description: an export takes MuJoCo's "
+            "actuators, IdealPDActuator and DCMotorActuator, delayed or not"
+        )
+    # JSON has no infinity.
+    numbers = {n: [min(value, 1e30)] * len(joints) for n, value in actuator.params.items()}
+    found = {"kind": kind, "joints": joints, "takes": sorted(actuator.takes), "numbers": numbers}
+    return {**found, "actuators": [actuator_of(view, n) for n in joints], "delay": delay}
+
+
+def actuator_of(view: EnvView, joint: str) -> str:
+    """Return the name of a joint's only actuator."""
+    return view.resolver.names("actuator")[view.targets.motor(joint_names(view, None).index(joint))]

@@ -1,0 +1,300 @@
+"""This module writes the folder that takes a policy out of the library: the policy, its robot, and what they mean."""
+
+import dataclasses
+import importlib.util
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ksim_rl.envs import ManagerBasedRlEnv
+from ksim_rl.envs.contract import part
+from ksim_rl.export import controls, policy
+from ksim_rl.export.describe import NotDescribedError, describe, joint_names
+from ksim_rl.export.record import Recording
+from ksim_rl.export.robot import write_robot
+from ksim_rl.physics import prepare_spec
+from ksim_rl.runs import record
+from ksim_rl.scene.scene import build_spec
+from ksim_rl.scene.sensors import ContactSensor
+from ksim_rl.trainers import checkpoint, load_policy
+from ksim_rl.trainers.build import EVALUATION_SEED_OFFSET, UNLIMITED_EPISODE_STEPS, build_env
+from ksim_rl.trainers.run_folder import Policy
+
+STANDALONE = Path(__file__).parent / "standalone"
+TRACED, TRACED_STEPS = 4, 150
+EXTRA = ("onnx", "onnxruntime", "onnxscript")
+README = """# {task}, iteration {iteration}
+
+| file | what is in it |
+|---|---|
+| `policy.onnx` | `obs` [batch, {obs_dim}] to `actions` [batch, {num_actions}], normalization inside{memory} |
+| `policy.pt2` | the same for `torch.export.load` |
+| `robot.xml` | the robot's model; actuators stand in the order of the actions |
+| `export.json` | names, order, units, scales, gains, rates, noise, lags; how each observation and reward is computed |
+| `runner.py` | `python runner.py --episodes 100` runs it on MuJoCo's C engine; needs numpy, onnxruntime, mujoco |
+| `episodes.npz`, `trace.npz` | starts, commands and pushes of recorded episodes, and steps to compare with |
+
+The policy's actions equal the trained network's within {difference:.1e} on {checked} observations. One step lasts
+{step_dt:g} s, of {decimation} physics steps. Joints, in the order of actions: {joints}.
+"""
+
+
+def export(
+    run: Path,
+    folder: Path | None = None,
+    *,
+    episodes: int = 100,
+    seed: int | None = None,
+    device: str = "cpu",
+    note: Callable[[str], None] = print,
+) -> Path:
+    """Write the policy of a run into `folder`, `<run>/export` by default, and return it.
+
+    `episodes` are recorded from `seed` for `sim2sim` to compare with; 0 leaves them out. Raises ValueError where the
+    policy or an observation term cannot be written down, naming it and what to do, or the files differ from the policy.
+    """
+    if episodes < 0:
+        raise ValueError(f"--episodes {episodes}: expected 0 or more")
+    found = checkpoint.latest(run)
+    run_folder = found.absolute().parent.parent
+    sessions = record.read(run_folder)
+    trained_with = {}
+    if sessions:
+        commit = sessions[-1].code.get("ksim_rl", {}).get("commit")
+        trained_with = {"commit": commit, "versions": dict(sessions[-1].versions)}
+    return export_policy(
+        load_policy(run, device=device),
+        run_folder / "export" if folder is None else folder,
+        run_path=str(found),
+        trained_with=trained_with,
+        episodes=episodes,
+        seed=seed,
+        note=note,
+    )
+
+
+def export_policy(
+    trained: Policy,
+    folder: Path,
+    *,
+    run_path: str = "",
+    trained_with: Mapping[str, Any] | None = None,
+    episodes: int = 100,
+    seed: int | None = None,
+    note: Callable[[str], None] = print,
+) -> Path:
+    """Write a policy into a folder; see `export`. `trained_with` holds commit and versions."""
+    missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ValueError(f"no package {missing[0]!r}: pip install 'ksim_rl[export]'")
+    cfg = dataclasses.replace(trained.cfg, task=dataclasses.replace(trained.cfg.task, curriculum={}))
+    seed = cfg.seed + EVALUATION_SEED_OFFSET if seed is None else seed
+    env = build_env(cfg, num_envs=max(episodes, TRACED), seed=seed)
+    ours = part(env, ManagerBasedRlEnv)
+    assert ours is not None  # the env of a config is ours
+    groups: list[Any] = cfg.modules.observation_keys("actor")
+    terms = {str(group): controls.observations(ours, [str(group)]) for group in groups}
+    meta = _metadata(ours, [term for of_group in terms.values() for term in of_group], note)
+    columns = {
+        group: [
+            policy.Column(
+                name=term["name"],
+                size=term["size"],
+                length=term["history_length"],
+                stride=term["history_stride"],
+            )
+            for term in terms[str(group)]
+        ]
+        for group in groups
+    }
+    exported = policy.ExportedPolicy(trained.actor.cpu().eval(), columns)
+    folder.mkdir(parents=True, exist_ok=True)
+    note("writing policy.onnx and policy.pt2")
+    policy.write(exported, folder)
+    difference = policy.greatest_difference(exported, folder / "policy.onnx")
+    if not difference <= policy.TOLERANCE:
+        (folder / "policy.onnx").unlink()
+        raise ValueError(
+            f"policy.onnx differs from the policy by {difference:.2g}: expected at most {policy.TOLERANCE:g}; weights "
+            "or observations that large lose digits in float32"
+        )
+    first = [name for law in meta["actuators"] for name in law["actuators"]]
+    asked = [name for action in meta["actions"] for name in action["names"]]
+    by_joint = dict(zip((j for law in meta["actuators"] for j in law["joints"]), first, strict=True))
+    spec = build_spec(cfg.task.scene)
+    cfg.task.sim.apply_to(spec)
+    prepare_spec(spec, [])
+    mj_model = ours.world.mj_model
+    order = write_robot(
+        spec, mj_model, list(dict.fromkeys(by_joint.get(name, name) for name in asked)), folder / "robot.xml"
+    )
+    states = [dataclasses.asdict(state) for state in exported.states]
+    own = {"inputs": exported.input_names, "outputs": exported.output_names, "states": states}
+    own |= {"num_actions": ours.action_manager.size, "obs_dim": exported.obs_dim, "difference": difference}
+    meta |= {"policy": own, "task": cfg.task_name, "iteration": trained.iteration, "run_path": run_path}
+    meta |= {"commit": None, "versions": {}, **(trained_with or {}), "seed": seed, "ours": None}
+    if episodes:
+        note(f"recording {episodes} episodes for sim2sim")
+        shared: dict[str, Any] = {
+            "groups": groups,
+            "joints": meta["joints"]["names"],
+            "order": order,
+            "seed": seed,
+        }
+        shared["params"] = sorted({name for law in meta["actuators"] for name in law["numbers"]})
+        actor, steps = trained.actor, ours.max_episode_length or UNLIMITED_EPISODE_STEPS
+        recorded = Recording(env, ours, actor, steps=steps, **shared)
+        figures = recorded.figures[:episodes]
+        meta["ours"] = {name: [one[name] for one in figures] for name in figures[0]}
+        np.savez_compressed(folder / "episodes.npz", **recorded.arrays)  # pyright: ignore
+        env.eval()
+        traced = Recording(env, ours, actor, steps=min(steps, TRACED_STEPS), traces=TRACED, **shared)
+        rates = {"trace/dt": np.array(ours.physics_dt), "trace/decimation": np.array(ours.cfg.decimation)}
+        np.savez_compressed(folder / "trace.npz", **traced.arrays, **rates)  # pyright: ignore
+    env.close(raise_if_closed=False)
+    _attach(folder / "policy.onnx", meta)
+    (folder / "export.json").write_text(json.dumps(meta, indent=1, allow_nan=False) + "\n")
+    (folder / "runner.py").write_text(runner_source())
+    (folder / "README.md").write_text(
+        README.format(
+            **{**meta, **own, "joints": ", ".join(meta["joint_names"])},
+            memory="; " + ", ".join(exported.input_names[1:]) + " carry its memory" if states else "",
+            checked=policy.CHECKED,
+        )
+    )
+    return folder
+
+
+def runner_source() -> str:
+    """Return the text of `runner.py`: the modules of the folder `standalone` as one."""
+    signals, runner = ((STANDALONE / f"{name}.py").read_text() for name in ("signals", "runner"))
+    doc, body = re.split(r'(?<=\n""")\n', runner, maxsplit=1)
+    body = re.sub(r"from ksim_rl[^\n]*\n", "", body)
+    return doc + "\n" + re.sub(r'\A""".*?"""\n', "", signals, flags=re.DOTALL) + "\n\n" + body
+
+
+def _metadata(
+    ours: ManagerBasedRlEnv, terms: list[dict[str, Any]], note: Callable[[str], None]
+) -> dict[str, Any]:
+    """Return what the env is made of; rewards, metrics and terminations without a description are left out."""
+    cfg, view = ours.cfg, ours.view
+    actions, laws = controls.actions(ours), controls.actuators(ours)
+    asked = list(dict.fromkeys(n for action in actions if action["kind"] != "ctrl" for n in action["names"]))
+    names = [*asked, *(n for n in joint_names(view, None) if n not in asked)]
+    left_out: list[str] = []
+
+    def described(kind: str, some: Any) -> dict[str, Any]:
+        found = {}
+        for name, term in some.items():
+            try:
+                found[name] = describe(term, view)
+            except NotDescribedError as error:
+                left_out.append(f"{kind}.{name}")
+                note(f"task.{kind}.{name} is left out of sim2sim: {error}")
+        return found
+
+    weights = {name: term for name, term in cfg.rewards.items() if term.weight != 0.0}
+    ends = {name: term for name, term in cfg.terminations.items() if type(term).__name__ != "TimeOut"}
+    means = {name: term for name, term in cfg.metrics.items() if term.reduce == "mean"}
+    gains = _gains(ours, laws, names)
+    by_term = [view.joints(n).default_pos_EL[0].tolist() for n in (asked, names)] if names else [[], []]
+    scales = [s for a in actions for s in np.broadcast_to(a["scale"], len(a["names"])).tolist()]
+    sensors = {n: s for n, s in cfg.scene.sensors.items() if isinstance(s, ContactSensor)}
+    return {
+        "format": 1,
+        "joint_names": asked,
+        "joint_stiffness": gains[0][: len(asked)],
+        "joint_damping": gains[1][: len(asked)],
+        "default_joint_pos": by_term[0],
+        "action_scale": scales,
+        "command_names": list(cfg.commands),
+        "observation_names": [term["name"] for term in terms],
+        "observation_history_lengths": [term["history_length"] for term in terms],
+        "joints": {"names": names, "default_pos": by_term[1], "limits": _limits(ours, names)},
+        "observations": terms,
+        "actions": actions,
+        "action_chain": controls.action_chain(cfg),
+        "actuators": laws,
+        "commands": {
+            name: {"size": value.shape[-1], "kind": type(cfg.commands[name]).__name__}
+            for name, value in ours.command_manager.values.items()
+        },
+        "contacts": {
+            name: {
+                "elements": [f"{name}_{e}" for e in s.elements(view.resolver.names("geom" if s.geoms else "body"))],
+                "strongest": s.reduce == "strongest",
+                "every_substep": s.every_substep,
+            }
+            for name, s in sensors.items()
+        },
+        "rewards": {
+            name: {"weight": weights[name].weight, "value": v} for name, v in described("rewards", weights).items()
+        },
+        "terminations": {
+            name: {"time_out": ends[name].time_out, "value": v} for name, v in described("terminations", ends).items()
+        },
+        "metrics": described("metrics", means),
+        "left_out": left_out,
+        "scale_rewards_by_dt": cfg.scale_rewards_by_dt,
+        "physics_dt": ours.physics_dt,
+        "decimation": cfg.decimation,
+        "step_dt": ours.step_dt,
+        "episode_steps": ours.max_episode_length if any(t.time_out for t in cfg.terminations.values()) else 0,
+        "frames": "x forward, y left, z up; quaternions (w, x, y, z); root velocities and gravity in its own axes",
+    }  # fmt: skip
+
+
+def _gains(
+    ours: ManagerBasedRlEnv, laws: Sequence[Any], names: Sequence[str]
+) -> tuple[list[float], list[float]]:
+    """Return stiffness and damping by joint: of laws their numbers, of MuJoCo's servos the model's."""
+    model, found = ours.world.mj_model, dict.fromkeys(names, (0.0, 0.0))
+    for law in laws:
+        for k, (joint, actuator) in enumerate(zip(law["joints"], law["actuators"], strict=True)):
+            of_model = model.actuator(actuator)
+            stiffness, damping = float(-of_model.biasprm[1]), float(-of_model.biasprm[2])
+            if "stiffness" in law["numbers"] and law["kind"] != "builtin":
+                stiffness, damping = (law["numbers"][name][k] for name in ("stiffness", "damping"))
+            found[joint] = (stiffness, damping)
+    return [found[n][0] for n in names], [found[n][1] for n in names]
+
+
+def _limits(ours: ManagerBasedRlEnv, names: Sequence[str]) -> dict[str, Any]:
+    """Return soft limits of position, and the model's limits of effort, by joint; null where there is none."""
+    model, limits = (
+        ours.world.mj_model,
+        ours.view.joints(list(names)).soft_limits_L2.tolist() if names else [],
+    )
+    effort = {}
+    for i in range(model.nu):
+        if model.actuator_trntype[i] == 0 and model.actuator_forcelimited[i]:
+            effort[model.joint(int(model.actuator_trnid[i, 0])).name] = float(model.actuator_forcerange[i, 1])
+    finite = [[None if not np.isfinite(edge) else edge for edge in pair] for pair in limits]
+    return {"position": finite, "effort": [effort.get(name) for name in names]}
+
+
+def _attach(path: Path, meta: dict[str, Any]) -> None:
+    """Put what controllers look for into the ONNX file: lists as text with commas, and all of ours as JSON."""
+    import onnx  # an extra
+
+    model = onnx.load(path, load_external_data=False)
+    keys = (
+        "run_path",
+        "joint_names",
+        "joint_stiffness",
+        "joint_damping",
+        "default_joint_pos",
+        "action_scale",
+    )
+    keys += ("command_names", "observation_names", "observation_history_lengths", "physics_dt", "decimation")
+    keys += ("step_dt", "task", "iteration", "commit")
+    for key in keys:
+        entry = model.metadata_props.add()
+        entry.key = key
+        value = meta[key]
+        entry.value = ",".join(map(str, value)) if isinstance(value, list) else str(value)
+    onnx.save(model, path)

@@ -1,0 +1,323 @@
+"""This module turns a policy into a file: its deterministic action, with normalization, history and memory inside."""
+
+import logging
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from tensordict import TensorDict
+from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+from torch.nn import functional
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ksim_rl.modules.actor import PARAMETERS, MixedHead
+from ksim_rl.modules.network import ObservationNormalizer, side_by_side
+from ksim_rl.modules.recurrent import RESET_KEY, RecurrentModule
+
+TOLERANCE, CHECKED, ROWS = 1e-5, 10_000, 100
+OPSET = 18
+
+
+@dataclass(frozen=True, kw_only=True)
+class StateSpec:
+    """What the policy carries from step to step: an input [batch, *shape] and the output that feeds it next.
+
+    An episode starts with zeros, or with its first frame, columns [start, stop) of the observation, in all places.
+    """
+
+    input: str
+    output: str
+    shape: tuple[int, ...]
+    starts_with: Literal["zeros", "frame"]
+    columns: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    """One term of what the policy reads: `size` numbers in a frame, of which `length` stand `stride` steps apart."""
+
+    name: str
+    size: int
+    length: int = 1
+    stride: int = 1
+
+
+class ExportedPolicy(nn.Module):
+    """A policy as a function of tensors: `obs` [batch, L] and its states to the actions [batch, A] and the next states.
+
+    `obs` is the newest frame of every term, side by side; `groups` are the terms of each observation that the actor
+    reads. Raises ValueError where the actor has a part that has no such form.
+    """
+
+    def __init__(self, actor: TensorDictModuleBase, groups: Mapping[Any, Sequence[Column]]) -> None:
+        super().__init__()
+        self.actor = actor
+        self.parts = list(_parts(actor))
+        self.groups = groups
+        mixed = _mixed_head(self.parts[-1])
+        self.action_keys: list[Any] = mixed.action_keys if mixed else ["action"]
+        self.states, start = [], 0
+        for column in self.columns:
+            if column.length > 1:
+                shape = ((column.length - 1) * column.stride, column.size)
+                name = f"history_{column.name}"
+                self.states.append(
+                    StateSpec(
+                        input=f"{name}_in",
+                        output=f"{name}_out",
+                        shape=shape,
+                        starts_with="frame",
+                        columns=(start, start + column.size),
+                    )
+                )
+            start += column.size
+        self.obs_dim = start
+        for part in self.parts:
+            if isinstance(part, RecurrentModule):
+                shape = (part.cfg.num_layers, part.cfg.hidden_dim)
+                self.states += [
+                    StateSpec(
+                        input=f"{key[-1]}_in", output=f"{key[-1]}_out", shape=shape, starts_with="zeros"
+                    )
+                    for key in part.state_keys
+                ]
+
+    @property
+    def columns(self) -> list[Column]:
+        """The terms of a frame, in order."""
+        return [column for columns in self.groups.values() for column in columns]
+
+    @property
+    def input_names(self) -> list[str]:
+        """Names of the inputs: "obs", then the states."""
+        return ["obs", *(state.input for state in self.states)]
+
+    @property
+    def output_names(self) -> list[str]:
+        """Names of the outputs: "actions", then the next states."""
+        return ["actions", *(state.output for state in self.states)]
+
+    def forward(
+        self, obs_BL: Float[Tensor, "B L"], *states: Float[Tensor, "B *?S"]
+    ) -> tuple[Float[Tensor, "B *?M"], ...]:
+        """Return the actions and the next states."""
+        given, after = list(states), []
+        values: dict[Any, Tensor] = {}
+        start = 0
+        for group, columns in self.groups.items():
+            terms = []
+            for column in columns:
+                frame = obs_BL[:, start : start + column.size]
+                start += column.size
+                if column.length > 1:
+                    frames = torch.cat((given.pop(0), frame[:, None]), 1)
+                    after.append(frames[:, 1:])
+                    frame = frames[:, :: column.stride].flatten(1)
+                terms.append(frame)
+            values[group] = torch.cat(terms, -1)
+        actions: list[Tensor] = []
+        for part in self.parts:
+            if isinstance(part, RecurrentModule):
+                features, kept = _recurrent(part, values, [given.pop(0) for _ in part.state_keys])
+                values[part.feature_key] = features
+                after += kept
+            elif isinstance(part, ProbabilisticTensorDictModule):
+                actions = _best(part, values)
+            else:
+                found = part.module(*(values[key] for key in part.in_keys))
+                found = found if isinstance(found, tuple) else (found,)
+                values |= dict(zip(part.out_keys, found, strict=True))
+                actions = [values["action"]] if "action" in part.out_keys else []
+        return torch.cat([_row(action) for action in actions], -1), *after
+
+
+def _parts(module: Any) -> Iterator[Any]:
+    """Return the parts of nested sequences in the order in which they run."""
+    inner = getattr(module, "module", None)
+    if isinstance(module, RecurrentModule | ProbabilisticTensorDictModule):
+        yield module
+    elif isinstance(inner, nn.ModuleList | list | tuple):
+        for part in inner:
+            yield from _parts(part)
+    elif isinstance(module, TensorDictModule) and isinstance(inner, nn.Module):
+        yield module
+    else:
+        raise ValueError(
+            f"the policy holds a {type(module).__name__}: an export takes TensorDictModules, RecurrentModules and "
+            "distributions one after another; make the policy such a sequence"
+        )
+
+
+def _best(part: Any, values: dict[Any, Tensor]) -> list[Tensor]:
+    """Return the deterministic action of each distribution, as `ExplorationType.DETERMINISTIC` does."""
+    if mixed := _mixed_head(part):
+        heads = zip(mixed.action_keys, mixed.heads, strict=True)
+        return [_of_head(head, values, (PARAMETERS, *_path(key))) for key, head in heads]
+    parameters = {str(key): values[key] for key in part.in_keys}
+    return [part.distribution_class(**parameters, **part.distribution_kwargs).deterministic_sample]
+
+
+def _mixed_head(part: Any) -> MixedHead | None:
+    owner = getattr(getattr(part, "distribution_class", None), "__self__", None)
+    return owner if isinstance(owner, MixedHead) else None
+
+
+def _of_head(head: Any, values: dict[Any, Tensor], path: tuple[Any, ...]) -> Tensor:
+    return head.distribution(
+        **{name: values[(*path, name)] for name in head.parameter_names}
+    ).deterministic_sample
+
+
+def _path(key: Any) -> tuple[Any, ...]:
+    return (key,) if isinstance(key, str) else tuple(key)
+
+
+def _row(action: Tensor) -> Tensor:
+    return (action.flatten(1) if action.ndim > 1 else action[:, None]).float()
+
+
+def _recurrent(
+    part: RecurrentModule, values: dict[Any, Tensor], state: list[Tensor]
+) -> tuple[Tensor, list[Tensor]]:
+    """Return the features and the state [B, N, H] after one step, by the formulas of `torch.nn.LSTM` and `GRU`."""
+    network, cfg = part.module, part.cfg
+    features = side_by_side([values[key] for key in part.obs_keys])
+    features = features if network.normalizer is None else network.normalizer(features)
+    after: list[tuple[Tensor, ...]] = []
+    for layer in range(cfg.num_layers):
+        weights = [
+            network.get_parameter(f"{name}_l{layer}")
+            for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+        ]
+        x = functional.linear(features, weights[0], weights[2])
+        h = functional.linear(state[0][:, layer], weights[1], weights[3])
+        if cfg.kind == "lstm":
+            i, f, g, o = (x + h).chunk(4, -1)
+            cell = f.sigmoid() * state[1][:, layer] + i.sigmoid() * g.tanh()
+            features = o.sigmoid() * cell.tanh()
+            after.append((features, cell))
+        else:
+            (rx, zx, nx), (rh, zh, nh) = x.chunk(3, -1), h.chunk(3, -1)
+            r, z = (rx + rh).sigmoid(), (zx + zh).sigmoid()
+            n = (nx + r * nh).tanh()
+            features = n + z * (state[0][:, layer] - n)
+            after.append((features,))
+    return features, [torch.stack(parts, 1) for parts in zip(*after, strict=True)]
+
+
+def write(policy: ExportedPolicy, folder: Path) -> None:
+    """Write `policy.onnx` and `policy.pt2`; their batch has any size."""
+    policy = policy.to("cpu").eval()
+    # Two rows: a batch of one would be taken for a constant.
+    example = (torch.zeros(2, policy.obs_dim), *(torch.zeros(2, *state.shape) for state in policy.states))
+    batch = torch.export.Dim("batch", min=1, max=2**20)
+    with torch.no_grad(), _quiet():
+        program = torch.export.export(policy, example, dynamic_shapes=_dynamic(policy, batch))
+        torch.export.save(program, folder / "policy.pt2")
+        onnx = torch.onnx.export(
+            program,
+            args=example,
+            input_names=policy.input_names,
+            output_names=policy.output_names,
+            opset_version=OPSET,
+            dynamo=True,
+            verbose=False,
+        )
+        assert onnx is not None
+        onnx.save(folder / "policy.onnx")
+
+
+def _dynamic(policy: ExportedPolicy, batch: Any) -> tuple[Any, ...]:
+    # One entry per parameter of `forward`; the states are a tuple of their own.
+    states = tuple({0: batch} for _ in policy.states)
+    return ({0: batch}, states) if states else ({0: batch},)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Leave out what the exporter says about its own workings."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)
+
+
+def greatest_difference(policy: ExportedPolicy, path: Path, *, seed: int = 0) -> float:
+    """Return the greatest difference of an ONNX file's actions from the actor's, over `CHECKED` observations.
+
+    They are drawn about the statistics of the policy's normalizer, in episodes of 100 steps that carry the states. The
+    actor itself is asked through TensorDicts, with histories put together here.
+    """
+    import onnxruntime  # an extra
+
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    draws, worst = np.random.default_rng(seed), 0.0
+    mean, std = _statistics(policy)
+    carried: dict[Any, Tensor] = {}
+    states: list[np.ndarray] = []
+    frames: list[np.ndarray] = []
+    for step in range(CHECKED // ROWS):
+        frames.append((mean + std * draws.standard_normal((ROWS, policy.obs_dim))).astype(np.float32))
+        if not step:
+            states = [_first(state, frames[0]) for state in policy.states]
+        feed = dict(zip(policy.input_names, [frames[-1], *states], strict=True))
+        actions, *states = (np.asarray(value) for value in session.run(policy.output_names, feed))
+        asked = TensorDict({RESET_KEY: torch.full((ROWS, 1), not step)}, batch_size=[ROWS])
+        start = 0
+        for group, columns in policy.groups.items():
+            terms = []
+            for column in columns:
+                back = [column.stride * k for k in reversed(range(column.length))]
+                terms += [frames[max(step - k, 0)][:, start : start + column.size] for k in back]
+                start += column.size
+            asked[group] = torch.from_numpy(np.concatenate(terms, -1))
+        for part in policy.parts:
+            if isinstance(part, RecurrentModule):
+                for key, zero in zip(part.state_keys, _zeros(part), strict=True):
+                    asked[key] = carried.get(key, zero)
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            answer = policy.actor(asked)
+        carried = {
+            key: answer["next", *key] for part in policy.parts for key in getattr(part, "state_keys", ())
+        }
+        wanted = torch.cat([_row(answer[key]) for key in policy.action_keys], -1).numpy()
+        # Also where one of the two is NaN.
+        difference = np.abs(actions - wanted).max()
+        worst = max(worst, float("inf") if np.isnan(difference) else float(difference))
+    return worst
+
+
+def _statistics(policy: ExportedPolicy) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and std of one frame, [L] each; 0 and 1 without a normalizer that covers it."""
+    mean, std = np.zeros(policy.obs_dim), np.ones(policy.obs_dim)
+    for module in policy.actor.modules():
+        whole = sum(column.size * column.length for column in policy.columns)
+        if isinstance(module, ObservationNormalizer) and module.dim == whole:
+            newest, stop = [], 0
+            for column in policy.columns:
+                stop += column.size * column.length
+                newest += range(stop - column.size, stop)
+            mean = module.mean.detach().cpu().double().numpy()[newest]
+            std = module.var.detach().cpu().double().sqrt().clamp(min=1e-3).numpy()[newest]
+    return mean, std
+
+
+def _first(state: StateSpec, frame: np.ndarray) -> np.ndarray:
+    if state.columns is None:
+        return np.zeros((len(frame), *state.shape), np.float32)
+    return np.repeat(frame[:, None, slice(*state.columns)], state.shape[0], 1)
+
+
+def _zeros(part: RecurrentModule) -> list[Tensor]:
+    return [torch.zeros(ROWS, part.cfg.num_layers, part.cfg.hidden_dim) for _ in part.state_keys]

@@ -1,0 +1,142 @@
+"""This module records episodes of a policy in our own physics, so that another simulator can run the same ones."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+
+from ksim_rl.envs import ManagerBasedRlEnv
+from ksim_rl.scene.sensors import ContactSensor
+
+Arrays = dict[str, np.ndarray]
+
+
+class Recording:
+    """Episodes of the envs `["E"]`, one in each, with deterministic actions.
+
+    `arrays` replay them: `start/...` [E, ...], `command/...` [E, steps + 1, K], which go on after an episode's end, and
+    `pushes` [N, 2 + nv] (env, step, change of velocity); with `traces`, `trace/...` [E, steps, ...] too. `figures` hold
+    return, length, falls, terms of reward, metrics, mean torques and shares of contact of each episode. Joints and
+    actuators stand in the order of `joints` and `order`; `params` name the numbers of motor models.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        ours: ManagerBasedRlEnv,
+        actor: TensorDictModuleBase,
+        *,
+        steps: int,
+        groups: Sequence[Any],
+        joints: Sequence[str],
+        params: Sequence[str],
+        order: Sequence[int],
+        seed: int,
+        traces: int = 0,
+    ) -> None:
+        self._ours, self._pushes, self._now = ours, [], 0
+        self._joints, every = list(joints), list(ours.view.joints().names)
+        self._columns = [every.index(name) for name in joints]
+        sensors = ours.cfg.scene.sensors.items()
+        self._sensors = [name for name, sensor in sensors if isinstance(sensor, ContactSensor)]
+        self._seen: dict[str, list[np.ndarray]] = {}
+        self._sums: dict[str, Tensor] = {}
+        self._running_E = torch.ones(ours.num_envs, dtype=torch.bool, device=ours.device)
+        run_events = ours.event_manager.step
+        ours.event_manager.step = lambda: self._watch(run_events)  # type: ignore[method-assign]
+        try:
+            env.set_seed(seed)
+            current = env.reset()
+            self.arrays = self._start(order, params)
+            self._keep("command", ours.command_manager.values)
+            with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+                for self._now in range(steps):
+                    if traces:
+                        obs = torch.cat([current[group] for group in groups], -1)
+                        self._keep(
+                            "trace", {"obs": obs, "qpos": ours.world.qpos_EL, "qvel": ours.world.qvel_EL}
+                        )
+                    stepped = env.step(actor(current.copy()))
+                    self._add(stepped["next", "done"][:, 0])
+                    if traces:
+                        self._keep("trace", self._reached(stepped))
+                    current = env.maybe_reset(step_mdp(stepped, keep_other=True))
+                    self._keep("command", ours.command_manager.values)
+        finally:
+            ours.event_manager.step = run_events  # type: ignore[method-assign]
+        self.arrays |= {name: np.stack(values, 1) for name, values in self._seen.items()}
+        width = 2 + ours.world.qvel_EL.shape[1]
+        self.arrays["pushes"] = np.array(self._pushes, np.float32).reshape(-1, width)
+        if traces:
+            self.arrays = {
+                name: value[value[:, 0] < traces] if name == "pushes" else value[:traces]
+                for name, value in self.arrays.items()
+            }
+
+    @property
+    def figures(self) -> list[dict[str, float]]:
+        """The figures of each episode."""
+        columns = {name: sum_E.tolist() for name, sum_E in self._sums.items()}
+        return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+    def _watch(self, run_events: Any) -> None:
+        before_EL = self._ours.world.qvel_EL.clone()
+        run_events()
+        change_EL = (self._ours.world.qvel_EL - before_EL).cpu().numpy()
+        for row in np.flatnonzero(np.abs(change_EL).max(-1) > 0):
+            self._pushes.append(np.concatenate(([row, self._now], change_EL[row])))
+
+    def _keep(self, kind: str, values: Any) -> None:
+        for name, value in values.items():
+            self._seen.setdefault(f"{kind}/{name}", []).append(value.detach().float().cpu().numpy().copy())
+
+    def _start(self, order: Sequence[int], params: Sequence[str]) -> Arrays:
+        view, world = self._ours.view, self._ours.world
+        found = {"qpos": world.qpos_EL, "qvel": world.qvel_EL}
+        by_joint = {"encoder_bias": view.encoder_bias_EL, "default_pos": view.default_joint_pos_EL}
+        by_joint |= {f"actuator/{name}": view.actuator_param(name).clamp(max=1e30) for name in params}
+        found |= {name: value[:, self._columns] for name, value in by_joint.items()}
+        for name, value in world.per_world_fields().items():
+            value = value[:, list(order)] if name.startswith("actuator_") else value
+            found["gravity" if name == "gravity" else f"model/{name}"] = value
+        return {f"start/{name}": value.detach().cpu().numpy().copy() for name, value in found.items()}
+
+    def _reached(self, stepped: Any) -> dict[str, Tensor]:
+        view = self._ours.view
+        targets = (view.joint_pos_target_EL, view.joint_vel_target_EL, view.joint_effort_target_EL)
+        return {
+            "action": stepped["action"],
+            "done": stepped["next", "done"],
+            "target": torch.cat([target[:, self._columns] for target in targets], -1),
+            "effort": view.joints().effort_EL[:, self._columns],
+            "next_qpos": self._ours.world.qpos_EL,
+            "next_qvel": self._ours.world.qvel_EL,
+            **{f"found_{name}": view.contact(name).found_EN for name in self._sensors},
+        }
+
+    def _add(self, done_E: Tensor) -> None:
+        view, metrics = self._ours.view, self._ours.metric_manager
+        step_E = view.episode_step_E.float()
+        now = {f"reward/{name}": value_E for name, value_E in view.episode_rewards.items()}
+        now["return"] = sum(now.values(), torch.zeros_like(step_E))
+        now |= {"length": step_E, "fell": view.terminated_E.float()}
+        now |= dict(
+            zip((f"metric/{name}" for name in metrics.names), metrics.reduced_EM.unbind(-1), strict=True)
+        )
+        effort_EL = view.joints(self._joints).effort_EL.abs()
+        mean = dict(zip((f"torque/{name}" for name in self._joints), effort_EL.unbind(-1), strict=True))
+        for name in self._sensors:
+            found = view.contact(name).found_EN.unbind(-1)
+            mean |= {f"contact/{name}/{k}": found_E for k, found_E in enumerate(found)}
+        for name, value_E in mean.items():
+            before_E = self._sums.get(name, torch.zeros_like(value_E))
+            now[name] = before_E + (value_E - before_E) / step_E
+        for name, value_E in now.items():
+            kept_E = self._sums.get(name, value_E)
+            self._sums[name] = torch.where(self._running_E, value_E, kept_E).clone()
+        self._running_E = self._running_E & ~done_E

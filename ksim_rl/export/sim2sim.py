@@ -1,0 +1,133 @@
+"""This module is the commands `ksim-rl export` and `ksim-rl sim2sim`, and the report of the second one."""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ksim_rl.export.causes import Cause, find_causes
+from ksim_rl.export.folder import export, runner_source
+from ksim_rl.export.standalone.signals import read_arrays, read_json
+
+TABLE = ("return", "length", "fell", "reward/", "metric/", "torque/", "contact/")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Means over episodes, recorded (`ours`) and on MuJoCo's C engine (`theirs`), and why they differ."""
+
+    task: str
+    episodes: int
+    ours: Mapping[str, float]
+    theirs: Mapping[str, float]
+    causes: Sequence[Cause]
+    left_out: Sequence[str]
+
+    @property
+    def return_ratio(self) -> float:
+        """Their mean return by ours, both of the reward terms that the export describes."""
+        return self.theirs["return"] / self.ours["return"] if self.ours["return"] else float("nan")
+
+    def table(self) -> str:
+        """Return the report as text."""
+        lines = [f"{self.task}: {self.episodes} episodes on MuJoCo's C engine, beside the recorded ones"]
+        lines.append(f"{'':<44}{'recorded':>12}{'C engine':>12}{'difference':>12}")
+        for name, value in self.theirs.items():
+            if name in self.ours:
+                own = self.ours[name]
+                share = f"{value / own - 1.0:+.1%}" if abs(own) > 1e-6 else f"{value - own:+.3g}"
+                lines.append(f"{name:<44}{own:>12.4g}{value:>12.4g}{share:>12}")
+        lines += [f"left out, since it has no description: {name}" for name in self.left_out]
+        lines += ["likely causes:", *(f"  {cause}" for cause in self.causes)] if self.causes else []
+        if not self.causes:
+            lines.append("single steps agree: what differs above is chance; more episodes make it smaller")
+        return "\n".join(lines)
+
+
+def sim2sim(
+    folder: Path, *, episodes: int = 100, seed: int = 0, note: Callable[[str], None] = print
+) -> Report:
+    """Run episodes of an exported folder on MuJoCo's C engine, on all cores, and compare them with the recorded ones.
+
+    They run in a Python of their own, by this library's `runner.py`: nothing in the folder is executed. Raises
+    ValueError for a folder that is no export, was made without episodes, or does not run.
+    """
+    if episodes < 1:
+        raise ValueError(f"--episodes {episodes}: expected at least 1")
+    meta = read_json(folder / "export.json")
+    ours = meta.get("ours")
+    if not isinstance(ours, dict) or "return" not in ours:
+        raise ValueError(
+            f"{folder}: exported without episodes: export the run once more, with --episodes 100"
+        )
+    note(f"running {episodes} episodes")
+    with tempfile.TemporaryDirectory() as temporary:
+        program, output, replay = (Path(temporary) / name for name in ("runner.py", "out.json", "replay.npz"))
+        program.write_text(runner_source())
+        arguments = [str(folder.absolute()), "--episodes", str(episodes), "--seed", str(seed)]
+        arguments += ["--output", str(output), "--replay", str(replay)]
+        # Isolated: neither the current folder nor PYTHONPATH adds modules.
+        done = subprocess.run(
+            [sys.executable, "-I", str(program), *arguments], capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            raise ValueError(f"{folder}: {(done.stderr.strip() or 'no message').splitlines()[-1]}")
+        found = json.loads(output.read_text())
+        try:
+            causes = find_causes(meta, read_arrays(folder / "trace.npz"), read_arrays(replay))
+        except (KeyError, IndexError, TypeError) as error:
+            raise ValueError(f"{folder}: trace.npz does not fit export.json: {error!r}") from error
+    count = len(ours["return"])
+    kept = min(count, episodes)
+    return Report(
+        task=str(meta["task"]),
+        episodes=episodes,
+        # The same episodes on both sides.
+        ours={name: float(np.mean(values[:kept])) for name, values in ours.items() if _in_table(name)},
+        theirs={name: float(np.mean([one[name] for one in found])) for name in found[0] if _in_table(name)},
+        causes=causes,
+        left_out=meta["left_out"],
+    )
+
+
+def _in_table(name: str) -> bool:
+    return name.startswith(TABLE)
+
+
+def run_export(arguments: Sequence[str]) -> int:
+    """Run `ksim-rl export RUN`."""
+    parser = argparse.ArgumentParser(
+        prog="ksim-rl export", description="Write a policy into a folder that runs without this library."
+    )
+    parser.add_argument("run", type=Path, metavar="RUN", help="a run folder, or one of its checkpoints")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="default: export in the run folder")
+    parser.add_argument("--episodes", type=int, default=100, help="to record for sim2sim; 0 for none")
+    parser.add_argument("--seed", type=int, help="of the recorded episodes; default: that of evaluations")
+    parser.add_argument("--device", default="cpu", help="of the recorded episodes: cpu, cuda or auto")
+    options: Any = parser.parse_args(arguments)
+    folder = export(
+        options.run, options.output, episodes=options.episodes, seed=options.seed, device=options.device
+    )
+    print(f"{folder}: see README.md in it; next: ksim-rl sim2sim {folder}")
+    return 0
+
+
+def run_sim2sim(arguments: Sequence[str]) -> int:
+    """Run `ksim-rl sim2sim DIR`; the code is 1 where single steps differ."""
+    parser = argparse.ArgumentParser(
+        prog="ksim-rl sim2sim", description="Run an exported policy on MuJoCo's C engine, and compare."
+    )
+    parser.add_argument("folder", type=Path, metavar="DIR", help="what `ksim-rl export` wrote")
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0, help="of noise and lags")
+    options: Any = parser.parse_args(arguments)
+    report = sim2sim(options.folder, episodes=options.episodes, seed=options.seed)
+    print(report.table())
+    return 1 if report.causes else 0

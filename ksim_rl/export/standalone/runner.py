@@ -1,0 +1,410 @@
+"""This program runs an exported policy on MuJoCo's C engine; it needs numpy, onnxruntime and mujoco, and nothing else.
+
+    python runner.py [DIR] --episodes 100 --output result.json
+
+In a program of yours: `runner = Runner(DIR)`, `runner.reset()`, then `runner.step(runner.act())` at each env step.
+`export.json` says what is observed and what actions do; names, not numbers, say which joint is which. All files are
+data: nothing in them is executed, and none may lead out of the folder.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from ksim_rl.export.standalone.signals import Array, Lag, Noise, Signals, read, read_arrays
+
+RECORD = "episodes.npz"
+KINDS = ("pos", "vel", "effort")
+
+
+class Policy:
+    """The policy in `policy.onnx`, with what it carries from step to step."""
+
+    def __init__(self, folder: Path, meta: dict[str, Any]) -> None:
+        import onnxruntime
+
+        data = read(folder / "policy.onnx")
+        if b"\x0a\x08location" in data:
+            raise ValueError(
+                f"{folder / 'policy.onnx'}: weights outside of the file: expected all of them in it"
+            )
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        self.session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        self.specs = meta["policy"]["states"]
+        self.states: list[Array] = []
+        self.outputs = ["actions", *(spec["output"] for spec in self.specs)]
+
+    def reset(self) -> None:
+        """Forget the episode."""
+        self.states = []
+
+    def __call__(self, obs: Array) -> Array:
+        """Return the action [A] for the newest frame [L]."""
+        frame = np.asarray(obs, np.float32)[None]
+        if not self.states:
+            self.states = [
+                np.zeros((1, *spec["shape"]), np.float32)
+                if spec["starts_with"] == "zeros"
+                else np.repeat(frame[:, None, slice(*spec["columns"])], spec["shape"][0], 1)
+                for spec in self.specs
+            ]
+        feed = {"obs": frame} | {s["input"]: v for s, v in zip(self.specs, self.states, strict=True)}
+        actions, *self.states = (np.asarray(value) for value in self.session.run(self.outputs, feed))
+        return actions[0].astype(np.float64)
+
+
+class Runner(Signals):
+    """An exported policy in its robot's model."""
+
+    def __init__(self, folder: str | Path, seed: int = 0) -> None:
+        super().__init__(folder, seed)
+        meta = self.meta
+        self.policy, self.noisy = Policy(self.folder, meta), True
+        self.lags: list[Lag] = []
+        self.noises: list[Noise] = []
+        self.terms = [self._term(spec) for spec in meta["observations"]]
+        self.rewards = {n: (s["weight"], self.value(s["value"])) for n, s in meta["rewards"].items()}
+        self.endings = {n: (s["time_out"], self.value(s["value"])) for n, s in meta["terminations"].items()}
+        self.metrics = {name: self.value(node) for name, node in meta["metrics"].items()}
+        self.chain = [self._stage(spec) for spec in meta["action_chain"]]
+        self.asked = [self._action(spec) for spec in meta["actions"]]
+        self.targets = {kind: dict.fromkeys(self.joints, 0.0) for kind in KINDS}
+        self.laws = [self._law(spec) for spec in meta["actuators"]]
+        self.reset()
+
+    # -- observations --------------------------------------------------------------------------------------------
+
+    def _term(self, spec: dict[str, Any]) -> Callable[[bool], Array]:
+        read_it, low, high = self.value(spec["value"]), *spec["clip"]
+        scale, lag = np.asarray(spec["scale"]), None
+        noise = Noise(spec["noise"], self) if spec["noise"] else None
+        self.noises += [noise] if noise else []
+        if spec["delay"]:
+            lag = Lag(spec["delay"], self)
+            self.lags.append(lag)
+
+        def term(advances: bool) -> Array:
+            value = read_it()
+            if noise and self.noisy:
+                value = noise(value)
+            low_, high_ = -np.inf if low is None else low, np.inf if high is None else high
+            value = np.clip(value, low_, high_) * scale
+            return value if lag is None else lag(value, advances)
+
+        return term
+
+    def observe(self, advances: bool = True) -> Array:
+        """Return the newest frame that the policy reads, [L]; call it once per env step."""
+        return np.concatenate([term(advances) for term in self.terms])
+
+    # -- actions and actuators -----------------------------------------------------------------------------------
+
+    def _stage(self, spec: dict[str, Any]) -> Callable[[Array], Array]:
+        if spec["kind"] == "delay":
+            lag = Lag(spec, self)
+            self.lags.append(lag)
+            return lag
+        if spec["kind"] == "clip":
+            return lambda action: np.clip(action, spec["low"], spec["high"])
+        if spec["kind"] == "scale":
+            return lambda action: action * np.asarray(spec["scale"]) + np.asarray(spec["offset"])
+        kept: list[Any] = [None]
+        self.resets.append(lambda: kept.__setitem__(0, spec["initial"]))
+
+        def low_pass(action: Array) -> Array:
+            before = action if kept[0] is None else kept[0]
+            kept[0] = before + spec["alpha"] * (action - before)
+            return kept[0]
+
+        return low_pass
+
+    def _action(self, spec: dict[str, Any]) -> Callable[[Array], None]:
+        columns, kind, names = slice(*spec["columns"]), spec["kind"], spec["names"]
+        shape = self._shaping(spec)
+        if kind == "ctrl":
+            at = [self.model.actuator(name).id for name in names]
+
+            def control(action: Array) -> None:
+                self.data.ctrl[at] = np.clip(shape(action[columns]), *spec["limits"])
+
+            return control
+        at = np.array([self.joints[name][0] for name in names])
+        second = self._shaping(spec["velocity"]) if spec.get("velocity") else None
+
+        def joints(action: Array) -> None:
+            given, value = action[columns], None
+            if second:
+                given, value = np.split(given, 2)
+                self.targets["vel"].update(zip(names, second(value), strict=True))
+            value = shape(given) + (self.data.qpos[at] if spec["relative"] else 0.0)
+            self.targets[kind].update(zip(names, np.clip(value, *spec["limits"]), strict=True))
+
+        return joints
+
+    def _shaping(self, spec: dict[str, Any]) -> Callable[[Array], Array]:
+        low, high = spec["clip"] or (-np.inf, np.inf)
+        scale, offset, alpha = np.asarray(spec["scale"]), np.asarray(spec["offset"]), spec["alpha"]
+        kept: list[Any] = [0.0]
+        self.resets.append(lambda: kept.__setitem__(0, 0.0))
+
+        def shaped(action: Array) -> Array:
+            action = np.clip(action, low, high)
+            action = (np.tanh(action) if spec["tanh"] else action) * scale
+            if alpha is not None:
+                kept[0] = action = kept[0] + alpha * (action - kept[0])
+            return action + offset
+
+        return shaped
+
+    def _law(self, spec: dict[str, Any]) -> Callable[[], None]:
+        """Return what sets the controls of some joints' actuators from their targets before each substep."""
+        names, takes, kind = spec["joints"], spec["takes"], spec["kind"]
+        pos, vel = (np.array([self.joints[n][k] for n in names], int) for k in (0, 1))
+        ctrl = [self.model.actuator(name).id for name in spec["actuators"]]
+        numbers = {key: np.asarray(value, np.float64) for key, value in spec["numbers"].items()}
+        self.numbers = getattr(self, "numbers", []) + [(names, numbers)]
+        lag = Lag(spec["delay"], self) if spec["delay"] else None
+        self.lags += [lag] if lag else []
+
+        def law() -> None:
+            target = {key: np.array([self.targets[key][n] for n in names]) for key in KINDS}
+            if lag:
+                late = lag(np.concatenate([target[key] for key in takes]))
+                target |= dict(zip(takes, np.split(late, len(takes)), strict=True))
+            if kind == "builtin":
+                self.data.ctrl[ctrl] = target[takes[0]]
+                return
+            now, moves = self.data.qpos[pos], self.data.qvel[vel]
+            effort = target["effort"] + numbers["stiffness"] * (target["pos"] - now)
+            effort = effort + numbers["damping"] * (target["vel"] - moves)
+            limit = numbers["effort_limit"]
+            low, high = -limit, limit
+            if kind == "dc_motor":
+                stall = numbers["saturation_effort"]
+                lost = stall * moves / numbers["velocity_limit"]
+                low, high = np.clip(-stall - lost, low, high), np.clip(stall - lost, low, high)
+            self.data.ctrl[ctrl] = np.clip(effort, low, high)
+
+        return law
+
+    # -- episodes ------------------------------------------------------------------------------------------------
+
+    def reset(self, start: dict[str, Array] | None = None) -> Array:
+        """Begin an episode at the default pose, or where a recorded one began; return the first frame."""
+        mujoco.mj_resetData(self.model, self.data)
+        if self.model.nkey:
+            mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
+        for name, value in (start or {}).items():
+            self._apply(name, value)
+        self.steps, self.terminated = 0, False
+        self.action = self.last_action = np.zeros_like(self.action)
+        for kind in KINDS:
+            self.targets[kind] = dict(self.default) if kind == "pos" else dict.fromkeys(self.joints, 0.0)
+        self.drawn.clear()
+        for part in (self.policy, *self.lags, *self.noises, *self.contacts.values()):
+            part.reset()
+        for forget in self.resets:
+            forget()
+        self.data.sensordata[:] = 0.0
+        self.refresh()
+        self.frame = self.observe(advances=False)
+        return self.frame
+
+    def _apply(self, name: str, value: Array) -> None:
+        kind, _, field = name.partition("/")
+        if kind in ("qpos", "qvel"):
+            getattr(self.data, kind)[:] = value
+        elif kind == "gravity":
+            self.model.opt.gravity[:] = value
+        elif kind == "model":
+            whole = getattr(self.model, field)
+            whole[:] = np.reshape(value, np.shape(whole))
+            mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+        elif kind == "encoder_bias":
+            self.bias = dict(zip(self.joints, value, strict=True))
+        elif kind == "default_pos":
+            self.default = dict(zip(self.joints, value, strict=True))
+        elif kind == "actuator":
+            by_joint = dict(zip(self.joints, value, strict=True))
+            for names, numbers in self.numbers:
+                if field in numbers:
+                    numbers[field] = np.array([by_joint[n] for n in names])
+
+    def refresh(self) -> None:
+        """Recompute what follows from position and velocity; contacts and forces stay those of the last substep."""
+        model, data = self.model, self.data
+        for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
+            compute(model, data)
+        mujoco.mj_sensorPos(model, data)
+        mujoco.mj_sensorVel(model, data)
+
+    def act(self) -> Array:
+        """Return the policy's action for the newest frame."""
+        return self.policy(self.frame)
+
+    def step(
+        self, action: Array, command: dict[str, Array] | None = None, *, observes: bool = True
+    ) -> dict[str, Any]:
+        """Run one env step; return rewards by term, metrics and what ended. `command` holds from the next frame on."""
+        for stage in self.chain:
+            action = stage(action)
+        self.last_action, self.action = self.action, np.asarray(action, np.float64)
+        for write in self.asked:
+            write(self.action)
+        dt = self.model.opt.timestep
+        for substep in range(self.decimation):
+            for law in self.laws:
+                law()
+            mujoco.mj_step(self.model, self.data)
+            for tracker in self.contacts.values():
+                if tracker.every:
+                    tracker.update(self.data, dt, starts=not substep)
+        self.refresh()
+        self.steps += 1
+        for tracker in self.contacts.values():
+            if not tracker.every:
+                tracker.update(self.data, self.step_dt, starts=True)
+        ended = [name for name, (_, value) in self.endings.items() if bool(value()[0])]
+        finite = bool(np.isfinite(self.data.qpos).all() and np.isfinite(self.data.qvel).all())
+        self.terminated = not finite or any(not self.endings[name][0] for name in ended)
+        unit = self.step_dt if self.meta["scale_rewards_by_dt"] else 1.0
+        rewards = {name: float(weight * unit * value()[0]) for name, (weight, value) in self.rewards.items()}
+        metrics = {name: float(value()[0]) for name, value in self.metrics.items()}
+        self.command |= command or {}
+        if observes:
+            self.frame = self.observe()
+        timed = 0 < self.limit <= self.steps
+        return {
+            "rewards": rewards if finite else dict.fromkeys(rewards, 0.0),
+            "metrics": metrics,
+            "terminated": self.terminated,
+            "done": self.terminated or timed or bool(ended),
+        }
+
+    def _begin(self, record: dict[str, Array], number: int) -> None:
+        self.command |= self._commands(record, number, 0)
+        self.reset({name[6:]: value[number] for name, value in record.items() if name.startswith("start/")})
+
+    def _commands(self, record: dict[str, Array], number: int, step: int) -> dict[str, Array]:
+        return {name: record[f"command/{name}"][number, step] for name in self.command}
+
+    def _push(self, record: dict[str, Array], number: int, step: int) -> None:
+        pushes = record["pushes"]
+        for push in pushes[(pushes[:, 0] == number) & (pushes[:, 1] == step)]:
+            self.data.qvel[:] += push[2:]
+
+    def episode(self, record: dict[str, Array], number: int) -> dict[str, float]:
+        """Run a recorded episode once more: its start, commands and pushes, with noise and lags drawn anew."""
+        self._begin(record, number)
+        sums: dict[str, float] = {}
+        joints = [at for _, at in self.joints.values()]
+        result: dict[str, Any] = {"done": False}
+        while not result["done"] and self.steps < (self.limit or 1000):
+            action = self.act()
+            self._push(record, number, self.steps)
+            result = self.step(action, self._commands(record, number, self.steps + 1))
+            now = {f"reward/{name}": value for name, value in result["rewards"].items()}
+            now |= {f"metric/{name}": value for name, value in result["metrics"].items()}
+            for name, tracker in self.contacts.items():
+                now |= {
+                    f"contact/{name}/{k}": touch for k, touch in enumerate(tracker.fields["found"].tolist())
+                }
+            efforts = np.abs(self.data.qfrc_actuator[joints]).tolist()
+            now |= {f"torque/{name}": effort for name, effort in zip(self.joints, efforts, strict=True)}
+            for name, value in now.items():
+                sums[name] = sums.get(name, 0.0) + value
+        earned = {name: value for name, value in sums.items() if name.startswith("reward/")}
+        means = {name: value / self.steps for name, value in sums.items() if name not in earned}
+        ended = {"length": float(self.steps), "fell": float(result["terminated"])}
+        return {"return": sum(earned.values()), **ended, **earned, **means}
+
+    def replay(self, record: dict[str, Array], number: int, lag: int) -> dict[str, Array]:
+        """Return what this model makes of each recorded step by itself: frames, actions, targets, efforts, next states.
+
+        Every step starts at the recorded state, with the recorded frame and action; lags are `lag` as far as they may.
+        """
+        trace = {name[6:]: v[number] for name, v in record.items() if name.startswith("trace/") and v.ndim}
+        joints, found, self.noisy = [at for _, at in self.joints.values()], {}, False
+        self._begin(record, number)
+        for delay in self.lags:
+            delay.lag = min(max(lag, int(delay.spec["min"])), delay.most)
+        for t in range(len(trace["done"])):
+            self.data.qpos[:], self.data.qvel[:] = trace["qpos"][t], trace["qvel"][t]
+            self.refresh()
+            frame = self.observe() if t else self.frame
+            action = self.policy(trace["obs"][t] if trace["obs"].shape[1] == len(frame) else frame)
+            self._push(record, number, t)
+            self.step(trace["action"][t], self._commands(record, number, t + 1), observes=False)
+            target = [self.targets[kind][name] for kind in KINDS for name in self.joints]
+            now = {
+                "obs": frame,
+                "action": action,
+                "target": target,
+                "effort": self.data.qfrc_actuator[joints],
+            }
+            now |= {"next_qpos": self.data.qpos, "next_qvel": self.data.qvel}
+            now |= {f"found_{name}": tracker.fields["found"] for name, tracker in self.contacts.items()}
+            for name, value in now.items():
+                found.setdefault(name, []).append(np.array(value))
+            if trace["done"][t]:
+                break
+        return {name: np.array(values) for name, values in found.items()}
+
+
+_own: list[Any] = []
+
+
+def _begin(folder: str, seed: int) -> None:
+    _own[:] = [Runner(folder, seed), read_arrays(Path(folder) / RECORD), seed]
+
+
+def _run(number: int) -> dict[str, float]:
+    runner, record, seed = _own
+    # One stream per episode: the number of processes changes nothing.
+    runner.draws = np.random.default_rng([seed, number])
+    return runner.episode(record, number % len(record["start/qpos"]))
+
+
+def _replay(runner: Runner, path: Path) -> None:
+    record = read_arrays(runner.folder / "trace.npz")
+    found = {"dt": np.array(runner.model.opt.timestep), "decimation": np.array(runner.decimation)}
+    for lag in range(1 + max((delay.most for delay in runner.lags), default=0)):
+        for number in range(len(record["trace/done"])):
+            replayed = runner.replay(record, number, lag)
+            found |= {f"{lag}/{number}/{name}": value for name, value in replayed.items()}
+    np.savez_compressed(path, **found)  # pyright: ignore[reportArgumentType]
+
+
+def main() -> None:
+    """Run episodes on all cores, and print or write their figures as JSON."""
+    parser = argparse.ArgumentParser(description="Run an exported policy on MuJoCo's C engine.")
+    parser.add_argument("folder", nargs="?", default=str(Path(__file__).parent))
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0, help="of noise and lags")
+    parser.add_argument("--output", help="a JSON file; without it the means are printed")
+    parser.add_argument("--replay", help="an .npz file for what each recorded step of trace.npz gives here")
+    options = parser.parse_args()
+    if options.replay:
+        _replay(Runner(options.folder, options.seed), Path(options.replay))
+    cores = min(len(os.sched_getaffinity(0)), options.episodes)
+    pool = multiprocessing.get_context("spawn").Pool(cores, _begin, (options.folder, options.seed))
+    with pool:
+        found = pool.map(_run, range(options.episodes), chunksize=1)
+    if options.output:
+        Path(options.output).write_text(json.dumps(found))
+        return
+    for name in found[0]:
+        values = [one[name] for one in found]
+        print(f"{name:<40} {np.mean(values):12.4f} +- {np.std(values):.4f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,373 @@
+"""This module reads an exported folder, and computes what its descriptions say from MuJoCo's state."""
+
+import json
+import math
+import os
+import re
+import stat
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+Array = np.ndarray
+Value = Callable[[], Array]
+MOST_BYTES, MOST_DEPTH, MOST_NODES = 2**30, 40, 100_000
+LEAVES_THE_FOLDER = re.compile(rb"<!|<\s*(include|extension|plugin|attach|model)\b", re.IGNORECASE)
+PATHS = re.compile(r"\b(?:file\w*|content_type|\w*dir)\s*=\s*[\"']([^\"']*)[\"']")
+FUNCTIONS: dict[str, Callable[..., Any]] = {
+    name: getattr(np, name)
+    for name in (
+        *("add", "subtract", "multiply", "divide", "maximum", "minimum", "where"),
+        *("negative", "absolute", "square", "sqrt", "exp", "log1p", "sin", "cos", "sign"),
+    )
+}
+FUNCTIONS |= {
+    "greater": lambda a, b: (a > b) * 1.0,
+    "less": lambda a, b: (a < b) * 1.0,
+    "any": lambda a: np.atleast_1d(np.any(a > 0) * 1.0),
+    "mean": lambda a: np.atleast_1d(a.mean()),
+    "concat": lambda *parts: np.concatenate(parts),
+    "normalize": lambda a: a / max(float(np.linalg.norm(a)), 1e-12),
+    "subtract_point": lambda a, b: (a.reshape(-1, 3) - b).ravel(),
+    "rotate_inverse": lambda quat, vector: rotated(quat * np.array([1.0, -1.0, -1.0, -1.0]), vector),
+}
+
+
+def rotated(quat: Array, vector: Array) -> Array:
+    """Return a vector turned by a quaternion (w, x, y, z)."""
+    result = np.zeros(3)
+    mujoco.mju_rotVecQuat(
+        result, np.ascontiguousarray(vector, np.float64), np.ascontiguousarray(quat, np.float64)
+    )
+    return result
+
+
+def read(path: Path, most: int = MOST_BYTES) -> bytes:
+    """Return the bytes of a regular file of limited size; links, pipes and devices are refused."""
+    try:
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW), "rb") as file:
+            about = os.fstat(file.fileno())
+            if not stat.S_ISREG(about.st_mode) or about.st_size > most:
+                raise ValueError(f"{path}: expected a regular file of at most {most} bytes")
+            return file.read(most)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return an export's metadata; a ValueError says what is wrong with the file."""
+    try:
+        found = json.loads(read(path, 2**26))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: {error}") from None
+    if not isinstance(found, dict) or found.get("format") != 1:
+        raise ValueError(f"{path}: expected the metadata of an export, of format 1")
+    return found
+
+
+def read_arrays(path: Path) -> dict[str, Array]:
+    """Return the arrays of numbers of an .npz file."""
+    read(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > MOST_BYTES:
+                raise ValueError(f"{path}: unpacked larger than {MOST_BYTES} bytes")
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (zipfile.BadZipFile, ValueError, EOFError, KeyError) as error:
+        raise ValueError(f"{path}: not arrays of numbers: {error}") from None
+
+
+def read_model(folder: Path) -> mujoco.MjModel:
+    """Return the model of `robot.xml`, which may name files of its own folder only."""
+    path = folder / "robot.xml"
+    text = read(path, 2**28)
+    if found := LEAVES_THE_FOLDER.search(text):
+        raise ValueError(f"{path}: {found.group().decode()!r}: an exported model stands for itself")
+    for name in PATHS.findall(text.decode(errors="replace")):
+        inside = (folder / name).resolve().is_relative_to(folder.resolve())
+        if not inside or os.path.isabs(name) or "&" in name:
+            raise ValueError(f"{path}: {name!r} is outside of the folder")
+    return mujoco.MjModel.from_xml_path(str(path))
+
+
+class Lag:
+    """A value as it was some steps ago; before an episode's first value lies that value, or `initial`."""
+
+    def __init__(self, spec: dict[str, Any], signals: "Signals") -> None:
+        self.spec, self.signals, self.most = spec, signals, int(spec["max"])
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self.kept, self.age = [], 0
+        self.lag = self._draw()
+
+    def _draw(self) -> int:
+        # Those that share a lag draw it once.
+        drawn, key = self.signals.drawn, (self.spec.get("shared") or id(self), self.age)
+        if key not in drawn:
+            drawn[key] = int(self.signals.draws.integers(self.spec["min"], self.most + 1))
+            if self.age and self.signals.draws.random() < self.spec["hold_probability"]:
+                drawn[key] = self.lag
+        return drawn[key]
+
+    def __call__(self, value: Array, advances: bool = True) -> Array:
+        """Return what arrives now, as `value` sets out."""
+        self.age += advances
+        every = self.spec["resample_every"]
+        if advances and every and self.age % every == 0:
+            self.lag = self._draw()
+        first = value if self.spec["initial"] is None else np.full_like(value, self.spec["initial"])
+        self.kept = [value, *(self.kept or [first] * self.most)][: self.most + 1]
+        return self.kept[self.lag]
+
+
+class Noise:
+    """A sensor's errors: bias, walk, noise, resolution, dropout, in this order."""
+
+    def __init__(self, spec: dict[str, Any], signals: "Signals") -> None:
+        self.spec, self.signals, self.bias, self.walk, self.last = spec, signals, None, 0.0, None
+
+    def _sample(self, spec: dict[str, Any], size: int) -> Array:
+        draws = self.signals.draws
+        unit = {"uniform": draws.random, "gaussian": draws.standard_normal, "none": np.zeros}[spec["draw"]](
+            size
+        )
+        return np.asarray(spec["offset"]) + np.asarray(spec["spread"]) * unit
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self.bias, self.walk, self.last = None, 0.0, None
+
+    def __call__(self, value: Array) -> Array:
+        """Return the reading of a value."""
+        spec, first = self.spec, self.last is None
+        if spec["bias"]:
+            self.bias = self._sample(spec["bias"], len(value)) if self.bias is None else self.bias
+            value = value * self.bias if spec["bias"]["operation"] == "multiply" else value + self.bias
+        if not first:
+            self.walk = self.walk + np.asarray(spec["walk_std"]) * self.signals.draws.standard_normal(
+                len(value)
+            )
+        value, sample = value + self.walk, self._sample(spec, len(value))
+        value = value * sample if spec["operation"] == "multiply" else value + sample
+        grain = np.broadcast_to(spec["resolution"], value.shape)
+        value = np.where(grain > 0, np.round(value / np.where(grain > 0, grain, 1.0)) * grain, value)
+        if not first and spec["dropout"] and self.signals.draws.random() < spec["dropout"]:
+            value = np.asarray(self.last) if spec["lost"] == "last" else np.zeros_like(value)
+        self.last = value
+        return value
+
+
+class Contacts:
+    """What one contact sensor of the export has seen: values by field, one per element, or three."""
+
+    def __init__(self, spec: dict[str, Any], mj_model: mujoco.MjModel) -> None:
+        self.strongest, self.every = spec["strongest"], spec["every_substep"]
+        first = [mj_model.sensor(name).adr[0] for name in spec["elements"]]
+        self.index = np.add.outer(first, np.arange(13 if self.strongest else 7))
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        count = len(self.index)
+        times = ("air_time", "last_air_time", "contact_time", "last_contact_time")
+        self.fields = {name: np.zeros(count) for name in ("found", "first_contact", "first_air", *times)}
+        self.fields["force"] = np.zeros(3 * count)
+        self.history: list[float] = []
+        self.fields["peak_history"] = np.zeros(1)
+
+    def update(self, data: mujoco.MjData, dt: float, starts: bool) -> None:
+        """Let `dt` seconds pass; `starts` where this begins an env step."""
+        reading, kept = data.sensordata[self.index], self.fields
+        force = reading[:, 1:4]
+        if self.strongest:
+            normal, tangent = reading[:, 7:10], reading[:, 10:13]
+            axes = np.stack((normal, tangent, np.cross(normal, tangent)), -1)
+            force = np.einsum("nij,nj->ni", axes, force)
+        kept["force"] = force.ravel()
+        self.history = ([] if starts else self.history) + [
+            float(np.linalg.norm(force, axis=1).max(initial=0.0))
+        ]
+        kept["peak_history"] = np.array(self.history)
+        touches, touched = reading[:, 0] > 0, kept["found"] > 0
+        lands, leaves = touches & ~touched, touched & ~touches
+        flight = kept["air_time"] + dt
+        kept["last_air_time"] = np.where(lands & (kept["air_time"] > 0), flight, kept["last_air_time"])
+        kept["last_contact_time"] = np.where(leaves, kept["contact_time"], kept["last_contact_time"])
+        kept["air_time"] = np.where(touches, 0.0, flight)
+        kept["contact_time"] = np.where(touches, kept["contact_time"] + dt, 0.0)
+        kept["found"] = touches * 1.0
+        for name, event in (("first_contact", lands), ("first_air", leaves)):
+            kept[name] = event * 1.0 if starts else np.maximum(kept[name], event)
+
+
+class Signals:
+    """The quantities of a robot's model, and the descriptions that are made of them."""
+
+    def __init__(self, folder: str | Path, seed: int = 0) -> None:
+        self.folder = Path(folder)
+        self.meta = meta = read_json(self.folder / "export.json")
+        self.model = model = read_model(self.folder)
+        self.data = mujoco.MjData(model)
+        self.draws = np.random.default_rng(seed)
+        self.decimation, self.limit = int(meta["decimation"]), int(meta["episode_steps"])
+        self.resets: list[Callable[[], None]] = []
+        self.drawn: dict[Any, int] = {}
+        self._nodes = 0
+        names = meta["joints"]["names"]
+        self.joints = {n: (int(model.joint(n).qposadr[0]), int(model.joint(n).dofadr[0])) for n in names}
+        self.default = dict(zip(names, meta["joints"]["default_pos"], strict=True))
+        self.bias = dict.fromkeys(names, 0.0)
+        self.command: dict[str, Array] = {n: np.zeros(c["size"]) for n, c in meta["commands"].items()}
+        self.contacts = {name: Contacts(spec, model) for name, spec in meta["contacts"].items()}
+        self.action = self.last_action = np.zeros(meta["policy"]["num_actions"])
+        self.steps, self.terminated = 0, False
+        self.ground = [g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_HFIELD]
+
+    @property
+    def step_dt(self) -> float:
+        """Seconds of one env step."""
+        return self.model.opt.timestep * self.decimation
+
+    def value(self, node: Any, depth: int = 0) -> Value:
+        """Return what computes a description; a ValueError says what is no description."""
+        self._nodes += 1
+        if depth > MOST_DEPTH or self._nodes > MOST_NODES:
+            raise ValueError("export.json: a description has too many parts")
+        if not isinstance(node, dict):
+            constant = np.atleast_1d(np.asarray(node, np.float64))
+            return lambda: constant
+        try:
+            if "quantity" in node:
+                return self._quantity(node["quantity"], node)
+            return self._op(node["op"], node, [self.value(part, depth + 1) for part in node["of"]])
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"export.json: {str(node)[:200]}: {error}") from None
+
+    def _op(self, name: str, node: dict[str, Any], parts: list[Value]) -> Value:
+        width = node.get("width")
+        if name in ("sum", "norm"):
+            power = (lambda v: np.sqrt((v * v).sum(-1))) if name == "norm" else (lambda v: v.sum(-1))
+            return lambda: power(parts[0]().reshape(-1, width) if width else parts[0]()[None])
+        if name == "take":
+            wanted = np.asarray(node["indices"], int)
+            return lambda: parts[0]().reshape(-1, width)[:, wanted].ravel() if width else parts[0]()[wanted]
+        if name == "clip":
+            return lambda: np.clip(parts[0](), node["low"], node["high"])
+        if name == "into":
+            body = self.model.body(node["body"]).id
+            return lambda: (parts[0]().reshape(-1, 3) @ self.data.xmat[body].reshape(3, 3)).ravel()
+        if name in ("previous", "peak", "low_pass"):
+            return self._remembering(name, node, parts)
+        function = FUNCTIONS[name]
+        return lambda: function(*[part() for part in parts])
+
+    def _remembering(self, name: str, node: dict[str, Any], parts: list[Value]) -> Value:
+        kept: list[Any] = [None]
+        self.resets.append(lambda: kept.__setitem__(0, None))
+
+        def previous() -> Array:
+            value = parts[0]()
+            before, kept[0] = np.zeros_like(value) if kept[0] is None else kept[0], value
+            return before
+
+        def peak() -> Array:
+            height, found, landed = (part() for part in parts)
+            before = np.zeros_like(height) if kept[0] is None else kept[0]
+            highest = np.where(found > 0, before, np.maximum(before, height))
+            kept[0] = np.where(landed > 0, 0.0, highest)
+            return highest
+
+        def low_pass() -> Array:
+            gain = 1.0 - math.exp(-self.step_dt / node["time_constant"])
+            kept[0] = parts[0]() if kept[0] is None else kept[0] + gain * (parts[0]() - kept[0])
+            return kept[0]
+
+        return {"previous": previous, "peak": peak, "low_pass": low_pass}[name]
+
+    def _quantity(self, name: str, node: dict[str, Any]) -> Value:
+        data, model = self.data, self.model
+        if "joints" in node:
+            names = node["joints"]
+            pos, vel = (np.array([self.joints[n][k] for n in names], int) for k in (0, 1))
+            shift = np.array([self.default[n] if name == "joint_pos_rel" else 0.0 for n in names])
+            biased = bool(node.get("biased"))
+            of_joints = {
+                "joint_pos": lambda: data.qpos[pos] + ([self.bias[n] for n in names] if biased else 0.0),
+                "joint_vel": lambda: data.qvel[vel],
+                "joint_acc": lambda: data.qacc[vel],
+                "joint_effort": lambda: data.qfrc_actuator[vel],
+            }
+            return (lambda: of_joints["joint_pos"]() - shift) if name == "joint_pos_rel" else of_joints[name]
+        if "bodies" in node or "sites" in node:
+            kind = "body" if "bodies" in node else "site"
+            ids = [getattr(model, kind)(n).id for n in node["bodies" if kind == "body" else "sites"]]
+            where = data.xpos if kind == "body" else data.site_xpos
+            return {
+                f"{kind}_pos": lambda: where[ids].ravel(),
+                f"{kind}_height": lambda: where[ids][:, 2] - [self.ground_at(p) for p in where[ids]],
+                f"{kind}_lin_vel": lambda: self._velocities(kind, ids)[:, 3:].ravel(),
+                f"{kind}_ang_vel": lambda: self._velocities(kind, ids)[:, :3].ravel(),
+                "body_quat": lambda: data.xquat[ids].ravel(),
+                "body_axes": lambda: data.xmat[ids].reshape(-1, 3, 3).transpose(0, 2, 1)[:, :2].ravel(),
+                "com_pos": lambda: data.subtree_com[ids].ravel(),
+            }[name]
+        if "body" in node:
+            body, local = model.body(node["body"]).id, node.get("frame") == "root"
+            return {
+                "projected_gravity": lambda: -data.xmat[body].reshape(3, 3)[2],
+                "root_lin_vel": lambda: self._velocities("body", [body], local)[0, 3:],
+                "root_ang_vel": lambda: self._velocities("body", [body], local)[0, :3],
+                "height_scan": lambda: self._scan(body, np.asarray(node["points"])),
+            }[name]
+        if name == "sensor":
+            start = int(model.sensor(node["sensor"]).adr[0])
+            stop = start + int(model.sensor(node["sensor"]).dim[0])
+            return lambda: data.sensordata[start:stop].copy()
+        if name == "contact":
+            tracker, field = self.contacts[node["sensor"]], node["field"]
+            return lambda: tracker.fields[field]
+        if name == "command":
+            return lambda: self.command[node["command"]]
+        if name == "actuator_force":
+            actuators = [model.actuator(n).id for n in node["actuators"]]
+            return lambda: data.actuator_force[actuators]
+        return {
+            "action": lambda: self.action,
+            "last_action": lambda: self.last_action,
+            "terminated": lambda: np.array([float(self.terminated)]),
+            "time": lambda: np.array([self.steps * self.step_dt]),
+            "time_left": lambda: np.array([max(self.limit - self.steps, 0) * self.step_dt]),
+        }[name]
+
+    def _velocities(self, kind: str, ids: list[int], local: bool = False) -> Array:
+        """Return angular, then linear velocity of the frames of bodies or sites, [N, 6]."""
+        of_kind = mujoco.mjtObj.mjOBJ_XBODY if kind == "body" else mujoco.mjtObj.mjOBJ_SITE
+        found = np.zeros((len(ids), 6))
+        for row, number in zip(found, ids, strict=True):
+            mujoco.mj_objectVelocity(self.model, self.data, of_kind, number, row, local)
+        return found
+
+    def _scan(self, body: int, points: Array) -> Array:
+        """Return how far the ground is below a body at points [N, 2] that turn with its yaw."""
+        axis, origin = self.data.xmat[body].reshape(3, 3)[:, 0], self.data.xpos[body]
+        yaw = math.atan2(axis[1], axis[0])
+        turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+        return origin[2] - np.array([self.ground_at(p) for p in origin[:2] + points @ turn])
+
+    def ground_at(self, point: Array) -> float:
+        """Return the height of the terrain below a point: 0 on a plane, beyond an edge that of the nearest point."""
+        heights = [0.0] * (not self.ground)
+        for geom in self.ground:
+            size = self.model.hfield_size[self.model.geom_dataid[geom]]
+            near = np.clip(point[:2] - self.data.geom_xpos[geom][:2], -size[:2] + 1e-6, size[:2] - 1e-6)
+            above = np.append(near + self.data.geom_xpos[geom][:2], 1e3)
+            distance = mujoco.mj_rayHfield(self.model, self.data, geom, above, np.array([0.0, 0.0, -1.0]))
+            heights += [1e3 - distance] * (distance >= 0)
+        return max(heights, default=0.0)
