@@ -7,6 +7,7 @@ only way in which other modules look at what kind of env they were given.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import ClassVar, TypeVar
 
 import numpy as np
@@ -60,6 +61,10 @@ class EpisodeSums(ABC):
     @abstractmethod
     def episode_log_reset_(self) -> None:
         """Start the sums anew."""
+
+    def non_finite_terms(self) -> Sequence[str]:
+        """Return a line for each term that gave a number that is not finite, as `non_finite_terms` counts them."""
+        return ()
 
 
 class DifficultyLevels(ABC):

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
+from ksim_rl.envs.non_finite import NonFiniteTerms
 from ksim_rl.envs.view import EnvView, Readings
 from ksim_rl.physics import World
 from ksim_rl.scene.sensors import Sensor
@@ -22,6 +23,7 @@ class EnvDriver(Simulation):
     ) -> None:
         super().__init__(world, step_dt=step_dt, max_episode_length=max_episode_length)
         self.readings = Readings(self)
+        self.non_finite = NonFiniteTerms(self.num_envs, self.step_count)
         factor = soft_joint_pos_limit_factor
         self.view = EnvView(self, self.readings, soft_joint_pos_limit_factor=factor, entities=entities)
 
@@ -36,4 +38,5 @@ class EnvDriver(Simulation):
     def freeze(self) -> None:
         """End construction: no new buffers, and all that lives on is known to `detached`."""
         super().freeze()
+        self.non_finite.start()
         self._lasting.add(self.view.default_qpos_L.untyped_storage().data_ptr())

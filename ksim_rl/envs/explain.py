@@ -38,7 +38,9 @@ def explain(
     characters.
     """
     output = io.StringIO()
-    console = Console(file=output, force_jupyter=False, width=width, highlight=False, markup=False, color_system=None)
+    console = Console(
+        file=output, force_jupyter=False, width=width, highlight=False, markup=False, color_system=None
+    )
     console.print(_summary(cfg, driver))
     for table in _tables(cfg, driver, shapes, action_sizes, events, levels):
         console.print(table)
@@ -52,6 +54,7 @@ def _summary(cfg: ManagerBasedRlEnvCfg, driver: EnvDriver) -> str:
         f"{driver.step_dt:g} s per step = {cfg.decimation} x {driver.physics_dt:g} s, "
         f"episodes of {length if driver.max_episode_length else 'any length'}\n"
         f"constraints are solved by {_solver(driver.world)}"
+        + "".join(f"\n{line}" for line in driver.non_finite.lines())
     )
 
 

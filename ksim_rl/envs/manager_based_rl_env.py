@@ -140,7 +140,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         )
         self.metric_manager = MetricManager(cfg.metrics, driver)
         self.curriculum_manager = CurriculumManager(cfg.curriculum, driver)
-        self._log = EpisodeLog(view, self.reward_manager, self.termination_manager, self.metric_manager)
+        self._log = EpisodeLog(driver, self.reward_manager, self.termination_manager, self.metric_manager)
 
     @property
     def unwrapped(self) -> "ManagerBasedRlEnv":
@@ -296,6 +296,10 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
     def episode_log_reset_(self) -> None:
         """Start the sums of `episode_log` anew."""
         self._log.clear()
+
+    def non_finite_terms(self) -> list[str]:
+        """Return a line for each term that gave a number that is not finite; reads the device."""
+        return self.driver.non_finite.lines()
 
     def curriculum_levels(self) -> dict[str, Float[Tensor, ""]]:
         """Return the latest level of each curriculum."""

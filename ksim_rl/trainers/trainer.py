@@ -10,7 +10,7 @@ import torch
 
 from ksim_rl.checks import near
 from ksim_rl.collectors import RolloutCollector
-from ksim_rl.envs.contract import EpisodeClock, missing_parts, part
+from ksim_rl.envs.contract import EpisodeClock, EpisodeSums, missing_parts, part
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.algorithm import HasNotes, Update
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
@@ -170,6 +170,7 @@ class Trainer:
         self._unread: list[tuple[int, PendingMetrics]] = []
         self._target_met = False
         self._warned: set[str] = set()
+        self._non_finite_terms = 0.0
 
     @property
     def env_states(self) -> int:
@@ -333,6 +334,10 @@ class Trainer:
             )
         if skipped := metrics["update/skipped_steps"]:
             texts["skipped"] = f"{skipped:.0f} gradient steps were not finite and were skipped"
+        if (found := metrics.get("sum/non_finite_terms", 0.0)) > self._non_finite_terms:
+            self._non_finite_terms = found
+            terms = part(self.collector.env, EpisodeSums)
+            texts |= {line.split(":")[0]: line for line in (terms.non_finite_terms() if terms else ())}
         for kind, text in texts.items():
             if kind not in self._warned:
                 self._warned.add(kind)

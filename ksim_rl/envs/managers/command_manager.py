@@ -43,6 +43,7 @@ class CommandManager:
                     "row per env"
                 )
             self.values[name] = view.buffers.get(f"commands/{name}.value_EK", value_EK.shape[1])
+            driver.non_finite.watch("command", self.values[name], (name,), value_EK.shape[1:])
 
     def time_left(self, name: str) -> Float[Tensor, " E"]:
         """Return the seconds until each env resamples, [E]; infinite for a command that resets alone resample."""
@@ -83,6 +84,7 @@ class CommandManager:
                 value_EK = term(self._view)
             held_EK = self.values[name]
             held_EK.copy_(torch.where(mask_E[:, None], value_EK, held_EK))
+            self._driver.non_finite.watch("command", held_EK, (name,), (held_EK.shape[1],))
         self._view.command_cache.clear()
 
     def step(self, going_on_E: Bool[Tensor, " E"]) -> None:

@@ -47,8 +47,13 @@ class ObservationManager:
             else:
                 readings[name] = self._driver.detached(readings[name])
         if len(vectors) < 2:
+            for name, value in readings.items():
+                if value.is_floating_point() and value.ndim > 1:
+                    flat_EL = value.flatten(1)
+                    self._driver.non_finite.watch("observation", flat_EL, (name,), flat_EL.shape[1:])
             return {name: self._driver.detached(value) for name, value in readings.items()}
         # One copy for all of them, which also takes them off the state.
         together_EL = torch.cat([readings[name] for name in vectors], dim=1)
         widths = [readings[name].shape[1] for name in vectors]
+        self._driver.non_finite.watch("observation", together_EL, vectors, widths)
         return readings | dict(zip(vectors, together_EL.split(widths, dim=1), strict=True))

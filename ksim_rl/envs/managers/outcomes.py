@@ -10,7 +10,6 @@ from torch import Tensor
 from ksim_rl.checks import near
 from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.term import CurriculumTerm, MetricTerm, RewardTerm, TerminationTerm
-from ksim_rl.envs.view import EnvView
 from ksim_rl.transforms.trackers import kept_value
 
 
@@ -71,7 +70,9 @@ class RewardManager(_OutcomeManager):
         values = self._values()
         if not values:
             return torch.zeros(self._view.num_envs, device=self._view.device)
-        weighted_ER = torch.stack(values, dim=-1) * (self.weights_R * self._scale)
+        value_ER = torch.stack(values, dim=-1)
+        self._driver.non_finite.watch(self.kind, value_ER, self.names)
+        weighted_ER = value_ER * (self.weights_R * self._scale)
         weighted_ER = torch.where(finite_E[:, None], weighted_ER, 0.0)
         self.episode_sums_ER.add_(weighted_ER)
         return weighted_ER.sum(-1)
@@ -145,6 +146,7 @@ class MetricManager(_OutcomeManager):
         if not values:
             return
         value_EM = torch.where(finite_E[:, None], torch.stack(values, dim=-1), 0.0)
+        self._driver.non_finite.watch(self.kind, value_EM, self.names)
         held_EM = self._held_EM
         next_EM = kept_value("sum", held_EM, value_EM)
         if "last" in self._occurring:
@@ -195,13 +197,19 @@ class EpisodeLog:
     """One vector of sums over the episodes that ended since the last `clear`, kept on the device until it is read.
 
     Entries: `episodes` (count), `length_sum` (env steps), `return_sum`, `reward/<term>` (weighted sums over the
-    episode), `termination/<term>` (counts), `metric/<term>` (reduced values).
+    episode), `termination/<term>` (counts), `metric/<term>` (reduced values); `non_finite_terms` since the start.
     """
 
     def __init__(
-        self, view: EnvView, rewards: RewardManager, terminations: TerminationManager, metrics: MetricManager
+        self,
+        driver: EnvDriver,
+        rewards: RewardManager,
+        terminations: TerminationManager,
+        metrics: MetricManager,
     ) -> None:
+        view = driver.view
         self._view, self._rewards, self._terminations, self._metrics = view, rewards, terminations, metrics
+        self._num_non_finite = driver.non_finite.num_terms
         parts = {"reward": rewards.names, "termination": terminations.names, "metric": metrics.names}
         of_terms = [f"{kind}/{name}" for kind, names in parts.items() for name in names]
         self.names = ("episodes", "length_sum", "return_sum", *of_terms)
@@ -226,7 +234,8 @@ class EpisodeLog:
 
     def read(self) -> dict[str, Float[Tensor, ""]]:
         """Return the sums by name, float32 [] each, still on the device."""
-        return dict(zip(self.names, self.totals_N.unbind(), strict=True))
+        sums = dict(zip(self.names, self.totals_N.unbind(), strict=True))
+        return sums | {"non_finite_terms": self._num_non_finite()}
 
     def clear(self) -> None:
         """Start anew."""

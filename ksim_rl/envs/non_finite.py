@@ -1,0 +1,104 @@
+"""This module watches what terms give: what is not finite is named, with env and step."""
+
+from collections.abc import Sequence
+
+import torch
+import warp as wp
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from ksim_rl.device.quick_launch import QuickLaunch, address
+
+_NEVER = 2**62
+
+
+@wp.struct
+class _Table:
+    width: int
+    num_envs: int
+    table: wp.uint64
+    term_of_column: wp.uint64
+    step: wp.uint64
+    first: wp.uint64
+    count: wp.uint64
+
+
+_LOOK = """
+    if (fabsf(((const float*)a.table)[(long long)row * a.width + column]) <= 3.402823466e38f) return;
+    const int term = ((const int*)a.term_of_column)[column];
+    const long long place = *(const long long*)a.step * a.num_envs + row;
+    #if defined(__CUDA_ARCH__)
+        atomicAdd((unsigned long long*)a.count + term, 1ull);
+        atomicMin((unsigned long long*)a.first + term, (unsigned long long)place);
+    #else
+        ((long long*)a.count)[term] += 1;
+        long long* first = (long long*)a.first + term;
+        *first = place < *first ? place : *first;
+    #endif
+"""
+
+
+@wp.func_native(_LOOK)
+def _look(row: int, column: int, a: _Table): ...
+
+
+@wp.kernel(enable_backward=False)
+def _look_at(a: _Table):
+    row, column = wp.tid()
+    _look(row, column, a)
+
+
+_quick = QuickLaunch(_look_at, _Table)
+
+
+class NonFiniteTerms:
+    """Counts, on the device and without a sync, the numbers that are not finite by the term that gave them."""
+
+    def __init__(self, num_envs: int, step_count: Int64[Tensor, ""]) -> None:
+        self._num_envs, self._step, self._names = num_envs, step_count, []
+        self._columns: dict[tuple[str, ...], Tensor] = {}
+        self._is_learning = True
+        self._count_N = self._first_N = torch.zeros(0, dtype=torch.int64, device=step_count.device)
+
+    def watch(
+        self, kind: str, table_EL: Float[Tensor, "E L"], names: Sequence[str], widths: Sequence[int] = ()
+    ) -> None:
+        """Look at the values of some terms of a kind, side by side; before `start` it only learns their names."""
+        key = kind, *names
+        if self._is_learning:
+            columns = [
+                len(self._names) + i for i, n in enumerate(widths or [1] * len(names)) for _ in range(n)
+            ]
+            self._columns[key] = torch.tensor(columns, dtype=torch.int32, device=self._step.device)
+            self._names += [f"{kind} {name!r}" for name in names]
+            return
+        tensors = (
+            table_EL.float().contiguous(),
+            self._columns[key],
+            self._step,
+            self._first_N,
+            self._count_N,
+        )
+        sizes = table_EL.shape[1], self._num_envs
+        _quick(table_EL.device, tuple(table_EL.shape), *sizes, *map(address, tensors))
+
+    def start(self) -> None:
+        """Count from here: what terms give while an env is constructed is of no state that anybody sees."""
+        self._is_learning = False
+        self._count_N = self._count_N.new_zeros(len(self._names))
+        self._first_N = torch.full_like(self._count_N, _NEVER)
+
+    def num_terms(self) -> Float[Tensor, ""]:
+        """Return how many terms have given such a number so far, on the device."""
+        return (self._count_N > 0).sum(dtype=torch.float32)
+
+    def lines(self) -> list[str]:
+        """Return a line for each of these terms; reads the device."""
+        return [
+            f"{name} is not finite: first in env {first % self._num_envs} at its step {first // self._num_envs}, "
+            f"{count} numbers so far"
+            for name, count, first in zip(
+                self._names, self._count_N.tolist(), self._first_N.tolist(), strict=False
+            )
+            if count
+        ]
