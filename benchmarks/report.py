@@ -110,7 +110,7 @@ def write(
     }
     for key, value in measured.items():
         saved[key] = {**saved.get(key, {}), **value} if isinstance(value, Mapping) else value
-    _replace(path, saved)
+    replace(path, saved)
     return path
 
 
@@ -131,11 +131,12 @@ def merge(name: str, sources: Sequence[Path], *, folder: Path = RESULTS) -> Path
             # What a run was made with is its own; everything else that is a mapping has entries of many runs.
             many = isinstance(value, Mapping) and key != "versions"
             merged[key] = {**merged.get(key, {}), **value} if many else value
-    _replace(path, merged)
+    replace(path, merged)
     return path
 
 
-def _replace(path: Path, saved: Mapping[str, Any]) -> None:
+def replace(path: Path, saved: Mapping[str, Any]) -> None:
+    """Write a results file in one step."""
     unfinished = path.with_suffix(".json.part")
     unfinished.write_text(json.dumps(saved, indent=2) + "\n")
     os.replace(unfinished, path)

@@ -1,0 +1,173 @@
+"""A soak looks for what grows while nothing should: memory, open files, threads, files on disk, and bytes of logs."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import json
+import os
+import threading
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.faults import children
+from benchmarks.faults.row import AT_LEAST, AT_MOST, EXACTLY, Figures, Row
+from ksim_rl.trainers import Hook, RunProgress, Trainer, run_folder
+
+PAGE = os.sysconf("SC_PAGE_SIZE")
+# Torch, Warp and the allocator settle within this share of a run.
+SETTLED = 0.4
+# Iterations whose allocations in Python are traced, each of which then takes some times longer.
+TRACED = 60
+
+
+def memory() -> int:
+    """Return the resident memory of this process, in bytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
+
+
+class _Samples(Hook):
+    """Looks at the process and at the run folder, a hundred times in a run; traces what Python holds at its end."""
+
+    interval = 1
+
+    def __init__(self, folder: Path, *, iterations: int, traced: int) -> None:
+        self.folder, self.iterations, self.traced = folder, iterations, traced
+        self.samples = folder.parent / "samples.json"
+        self.every = max(1, iterations // 100)
+        self.rows: list[dict[str, float]] = []
+        self.held: list[int] = []
+
+    def __call__(self, trainer: Trainer) -> None:
+        at = trainer.iteration
+        if at <= self.iterations and at % self.every == 0:
+            files = [path for path in self.folder.rglob("*") if path.is_file()]
+            self.rows.append(
+                {
+                    "iteration": at,
+                    "memory": memory(),
+                    "open_files": len(os.listdir("/proc/self/fd")),
+                    "threads": threading.active_count(),
+                    "files": len(files),
+                    "log_bytes": sum(path.stat().st_size for path in files if "checkpoint" not in str(path)),
+                }
+            )
+            self.write()
+        if at == self.iterations:
+            tracemalloc.start()
+        elif at in (self.iterations + self.traced, self.iterations + 2 * self.traced):
+            gc.collect()
+            self.held.append(tracemalloc.get_traced_memory()[0])
+            self.write()
+
+    def write(self) -> None:
+        """Keep what was seen, also if the process is killed."""
+        self.samples.write_text(json.dumps({"rows": self.rows, "held": self.held}))
+
+
+def soak(folder: Path, *, iterations: int, traced: int = TRACED, samples: Path | None = None) -> Figures:
+    """Train the smallest task with all that a run does by default, and look for growth."""
+    cfg, _ = children.warm()
+    sampler = _Samples(folder / "run", iterations=iterations, traced=traced)
+
+    def work() -> int:
+        quiet = RunProgress(1, enabled=False)
+        trainer_cfg = dataclasses.replace(
+            cfg.trainer,
+            num_iterations=iterations + 2 * traced,
+            checkpoint_interval=max(5, iterations // 100),
+            eval_interval=max(10, iterations // 20),
+            stop_when_solved=False,
+        )
+        run_folder.run(dataclasses.replace(cfg, trainer=trainer_cfg), folder / "run", progress=quiet)
+        return 0
+
+    build = run_folder.build
+
+    def build_with_samples(*arguments, hooks=(), **options):
+        return build(*arguments, hooks=(*hooks, sampler), **options)
+
+    def in_child() -> int:
+        run_folder.build = build_with_samples
+        return work()
+
+    ended = children.start(in_child, hangs_s=24 * 3600).wait()
+    if ended.code:
+        raise RuntimeError(f"the soak ended with exit code {ended.code}:\n{ended.text}")
+    found = json.loads((folder / "samples.json").read_text())
+    if samples is not None:
+        samples.write_text(json.dumps(found))
+    return figures_of(found["rows"], found["held"], iterations=iterations, traced=traced)
+
+
+def figures_of(rows: list[dict[str, float]], held: list[int], *, iterations: int, traced: int) -> Figures:
+    """Return the growth per iteration once all is settled; a slope is that of the best line."""
+    settled = [row for row in rows if row["iteration"] >= SETTLED * iterations]
+    at = np.array([row["iteration"] for row in settled])
+
+    def slope(name: str) -> float:
+        return float(np.polyfit(at, [row[name] for row in settled], 1)[0])
+
+    def rise(name: str) -> float:
+        return settled[-1][name] - settled[0][name]
+
+    return {
+        "iterations": iterations,
+        "memory_bytes_per_iteration": round(slope("memory"), 1),
+        "memory_mb": round(settled[-1]["memory"] / 1e6, 1),
+        "python_bytes_per_iteration": round((held[1] - held[0]) / traced, 1),
+        "open_files_rise": rise("open_files"),
+        "threads_rise": rise("threads"),
+        "files_rise": rise("files"),
+        "log_bytes_per_iteration": round(slope("log_bytes"), 1),
+    }
+
+
+def draw(rows: list[dict[str, float]], picture: Path) -> None:
+    """Plot memory, files, threads and logs over the iterations."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    panels = {
+        "resident memory (MB)": (("memory", 1e-6),),
+        "open files and threads": (("open_files", 1), ("threads", 1)),
+        "files in the run folder": (("files", 1),),
+        "bytes of logs (MB)": (("log_bytes", 1e-6),),
+    }
+    figure = Figure(figsize=(9, 5.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    for number, (title, series) in enumerate(panels.items()):
+        axes = figure.add_subplot(2, 2, number + 1)
+        for name, scale in series:
+            axes.plot([row["iteration"] for row in rows], [row[name] * scale for row in rows], label=name)
+        axes.set_title(title, fontsize=10)
+        axes.set_ylim(bottom=0)
+        axes.grid(alpha=0.25)
+        if len(series) > 1:
+            axes.legend(fontsize=8)
+    figure.supxlabel("iteration", fontsize=9)
+    figure.savefig(picture, dpi=100)
+
+
+ROWS = {
+    "soak": Row(
+        fault="10,000 iterations of the smallest task, with logs, evaluations and checkpoints",
+        must="memory of the host flat; open files, threads and files bounded; logs grow by a row per iteration",
+        limits={
+            "iterations": (AT_LEAST, "iterations"),
+            "memory_bytes_per_iteration": (AT_MOST, "most_bytes"),
+            "python_bytes_per_iteration": (AT_MOST, 300),
+            "open_files_rise": (EXACTLY, 0),
+            "threads_rise": (EXACTLY, 0),
+            "files_rise": (AT_MOST, 0),
+            "log_bytes_per_iteration": (AT_MOST, 5000),
+        },
+        measure=lambda folder, *, iterations, most_bytes, **more: soak(folder, iterations=iterations, **more),
+        # Ten megabytes in a million iterations; in a short run the pages that Python takes count for more.
+        amounts={"iterations": 10_000, "most_bytes": 100},
+        short={"iterations": 100, "traced": 40, "most_bytes": 100_000},
+        files=("ksim_rl/runs/csv_table.py", "ksim_rl/trainers/trainer.py", "ksim_rl/trainers/loggers.py"),
+    )
+}
