@@ -17,6 +17,8 @@ usage: ksim-rl <command> [arguments]
   resume   continue a run:          ksim-rl resume RUN
   eval     evaluate a policy:       ksim-rl eval RUN --episodes 100
   play     record a video:          ksim-rl play RUN --seconds 10
+           watch and drive it:      ksim-rl play RUN --live
+           without a policy:        ksim-rl play task=cartpole_swingup --agent random --live
   runs     list runs, with return and speed:  ksim-rl runs [FOLDER]
   compare  a table and a picture:   ksim-rl compare RUN1 RUN2
   export   a folder that runs elsewhere:  ksim-rl export RUN
@@ -38,7 +40,7 @@ COMMANDS = {
     "train": "ksim_rl.cli.train:train",
     "resume": "ksim_rl.cli.run_commands:resume",
     "eval": "ksim_rl.cli.run_commands:evaluate",
-    "play": "ksim_rl.cli.run_commands:play",
+    "play": "ksim_rl.viewer.play_command:play",
     "runs": "ksim_rl.cli.runs:runs",
     "compare": "ksim_rl.cli.runs:compare",
     "export": "ksim_rl.export.sim2sim:run_export",

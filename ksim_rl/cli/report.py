@@ -7,6 +7,7 @@ from ksim_rl.cli.errors import interruption
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.trainers import Checkpoint, Evaluation, Outcome, RunCfg, RunProgress, checkpoint, run
 from ksim_rl.trainers.build import solved_at
+from ksim_rl.viewer.live_training import watched
 
 
 def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None = None) -> int:
@@ -19,8 +20,8 @@ def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None 
         f"on {cfg.device}; run folder {shown(folder)}"
     )
     try:
-        with compile_notice(progress.status):
-            outcome = run(cfg, folder, progress=progress, resume_from=resume_from)
+        with compile_notice(progress.status), watched(cfg, progress.note) as hooks:
+            outcome = run(cfg, folder, progress=progress, hooks=hooks, resume_from=resume_from)
     except KeyboardInterrupt as stopped:
         number = interruption(stopped)
         progress.note(f"{number.name}: {_what_is_saved(folder)}")

@@ -7,20 +7,18 @@ from pathlib import Path
 import torch
 
 from ksim_rl import envs
-from ksim_rl.checks import check_in_range
 from ksim_rl.cli.errors import say
-from ksim_rl.cli.report import run_and_report, shown, verdict
+from ksim_rl.cli.report import run_and_report, verdict
 from ksim_rl.cli.runs import print_table
 from ksim_rl.config.plain_data import check_links
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.envs.contract import part
 from ksim_rl.scene.robots import analyse
 from ksim_rl.scene.robots.analysis import TRIAL_S
-from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, load_policy, record_video
+from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, load_policy
 from ksim_rl.trainers.build import build_evaluator, solved_at
 from ksim_rl.trainers.run_cfg import check_run_tree
 
-VIDEO_SUFFIXES = (".mp4", ".gif")
 # Folders in a run folder that a run writes to.
 FOLDERS = ("checkpoint", "tensorboard", "wandb", "mlflow")
 
@@ -68,39 +66,6 @@ def evaluate(arguments: list[str]) -> int:
     threshold = solved_at(policy.cfg)
     print(f"{policy.cfg.task_name}, iteration {policy.iteration}: {verdict(evaluation, threshold)}")
     return 0 if threshold is None or evaluation.return_mean >= threshold else 1
-
-
-def play(arguments: list[str]) -> int:
-    """Record a video of a policy."""
-    parser = _parser("play", "Record a video of a policy.")
-    parser.add_argument("--seconds", type=float, help="of simulated time; default: as the run was configured")
-    parser.add_argument(
-        "--output", type=Path, help="an .mp4 or .gif file; default: play.mp4 in the run folder"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of the initial state")
-    options = parser.parse_args(arguments)
-    if options.seconds is not None:
-        check_in_range("--seconds", options.seconds, low=0.0, low_open=True)
-    if options.output is not None and options.output.suffix not in VIDEO_SUFFIXES:
-        raise ValueError(
-            f"--output {options.output}: expected a file that ends in {' or '.join(VIDEO_SUFFIXES)}"
-        )
-    progress = RunProgress(1)
-    with compile_notice(progress.status):
-        saved = checkpoint.latest(options.run, note=say)
-        policy = load_policy(saved, device=options.device)
-        path = options.output
-        if path is None:
-            folder = saved.absolute().parent.parent
-            check_links(folder, below=())
-            path = folder / "play.mp4"
-        written = record_video(
-            policy.cfg, policy.actor, path, note=progress.note, seconds=options.seconds, seed=options.seed
-        )
-    if written is None:
-        return 3
-    print(f"{policy.cfg.task_name}, iteration {policy.iteration}: {shown(written)}")
-    return 0
 
 
 def list_envs(arguments: list[str]) -> int:

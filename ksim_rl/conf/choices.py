@@ -16,6 +16,7 @@ from ksim_rl.envs import Task
 from ksim_rl.modules import ActorCfg, CriticCfg, RecurrentCfg, SharedTrunkCfg
 from ksim_rl.trainers import Algorithm, ModulesCfg, RunCfg, TrainingCfg
 from ksim_rl.trainers.loggers import LoggerCfg, MLflowCfg, WandbCfg
+from ksim_rl.trainers.run_cfg import BrowserCfg
 
 HINTS = get_type_hints(RunCfg)
 DEFAULTS = default_tree(RunCfg)
@@ -47,6 +48,7 @@ CHOICES: dict[str, dict[str, Any]] = {
         "wandb": LoggerCfg(tensorboard=False, wandb=WandbCfg()),
         "mlflow": LoggerCfg(tensorboard=False, mlflow=MLflowCfg()),
     },
+    "viewer": {"none": BrowserCfg(), "browser": BrowserCfg(browser=True)},
 }
 
 

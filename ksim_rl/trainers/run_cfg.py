@@ -36,8 +36,8 @@ MOST_SEED = 2**62
 PLUGINS = "plugins"
 # It becomes part of the path of the run folder.
 TASK_NAME = re.compile(r"\w[\w.+-]*")
-# Fields that name places to write to beside the run folder, and the variables of those that have one.
-WRITTEN = ("logger.mlflow.tracking_uri", "task.sim.nan_guard.folder")
+# Fields that reach beyond the run folder, to write or to listen, and the variables of those that have one.
+WRITTEN = ("logger.mlflow.tracking_uri", "task.sim.nan_guard.folder", "viewer.host")
 VOUCHED_BY = {"logger.mlflow.tracking_uri": "MLFLOW_TRACKING_URI"}
 
 
@@ -123,6 +123,20 @@ class ModulesCfg(Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
+class BrowserCfg(Checked):
+    """The viewer that `ksim-rl train` opens on a running training; `host` None is this machine only."""
+
+    browser: bool = False
+    host: str | None = None
+    port: Annotated[int, Within(low=1, high=65000)] = 8080
+
+    @property
+    def address(self) -> str:
+        """Where it listens."""
+        return self.host or "127.0.0.1"
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainingCfg(Checked):
     """What training needs to know beside the env: what a task recommends, and the larger part of a run's config."""
 
@@ -144,6 +158,7 @@ class RunCfg(TrainingCfg):
     device: str = "auto"  # "cpu", "cuda", "cuda:<index>", or "auto" for CUDA where there is a GPU
     checkpoint: str | None = None  # a run folder or a checkpoint: its networks and normalizers are the start
     logger: LoggerCfg = field(default_factory=LoggerCfg)
+    viewer: BrowserCfg = field(default_factory=BrowserCfg)
 
     def __post_init__(self) -> None:
         """Refuse values that no run can have, before any model is compiled."""
@@ -234,7 +249,7 @@ def check_run_tree(tree: Mapping[str, Any], where: Path, *, given: Collection[st
         own = any(f"{path}.".startswith(f"{field}.") for field in given)
         if value is not None and not own and value != os.environ.get(VOUCHED_BY.get(path, "")):
             raise ValueError(
-                f"{where}: {path}={value!r} says where to write outside of the run folder: if that is yours, set "
+                f"{where}: {path}={value!r} reaches outside of the run folder: if that is yours, set "
                 f"{path} on the command line, or resume with --trust"
             )
 

@@ -94,7 +94,8 @@ def _run_locked(
         _write(run_folder / EVALUATION, json.dumps(figures, indent=2) + "\n")
     _draw_curves(cfg, run_folder, solved_at=trainer.solved_at, note=progress.note)
     if cfg.trainer.video and outcome.interrupted_by is None:
-        record_video(cfg, trainer.update.actor, run_folder / VIDEO, note=progress.note)
+        path = run_folder / VIDEO
+        record_video(cfg, trainer.update.actor, path, note=progress.note, status=progress.status)
     for owner in (trainer.collector, trainer.evaluator):
         if owner is not None:
             owner.env.close(raise_if_closed=False)
@@ -106,16 +107,18 @@ def _write(path: Path, text: str) -> None:
         temporary.write_text(text)
 
 
-def load_policy(path: Path, *, device: str = "auto", plugins: Sequence[str] = ()) -> Policy:
+def load_policy(
+    path: Path, *, device: str = "auto", plugins: Sequence[str] = (), cfg: RunCfg | None = None
+) -> Policy:
     """Rebuild the policy of a checkpoint, or of the newest one in a run folder.
 
-    `plugins` are packages to import first, whose classes the run's config may then name. Nothing is written: the run's
-    `nan_guard` is off. Raises CheckpointError when there is none, or it is damaged; ValueError when its config does not
-    fit this version, or makes other observations.
+    `plugins` are packages to import first, whose classes the run's config may then name. A `cfg` stands in for the
+    run's own. Nothing is written: the run's `nan_guard` is off. Raises CheckpointError when there is none, or it is
+    damaged; ValueError when its config does not fit this version, or makes other observations.
     """
     load_plugins(plugins)
     saved = checkpoint.load(checkpoint.latest(path))
-    cfg = RunCfg.from_tree({**saved.config, "device": device})
+    cfg = RunCfg.from_tree({**saved.config, "device": device}) if cfg is None else cfg
     task = dataclasses.replace(cfg.task, sim=dataclasses.replace(cfg.task.sim, nan_guard=None))
     cfg = dataclasses.replace(cfg, task=task)
     env = build_env(cfg, num_envs=1, seed=cfg.seed)
@@ -132,6 +135,7 @@ def record_video(
     path: Path,
     *,
     note: Callable[[str], None],
+    status: Callable[[str], None] = lambda _: None,
     seconds: float | None = None,
     seed: int = 0,
 ) -> Path | None:
@@ -145,7 +149,8 @@ def record_video(
         with warnings.catch_warnings():
             # Each OpenGL platform that fails warns on its own; the error says it once, with the fix.
             warnings.filterwarnings("ignore", module="glfw")
-            return video.record(env, actor, path, steps=steps, fps=1.0 / clock.step_dt, seed=seed)
+            fps = 1.0 / clock.step_dt
+            return video.record(env, actor, path, steps=steps, fps=fps, seed=seed, status=status)
     except video.VideoUnavailableError as error:
         note(f"no video: {error}")
         return None

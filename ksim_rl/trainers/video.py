@@ -1,6 +1,7 @@
 """A video of a policy consists of the pictures that its env renders while it acts."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -23,7 +24,14 @@ class VideoUnavailableError(RuntimeError):
 
 
 def record(
-    env: EnvBase, policy: TensorDictModuleBase, path: Path, *, steps: int, fps: float, seed: int = 0
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    path: Path,
+    *,
+    steps: int,
+    fps: float,
+    seed: int = 0,
+    status: Callable[[str], None] = lambda _: None,
 ) -> Path:
     """Let the policy act, deterministically, and write what a camera sees; return the file written.
 
@@ -34,7 +42,8 @@ def record(
     if _failed:
         raise VideoUnavailableError(_failed[0])
     every = max(1, round(fps / 50))
-    frames = _frames(env, policy, steps=steps, every=every, seed=seed)
+    acting = partial(_frames, env, policy, steps=steps, every=every, seed=seed, status=status)
+    frames = acting()
     try:
         first = next(frames)
     except VideoUnavailableError:
@@ -47,7 +56,7 @@ def record(
         return _write(path, first, frames, fps=fps / every)
     except (ImportError, RuntimeError, OSError):
         # No ffmpeg for this platform: a GIF needs only Pillow. The frames begin anew, as the generator is spent.
-        frames = _frames(env, policy, steps=steps, every=every, seed=seed)
+        frames = acting()
         return _write(path.with_suffix(".gif"), next(frames), frames, fps=min(fps / every, 25))
 
 
@@ -63,7 +72,13 @@ def _write(path: Path, first: np.ndarray, rest: Iterator[np.ndarray], *, fps: fl
 
 
 def _frames(
-    env: EnvBase, policy: TensorDictModuleBase, *, steps: int, every: int, seed: int
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    *,
+    steps: int,
+    every: int,
+    seed: int,
+    status: Callable[[str], None],
 ) -> Iterator[np.ndarray]:
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         env.set_seed(seed)
@@ -75,5 +90,6 @@ def _frames(
                     raise VideoUnavailableError(
                         "the env has no render mode: build it with render_mode='rgb_array'"
                     )
+                status(f"drawing the video: {step / steps:.0%}")
                 yield frame
             _, current_E = env.step_and_maybe_reset(policy(current_E))

@@ -84,14 +84,14 @@ class OffscreenRenderer:
         """Return a picture of the current state, uint8 [H, W, 3]; `draw` adds the debug drawing of one env."""
         renderer = self._open()
         first, last = self._cfg.env_index, min(self._cfg.env_index + self._cfg.num_envs, world.num_envs)
-        self._pose(world, first)
+        pose_env(self._mj_model, self._data, world, first)
         target = self._cfg.lookat if self._body is None else self._data.xpos[self._body]
         self._camera.lookat[:] = target
         renderer.update_scene(self._data, self._camera, visible_groups(self._mj_model))
         draw(DebugVisualizer(self._mj_model, renderer.scene), first)
         columns = int(np.ceil(np.sqrt(last - first)))
         for index in range(1, last - first):
-            self._pose(world, first + index)
+            pose_env(self._mj_model, self._data, world, first + index)
             row, column = divmod(index, columns)
             offset = np.array([column * self._spacing, row * self._spacing, 0.0])
             add_geoms(self._mj_model, self._data, renderer.scene, offset)
@@ -107,18 +107,6 @@ class OffscreenRenderer:
             self._renderer.close()
             self._renderer = None
 
-    def _pose(self, world: World, env: int) -> None:
-        """Take over what is visible of one env: its state, and its own model fields."""
-        write_fields(
-            self._mj_model,
-            {name: field[env].cpu().numpy() for name, field in world.per_world_fields().items()},
-        )
-        self._data.qpos[:] = world.qpos_EL[env].cpu()
-        if self._mj_model.nmocap:
-            self._data.mocap_pos[:] = world.view("mocap_pos")[env].cpu()
-            self._data.mocap_quat[:] = world.view("mocap_quat")[env].cpu()
-        place(self._mj_model, self._data)
-
     def _open(self) -> mujoco.Renderer:
         if self._renderer is None:
             platform = choose_gl_platform()
@@ -129,3 +117,15 @@ class OffscreenRenderer:
             except Exception as error:  # MuJoCo's platforms raise whatever their loader raises
                 raise RuntimeError(f"{_FIXES}. MUJOCO_GL is {platform!r}, and it said: {error}") from error
         return self._renderer
+
+
+def pose_env(mj_model: mujoco.MjModel, data: mujoco.MjData, world: World, env: int) -> None:
+    """Take over what is visible of one env: its state, and its own fields, which are written into `mj_model`."""
+    write_fields(
+        mj_model, {name: field[env].cpu().numpy() for name, field in world.per_world_fields().items()}
+    )
+    data.qpos[:] = world.qpos_EL[env].cpu()
+    if mj_model.nmocap:
+        data.mocap_pos[:] = world.view("mocap_pos")[env].cpu()
+        data.mocap_quat[:] = world.view("mocap_quat")[env].cpu()
+    place(mj_model, data)

@@ -1,0 +1,7 @@
+"""This room shows what a policy does, while one watches and drives: in a browser, or in MuJoCo's own window.
+
+`Session` steps an env at the pace of the clock and takes requests; a display (`browser`, `native`) shows it.
+"""
+# ruff: noqa: F401
+
+from ksim_rl.viewer.session import Conditions, Session

@@ -1,0 +1,115 @@
+"""The browser viewer serves a session on a port of this machine, through viser."""
+
+import contextlib
+import io
+import time
+from collections.abc import Callable
+
+import numpy as np
+import viser
+
+from ksim_rl.scene.viewer_cfg import ViewerCfg
+from ksim_rl.viewer.browser_scene import BrowserScene, SceneOfEnv
+from ksim_rl.viewer.pad import Pad
+from ksim_rl.viewer.panel import Panel
+from ksim_rl.viewer.plots import Plots
+from ksim_rl.viewer.session import Session
+
+FRAME_S = 1.0 / 30.0
+# How often it is looked for somebody to show something to.
+IDLE_S = 0.2
+
+
+class BrowserViewer:
+    """A server on `host`:`port`, or the next port that is free; it opens at once and shows a session once it has one.
+
+    Anybody who reaches the port can drive, and nobody beyond this machine does with the default host.
+    """
+
+    def __init__(self, *, host: str = "127.0.0.1", port: int = 8080, label: str = "ksim_rl") -> None:
+        with contextlib.redirect_stdout(io.StringIO()):  # where it prints a panel of its own
+            self.server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+        self.server.gui.configure_theme(control_layout="fixed", show_share_button=False, show_logo=False)
+        self.port = self.server.get_port()
+        self.address = f"http://{'localhost' if host == '0.0.0.0' else host}:{self.port}"
+        self._host = host
+        self._notice = self.server.gui.add_markdown("building the env ...")
+        self._session: Session | None = None
+
+    @property
+    def watched(self) -> bool:
+        """Whether a browser is connected."""
+        return bool(self.server.get_clients())
+
+    def open(self, session: Session) -> None:
+        """Show a session from now on."""
+        self._session = session
+        self._notice.remove()
+        server, cfg = self.server, session.ours.cfg.viewer
+        _aim(server, cfg)
+        tabs = server.gui.add_tab_group()
+        with tabs.add_tab("Control"):
+            self._panel = Panel(server.gui, session)
+        with tabs.add_tab("Plots"):
+            self._plots = Plots(server.gui, session)
+        self._pad = Pad(self._panel, session, host=self._host, port=self.port + 1, viewer_port=self.port)
+        self._built = 0
+        self._scene: BrowserScene | None = None
+
+    @property
+    def pad_address(self) -> str:
+        """Where the page for keyboard and gamepad is."""
+        return self._pad.address
+
+    def show(self) -> None:
+        """Send the present state."""
+        session = self._session
+        assert session is not None
+        with self.server.atomic():
+            if session.built != self._built:
+                self.server.scene.reset()
+                self._built, self._env_scene = session.built, SceneOfEnv(session.ours)
+                self._scene = BrowserScene(self.server.scene, self._env_scene.mj_model)
+            assert self._scene is not None
+            self._env_scene.fill(session.env_index, drawn=self._panel.drawn, contacts=self._panel.contacts)
+            center = (
+                self._env_scene.center(session.ours.cfg.viewer.body) if self._panel.follows else np.zeros(3)
+            )
+            self._scene.show(self._env_scene.mjv, center=center)
+            self._panel.show()
+            self._plots.show()
+
+    def run(self, *, goes_on: Callable[[], bool] = lambda: True) -> None:
+        """Step the session and show it while `goes_on`; as long as no browser is connected, nothing happens."""
+        session = self._session
+        assert session is not None
+        sent = False
+        while goes_on():
+            if not self.watched:
+                session.rest()
+                sent = False
+                time.sleep(IDLE_S)
+                continue
+            start = time.monotonic()
+            changed = session.advance(self._plots.take)
+            if changed or not sent:
+                self.show()
+                sent = True
+            time.sleep(max(0.001, FRAME_S - (time.monotonic() - start)))
+
+    def close(self) -> None:
+        """Stop serving."""
+        if self._session is not None:
+            self._pad.close()
+        self.server.stop()
+
+
+def _aim(server: viser.ViserServer, cfg: ViewerCfg) -> None:
+    """Look from where the pictures of videos are taken."""
+    azimuth, elevation = np.radians(cfg.azimuth), np.radians(cfg.elevation)
+    ahead = np.array(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )
+    target = np.array([0.0, 0.0, cfg.lookat[2]])
+    server.initial_camera.look_at = target
+    server.initial_camera.position = target - cfg.distance * ahead

@@ -1,0 +1,140 @@
+"""A running training is watched in a process of its own, on the CPU, which acts with the newest policy.
+
+The training gives its weights away every few seconds, between two iterations and only while a browser is connected.
+Otherwise it does nothing for the viewer: its graphs, its envs and its stream stay as they are.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+from ksim_rl.config import plugins
+from ksim_rl.device import state_tree
+from ksim_rl.trainers import Hook, RunCfg, Trainer
+from ksim_rl.trainers.algorithm import make_policy
+from ksim_rl.trainers.build import build_env
+from ksim_rl.viewer.play_command import Played, addresses, check_viser, session_of
+
+# Seconds between two policies that are given away: a hook lets the host wait for the device, so these are rare.
+PERIOD_S = 2.0
+CONFIG, WEIGHTS = "config.json", "weights.pt"
+_SOME, _NOBODY = "watched", "alone"
+
+
+class GiveWeights(Hook):
+    """Writes the actor's weights for the viewer every `PERIOD_S`, while somebody watches."""
+
+    def __init__(self, folder: Path) -> None:
+        self.interval, self._path = 0, folder / WEIGHTS
+        self._last: tuple[float, int] | None = None
+
+    def watched(self, is_watched: bool) -> None:
+        """Begin, or end; from any thread."""
+        self._last = None
+        self.interval = 1 if is_watched else 0
+
+    def __call__(self, trainer: Trainer) -> None:
+        """Write them, and find out in how many iterations it is time again."""
+        now = time.monotonic()
+        if self._last is not None and self.interval:
+            seconds, iterations = now - self._last[0], trainer.iteration - self._last[1]
+            self.interval = max(1, round(PERIOD_S * max(iterations, 1) / max(seconds, 1e-3)))
+        self._last = now, trainer.iteration
+        state = {name: tensor.cpu() for name, tensor in trainer.update.actor.state_dict().items()}
+        unfinished = self._path.with_suffix(".new")
+        torch.save({"iteration": trainer.iteration, "actor": state}, unfinished)
+        unfinished.replace(self._path)
+
+
+@contextmanager
+def watched(cfg: RunCfg, note: Callable[[str], None]) -> Iterator[list[Hook]]:
+    """Open the viewer that `cfg.viewer` asks for, and yield the hooks that a run needs for it; close it at the end.
+
+    A viewer that ends early costs a line of `note`, not the run.
+    """
+    if not cfg.viewer.browser:
+        yield []
+        return
+    check_viser()
+    with tempfile.TemporaryDirectory(prefix="ksim_rl_viewer_") as name:
+        folder = Path(name)
+        (folder / CONFIG).write_text(json.dumps(cfg.to_tree()))
+        hook = GiveWeights(folder)
+        child = subprocess.Popen(
+            [sys.executable, "-m", "ksim_rl.viewer.live_training", name],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            # No memory on the GPU, and no core that the training needs.
+            env={
+                **os.environ,
+                "CUDA_VISIBLE_DEVICES": "",
+                "OMP_NUM_THREADS": "1",
+            },
+            preexec_fn=lambda: os.nice(10),
+            start_new_session=True,  # Ctrl-C is for the training, which closes the viewer
+        )
+        threading.Thread(target=_listen, args=(child, hook, note), daemon=True).start()
+        try:
+            yield [hook]
+        finally:
+            child.terminate()
+            child.wait()
+
+
+def _listen(child: "subprocess.Popen[str]", hook: GiveWeights, note: Callable[[str], None]) -> None:
+    assert child.stdout is not None
+    for line in child.stdout:
+        if line.strip() in (_SOME, _NOBODY):
+            hook.watched(line.strip() == _SOME)
+        else:
+            note(line.strip())
+    hook.watched(False)
+
+
+def main(folder: Path) -> None:
+    """Serve what the training in the other process has learned, until that ends."""
+    from ksim_rl.viewer.browser import BrowserViewer
+
+    # The training holds the other end of the pipe for as long as it lives.
+    threading.Thread(target=lambda: (sys.stdin.read(), os._exit(0)), daemon=True).start()
+    torch.set_num_threads(1)
+    plugins.load(())
+    cfg = RunCfg.from_tree({**json.loads((folder / CONFIG).read_text()), "device": "cpu", "checkpoint": None})
+    viewer = BrowserViewer(host=cfg.viewer.address, port=cfg.viewer.port, label="training")
+    probe = build_env(cfg, num_envs=1, seed=cfg.seed)
+    actor = make_policy(cfg, probe)
+    probe.close()
+    session = session_of(Played(cfg=cfg, title=cfg.task_name, folder=folder, actor=actor), num_envs=4, seed=0)
+    viewer.open(session)
+    print(*addresses(viewer.address, viewer.pad_address), sep="\n", flush=True)
+    read_at, said = 0, False
+
+    def follow() -> bool:
+        nonlocal read_at, said
+        if viewer.watched != said:
+            said = viewer.watched
+            print(_SOME if said else _NOBODY, flush=True)
+        path = folder / WEIGHTS
+        session.note = session.note or "waiting for the first policy"
+        if path.exists() and path.stat().st_mtime_ns != read_at:
+            read_at = path.stat().st_mtime_ns
+            saved = torch.load(path, weights_only=True)
+            state_tree.copy_into(actor.state_dict(), saved["actor"], what="actor")
+            session.note = f"iteration {saved['iteration']} of a running training"
+        return True
+
+    viewer.run(goes_on=follow)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

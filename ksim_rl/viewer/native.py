@@ -1,0 +1,78 @@
+"""MuJoCo's own window shows a session, on a machine with a display."""
+
+import copy
+import time
+from collections.abc import Callable
+
+import mujoco
+import mujoco.viewer
+
+from ksim_rl.scene.rendering.rendering import pose_env
+from ksim_rl.scene.rendering.visualizer import DebugVisualizer
+from ksim_rl.viewer.browser_scene import draw
+from ksim_rl.viewer.session import SPEEDS, Session
+
+FRAME_S = 1.0 / 60.0
+HELP = "space pauses, N steps, Backspace resets, P pushes, [ and ] change the speed, , and . the env"
+_SPACE, _BACKSPACE = 32, 259
+
+
+def show(
+    session: Session, *, note: Callable[[str], None], goes_on: Callable[[], bool] = lambda: True
+) -> None:
+    """Show a session in a window until that is closed, or `goes_on` says no; keys are those of `HELP`.
+
+    A RuntimeError says that there is no display to open a window on.
+    """
+    mj_model = copy.copy(session.ours.world.mj_model)
+    data = mujoco.MjData(mj_model)
+    keys = _keys(session)
+
+    def pressed(code: int) -> None:
+        if code in keys:
+            session.ask(keys[code])
+
+    note(HELP)
+    try:
+        window = mujoco.viewer.launch_passive(mj_model, data, key_callback=pressed, show_left_ui=False)
+    except (RuntimeError, mujoco.FatalError) as error:
+        raise RuntimeError(
+            f"MuJoCo's window needs a display ({error}): use --viewer browser, which needs none"
+        ) from error
+    said = ""
+    with window:
+        while window.is_running() and goes_on():
+            start = time.monotonic()
+            session.advance()
+            if session.error and session.error != said:
+                note(f"paused by an error: {session.error}; space goes on")
+            said = session.error
+            with window.lock():
+                pose_env(mj_model, data, session.ours.world, session.env_index)
+                marks = window.user_scn
+                assert marks is not None
+                marks.ngeom = 0
+                every = session.ours.setup_manager_visualizers()
+                draw(session.ours, DebugVisualizer(mj_model, marks), session.env_index, every)
+            window.sync()
+            time.sleep(max(0.001, FRAME_S - (time.monotonic() - start)))
+
+
+def _keys(session: Session) -> dict[int, Callable[[], None]]:
+    def speed(change: int) -> None:
+        now = SPEEDS.index(session.speed)
+        session.speed = SPEEDS[min(max(now + change, 0), len(SPEEDS) - 1)]
+
+    def env(change: int) -> None:
+        session.choose((session.env_index + change) % session.ours.num_envs)
+
+    return {
+        _SPACE: lambda: session.play(not session.playing),
+        ord("N"): session.step_once,
+        _BACKSPACE: session.reset,
+        ord("P"): lambda: session.push(1.0),
+        ord("["): lambda: speed(-1),
+        ord("]"): lambda: speed(1),
+        ord(","): lambda: env(-1),
+        ord("."): lambda: env(1),
+    }

@@ -1,0 +1,149 @@
+"""The panel beside the scene holds the controls of a session, in viser's widgets."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from functools import partial
+
+import viser
+
+from ksim_rl.viewer.session import SPEEDS, Conditions, Session
+
+_SPEED_NAMES = {("1/8", "1/4", "1/2", "1", "2", "4", "8")[i]: speed for i, speed in enumerate(SPEEDS)}
+
+
+class Panel:
+    """Shows how a session goes, and asks it for what is clicked.
+
+    Attributes:
+        follows: whether the camera follows the robot.
+        contacts: whether contact points are drawn.
+        drawn: the names of what is drawn for debugging.
+        push_speed: how hard a push is, m/s.
+    """
+
+    def __init__(self, gui: viser.GuiApi, session: Session) -> None:
+        self._gui, self._session = gui, session
+        self.follows, self.contacts = True, False
+        self.drawn: set[str] = set()
+        self._steering: dict[str, tuple[viser.GuiCheckboxHandle, dict[str, viser.GuiSliderHandle]]] = {}
+        self._status = gui.add_markdown("")
+        self._error = gui.add_markdown("", visible=False)
+        self._play = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
+        self._play.on_click(lambda _: session.ask(lambda: session.play(not session.playing)))
+        runs = gui.add_button_group("Run", ("Step", "Reset"))
+        runs.on_click(
+            lambda event: session.ask(session.step_once if _value(event) == "Step" else session.reset)
+        )
+        self._speed = gui.add_button_group("Speed", tuple(_SPEED_NAMES))
+        self._speed.on_click(lambda event: setattr(session, "speed", _SPEED_NAMES[str(_value(event))]))
+        self._env = gui.add_number("Env", 0, min=0, max=session.ours.num_envs - 1, step=1)
+        self._env.on_update(lambda _: session.ask(partial(session.choose, int(self._env.value))))
+        follow = gui.add_checkbox("Camera follows", True)
+        follow.on_update(lambda _: setattr(self, "follows", follow.value))
+        self.push_speed = gui.add_slider("Push (m/s)", 0.1, 3.0, 0.1, 1.0)
+        push = gui.add_button("Push", icon=viser.Icon.HAND_MOVE)
+        push.on_click(lambda _: session.ask(partial(session.push, float(self.push_speed.value))))
+        steerable = {name: term for name, term in session.ours.cfg.commands.items() if term.ranges}
+        if steerable:
+            with gui.add_folder("Commands"):
+                for name, term in steerable.items():
+                    self._add_command(name, term.ranges, prefix=f"{name}." if len(steerable) > 1 else "")
+        with gui.add_folder("Conditions", expand_by_default=False):
+            for field in dataclasses.fields(Conditions):
+                self._add_condition(field.name)
+        with gui.add_folder("Draw", expand_by_default=False):
+            contacts = gui.add_checkbox("contact points", False)
+            contacts.on_update(lambda _: setattr(self, "contacts", contacts.value))
+            for name in session.ours.setup_manager_visualizers():
+                self._add_drawing(name)
+
+    def show(self) -> None:
+        """Bring the widgets up to date."""
+        session = self._session
+        label, icon = (
+            ("Pause", viser.Icon.PLAYER_PAUSE) if session.playing else ("Play", viser.Icon.PLAYER_PLAY)
+        )
+        if self._play.label != label:
+            self._play.label, self._play.icon = label, icon
+        if int(self._env.value) != session.env_index:
+            self._env.value = session.env_index
+        _write(self._status, self._status_text())
+        _write(self._error, f"**Paused by an error**\n```text\n{session.error}\n\n{session.trace}\n```")
+        if self._error.visible != bool(session.error):
+            self._error.visible = bool(session.error)
+
+    def drive(self, shares: Mapping[int, float]) -> None:
+        """Set the fields of the first command to shares of their ranges: -1 is the low end, 0 rest, 1 the high end.
+
+        Rest is 0 where the range holds it, else its middle. From any thread.
+        """
+        for command, (by_hand, sliders) in self._steering.items():
+            for number, share in shares.items():
+                if number >= len(sliders):
+                    continue
+                slider = list(sliders.values())[number]
+                slider.value = _at_share(share, float(slider.min), float(slider.max))
+            by_hand.value = True
+            self._session.ask(partial(self._steer, command))
+            return
+
+    def _status_text(self) -> str:
+        session = self._session
+        ours = session.ours
+        seconds = float(ours.episode_step_E[session.env_index]) * ours.step_dt
+        state = "running" if session.playing else "paused"
+        return (
+            f"**{session.title}** {session.note}\n\n{state}, episode {seconds:.2f} s, return "
+            f"{session.episode_return:.2f}, speed {session.achieved_speed:.2f}, step {session.steps}"
+        )
+
+    def _add_command(self, name: str, ranges: Mapping[str, tuple[float, float]], *, prefix: str) -> None:
+        gui = self._gui
+        by_hand = gui.add_checkbox(f"{name} by hand", False)
+        by_hand.on_update(lambda _: self._session.ask(partial(self._steer, name)))
+        sliders = {}
+        for field, (low, high) in ranges.items():
+            step = max((high - low) / 100, 1e-3)
+            rest = _at_share(0.0, low, high)
+            sliders[field] = gui.add_slider(prefix + field, low, max(high, low + step), step, rest)
+            sliders[field].on_update(partial(self._moved, name))
+        self._steering[name] = (by_hand, sliders)
+
+    def _moved(self, name: str, event: viser.GuiEvent) -> None:
+        if event.client is None:  # moved by the program, which asks for itself
+            return
+        self._steering[name][0].value = True
+        self._session.ask(partial(self._steer, name))
+
+    def _steer(self, name: str) -> None:
+        by_hand, sliders = self._steering[name]
+        values = {field: float(slider.value) for field, slider in sliders.items()}
+        self._session.steer(name, values if by_hand.value else None)
+
+    def _add_condition(self, name: str) -> None:
+        widget = self._gui.add_checkbox(name, getattr(self._session.conditions, name))
+
+        def change() -> None:
+            self._session.change(dataclasses.replace(self._session.conditions, **{name: widget.value}))
+
+        widget.on_update(lambda _: self._session.ask(change))
+
+    def _add_drawing(self, name: str) -> None:
+        self.drawn.add(name)
+        widget = self._gui.add_checkbox(name, True)
+        act: dict[bool, Callable[[str], None]] = {True: self.drawn.add, False: self.drawn.discard}
+        widget.on_update(lambda _: self._session.ask(partial(act[widget.value], name)))
+
+
+def _at_share(share: float, low: float, high: float) -> float:
+    rest = 0.0 if low <= 0.0 <= high else (low + high) / 2
+    return rest + share * (high - rest if share > 0 else rest - low)
+
+
+def _value(event: viser.GuiEvent) -> object:
+    return event.target.value
+
+
+def _write(handle: viser.GuiMarkdownHandle, text: str) -> None:
+    if handle.content != text:
+        handle.content = text

@@ -1,0 +1,201 @@
+"""`ksim-rl play` shows a policy, or an agent without one: as a video, in a browser or in MuJoCo's window."""
+
+import argparse
+import dataclasses
+import importlib
+import importlib.util
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
+from ksim_rl import conf
+from ksim_rl.checks import check_in_range
+from ksim_rl.config.plain_data import check_links
+from ksim_rl.device.kernel_loading import compile_notice
+from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, load_policy, record_video
+from ksim_rl.trainers.build import build_env
+from ksim_rl.viewer.session import AGENTS, Conditions, Session, UntrainedAgent
+
+VIDEO_SUFFIXES = (".mp4", ".gif")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Played:
+    """What is played: a run's policy, or an agent in a task (`actor` is None, and `agent` its kind)."""
+
+    cfg: RunCfg
+    title: str
+    folder: Path
+    actor: TensorDictModuleBase | None = None
+    agent: str = ""
+
+    def policy(self, env: EnvBase) -> TensorDictModuleBase:
+        """Return what acts in an env of `cfg`."""
+        return UntrainedAgent(self.agent, env) if self.actor is None else self.actor
+
+
+def play(arguments: list[str]) -> int:
+    """Run `ksim-rl play <arguments>` and return its exit code."""
+    options = _parser().parse_args(arguments)
+    _check(options)
+    progress = RunProgress(1)
+    with compile_notice(progress.status):
+        played = _find(options)
+        if options.viewer is None:
+            return _record(played, options, progress)
+        session = session_of(played, num_envs=options.num_envs, seed=options.seed)
+    try:
+        if options.viewer == "native":
+            importlib.import_module("ksim_rl.viewer.native").show(session, note=progress.note)
+        else:
+            serve(session, host=options.host, port=options.port, note=progress.note)
+    except KeyboardInterrupt:
+        progress.note("closed")
+    finally:
+        session.close()
+    return 0
+
+
+def session_of(played: Played, *, num_envs: int, seed: int) -> Session:
+    """Make a session of what is played, in so many envs."""
+
+    def make_env(conditions: Conditions) -> EnvBase:
+        cfg = dataclasses.replace(played.cfg, task=conditions.apply(played.cfg.task))
+        return build_env(cfg, num_envs=num_envs, seed=seed)
+
+    return Session(make_env, played.policy, title=played.title, seed=seed)
+
+
+def serve(session: Session, *, host: str, port: int, note: Callable[[str], None]) -> None:
+    """Serve a session to browsers until Ctrl-C."""
+    from ksim_rl.viewer.browser import BrowserViewer
+
+    viewer = BrowserViewer(host=host, port=port, label=session.title)
+    try:
+        viewer.open(session)
+        for line in addresses(viewer.address, viewer.pad_address):
+            note(line)
+        viewer.run()
+    finally:
+        viewer.close()
+
+
+def addresses(viewer: str, pad: str) -> list[str]:
+    """Return the lines that say where the viewer is, and how to reach it from another machine."""
+    ports = [address.rpartition(":")[2] for address in (viewer, pad)]
+    forwarded = " ".join(f"-L {port}:127.0.0.1:{port}" for port in ports)
+    return [
+        f"viewer: {viewer}; with keyboard and gamepad: {pad} (Ctrl-C closes it)",
+        f"from another machine: ssh -N {forwarded} THIS_MACHINE, then the same address there",
+    ]
+
+
+def check_viser() -> None:
+    """Raise a ValueError where viser, which the browser viewer is made of, is missing."""
+    if importlib.util.find_spec("viser") is None:
+        raise ValueError('the browser viewer needs viser: pip install "ksim_rl[viewer]"')
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="ksim-rl play",
+        description="Show a policy, or with --agent a task without one: a video, or with --live a viewer to drive it.",
+    )
+    parser.add_argument(
+        "what",
+        nargs="+",
+        metavar="RUN | task=NAME | field=value",
+        help="a run folder or one of its checkpoints, or with --agent a task; then fields of its config to change",
+    )
+    parser.add_argument(
+        "--live", dest="viewer", action="store_const", const="browser", help="as --viewer browser"
+    )
+    parser.add_argument(
+        "--viewer", choices=("browser", "native"), help="look and drive; native is MuJoCo's window"
+    )
+    parser.add_argument("--agent", choices=AGENTS, help="act without a policy: not at all, or at random")
+    parser.add_argument(
+        "--num-envs", type=int, default=4, help="of a viewer, which shows one at a time; default: 4"
+    )
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="where the browser viewer listens; default: this machine"
+    )
+    parser.add_argument(
+        "--port", type=int, default=8080, help="of the browser viewer, or the next that is free"
+    )
+    parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:<index> or auto")
+    parser.add_argument("--seed", type=int, default=0, help="of the initial state")
+    parser.add_argument(
+        "--seconds", type=float, help="of a video, simulated time; default: as the run was configured"
+    )
+    parser.add_argument(
+        "--output", type=Path, help="of a video: an .mp4 or .gif file; default: play.mp4 in the run folder"
+    )
+    return parser
+
+
+def _check(options: argparse.Namespace) -> None:
+    if options.seconds is not None:
+        check_in_range("--seconds", options.seconds, low=0.0, low_open=True)
+    if options.num_envs < 1:
+        raise ValueError(f"--num-envs {options.num_envs}: expected at least 1")
+    if options.output is not None and options.output.suffix not in VIDEO_SUFFIXES:
+        raise ValueError(
+            f"--output {options.output}: expected a file that ends in {' or '.join(VIDEO_SUFFIXES)}"
+        )
+    if options.viewer == "browser":
+        check_viser()
+    if options.viewer is not None and (options.output, options.seconds) != (None, None):
+        raise ValueError("--output and --seconds are of a video: leave them out, or leave out the viewer")
+
+
+def _find(options: argparse.Namespace) -> Played:
+    """Find the run or the task, with the changes to its config."""
+    first, *overrides = options.what
+    if "=" in first and not Path(first).exists():
+        if options.agent is None or not any(text.startswith("task=") for text in options.what):
+            raise ValueError(
+                f"{first!r}: expected a run folder, or task=NAME with --agent zero or random, as it has no policy"
+            )
+        return _without_policy(conf.compose([*options.what, f"device={options.device}"]), options.agent)
+    changed = None
+    folder = checkpoint.latest(Path(first)).absolute().parent.parent
+    if overrides:
+        conf.register_run(folder, [text.lstrip("+~").partition("=")[0] for text in overrides])
+        composed = conf.check_command_line(overrides, name=conf.RUN_AGAIN, multirun=False, values=True)
+        changed = dataclasses.replace(composed[0], device=options.device)
+    policy = load_policy(Path(first), device=options.device, cfg=changed)
+    if options.agent is not None:
+        return _without_policy(policy.cfg, options.agent)
+    title = f"{policy.cfg.task_name}, iteration {policy.iteration}"
+    return Played(cfg=policy.cfg, title=title, folder=folder, actor=policy.actor)
+
+
+def _without_policy(cfg: RunCfg, agent: str) -> Played:
+    # Looking on leaves no files of states that are not finite.
+    sim = dataclasses.replace(cfg.task.sim, nan_guard=None)
+    cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, sim=sim))
+    return Played(cfg=cfg, title=f"{cfg.task_name}, {agent} actions", folder=Path(), agent=agent)
+
+
+def _record(played: Played, options: argparse.Namespace, progress: RunProgress) -> int:
+    path = options.output
+    if path is None:
+        if played.actor is not None:
+            check_links(played.folder, below=())
+        path = played.folder / "play.mp4"
+    probe = build_env(played.cfg, num_envs=1, seed=options.seed)
+    actor = played.policy(probe)
+    probe.close()
+    how = {"note": progress.note, "seconds": options.seconds, "seed": options.seed}
+    with progress.console.status("drawing the video") as spinner:
+        status = spinner.update if progress.console.is_terminal else progress.status
+        written = record_video(played.cfg, actor, path, status=status, **how)
+    if written is None:
+        return 3
+    progress.note(f"{played.title}: {min(str(written), os.path.relpath(written), key=len)}")
+    return 0

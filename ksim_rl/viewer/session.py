@@ -1,0 +1,269 @@
+"""A session steps an env at the pace of the clock, under an agent, and takes requests from those who watch."""
+
+import dataclasses
+import queue
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
+from ksim_rl.envs.contract import part
+from ksim_rl.transforms import ActionDelay, ObservationDelay, ObservationNoise
+
+AGENTS = ("zero", "random")
+Agent = Callable[[TensorDictBase], TensorDictBase]
+SPEEDS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+# Longer gaps in which nothing was stepped, such as a rebuilt env, are not made up for.
+MOST_LAG_S = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conditions:
+    """What disturbs the policy: each can be switched off. Curricula are always off, as in evaluations.
+
+    `randomization` are events that run at startup or write the model's fields, `pushes` those that run at intervals.
+    """
+
+    noise: bool = True
+    delay: bool = True
+    randomization: bool = True
+    pushes: bool = True
+
+    def apply(self, cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
+        """Return the config of an env without what is switched off."""
+        replace, own = dataclasses.replace, (lambda delay: delay if self.delay else None)
+        groups = {}
+        for name, group in cfg.observations.items():
+            terms = {key: replace(term, delay=own(term.delay)) for key, term in group.terms.items()}
+            noise = group.enable_noise and self.noise
+            groups[name] = replace(group, enable_noise=noise, delay=own(group.delay), terms=terms)
+        dropped = () if self.noise else (ObservationNoise,)
+        dropped += () if self.delay else (ObservationDelay, ActionDelay)
+        kept = [name for name, own in cfg.transforms.items() if not issubclass(own.transform, dropped)]
+        transforms = {name: cfg.transforms[name] for name in kept}
+        events = cfg.events
+        if events is not None:
+            events = {
+                name: event
+                for name, event in events.items()
+                if (self.pushes or event.mode != "interval")
+                and (self.randomization or not (event.per_world_fields or event.mode == "startup"))
+            }
+        return replace(cfg, observations=groups, transforms=transforms, events=events, curriculum={})
+
+
+class UntrainedAgent(TensorDictModuleBase):
+    """Writes "action" into the roots of an env: zeros, or draws of the action spec (normal where it has no bounds)."""
+
+    def __init__(self, kind: str, env: EnvBase) -> None:
+        super().__init__()
+        self._draw = {"zero": env.action_spec.zero, "random": env.action_spec.rand}[kind]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        return tensordict.set("action", self._draw())
+
+
+class Session:
+    """Steps an env under an agent; all that touches the env runs in the thread that calls `advance`.
+
+    Other threads ask with `ask(function)`, which then runs between two steps. An error of the agent, the env or such a
+    request pauses the session and stands in `error`, with its traceback in `trace`, until it plays again. The methods
+    from `play` to `change` are such requests.
+
+    Attributes:
+        make_env: builds the env for given conditions; called anew when these change.
+        agent: writes "action" into a root of the env; it acts deterministically.
+        env_index: the env that is shown, pushed and plotted.
+        rewards: the weighted reward terms of that env in the last step.
+        note: what is said beside the figures, such as how old the policy is.
+    """
+
+    def __init__(
+        self,
+        make_env: Callable[[Conditions], EnvBase],
+        make_agent: Callable[[EnvBase], Agent],
+        *,
+        title: str = "",
+        seed: int = 0,
+    ) -> None:
+        self.title, self.seed, self.note = title, seed, ""
+        self._make_env, self._make_agent = make_env, make_agent
+        self.conditions = Conditions()
+        self.playing, self.speed, self.env_index = True, 1.0, 0
+        self.error, self.trace = "", ""
+        self.steps = 0
+        self.built = 0  # how many envs there have been
+        self.rewards: dict[str, float] = {}
+        self.episode_return, self.achieved_speed = 0.0, 0.0
+        self._steered: dict[str, dict[str, float]] = {}
+        self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._last: float | None = None
+        self._due = 0.0
+        self._paces: list[tuple[float, int]] = []
+        self._build()
+
+    @property
+    def ours(self) -> ManagerBasedRlEnv:
+        """The env inside of all transforms."""
+        found = part(self.env, ManagerBasedRlEnv)
+        if found is None:
+            raise ValueError(f"{type(self.env).__name__}: the viewer shows envs of this package only")
+        return found
+
+    @property
+    def observations(self) -> Mapping[str, Float[Tensor, " ?L"]]:
+        """The clean reading of each observation term that is a vector, of the shown env."""
+        terms = self._root_E.get("obs")
+        return {key: terms.get(key)[self.env_index] for key in terms.keys() if terms.get(key).ndim == 2}
+
+    @property
+    def commands(self) -> Mapping[str, Float[Tensor, " ?L"]]:
+        """The present command vectors of the shown env."""
+        return {name: value_EK[self.env_index] for name, value_EK in self.ours.command_manager.values.items()}
+
+    def ask(self, request: Callable[[], None]) -> None:
+        """Let `request` run between two steps; from any thread."""
+        self._requests.put(request)
+
+    def play(self, playing: bool = True) -> None:
+        """Go on, or pause; an error is forgotten."""
+        self.playing, self.error, self.trace, self._last = playing, "", "", None
+
+    def step_once(self) -> None:
+        """Pause, and do a single env step."""
+        self.play(False)
+        self._step()
+
+    def reset(self) -> None:
+        """Start new episodes in all envs."""
+        with torch.no_grad():
+            self._root_E = self.env.reset()
+        self.episode_return, self.rewards = 0.0, {}
+
+    def choose(self, env_index: int) -> None:
+        """Show another env; a ValueError if there is none of this number."""
+        if not 0 <= env_index < self.ours.num_envs:
+            raise ValueError(f"env {env_index}: expected 0 to {self.ours.num_envs - 1}")
+        self.env_index, self.episode_return, self.rewards = env_index, 0.0, {}
+
+    def push(self, speed: float, direction: float | None = None) -> None:
+        """Add a horizontal velocity (m/s) in a direction (rad, world frame; None draws one) to the shown env's robot.
+
+        A robot that stands on a fixed base gets its first joint pushed instead, in rad/s or m/s.
+        """
+        ours = self.ours
+        angle = torch.rand(()) * 2.0 * torch.pi if direction is None else torch.tensor(direction)
+        robot = ours.view.entity("")
+        if robot.free_root:
+            first = robot.root_qvel.start
+            kick = speed * torch.stack((torch.cos(angle), torch.sin(angle)))
+            ours.world.qvel_EL[self.env_index, first : first + 2] += kick.to(ours.world.qvel_EL)
+        else:
+            ours.world.qvel_EL[self.env_index, 0] += speed * float(torch.sign(torch.cos(angle)))
+        ours.driver.changed()
+        ours.world.refresh()
+        ours.driver.refreshed()
+
+    def steer(self, command: str, values: Mapping[str, float] | None) -> None:
+        """Hold the fields of a drawn command at these values in all envs; None lets it be drawn again.
+
+        Fields are those of the term's `ranges`, in its units: both ends of a range become the value. Draws that are
+        the term's own, such as which envs stand still, then fall on the last choice, that of none.
+        """
+        ours = self.ours
+        term, driver = ours.cfg.commands[command], ours.driver
+        own = torch.tensor(list(term.ranges.values()), dtype=torch.float32).T
+        with driver.scope(f"commands/{command}", draws="step"):
+            shared_2N = term.shared_ranges(ours.view)
+            shared_2N[:, : own.shape[1]] = own.to(shared_2N)
+            shared_2N[:, own.shape[1] :] = torch.tensor([[0.0], [1.0]]).to(shared_2N)
+            if values is not None:
+                shared_2N[0] = shared_2N[1]
+                for column, field in enumerate(term.ranges):
+                    shared_2N[:, column] = values[field]
+            everybody_E = torch.ones(ours.num_envs, dtype=torch.bool, device=shared_2N.device)
+            term.resample(ours.view, everybody_E)
+        ours.command_manager.refresh(everybody_E)
+        if values is None:
+            self._steered.pop(command, None)
+        else:
+            self._steered[command] = dict(values)
+
+    def change(self, conditions: Conditions) -> None:
+        """Build the env anew under other conditions, and start new episodes in it."""
+        self.conditions = conditions
+        self.env.close(raise_if_closed=False)
+        self._build()
+
+    def rest(self) -> None:
+        """Let the time that passes until the next `advance` not count."""
+        self._last = None
+
+    def advance(self, after_step: Callable[[], None] = lambda: None) -> bool:
+        """Do what was asked for, then the steps that are due by now; return whether anything changed."""
+        before = self.steps
+        changed = False
+        while not self._requests.empty():
+            self._guarded(self._requests.get())
+            changed = True
+        now = time.monotonic()
+        if self._last is None or not self.playing:
+            self._last, self._due, self._paces = now, 0.0, [(now, self.steps)]
+        self._due += min(now - self._last, MOST_LAG_S) * self.speed / self.ours.step_dt
+        self._last = now
+        # No display is kept waiting for long by steps that take longer than they last.
+        while self.playing and self._due >= 1.0 and time.monotonic() - now < MOST_LAG_S:
+            self._due -= 1.0
+            self._guarded(self._step)
+            after_step()
+        self._due = min(self._due, 1.0)
+        self._paces = [*self._paces[-60:], (now, self.steps)]
+        (start, first), (end, last) = self._paces[0], self._paces[-1]
+        self.achieved_speed = (last - first) * self.ours.step_dt / (end - start) if end > start else 0.0
+        return changed or self.steps != before
+
+    def close(self) -> None:
+        """Free the env's worlds."""
+        self.env.close(raise_if_closed=False)
+
+    def _guarded(self, action: Callable[[], None]) -> None:
+        try:
+            action()
+        except Exception as error:  # whatever a policy, a term or a config of the user's raises
+            self.playing = False
+            self.error = f"{type(error).__name__}: {error}"
+            self.trace = "".join(traceback.format_exception(error))
+
+    def _build(self) -> None:
+        self.env = self._make_env(self.conditions)
+        self.env_index = min(self.env_index, self.ours.num_envs - 1)
+        self.agent = self._make_agent(self.env)
+        self.built += 1
+        self.env.set_seed(self.seed)
+        self.reset()
+        for command, values in self._steered.copy().items():
+            self.steer(command, values)
+
+    def _step(self) -> None:
+        sums_ER = self.ours.reward_manager.episode_sums_ER
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            before_R = sums_ER[self.env_index].clone()
+            stepped_E = self.env.step(self.agent(self._root_E))
+            # Sums of episodes that ended are cleared by the reset, so they are read before.
+            rewards_R = (sums_ER[self.env_index] - before_R).tolist()
+            next_E = stepped_E.get("next")
+            reward, done = (float(next_E.get(key)[self.env_index]) for key in ("reward", "done"))
+            self._root_E = self.env.maybe_reset(self.env.step_mdp(stepped_E))
+        self.rewards = dict(zip(self.ours.reward_manager.names, rewards_R, strict=True))
+        self.episode_return = 0.0 if done else self.episode_return + reward
+        self.steps += 1
