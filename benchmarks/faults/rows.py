@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from benchmarks.faults import disk, growth, interrupts, saving
+from benchmarks.faults import disk, gpu, growth, interrupts, machine, numbers, saving, strangers
 from benchmarks.faults.row import Row
 
 ROWS: dict[str, Row] = {
     **saving.ROWS,
     **disk.ROWS,
     **interrupts.ROWS,
+    **numbers.ROWS,
+    **strangers.ROWS,
+    **machine.ROWS,
     **growth.ROWS,
+    **gpu.ROWS,
 }
