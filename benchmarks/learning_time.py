@@ -3,7 +3,7 @@
     python -m benchmarks.learning_time task=go1_velocity_flat seeds=1,2,3 env_states=60e6 device=cuda
 
 takes the overrides of `ksim-rl train`. Each seed is trained as in `benchmarks.learning_curve`; the seconds are those of
-training (collecting, learning, logging) up to the end of the first `HELD_STATES` env states over which the mean of each
+training (collecting, learning, logging) up to the end of the first million env states over which the mean of each
 of `LEVELS` (or of `TWO_LEGS`) is at least its level. Figures go to benchmarks/results/learning_time.json:
 `seconds_to_track`, the median over the seeds, and `env_states_to_track`, with another objective than PPO or other
 modules than MLPs under the names of those; and `seconds_of_seeds`. A seed that does not get there counts as infinite;
@@ -23,36 +23,21 @@ from rich.table import Table
 from benchmarks import command_line, report
 from benchmarks.learning_curve import (
     OWN_OPTIONS,
-    Point,
     chosen_seeds,
     fail_without,
     other_choices,
     run_cfg,
     train_and_keep,
 )
+from ksim_rl.tables.levels import Point, reached
 
 # What mjlab 1.6.0 with rsl_rl 5.4.2 reaches after 30 M env states, in 192 s on an H200.
 LEVELS = {"reward/track_linear_velocity": 1.39, "reward/track_angular_velocity": 1.20}
 # The peer has no level for robots on two legs: after 30 M env states its G1 falls at once.
 TWO_LEGS = {"reward/track_linear_velocity": 1.40, "reward/track_angular_velocity": 1.00}
 LEVELS_OF = {"g1_velocity_flat": TWO_LEGS, "t1_velocity_flat": TWO_LEGS, "humanoid_velocity_flat": TWO_LEGS}
-HELD_STATES = 1e6
 # On a GPU its medians, with PPO and MLPs, stand in the results by their names alone.
 TASK = "go1_velocity_flat"
-
-
-def reached(points: list[Point], levels: dict[str, float] = LEVELS) -> Point | None:
-    """Return the end of the first `HELD_STATES` env states over which all levels hold in the mean; None: never."""
-    for index, point in enumerate(points):
-        end = point["env_states"] + HELD_STATES
-        held = [other for other in points[index:] if other["env_states"] <= end]
-        if points[-1]["env_states"] < end:
-            return None
-        if all(
-            statistics.fmean(p.get(name, -math.inf) for p in held) >= level for name, level in levels.items()
-        ):
-            return held[-1]
-    return None
 
 
 def medians(ends: dict[int, Point | None]) -> dict[str, float]:

@@ -26,6 +26,7 @@ usage: ksim-rl <command> [arguments]
   warmup   compile ahead of time:   ksim-rl warmup task=go1_velocity_flat device=cuda
   envs     list the tasks, or print what one is made of: ksim-rl envs cartpole_swingup
   robot    analyse a robot's model: ksim-rl robot unitree_a1/a1 [--code]
+  reproduce  run a table of results: ksim-rl reproduce dm_control --rows 'ppo/Cart.*'
 
 RUN is a run folder (its newest checkpoint) or one of its checkpoints.
 --plugin PACKAGE, with any command and repeatable, imports a package of yours: its tasks, and the terms, robots,
@@ -48,6 +49,7 @@ COMMANDS = {
     "warmup": "ksim_rl.cli.warmup:warmup",
     "envs": "ksim_rl.cli.run_commands:list_envs",
     "robot": "ksim_rl.cli.run_commands:robot",
+    "reproduce": "ksim_rl.tables.reproduce:reproduce",
 }
 
 

@@ -28,6 +28,7 @@ class Evaluator:
     """Runs the first episode of each env from the same seed, with the policy's deterministic action.
 
     The envs `["E"]` are stepped by nothing else. Their own `max_episode_length` is the natural `max_steps`.
+    After a call `length_E`, float64 [E], has the steps of each episode.
     """
 
     def __init__(self, env: EnvBase, policy: TensorDictModuleBase, *, max_steps: int, seed: int) -> None:
@@ -35,7 +36,7 @@ class Evaluator:
         self.max_steps, self.seed = max_steps, seed
         num_envs, device = env.batch_size[0], env.device or torch.device("cpu")
         self._return_E = torch.zeros(num_envs, dtype=torch.float64, device=device)
-        self._length_E = torch.zeros(num_envs, dtype=torch.float64, device=device)
+        self.length_E = torch.zeros(num_envs, dtype=torch.float64, device=device)
         self._running_E = torch.ones(num_envs, dtype=torch.bool, device=device)
         self._current_E: TensorDictBase | None = None
         self._step = Captured(self._count_one_step, device=device)
@@ -49,7 +50,7 @@ class Evaluator:
                     return None
                 self._step()
         std, mean = torch.std_mean(self._return_E, correction=0)
-        figures = torch.stack([mean, std, self._length_E.mean(), self._running_E.sum().to(torch.float64)])
+        figures = torch.stack([mean, std, self.length_E.mean(), self._running_E.sum().to(torch.float64)])
         *means, unfinished = figures.tolist()
         names = ("return_mean", "return_std", "length_mean")
         return Evaluation(
@@ -66,7 +67,7 @@ class Evaluator:
         else:
             self._keep(first_E)
         self._return_E.zero_()
-        self._length_E.zero_()
+        self.length_E.zero_()
         self._running_E.fill_(True)
 
     def _count_one_step(self) -> None:
@@ -76,7 +77,7 @@ class Evaluator:
         next_E = stepped_E.get("next")
         reward_E, done_E = (next_E.get(key).reshape(-1) for key in self._signals[:2])
         self._return_E.add_(torch.where(self._running_E, reward_E.to(torch.float64), 0.0))
-        self._length_E.add_(self._running_E)
+        self.length_E.add_(self._running_E)
         self._running_E.logical_and_(~done_E)
         self._keep(current_E)
 

@@ -1,0 +1,48 @@
+"""This module says when a learning curve has reached levels, what several seeds come to, and whether that suffices."""
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ksim_rl.tables.table import Row
+
+HELD_STATES = 1e6
+Point = Mapping[str, float]
+
+
+def reached(points: Sequence[Point], levels: Mapping[str, float]) -> Point | None:
+    """Return the end of the first `HELD_STATES` env states over which all levels hold in the mean; None: never.
+
+    Points have "env_states" and metrics by name. A metric that a point lacks is minus infinite.
+    """
+    for index, point in enumerate(points):
+        end = point["env_states"] + HELD_STATES
+        held = [other for other in points[index:] if other["env_states"] <= end]
+        if points[-1]["env_states"] < end:
+            return None
+        if all(
+            statistics.fmean(p.get(name, -math.inf) for p in held) >= level for name, level in levels.items()
+        ):
+            return held[-1]
+    return None
+
+
+def value_of(row: Row, results: Sequence[Mapping[str, Any]]) -> float | None:
+    """Return what the seeds of a row come to: the mean return, or the median of seconds; None is infinite."""
+    if row.measure == "return":
+        return statistics.fmean(result["evaluation"]["return_mean"] for result in results)
+    seconds = [result["seconds_to_levels"] for result in results]
+    middle = statistics.median(math.inf if value is None else value for value in seconds)
+    return middle if math.isfinite(middle) else None
+
+
+def is_reached(row: Row, results: Sequence[Mapping[str, Any]]) -> bool | None:
+    """Return whether a row reaches all its goals; None where it has none."""
+    value, found = value_of(row, results), []
+    if row.goal is not None:
+        is_good = value is not None and (value >= row.goal if row.measure == "return" else value <= row.goal)
+        found.append(is_good)
+    if row.most_falls is not None:
+        found.append(max(result["falls"] for result in results) < row.most_falls)
+    return all(found) if found else None

@@ -1,0 +1,108 @@
+"""This module trains one seed of a row, judges its final policy, and writes what came of it.
+
+    python -m ksim_rl.tables.measure TABLE ROW SEED RESULT RUN_FOLDER DEVICE [smoke]
+
+is a process of its own for each, which `ksim-rl reproduce` starts.
+"""
+
+import hashlib
+import json
+import os
+import sys
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from ksim_rl import conf
+from ksim_rl.device.kernel_loading import compile_notice
+from ksim_rl.runs import record
+from ksim_rl.runs.csv_table import read_table
+from ksim_rl.tables.levels import reached
+from ksim_rl.tables.table import Row, load
+from ksim_rl.trainers import Hook, RunCfg, RunProgress, Trainer, run
+
+KEPT_POINTS = 60
+# One evaluation, at the end, of the final policy.
+FIXED = "trainer.eval_interval=0 trainer.checkpoint_interval=0 trainer.stop_when_solved=false logger=local"
+# Two iterations and a few short episodes say whether all parts of a row work, and nothing about how well it learns.
+SMOKE = "num_envs=8 data.num_env_states_per_minibatch=32 data.num_minibatches=2 task.episode_length_s=0.4"
+
+
+def run_cfg(row: Row, seed: int, *, device: str = "auto", smoke: bool = False) -> RunCfg:
+    """Compose the config of a seed, as `ksim-rl train` does; a ValueError names the override that is wrong."""
+    words = [f"task={row.task}", f"objective={row.objective}", f"seed={seed}", f"device={device}"]
+    words += [*FIXED.split(), *row.overrides, f"trainer.eval_episodes={8 if smoke else row.episodes}"]
+    cfg = conf.compose([*words, *(SMOKE.split() if smoke else ())])
+    per_iteration = cfg.num_envs * cfg.data.rollout_length(cfg.num_envs)
+    num_iterations = 2 if smoke else max(1, int(row.env_states // per_iteration))
+    quick = {"compile": False} if smoke and hasattr(cfg.objective, "compile") else {}
+    trainer = replace(cfg.trainer, num_iterations=num_iterations, video=False)
+    return replace(cfg, trainer=trainer, objective=replace(cfg.objective, **quick))
+
+
+def settings(row: Row, cfg: RunCfg) -> str:
+    """Return a fingerprint of all that makes a row, its seed apart: seeds of different settings are never mixed."""
+    tree = {key: value for key, value in cfg.to_tree().items() if key not in ("seed", "device")}
+    tree["row"] = {"levels": dict(row.levels), "episodes": row.episodes, "measure": row.measure}
+    return hashlib.sha256(json.dumps(tree, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+class _Judge(Hook):
+    """Keeps what is known when training has ended: the evaluation comes before this hook."""
+
+    interval = 0
+
+    def __init__(self) -> None:
+        self.falls, self.seconds_in_all, self.ended = 0.0, 0.0, 0.0
+
+    def at_end(self, trainer: Trainer) -> None:
+        self.ended, self.seconds_in_all = time.monotonic(), trainer.clock.total
+        if trainer.evaluator is not None:
+            too_early_E = trainer.evaluator.length_E < trainer.evaluator.max_steps
+            self.falls = float(too_early_E.double().mean())
+
+
+def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) -> dict[str, Any]:
+    """Train and judge; return plain data. An interrupted run raises, so that it leaves no result."""
+    cfg, judge = run_cfg(row, seed, device=device, smoke=smoke), _Judge()
+    progress, began = RunProgress(cfg.trainer.num_iterations), time.monotonic()
+    with compile_notice(progress.status):
+        outcome = run(cfg, run_folder, progress=progress, hooks=[judge])
+    if outcome.interrupted_by is not None or outcome.evaluation is None:
+        raise KeyboardInterrupt
+    names = ("env_states", "seconds", "episode/return", "episode/length", *row.levels)
+    _, lines = read_table(run_folder / "metrics.csv")
+    points = [{n: float(line[n]) for n in names if line.get(n)} for line in lines if line.get("seconds")]
+    end = reached(points, row.levels) if row.levels else None
+    session = record.read(run_folder)[-1]
+    code = session.code.get("ksim_rl", {"commit": os.environ.get("GIT_COMMIT", "unknown")})
+    return {
+        "settings": settings(row, cfg),
+        "commit": code["commit"] + ("-dirty" if len(code) > 1 else ""),
+        "date": session.began,
+        "versions": dict(session.versions),
+        "device": next((v for k, v in session.hardware.items() if k.startswith("gpu")), "CPU"),
+        "env_states": outcome.env_states,
+        # From the start of training, its first iteration included; what was compiled and allocated before is apart.
+        "seconds": round(points[-1]["seconds"], 2),
+        "seconds_before": round(judge.ended - began - judge.seconds_in_all, 2),
+        "evaluation": asdict(outcome.evaluation),
+        "falls": round(judge.falls, 5),
+        "seconds_to_levels": None if end is None else round(end["seconds"], 2),
+        "env_states_to_levels": None if end is None else end["env_states"],
+        "curve": [*points[: -1 : max(1, len(points) // KEPT_POINTS)], points[-1]],
+    }
+
+
+def main(name: str, row: str, seed: str, result: str, run_folder: str, device: str, smoke: str = "") -> None:
+    """Measure and write; the result appears whole or not at all."""
+    found = measure(load(name).rows[row], int(seed), Path(run_folder), device=device, smoke=bool(smoke))
+    path = Path(result)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.with_suffix(".part").write_text(json.dumps(found, indent=1) + "\n")
+    os.replace(path.with_suffix(".part"), path)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

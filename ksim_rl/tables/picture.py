@@ -1,0 +1,43 @@
+"""This module draws a table: each row's seeds and what they come to, beside what others report."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ksim_rl.tables.levels import value_of
+from ksim_rl.tables.table import Table
+
+OURS, OTHERS = "#3465a4", (("D", "#cc5500"), ("s", "#75507b"), ("^", "#4e9a06"), ("v", "#c4a000"))
+
+
+def draw(table: Table, rows: Mapping[str, Sequence[Mapping[str, Any]]], path: Path) -> None:
+    """Draw one panel per group; `rows` has the results of those rows that are complete."""
+    groups = [(group, [n for n in names if n in rows]) for group, names in table.groups().items()]
+    groups = [(group, names) for group, names in groups if names]
+    height = 1.8 + 0.27 * max(len(names) for _, names in groups)
+    figure = Figure(figsize=(6.0 * len(groups), height), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(table.title, fontsize=12)
+    for column, (group, names) in enumerate(groups):
+        axes = figure.add_subplot(1, len(groups), column + 1)
+        for line, name in enumerate(names):
+            for result in (*[[one] for one in rows[name]], rows[name]):
+                if (value := value_of(table.rows[name], result)) is not None:
+                    axes.plot([value], [line], "|" if result is rows[name] else ".", color=OURS, ms=12)
+        others = list(dict.fromkeys(key for name in names for key in table.rows[name].published))
+        for other, (marker, color) in zip(others, OTHERS, strict=False):
+            pairs = [(table.rows[n].published.get(other), line) for line, n in enumerate(names)]
+            values, lines = zip(*((v, line) for v, line in pairs if v is not None), strict=True)
+            axes.plot(values, lines, marker, color=color, ms=4, label=other)
+        axes.plot([], [], "|", color=OURS, label="ours, and its seeds")
+        axes.set_yticks(range(len(names)), [name.rpartition("/")[2] for name in names], fontsize=8)
+        axes.set_ylim(len(names) - 0.5, -0.5)
+        axes.set_xlim(left=0.0)
+        axes.set_xlabel(table.rows[names[0]].measure, fontsize=9)
+        axes.set_title(group or table.name, fontsize=10.5)
+        axes.grid(alpha=0.25)
+        axes.legend(fontsize=8, frameon=False)
+    figure.savefig(path, dpi=100)

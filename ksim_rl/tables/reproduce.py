@@ -1,0 +1,74 @@
+"""`ksim-rl reproduce TABLE` runs what a table lacks, and writes it as JSON, Markdown and a picture."""
+
+import argparse
+import math
+import re
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from ksim_rl.checks import near
+from ksim_rl.tables import report
+from ksim_rl.tables.levels import is_reached
+from ksim_rl.tables.measure import run_cfg
+from ksim_rl.tables.runner import Runs
+from ksim_rl.tables.table import load, shipped
+
+
+def reproduce(arguments: Sequence[str]) -> int:
+    """Run the command; the code is 1 where a row does not reach its goal or has no result, 0 else."""
+    options = _parser().parse_args(arguments)
+    began, smoke, seeds, table = time.monotonic(), options.smoke, options.seeds, load(options.table)
+    rows = {name: row for name, row in table.rows.items() if re.fullmatch(options.rows, name)}
+    known = sorted({seed for row in rows.values() for seed in row.seeds})
+    if not rows:
+        raise ValueError(f"--rows {options.rows}: {table.name} has no such: {near(options.rows, table.rows)}")
+    if strangers := set(seeds) - set(known):
+        raise ValueError(f"--seeds: {strangers} are none of {known}; try other seeds with ksim-rl train")
+    default = "benchmarks/results/tables" if Path("benchmarks/results").is_dir() else "tables"
+    output = (options.output or Path(default)) / ("smoke" if smoke else "")
+    run_folder = options.runs / ("smoke" if smoke else "") / table.name
+    device = options.device if torch.cuda.is_available() else "cpu"
+    runs = Runs(table, output / table.name, run_folder, source=options.table, smoke=smoke)
+
+    def write(said: str) -> None:
+        report.write(table, runs.complete(seeds), output, seeds=seeds)
+        print(said, flush=True)
+
+    present = {} if smoke else runs.results()
+    # Seed by seed, so that what is cut off has some seeds of all rows.
+    jobs = [
+        (name, seed)
+        for seed in seeds or known
+        for name, row in rows.items()
+        if seed in row.seeds and seed not in present.get(name, {})
+    ]
+    for name in {name for name, _ in jobs}:
+        run_cfg(rows[name], 1, device="cpu", smoke=smoke)  # what is wrong is said before anything runs
+    left = runs.run(jobs, device=device, until=began + 60.0 * options.minutes, note=write)
+    write(f"{left} runs are missing; the table is {output / table.name}.md")
+    done = runs.complete(seeds)
+    missed = [name for name in rows if name in done and is_reached(rows[name], done[name]) is False]
+    return 1 if left or (missed and not smoke) else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="ksim-rl reproduce",
+        description="Run what is missing of a table of results, and write the table. Results that are there stay.",
+    )
+    parser.add_argument("table", help=f"one of {', '.join(shipped())}, or a YAML file of yours")
+    parser.add_argument("--rows", default=".*", help="regular expression of rows, such as 'ppo/Walker.*'")
+    parser.add_argument("--seeds", type=_seeds, default=[], help="some of the table's, such as 1,2")
+    parser.add_argument("--device", default="cuda", help="cpu, or cuda where there is a GPU")
+    parser.add_argument("--output", type=Path, help="default: benchmarks/results/tables, or tables elsewhere")
+    parser.add_argument("--runs", type=Path, default=Path("runs/tables"), help="where the runs lie")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="end then; 0 writes what is there")
+    parser.add_argument("--smoke", action="store_true", help="two iterations each: does it run at all?")
+    return parser
+
+
+def _seeds(text: str) -> list[int]:
+    return [int(word) for word in text.split(",")]

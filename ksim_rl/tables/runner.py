@@ -1,0 +1,93 @@
+"""This module runs what a table lacks: a process for each row and seed, side by side where there are several GPUs."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ksim_rl.tables.measure import run_cfg, settings
+from ksim_rl.tables.table import Table
+
+POLL_S = 0.2
+Job = tuple[str, int]  # a row and a seed
+
+
+class Runs:
+    """The runs of one table: results in `folder`/<row>/seed_<n>.json, run folders and logs below `run_folder`."""
+
+    def __init__(self, table: Table, folder: Path, run_folder: Path, *, source: str, smoke: bool) -> None:
+        self.table, self.folder, self.run_folder, self.source = table, folder, run_folder, source
+        self.smoke, self._of = smoke, cache(lambda name: run_cfg(table.rows[name], 1, smoke=smoke))
+
+    def results(self) -> dict[str, dict[int, dict[str, Any]]]:
+        """Return the results that count, by row and seed: those of the settings that the row has now."""
+        found: dict[str, dict[int, dict[str, Any]]] = {}
+        for name, row in self.table.rows.items():
+            paths = {seed: self.folder / name / f"seed_{seed}.json" for seed in row.seeds}
+            present = {seed: json.loads(path.read_text()) for seed, path in paths.items() if path.exists()}
+            own = settings(row, self._of(name)) if present else ""
+            found[name] = {seed: result for seed, result in present.items() if result["settings"] == own}
+        return found
+
+    def complete(self, seeds: Sequence[int]) -> dict[str, list[dict[str, Any]]]:
+        """Return the results of the rows of which each of `seeds` (none: all of the row) is there."""
+        rows, found = self.table.rows, {}
+        for name, results in self.results().items():
+            wanted = [seed for seed in rows[name].seeds if not seeds or seed in seeds]
+            if wanted and set(wanted) <= results.keys():
+                found[name] = [results[seed] for seed in wanted]
+        return found
+
+    def run(self, jobs: Sequence[Job], *, device: str, until: float, note: Callable[[str], None]) -> int:
+        """Run jobs, one per GPU at a time, until a moment of `time.monotonic`; return how many have no result."""
+        waiting, left = list(jobs), 0
+        running: dict[str, tuple[Job, subprocess.Popen[bytes]]] = {}
+        try:
+            while waiting or running:
+                is_over = time.monotonic() > until
+                if is_over:
+                    left, waiting = left + len(waiting), []
+                    for _, process in running.values():
+                        process.kill()
+                for slot in _slots(device):
+                    if slot not in running and waiting:
+                        running[slot] = waiting[0], self._start(waiting.pop(0), device, slot)
+                for slot, (job, process) in list(running.items()):
+                    if (code := process.poll()) is not None:
+                        del running[slot]
+                        last = "".join(self._log(job).read_text(errors="replace").splitlines()[-1:])
+                        why = "no time left" if is_over else f"exit code {code}, {last} ({self._log(job)})"
+                        note(f"{job[0]}, seed {job[1]}: " + (why if code else "done"))
+                        left += bool(code)
+                time.sleep(POLL_S)
+        finally:
+            for _, process in running.values():
+                process.kill()
+                process.wait()
+        return left
+
+    def _start(self, job: Job, device: str, slot: str) -> subprocess.Popen[bytes]:
+        log, result = self._log(job), self.folder / job[0] / f"seed_{job[1]}.json"
+        words = [self.source, job[0], str(job[1]), str(result), str(log.with_suffix("")), device]
+        command = [sys.executable, "-m", "ksim_rl.tables.measure", *words, "smoke" if self.smoke else ""]
+        log.parent.mkdir(parents=True, exist_ok=True)
+        result.unlink(missing_ok=True)
+        environment = os.environ | ({"CUDA_VISIBLE_DEVICES": slot} if slot else {})
+        with log.open("wb") as file:
+            return subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
+
+    def _log(self, job: Job) -> Path:
+        return self.run_folder / job[0] / f"seed_{job[1]}.log"
+
+
+def _slots(device: str) -> list[str]:
+    """Return the GPUs that jobs may have, as `CUDA_VISIBLE_DEVICES` names them; [""] on the CPU: one job at a time."""
+    every = ",".join(str(index) for index in range(torch.cuda.device_count()))
+    return [""] if device == "cpu" else (os.environ.get("CUDA_VISIBLE_DEVICES") or every).split(",")

@@ -1,0 +1,112 @@
+"""This module reads a table: rows (task, objective, overrides, env states, seeds), what is measured, what others got.
+
+A file has groups, whose rows inherit the fields of their group; docs/tables.md shows one.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Literal
+
+from ksim_rl.checked import Checked, Count, Positive, Share, WholeNumber
+from ksim_rl.checks import unknown_name
+from ksim_rl.config import plain_data
+from ksim_rl.config.config_tree import from_tree
+
+SUFFIX = ".yaml"
+FOLDER = Path(str(files("ksim_rl.tables")))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row(Checked):
+    """One setting that is trained with some seeds.
+
+    Attributes:
+        overrides: of `ksim-rl train`, beside task, objective and seed.
+        env_states: that training collects at most: as many iterations as fit.
+        seeds: those that count. They are for nothing else: settings are chosen with other ones.
+        measure: "return" of the final evaluation, the mean over the seeds; or "seconds" of training until `levels` of
+            training metrics hold, the median over the seeds, one that does not get there counting as infinite.
+        episodes: of the final evaluation: deterministic actions, fresh envs.
+        within_s: seconds in which the levels should be reached.
+        most_falls: share of these episodes that may end before their time; the worst seed counts.
+        published: what others report, by who; `against` says which of them a return should reach, "" none.
+    """
+
+    task: str
+    objective: str
+    env_states: Positive
+    seeds: tuple[WholeNumber, ...]
+    overrides: tuple[str, ...] = ()
+    measure: Literal["return", "seconds"] = "return"
+    episodes: Count = 128
+    levels: Mapping[str, float] = field(default_factory=dict)
+    within_s: Positive | None = None
+    most_falls: Share | None = None
+    published: Mapping[str, float] = field(default_factory=dict)
+    against: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"seeds={self.seeds!r}: expected at least one, and each once")
+        if (self.measure == "seconds") != bool(self.levels):
+            raise ValueError(f"levels={dict(self.levels)!r}: give them with measure=seconds, and only then")
+        for word in self.overrides:
+            if word.partition("=")[0] in ("task", "objective", "seed", "trainer.num_iterations"):
+                raise ValueError(f"overrides: {word!r} has a field of its own in the row")
+
+    @property
+    def goal(self) -> float | None:
+        """What the measure should reach: a return at least, or seconds at most; None where nothing is asked."""
+        return self.within_s if self.measure == "seconds" else self.published.get(self.against)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mean(Checked):
+    """A mean over the rows of each group, but for some; `at_least` has the goals by group."""
+
+    without: tuple[str, ...] = ()
+    at_least: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table(Checked):
+    """Rows by `<group>/<name>`, or by name in the group ""; `notes` is a paragraph below the table."""
+
+    name: str
+    title: str
+    rows: Mapping[str, Row]
+    means: Mapping[str, Mean] = field(default_factory=dict)
+    notes: str = ""
+
+    def groups(self) -> dict[str, list[str]]:
+        """Return the names of the rows of each group."""
+        found: dict[str, list[str]] = {}
+        for name in self.rows:
+            found.setdefault(name.rpartition("/")[0], []).append(name)
+        return found
+
+
+def shipped() -> list[str]:
+    """Return the names of the tables that come with the package."""
+    return sorted(path.stem for path in FOLDER.glob(f"*{SUFFIX}"))
+
+
+def load(name: str) -> Table:
+    """Read a table of the package by name, or a file of yours by path; a ValueError says what is wrong."""
+    path = Path(name) if name.endswith(SUFFIX) else FOLDER / f"{name}{SUFFIX}"
+    if path.parent == FOLDER and path.stem not in shipped():
+        raise unknown_name("table", name, shipped())
+    tree = plain_data.read_yaml(path)
+    groups, rows = tree.pop("groups", None) if isinstance(tree, dict) else None, {}
+    if not isinstance(groups, dict) or not all(
+        isinstance((g or {}).get("rows"), dict) for g in groups.values()
+    ):
+        raise ValueError(f"{path}: expected a mapping with a title, and groups that have rows")
+    for group, fields in groups.items():
+        shared = {key: value for key, value in fields.items() if key != "rows"}
+        for row, own in fields["rows"].items():
+            rows[f"{group}/{row}" if group else row] = {**shared, **(own or {})}
+    return from_tree(Table, {"name": path.stem, **tree, "rows": rows}, str(path))

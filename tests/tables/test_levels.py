@@ -1,0 +1,52 @@
+"""When a curve has reached its levels, and what several seeds come to."""
+
+import pytest
+
+from ksim_rl.tables.levels import is_reached, reached, value_of
+from ksim_rl.tables.table import Row
+
+LEVELS = {"linear": 1.4, "angular": 1.0}
+COMMON = {"task": "go1_velocity_flat", "objective": "ppo", "env_states": 1e6, "seeds": (1, 2, 3)}
+SECONDS = Row(**COMMON, measure="seconds", levels=LEVELS, within_s=100.0, most_falls=0.02)
+RETURN = Row(**COMMON, published={"PPO": 500.0}, against="PPO")
+
+
+def curve(*linear):
+    return [
+        {"env_states": 5e5 * i, "seconds": 10.0 * i, "linear": value, "angular": 1.2}
+        for i, value in enumerate(linear)
+    ]
+
+
+def test_a_level_must_hold_in_the_mean_over_a_million_env_states():
+    found = reached(curve(0.0, 1.5, 1.0, 1.5, 1.5, 1.5), LEVELS)
+    assert found is not None and (found["env_states"], found["seconds"]) == (2.5e6, 50.0)
+    assert reached(curve(0.0, 0.0, 1.5, 1.5), LEVELS) is None, "two points span half a million"
+    assert reached(curve(1.5, 1.5, 1.5), LEVELS | {"absent": 0.0}) is None
+
+
+def seeds(*seconds, falls=0.0):
+    return [{"seconds_to_levels": value, "falls": falls} for value in seconds]
+
+
+@pytest.mark.parametrize(
+    ("results", "value", "verdict"),
+    [
+        (seeds(50.0, 90.0, 300.0), 90.0, True),
+        (seeds(50.0, 90.0, None), 90.0, True),
+        (seeds(50.0, None, None), None, False),
+        (seeds(50.0, 110.0, 300.0), 110.0, False),
+        (seeds(50.0, 90.0, 95.0, falls=0.02), 90.0, False),
+    ],
+)
+def test_a_seed_that_does_not_get_there_counts_as_infinite(results, value, verdict):
+    assert value_of(SECONDS, results) == value
+    assert is_reached(SECONDS, results) is verdict
+
+
+def test_returns_are_compared_with_what_one_of_the_others_reports():
+    results = [{"evaluation": {"return_mean": value}, "falls": 1.0} for value in (400.0, 500.0, 601.0)]
+    assert value_of(RETURN, results) == pytest.approx(500.333, abs=1e-3)
+    assert is_reached(RETURN, results) is True
+    assert is_reached(RETURN, results[:1]) is False
+    assert is_reached(Row(**COMMON), results) is None

@@ -1,0 +1,175 @@
+"""`ksim-rl reproduce` runs what is missing, keeps what is there, and says what is reached."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from ksim_rl.cli.main import main
+from ksim_rl.tables import reproduce as reproduce_command
+from ksim_rl.tables import runner
+from ksim_rl.tables.measure import measure, run_cfg, settings
+from ksim_rl.tables.table import load
+
+TABLE = """
+title: Two poles
+means: {mean_all: {without: [Other], at_least: {ppo: 150}}}
+groups:
+  ppo:
+    objective: ppo
+    env_states: 1.0e+6
+    seeds: [1, 2]
+    against: PPO
+    rows:
+      Balance: {task: cartpole_balance, published: {PPO: 100}}
+      Swingup: {task: cartpole_swingup, published: {PPO: 250, SAC: 300}}
+      Other: {task: reacher}
+"""
+RETURNS = {"ppo/Balance": 100.0, "ppo/Swingup": 200.0, "ppo/Other": 7.0}
+
+
+@pytest.fixture
+def reproduce(monkeypatch, tmp_path):
+    """Run the command where each job is a process that writes a result, or fails; return code, jobs and table."""
+    started = []
+
+    def start(self, job, device, slot):
+        started.append(job)
+        row = self.table.rows[job[0]]
+        result = {
+            "settings": str(row.overrides),
+            "commit": "abc",
+            "date": f"2026-01-0{job[1]}",
+            "device": "CPU",
+            "versions": {},
+            "evaluation": {"return_mean": RETURNS[job[0]] + job[1]},
+            "falls": 0.0,
+            "seconds_to_levels": None,
+            "env_states": 1e6,
+            "seconds": 5.0,
+            "seconds_before": 1.0,
+            "curve": [],
+        }
+        path = self.folder / job[0] / f"seed_{job[1]}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._log(job).parent.mkdir(parents=True, exist_ok=True)
+        self._log(job).write_text("first\nno such cube")
+        code = "import sys; open(sys.argv[1], 'w').write(sys.argv[2]); sys.exit(int(sys.argv[3]))"
+        fails = str(int(job == failing.get("job")))
+        written = "{" if fails == "1" else json.dumps(result)
+        target = str(path.with_suffix(".failed" if fails == "1" else ".json"))
+        return subprocess.Popen([sys.executable, "-c", code, target, written, fails])
+
+    failing = {}
+    monkeypatch.setattr(runner.Runs, "_start", start)
+    # Composing a run's config takes its time, and has tests of its own below.
+    monkeypatch.setattr(runner, "settings", lambda row, cfg: str(row.overrides))
+    for module in (runner, reproduce_command):
+        monkeypatch.setattr(module, "run_cfg", lambda row, seed, **options: None)
+    path = tmp_path / "poles.yaml"
+
+    def reproduce(*words, text=TABLE, fail=None):
+        path.write_text(text)
+        started.clear()
+        failing["job"] = fail
+        arguments = [str(path), "--output", str(tmp_path / "out"), "--runs", str(tmp_path / "runs"), *words]
+        with pytest.raises(SystemExit) as ended:
+            main(["reproduce", *arguments])
+        written = tmp_path / "out" / "poles.json"
+        table = json.loads(written.read_text()) if written.exists() else {}
+        return ended.value.code, list(started), table
+
+    reproduce.folder = tmp_path / "out"
+    return reproduce
+
+
+def test_what_is_missing_is_run_seed_by_seed_and_what_is_there_stays(reproduce):
+    code, started, table = reproduce("--seeds", "1", "--rows", "ppo/(Balance|Swingup)")
+    assert started == [("ppo/Balance", 1), ("ppo/Swingup", 1)]
+    assert table["figures"]["poles/ppo/Balance"] == 101.0 and table["seeds"] == [1]
+    code, started, table = reproduce()
+    assert started == [("ppo/Other", 1), ("ppo/Balance", 2), ("ppo/Swingup", 2), ("ppo/Other", 2)]
+    assert table["figures"] == {
+        "poles/ppo/Balance": 101.5,
+        "poles/ppo/Swingup": 201.5,
+        "poles/ppo/Other": 8.5,
+        "poles/ppo/mean_all": 151.5,
+        "poles/best/mean_all": 151.5,
+    }
+    assert table["seeds"] == [1, 2] and table["commit"] == "abc"
+    assert {name: row["reached"] for name, row in table["rows"].items()} == {
+        "ppo/Balance": True,
+        "ppo/Swingup": False,
+        "ppo/Other": None,
+    }
+    assert code == 1, "a row misses its goal"
+    assert reproduce("--rows", "ppo/Balance")[:2] == (0, [])
+    page = (reproduce.folder / "poles.md").read_text()
+    assert "| Swingup | 250.0 | 300.0 | 202 ± 1 | 2 | 1.0 M | 5 + 1 | no |" in page
+    assert "mean_all: 152, at least 150 asked" in page
+    assert (reproduce.folder / "poles.png").stat().st_size > 10_000
+
+
+def test_results_of_other_settings_do_not_count(reproduce):
+    reproduce("--rows", "ppo/Balance")
+    changed = TABLE.replace(
+        "task: cartpole_balance,", "task: cartpole_balance, overrides: [objective.gamma=0.9],"
+    )
+    code, started, _ = reproduce("--rows", "ppo/Balance", text=changed)
+    assert started == [("ppo/Balance", 1), ("ppo/Balance", 2)] and code == 0
+
+
+def test_a_run_that_fails_is_said_and_costs_its_row_only(reproduce, capsys):
+    code, _, table = reproduce("--rows", "ppo/(Balance|Other)", fail=("ppo/Balance", 2))
+    assert code == 1 and list(table["figures"]) == ["poles/ppo/Other"]
+    said = capsys.readouterr().out
+    assert "ppo/Balance, seed 2: exit code 1, no such cube" in said and "1 runs are missing" in said
+
+
+def test_without_time_nothing_runs_and_the_table_is_of_what_is_there(reproduce):
+    reproduce("--rows", "ppo/Balance")
+    code, started, table = reproduce("--minutes", "0")
+    assert (code, started, list(table["figures"])) == (1, [], ["poles/ppo/Balance"])
+
+
+def test_unknown_rows_and_seeds_are_refused(reproduce, capsys):
+    assert reproduce("--rows", "ppo/Balanc")[:2] == (2, [])
+    assert "'ppo/Balance'" in capsys.readouterr().err
+    assert reproduce("--seeds", "11")[:2] == (2, [])
+    assert "none of [1, 2]" in capsys.readouterr().err
+
+
+def test_settings_differ_by_everything_but_the_seed():
+    row = load("velocity").rows["ppo/go1"]
+    first = settings(row, run_cfg(row, 1, device="cpu"))
+    assert first == settings(row, run_cfg(row, 2, device="cpu"))
+    assert first != settings(row, run_cfg(row, 1, device="cpu", smoke=True))
+
+
+def test_a_seed_is_trained_and_its_final_policy_judged(tmp_path):
+    path = tmp_path / "one.yaml"
+    path.write_text(TABLE)
+    row = load(str(path)).rows["ppo/Balance"]
+    found = measure(row, 1, tmp_path / "run", device="cpu", smoke=True)
+    assert found["settings"] == settings(row, run_cfg(row, 1, device="cpu", smoke=True))
+    assert found["evaluation"]["episodes"] == 8 and found["env_states"] == 2 * 64
+    assert 0.0 < found["evaluation"]["return_mean"] <= 40.0
+    assert 0.0 <= found["falls"] <= 1.0
+    assert found["seconds"] == pytest.approx(found["curve"][-1]["seconds"], abs=0.01)
+    assert found["seconds_before"] > 0.0 and len(found["commit"]) >= 7
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("table", "rows"),
+    [("dm_control", "(ppo|fast_sac)/(CartpoleSwingup|ReacherHard)"), ("velocity", ".*"), ("humanoids", ".*")],
+)
+def test_the_shipped_tables_run_for_two_iterations(table, rows, tmp_path, capsys):
+    words = [table, "--rows", rows, "--seeds", "1", "--smoke", "--device", "cpu"]
+    with pytest.raises(SystemExit) as ended:
+        main(["reproduce", *words, "--output", str(tmp_path / "out"), "--runs", str(tmp_path / "runs")])
+    said = capsys.readouterr().out
+    if "menagerie model" in said:
+        pytest.skip(said)
+    assert ended.value.code == 0, said

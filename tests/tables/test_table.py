@@ -1,0 +1,99 @@
+"""Tables are read from YAML; the shipped ones name tasks that exist and figures that add up."""
+
+import statistics
+
+import pytest
+
+from ksim_rl import envs
+from ksim_rl.tables.measure import run_cfg
+from ksim_rl.tables.table import load, shipped
+
+OWN = """
+title: Ours
+groups:
+  ppo:
+    objective: ppo
+    env_states: 1.0e+6
+    seeds: [1, 2]
+    against: PPO
+    rows:
+      Balance: {task: cartpole_balance, published: {PPO: 900}}
+      Swingup: {task: cartpole_swingup, env_states: 2.0e+6}
+"""
+
+
+def written(tmp_path, text=OWN):
+    path = tmp_path / "ours.yaml"
+    path.write_text(text)
+    return str(path)
+
+
+def test_rows_inherit_the_fields_of_their_group(tmp_path):
+    table = load(written(tmp_path))
+    balance, swingup = table.rows["ppo/Balance"], table.rows["ppo/Swingup"]
+    assert (table.name, balance.seeds, balance.env_states, balance.goal) == ("ours", (1, 2), 1e6, 900.0)
+    assert (swingup.env_states, swingup.goal) == (2e6, None)
+    assert table.groups() == {"ppo": ["ppo/Balance", "ppo/Swingup"]}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("seeds: [1, 2]", "seeds: [1, 1]", "rows.ppo/Balance.seeds=.*each once"),
+        ("task: cartpole_balance", "tsak: cartpole_balance", "unknown field .*tsak.*task"),
+        ("against: PPO", "measure: seconds", "levels=.*measure=seconds"),
+        ("against: PPO", "overrides: [seed=3]", "'seed=3' has a field of its own"),
+        ("rows:", "lines:", "groups that have rows"),
+    ],
+)
+def test_what_is_wrong_in_a_table_is_named(tmp_path, old, new, message):
+    with pytest.raises(ValueError, match=message):
+        load(written(tmp_path, OWN.replace(old, new)))
+
+
+def test_a_table_that_does_not_exist_gives_the_near_names():
+    with pytest.raises(ValueError, match="'dm_control'"):
+        load("dm_contrl")
+
+
+def test_the_shipped_tables_name_tasks_that_exist():
+    assert shipped() == ["dm_control", "humanoids", "velocity"]
+    for name in shipped():
+        assert {row.task for row in load(name).rows.values()} <= set(envs.names())
+
+
+def test_the_published_means_of_23_tasks_are_those_of_the_issue():
+    table = load("dm_control")
+    without = table.means["mean_23"].without
+    assert set(table.groups()) == {"ppo", "fast_sac"}
+    for names in table.groups().values():
+        rows = [table.rows[name] for name in names if name.rpartition("/")[2] not in without]
+        assert (len(names), len(rows)) == (25, 23)
+        for who, mean in (("PPO", 596), ("SAC", 659), ("REPPO", 749)):
+            assert round(statistics.fmean(row.published[who] for row in rows)) == mean
+
+
+def test_the_other_algorithm_stays_within_its_env_states():
+    long = ("Hopper", "Humanoid", "Acrobot", "Pendulum")
+    for name, row in load("dm_control").rows.items():
+        group, _, task = name.partition("/")
+        if group == "fast_sac":
+            assert row.env_states <= (100e6 if task.startswith(long) else 20e6)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "velocity:fast_sac/go1",
+        "humanoids:g1_flat",
+        *(pytest.param(f"dm_control:{row}", marks=pytest.mark.full) for row in load("dm_control").rows),
+    ],
+)
+def test_a_row_composes_with_one_evaluation_at_its_end_and_at_most_its_env_states(name):
+    table, _, row_name = name.partition(":")
+    row = load(table).rows[row_name]
+    cfg = run_cfg(row, 2, device="cpu")
+    states = cfg.trainer.num_iterations * cfg.num_envs * cfg.data.rollout_length(cfg.num_envs)
+    assert 0.95 * row.env_states < states <= row.env_states
+    assert (cfg.seed, cfg.trainer.eval_interval, cfg.trainer.eval_episodes) == (2, 0, row.episodes)
+    assert not cfg.trainer.stop_when_solved and cfg.trainer.stop_at is None
