@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.utils.tensorboard  # imported once, before the forks, as Matplotlib is
@@ -114,6 +115,7 @@ class Child:
 
 def start(work: Callable[[], int], *, hangs_s: float = HANGS_S) -> Child:
     """Fork, and let the child do `work` and exit with what it returns; its output goes to the parent."""
+    warm()
     sys.stdout.flush(), sys.stderr.flush()
     reading, writing = os.pipe()
     pid = os.fork()
@@ -170,6 +172,19 @@ def train(
         return 128 + int(errors.interruption(stopped))
     except Exception as error:
         return errors.report(error)
+
+
+def before_first(owner: Any, name: str, act: Callable[[], None]) -> None:
+    """Do something before the first call of a function; in a forked process only."""
+    inner, done = getattr(owner, name), []
+
+    def first(*arguments: Any, **options: Any) -> Any:
+        if not done:
+            done.append(True)
+            act()
+        return inner(*arguments, **options)
+
+    setattr(owner, name, first)
 
 
 class At(Hook):

@@ -51,7 +51,7 @@ def disk_full(folder: Path, *, points: int, sizes: int) -> Figures:
         for lasts in (False, True):
             cases.append((names[at], lambda run, at=at, lasts=lasts: _fail(run, at, lasts)))
     limits = [0, 100, 1000, 4000, 8000, 12000, 20000, 40000][:: max(1, 8 // sizes)]
-    cases += [(f"files of {size} bytes", lambda _, size=size: limit_files(size)) for size in limits]
+    cases += [(f"files of {size} bytes", lambda _, size=size: _limit(size)) for size in limits]
     found = {"cases": 0, "files": 0, "ended_badly": 0, "said": 0, "unloadable": 0, "half_files": 0}
     found |= {"raw_tracebacks": 0, "hangs": 0}
     for number, (_, harm) in enumerate(cases):
@@ -74,6 +74,12 @@ def disk_full(folder: Path, *, points: int, sizes: int) -> Figures:
         shutil.rmtree(run, ignore_errors=True)
     found["files"] = len({name.split()[-1].split(".")[0] for name, _ in cases})
     return found
+
+
+def _limit(size: int) -> None:
+    """Limit files from the first rollout on; torch makes a file of its own before."""
+    _, trainer = children.warm()
+    children.before_first(trainer.collector, "collect", lambda: limit_files(size))
 
 
 def _fail(run: Path, at: int, lasts: bool) -> None:

@@ -24,19 +24,6 @@ FILES = (
 )
 
 
-def _before(owner: Any, name: str, act: Callable[[], None]) -> None:
-    """Do something once, before the first call of a function; in a forked process only."""
-    inner, done = getattr(owner, name), []
-
-    def first(*arguments: Any, **options: Any) -> Any:
-        if not done:
-            done.append(True)
-            act()
-        return inner(*arguments, **options)
-
-    setattr(owner, name, first)
-
-
 def _phases() -> dict[str, tuple[Any, str, int]]:
     """Return for each phase whose first call the signal precedes, and how many iterations are saved at least."""
     _, trainer = children.warm()
@@ -67,7 +54,7 @@ def signals(folder: Path, *, phases: int) -> Figures:
                     if name == "build":
                         build = _warm_build_that(send)
                         return build(run)
-                    _before(owner, name, send)
+                    children.before_first(owner, name, send)
                     return children.train(run)
 
                 ended = children.start(work).wait()

@@ -145,9 +145,15 @@ def same_seed(folder: Path, *, iterations: int) -> Figures:
     """Train twice from one seed in processes of their own, and compare every tensor of the last checkpoints."""
     runs = [folder / "one", folder / "other"]
     for run in runs:
-        children.start(
-            lambda run=run: children.train(run, num_iterations=iterations, checkpoint_interval=iterations)
-        ).wait()
+
+        def work(run=run) -> int:
+            trainer = build(conf.compose([*children.SMALLEST, "logger=none"]))  # anew, not the parent's
+            for _ in range(iterations):
+                trainer.iterate()
+            checkpoint.save(run, trainer.state_dict(), iteration=trainer.iteration, config={})
+            return 0
+
+        children.start(work).wait()
     one, other = (checkpoint.load(checkpoint.latest(run)).state for run in runs)
     return {"iterations": one["iteration"], "differ": same_bits(one, other)}
 
