@@ -29,7 +29,8 @@ class BrowserViewer:
     def __init__(self, *, host: str = "127.0.0.1", port: int = 8080, label: str = "ksim_rl") -> None:
         with contextlib.redirect_stdout(io.StringIO()):  # where it prints a panel of its own
             self.server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
-        self.server.gui.configure_theme(control_layout="fixed", show_share_button=False, show_logo=False)
+        self.server.gui.configure_theme(show_share_button=False, show_logo=False)
+        self.server.gui.main_panel.dock_right()
         self.port = self.server.get_port()
         self.address = f"http://{'localhost' if host == '0.0.0.0' else host}:{self.port}"
         self._host = host
@@ -50,8 +51,8 @@ class BrowserViewer:
         tabs = server.gui.add_tab_group()
         with tabs.add_tab("Control"):
             self._panel = Panel(server.gui, session)
-        with tabs.add_tab("Plots"):
-            self._plots = Plots(server.gui, session)
+        with tabs.add_tab("Plots") as plots:
+            self._plots = Plots(server.gui, plots, session)
         self._pad = Pad(self._panel, session, host=self._host, port=self.port + 1, viewer_port=self.port)
         self._built = 0
         self._scene: BrowserScene | None = None

@@ -21,7 +21,7 @@ _OF_MODEL = (_KIND.mjGEOM_MESH, _KIND.mjGEOM_SDF, _KIND.mjGEOM_HFIELD)
 _LINE_RADIUS = 0.004
 _SHADES = 24
 _GROUND: dict[str, Any] = {
-    "cell_size": 0.25, "cell_color": (180, 184, 190), "section_color": (140, 146, 156),
+    "cell_size": 0.25, "cell_color": (180, 184, 190), "section_color": (166, 172, 180),
     "plane_color": (226, 230, 235), "plane_opacity": 1.0, "shadow_opacity": 0.25,
 }  # fmt: skip
 Mesh = tuple[np.ndarray, np.ndarray]

@@ -1,0 +1,29 @@
+"""`ksim-rl play` refuses what it cannot show before anything compiles, and shows agents without a policy."""
+
+import pytest
+
+from ksim_rl.cli.main import main
+from ksim_rl.viewer.play_command import addresses
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["task=cartpole_swingup"], "task=NAME with --agent zero or random"),
+        (["num_envs=4", "--agent", "zero"], "'num_envs=4': expected a run folder, or task=NAME"),
+        (["task=cartpole_swingupp", "--agent", "zero"], "did you mean 'cartpole_swingup'"),
+        (["RUN", "--live", "--seconds", "3"], "--output and --seconds are of a video"),
+        (["RUN", "--num-envs", "0"], "--num-envs 0: expected at least 1"),
+        (["RUN", "--output", "clip.avi"], "ends in .mp4 or .gif"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused_in_one_line(words, said, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["play", *words])
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+def test_both_ports_are_forwarded():
+    lines = addresses("http://127.0.0.1:8090", "http://127.0.0.1:8092")
+    assert "ssh -N -L 8090:127.0.0.1:8090 -L 8092:127.0.0.1:8092 THIS_MACHINE" in lines[1]
