@@ -77,16 +77,15 @@ def check_value(field: str, value: object, annotation: Any) -> None:
     if annotation is Any:  # a class since Python 3.11, but none to ask `isinstance` of
         return
     if origin is Annotated:
-        bounds = [extra for extra in arguments[1:] if isinstance(extra, Within)]
-        if not (bounds and _is_numeric(arguments[0])):
-            check_value(field, value, arguments[0])
-        for bound in bounds:
+        for bound in (extra for extra in arguments[1:] if isinstance(extra, Within)):
             if arguments[0] is int and bound.high is None and bound.low is not None:
                 check_count(field, value, low=int(bound.low))
-                continue
-            if arguments[0] is int:
-                _check_instance(field, value, int)
+            elif arguments[0] in (int, float):
+                check_in_range(field, value, low=bound.low, high=bound.high, low_open=bound.low_open)
+            elif value is None or not bound.ordered:
+                check_value(field, value, arguments[0])
             bound.check(field, value)
+        check_value(field, value, arguments[0])
     elif origin in (typing.Union, types.UnionType):
         _check_union(field, value, arguments)
     elif origin is Literal:
@@ -103,13 +102,6 @@ def check_value(field: str, value: object, annotation: Any) -> None:
         check_in_range(field, value)
     elif isinstance(annotation, type) and not getattr(annotation, "_is_protocol", False):
         _check_instance(field, value, annotation)
-
-
-def _is_numeric(annotation: Any) -> bool:
-    """Whether bounds alone say all about the values of this annotation."""
-    if annotation in (int, float):
-        return True
-    return typing.get_origin(annotation) is tuple and typing.get_args(annotation) == (float, float)
 
 
 def _check_instance(field: str, value: object, kind: type) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from ksim_rl.checked import Count, NonNegative, Within, check_value
+from ksim_rl.checked import Checked, Count, NonNegative, Within
 from ksim_rl.envs.term import (
     ActionTerm,
     CommandTerm,
@@ -24,7 +24,7 @@ Seed = Annotated[int, Within(low=0, high=2**63 - 1)] | None
 
 
 @dataclass(frozen=True, kw_only=True)
-class ManagerBasedRlEnvCfg:
+class ManagerBasedRlEnvCfg(Checked):
     """What an env is made of: terms by name, of which each action term takes its columns of `"action"` in this order.
 
     The env emits each observation term once as `("obs", term)`, clean; `envs.make` compiles the groups into transforms
@@ -32,15 +32,17 @@ class ManagerBasedRlEnvCfg:
     what the env emits passes them from the first to the last, and an action from the last to the first.
     """
 
-    decimation: int  # physics substeps per env step
+    decimation: Count  # physics substeps per env step
     scene: SceneCfg
     observations: Mapping[str, ObservationGroupCfg] = field(default_factory=dict)
     actions: Mapping[str, ActionTerm] = field(default_factory=dict)
     events: Mapping[str, EventTerm] | None = None  # `ResetToDefault`; {} leaves rows at `qpos0`
-    seed: int | None = None  # None draws one; the env stores the seed that it used in its own `cfg`
+    seed: Seed = None  # None draws one; the env stores the seed that it used in its own `cfg`
     sim: SimCfg = field(default_factory=SimCfg)
     viewer: ViewerCfg = field(default_factory=ViewerCfg)  # the camera of `render()`
-    episode_length_s: float = 0.0  # 0: no episode ends by time, and there must be no time-out termination
+    episode_length_s: NonNegative = (
+        0.0  # 0: no episode ends by time, and there must be no time-out termination
+    )
     rewards: Mapping[str, RewardTerm] = field(default_factory=dict)  # a term of weight 0 is not computed
     terminations: Mapping[str, TerminationTerm] = field(default_factory=dict)  # always: non-finite physics
     commands: Mapping[str, CommandTerm] = field(default_factory=dict)  # emitted as `("command", name)`
@@ -51,22 +53,11 @@ class ManagerBasedRlEnvCfg:
     transforms: Mapping[str, TransformCfg] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, annotation in (
-            ("decimation", Count),
-            ("episode_length_s", NonNegative),
-            ("seed", Seed),
-        ):
-            check_value(name, getattr(self, name), annotation)
+        super().__post_init__()
         if self.viewer.env_index >= self.scene.num_envs:
             raise ValueError(
                 f"viewer.env_index={self.viewer.env_index}: expected less than scene.num_envs={self.scene.num_envs}"
             )
-        for name, transform in self.transforms.items():
-            if not isinstance(transform, TransformCfg):
-                raise ValueError(
-                    f"transforms.{name}={transform!r}: each env builds its own, so give "
-                    "TransformCfg(<class>, <arguments>)"
-                )
         timed = [name for name, term in self.terminations.items() if term.time_out]
         if timed and self.episode_length_s == 0.0:
             raise ValueError(

@@ -132,8 +132,8 @@ class OnPolicyNetworkCfg(NetworkCfg):
 
     def __post_init__(self) -> None:
         """Check the fields, and keep what is hashable."""
-        object.__setattr__(self, "in_keys", checked_keys(self.in_keys))
         super().__post_init__()
+        object.__setattr__(self, "in_keys", checked_keys(self.in_keys))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ import warp as wp
 from ksim_rl.checks import near
 from ksim_rl.device.streams import start_warp
 from ksim_rl.physics.model_checks import check_finite, check_meant, warp_model_of
-from ksim_rl.physics.model_size import check_spec, check_text
+from ksim_rl.physics.model_size import check_text
 from ksim_rl.physics.sim_cfg import SimCfg
 
 SUFFIXES = (".xml", ".mjcf", ".urdf")
@@ -53,7 +53,6 @@ def load_model(source: Source, sim: SimCfg | None = None) -> mujoco.MjModel:
     spec, text, label, caught = _parsed(source)
     if sim is not None:
         sim.apply_to(spec)
-    check_spec(spec, label)
     with caught_warnings() as caught_later, _named(label, text):
         mj_model = spec.compile()
     check_finite(mj_model, label)

@@ -10,11 +10,12 @@ from typing import ClassVar
 
 import mujoco
 
+from ksim_rl.checked import Checked
 from ksim_rl.physics import load_spec
 from ksim_rl.scene.actuators import Actuator, PositionActuator, set_actuators
 
 
-class ShippedModel:
+class ShippedModel(Checked):
     """A model whose MJCF file, `<name>.xml`, comes with this package."""
 
     name: ClassVar[str]

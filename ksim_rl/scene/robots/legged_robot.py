@@ -6,6 +6,7 @@ from typing import ClassVar, Protocol
 
 import mujoco
 
+from ksim_rl.checked import Checked, Share
 from ksim_rl.physics import load_spec
 from ksim_rl.scene.actuators import Actuator, set_actuators
 from ksim_rl.scene.robots import edit
@@ -40,7 +41,7 @@ class LeggedRobot(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MenagerieRobot:
+class MenagerieRobot(Checked):
     """A `LeggedRobot` made from a model of MuJoCo Menagerie and the tables of facts in its own file."""
 
     init_pos: tuple[float, float, float]  # of the root in the stance, m
@@ -48,7 +49,7 @@ class MenagerieRobot:
     default_joint_pos: Mapping[str, float]  # the stance, rad, by joint name
     action_scale: Mapping[str, float]
     actuators: tuple[Actuator, ...]
-    soft_joint_pos_limit_factor: float = 0.9
+    soft_joint_pos_limit_factor: Share = 0.9
 
     name: ClassVar[str]
     root_body: ClassVar[str]

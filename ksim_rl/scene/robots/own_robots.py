@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+from ksim_rl.checked import Share
 from ksim_rl.scene.robots.control_models import ShippedModel
 
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
@@ -21,7 +22,7 @@ class Quadruped(ShippedModel):
     """12 kg on four legs with three joints each, called `<front|rear>_<left|right>_<roll|hip|knee>`."""
 
     action_scale: Mapping[str, float] = field(default_factory=lambda: {".*_roll": 0.2, ".*_(hip|knee)": 0.3})
-    soft_joint_pos_limit_factor: float = 0.9
+    soft_joint_pos_limit_factor: Share = 0.9
 
     name: ClassVar[str] = "quadruped"
     root_body: ClassVar[str] = "trunk"
@@ -37,7 +38,7 @@ class Humanoid(ShippedModel):
     """0.95 m, 19 kg, 19 joints, called `<left|right>_<kind>`, but for `waist_yaw`; fields as of `LeggedRobot`."""
 
     action_scale: Mapping[str, float] = field(default_factory=lambda: {".*": 0.3})
-    soft_joint_pos_limit_factor: float = 0.9
+    soft_joint_pos_limit_factor: Share = 0.9
 
     name: ClassVar[str] = "humanoid"
     root_body: ClassVar[str] = "pelvis"

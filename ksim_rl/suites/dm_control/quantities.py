@@ -94,7 +94,9 @@ class Offset(ObservationTerm):
         super().__post_init__()
         for point in (*self.ends, *filter(None, (self.start, self.frame))):
             if point.partition(":")[0] not in POINTS:
-                raise ValueError(f"{point!r}: expected a point such as 'body:torso'; kinds are {POINTS}")
+                raise ValueError(
+                    f"ends, start or frame {point!r}: expected a point such as 'body:torso'; kinds are {POINTS}"
+                )
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         offset_EN3 = torch.stack([_point(view, end) for end in self.ends], dim=1)

@@ -73,7 +73,7 @@ class UniformNoise(NoiseCfg):
     def __post_init__(self) -> None:
         super().__post_init__()
         low, high = _numbers(self.low), _numbers(self.high)
-        if len(low) != len(high) and 1 not in (len(low), len(high)):
+        if not low or not high or (len(low) != len(high) and 1 not in (len(low), len(high))):
             raise ValueError(f"low has {len(low)} numbers and high has {len(high)}: give as many, or one")
         width = max(len(low), len(high))
         if any(low[i % len(low)] > high[i % len(high)] for i in range(width)):
