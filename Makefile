@@ -10,7 +10,7 @@ ARGS ?=
 # Whole files go to one worker, since their tests share envs and compiled kernels.
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: setup train check lint types imports house docs test test-full dist clean
+.PHONY: setup train check lint types imports house docs test test-full dist figures clean
 
 setup: $(STAMP)
 
@@ -52,6 +52,10 @@ test-full: setup check docs
 # sdist and wheel, under dist/.
 dist: setup
 	$(BIN)/python -m build --no-isolation --outdir dist .
+
+# Committed figures that are older than the files which they measure, with the commands that renew them.
+figures: setup
+	$(BIN)/python -m benchmarks.figures
 
 clean:
 	rm -rf build dist site .coverage .pytest_cache .ruff_cache .import_linter_cache

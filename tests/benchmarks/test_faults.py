@@ -1,0 +1,253 @@
+"""Each row passes in its short form, and fails where what protects from its fault is taken away."""
+
+import contextlib
+import copy
+import json
+import os
+
+import pytest
+import torch
+
+from benchmarks import report
+from benchmarks.faults import children, page
+from benchmarks.faults.row import Row
+from benchmarks.faults.rows import ROWS
+from ksim_rl.cli import errors
+from ksim_rl.config import plain_data
+from ksim_rl.envs.managers.action_manager import ActionManager
+from ksim_rl.envs.non_finite import NonFiniteTerms
+from ksim_rl.objectives.gradient_step import StepGuard
+from ksim_rl.physics import World, load
+from ksim_rl.runs import csv_table, run_lock
+from ksim_rl.scene.rendering import rendering
+from ksim_rl.trainers import checkpoint, progress, run_cfg, run_folder
+from ksim_rl.trainers import trainer as trainer_module
+from ksim_rl.trainers.interrupt import InterruptRequest
+from tests.cli.payloads import with_pickles
+from tests.cli.test_foreign_files import with_pickled_arrays
+
+RESULTS = report.RESULTS / "faults.json"
+# Those of seconds; the others run in the full tests, as their long forms do by the command.
+QUICK = ("latest", "corruption", "kill9", "data_files", "headless", "nan_actions", "nan_worlds")
+
+
+def short(name, folder):
+    """Run a row's short form, with torch's threads as they were afterwards."""
+    threads = torch.get_num_threads()
+    try:
+        return ROWS[name].run(folder, short=True)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def quick(names):
+    return [name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in names]
+
+
+SABOTAGE = {}
+
+
+def sabotage(name):
+    def register(harm):
+        SABOTAGE[name] = harm
+        return harm
+
+    return register
+
+
+@sabotage("latest")
+def newest_in_any_case(patch):
+    patch.setattr(checkpoint, "latest", lambda run, note=None: checkpoint.saved(run / "checkpoint")[-1])
+
+
+@sabotage("corruption")
+def no_hashes(patch):
+    patch.setattr(checkpoint, "_sha256", lambda content: "0")
+
+
+@sabotage("kill9")
+def written_in_place(patch):
+    """Write a checkpoint under its own name from the beginning."""
+
+    def save(folder, state, *, iteration, config, keep=3):
+        tensors, values = checkpoint.state_tree.split(state)
+        content = checkpoint.safetensors.torch.save(tensors)
+        files = {checkpoint.TENSORS: {"bytes": len(content), "sha256": checkpoint._sha256(content)}}
+        known = {"format_version": 2, "iteration": iteration, "files": files, "values": values}
+        path = folder / f"{iteration:08d}"
+        path.mkdir(parents=True)
+        checkpoint._write_durably(path / checkpoint.TENSORS, content)
+        checkpoint._write_durably(
+            path / checkpoint.MANIFEST, checkpoint._seal({**known, "config": dict(config)})
+        )
+        return path
+
+    patch.setattr(checkpoint, "save", save)
+
+
+@sabotage("resume")
+def without_random_state(patch):
+    patch.setattr(torch, "set_rng_state", lambda state: None)
+    patch.setattr(trainer_module.RolloutCollector, "load_state_dict", lambda self, state: None)
+
+
+@sabotage("disk_full")
+def errors_are_not_said(patch):
+    patch.setattr(errors, "report", lambda error, about="": 3)
+
+
+@sabotage("folder_gone")
+def nobody_watches(patch):
+    patch.setattr(run_folder, "watch", lambda *_, **__: lambda: None)
+
+
+@sabotage("signals")
+def signals_as_python_has_them(patch):
+    patch.setattr(errors, "sigterm_interrupts", contextlib.nullcontext)
+    patch.setattr(InterruptRequest, "__enter__", lambda self: self)
+
+
+@sabotage("lock")
+def no_lock(patch):
+    patch.setattr(run_lock, "_try_lock", lambda file: True)
+
+
+@sabotage("clock")
+def wall_clock(patch):
+    patch.setattr(progress.time, "monotonic", lambda: progress.time.time())
+
+
+@sabotage("nan_worlds")
+def worlds_are_not_cleared(patch):
+    patch.setattr(World, "reset", lambda *_: None)
+
+
+@sabotage("nan_actions")
+def actions_are_taken_as_they_are(patch):
+    def apply(self, action_EL):
+        self._action_EL.copy_(action_EL)
+        self._run_terms(self._action_EL)
+        return torch.ones(len(action_EL), dtype=torch.bool)
+
+    patch.setattr(ActionManager, "apply", apply)
+
+
+@sabotage("nan_terms")
+def terms_are_not_watched(patch):
+    patch.setattr(NonFiniteTerms, "lines", lambda self: [])
+
+
+@sabotage("non_finite_loss")
+def no_stop(patch):
+    patch.setattr(StepGuard, "check", lambda *_, **__: None)
+
+
+@sabotage("overflow")
+def resets_forget(patch):
+    reset = World.reset
+
+    def forget(self, mask_E):
+        reset(self, mask_E)
+        self.overflow_report()
+
+    patch.setattr(World, "reset", forget)
+
+
+@sabotage("same_seed")
+def seeds_of_the_process(patch):
+    patch.setattr(torch, "manual_seed", lambda seed: torch.default_generator.manual_seed(os.getpid()))
+
+
+@sabotage("threads")
+def seeds_that_nobody_set(patch):
+    patch.setattr(torch, "manual_seed", lambda seed: torch.default_generator.seed())
+
+
+@sabotage("payloads")
+def configs_are_not_checked(patch):
+    patch.setattr(run_cfg, "check_plain", lambda *_: None)
+    patch.setattr(run_cfg, "WRITTEN", ())
+    patch.setattr(plain_data, "check_events", lambda *_: None)
+    patch.setattr(plain_data, "check_plain", lambda *_: None)
+
+
+@sabotage("data_files")
+def pickles_are_loaded(patch):
+    with_pickles(patch)
+    with_pickled_arrays(patch)
+
+
+@sabotage("models")
+def as_mujoco_takes_them(patch):
+    patch.setattr(load, "check_meant", lambda *_, **__: None)
+    patch.setattr(load, "check_finite", lambda *_, **__: None)
+
+
+@sabotage("no_gpu")
+def the_device_is_not_looked_at(patch):
+    patch.setattr(run_cfg.RunCfg, "__post_init__", lambda self: None)
+    patch.setattr(run_cfg.RunCfg, "resolved_device", lambda self: torch.device("cpu"))
+
+
+@sabotage("headless")
+def egl_in_any_case(patch):
+    always = type("Always", (), {"__wrapped__": staticmethod(lambda: "egl")})
+    patch.setattr(rendering, "choose_gl_platform", always)
+
+
+@sabotage("soak")
+def rows_are_kept(patch):
+    kept, log = [], csv_table.CsvTable.log_metrics
+
+    def log_and_keep(self, metrics, step):
+        kept.append({name: f"{value:.9g}" for name, value in metrics.items()})
+        log(self, metrics, step)
+
+    patch.setattr(csv_table.CsvTable, "log_metrics", log_and_keep)
+
+
+@pytest.mark.parametrize("name", quick(name for name, row in ROWS.items() if row.device == "cpu"))
+def test_a_row_passes_in_its_short_form(name, tmp_path):
+    figures, broken = short(name, tmp_path)
+    assert broken == [], figures
+
+
+@pytest.mark.parametrize("name", quick(SABOTAGE))
+def test_a_row_fails_where_its_protection_is_taken_away(name, tmp_path, monkeypatch):
+    children.warm()
+    SABOTAGE[name](monkeypatch)
+    _, broken = short(name, tmp_path)
+    assert broken
+
+
+def test_each_row_of_this_machine_has_a_sabotage():
+    assert set(SABOTAGE) == {name for name, row in ROWS.items() if row.device == "cpu"}
+    assert len(SABOTAGE) >= 20
+
+
+def test_a_limit_breaks_where_a_figure_is_missing_or_beyond():
+    row = Row(
+        fault="",
+        must="",
+        limits={"a": ("at most", 1), "b": ("at least", "n")},
+        measure=dict,
+        amounts={"n": 3},
+    )
+    assert row.broken({"a": 1, "b": 3}) == []
+    assert row.broken({"a": 2, "b": 3}) == ["a = 2: expected at most 1"]
+    assert row.broken({"a": float("nan"), "b": 3}) == ["a = nan: expected at most 1"]
+    assert row.broken({"a": 0}) == ["b = absent: expected at least 3"]
+
+
+def test_what_is_committed_passes_by_its_figures_and_the_page_shows_it():
+    saved = json.loads(RESULTS.read_text())
+    assert saved["passed"] == page.passed(saved)
+    assert page.with_table(page.PAGE.read_text(), saved) == page.PAGE.read_text()
+    gpu = {name for name, row in ROWS.items() if row.device == "cuda"}
+    assert set(saved["not_measured"]) == gpu - set(saved["passed"])
+
+
+def test_a_figure_that_is_changed_fails_its_row():
+    saved = copy.deepcopy(json.loads(RESULTS.read_text()))
+    saved["figures"]["cpu/corruption/refused"] -= 1
+    assert page.passed(saved)["corruption"] is False
