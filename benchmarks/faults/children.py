@@ -128,6 +128,8 @@ def start(work: Callable[[], int], *, hangs_s: float = HANGS_S) -> Child:
         os.dup2(writing, 1), os.dup2(writing, 2)
         # Whatever a test runner put in their place belongs to the parent.
         sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
+        # A shell lets what it starts in the background ignore SIGINT.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         code = work()
     except BaseException:
         traceback.print_exc()

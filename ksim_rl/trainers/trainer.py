@@ -346,6 +346,7 @@ class Trainer:
     def save(self) -> Path:
         """Write a checkpoint of everything that the next iteration depends on; see `checkpoint.save`."""
         assert self.folder is not None
+        self.watch()
         with self.clock.paused():
             path = checkpoint.save(
                 self.folder,
