@@ -30,11 +30,11 @@ _COLORS = ("#3465a4", "#cc5500")
 def draw(table: Path, picture: Path, *, title: str, solved_at: float | None = None) -> None:
     """Draw the learning curves of a `metrics.csv` into a PNG, with a line at `solved_at`; ValueError without rows."""
     _, rows = read_table(table)
-    if not rows:
-        raise ValueError(f"{table}: no rows to draw")
     present = [
         (name, series) for name, series in PANELS if any(row.get(key) for row in rows for key, _ in series)
     ]
+    if not present:
+        raise ValueError(f"{table}: no rows to draw")
     columns = min(3, len(present))
     lines = -(-len(present) // columns)
     figure = Figure(figsize=(4.6 * columns, 2.9 * lines + 0.5), layout="constrained")
