@@ -1,10 +1,13 @@
 """Tables are read from YAML; the shipped ones name tasks that exist and figures that add up."""
 
+import re
 import statistics
+from pathlib import Path
 
 import pytest
 
 from ksim_rl import envs
+from ksim_rl.suites.dm_control.domains import DOMAINS
 from ksim_rl.tables.measure import run_cfg
 from ksim_rl.tables.table import load, shipped
 
@@ -97,3 +100,18 @@ def test_a_row_composes_with_one_evaluation_at_its_end_and_at_most_its_env_state
     assert 0.95 * row.env_states < states <= row.env_states
     assert (cfg.seed, cfg.trainer.eval_interval, cfg.trainer.eval_episodes) == (2, 0, row.episodes)
     assert not cfg.trainer.stop_when_solved and cfg.trainer.stop_at is None
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "tables.md"
+
+
+def test_the_table_of_the_page_can_be_read(tmp_path):
+    text = re.search(r"```yaml\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    assert text is not None
+    assert list(load(written(tmp_path, text[1])).rows) == ["ppo/Balance", "ppo/Swingup", "fast/go1"]
+
+
+def test_the_page_has_the_iterations_that_playground_gives_each_domain():
+    for name, domain in DOMAINS.items():
+        sim = domain.playground["sim"]
+        assert f"| {name} | {sim.iterations} / {sim.ls_iterations} |" in PAGE.read_text()

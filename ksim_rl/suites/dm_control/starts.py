@@ -124,7 +124,7 @@ class StartFromBank(StartRule):
     def _drawn_once(self, mj_model: mujoco.MjModel, default_L: np.ndarray) -> np.ndarray:
         content = np.empty(mujoco.mj_sizeModel(mj_model), np.uint8)
         mujoco.mj_saveModel(mj_model, None, content)
-        key = repr(self), hashlib.sha256(content).digest()
+        key = repr(self), hashlib.sha256(content.tobytes()).digest()
         if key not in _DRAWN:
             _DRAWN[key] = self.draw(mj_model, default_L)
         return _DRAWN[key]
