@@ -22,7 +22,7 @@ PACKAGE = "ksim_rl"
 PACKAGE_LINES = 38_000
 ROOMS_AROUND = {
     "diagnosis": 800,
-    "export": 2_600,
+    "export": 2_610,
     "runs": 800,
     "suites": 1_500,
     "tables": 600,

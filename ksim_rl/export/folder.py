@@ -25,7 +25,7 @@ from ksim_rl.trainers.build import EVALUATION_SEED_OFFSET, UNLIMITED_EPISODE_STE
 from ksim_rl.trainers.run_folder import Policy
 
 STANDALONE = Path(__file__).parent / "standalone"
-TRACED, TRACED_STEPS = 4, 150
+TRACED, TRACED_STEPS = 4, 60
 EXTRA = ("onnx", "onnxruntime", "onnxscript")
 README = """# {task}, iteration {iteration}
 

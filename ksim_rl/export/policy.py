@@ -256,6 +256,7 @@ def _quiet() -> Iterator[None]:
 def greatest_difference(policy: ExportedPolicy, path: Path, *, seed: int = 0) -> float:
     """Return the greatest difference of an ONNX file's actions from the actor's, over `CHECKED` observations.
 
+    It is relative to actions above 1, which float32 holds no better.
     They are drawn about the statistics of the policy's normalizer, in episodes of 100 steps that carry the states. The
     actor itself is asked through TensorDicts, with histories put together here.
     """
@@ -293,7 +294,7 @@ def greatest_difference(policy: ExportedPolicy, path: Path, *, seed: int = 0) ->
         }
         wanted = torch.cat([_row(answer[key]) for key in policy.action_keys], -1).numpy()
         # Also where one of the two is NaN.
-        difference = np.abs(actions - wanted).max()
+        difference = (np.abs(actions - wanted) / np.maximum(np.abs(wanted), 1.0)).max()
         worst = max(worst, float("inf") if np.isnan(difference) else float(difference))
     return worst
 

@@ -19,7 +19,7 @@ Arrays = dict[str, np.ndarray]
 class Recording:
     """Episodes of the envs `["E"]`, one in each, with deterministic actions.
 
-    `arrays` replay them: `start/...` [E, ...], `command/...` [E, steps + 1, K], which go on after an episode's end, and
+    `arrays` replay them: `start/...` [E, ...], `command/...` [E, T + 1, K], which go on after an episode's end, and
     `pushes` [N, 2 + nv] (env, step, change of velocity); with `traces`, `trace/...` [E, steps, ...] too. `figures` hold
     return, length, falls, terms of reward, metrics, mean torques and shares of contact of each episode. Joints and
     actuators stand in the order of `joints` and `order`; `params` name the numbers of motor models.
@@ -67,6 +67,8 @@ class Recording:
                         self._keep("trace", self._reached(stepped))
                     current = env.maybe_reset(step_mdp(stepped, keep_other=True))
                     self._keep("command", ours.command_manager.values)
+                    if not self._running_E[: traces or None].any():
+                        break
         finally:
             ours.event_manager.step = run_events  # type: ignore[method-assign]
         self.arrays |= {name: np.stack(values, 1) for name, values in self._seen.items()}

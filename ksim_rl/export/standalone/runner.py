@@ -294,7 +294,9 @@ class Runner(Signals):
         self.reset({name[6:]: value[number] for name, value in record.items() if name.startswith("start/")})
 
     def _commands(self, record: dict[str, Array], number: int, step: int) -> dict[str, Array]:
-        return {name: record[f"command/{name}"][number, step] for name in self.command}
+        # The last command holds where an episode lasts longer than all recorded ones.
+        every = {name: record[f"command/{name}"][number] for name in self.command}
+        return {name: values[min(step, len(values) - 1)] for name, values in every.items()}
 
     def _push(self, record: dict[str, Array], number: int, step: int) -> None:
         pushes = record["pushes"]

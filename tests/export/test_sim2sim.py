@@ -1,0 +1,354 @@
+"""Exports of policies run on MuJoCo's C engine as they did here, and what is broken in one of them is named."""
+
+import dataclasses
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("onnxruntime", reason="needs the extra: pip install ksim_rl[export]")
+onnx = pytest.importorskip("onnx", reason="needs the extra: pip install ksim_rl[export]")
+
+from ksim_rl import envs  # noqa: E402
+from ksim_rl.envs import ManagerBasedRlEnv  # noqa: E402
+from ksim_rl.envs.contract import part  # noqa: E402
+from ksim_rl.envs.term import ObservationTerm  # noqa: E402
+from ksim_rl.envs.view import EnvView  # noqa: E402
+from ksim_rl.export import controls, export_policy, sim2sim  # noqa: E402
+from ksim_rl.export.standalone.runner import Runner, read_arrays  # noqa: E402
+from ksim_rl.modules import update_normalizers  # noqa: E402
+from ksim_rl.trainers.algorithm import make_policy  # noqa: E402
+from ksim_rl.trainers.build import build_env  # noqa: E402
+from ksim_rl.trainers.run_cfg import RunCfg  # noqa: E402
+from ksim_rl.trainers.run_folder import Policy  # noqa: E402
+from ksim_rl.transforms import ObservationTermCfg  # noqa: E402
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "deploy"
+# Of the recorded episodes; the report was written with others.
+SEED = 4711
+
+
+def silent(_: str) -> None:
+    """Say nothing."""
+
+
+def exported(task, folder, *, episodes=4, change=lambda cfg: cfg, seed=SEED):
+    """Export a policy that has seen some observations."""
+    found = envs.task(task)
+    settings = {f.name: getattr(found.training, f.name) for f in dataclasses.fields(found.training)}
+    cfg = RunCfg(**settings, task_name=task, task=change(found.cfg()), device="cpu")
+    torch.manual_seed(3)
+    env = build_env(cfg, num_envs=4, seed=5)
+    actor = make_policy(cfg, env)
+    with torch.no_grad():
+        update_normalizers(env.rollout(20, break_when_any_done=False), actor)
+    env.close()
+    policy = Policy(cfg=cfg, actor=actor, iteration=0)
+    return export_policy(policy, folder, episodes=episodes, seed=seed, note=silent)
+
+
+def report_of(folder, **options):
+    return sim2sim(folder, note=silent, **{"episodes": 2, **options})
+
+
+@pytest.fixture(scope="module")
+def cartpole(tmp_path_factory):
+    return exported("cartpole_balance", tmp_path_factory.mktemp("cartpole") / "export")
+
+
+@pytest.fixture(scope="module")
+def quadruped(tmp_path_factory):
+    return exported("quadruped_velocity_delayed", tmp_path_factory.mktemp("quadruped") / "export")
+
+
+def test_cartpole_earns_the_same_from_the_folder_alone(cartpole):
+    report = report_of(cartpole, episodes=4)
+    assert report.causes == []
+    assert report.return_ratio == pytest.approx(1.0, abs=1e-3)
+    names = {path.name for path in cartpole.iterdir()}
+    assert names >= {"policy.onnx", "policy.pt2", "robot.xml", "export.json", "runner.py", "README.md"}
+    stored = {entry.key: entry.value for entry in onnx.load(cartpole / "policy.onnx").metadata_props}
+    assert stored["observation_names"] == "position,velocity"
+    assert float(stored["step_dt"]) == pytest.approx(0.01)
+
+
+def test_runner_needs_neither_torch_nor_this_library(cartpole, tmp_path):
+    for name in ("torch", "ksim_rl", "warp", "tensordict"):
+        (tmp_path / f"{name}.py").write_text(f"raise ImportError('{name} is not here')\n")
+    done = subprocess.run(
+        [sys.executable, "runner.py", "--episodes", "2"],
+        cwd=cartpole,
+        env={"PATH": os.environ["PATH"], "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "return" in done.stdout
+
+
+def test_the_loop_of_the_examples_runs_an_export(cartpole):
+    loop = EXAMPLES / "loop.py"
+    done = subprocess.run(
+        [sys.executable, str(loop), str(cartpole), "--seconds", "0.1"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "0.1 s at 100 Hz" in done.stdout
+
+
+def test_the_loop_in_cpp_compiles(tmp_path):
+    roots = [os.environ.get("ONNXRUNTIME_ROOT", ""), "/usr", "/usr/local"]
+    found = [f"{root}/{place}" for root in roots if root for place in ("include", "include/onnxruntime")]
+    headers = [place for place in found if os.path.exists(f"{place}/onnxruntime_cxx_api.h")]
+    if not headers or shutil.which("g++") is None:
+        pytest.skip("no onnxruntime_cxx_api.h: set ONNXRUNTIME_ROOT to an unpacked release, and install g++")
+    command = ["g++", "-std=c++17", "-Wall", "-Werror", "-fsyntax-only", f"-I{headers[0]}"]
+    done = subprocess.run([*command, str(EXAMPLES / "loop.cpp")], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert len((EXAMPLES / "loop.cpp").read_text().splitlines()) <= 200
+
+
+def test_an_observation_without_a_description_is_refused_by_name():
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Riddle(ObservationTerm):
+        def __call__(self, view: EnvView) -> torch.Tensor:
+            return view.joints().pos_EL
+
+    cfg = envs.make_cfg("cartpole_balance", ["task.scene.num_envs=1"])
+    group = dataclasses.replace(
+        cfg.observations["actor"], terms={"riddle": ObservationTermCfg(term=Riddle())}
+    )
+    env = part(envs.build(dataclasses.replace(cfg, observations={"actor": group})), ManagerBasedRlEnv)
+    with pytest.raises(ValueError, match=r"observations.actor.terms.riddle: Riddle .*describe.register"):
+        controls.observations(env, ["actor"])
+
+
+# -- what is broken is named -------------------------------------------------------------------------------------
+
+
+def change_json(folder, edit):
+    path = folder / "export.json"
+    meta = json.loads(path.read_text())
+    edit(meta, {term["name"]: term for term in meta["observations"]})
+    path.write_text(json.dumps(meta))
+
+
+def change_xml(folder, edit):
+    path = folder / "robot.xml"
+    root = ElementTree.fromstring(path.read_text())
+    edit(root)
+    path.write_text(ElementTree.tostring(root, encoding="unicode"))
+
+
+def observed_order(folder):
+    def edit(meta, terms):
+        names = terms["joint_vel"]["value"]["joints"]
+        names[0], names[5] = names[5], names[0]
+
+    change_json(folder, edit)
+
+
+def actuator_order(folder):
+    def edit(root):
+        one, other = list(root.find("actuator"))[:2]
+        joint = one.get("joint")
+        one.set("joint", other.get("joint"))
+        other.set("joint", joint)
+
+    change_xml(folder, edit)
+
+
+def gain(folder):
+    def edit(root):
+        for actuator in root.find("actuator"):
+            for field in ("gainprm", "biasprm"):
+                halved = [str(0.5 * float(x)) for x in actuator.get(field).split()]
+                actuator.set(field, " ".join(halved))
+
+    change_xml(folder, edit)
+
+
+def delay(folder):
+    def edit(meta, _):
+        (lag,) = meta["action_chain"]
+        lag["min"] = lag["max"] = 4
+
+    change_json(folder, edit)
+
+
+def frame(folder):
+    def edit(meta, terms):
+        body = terms["projected_gravity"]["value"]["body"]
+        terms["base_lin_vel"]["value"] = {"quantity": "root_lin_vel", "body": body, "frame": "world"}
+
+    change_json(folder, edit)
+
+
+def rate(folder):
+    change_json(folder, lambda meta, _: meta.update(decimation=2))
+
+
+def scale(folder):
+    change_json(folder, lambda _, terms: terms["base_ang_vel"].update(scale=[0.25] * 3))
+
+
+def action_scale(folder):
+    change_json(folder, lambda meta, _: meta["actions"][0].update(scale=1.0))
+
+
+def normalizer(folder):
+    model = onnx.load(folder / "policy.onnx")
+    for tensor in model.graph.initializer:
+        if tensor.name.endswith("normalizer.mean"):
+            zeros = np.zeros(onnx.numpy_helper.to_array(tensor).shape, np.float32)
+            tensor.CopyFrom(onnx.numpy_helper.from_array(zeros, tensor.name))
+            break
+    else:
+        raise AssertionError([tensor.name for tensor in model.graph.initializer])
+    onnx.save(model, folder / "policy.onnx")
+
+
+def stale_sensor(folder):
+    late = {"min": 1, "max": 1, "resample_every": 0, "hold_probability": 0.0, "shared": None, "initial": None}
+    change_json(folder, lambda _, terms: terms["base_ang_vel"].update(delay=late))
+
+
+def contact_parameters(folder):
+    def edit(root):
+        for geom in root.iter("geom"):
+            geom.set("solref", "0.2 1")
+
+    change_xml(folder, edit)
+
+
+def mass(folder):
+    def edit(root):
+        for body in root.iter("body"):
+            for owner in (*body.findall("inertial"), *body.findall("geom")):
+                if owner.get("mass"):
+                    owner.set("mass", str(1.5 * float(owner.get("mass"))))
+
+    change_xml(folder, edit)
+
+
+BREAKS = {
+    observed_order: "joint order",
+    actuator_order: "joint order",
+    gain: "gain",
+    delay: "delay",
+    frame: "frame",
+    rate: "rate",
+    scale: "scale",
+    action_scale: "scale",
+    normalizer: "normalizer",
+    stale_sensor: "stale sensor",
+    contact_parameters: "contact parameters",
+    mass: "mass or inertia",
+}
+
+
+@pytest.mark.full
+def test_an_unbroken_quadruped_differs_in_nothing(quadruped):
+    assert report_of(quadruped).causes == []
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("break_it", BREAKS, ids=lambda function: function.__name__)
+def test_what_is_broken_is_the_first_cause(quadruped, break_it, tmp_path):
+    broken = tmp_path / "broken"
+    shutil.copytree(quadruped, broken)
+    break_it(broken)
+    report = report_of(broken)
+    assert report.causes, report.table()
+    assert report.causes[0].name == BREAKS[break_it], report.table()
+
+
+# -- the order of actuators --------------------------------------------------------------------------------------
+
+
+@pytest.mark.full
+def test_ctrl_of_the_exported_robot_is_the_order_of_actions(quadruped):
+    meta = json.loads((quadruped / "export.json").read_text())
+    model = mujoco.MjModel.from_xml_path(str(quadruped / "robot.xml"))
+    driven = [model.joint(int(model.actuator_trnid[i, 0])).name for i in range(model.nu)]
+    assert driven == meta["joint_names"]
+
+
+# -- folders of strangers ----------------------------------------------------------------------------------------
+
+
+def include(folder):
+    (folder / "robot.xml").write_text('<mujoco><include file="/etc/passwd"/></mujoco>')
+
+
+def mesh_outside(folder):
+    (folder / "robot.xml").write_text('<mujoco><asset><mesh file="../../secret.stl"/></asset></mujoco>')
+
+
+def entities(folder):
+    (folder / "robot.xml").write_text('<!DOCTYPE a [<!ENTITY b "c">]><mujoco model="&b;"/>')
+
+
+def pickled(folder):
+    np.savez(folder / "episodes.npz", allow_pickle=True, start=np.array([{"a": 1}], dtype=object))
+
+
+def deep(folder):
+    node = 1.0
+    for _ in range(100):
+        node = {"op": "negative", "of": [node]}
+    change_json(folder, lambda meta, terms: terms["velocity"].update(value=node))
+
+
+def unknown(folder):
+    change_json(folder, lambda _, terms: terms["velocity"].update(value={"op": "__import__", "of": [1.0]}))
+
+
+def linked(folder):
+    (folder / "policy.onnx").unlink()
+    (folder / "policy.onnx").symlink_to("/etc/hostname")
+
+
+def not_json(folder):
+    (folder / "export.json").write_text("{" * 5000)
+
+
+def no_weights(folder):
+    path = folder / "policy.onnx"
+    path.write_bytes(path.read_bytes() + b"\x0a\x08location")
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [include, mesh_outside, entities, pickled, deep, unknown, linked, not_json, no_weights],
+    ids=lambda function: function.__name__,
+)
+def test_a_strangers_folder_is_refused_in_one_line(cartpole, payload, tmp_path):
+    folder = tmp_path / "stranger"
+    shutil.copytree(cartpole, folder)
+    payload(folder)
+    with pytest.raises(ValueError) as refused:
+        runner = Runner(folder)
+        runner.episode(read_arrays(folder / "episodes.npz"), 0)
+    assert not re.search(r"root:|secret.*secret", str(refused.value))
+
+
+def test_sim2sim_says_what_is_wrong_with_a_folder_and_runs_no_program_in_it(cartpole, tmp_path):
+    folder = tmp_path / "stranger"
+    shutil.copytree(cartpole, folder)
+    (folder / "runner.py").write_text("raise SystemExit('the folder was executed')\n")
+    unknown(folder)
+    with pytest.raises(ValueError, match="export.json: .*__import__"):
+        report_of(folder)
