@@ -1,5 +1,6 @@
 """The updates share what is here: their datasets, gradient steps, what these measured, and what a checkpoint holds."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 from ksim_rl.data import DatasetBuffer, DatasetCfg, SequenceSampler
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
+from ksim_rl.envs.signal_keys import STANDARD, SignalKeys
 from ksim_rl.modules import burnt_in, recurrent_modules
 from ksim_rl.objectives import NonFiniteStepsError, StepGuard, load_optimizer_state_, make_optimizer, ppo_step
 
@@ -39,18 +41,24 @@ class StepMeans(dict[str, Tensor]):
                 self.setdefault(logged, torch.zeros_like(total)).copy_(total / count)
 
 
-class RolloutUpdate:
+class RolloutUpdate(ABC):
     """What the updates have in common: each is one piece of work on a rollout, without a host sync.
 
     On CUDA the first updates run eagerly and the next is captured. So each rollout must be the same memory, which is
     what `RolloutCollector` gives. The `networks` are all that learn, by the names that a checkpoint gives them; so many
-    as `max_skipped_steps` in a row that are not finite, which `guard` counts, end the run.
+    as `max_skipped_steps` in a row that are not finite, which `guard` counts, end the run. The env's own keys of reward
+    and flags are `signals`; see `signal_keys`.
     """
 
     def __init__(
-        self, networks: Mapping[str, nn.Module], *, max_skipped_steps: int, device: torch.device | str
+        self,
+        networks: Mapping[str, nn.Module],
+        *,
+        max_skipped_steps: int,
+        device: torch.device | str,
+        signals: SignalKeys = STANDARD,
     ) -> None:
-        self.device, self.networks = torch.device(device), networks
+        self.device, self.networks, self.signals = torch.device(device), networks, signals
         self.guard = StepGuard(device=self.device)
         self._max_skipped_steps = max_skipped_steps
         self._rollout_ET: TensorDictBase | None = None
@@ -71,16 +79,17 @@ class RolloutUpdate:
 
     @property
     def rollout_ET(self) -> TensorDictBase:
-        """The rollout that the update is about."""
+        """The rollout that the update is about, with its signals under TorchRL's names."""
         assert self._rollout_ET is not None
-        return self._rollout_ET
+        return self.signals.renamed(self._rollout_ET)
 
     def _skipped(self) -> dict[str, Tensor]:
         """Return the metrics of the gradient steps that were not made."""
         return {"update/skipped_steps": self.guard.skipped, "update/skipped_in_a_row": self._longest_skip}
 
+    @abstractmethod
     def _update(self) -> None:
-        raise NotImplementedError
+        """Learn from `rollout_ET`."""
 
     def state_dict(self) -> state_tree.State:
         """Return everything that the next update depends on."""
@@ -114,9 +123,10 @@ class DatasetUpdate(RolloutUpdate):
         data: DatasetCfg,
         seed: int,
         device: torch.device | str,
+        signals: SignalKeys,
         logged: Mapping[str, str],
     ) -> None:
-        super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, device=device)
+        super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, device=device, signals=signals)
         self.cfg, self.loss = cfg, loss
         self.num_env_states = data.num_env_states
         self.optimizer = make_optimizer(cfg, *networks.values())

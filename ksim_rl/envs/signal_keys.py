@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from tensordict.utils import NestedKey
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
 from torchrl.envs import EnvBase
 
 
@@ -14,6 +15,18 @@ class SignalKeys(NamedTuple):
     done: NestedKey = "done"
     terminated: NestedKey = "terminated"
     truncated: NestedKey | None = "truncated"
+
+    @property
+    def following(self) -> list[NestedKey]:
+        """Where reward, done and terminated lie in an env state."""
+        return [unravel_key(("next", key)) for key in self[:3] if key is not None]
+
+    def renamed(self, rollout_ET: TensorDictBase) -> TensorDictBase:
+        """Return a copy of the tree, not of the tensors, with reward, done and terminated under TorchRL's names too."""
+        rollout_ET = rollout_ET.copy()
+        for key, own in zip(STANDARD.following, self.following, strict=True):
+            rollout_ET.set(key, rollout_ET.get(own))
+        return rollout_ET
 
 
 STANDARD = SignalKeys()

@@ -1,6 +1,7 @@
 """This module has the distributions of actions, free of host syncs: gaussians, with and without bounds, and choices."""
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from functools import reduce
 from operator import add
@@ -49,7 +50,7 @@ class VectorDistribution(Distribution):
             return self.rsample(sample_shape)
 
 
-class BoundedDistribution(VectorDistribution):
+class BoundedDistribution(VectorDistribution, ABC):
     """The base of those whose components lie in [low, high], both numbers or both tensors [L]."""
 
     def __init__(
@@ -68,9 +69,9 @@ class BoundedDistribution(VectorDistribution):
         """The box [low, high]."""
         return constraints.independent(constraints.interval(self.low, self.high), 1)
 
+    @abstractmethod
     def _prepare(self, low: Any, high: Any) -> None:
         """Compute once what several quantities need."""
-        raise NotImplementedError
 
     def _clamp(self, value: Tensor) -> Tensor:
         return value.clamp(self.low, self.high)  # type: ignore[arg-type]

@@ -2,6 +2,7 @@
 
 import copy
 import math
+from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -129,13 +130,13 @@ class OffPolicyLoss(LossModule):
             network.reset_parameters_recursive()
         self.update_target_(1.0)
 
+    @abstractmethod
     def critic_loss(self, tensordict: TensorDictBase) -> tuple[Scalar, dict[str, Scalar]]:
         """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
         """Return the losses of all else, each with gradients for its own network alone, and what is logged."""
-        raise NotImplementedError
 
     @dispatch  # type: ignore[arg-type]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

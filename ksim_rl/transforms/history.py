@@ -1,5 +1,6 @@
 """This module holds the base of transforms that remember the last values of signals, and histories of observations."""
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -71,9 +72,9 @@ class RingTransform(RowTransform):
             tensordict.set(out_key, self._shaped(index, found[index], values[index], tensordict.batch_size))
         return tensordict
 
+    @abstractmethod
     def _through(self, index: int, value: Tensor, mask_E: Tensor | None) -> Tensor:
         """Write this step's value [E, ...] and return what is due, [E, N * L]; masked rows begin with it."""
-        raise NotImplementedError
 
     def _shaped(self, index: int, found_EL: Tensor, value: Tensor, batch_size: torch.Size) -> Tensor:
         """Return what comes out in the shape that the env emits."""

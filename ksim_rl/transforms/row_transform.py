@@ -1,5 +1,6 @@
 """This module holds the bases of transforms with state per env: buffers, draws of their own, a level to follow."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NoReturn, Self
 
@@ -97,7 +98,7 @@ class CheckedKeys(Transform):
         return found
 
 
-class RowTransform(CheckedKeys):
+class RowTransform(CheckedKeys, ABC):
     """Base of transforms with state per env row.
 
     All state lives in buffers that are changed in place. Those sized by the env are made when the env first asks for
@@ -153,9 +154,9 @@ class RowTransform(CheckedKeys):
         self._sized()
         return self._begin(tensordict_reset, self._rows_that_reset(tensordict, tensordict_reset))
 
+    @abstractmethod
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
         """Let the masked rows begin an episode."""
-        raise NotImplementedError
 
     def _rows_that_reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
         """Return which rows reset, bool [E]; all of them where there is no mask."""

@@ -4,6 +4,7 @@ import torch
 
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.data import ReplayCfg
+from ksim_rl.envs.signal_keys import STANDARD
 from ksim_rl.modules import (
     DeterministicActorCfg,
     ExploringPolicy,
@@ -29,7 +30,9 @@ OBJECTIVES = {
 }
 
 
-def make_update(name, env, *, device="cpu", objective=None, obs_dim=1, support=(-15.0, 15.0), **data):
+def make_update(
+    name, env, *, device="cpu", objective=None, obs_dim=1, support=(-15.0, 15.0), signals=STANDARD, **data
+):
     """Return the update of an algorithm for an env with actions of one number; `data` are fields of `ReplayCfg`."""
     cfg = objective or OBJECTIVES[name]
     fields = {
@@ -82,6 +85,7 @@ def make_update(name, env, *, device="cpu", objective=None, obs_dim=1, support=(
         data=ReplayCfg(**(fields | data)),
         num_envs=num_envs,
         device=device,
+        signals=signals,
     )
 
 

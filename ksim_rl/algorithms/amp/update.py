@@ -22,6 +22,7 @@ from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.algorithms.ppo.wiring import make_ppo_update
 from ksim_rl.data import ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
+from ksim_rl.envs.signal_keys import STANDARD
 from ksim_rl.mdp.motion_observations import observe_motion
 from ksim_rl.modules import Discriminator
 from ksim_rl.objectives import AMPCfg, descend, discriminator_loss, make_optimizer, style_reward
@@ -35,8 +36,6 @@ LOGGED = {
     "policy_score": "style/policy_score",
     "accuracy": "style/accuracy",
 }
-# What the replay stores beside the features.
-_SIGNALS = [("next", "reward"), ("next", "done"), ("next", "terminated")]
 
 
 def make_amp_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> "AMPUpdate":
@@ -74,7 +73,9 @@ class AMPUpdate(RolloutUpdate):
             device=ppo.device,
         )
         networks = {"discriminator": self.discriminator}
-        super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, device=ppo.device)
+        super().__init__(
+            networks, max_skipped_steps=cfg.max_skipped_steps, device=ppo.device, signals=ppo.signals
+        )
         # So that the first scores are of features in a fitting range.
         self.discriminator.normalizer.update(self.reference_N2L)
         own = {
@@ -129,13 +130,12 @@ class AMPUpdate(RolloutUpdate):
         """Return the rollout with the sum of both rewards, which leaves the env's own as it was."""
         style_ET = style_reward(self.discriminator(_transitions(rollout_ET, *self._features))).unsqueeze(-1)
         self._style.copy_(style_ET.nanmean())
-        reward_ET = rollout_ET.get(("next", "reward"))
-        rewarded_ET = rollout_ET.copy()
-        total_ET = self.cfg.task_coeff * reward_ET + self.cfg.style_coeff * style_ET
-        return rewarded_ET.set(("next", "reward"), total_ET)
+        reward = self.signals.following[0]
+        total_ET = self.cfg.task_coeff * rollout_ET.get(reward) + self.cfg.style_coeff * style_ET
+        return rollout_ET.copy().set(reward, total_ET)
 
     def _learn_style(self, rollout_ET: TensorDictBase) -> None:
-        self.replay.extend(rollout_ET.select(*self._features, *_SIGNALS))
+        self.replay.extend(rollout_ET.select(*self._features, *STANDARD.following))
         net, made, shown = self.discriminator, [], []
         for minibatch_B in self.replay.minibatches(self.cfg.num_discriminator_steps):
             drawn_B = torch.randint(

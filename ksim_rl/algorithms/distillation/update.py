@@ -15,6 +15,7 @@ from ksim_rl.algorithms.gradient_steps import DatasetUpdate, in_columns
 from ksim_rl.algorithms.ppo.wiring import make_ppo_policy
 from ksim_rl.data import DatasetCfg
 from ksim_rl.device import state_tree
+from ksim_rl.envs.signal_keys import STANDARD, SignalKeys, signal_keys
 from ksim_rl.modules import MixedPolicy, update_normalizers
 from ksim_rl.objectives import (
     DistillationCfg,
@@ -44,7 +45,13 @@ def make_distillation_update(
     else:
         teacher = restored_teacher(resumed["teacher"], env, cfg=cfg)
     return DistillationUpdate(
-        objective, actor=student, teacher=teacher, data=cfg.data, seed=cfg.seed, device=cfg.resolved_device()
+        objective,
+        actor=student,
+        teacher=teacher,
+        data=cfg.data,
+        seed=cfg.seed,
+        device=cfg.resolved_device(),
+        signals=signal_keys(env),
     )
 
 
@@ -64,11 +71,19 @@ class DistillationUpdate(DatasetUpdate):
         data: DatasetCfg,
         seed: int = 0,
         device: torch.device | str = "cpu",
+        signals: SignalKeys = STANDARD,
     ) -> None:
         self.actor, self.teacher = actor, teacher
         loss = DistillationLoss(actor, teacher.policy, loss=cfg.loss)
         super().__init__(
-            cfg, loss=loss, networks={"actor": actor}, data=data, seed=seed, device=device, logged=LOGGED
+            cfg,
+            loss=loss,
+            networks={"actor": actor},
+            data=data,
+            seed=seed,
+            device=device,
+            signals=signals,
+            logged=LOGGED,
         )
         self.teacher_share = torch.tensor(cfg.teacher_share, device=self.device)
         helps = cfg.teacher_share > 0.0
@@ -88,7 +103,7 @@ class DistillationUpdate(DatasetUpdate):
     def rollout_keys(self) -> list[Any]:
         """The leaves of an env state that an update reads."""
         read = [*observation_keys(self.actor), *self._teacher_keys, *distribution_keys(self.actor)]
-        return list(dict.fromkeys([*read, ("next", "reward")]))
+        return list(dict.fromkeys([*read, *self.signals.following]))
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return what the last update measured, each a tensor [] on the device; means are over the steps made.

@@ -9,13 +9,14 @@ import torch
 from jaxtyping import Num
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 from ksim_rl.algorithms.gradient_steps import RolloutUpdate, load_optimizer_state, optimizer_state
 from ksim_rl.data import ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
+from ksim_rl.envs.signal_keys import STANDARD, SignalKeys
 from ksim_rl.modules import ExploringPolicy, update_normalizers
 from ksim_rl.objectives import (
     OffPolicyCfg,
@@ -59,6 +60,7 @@ class OffPolicyUpdate(RolloutUpdate):
         num_envs: int,
         device: torch.device | str = "cpu",
         mirror: Mapping[NestedKey, MirrorMap] | None = None,
+        signals: SignalKeys = STANDARD,
     ) -> None:
         if data.num_minibatches % cfg.policy_delay:
             raise ValueError(
@@ -70,7 +72,7 @@ class OffPolicyUpdate(RolloutUpdate):
             "critic": loss.critic_network,
             "target_critic": loss.target_critic_network,
         }
-        super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, device=device)
+        super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, device=device, signals=signals)
         self.cfg, self.loss, self.data = cfg, loss, data
         self.actor: TensorDictModuleBase = loss.actor_network
         self.critic = loss.critic_network
@@ -105,8 +107,8 @@ class OffPolicyUpdate(RolloutUpdate):
     @property
     def rollout_keys(self) -> list[Any]:
         """The leaves of an env state that an update reads."""
-        following = [("next", key) for key in (*self._observations, "reward", "done", "terminated")]
-        return [*self._observations, "action", *following]
+        following = [unravel_key(("next", key)) for key in self._observations]
+        return [*self._observations, "action", *following, *self.signals.following]
 
     def __call__(self, rollout_ET: TensorDictBase) -> None:
         """Learn from a rollout `["E","T"]`, or only keep it while the actions are random."""

@@ -8,6 +8,7 @@ from torchrl.envs import EnvBase
 
 from ksim_rl.algorithms.off_policy.update import OffPolicyUpdate
 from ksim_rl.data import ReplayCfg
+from ksim_rl.envs.signal_keys import signal_keys
 from ksim_rl.mdp.mirror_maps import mirror_maps
 from ksim_rl.modules import (
     DeterministicActorCfg,
@@ -68,6 +69,7 @@ def make_off_policy_update(
         num_envs=cfg.num_envs,
         device=cfg.resolved_device(),
         mirror=mirror_maps(env, loss.observation_keys) if objective.symmetry != "none" else None,
+        signals=signal_keys(env),
     )
 
 

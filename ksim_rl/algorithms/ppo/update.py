@@ -46,7 +46,7 @@ class PPOUpdate(DatasetUpdate):
 
     The actor is any probabilistic module, which writes actions, their log-probabilities and parameters of the
     distribution; the critic writes `state_value`. For `cfg.symmetry`, `mirror` has the mirror images of what they read
-    and of the action. The env's own keys of reward and flags are `signals`; see `signal_keys`.
+    and of the action.
     """
 
     def __init__(
@@ -63,12 +63,19 @@ class PPOUpdate(DatasetUpdate):
     ) -> None:
         cfg = with_precision_of(cfg, device)
         self.actor = self.behavior = actor
-        self.critic, self.signals = critic, signals
+        self.critic = critic
         self.advantage = make_advantage(cfg, actor, critic)
         loss = make_loss(cfg, actor, critic)
         networks = {"actor": actor, "critic": critic}
         super().__init__(
-            cfg, loss=loss, networks=networks, data=data, seed=seed, device=device, logged=LOGGED
+            cfg,
+            loss=loss,
+            networks=networks,
+            data=data,
+            seed=seed,
+            device=device,
+            signals=signals,
+            logged=LOGGED,
         )
         losses = make_symmetric(cfg, loss, mirror, device=self.device)
         self._losses = in_precision(losses, cfg.precision, device=self.device)
@@ -94,7 +101,7 @@ class PPOUpdate(DatasetUpdate):
         actor = self.actor
         written = [*actor.dist_sample_keys, *actor.log_prob_keys, *distribution_keys(actor)]
         valued = [key for key in self.critic.in_keys if key not in self._carried.keys]
-        following = [unravel_key(("next", key)) for key in (*valued, *self.signals[:3])]
+        following = [*(unravel_key(("next", key)) for key in valued), *self.signals.following]
         return list(dict.fromkeys([*observation_keys(actor), *valued, *written, *following]))
 
     @property
@@ -109,10 +116,7 @@ class PPOUpdate(DatasetUpdate):
         return super().metrics() | std | {"update/fused": self._is_fused}
 
     def _update(self) -> None:
-        # A copy of the tree, not of the tensors: what computes advantages knows the signals by TorchRL's names.
-        rollout_ET = self.rollout_ET.copy()
-        for name, key in zip(SignalKeys._fields[:3], self.signals, strict=False):
-            rollout_ET.set(("next", name), rollout_ET.get(unravel_key(("next", key))))
+        rollout_ET = self.rollout_ET
         if isinstance(self.fused, str):
             steps = self._torch_steps(rollout_ET)
         else:
