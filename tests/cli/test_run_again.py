@@ -153,6 +153,7 @@ def test_weights_that_are_not_there_are_one_line(tmp_path, capsys):
     assert "no checkpoint here; expected a run folder" in capsys.readouterr().err
 
 
+@pytest.mark.full
 def test_a_sweep_of_a_run_made_again(first, tmp_path):
     axes = ("seed=1", "objective.clip_epsilon=0.1,0.2", "trainer.num_iterations=1")
     assert run("--multirun", "--config-dir", str(first), *axes, f"hydra.sweep.dir={tmp_path}") == 0

@@ -100,6 +100,7 @@ def test_fewer_iterations_than_are_done_are_refused(trained, capsys):
     assert "--num-iterations 1: expected at least " in capsys.readouterr().err
 
 
+@pytest.mark.full
 def test_a_sweep_runs_one_job_for_each_combination(tmp_path):
     quick = ("trainer.num_iterations=1", "trainer.eval_episodes=0", "trainer.video=false")
     assert run("train", "--multirun", *SMALL, *quick, "seed=1,2", f"hydra.sweep.dir={tmp_path}") == 0

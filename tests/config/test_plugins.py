@@ -101,7 +101,12 @@ def test_its_classes_task_and_configs_are_used_and_its_name_is_remembered(traine
     assert list(config["task"]["transforms"]) == ["negate"]
 
 
-@pytest.mark.parametrize("command", ["eval", "resume", "play"])
+FULL = pytest.mark.full
+
+
+@pytest.mark.parametrize(
+    "command", ["eval", *(pytest.param(name, marks=FULL) for name in ("resume", "play"))]
+)
 def test_a_remembered_plug_in_is_not_imported_until_it_is_named(work, trained, command):
     done = ksim_rl(work, command, "run")
     assert done.returncode == 2
@@ -110,6 +115,7 @@ def test_a_remembered_plug_in_is_not_imported_until_it_is_named(work, trained, c
     assert len(done.stderr.strip().splitlines()) == 1
 
 
+@pytest.mark.full
 def test_it_is_named_by_the_flag_or_by_the_users_settings(work, trained):
     done = ksim_rl(work, "eval", "run", "--episodes", "2", "--plugin=mine_of_test")
     assert done.returncode == 0, done.stderr[-2000:]

@@ -41,10 +41,12 @@ def test_the_robot_stands_and_is_drawn(folder: Path) -> None:
     assert seat.sum() > 500  # the red cushions
 
 
+@pytest.mark.full
 def test_its_unit_tests_pass(folder: Path) -> None:
     assert "2 passed" in run(folder, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_stool.py")
 
 
+@pytest.mark.full
 def test_it_trains(folder: Path) -> None:
     (command,) = (command for command in commands("ksim-rl train") if "device=cuda" not in command)
     run(folder, "-m", "ksim_rl.cli.main", "train", *command.split())

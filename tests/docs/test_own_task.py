@@ -32,12 +32,14 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     return Installed(tmp_path_factory.mktemp("own_task"))
 
 
+@pytest.mark.full
 def test_the_task_is_listed_with_ours(installed: Installed) -> None:
     done = installed.ksim_rl("envs")
     assert done.returncode == 0, done.stderr
     assert "puck_center" in done.stdout and "cartpole_balance" in done.stdout
 
 
+@pytest.mark.full
 def test_its_unit_test_passes(installed: Installed) -> None:
     done = installed.run("-m", "pytest", "-q", "-p", "no:cacheprovider", installed.folder / "test_puck.py")
     assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout + done.stderr
@@ -68,6 +70,7 @@ def test_without_the_package_its_classes_are_not_built() -> None:
     assert "only classes of these packages are built: ksim_rl" in done.stderr
 
 
+@pytest.mark.full
 def test_a_broken_package_is_named(tmp_path: Path) -> None:
     broken = Installed(tmp_path)
     (broken.folder / "puck_rink" / "tasks.py").write_text("import no_such_module\n")
@@ -77,6 +80,7 @@ def test_a_broken_package_is_named(tmp_path: Path) -> None:
     assert "puck_rink" in done.stderr and "no_such_module" in done.stderr and "uninstall" in done.stderr
 
 
+@pytest.mark.full
 def test_a_name_that_is_taken_is_refused(tmp_path: Path) -> None:
     rival = Installed(tmp_path)
     tasks = rival.folder / "puck_rink" / "tasks.py"

@@ -115,8 +115,8 @@ def trained(kind, **sequences):
 @pytest.mark.parametrize(
     ("kind", "sequences"),
     [
-        ("lstm", {}),
-        ("gru", {}),
+        pytest.param("lstm", {}, marks=pytest.mark.full),
+        pytest.param("gru", {}, marks=pytest.mark.full),
         ("lstm", {"sequence_length": 4}),
         ("gru", {"sequence_length": 4, "burn_in": 2}),
     ],
