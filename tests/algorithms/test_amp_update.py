@@ -25,6 +25,7 @@ def turns(actor):
     return (after.norm(dim=-1) - 1.0).abs(), torch.atan2(cross, (before * after).sum(-1))
 
 
+@pytest.mark.full
 def test_a_circle_is_walked_in_the_motions_direction_and_speed_without_another_reward():
     trainer = make_amp(iterations=45)
     off_ET, turn_ET = turns(trainer.update.actor)
