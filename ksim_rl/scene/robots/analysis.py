@@ -246,11 +246,12 @@ def analyse(source: Source) -> RobotAnalysis:
     )
 
 
-def robot_name(source: Source) -> str:
+def robot_name(source: Source, spec: mujoco.MjSpec | None = None) -> str:
     """Return what a robot is called: its file without the suffix, or what the model calls itself."""
     is_file = not isinstance(source, mujoco.MjSpec) and not str(source).lstrip().startswith("<")
     stem = Path(source).stem if is_file else "scene"
-    return re.sub(r"\W+", "_", (load_spec(source).modelname if stem == "scene" else stem).lower()) or "robot"
+    called = (spec or load_spec(source)).modelname if stem == "scene" else stem
+    return re.sub(r"\W+", "_", called.lower()) or "robot"
 
 
 def _robot(
@@ -275,7 +276,7 @@ def _robot(
     if not any(site.name == "imu" for site in spec.sites):
         sites.append(Site(name="imu", body=anatomy.root))
     robot = ModelRobot(
-        name=robot_name(source),
+        name=robot_name(source, spec),
         model=_as_text(spec) if isinstance(source, mujoco.MjSpec) else str(source),
         root_body=anatomy.root,
         joint_names=tuple(names.values()),
