@@ -48,10 +48,9 @@ class BrowserViewer:
         self._notice.remove()
         server, cfg = self.server, session.ours.cfg.viewer
         _aim(server, cfg)
-        tabs = server.gui.add_tab_group()
-        with tabs.add_tab("Control"):
-            self._panel = Panel(server.gui, session)
-        with tabs.add_tab("Plots") as plots:
+        self._panel = Panel(server.gui, session)
+        # No tab: charts that are made while they are hidden stay empty.
+        with server.gui.add_folder("Plots") as plots:
             self._plots = Plots(server.gui, plots, session)
         self._pad = Pad(self._panel, session, host=self._host, port=self.port + 1, viewer_port=self.port)
         self._built = 0
@@ -93,6 +92,7 @@ class BrowserViewer:
                 continue
             start = time.monotonic()
             changed = session.advance(self._plots.take)
+            self._plots.take()
             if changed or not sent:
                 self.show()
                 sent = True

@@ -22,8 +22,8 @@ MOST_CURVES = 16
 class Curves:
     """A chart of named values over the last seconds of simulated time, with a table of what they are now."""
 
-    def __init__(self, gui: viser.GuiApi, tab: viser.GuiTabHandle, *, points: int) -> None:
-        self._gui, self._tab = gui, tab
+    def __init__(self, gui: viser.GuiApi, folder: viser.GuiFolderHandle, *, points: int) -> None:
+        self._gui, self._folder = gui, folder
         self._rows: deque[tuple[float, list[float]]] = deque(maxlen=points)
         self._names: tuple[str, ...] = ()
         self._chart: viser.GuiUplotHandle | None = None
@@ -54,7 +54,7 @@ class Curves:
             series = [uplot.Series(label="s")]
             for column, name in enumerate(shown):
                 series.append(uplot.Series(label=name, stroke=COLORS[column % len(COLORS)], width=1.5))
-            with self._tab:
+            with self._folder:
                 self._chart = self._gui.add_uplot(
                     data,
                     tuple(series),
@@ -79,15 +79,15 @@ class Curves:
 class Plots:
     """The reward terms and one observation term of the shown env; a dropdown chooses which."""
 
-    def __init__(self, gui: viser.GuiApi, tab: viser.GuiTabHandle, session: Session) -> None:
+    def __init__(self, gui: viser.GuiApi, folder: viser.GuiFolderHandle, session: Session) -> None:
         self._session = session
         points = max(2, round(SECONDS / session.ours.step_dt))
         self._seconds, self._seen, self._shown_at = 0.0, session.steps, 0.0
         gui.add_markdown("**Reward terms** (weighted, per step)")
-        self._rewards = Curves(gui, tab, points=points)
+        self._rewards = Curves(gui, folder, points=points)
         gui.add_markdown("**Observation**")
         self._term = gui.add_dropdown("Term", tuple(session.observations) or ("none",))
-        self._observation = Curves(gui, tab, points=points)
+        self._observation = Curves(gui, folder, points=points)
 
     def take(self) -> None:
         """Take in the last env step, if there was one."""
@@ -103,8 +103,8 @@ class Plots:
             self._observation.add(self._seconds, named)
 
     def show(self) -> None:
-        """Send the curves, a few times per second."""
-        if time.monotonic() - self._shown_at >= PERIOD_S:
+        """Send the curves, a few times per second while it plays."""
+        if time.monotonic() - self._shown_at >= PERIOD_S or not self._session.playing:
             self._shown_at = time.monotonic()
             self._rewards.show()
             self._observation.show()
