@@ -1,0 +1,110 @@
+"""`ksim-rl new robot PATH` writes a package around a robot's model: robot, task, test and README."""
+
+import importlib.util
+import re
+import shutil
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+
+from rich.pretty import pretty_repr
+
+from ksim_rl import envs
+from ksim_rl.cli.errors import OneLineParser
+from ksim_rl.cli.report import shown, shown_working
+from ksim_rl.physics import load_spec
+from ksim_rl.scene.robots import analyse
+from ksim_rl.scene.robots.analysis import TRIAL_S, robot_name
+
+MODEL = "@model@"
+
+
+def new(arguments: list[str]) -> int:
+    """Write the package; the code is 1 for a robot that does not stand."""
+    parser = OneLineParser(prog="ksim-rl new", description="Write a package around a robot's model.")
+    parser.add_argument("kind", choices=["robot"])
+    parser.add_argument(
+        "model", metavar="PATH", help="an MJCF or URDF file, or a menagerie name: unitree_a1/a1"
+    )
+    parser.add_argument("--name", help="of the package; default: that of the model")
+    parser.add_argument("--output", type=Path, help="the new folder; default: the package's name, here")
+    options = parser.parse_args(arguments)
+    name = options.name or robot_name(options.model)
+    folder = options.output or Path(name)
+    task = f"{name}_velocity_flat"
+    _check_name(name, task)
+    if folder.exists():
+        raise ValueError(f"{folder}: exists already; choose another folder with --output")
+    with shown_working(f"analysing {options.model}"):
+        found = analyse(options.model)
+    robot, stands = replace(found.robot, name=name, model=MODEL), found.stands_s >= TRIAL_S
+    is_file = Path(options.model).exists()
+    path = f'str(files("{name}").joinpath("{name}.xml"))'
+    words = {
+        "name": name,
+        "task": task,
+        "mass": f"{found.mass:.2f}",
+        "height": f"{found.height:.2f}",
+        "joints": len(robot.joint_names),
+        "feet": ", ".join(found.foot_bodies),
+        "model": path if is_file else repr(options.model),
+        "robot": pretty_repr(robot, max_width=110).replace(repr(MODEL), "MODEL"),
+        "stands": f"With zero actions it stands for {found.stands_s:g} s"
+        + (", as long as it was watched." if stands else " only: see to gains and stance first."),
+        "and_stands": ", and it stands" if stands else "",
+    }
+    texts = {
+        "pyproject.toml": _text("pyproject.toml", words),
+        "README.md": _text("README.md", words),
+        f"{name}/__init__.py": _text("package.py", words),
+        f"{name}/robot.py": _text(
+            "robot.py", words, "from importlib.resources import files\n" if is_file else ""
+        ),
+        f"{name}/tasks.py": _text("tasks.py", words),
+        f"tests/test_{name}.py": _text(
+            "test.py", words, "import dataclasses\n\nimport torch" if stands else ""
+        )
+        + (_text("test_stands.py", words) if stands else ""),
+    }
+    for file, text in texts.items():
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).write_text(text)
+    if is_file:
+        copy_model(Path(options.model), folder / name / f"{name}.xml")
+    for file in sorted(path for path in folder.rglob("*") if path.is_file()):
+        print(shown(file))
+    print(f"next: cd {shown(folder)}; its README.md has the commands")
+    return 0 if stands else 1
+
+
+def copy_model(source: Path, target: Path) -> None:
+    """Write a model as one MJCF file, with the meshes, textures and height fields it names, in `assets`."""
+    spec = load_spec(source)
+    assets = [(spec.meshdir, entry) for entry in (*spec.meshes, *spec.hfields, *spec.skins) if entry.file]
+    assets += [(spec.texturedir, entry) for entry in spec.textures if entry.file]
+    for folder, entry in assets:
+        (target.parent / "assets").mkdir(exist_ok=True)
+        copied = shutil.copy(source.resolve().parent / folder / entry.file, target.parent / "assets")
+        entry.file = Path(copied).name
+    if not assets and source.suffix == ".xml" and "<include" not in source.read_text():
+        shutil.copyfile(source, target)  # with its comments
+        return
+    spec.meshdir = spec.texturedir = "assets"
+    spec.modelfiledir = str(target.parent)
+    spec.compile()
+    target.write_text(spec.to_xml())
+
+
+def _text(name: str, words: dict[str, object], imports: str = "") -> str:
+    template = files("ksim_rl.cli").joinpath("new_robot", f"{name}.txt").read_text()
+    return Template(template).substitute(words, imports=imports).replace('"""\n\n\n', '"""\n\n')
+
+
+def _check_name(name: str, task: str) -> None:
+    if not re.fullmatch(r"[a-z]\w*", name, re.ASCII):
+        raise ValueError(f"--name {name}: expected a name for a Python package: small letters, digits and _")
+    if task in envs.names():
+        raise ValueError(f"--name {name}: there is a task {task!r} already; choose another name")
+    if importlib.util.find_spec(name) is not None:
+        raise ValueError(f"--name {name}: Python knows a package of this name already; choose another name")
