@@ -18,7 +18,9 @@ setup: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python >= 3.11 is needed; choose one with: make setup PYTHON=python3.11"; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev]"
+	@echo "installing what ksim_rl needs, several minutes where nothing is cached"
+	@test -t 1 || while sleep 15; do echo "still installing"; done & ticking=$$!; \
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev]"; code=$$?; kill $$ticking 2>/dev/null; exit $$code
 	@touch $@
 
 train: setup

@@ -1,5 +1,6 @@
 """This module turns an error into one line for the user and an exit code."""
 
+import argparse
 import os
 import signal
 import sys
@@ -7,6 +8,7 @@ import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import NoReturn
 
 REFUSED, FAILED = 2, 3
 
@@ -51,3 +53,11 @@ def interruption(stopped: KeyboardInterrupt) -> signal.Signals:
 def say(text: str) -> None:
     """Print one line of the program's own on stderr."""
     print(f"ksim-rl: {text}", file=sys.stderr)
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Answers wrong arguments in one line, as all other errors."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise what `main` reports."""
+        raise ValueError(f"{message} (see {self.prog} --help)")

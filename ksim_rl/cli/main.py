@@ -26,6 +26,7 @@ usage: ksim-rl <command> [arguments]
   warmup   compile ahead of time:   ksim-rl warmup task=go1_velocity_flat device=cuda
   envs     list the tasks, or print what one is made of: ksim-rl envs cartpole_swingup
   robot    analyse a robot's model: ksim-rl robot unitree_a1/a1 [--code]
+  new      a package around it:     ksim-rl new robot PATH.xml
   reproduce  run a table of results: ksim-rl reproduce dm_control --rows 'ppo/Cart.*'
 
 RUN is a run folder (its newest checkpoint) or one of its checkpoints.
@@ -49,6 +50,7 @@ COMMANDS = {
     "warmup": "ksim_rl.cli.warmup:warmup",
     "envs": "ksim_rl.cli.run_commands:list_envs",
     "robot": "ksim_rl.cli.run_commands:robot",
+    "new": "ksim_rl.cli.new:new",
     "reproduce": "ksim_rl.tables.reproduce:reproduce",
 }
 

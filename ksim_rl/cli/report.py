@@ -1,13 +1,30 @@
 """This module trains for a command, and prints how the run went."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from rich.console import Console
+
+from ksim_rl import envs
 from ksim_rl.cli.errors import interruption
 from ksim_rl.device.kernel_loading import compile_notice
-from ksim_rl.trainers import Checkpoint, Evaluation, Outcome, RunCfg, RunProgress, checkpoint, run
+from ksim_rl.trainers import (
+    Checkpoint,
+    Evaluation,
+    Outcome,
+    RunCfg,
+    RunProgress,
+    TrainingCfg,
+    checkpoint,
+    run,
+)
 from ksim_rl.trainers.build import solved_at
 from ksim_rl.viewer.live_training import watched
+
+# By so much a rollout length may differ from the task's own before a run says so.
+FAR = 4
 
 
 def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None = None) -> int:
@@ -19,6 +36,10 @@ def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None 
         f"{cfg.task_name}: {cfg.num_envs} envs x {length} steps = {cfg.num_envs * length} env states per iteration, "
         f"on {cfg.device}; run folder {shown(folder)}"
     )
+    if own := _far_from(cfg, length):
+        progress.note(
+            f"rollouts of {length} steps are far from the {own}: collector.rollout_length keeps to that"
+        )
     try:
         with compile_notice(progress.status), watched(cfg, progress.note) as hooks:
             outcome = run(cfg, folder, progress=progress, hooks=hooks, resume_from=resume_from)
@@ -44,6 +65,14 @@ def _what_is_saved(folder: Path) -> str:
     return "nothing is saved, and no folder is left"
 
 
+@contextmanager
+def shown_working(text: str) -> Iterator[RunProgress]:
+    """Show on stderr that a command works, and what it compiles, while it says nothing else."""
+    progress = RunProgress(1, console=Console(stderr=True, highlight=False))
+    with compile_notice(progress.status), progress.busy(text):
+        yield progress
+
+
 def verdict(evaluation: Evaluation, threshold: float | None) -> str:
     """Say how good an evaluation is, against the threshold of the task if it has one."""
     text = (
@@ -62,6 +91,18 @@ def shown(path: Path) -> str:
     """Return a path as short as it can be written from here."""
     relative = os.path.relpath(path)
     return str(path) if relative.startswith("..") else relative
+
+
+def _far_from(cfg: RunCfg, length: int) -> str:
+    """Say which rollout length the task is tuned for, where a run's is very different, by the same algorithm."""
+    task = envs.task(cfg.task_name) if cfg.task_name in envs.names() else None
+    trainings = [] if task is None else [task.training, *task.other_trainings]
+    for training in trainings:
+        if isinstance(training, TrainingCfg) and type(training.objective) is type(cfg.objective):
+            own = training.data.rollout_length(training.num_envs)
+            if not own / FAR <= length <= own * FAR:
+                return f"{own} that {cfg.task_name} is tuned for, with {training.num_envs} envs"
+    return ""
 
 
 def _summary(cfg: RunCfg, outcome: Outcome, folder: Path) -> list[str]:

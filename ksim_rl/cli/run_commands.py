@@ -1,24 +1,25 @@
 """This module holds the commands that take no Hydra overrides: resume, eval, play, envs, robot."""
 
-import argparse
 import dataclasses
 from pathlib import Path
 
 import torch
 
-from ksim_rl import envs
-from ksim_rl.cli.errors import say
-from ksim_rl.cli.report import run_and_report, verdict
+from ksim_rl import conf, envs
+from ksim_rl.cli.errors import OneLineParser, say
+from ksim_rl.cli.report import run_and_report, shown_working, verdict
 from ksim_rl.cli.runs import print_table
 from ksim_rl.config.plain_data import check_links
-from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.envs.contract import part
 from ksim_rl.scene.robots import analyse
 from ksim_rl.scene.robots.analysis import TRIAL_S
-from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, load_policy
+from ksim_rl.trainers import RunCfg, checkpoint, load_policy
 from ksim_rl.trainers.build import build_evaluator, solved_at
 from ksim_rl.trainers.run_cfg import check_run_tree
+from ksim_rl.trainers.sources import check_sources
 
+# What a checkpoint is of, and a resumed run cannot change.
+KEPT = ("task_name", "num_envs", "seed", "modules", "checkpoint")
 # Folders in a run folder that a run writes to.
 FOLDERS = ("checkpoint", "tensorboard", "wandb", "mlflow")
 
@@ -26,26 +27,44 @@ FOLDERS = ("checkpoint", "tensorboard", "wandb", "mlflow")
 def resume(arguments: list[str]) -> int:
     """Continue a run from its newest checkpoint."""
     parser = _parser("resume", "Continue a run from its newest checkpoint, in the same folder.")
+    parser.add_argument(
+        "overrides", nargs="*", metavar="field=value", help="what changes: objective.learning_rate=1e-4"
+    )
     parser.add_argument("--num-iterations", type=int, help="of the whole run; default: as it was configured")
     parser.add_argument(
         "--trust", action="store_true", help="the folder is yours: it may hold links, and say where to write"
     )
-    options = parser.parse_args(arguments)
+    options = parser.parse_intermixed_args(arguments)
     saved = checkpoint.load(checkpoint.latest(options.run, note=say))
+    overrides = list(options.overrides)
+    if options.num_iterations is not None:
+        overrides.append(f"trainer.num_iterations={options.num_iterations}")
+    fields = [text.lstrip("+~").partition("=")[0] for text in overrides]
+    for field in fields:
+        if field.partition(".")[0] in KEPT:
+            raise ValueError(
+                f"{field}: a resumed run keeps it: start a new run from these weights, "
+                f"ksim-rl train --config-dir {options.run} checkpoint={options.run} {field}=..."
+            )
     # A checkpoint lies in <run folder>/checkpoint/<iteration>.
     folder = saved.path.absolute().parent.parent
     if not options.trust:
         check_links(folder, below=FOLDERS)
-        check_run_tree(saved.config, saved.path)
-    cfg = RunCfg.from_tree({**saved.config, "device": options.device})
+        check_run_tree(saved.config, saved.path, given=fields)
+    tree = {**saved.config, "device": options.device}
+    if overrides:
+        conf.register()
+        conf.store_run(tree, saved.path)
+        (cfg,) = conf.check_command_line(overrides, name=conf.RUN_AGAIN, multirun=False, values=True)
+    else:
+        cfg = RunCfg.from_tree(tree)
     cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
-    if options.num_iterations is not None:
-        if options.num_iterations < saved.iteration:
-            raise ValueError(
-                f"--num-iterations {options.num_iterations}: expected at least {saved.iteration}, those that are done"
-            )
-        longer = dataclasses.replace(cfg.trainer, num_iterations=options.num_iterations)
-        cfg = dataclasses.replace(cfg, trainer=longer)
+    if cfg.trainer.num_iterations < saved.iteration:
+        raise ValueError(
+            f"trainer.num_iterations={cfg.trainer.num_iterations}: expected at least {saved.iteration}, those that are "
+            "done"
+        )
+    check_sources(cfg, resumes=True)
     return run_and_report(cfg, folder.resolve(), resume_from=saved)
 
 
@@ -57,7 +76,7 @@ def evaluate(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     if options.episodes is not None and options.episodes < 1:
         raise ValueError(f"--episodes {options.episodes}: expected at least 1")
-    with compile_notice(RunProgress(1).status):
+    with shown_working("evaluating"):
         policy = load_policy(checkpoint.latest(options.run, note=say), device=options.device)
         episodes = options.episodes or policy.cfg.trainer.eval_episodes or 100
         evaluate = build_evaluator(policy.cfg, policy.actor, episodes=episodes, seed=options.seed)
@@ -70,13 +89,13 @@ def evaluate(arguments: list[str]) -> int:
 
 def list_envs(arguments: list[str]) -> int:
     """List the tasks, or print what one is made of."""
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="ksim-rl envs", description="List the tasks, or print what one of them is made of."
     )
     parser.add_argument("task", nargs="?", help="build this one and print its managers as tables")
     options = parser.parse_args(arguments)
     if options.task is not None:
-        with compile_notice(RunProgress(1).status):
+        with shown_working(f"building {options.task}"):
             device = "cuda" if torch.cuda.is_available() else "cpu"
             env = envs.make(options.task, num_envs=1, device=device)
         ours = part(env, envs.ManagerBasedRlEnv)
@@ -103,7 +122,7 @@ def list_envs(arguments: list[str]) -> int:
 
 def robot(arguments: list[str]) -> int:
     """Analyse a robot; the code is 1 for one that does not stand."""
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="ksim-rl robot",
         description="Say what a legged robot's model holds, and propose all that walking needs.",
     )
@@ -115,15 +134,16 @@ def robot(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     if options.picture is not None and options.picture.suffix != ".png":
         raise ValueError(f"--picture {options.picture}: expected a file that ends in .png")
-    found = analyse(options.model)
+    with shown_working(f"analysing {options.model}"):
+        found = analyse(options.model)
     print(found.code() if options.code else found.table(), end="")
     if options.picture is not None:
         found.draw(options.picture)
     return 0 if found.stands_s >= TRIAL_S else 1
 
 
-def _parser(command: str, description: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=f"ksim-rl {command}", description=description)
+def _parser(command: str, description: str) -> OneLineParser:
+    parser = OneLineParser(prog=f"ksim-rl {command}", description=description)
     parser.add_argument("run", type=Path, metavar="RUN", help="a run folder, or one of its checkpoints")
     parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:<index> or auto")
     return parser

@@ -1,13 +1,16 @@
 """`ksim-rl runs` lists runs, `ksim-rl compare` sets them side by side; both read run folders as data."""
 
-import argparse
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ksim_rl.cli.errors import OneLineParser
 from ksim_rl.cli.report import shown
 from ksim_rl.runs import comparison, listing
 
@@ -16,7 +19,7 @@ ORDERS = {"began": "began", "return": "evaluation", "speed": "speed"}
 
 def runs(arguments: list[str]) -> int:
     """List the runs in folders."""
-    parser = argparse.ArgumentParser(prog="ksim-rl runs", description="List runs with return and speed.")
+    parser = OneLineParser(prog="ksim-rl runs", description="List runs with return and speed.")
     parser.add_argument("folders", nargs="*", type=Path, default=[Path("runs")], help="default: runs")
     parser.add_argument("--task", help="only runs of this task")
     parser.add_argument("--sort", choices=ORDERS, default="began", help="the highest or newest comes last")
@@ -36,9 +39,7 @@ def runs(arguments: list[str]) -> int:
 
 def compare(arguments: list[str]) -> int:
     """Print figures and differences of runs, and draw their curves."""
-    parser = argparse.ArgumentParser(
-        prog="ksim-rl compare", description="Compare runs: a table and a picture."
-    )
+    parser = OneLineParser(prog="ksim-rl compare", description="Compare runs: a table and a picture.")
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folders, two or more")
     parser.add_argument(
         "--output", type=Path, default=Path("compare.png"), help="a .png file; default: compare.png"
@@ -56,6 +57,17 @@ def compare(arguments: list[str]) -> int:
     comparison.draw(options.runs, options.output)
     print(shown(options.output))
     return 0
+
+
+class TableOfJobs(Callback):
+    """Ends a multirun with a table of its runs; Hydra calls it."""
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        """Print the runs in the sweep's folder, by the numbers of their jobs."""
+        folder = Path(str(config.hydra.sweep.dir))
+        found = sorted(listing.find(folder), key=lambda run: (len(run.name.partition("_")[0]), run.name))
+        print_table(listing.HEADS, (listing.line(listing.summarize(run), name=run.name) for run in found))
+        print(f"{shown(folder)}: ksim-rl runs {shown(folder)} --sort return")
 
 
 def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from ksim_rl.cli.upstream import parse_flags
 from ksim_rl.config import plugins
 from ksim_rl.runs.run_lock import is_locked
 from ksim_rl.trainers import RunCfg
+from ksim_rl.trainers.sources import check_sources
 
 
 def train(arguments: list[str]) -> int:
@@ -29,12 +31,15 @@ def train(arguments: list[str]) -> int:
     nothing was built or written then.
     """
     conf.register()
-    flags = parse_flags(arguments)
+    flags, unknown = parse_flags(arguments)
+    if unknown:
+        raise conf.spelling.of_flag(unknown[0], arguments)
     name, own_config = _primary_config(flags)
     if not (flags.help or flags.hydra_help or flags.shell_completion or own_config):
         builds = flags.cfg is None and flags.info is None
         multirun = flags.multirun or not builds
-        conf.check_command_line(flags.overrides, name=name, multirun=multirun, values=builds)
+        for cfg in conf.check_command_line(flags.overrides, name=name, multirun=multirun, values=builds):
+            check_sources(cfg)
 
     codes: list[int] = []
     process, own_command = os.getpid(), sys.argv
@@ -49,6 +54,7 @@ def train(arguments: list[str]) -> int:
                 raise
             # Kept from Hydra, which would print a line of its own about it and start no other job.
             codes.append(report(error, about=_job_of_a_multirun()))
+            _remove_empty(Path(HydraConfig.get().runtime.output_dir))
         if codes[-1] >= 128:  # interrupted: the other jobs of a multirun must not start
             sys.exit(codes[-1])
 
@@ -56,7 +62,13 @@ def train(arguments: list[str]) -> int:
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     # A run folder is data: Hydra must not look for configs in it. The last of two folders counts.
     away = ["--config-dir", str(Path(conf.__file__).parent)] if name == conf.RUN_AGAIN else []
-    sys.argv = ["ksim-rl train", *arguments, *away]
+    overrides = list(flags.overrides)
+    if flags.multirun:  # jobs are named by what they differ in
+        same = ",".join(f"'{key}'" for key in conf.without_sweeps(overrides))
+        overrides.append(f"hydra.job.config.override_dirname.exclude_keys=[{same}]")
+    # Overrides come together: Hydra takes those after a flag for faults.
+    options = [text for text in arguments if text not in flags.overrides]
+    sys.argv = ["ksim-rl train", *options, *away, *overrides]
     try:
         job()
     except HydraException as error:  # all that is left for Hydra to find, such as another --config-name
@@ -112,3 +124,11 @@ def _unused(folder: Path) -> Path:
         number += 1
         candidate = folder.with_name(f"{folder.name}_{number}")
     return candidate
+
+
+def _remove_empty(folder: Path) -> None:
+    """Remove the folder that Hydra made for a run which left nothing in it, and those above it in our own `runs`."""
+    made = [folder, *(above for above in folder.parents if above.is_relative_to(Path.cwd() / "runs"))]
+    with suppress(OSError):  # as soon as there is something in one
+        for empty in made:
+            empty.rmdir()

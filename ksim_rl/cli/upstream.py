@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from hydra._internal.utils import get_args_parser
 
 
-def parse_flags(arguments: Sequence[str]) -> argparse.Namespace:
-    """Read Hydra's own flags from a command line.
+def parse_flags(arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+    """Read Hydra's own flags from a command line; return them, and flags that Hydra does not know.
 
     Hydra does so only when the job starts, which is too late to check overrides before anything is written.
     """
-    return get_args_parser().parse_args(list(arguments))
+    return get_args_parser().parse_known_intermixed_args(list(arguments))

@@ -8,6 +8,7 @@ import warp as wp
 from ksim_rl import conf
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.trainers import RunProgress, build
+from ksim_rl.trainers.sources import check_sources
 
 USAGE = """usage: ksim-rl warmup [overrides of ksim-rl train]
 
@@ -21,6 +22,7 @@ def warmup(arguments: list[str]) -> int:
         print(USAGE)
         return 0
     cfg = conf.compose([*arguments, "logger=none", "trainer.eval_episodes=0"])
+    check_sources(cfg)
     cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
     compiled: list[str] = []
     progress, began = RunProgress(1), time.perf_counter()
@@ -29,7 +31,7 @@ def warmup(arguments: list[str]) -> int:
         compiled.append(text)
         progress.status(text)
 
-    with compile_notice(notice):
+    with compile_notice(notice), progress.busy("compiling"):
         build(cfg).iterate()
     seconds = time.perf_counter() - began
     print(

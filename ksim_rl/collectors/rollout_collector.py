@@ -26,12 +26,14 @@ class CollectorCfg(Checked):
 
     `require_graphs` fails where CUDA graphs are unavailable, instead of running slower with a warning.
     `stagger_episodes` spreads the time-outs of the envs over an episode's length at the first reset, where the env
-    offers it. The first `warmup` rollouts on CUDA run eagerly.
+    offers it. The first `warmup` rollouts on CUDA run eagerly. In the config of a run, `rollout_length` may be given
+    instead of the dataset's size, which then follows from it and the number of envs.
     """
 
     require_graphs: bool = False
     stagger_episodes: bool = False
     warmup: Count = 2
+    rollout_length: Count | None = None
 
 
 Policy = Callable[[TensorDictBase], TensorDictBase]

@@ -1,7 +1,8 @@
 """This room composes the config of `ksim-rl train` with Hydra, from YAML, the dataclasses and what is registered."""
 # ruff: noqa: F401
 
-from ksim_rl.conf.command_line import check_command_line, compose
+from ksim_rl.conf import spelling
+from ksim_rl.conf.command_line import check_command_line, compose, without_sweeps
 from ksim_rl.conf.registration import (
     MODULE,
     NAME,
@@ -10,4 +11,5 @@ from ksim_rl.conf.registration import (
     check_groups,
     register,
     register_run,
+    store_run,
 )

@@ -13,12 +13,15 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ksim_rl.checks import unknown_name
+from ksim_rl.conf import spelling
 from ksim_rl.conf.registration import MODULE, NAME, RUN_AGAIN, register
 from ksim_rl.config.overrides import check_parsed
 from ksim_rl.trainers import RunCfg
 
 # A sweep over more combinations than this is checked in part here; each job checks its own config again.
 MAX_CHECKED_JOBS = 50
+# What follows from a rollout length that is given.
+SIZES = ("data.num_env_states_per_minibatch", "data.num_steps")
 
 
 def compose(overrides: Sequence[str] = ()) -> RunCfg:
@@ -50,16 +53,33 @@ def check_command_line(texts: Sequence[str], *, name: str, multirun: bool, value
         raise ValueError(f"the overrides do not compose: {' '.join(str(error).split())}") from error
 
 
+def without_sweeps(texts: Sequence[str]) -> list[str]:
+    """Return the keys of overrides that are the same in all jobs of a multirun."""
+    parsed = (OverridesParser.create().parse_override(text) for text in texts)
+    return [override.get_key_element() for override in parsed if not override.is_sweep_override()]
+
+
 def _compose(overrides: list[str], name: str) -> RunCfg:
     plain = OmegaConf.to_container(hydra.compose(name, overrides=overrides), resolve=True)
     assert isinstance(plain, dict)
-    return RunCfg.from_tree({str(key): value for key, value in plain.items()})
+    cfg = RunCfg.from_tree({str(key): value for key, value in plain.items()})
+    for override in overrides:
+        if override.partition("=")[0] in SIZES and cfg.collector.rollout_length is not None:
+            raise ValueError(
+                f"override {override!r}: collector.rollout_length={cfg.collector.rollout_length} sets it; leave one of "
+                "the two out, or set collector.rollout_length=null"
+            )
+    return cfg
 
 
 def _parse(text: str, loader: ConfigLoader) -> Override:
+    if text.startswith("-"):
+        raise spelling.of_flag(text)
     try:
         return OverridesParser.create(config_loader=loader).parse_override(text)
     except HydraException as error:
+        if "=" not in text and (explained := spelling.of_word(text)) is not None:
+            raise explained from error
         reason = " ".join(str(error).split())
         raise ValueError(
             f"override {text!r} does not parse (expected group=name or field=value): {reason}"

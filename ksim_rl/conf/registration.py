@@ -1,15 +1,18 @@
 """This module registers with Hydra what configs are composed of, and the config of a run that is made once more."""
 
 import os
-from collections.abc import Collection
+import re
+from collections.abc import Collection, Mapping
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import yaml
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import OmegaConf
 
 from ksim_rl import algorithms, envs
 from ksim_rl.conf import choices
@@ -19,6 +22,18 @@ from ksim_rl.trainers.run_cfg import check_run_tree, without_env_size
 MODULE, NAME = "ksim_rl.conf", "train"
 RUN_AGAIN, RUN_CONFIG = "run_again", "config.yaml"
 WRITTEN_BY_LOGGERS = ("wandb", "mlflow")
+
+MOST_LETTERS = 120
+
+
+def job_folder(number: int, task: str, overrides: str) -> str:
+    """Return what the folder of a multirun's job is called: its number, and what jobs differ in."""
+    name = re.sub(r"[^\w.+=,-]", "-", overrides or task)
+    return f"{number}_{name[:MOST_LETTERS]}"
+
+
+# Where this room is imported, so that it is known too in the processes that a launcher starts.
+OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
 
 
 def register() -> None:
@@ -58,7 +73,12 @@ def register_run(folder: Path, given: Collection[str] = ()) -> None:
         if beside.parts[0] not in (RUN_CONFIG, *WRITTEN_BY_LOGGERS):
             raise ValueError(f"{folder / beside}: a run folder has no configs but its {RUN_CONFIG}")
     check_run_tree(tree, path, given=given)
-    task = tree["task"]
+    store_run(tree, path)
+
+
+def store_run(tree: Mapping[str, Any], path: Path) -> None:
+    """Store the config of a run, which `check_run_tree` has seen, as the primary config `RUN_AGAIN`."""
+    task = tree.get("task")
     if not isinstance(task, dict) or not isinstance(task.get("scene"), dict):
         raise ValueError(f"{path}: task={task!r}: expected the config of an env, as a run writes it")
     plain = without_env_size(tree)

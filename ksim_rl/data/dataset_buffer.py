@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -41,6 +41,18 @@ class DatasetCfg(Checked):
     def rollout_length(self, num_envs: int) -> int:
         """Return T for so many parallel environments; see `rollout_length`."""
         return rollout_length(self.num_env_states_per_minibatch, self.num_minibatches, num_envs)
+
+    def with_rollout_length(self, length: int, num_envs: int) -> "DatasetCfg":
+        """Return as many minibatches, of the size that makes T `length`; a ValueError where there is none."""
+        size, rest = divmod(length * num_envs, self.num_minibatches)
+        if rest:
+            step = self.num_minibatches // math.gcd(num_envs, self.num_minibatches)
+            raise ValueError(
+                f"collector.rollout_length={length} * num_envs={num_envs} = {length * num_envs} env states are not "
+                f"data.num_minibatches={self.num_minibatches} equal parts: "
+                f"collector.rollout_length={_near_multiples(length, step)} are"
+            )
+        return replace(self, num_env_states_per_minibatch=size)
 
 
 def rollout_length(num_env_states_per_minibatch: int, num_minibatches: int, num_envs: int) -> int:

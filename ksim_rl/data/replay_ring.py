@@ -1,7 +1,7 @@
 """This module has the replay of off-policy learning: it holds the last env states of each env, and draws of them."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -195,6 +195,10 @@ class ReplayCfg(Checked):
     def rollout_length(self, num_envs: int) -> int:
         """Return T, which does not depend on the number of envs."""
         return self.num_steps
+
+    def with_rollout_length(self, length: int, num_envs: int) -> "ReplayCfg":
+        """Return the same with rollouts of `length` steps."""
+        return replace(self, num_steps=length)
 
 
 class ReplayRing(ReplayBuffer):

@@ -19,6 +19,8 @@ class AlgorithmCfg(Checked):
 
     learns_on_sequences: ClassVar[bool] = False
     """Whether networks may be recurrent."""
+    checkpoint_fields: ClassVar[tuple[str, ...]] = ()
+    """The fields that name run folders or checkpoints."""
 
     @property
     def observation_groups(self) -> tuple[str, ...]:
@@ -30,7 +32,9 @@ class AlgorithmCfg(Checked):
 
     def with_absolute_paths(self) -> Self:
         """Return the same settings with paths that lead to the same files from any folder."""
-        return self
+        return replace(
+            self, **{name: str(Path(getattr(self, name)).resolve()) for name in self.checkpoint_fields}
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,15 +193,13 @@ class DistillationCfg(OnPolicyCfg):
     by a factor.
     """
 
+    checkpoint_fields: ClassVar[tuple[str, ...]] = ("teacher",)
+
     teacher: str = ""
     loss: DistillationKind = "kl"
     num_epochs: Count = 2
     teacher_share: Share = 0.0
     teacher_share_decay: Share = 0.95
-
-    def with_absolute_paths(self) -> Self:
-        """Return the same settings, whose teacher is found from any folder."""
-        return replace(self, teacher=str(Path(self.teacher).resolve()))
 
     def __post_init__(self) -> None:
         """Check all fields, and that there is a teacher."""

@@ -18,6 +18,7 @@ from ksim_rl.trainers.checkpoint import Checkpoint
 from ksim_rl.trainers.evaluation import Evaluator
 from ksim_rl.trainers.loggers import check_installed, make_loggers
 from ksim_rl.trainers.run_cfg import RunCfg
+from ksim_rl.trainers.sources import check_targets
 from ksim_rl.trainers.trainer import Hook, Trainer
 
 # Evaluations see other initial states than training does.
@@ -50,6 +51,8 @@ def build(
 
     env = build_env(cfg, num_envs=cfg.num_envs, seed=cfg.seed)
     update = make_update(cfg, env, resumed=resume_from.state["update"] if resume_from else None)
+    if cfg.trainer.stop_at and not hooks:  # which may log figures of their own
+        check_targets(cfg, update.metrics())
     collector = RolloutCollector(
         env,
         update.behavior,

@@ -1,10 +1,11 @@
 """The progress of a run is timed, and shown as one live panel on a terminal or as plain lines in a pipe."""
 
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -26,6 +27,9 @@ SHOWN = (
     ("evaluation/return_mean", "evaluation", "{:.4g}"),
 )
 
+# In a pipe, nothing is silent for longer: who reads it would take a long silence for a hang.
+SILENCE_S = 15.0
+
 
 class _OwnConsole(Console):
     """Goes on in silence where the pipe it writes to is closed; rich's own console would end the process."""
@@ -42,7 +46,8 @@ class RunProgress:
     """Shows iteration, speed, return, episode length, losses and the time left.
 
     Use as a context manager around the run. `note` prints a line that stays; `status` shows what is going on while
-    nothing else moves (kernel compilation). Of the `total` iterations of the whole run, `done` are already done;
+    nothing else moves (kernel compilation), and `busy` does so for a block, in which a pipe gets a line every
+    `SILENCE_S`. Of the `total` iterations of the whole run, `done` are already done;
     without `enabled` only notes are shown.
     """
 
@@ -55,6 +60,10 @@ class RunProgress:
         self._status = ""
         self._metrics: dict[str, float] = {}
         self._live: Live | None = None
+        self._doing, self._since, self._moved = "", 0.0, 0.0
+        self._spoken = time.monotonic()
+        self._watched = False
+        self._open = ExitStack()
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(bar_width=None),
@@ -70,9 +79,11 @@ class RunProgress:
         if self._enabled and self.console.is_terminal:
             self._live = Live(self._panel(), console=self.console, refresh_per_second=4)
             self._live.start()
+        self._open.enter_context(self.busy(""))
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._open.close()
         if self._live is not None:
             self._live.update(self._panel(), refresh=True)
             self._live.stop()
@@ -80,7 +91,7 @@ class RunProgress:
 
     def update(self, iteration: int, metrics: Mapping[str, float], *, seconds_left: float | None) -> None:
         """Show the state after `iteration`."""
-        self.done = iteration
+        self.done, self._moved = iteration, time.monotonic()
         self._metrics |= metrics
         self._status = ""
         left = "?" if seconds_left is None else clock(seconds_left)
@@ -93,6 +104,7 @@ class RunProgress:
 
     def note(self, text: str) -> None:
         """Print one line that stays."""
+        self._spoken = time.monotonic()
         self.console.print(text, markup=False, soft_wrap=True)
 
     def status(self, text: str) -> None:
@@ -100,10 +112,48 @@ class RunProgress:
         beginning = text.split(":")[0]
         if self._live is not None:
             self._status = text
-            self._live.update(self._panel())
+            self._live.update(self._panel(), refresh=True)
         elif beginning != self._status:
             self._status = beginning
             self.note(text)
+
+    @contextmanager
+    def busy(self, text: str) -> Iterator[None]:
+        """Show what a block does while it takes its time; without a text, that iterations go on."""
+        before = self._doing, self._since
+        self._doing, self._since = text, time.monotonic()
+        with ExitStack() as shown:
+            if self._live is not None and text:
+                self.status(text)
+                shown.callback(self.status, "")
+            elif self._enabled and self.console.is_terminal and text:
+                shown.enter_context(self.console.status(text))
+            elif self._enabled and not self.console.is_terminal and not self._watched:
+                shown.enter_context(self._watch())
+            yield
+        self._doing, self._since = before
+
+    @contextmanager
+    def _watch(self) -> Iterator[None]:
+        """Break the silence of a pipe."""
+        done, self._watched = threading.Event(), True
+
+        def speak() -> None:
+            while not done.wait(SILENCE_S / 15.0):
+                now = time.monotonic()
+                if now - self._spoken >= SILENCE_S:
+                    text = self._doing or f"iteration {self.done + 1}/{self.total}"
+                    since = self._since if self._doing else max(self._since, self._moved)
+                    self.note(f"{text}: {now - since:.0f} s so far")
+
+        watcher = threading.Thread(target=speak, daemon=True)
+        watcher.start()
+        try:
+            yield
+        finally:
+            done.set()
+            watcher.join()
+            self._watched = False
 
     def _figures(self, metrics: Mapping[str, float]) -> list[tuple[str, str]]:
         return [(label, pattern.format(metrics[name])) for name, label, pattern in SHOWN if name in metrics]

@@ -148,6 +148,13 @@ class TrainingCfg(Checked):
     collector: CollectorCfg = field(default_factory=lambda: CollectorCfg(stagger_episodes=True))
     trainer: TrainerCfg = field(default_factory=TrainerCfg)
 
+    def __post_init__(self) -> None:
+        """Let the size of the data follow from `collector.rollout_length`, where that is given."""
+        super().__post_init__()
+        if self.collector.rollout_length is not None:
+            data = self.data.with_rollout_length(self.collector.rollout_length, self.num_envs)
+            object.__setattr__(self, "data", data)
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunCfg(TrainingCfg):

@@ -76,7 +76,8 @@ def _run_locked(
         checkpoint.remove_leftovers(folder)
     # The graphs that the first iterations record take memory as well.
     with memory_for(cfg.num_envs, cfg.resolved_device()):
-        trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
+        with progress.busy("building envs and networks"):
+            trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
         _write(run_folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
         trainer.watch = watch(run_folder, holds=CONFIG, note=progress.note)
         with recorded(run_folder, note=progress.note) as ended:
@@ -92,10 +93,11 @@ def _run_locked(
         if trainer.solved_at is not None:
             figures["solved"] = outcome.solved
         _write(run_folder / EVALUATION, json.dumps(figures, indent=2) + "\n")
-    _draw_curves(cfg, run_folder, solved_at=trainer.solved_at, note=progress.note)
-    if cfg.trainer.video and outcome.interrupted_by is None:
-        path = run_folder / VIDEO
-        record_video(cfg, trainer.update.actor, path, note=progress.note, status=progress.status)
+    with progress.busy("drawing learning curves and video"):
+        _draw_curves(cfg, run_folder, solved_at=trainer.solved_at, note=progress.note)
+        if cfg.trainer.video and outcome.interrupted_by is None:
+            path = run_folder / VIDEO
+            record_video(cfg, trainer.update.actor, path, note=progress.note, status=progress.status)
     for owner in (trainer.collector, trainer.evaluator):
         if owner is not None:
             owner.env.close(raise_if_closed=False)

@@ -88,7 +88,8 @@ class EvaluationHook(Hook):
 
     def __call__(self, trainer: "Trainer") -> None:
         """Evaluate, unless a signal asks to stop meanwhile."""
-        with trainer.clock.paused():
+        episodes = self.evaluator.env.batch_size[0]
+        with trainer.clock.paused(), trainer.progress.busy(f"evaluating over {episodes} episodes"):
             evaluation = self.evaluator(stop=trainer.interrupt.__bool__)
         if evaluation is None:
             return

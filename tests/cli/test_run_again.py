@@ -143,14 +143,15 @@ def test_a_run_names_its_teacher_so_that_it_is_found_from_anywhere(tmp_path, mon
     seen = []
     monkeypatch.setattr(train, "run_and_report", lambda cfg, folder: seen.append(cfg) or 0)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train, "check_sources", lambda cfg: None)
     assert run("objective=distillation", "objective.teacher=runs/expert") == 0
     assert seen[0].objective.teacher == str(tmp_path / "runs" / "expert")
 
 
-def test_weights_that_are_not_there_are_one_line(tmp_path, capsys):
-    code = run(*SMALL, f"checkpoint={tmp_path / 'nowhere'}", f"hydra.run.dir={tmp_path / 'run'}")
-    assert code == 2
-    assert "no checkpoint here; expected a run folder" in capsys.readouterr().err
+def test_a_run_is_made_again_from_its_own_weights(first, tmp_path):
+    code = run("--config-dir", str(first), f"checkpoint={first}", "seed=5", f"hydra.run.dir={tmp_path}")
+    config = checkpoint.load(checkpoint.latest(tmp_path)).config
+    assert code == 0 and (config["seed"], config["checkpoint"]) == (5, str(first))
 
 
 @pytest.mark.full
@@ -165,15 +166,16 @@ def test_a_sweep_of_a_run_made_again(first, tmp_path):
 
 
 def test_each_job_of_a_sweep_that_fails_says_so_and_the_others_run(first, tmp_path, capsys):
-    sources = f"checkpoint={tmp_path / 'none'},{first},{tmp_path / 'nowhere'}"
-    assert run("--multirun", *SMALL, sources, f"hydra.sweep.dir={tmp_path / 'sweep'}") == 2
+    widths = (f"checkpoint={first}", "modules.actor.hidden_dims=[8],[16],[9]")
+    assert run("--multirun", *SMALL, *widths, f"hydra.sweep.dir={tmp_path / 'sweep'}") == 2
     errors = capsys.readouterr().err.splitlines()
     assert [error.split(" (")[0] for error in errors] == [
         "ksim-rl: error: job 0",
         "ksim-rl: error: job 2",
     ]
-    assert "none: no checkpoint here" in errors[0] and "nowhere: no checkpoint here" in errors[1]
-    assert checkpoint.load(checkpoint.latest(tmp_path / "sweep" / "1_cartpole_balance")).iteration == 2
+    assert all("its networks are others" in error for error in errors)
+    (done,) = [folder for folder in (tmp_path / "sweep").iterdir() if folder.is_dir()]
+    assert checkpoint.load(checkpoint.latest(done)).iteration == 2
 
 
 @pytest.mark.full

@@ -97,11 +97,11 @@ def test_resume_continues_in_the_same_folder(trained):
 def test_fewer_iterations_than_are_done_are_refused(trained, capsys):
     _, folder = trained
     assert run("resume", str(folder), "--num-iterations", "1") == 2
-    assert "--num-iterations 1: expected at least " in capsys.readouterr().err
+    assert "trainer.num_iterations=1: expected at least 3, those that are done" in capsys.readouterr().err
 
 
 @pytest.mark.full
-def test_a_sweep_runs_one_job_for_each_combination(tmp_path):
+def test_a_sweep_runs_one_job_for_each_combination_and_ends_with_a_table(tmp_path, capsys):
     quick = ("trainer.num_iterations=1", "trainer.eval_episodes=0", "trainer.video=false")
     assert run("train", "--multirun", *SMALL, *quick, "seed=1,2", f"hydra.sweep.dir={tmp_path}") == 0
     seeds = {
@@ -109,7 +109,13 @@ def test_a_sweep_runs_one_job_for_each_combination(tmp_path):
         for folder in tmp_path.iterdir()
         if folder.is_dir()
     }
-    assert seeds == {"0_cartpole_balance": 1, "1_cartpole_balance": 2}
+    assert seeds == {"0_seed=1": 1, "1_seed=2": 2}
+    head, *rows, end = capsys.readouterr().out.splitlines()[-4:]
+    assert head.split()[:3] == ["run", "task", "status"] and end.startswith(str(tmp_path))
+    assert [row.split()[:3] for row in rows] == [
+        ["0_seed=1", "cartpole_balance", "done"],
+        ["1_seed=2", "cartpole_balance", "done"],
+    ]
 
 
 def test_a_damaged_checkpoint_is_one_line(trained, capsys, tmp_path):

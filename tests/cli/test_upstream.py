@@ -11,6 +11,8 @@ FLAGS = ("help", "hydra_help", "shell_completion", "cfg", "info", "multirun", "c
 
 @pytest.mark.parametrize("flag", [*FLAGS, "config_path", "overrides"])
 def test_hydras_parser_knows_the_flags_that_we_read(flag):
-    flags = vars(upstream.parse_flags(["--multirun", "seed=1"]))
+    known, unknown = upstream.parse_flags(["--multirun", "seed=1", "--seed=2"])
+    flags = vars(known)
+    assert unknown == ["--seed=2"]
     assert flag in flags, f"Hydra {version('hydra-core')}: get_args_parser has no {flag}"
     assert flags["overrides"] == ["seed=1"] and flags["multirun"]

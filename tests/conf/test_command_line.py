@@ -74,7 +74,7 @@ def test_an_error_that_nobody_foresaw_shows_its_traceback_and_is_not_an_unsolved
     def fault(_):
         raise KeyError("weight")
 
-    monkeypatch.setattr(run_commands, "_envs", fault)
+    monkeypatch.setattr(run_commands, "list_envs", fault)
     code, output = run(capsys, "envs")
     assert code == 3
     assert "in fault" in output.err and output.err.endswith("ksim-rl: error: KeyError: 'weight'\n")

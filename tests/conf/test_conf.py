@@ -6,6 +6,7 @@ import pytest
 
 from ksim_rl import algorithms, conf, envs
 from ksim_rl.collectors import CollectorCfg
+from ksim_rl.conf import registration
 from ksim_rl.conf.choices import CHOICES
 from ksim_rl.envs import Task
 from ksim_rl.objectives import PPOCfg
@@ -92,3 +93,23 @@ def test_the_command_line_overrides_the_tasks_defaults():
 
 def test_a_group_choice_replaces_the_group():
     assert conf.compose(["logger=none"]).logger == LoggerCfg(csv=False, tensorboard=False)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "name"),
+    [
+        ("seed=1,task=x", "3_seed=1,task=x"),
+        ("", "3_cartpole_balance"),
+        ("checkpoint=/a/../b", "3_checkpoint=-a-..-b"),
+        ("a" * 500, "3_" + "a" * 120),
+    ],
+)
+def test_the_folder_of_a_job_is_one_folder(overrides, name):
+    assert registration.job_folder(3, "cartpole_balance", overrides) == name
+
+
+def test_what_jobs_differ_in_is_told_from_what_they_share():
+    assert conf.without_sweeps(["seed=1,2", "+a.b=[1,2]", "num_envs=3", "c=choice(1,2)"]) == [
+        "+a.b",
+        "num_envs",
+    ]

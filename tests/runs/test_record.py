@@ -9,6 +9,7 @@ import pytest
 
 from ksim_rl.config import plugins
 from ksim_rl.runs import record
+from ksim_rl.runs.whole_file import WRITING
 from tests.runs.test_run_lock import hold
 
 SECRET = "a-token-that-nobody-may-see"
@@ -158,7 +159,7 @@ def test_links_and_pipes_of_a_stranger_are_not_followed(run, tmp_path, notes):
     outside = tmp_path / "outside"
     outside.write_text("mine")
     (run / record.RECORD).symlink_to(outside)
-    (run / f".{record.RECORD}.writing").symlink_to(outside)
+    (run / f"{WRITING}{record.RECORD}").symlink_to(outside)
     assert record.status(run)[0] == "unknown"
     with record.recorded(run, note=notes.append):
         pass

@@ -3,10 +3,12 @@
 import io
 import subprocess
 import sys
+import time
 
 import pytest
 from rich.console import Console
 
+from ksim_rl.trainers import progress as progress_module
 from ksim_rl.trainers.progress import RunProgress, clock
 
 METRICS = {
@@ -93,3 +95,56 @@ with RunProgress(10) as progress:
 def test_a_pipe_that_nobody_reads_does_not_end_the_run():
     done = subprocess.run([sys.executable, "-c", CLOSED], stderr=subprocess.PIPE, text=True)
     assert (done.returncode, done.stderr.count("nobody reads the output any more")) == (0, 1)
+
+
+def lines_within(progress, count):
+    """Wait for so many lines, and return what was printed."""
+    for _ in range(500):
+        if progress.console.file.getvalue().count("\n") >= count:
+            break
+        time.sleep(0.01)
+    return progress.console.file.getvalue().splitlines()
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    monkeypatch.setattr(progress_module, "SILENCE_S", 0.05)
+
+
+def test_a_pipe_is_never_silent_for_long(impatient):
+    progress = piped()
+    with progress:
+        assert lines_within(progress, 2)[0] == "iteration 1/10: 0 s so far"
+        with progress.busy("evaluating over 100 episodes"):
+            before = len(progress.console.file.getvalue().splitlines())
+            assert lines_within(progress, before + 2)[-1] == "evaluating over 100 episodes: 0 s so far"
+        progress.update(3, METRICS, seconds_left=None)
+        told = len(progress.console.file.getvalue().splitlines())
+        assert lines_within(progress, told + 1)[-1] == "iteration 4/10: 0 s so far"
+    said = progress.console.file.getvalue()
+    time.sleep(0.2)
+    assert progress.console.file.getvalue() == said, "nothing is said once the run is over"
+
+
+def test_a_command_that_is_no_run_speaks_too(impatient):
+    progress = piped()
+    with progress.busy("analysing"):
+        assert lines_within(progress, 1)[0] == "analysing: 0 s so far"
+
+
+def test_what_is_said_otherwise_is_enough():
+    progress = piped()
+    with progress, progress.busy("evaluating"):
+        time.sleep(0.05)
+    assert progress.console.file.getvalue() == ""
+
+
+def test_a_terminal_shows_what_goes_on():
+    console = Console(file=io.StringIO(), force_terminal=True, width=100, highlight=False)
+    progress = RunProgress(10, console=console)
+    with progress.busy("analysing"):
+        pass
+    assert "analysing" in console.file.getvalue()
+    with progress, progress.busy("evaluating"):
+        pass
+    assert "evaluating" in console.file.getvalue()

@@ -1,0 +1,51 @@
+"""This module answers arguments that are spelled as other programs spell theirs."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ksim_rl import envs
+from ksim_rl.checks import near
+from ksim_rl.conf.choices import DEFAULTS
+from ksim_rl.conf.registration import RUN_CONFIG
+
+GROUPS = ("task", "objective", "data", "modules", "collector", "trainer", "logger")
+
+
+def of_flag(flag: str, arguments: Sequence[str] = ()) -> ValueError:
+    """Build the error for a flag that does not exist, such as `--num_envs=4`, or `--task x` in `arguments`."""
+    name, equals, value = flag.lstrip("-").partition("=")
+    if not equals:
+        after = list(arguments)[list(arguments).index(flag) + 1 :] if flag in arguments else []
+        value = after[0] if after and not after[0].startswith("-") and "=" not in after[0] else "VALUE"
+    name = name.replace("-", "_")
+    known = [*GROUPS, *_fields(DEFAULTS)]
+    found = [field for field in known if field == name] or [
+        field for field in known if field.endswith(f".{name}")
+    ]
+    if not found and name.partition(".")[0] not in known:
+        return ValueError(f"{flag}: no such flag, and no field {name!r}: {near(name, known)}")
+    options = " or ".join(f"{field}={value}" for field in (found or [name])[:3])
+    return ValueError(f"{flag}: fields are set without dashes: {options}")
+
+
+def of_word(word: str) -> ValueError | None:
+    """Build the error for an argument that is no `name=value`, if it names a task or a run."""
+    if (Path(word) / RUN_CONFIG).exists():
+        return ValueError(
+            f"{word!r}: expected name=value; make this run once more with --config-dir {word}, start from its weights "
+            f"with checkpoint={word}, or continue it with: ksim-rl resume {word}"
+        )
+    hint = near(word, envs.names())
+    if not hint.startswith("did you mean"):
+        return None
+    return ValueError(
+        f"{word!r}: expected name=value: {hint.replace(chr(39), '').replace('mean ', 'mean task=')}"
+    )
+
+
+def _fields(tree: Mapping[str, Any], path: str = "") -> Iterator[str]:
+    for name, value in tree.items():
+        yield f"{path}{name}"
+        if isinstance(value, Mapping):
+            yield from _fields(value, f"{path}{name}.")

@@ -1,0 +1,65 @@
+"""This module looks for what a run reads and names before anything is built: checkpoints, robots, targets."""
+
+from collections.abc import Iterable
+from dataclasses import fields
+from pathlib import Path
+
+from ksim_rl.checks import near
+from ksim_rl.trainers import checkpoint
+from ksim_rl.trainers.evaluation import Evaluation
+from ksim_rl.trainers.loggers import check_installed
+from ksim_rl.trainers.run_cfg import RunCfg
+
+# Of each kind that the env's terms do not name.
+EPISODE = ("return", "length", "count", "non_finite")
+ALWAYS = ("iteration", "seconds", "rollout/reward", "throughput/env_states_per_s")
+NAMED_LATER = ("curriculum", "command", "physics")
+
+
+def check_sources(cfg: RunCfg, *, resumes: bool = False) -> None:
+    """Refuse a run whose checkpoints, loggers' packages, robots' files or targets are not there, by a ValueError.
+
+    Nothing is compiled or written. A run that `resumes` has in its checkpoint what it started from.
+    """
+    check_installed(cfg.logger)
+    named = {"checkpoint": cfg.checkpoint} if not resumes else {}
+    if not resumes:
+        named |= {
+            f"objective.{name}": getattr(cfg.objective, name) for name in cfg.objective.checkpoint_fields
+        }
+    for field, path in named.items():
+        if path is not None:
+            try:
+                checkpoint.load(checkpoint.latest(Path(path)))
+            except checkpoint.CheckpointError as error:
+                raise ValueError(f"{field}={path}: {error}") from error
+    for kind, entities in (("robots", cfg.task.scene.robots), ("objects", cfg.task.scene.objects)):
+        for name, entity in entities.items():
+            try:
+                entity.spec()
+            except (ValueError, OSError) as error:
+                raise ValueError(f"task.scene.{kind}.{name}: {error}") from error
+    check_targets(cfg)
+
+
+def check_targets(cfg: RunCfg, measured: Iterable[str] | None = None) -> None:
+    """Refuse names in `stop_at` that no metric will have; its algorithm names what it has `measured`."""
+    task, measured = cfg.task, None if measured is None else list(measured)
+    known = [*ALWAYS, *(f"episode/{name}" for name in EPISODE)]
+    # A term of weight 0 is not computed.
+    known += [f"reward/{name}" for name, term in task.rewards.items() if term.weight != 0.0]
+    known += [f"termination/{name}" for name in (*task.terminations, "non_finite")]
+    known += [f"metric/{name}" for name in task.metrics]
+    if cfg.trainer.eval_episodes:
+        known += [f"evaluation/{entry.name}" for entry in fields(Evaluation)]
+    kinds = {name.partition("/")[0] for name in known} | {"evaluation", "metric", "reward"}
+    for name in cfg.trainer.stop_at or {}:
+        kind, slash, _ = name.partition("/")
+        if name in known or (slash and kind in NAMED_LATER):
+            continue
+        # The algorithm's own: `loss/policy`, `update/kl`, `style/reward` and the like.
+        if slash and kind not in kinds and (measured is None or name in measured):
+            continue
+        raise ValueError(
+            f"trainer.stop_at: no metric is called {name!r}: {near(name, [*known, *(measured or [])])}"
+        )
