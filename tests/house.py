@@ -18,9 +18,11 @@ from pathlib import Path
 from tests import signatures
 
 PACKAGE = "ksim_rl"
-# Lines of the rooms that train; the rooms around them have ceilings of their own, so that neither pays for the other.
+# Lines of the rooms that train; the rooms around them, the command line among them, have ceilings of their own, so that
+# neither pays for the other.
 PACKAGE_LINES = 38_000
 ROOMS_AROUND = {
+    "cli": 900,
     "diagnosis": 800,
     "export": 2_610,
     "runs": 800,
