@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
@@ -64,10 +65,12 @@ def _write(path: Path, first: np.ndarray, rest: Iterator[np.ndarray], *, fps: fl
     # H.264 wants even sides; with macro_block_size=2 imageio pads only odd ones.
     h264 = {"fps": fps, "codec": "libx264", "quality": 7, "macro_block_size": 2}
     options = {"duration": 1000 / fps, "loop": 0} if path.suffix == ".gif" else h264
-    with whole_file(path) as temporary, imageio.get_writer(temporary, **options) as writer:
-        writer.append_data(first)
-        for frame in rest:
-            writer.append_data(frame)
+    with whole_file(path) as temporary:
+        writer: Any = imageio.get_writer(temporary, **options)
+        with writer:
+            writer.append_data(first)
+            for frame in rest:
+                writer.append_data(frame)
     return path
 
 
