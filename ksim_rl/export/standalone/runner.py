@@ -378,6 +378,13 @@ def _run(number: int) -> dict[str, float]:
 def _replay(runner: Runner, path: Path) -> None:
     record = read_arrays(runner.folder / "trace.npz")
     found = {"dt": np.array(runner.model.opt.timestep), "decimation": np.array(runner.decimation)}
+    pairs = [
+        pair for law in runner.meta["actuators"] for pair in zip(law["joints"], law["actuators"], strict=True)
+    ]
+    drives = [runner.model.joint(int(runner.model.actuator(a).trnid[0])).name for _, a in pairs]
+    found["crossed"] = np.array(
+        [joint != driven for (joint, _), driven in zip(pairs, drives, strict=True)], bool
+    )
     for lag in range(1 + max((delay.most for delay in runner.lags), default=0)):
         for number in range(len(record["trace/done"])):
             replayed = runner.replay(record, number, lag)
