@@ -23,6 +23,8 @@ usage: ksim-rl <command> [arguments]
   compare  a table and a picture:   ksim-rl compare RUN1 RUN2
   export   a folder that runs elsewhere:  ksim-rl export RUN
   sim2sim  run it on MuJoCo's C engine:   ksim-rl sim2sim RUN/export --episodes 100
+  diagnose what goes wrong in learning:   ksim-rl diagnose RUN
+  doctor   check this machine, for bug reports: ksim-rl doctor
   warmup   compile ahead of time:   ksim-rl warmup task=go1_velocity_flat device=cuda
   envs     list the tasks, or print what one is made of: ksim-rl envs cartpole_swingup
   robot    analyse a robot's model: ksim-rl robot unitree_a1/a1 [--code]
@@ -34,8 +36,8 @@ RUN is a run folder (its newest checkpoint) or one of its checkpoints.
 transforms, networks and algorithms that configs name. KSIM_RL_PLUGINS=PACKAGE,... does so for all commands.
 `ksim-rl <command> --help` tells more. KSIM_RL_TRACEBACK=1 shows the traceback of an error.
 
-exit codes: 0 done (and solved, or its target met, where there is one), 1 not solved, 2 refused: the command or its
-configuration is wrong, 3 the run failed, 130 / 143 interrupted by SIGINT / SIGTERM: what is saved is said"""
+exit codes: 0 done (and solved, or its target met, where there is one), 1 not solved, or a fault found, 2 refused: the
+command or its configuration is wrong, 3 the run failed, 130 / 143 interrupted by SIGINT / SIGTERM: what is saved is said"""
 
 # Where each is: a module and its function, which takes the arguments and returns the exit code.
 COMMANDS = {
@@ -47,6 +49,8 @@ COMMANDS = {
     "compare": "ksim_rl.cli.runs:compare",
     "export": "ksim_rl.export.sim2sim:run_export",
     "sim2sim": "ksim_rl.export.sim2sim:run_sim2sim",
+    "diagnose": "ksim_rl.diagnosis.diagnose:command",
+    "doctor": "ksim_rl.diagnosis.doctor:command",
     "warmup": "ksim_rl.cli.warmup:warmup",
     "envs": "ksim_rl.cli.run_commands:list_envs",
     "robot": "ksim_rl.cli.run_commands:robot",

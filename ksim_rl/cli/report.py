@@ -10,6 +10,7 @@ from rich.console import Console
 from ksim_rl import envs
 from ksim_rl.cli.errors import interruption
 from ksim_rl.device.kernel_loading import compile_notice
+from ksim_rl.diagnosis.diagnose import one_line
 from ksim_rl.trainers import (
     Checkpoint,
     Evaluation,
@@ -119,5 +120,7 @@ def _summary(cfg: RunCfg, outcome: Outcome, folder: Path) -> list[str]:
         lines.append(f"{name}: everything is saved; continue with: ksim-rl resume {shown(folder)}")
     elif outcome.evaluation is not None:
         lines.append(verdict(outcome.evaluation, solved_at(cfg)))
+    if (seen := one_line(folder, shown(folder))).startswith("diagnosis"):
+        lines.append(seen)
     lines.append(f"{shown(folder)}: {', '.join(sorted(entry.name for entry in folder.iterdir()))}")
     return lines

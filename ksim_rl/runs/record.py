@@ -78,8 +78,8 @@ def recorded(
         began=began,
         command=shlex.join(sys.argv if command is None else command),
         code=_code(folder, len(earlier) + 1),
-        versions=_versions(),
-        hardware=_hardware(),
+        versions=versions(),
+        hardware=hardware(),
     )
 
     def ended(status: Status, why: str) -> None:
@@ -188,7 +188,8 @@ def _git(folder: Path, *arguments: str) -> bytes | None:
         return None
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that a run depends on."""
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
@@ -198,7 +199,8 @@ def _versions() -> dict[str, str]:
     return found
 
 
-def _hardware() -> dict[str, str]:
+def hardware() -> dict[str, str]:
+    """Return what this machine is: host, system, cores, memory, processor, GPUs."""
     found = {"host": platform.node(), "system": platform.platform(), "cores": str(os.cpu_count())}
     found["memory"] = f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB"
     processors = Path("/proc/cpuinfo")

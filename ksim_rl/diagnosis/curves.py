@@ -1,0 +1,85 @@
+"""The metrics of a run are read from its folder here, finished or not, and asked how they were early and late."""
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ksim_rl.config import plain_data
+from ksim_rl.runs.csv_table import read_table
+
+METRICS, CONFIG = "metrics.csv", "config.yaml"
+# Fewer rows say nothing about where a run is going.
+LEAST_ROWS = 10
+# "Early" is this share of the rows at the beginning, "late" the same at the end.
+SHARE = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curves:
+    """The logged metrics of a run, each a column with None where a row has no such metric, and its config as a tree."""
+
+    columns: Mapping[str, Sequence[float | None]]
+    config: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def num_rows(self) -> int:
+        """Rows of the table."""
+        return max((len(column) for column in self.columns.values()), default=0)
+
+    def values(self, name: str) -> list[float]:
+        """Return what a metric was, where it was a finite number."""
+        return [value for value in self.columns.get(name, ()) if value is not None and math.isfinite(value)]
+
+    def early(self, name: str) -> float | None:
+        """Return the median of a metric's first values, or None where there are too few of them."""
+        return _median(self.values(name)[: self._span])
+
+    def late(self, name: str) -> float | None:
+        """Return the median of a metric's last values, or None where there are too few of them."""
+        return _median(self.values(name)[-self._span :])
+
+    def names(self, room: str) -> list[str]:
+        """Return the metrics `<room>/<name>`."""
+        return [name for name in self.columns if name.startswith(f"{room}/")]
+
+    def setting(self, path: str, default: float) -> float:
+        """Return a number of the config by dotted path, or the default where there is none."""
+        value: Any = self.config
+        for name in path.split("."):
+            value = value.get(name) if isinstance(value, Mapping) else None
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        return float(value) if is_number else default
+
+    @property
+    def _span(self) -> int:
+        return max(3, round(SHARE * self.num_rows))
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return statistics.median(values) if len(values) >= 3 else None
+
+
+def read_run(folder: Path) -> Curves:
+    """Read the metrics of a run folder, or of the run that a checkpoint belongs to; a run may be under way.
+
+    Raises ValueError where there is no table of metrics, or it is damaged.
+    """
+    places = [folder, *folder.absolute().parents[:2]]
+    found = next((place for place in places if (place / METRICS).is_file()), None)
+    if found is None:
+        raise ValueError(
+            f"{folder}: there is no {METRICS}: name the folder of a run whose logger wrote one (logger.csv=true)"
+        )
+    config = plain_data.read_yaml(found / CONFIG) if (found / CONFIG).is_file() else {}
+    return Curves(columns=_columns(found / METRICS), config=config if isinstance(config, Mapping) else {})
+
+
+def _columns(path: Path) -> dict[str, list[float | None]]:
+    names, rows = read_table(path)
+    try:
+        return {name: [float(text) if (text := row.get(name)) else None for row in rows] for name in names}
+    except ValueError as error:
+        raise ValueError(f"{path}: damaged: {error}") from error

@@ -1,0 +1,101 @@
+"""This module tries on each device what every run needs: physics as in MuJoCo's C engine, graphs, and an update."""
+
+from collections.abc import Callable
+from importlib.resources import files
+
+import mujoco
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torchrl.data import Unbounded
+
+from ksim_rl.device.capture import Captured, live_launches
+from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
+from ksim_rl.objectives import PPOCfg, StepGuard, make_loss, make_optimizer, ppo_step
+from ksim_rl.physics import World
+
+NUM_ENVS, NUM_STEPS = 4, 50
+# float32 against float64 over half a second of a pole that swings.
+MOST_DIFFERENCE = 1e-4
+
+
+def try_device(device: torch.device) -> list[tuple[str, str | None]]:
+    """Return what was tried on a device and how it went, with what is wrong, or None."""
+    mj_model = mujoco.MjModel.from_xml_string(
+        files("ksim_rl.scene.robots").joinpath("cartpole.xml").read_text()
+    )
+    trials: dict[str, Callable[[], str | None]] = {
+        "physics as in C": lambda: _physics(mj_model, device),
+        "graphs as eager": lambda: _graphs(mj_model, device),
+        "an update": lambda: _update(device),
+    }
+    done = []
+    for name, trial in trials.items():
+        try:
+            wrong = trial()
+        except Exception as error:  # whatever a broken installation raises is what the report is for
+            wrong = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        done.append((name, wrong))
+    return done
+
+
+def _physics(mj_model: mujoco.MjModel, device: torch.device) -> str | None:
+    world, data = _pushed(mj_model, device), mujoco.MjData(mj_model)
+    data.ctrl[:] = 0.5
+    for _ in range(NUM_STEPS):
+        world.step(1)
+        mujoco.mj_step(mj_model, data)
+    difference = float(np.abs(world.qpos_EL.cpu().numpy() - data.qpos).max())
+    world.close()
+    if difference < MOST_DIFFERENCE:
+        return None
+    return f"after {NUM_STEPS} steps positions differ by {difference:.2g} from the C engine's"
+
+
+def _graphs(mj_model: mujoco.MjModel, device: torch.device) -> str | None:
+    graphed, live = (_pushed(mj_model, device) for _ in range(2))
+    total = torch.zeros((), device=device)
+
+    def step() -> None:
+        graphed.step(1)
+        total.add_(graphed.qpos_EL.sum())
+
+    captured, expected = (
+        Captured(step, device=device, require_graphs=device.type == "cuda"),
+        torch.zeros_like(total),
+    )
+    for _ in range(5):
+        captured()
+        with live_launches():
+            live.step(1)
+        expected.add_(live.qpos_EL.sum())
+    difference = float((total - expected).abs())
+    graphed.close()
+    live.close()
+    return None if difference < 1e-6 else f"what a graph computes differs by {difference:.2g}"
+
+
+def _update(device: torch.device) -> str | None:
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(size: int) -> torch.Tensor:
+        return torch.randn(64, size, generator=generator).to(device)
+
+    cfg, spec = PPOCfg(), Unbounded(torch.Size([2]), device=device)
+    actor = make_actor(ActorCfg(hidden_dims=(16,)), obs_dim=3, action_dim=2, action_spec=spec, device=device)
+    critic = make_critic(CriticCfg(hidden_dims=(16,)), obs_dim=3, device=device)
+    minibatch_B = actor(
+        TensorDict({"actor": draw(3), "critic": draw(3)}, batch_size=[64], device=device)
+    ).detach()
+    minibatch_B.update({"advantage": draw(1), "value_target": draw(1), "state_value": draw(1)})
+    before = [parameter.clone() for parameter in actor.parameters()]
+    optimizer, guard = make_optimizer(cfg, actor, critic), StepGuard(device=device)
+    ppo_step(make_loss(cfg, actor, critic), optimizer, minibatch_B, cfg=cfg, guard=guard)
+    moved = any(not torch.equal(old, new) for old, new in zip(before, actor.parameters(), strict=True))
+    return None if moved and not int(guard.skipped) else "a gradient step changed nothing"
+
+
+def _pushed(mj_model: mujoco.MjModel, device: torch.device) -> World:
+    world = World(mj_model, num_envs=NUM_ENVS, device=device)
+    world.ctrl_EL.fill_(0.5)
+    return world
