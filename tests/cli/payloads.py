@@ -326,7 +326,7 @@ def with_pickles(monkeypatch):
 @family(with_pickles)
 def pickle_for_the_tensors_of_a_checkpoint(place):
     command = place.write_checkpoint()
-    saved = checkpoint.latest(place.run)
+    saved = checkpoint.saved(place.run / "checkpoint")[-1]
     data = io.BytesIO()
     torch.save({"x": Bomb(place.code)}, data)
     (saved / checkpoint.TENSORS).write_bytes(data.getvalue())

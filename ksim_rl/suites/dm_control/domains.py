@@ -15,7 +15,6 @@ from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.suites.dm_control.quantities import BodyAxes, GeneralizedVelocity, Offset, Readings
 from ksim_rl.suites.dm_control.starts import DrawStart, StartFromBank
 
-Observations = Mapping[str, ObservationTerm]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +29,7 @@ class Domain:
     """
 
     decimation: int
-    observations: Observations
+    observations: Mapping[str, ObservationTerm]
     events: Mapping[str, EventTerm] | None
     viewer: ViewerCfg
     sim: SimCfg = field(default_factory=SimCfg)
