@@ -37,7 +37,8 @@ transforms, networks and algorithms that configs name. KSIM_RL_PLUGINS=PACKAGE,.
 `ksim-rl <command> --help` tells more. KSIM_RL_TRACEBACK=1 shows the traceback of an error.
 
 exit codes: 0 done (and solved, or its target met, where there is one), 1 not solved, or a fault found, 2 refused: the
-command or its configuration is wrong, 3 the run failed, 130 / 143 interrupted by SIGINT / SIGTERM: what is saved is said"""
+command or its configuration is wrong, 3 the run failed, 130 / 143 interrupted by SIGINT / SIGTERM: what is saved is
+said"""
 
 # Where each is: a module and its function, which takes the arguments and returns the exit code.
 COMMANDS = {

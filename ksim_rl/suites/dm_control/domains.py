@@ -16,7 +16,6 @@ from ksim_rl.suites.dm_control.quantities import BodyAxes, GeneralizedVelocity, 
 from ksim_rl.suites.dm_control.starts import DrawStart, StartFromBank
 
 
-
 @dataclass(frozen=True, kw_only=True)
 class Domain:
     """What the tasks of one model share; `playground` has the fields that MuJoCo Playground has otherwise.
