@@ -1,4 +1,4 @@
-"""What the metrics of healthy and of sabotaged runs look like: the curves on which `ksim-rl diagnose` is tested.
+"""This benchmark records the metrics of healthy and of sabotaged runs, on which `ksim-rl diagnose` is tested.
 
     python -m benchmarks.diagnosis runs=healthy
     python -m benchmarks.diagnosis runs=faults
@@ -19,6 +19,7 @@ import torch
 
 from benchmarks import command_line, report
 from ksim_rl.runs.csv_table import read_table
+from ksim_rl.tables.levels import thinned
 from ksim_rl.trainers import Hook, RunProgress, Trainer, build
 
 KEPT_ROWS = 30
@@ -200,12 +201,12 @@ def train(overrides: tuple[str, ...], hooks: tuple[Hook, ...], sabotage: Sabotag
         _, rows = read_table(Path(folder) / "metrics.csv")
     tree = cfg.to_tree()
     config = {"objective": tree["objective"], "modules": {"actor": tree["modules"]["actor"]}}
-    return {"overrides": list(overrides), "config": config, "metrics": thinned(rows)}
+    return {"overrides": list(overrides), "config": config, "metrics": kept_metrics(rows)}
 
 
-def thinned(rows: list[dict[str, str]]) -> dict[str, str]:
+def kept_metrics(rows: list[dict[str, str]]) -> dict[str, str]:
     """Return about `KEPT_ROWS` rows, the last one among them, each metric in one text; "-" where a row has none."""
-    rows = [*rows[: -1 : max(1, len(rows) // KEPT_ROWS)], rows[-1]]
+    rows = thinned(rows, KEPT_ROWS)
     names = [name for name in rows[-1] if name.startswith(KEPT)]
     return {
         name: " ".join(f"{float(row[name]):.4g}" if row.get(name) else "-" for row in rows) for name in names

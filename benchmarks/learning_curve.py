@@ -28,6 +28,7 @@ from rich.table import Table
 from benchmarks import command_line, report
 from benchmarks.learning_picture import draw
 from ksim_rl.runs.csv_table import read_table
+from ksim_rl.tables.levels import thinned
 from ksim_rl.trainers import RunCfg, RunProgress, run
 
 KEPT_POINTS = 60
@@ -88,7 +89,7 @@ def train_and_keep(
             figures=figures,
             device=device,
             module=module,
-            curves={f"{label}/seed_{seed}": _some(points, KEPT_POINTS) for seed, points in curves.items()},
+            curves={f"{label}/seed_{seed}": thinned(points, KEPT_POINTS) for seed, points in curves.items()},
         )
 
     for seed, points in train_all(seeds):
@@ -206,18 +207,13 @@ def run_cfg(overrides: list[str], env_states: str) -> RunCfg:
     return command_line.compose([*overrides, *fixed, f"trainer.num_iterations={iterations}"])
 
 
-def _some(points: list[Point], count: int) -> list[Point]:
-    """Return about so many of the points, the last one among them."""
-    return [*points[: -1 : max(1, len(points) // count)], points[-1]]
-
-
 def _table(title: str, curves: dict[int, list[Point]]) -> Table:
     table = Table(title=title)
     names: list[Any] = list(next(iter(curves.values()))[-1])
     for name in ("seed", *names):
         table.add_column(name.removeprefix("reward/"))
     for seed, points in curves.items():
-        for point in _some(points, 6):
+        for point in thinned(points, 6):
             table.add_row(str(seed), *(f"{point.get(name, float('nan')):.4g}" for name in names))
     return table
 

@@ -13,9 +13,10 @@ from ksim_rl.config.plain_data import check_links
 from ksim_rl.envs.contract import part
 from ksim_rl.scene.robots import analyse
 from ksim_rl.scene.robots.analysis import TRIAL_S
-from ksim_rl.trainers import RunCfg, checkpoint, load_policy
+from ksim_rl.trainers import RunCfg, checkpoint
 from ksim_rl.trainers.build import build_evaluator, solved_at
 from ksim_rl.trainers.run_cfg import check_run_tree
+from ksim_rl.trainers.run_folder import policy_of
 from ksim_rl.trainers.sources import check_sources
 
 # What a checkpoint is of, and a resumed run cannot change.
@@ -35,19 +36,18 @@ def resume(arguments: list[str]) -> int:
         "--trust", action="store_true", help="the folder is yours: it may hold links, and say where to write"
     )
     options = parser.parse_intermixed_args(arguments)
-    saved = checkpoint.load(checkpoint.latest(options.run, note=say))
+    saved = checkpoint.load_latest(options.run, note=say)
     overrides = list(options.overrides)
     if options.num_iterations is not None:
         overrides.append(f"trainer.num_iterations={options.num_iterations}")
-    fields = [text.lstrip("+~").partition("=")[0] for text in overrides]
+    fields = conf.fields_of(overrides)
     for field in fields:
         if field.partition(".")[0] in KEPT:
             raise ValueError(
                 f"{field}: a resumed run keeps it: start a new run from these weights, "
                 f"ksim-rl train --config-dir {options.run} checkpoint={options.run} {field}=..."
             )
-    # A checkpoint lies in <run folder>/checkpoint/<iteration>.
-    folder = saved.path.absolute().parent.parent
+    folder = saved.run_folder
     if not options.trust:
         check_links(folder, below=FOLDERS)
         check_run_tree(saved.config, saved.path, given=fields)
@@ -77,7 +77,7 @@ def evaluate(arguments: list[str]) -> int:
     if options.episodes is not None and options.episodes < 1:
         raise ValueError(f"--episodes {options.episodes}: expected at least 1")
     with shown_working("evaluating"):
-        policy = load_policy(checkpoint.latest(options.run, note=say), device=options.device)
+        policy = policy_of(checkpoint.load_latest(options.run, note=say), device=options.device)
         episodes = options.episodes or policy.cfg.trainer.eval_episodes or 100
         evaluate = build_evaluator(policy.cfg, policy.actor, episodes=episodes, seed=options.seed)
         evaluation = evaluate()

@@ -86,8 +86,7 @@ def _primary_config(flags: argparse.Namespace) -> tuple[str, bool]:
     if flags.config_dir and not flags.config_name:
         folder = Path(flags.config_dir)
         if os.path.lexists(folder / conf.RUN_CONFIG):
-            fields = [text.lstrip("+~").partition("=")[0] for text in flags.overrides]
-            conf.register_run(folder, fields)
+            conf.register_run(folder, conf.fields_of(flags.overrides))
             return conf.RUN_AGAIN, False
         conf.check_groups(folder)
     return conf.NAME, bool(flags.config_name or flags.config_dir or flags.config_path)

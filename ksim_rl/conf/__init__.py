@@ -2,7 +2,7 @@
 # ruff: noqa: F401
 
 from ksim_rl.conf import spelling
-from ksim_rl.conf.command_line import check_command_line, compose, without_sweeps
+from ksim_rl.conf.command_line import check_command_line, compose, fields_of, without_sweeps
 from ksim_rl.conf.registration import (
     MODULE,
     NAME,

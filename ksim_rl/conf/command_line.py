@@ -53,6 +53,11 @@ def check_command_line(texts: Sequence[str], *, name: str, multirun: bool, value
         raise ValueError(f"the overrides do not compose: {' '.join(str(error).split())}") from error
 
 
+def fields_of(overrides: Sequence[str]) -> list[str]:
+    """Return the fields that overrides name: "task.sim.njmax" of "+task.sim.njmax=90"."""
+    return [text.lstrip("+~").partition("=")[0] for text in overrides]
+
+
 def without_sweeps(texts: Sequence[str]) -> list[str]:
     """Return the keys of overrides that are the same in all jobs of a multirun."""
     parsed = (OverridesParser.create().parse_override(text) for text in texts)

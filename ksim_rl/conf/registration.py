@@ -17,10 +17,11 @@ from omegaconf import OmegaConf
 from ksim_rl import algorithms, envs
 from ksim_rl.conf import choices
 from ksim_rl.config import plain_data, plugins, upstream
+from ksim_rl.runs.listing import CONFIG
 from ksim_rl.trainers.run_cfg import check_run_tree, without_env_size
 
 MODULE, NAME = "ksim_rl.conf", "train"
-RUN_AGAIN, RUN_CONFIG = "run_again", "config.yaml"
+RUN_AGAIN, RUN_CONFIG = "run_again", CONFIG
 WRITTEN_BY_LOGGERS = ("wandb", "mlflow")
 
 MOST_LETTERS = 120

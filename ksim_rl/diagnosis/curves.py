@@ -9,8 +9,8 @@ from typing import Any
 
 from ksim_rl.config import plain_data
 from ksim_rl.runs.csv_table import read_table
+from ksim_rl.runs.listing import CONFIG, METRICS
 
-METRICS, CONFIG = "metrics.csv", "config.yaml"
 # Fewer rows say nothing about where a run is going.
 LEAST_ROWS = 10
 # "Early" is this share of the rows at the beginning, "late" the same at the end.

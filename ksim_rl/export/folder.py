@@ -20,9 +20,9 @@ from ksim_rl.physics import prepare_spec
 from ksim_rl.runs import record
 from ksim_rl.scene.scene import build_spec
 from ksim_rl.scene.sensors import ContactSensor
-from ksim_rl.trainers import checkpoint, load_policy
+from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.build import EVALUATION_SEED_OFFSET, UNLIMITED_EPISODE_STEPS, build_env
-from ksim_rl.trainers.run_folder import Policy
+from ksim_rl.trainers.run_folder import Policy, policy_of
 
 STANDALONE = Path(__file__).parent / "standalone"
 TRACED, TRACED_STEPS = 4, 60
@@ -59,17 +59,17 @@ def export(
     """
     if episodes < 0:
         raise ValueError(f"--episodes {episodes}: expected 0 or more")
-    found = checkpoint.latest(run)
-    run_folder = found.absolute().parent.parent
+    saved = checkpoint.load_latest(run)
+    run_folder = saved.run_folder
     sessions = record.read(run_folder)
     trained_with = {}
     if sessions:
         commit = sessions[-1].code.get("ksim_rl", {}).get("commit")
         trained_with = {"commit": commit, "versions": dict(sessions[-1].versions)}
     return export_policy(
-        load_policy(run, device=device),
+        policy_of(saved, device=device),
         run_folder / "export" if folder is None else folder,
-        run_path=str(found),
+        run_path=str(saved.path),
         trained_with=trained_with,
         episodes=episodes,
         seed=seed,

@@ -24,7 +24,7 @@ import torch
 from ksim_rl.checked import Checked
 from ksim_rl.config import plain_data, plugins
 from ksim_rl.runs.run_lock import is_locked
-from ksim_rl.runs.whole_file import whole_file
+from ksim_rl.runs.whole_file import write_whole
 
 RECORD = "run.json"
 Status = Literal["running", "done", "interrupted", "failed"]
@@ -137,10 +137,8 @@ def _text(value: Any) -> Any:
 
 
 def _write(folder: Path, sessions: Sequence[Session]) -> None:
-    with whole_file(folder / RECORD) as temporary:
-        temporary.write_text(
-            json.dumps({"sessions": [dataclasses.asdict(s) for s in sessions]}, indent=2) + "\n"
-        )
+    tree = {"sessions": [dataclasses.asdict(session) for session in sessions]}
+    write_whole(folder / RECORD, json.dumps(tree, indent=2) + "\n")
 
 
 def _code(folder: Path, session: int) -> dict[str, dict[str, str]]:

@@ -20,3 +20,9 @@ def whole_file(path: Path) -> Iterator[Path]:
         with suppress(OSError):
             temporary.unlink()
         raise
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text into a file that appears once it is whole."""
+    with whole_file(path) as temporary:
+        temporary.write_text(text)

@@ -3,12 +3,13 @@
 import math
 import statistics
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 from ksim_rl.tables.table import Row
 
 HELD_STATES = 1e6
 Point = Mapping[str, float]
+T = TypeVar("T")
 
 
 def reached(points: Sequence[Point], levels: Mapping[str, float]) -> Point | None:
@@ -26,6 +27,11 @@ def reached(points: Sequence[Point], levels: Mapping[str, float]) -> Point | Non
         ):
             return held[-1]
     return None
+
+
+def thinned(points: Sequence[T], count: int) -> list[T]:
+    """Return about so many of the points, the last one among them."""
+    return [*points[: -1 : max(1, len(points) // count)], points[-1]]
 
 
 def value_of(row: Row, results: Sequence[Mapping[str, Any]]) -> float | None:

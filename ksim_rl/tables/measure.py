@@ -18,7 +18,9 @@ from ksim_rl import conf
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.runs import record
 from ksim_rl.runs.csv_table import read_table
-from ksim_rl.tables.levels import reached
+from ksim_rl.runs.listing import METRICS
+from ksim_rl.runs.whole_file import write_whole
+from ksim_rl.tables.levels import reached, thinned
 from ksim_rl.tables.table import Row, load
 from ksim_rl.trainers import Hook, RunCfg, RunProgress, Trainer, run
 
@@ -72,7 +74,7 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
     if outcome.interrupted_by is not None or outcome.evaluation is None:
         raise KeyboardInterrupt
     names = ("env_states", "seconds", "episode/return", "episode/length", *row.levels)
-    _, lines = read_table(run_folder / "metrics.csv")
+    _, lines = read_table(run_folder / METRICS)
     points = [{n: float(line[n]) for n in names if line.get(n)} for line in lines if line.get("seconds")]
     end = reached(points, row.levels) if row.levels else None
     session = record.read(run_folder)[-1]
@@ -91,7 +93,7 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
         "falls": round(judge.falls, 5),
         "seconds_to_levels": None if end is None else round(end["seconds"], 2),
         "env_states_to_levels": None if end is None else end["env_states"],
-        "curve": [*points[: -1 : max(1, len(points) // KEPT_POINTS)], points[-1]],
+        "curve": thinned(points, KEPT_POINTS),
     }
 
 
@@ -100,8 +102,7 @@ def main(name: str, row: str, seed: str, result: str, run_folder: str, device: s
     found = measure(load(name).rows[row], int(seed), Path(run_folder), device=device, smoke=bool(smoke))
     path = Path(result)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.with_suffix(".part").write_text(json.dumps(found, indent=1) + "\n")
-    os.replace(path.with_suffix(".part"), path)
+    write_whole(path, json.dumps(found, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 """This module writes a table: figures as JSON, rows as Markdown, and a picture."""
 
 import json
-import os
 import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ksim_rl.runs.whole_file import write_whole
 from ksim_rl.tables.levels import is_reached, value_of
 from ksim_rl.tables.table import Row, Table
 
@@ -66,9 +66,8 @@ def write(table: Table, rows: Mapping[str, Results], folder: Path, *, seeds: Seq
     }
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{table.name}.json"
-    path.with_suffix(".part").write_text(json.dumps(tree, indent=2) + "\n")
-    os.replace(path.with_suffix(".part"), path)
-    path.with_suffix(".md").write_text(_markdown(table, rows, tree))
+    write_whole(path, json.dumps(tree, indent=2) + "\n")
+    write_whole(path.with_suffix(".md"), _markdown(table, rows, tree))
     if rows:
         from ksim_rl.tables import picture  # Matplotlib takes half a second to import
 

@@ -48,6 +48,11 @@ class Checkpoint:
     config: dict[str, Any]
     state: state_tree.State
 
+    @property
+    def run_folder(self) -> Path:
+        """The folder of its run: a checkpoint lies in <run folder>/checkpoint/<iteration>."""
+        return self.path.absolute().parent.parent
+
 
 def save(
     folder: Path, state: Mapping[str, Any], *, iteration: int, config: Mapping[str, Any], keep: int = 3
@@ -122,17 +127,22 @@ def saved(folder: Path) -> list[Path]:
 
 
 def latest(path: Path, *, note: Callable[[str], None] = warnings.warn) -> Path:
-    """Find the newest whole checkpoint of a run folder or a checkpoint folder; a checkpoint is returned as it is.
+    """Find the newest whole checkpoint, as `load_latest` does; a checkpoint is returned as it is, unread."""
+    return path if (path / MANIFEST).exists() else load_latest(path, note=note).path
+
+
+def load_latest(path: Path, *, note: Callable[[str], None] = warnings.warn) -> Checkpoint:
+    """Read the newest whole checkpoint of a run folder or a checkpoint folder, or the one that `path` is.
 
     A `note` says which damaged ones are passed over, and which one is taken. Where all are damaged, or the newest is of
     an unknown format, the error is that of the newest.
     """
     if (path / MANIFEST).exists():
-        return path
+        return load(path)
     damage: list[CheckpointError] = []
     for candidate in reversed(saved(path / "checkpoint") or saved(path)):
         try:
-            load(candidate)
+            found = load(candidate)
         except UnknownFormatError:
             raise
         except CheckpointError as error:
@@ -141,7 +151,7 @@ def latest(path: Path, *, note: Callable[[str], None] = warnings.warn) -> Path:
             if damage:
                 passed = "; ".join(map(str, damage))
                 note(f"{passed}: passed over, the checkpoint {candidate.name} is taken instead")
-            return candidate
+            return found
     if damage:
         raise damage[0]
     raise CheckpointError(

@@ -17,6 +17,7 @@ from torchrl.record.loggers.wandb import WandbLogger
 from ksim_rl.checked import Checked
 from ksim_rl.config import plain_data
 from ksim_rl.runs.csv_table import CsvTable
+from ksim_rl.runs.listing import METRICS
 
 # What MLflow takes in one request, and how long a value may be.
 _MAX_PARAMS, _MAX_LETTERS = 100, 6000
@@ -161,7 +162,7 @@ def make_loggers(
     """Open the loggers of a run, some of which show its `config`; a RuntimeError names a service that refuses."""
     loggers: list[MetricLogger] = []
     if cfg.csv:
-        loggers.append(CsvTable(run_folder / "metrics.csv"))
+        loggers.append(CsvTable(run_folder / METRICS))
     if cfg.tensorboard:
         loggers.append(TensorboardLogger("tensorboard", log_dir=str(run_folder)))
     if cfg.wandb is not None:

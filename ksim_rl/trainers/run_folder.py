@@ -15,10 +15,11 @@ from ksim_rl.config.plugins import load as load_plugins
 from ksim_rl.device import state_tree
 from ksim_rl.device.memory import memory_for
 from ksim_rl.envs.contract import EpisodeClock, part
+from ksim_rl.runs.listing import CONFIG, METRICS
 from ksim_rl.runs.record import recorded
 from ksim_rl.runs.run_lock import locked
 from ksim_rl.runs.watch import threads_that_fail, watch
-from ksim_rl.runs.whole_file import whole_file
+from ksim_rl.runs.whole_file import whole_file, write_whole
 from ksim_rl.trainers import checkpoint, video
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build, build_env
@@ -27,7 +28,7 @@ from ksim_rl.trainers.run_cfg import RunCfg
 from ksim_rl.trainers.trainer import Hook, Outcome
 from ksim_rl.transforms import observation_columns
 
-CONFIG, EVALUATION, CURVES, VIDEO = "config.yaml", "evaluation.json", "curves.png", "video.mp4"
+EVALUATION, CURVES, VIDEO = "evaluation.json", "curves.png", "video.mp4"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -78,7 +79,7 @@ def _run_locked(
     with memory_for(cfg.num_envs, cfg.resolved_device()):
         with progress.busy("building envs and networks"):
             trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
-        _write(run_folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
+        write_whole(run_folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
         trainer.watch = watch(run_folder, holds=CONFIG, note=progress.note)
         with recorded(run_folder, note=progress.note) as ended:
             outcome = trainer.train(progress)
@@ -92,7 +93,7 @@ def _run_locked(
         }
         if trainer.solved_at is not None:
             figures["solved"] = outcome.solved
-        _write(run_folder / EVALUATION, json.dumps(figures, indent=2) + "\n")
+        write_whole(run_folder / EVALUATION, json.dumps(figures, indent=2) + "\n")
     with progress.busy("drawing learning curves and video"):
         _draw_curves(cfg, run_folder, solved_at=trainer.solved_at, note=progress.note)
         if cfg.trainer.video and outcome.interrupted_by is None:
@@ -104,31 +105,33 @@ def _run_locked(
     return outcome
 
 
-def _write(path: Path, text: str) -> None:
-    with whole_file(path) as temporary:
-        temporary.write_text(text)
-
-
-def load_policy(
-    path: Path, *, device: str = "auto", plugins: Sequence[str] = (), cfg: RunCfg | None = None
-) -> Policy:
+def load_policy(path: Path, *, device: str = "auto", plugins: Sequence[str] = ()) -> Policy:
     """Rebuild the policy of a checkpoint, or of the newest one in a run folder.
 
-    `plugins` are packages to import first, whose classes the run's config may then name. A `cfg` stands in for the
-    run's own. Nothing is written: the run's `nan_guard` is off. Raises CheckpointError when there is none, or it is
-    damaged; ValueError when its config does not fit this version, or makes other observations.
+    `plugins` are packages to import first, whose classes the run's config may then name. Nothing is written: the run's
+    `nan_guard` is off. Raises CheckpointError when there is none, or it is damaged; ValueError when its config does not
+    fit this version, or makes other observations.
     """
     load_plugins(plugins)
-    saved = checkpoint.load(checkpoint.latest(path))
+    return policy_of(checkpoint.load_latest(path), device=device)
+
+
+def policy_of(saved: checkpoint.Checkpoint, *, device: str = "auto", cfg: RunCfg | None = None) -> Policy:
+    """Rebuild the policy of a checkpoint that was read; see `load_policy`. A `cfg` stands in for the run's own."""
     cfg = RunCfg.from_tree({**saved.config, "device": device}) if cfg is None else cfg
-    task = dataclasses.replace(cfg.task, sim=dataclasses.replace(cfg.task.sim, nan_guard=None))
-    cfg = dataclasses.replace(cfg, task=task)
+    cfg = without_nan_guard(cfg)
     env = build_env(cfg, num_envs=1, seed=cfg.seed)
     checkpoint.check_columns(saved.state["observation_columns"], observation_columns(env))
     actor = make_policy(cfg, env)
     env.close(raise_if_closed=False)
     state_tree.copy_into(actor.state_dict(), saved.state["update"]["actor"], what="actor")
     return Policy(cfg=cfg, actor=actor, iteration=saved.iteration)
+
+
+def without_nan_guard(cfg: RunCfg) -> RunCfg:
+    """Return the config of a run that only looks on, and leaves no files of states that are not finite."""
+    task = dataclasses.replace(cfg.task, sim=dataclasses.replace(cfg.task.sim, nan_guard=None))
+    return dataclasses.replace(cfg, task=task)
 
 
 def record_video(
@@ -163,7 +166,7 @@ def record_video(
 def _draw_curves(
     cfg: RunCfg, run_folder: Path, *, solved_at: float | None, note: Callable[[str], None]
 ) -> None:
-    table = run_folder / "metrics.csv"
+    table = run_folder / METRICS
     if not table.exists():
         reason = "which has no rows yet" if cfg.logger.csv else "which needs logger.csv=true"
         note(f"no learning curves: they are drawn from metrics.csv, {reason}")

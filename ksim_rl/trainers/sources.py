@@ -30,7 +30,7 @@ def check_sources(cfg: RunCfg, *, resumes: bool = False) -> None:
     for field, path in named.items():
         if path is not None:
             try:
-                checkpoint.load(checkpoint.latest(Path(path)))
+                checkpoint.load_latest(Path(path))
             except checkpoint.CheckpointError as error:
                 raise ValueError(f"{field}={path}: {error}") from error
     for kind, entities in (("robots", cfg.task.scene.robots), ("objects", cfg.task.scene.objects)):

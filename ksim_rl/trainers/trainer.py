@@ -361,11 +361,11 @@ class Trainer:
 
     def load(self, path: Path) -> None:
         """Continue from a checkpoint: a run folder (its newest), a checkpoint folder, or one checkpoint."""
-        self.load_state_dict(checkpoint.load(checkpoint.latest(path)).state)
+        self.load_state_dict(checkpoint.load_latest(path).state)
 
     def load_weights(self, path: Path) -> None:
         """Start from the networks and normalizers of a checkpoint of any task, if they fit here; all else stays new."""
-        state = checkpoint.load(checkpoint.latest(path)).state
+        state = checkpoint.load_latest(path).state
         checkpoint.check_columns(state["observation_columns"], observation_columns(self.collector.env))
         try:
             self.update.load_weights(state["update"])

@@ -19,6 +19,7 @@ import torch
 
 from ksim_rl.config import plugins
 from ksim_rl.device import state_tree
+from ksim_rl.runs.whole_file import whole_file
 from ksim_rl.trainers import Hook, RunCfg, Trainer
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build_env
@@ -50,9 +51,8 @@ class GiveWeights(Hook):
             self.interval = max(1, round(PERIOD_S * max(iterations, 1) / max(seconds, 1e-3)))
         self._last = now, trainer.iteration
         state = {name: tensor.cpu() for name, tensor in trainer.update.actor.state_dict().items()}
-        unfinished = self._path.with_suffix(".new")
-        torch.save({"iteration": trainer.iteration, "actor": state}, unfinished)
-        unfinished.replace(self._path)
+        with whole_file(self._path) as unfinished:
+            torch.save({"iteration": trainer.iteration, "actor": state}, unfinished)
 
 
 @contextmanager

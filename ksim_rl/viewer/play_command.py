@@ -16,8 +16,9 @@ from ksim_rl import conf
 from ksim_rl.checks import check_in_range
 from ksim_rl.config.plain_data import check_links
 from ksim_rl.device.kernel_loading import compile_notice
-from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, load_policy, record_video
+from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, record_video
 from ksim_rl.trainers.build import build_env
+from ksim_rl.trainers.run_folder import policy_of, without_nan_guard
 from ksim_rl.viewer.session import AGENTS, Conditions, Session, UntrainedAgent
 
 VIDEO_SUFFIXES = (".mp4", ".gif")
@@ -163,23 +164,22 @@ def _find(options: argparse.Namespace) -> Played:
             )
         return _without_policy(conf.compose([*options.what, f"device={options.device}"]), options.agent)
     changed = None
-    folder = checkpoint.latest(Path(first)).absolute().parent.parent
+    saved = checkpoint.load_latest(Path(first))
     if overrides:
-        conf.register_run(folder, [text.lstrip("+~").partition("=")[0] for text in overrides])
+        conf.register_run(saved.run_folder, conf.fields_of(overrides))
         composed = conf.check_command_line(overrides, name=conf.RUN_AGAIN, multirun=False, values=True)
         changed = dataclasses.replace(composed[0], device=options.device)
-    policy = load_policy(Path(first), device=options.device, cfg=changed)
+    policy = policy_of(saved, device=options.device, cfg=changed)
     if options.agent is not None:
         return _without_policy(policy.cfg, options.agent)
     title = f"{policy.cfg.task_name}, iteration {policy.iteration}"
-    return Played(cfg=policy.cfg, title=title, folder=folder, actor=policy.actor)
+    return Played(cfg=policy.cfg, title=title, folder=saved.run_folder, actor=policy.actor)
 
 
 def _without_policy(cfg: RunCfg, agent: str) -> Played:
-    # Looking on leaves no files of states that are not finite.
-    sim = dataclasses.replace(cfg.task.sim, nan_guard=None)
-    cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, sim=sim))
-    return Played(cfg=cfg, title=f"{cfg.task_name}, {agent} actions", folder=Path(), agent=agent)
+    return Played(
+        cfg=without_nan_guard(cfg), title=f"{cfg.task_name}, {agent} actions", folder=Path(), agent=agent
+    )
 
 
 def _record(played: Played, options: argparse.Namespace, progress: RunProgress) -> int:

@@ -70,10 +70,7 @@ def test_a_second_process_is_refused_in_one_line_with_pid_host_and_time(tmp_path
 @pytest.mark.parametrize("command", ["resume", "train"])
 def test_commands_that_write_exit_with_2(tmp_path, held, command, capsys, monkeypatch):
     monkeypatch.setattr(run_folder, "_run_locked", lambda *_: pytest.fail("both write"))
-    monkeypatch.setattr(run_commands.checkpoint, "load", saved)
-    monkeypatch.setattr(
-        run_commands.checkpoint, "latest", lambda path, note: path / "checkpoint" / "00000001"
-    )
+    monkeypatch.setattr(run_commands.checkpoint, "load_latest", saved)
     (tmp_path / "config.yaml").write_text("")
     own = (
         ["resume", str(tmp_path)]
@@ -89,11 +86,12 @@ def test_commands_that_write_exit_with_2(tmp_path, held, command, capsys, monkey
     assert beside == [tmp_path], "no other folder is made"
 
 
-def saved(path):
+def saved(run, note):
     from ksim_rl import conf
     from ksim_rl.trainers import Checkpoint
 
-    return Checkpoint(path=path, iteration=1, config=conf.compose(["num_envs=64"]).to_tree(), state={})
+    newest = run / "checkpoint" / "00000001"
+    return Checkpoint(path=newest, iteration=1, config=conf.compose(["num_envs=64"]).to_tree(), state={})
 
 
 def test_a_folder_that_was_not_named_is_one_beside(tmp_path, held):

@@ -40,7 +40,7 @@ def load_teacher(path: Path, env: EnvBase, *, cfg: RunCfg) -> Teacher:
     A ValueError says what is absent or damaged, or which observation or tensor this env has not, or has otherwise.
     """
     try:
-        saved = checkpoint.load(checkpoint.latest(path))
+        saved = checkpoint.load_latest(path)
         state = {
             "actor": saved.state["update"]["actor"],
             "config": json.dumps(saved.config),
