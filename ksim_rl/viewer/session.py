@@ -211,7 +211,6 @@ class Session:
 
     def advance(self, after_step: Callable[[], None] = lambda: None) -> bool:
         """Do what was asked for, then the steps that are due by now; return whether anything changed."""
-        before = self.steps
         changed = False
         while not self._requests.empty():
             self._guarded(self._requests.get())
@@ -224,13 +223,14 @@ class Session:
         # No display is kept waiting for long by steps that take longer than they last.
         while self.playing and self._due >= 1.0 and time.monotonic() - now < MOST_LAG_S:
             self._due -= 1.0
+            changed = True
             self._guarded(self._step)
             after_step()
         self._due = min(self._due, 1.0)
         self._paces = [*self._paces[-60:], (now, self.steps)]
         (start, first), (end, last) = self._paces[0], self._paces[-1]
         self.achieved_speed = (last - first) * self.ours.step_dt / (end - start) if end > start else 0.0
-        return changed or self.steps != before
+        return changed
 
     def close(self) -> None:
         """Free the env's worlds."""

@@ -73,7 +73,7 @@ def test_an_error_pauses_and_is_kept_until_it_plays_again(clock):
     working, session.agent = session.agent, agent
     session.advance()
     clock[0] += 0.05
-    session.advance()
+    assert session.advance()  # which a display has to show
     assert not session.playing
     assert session.error == "ZeroDivisionError: the policy broke" and "def agent" not in session.error
     assert "in agent" in session.trace
