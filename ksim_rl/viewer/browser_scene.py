@@ -74,7 +74,7 @@ class BrowserScene:
         self._scene, self._mj_model = scene, mj_model
         self._root = scene.add_frame("/env", show_axes=False)
         self._batches: dict[tuple[Any, ...], tuple[viser.BatchedMeshHandle, dict[str, np.ndarray]]] = {}
-        self._labels: list[tuple[viser.LabelHandle, str]] = []
+        self._labels: list[viser.LabelHandle] = []
         self._planes: dict[int, viser.GridHandle] = {}
         self.unknown: set[str] = set()
 
@@ -179,18 +179,13 @@ class BrowserScene:
         self._planes[geom.objid] = grid
 
     def _write_labels(self, geoms: list[mujoco.MjvGeom]) -> None:
-        for handle, _ in self._labels[len(geoms) :]:
-            handle.visible = False
-        for row, geom in enumerate(geoms):
-            text = str(geom.label)
-            if row == len(self._labels):
-                self._labels.append((self._scene.add_label(f"/env/label_{row}", text), text))
-            handle, held = self._labels[row]
-            if held != text:
-                handle.text = text
-                self._labels[row] = (handle, text)
-            handle.visible = True
-            handle.position = np.asarray(geom.pos, dtype=np.float64)
+        while len(self._labels) < len(geoms):
+            self._labels.append(self._scene.add_label(f"/env/label_{len(self._labels)}", ""))
+        for row, handle in enumerate(self._labels):
+            handle.visible = row < len(geoms)
+            if handle.visible:
+                handle.text = str(geoms[row].label)
+                handle.position = np.asarray(geoms[row].pos, dtype=np.float64)
 
 
 def _scale(kind: int, size: np.ndarray) -> tuple[float, float, float]:

@@ -2,8 +2,10 @@
 
 import copy
 import time
+import warnings
 from collections.abc import Callable
 
+import glfw
 import mujoco
 import mujoco.viewer
 
@@ -17,12 +19,20 @@ HELP = "space pauses, N steps, Backspace resets, P pushes, [ and ] change the sp
 _SPACE, _BACKSPACE = 32, 259
 
 
+def check_display() -> None:
+    """Raise a ValueError where there is no display to open a window on."""
+    with warnings.catch_warnings(category=glfw.GLFWError, action="ignore"):
+        if not glfw.init():
+            raise ValueError("--viewer native: no display to open a window on; --viewer browser needs none")
+    glfw.terminate()
+
+
 def show(
     session: Session, *, note: Callable[[str], None], goes_on: Callable[[], bool] = lambda: True
 ) -> None:
     """Show a session in a window until that is closed, or `goes_on` says no; keys are those of `HELP`.
 
-    A RuntimeError says that there is no display to open a window on.
+    Without a display it waits forever: see `check_display`.
     """
     mj_model = copy.copy(session.ours.world.mj_model)
     data = mujoco.MjData(mj_model)
@@ -33,12 +43,7 @@ def show(
             session.ask(keys[code])
 
     note(HELP)
-    try:
-        window = mujoco.viewer.launch_passive(mj_model, data, key_callback=pressed, show_left_ui=False)
-    except (RuntimeError, mujoco.FatalError) as error:
-        raise RuntimeError(
-            f"MuJoCo's window needs a display ({error}): use --viewer browser, which needs none"
-        ) from error
+    window = mujoco.viewer.launch_passive(mj_model, data, key_callback=pressed, show_left_ui=False)
     said = ""
     with window:
         while window.is_running() and goes_on():

@@ -58,19 +58,17 @@ class Panel:
                 self._add_drawing(name)
 
     def show(self) -> None:
-        """Bring the widgets up to date."""
+        """Bring the widgets up to date; viser sends those that changed."""
         session = self._session
         label, icon = (
             ("Pause", viser.Icon.PLAYER_PAUSE) if session.playing else ("Play", viser.Icon.PLAYER_PLAY)
         )
         if self._play.label != label:
             self._play.label, self._play.icon = label, icon
-        if int(self._env.value) != session.env_index:
-            self._env.value = session.env_index
-        _write(self._status, self._status_text())
-        _write(self._error, f"**Paused by an error**\n```text\n{session.error}\n\n{session.trace}\n```")
-        if self._error.visible != bool(session.error):
-            self._error.visible = bool(session.error)
+        self._env.value = session.env_index
+        self._status.content = self._status_text()
+        self._error.content = f"**Paused by an error**\n```text\n{session.error}\n\n{session.trace}\n```"
+        self._error.visible = bool(session.error)
 
     def drive(self, shares: Mapping[int, float]) -> None:
         """Set the fields of the first command to shares of their ranges: -1 is the low end, 0 rest, 1 the high end.
@@ -142,8 +140,3 @@ def _at_share(share: float, low: float, high: float) -> float:
 
 def _value(event: viser.GuiEvent) -> object:
     return event.target.value
-
-
-def _write(handle: viser.GuiMarkdownHandle, text: str) -> None:
-    if handle.content != text:
-        handle.content = text

@@ -150,6 +150,8 @@ def _check(options: argparse.Namespace) -> None:
         )
     if options.viewer == "browser":
         check_viser()
+    if options.viewer == "native":
+        importlib.import_module("ksim_rl.viewer.native").check_display()
     if options.viewer is not None and (options.output, options.seconds) != (None, None):
         raise ValueError("--output and --seconds are of a video: leave them out, or leave out the viewer")
 

@@ -24,6 +24,15 @@ def test_what_cannot_be_shown_is_refused_in_one_line(words, said, capsys):
     assert said in capsys.readouterr().err
 
 
+def test_the_window_is_refused_without_a_display(monkeypatch, capsys):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(SystemExit) as ended:
+        main(["play", "task=cartpole_swingup", "--agent", "zero", "--viewer", "native"])
+    assert ended.value.code == 2
+    assert "--viewer native: no display to open a window on" in capsys.readouterr().err
+
+
 def test_both_ports_are_forwarded():
     lines = addresses("http://127.0.0.1:8090", "http://127.0.0.1:8092")
     assert "ssh -N -L 8090:127.0.0.1:8090 -L 8092:127.0.0.1:8092 THIS_MACHINE" in lines[1]
