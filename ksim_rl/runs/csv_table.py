@@ -1,10 +1,12 @@
 """This module keeps all metrics of a run in one CSV file, one row per logged iteration."""
 
 import csv
-from collections.abc import Mapping
+import io
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
-from ksim_rl.config.plain_data import MOST_DATA_BYTES, read_bytes
+from ksim_rl.config.plain_data import MOST_DATA_BYTES, open_regular
 from ksim_rl.runs.whole_file import whole_file
 
 STEP = "env_states"
@@ -15,47 +17,54 @@ class CsvTable:
 
     TorchRL's `CSVLogger` writes one file per metric; this one opens in a spreadsheet. A cell is empty where a row has
     no such metric. Rows at or beyond the first step that is logged are dropped, so that a resumed run has each
-    iteration once.
+    iteration once. However long the table is, only its last row is in memory.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._columns = read_table(path)[0] if path.exists() else [STEP]
-        # The last row, and those before it that are not in the file yet; it alone holds all others.
+        with _opened(path) as (self._columns, _):
+            pass
+        # The last row, and those before it that could not be written yet.
         self._rows: list[dict[str, str]] = []
-        self._started = False
+        self._last_begins: int | None = None  # its place in the file; None: the whole table has to be copied
 
     def log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
         """Append one row, or complete the last one."""
         row = {STEP: str(step), **{name: f"{value:.9g}" for name, value in metrics.items()}}
         new_columns = [name for name in row if name not in self._columns]
-        # False until the row is written, so that after a failure the next row writes the whole table again.
-        started, self._started = self._started, False
         same_row = bool(self._rows) and int(self._rows[-1][STEP]) == step
         if same_row:
             self._rows[-1] |= row
         else:
             self._rows.append(row)
         self._columns += new_columns
-        if new_columns or same_row or not started:
-            self._rewrite()
+        # None until the row is written, so that after a failure the next row copies the table.
+        begins, self._last_begins = self._last_begins, None
+        if new_columns or begins is None:
+            begins = self._copy()
         else:
-            with open(self.path, "a", newline="") as file:
-                self._writer(file).writerow(row)
-        self._started = True
+            with open(self.path, "r+", newline="") as file:
+                begins = file.seek(begins) if same_row else file.seek(0, io.SEEK_END)
+                self._writer(file).writerow(self._rows[-1])
+                file.truncate()
+        self._last_begins = begins
         del self._rows[:-1]
 
     def close(self) -> None:
         """Do nothing: each row is written when it is logged."""
 
-    def _rewrite(self) -> None:
-        saved = read_table(self.path)[1] if self.path.exists() else []
-        earlier = [row for row in saved if int(row[STEP]) < int(self._rows[0][STEP])]
+    def _copy(self) -> int:
+        """Write the table anew with all columns, row by row; return where its last row begins."""
         with whole_file(self.path) as temporary, open(temporary, "w", newline="") as file:
             writer = self._writer(file)
             writer.writeheader()
-            writer.writerows([*earlier, *self._rows])
+            with _opened(self.path) as (_, rows):
+                writer.writerows(row for row in rows if int(row[STEP]) < int(self._rows[0][STEP]))
+            writer.writerows(self._rows[:-1])
+            begins = file.tell()
+            writer.writerow(self._rows[-1])
+        return begins
 
     def _writer(self, file) -> csv.DictWriter:
         return csv.DictWriter(file, self._columns, restval="", lineterminator="\n")
@@ -63,7 +72,18 @@ class CsvTable:
 
 def read_table(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     """Read a table: its columns, and its rows as text by column; a row that a crash cut off is left out."""
-    text = read_bytes(path, limit=MOST_DATA_BYTES).decode(errors="replace")
-    reader = csv.DictReader(line for line in text.splitlines(keepends=True) if line.endswith("\n"))
-    rows = [row for row in reader if row.get(STEP) and None not in row.values()]
-    return list(reader.fieldnames or [STEP]), rows
+    open_regular(path, limit=MOST_DATA_BYTES).close()  # which says that there is none
+    with _opened(path) as (columns, rows):
+        return columns, list(rows)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[list[str], Iterator[dict[str, str]]]]:
+    """Give the columns of a table, and its whole rows one by one; of no file, those of a new table."""
+    if not path.exists():
+        yield [STEP], iter(())
+        return
+    with io.TextIOWrapper(open_regular(path, limit=MOST_DATA_BYTES), errors="replace", newline="") as file:
+        reader = csv.DictReader(line for line in file if line.endswith("\n"))
+        rows = (row for row in reader if row.get(STEP) and None not in row.values())
+        yield list(reader.fieldnames or [STEP]), rows

@@ -1,6 +1,7 @@
 """One table with all metrics of a run."""
 
 import csv
+import tracemalloc
 
 import pytest
 
@@ -81,11 +82,37 @@ def test_a_row_that_a_crash_cut_off_is_left_out(path):
     assert [row["env_states"] for row in rows(path)] == ["100", "300"]
 
 
-def test_memory_holds_no_more_than_the_last_row(path):
+def test_the_table_is_never_in_memory(path):
     table = CsvTable(path)
-    for step in range(100, 1000, 100):
-        table.log_metrics({"loss": 1.0}, step)
-    assert len(table._rows) == 1 and len(rows(path)) == 9
+    table.log_metrics({"loss": 1.0}, 0)
+    with open(path, "a") as file:
+        file.writelines(f"{step},0.123456789\n" for step in range(1, 50_000))
+    tracemalloc.start()
+    try:
+        table.log_metrics({"loss": 1.0}, 60_000)
+        table.log_metrics({"a new column": 2.0}, 60_000)
+        CsvTable(path).log_metrics({"loss": 1.0}, 60_001)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert len(rows(path)) == 50_002
+    assert peak < path.stat().st_size / 3
+
+
+def test_a_row_is_completed_without_a_copy_of_the_table(path):
+    table = CsvTable(path)
+    table.log_metrics({"loss": 1.0, "evaluation": 4.0}, 100)
+    file = path.stat().st_ino
+    table.log_metrics({"loss": 1.25}, 200)
+    table.log_metrics({"evaluation": 5.0}, 200)
+    table.log_metrics({"loss": 2.0}, 200)
+    table.log_metrics({"loss": 3.0}, 300)
+    assert path.stat().st_ino == file
+    assert [tuple(row.values()) for row in rows(path)] == [
+        ("100", "1", "4"),
+        ("200", "2", "5"),
+        ("300", "3", ""),
+    ]
 
 
 def test_a_row_that_a_crash_cut_off_in_its_last_number_is_left_out(path):
