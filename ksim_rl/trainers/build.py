@@ -45,9 +45,7 @@ def build(
     check_installed(cfg.logger)
     torch.manual_seed(cfg.seed)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
-    all_but_one = max(1, (os.cpu_count() or 1) - 1)
-    most = MOST_THREADS_BESIDE_CUDA if cfg.resolved_device().type == "cuda" else all_but_one
-    torch.set_num_threads(cfg.trainer.num_threads or min(all_but_one, most))
+    torch.set_num_threads(cfg.trainer.num_threads or default_threads(cfg.resolved_device()))
 
     env = build_env(cfg, num_envs=cfg.num_envs, seed=cfg.seed)
     update = make_update(cfg, env, resumed=resume_from.state["update"] if resume_from else None)
@@ -78,6 +76,11 @@ def build(
         # Last, because a run that cannot be built must not show up anywhere.
         trainer.loggers = make_loggers(cfg.logger, run_folder, config=trainer.config)
     return trainer
+
+
+def default_threads(device: torch.device) -> int:
+    """Return torch's threads on the CPU: beside CUDA all cores but one; one on the CPU, whose sums depend on them."""
+    return max(1, min((os.cpu_count() or 1) - 1, MOST_THREADS_BESIDE_CUDA)) if device.type == "cuda" else 1
 
 
 def build_env(cfg: RunCfg, *, num_envs: int, seed: int, render_mode: str | None = None) -> EnvBase:

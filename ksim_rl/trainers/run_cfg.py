@@ -52,9 +52,10 @@ class TrainerCfg(Checked):
     else asks for them earlier, `stop_at` and the guards then act one iteration later. What is learned, logged and saved
     is the same.
 
-    `num_threads` are torch's on the CPU; None leaves one core free, and takes eight at most for a run on CUDA. A thread
-    that has to wait for a core that is busy elsewhere stalls all others: on two cores that made runs beside other work
-    twenty times slower.
+    `num_threads` are torch's on the CPU. None takes one for a run on the CPU, so that the same seed gives the same bits
+    on every machine: torch's sums depend on how many threads share them, so another number stands for other bits, as
+    another seed does. For a run on CUDA None leaves one core free, and takes eight at most. A thread that has to wait
+    for a core that is busy elsewhere stalls all others.
     """
 
     num_iterations: Count = 100

@@ -4,6 +4,7 @@ import contextlib
 import copy
 import json
 import os
+import sys
 
 import pytest
 import torch
@@ -159,8 +160,8 @@ def seeds_of_the_process(patch):
 
 
 @sabotage("threads")
-def seeds_that_nobody_set(patch):
-    patch.setattr(torch, "manual_seed", lambda seed: torch.default_generator.seed())
+def as_many_as_there_are(patch):
+    patch.setattr(sys.modules["ksim_rl.trainers.build"], "default_threads", lambda device: os.cpu_count() - 1)
 
 
 @sabotage("payloads")
