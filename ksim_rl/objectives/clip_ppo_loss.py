@@ -98,6 +98,9 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
                 f"the advantage has shape {tuple(adv_B.shape)}, the log-probability ratio "
                 f"{tuple(log_weight_B.shape)}: both must be batch shape + (1,)"
             )
+        if (mask_B := self._mask(tensordict, log_weight_B)) is not None:
+            # The ratio of a row that is left out may be infinite, and zero times that is a gradient of NaN.
+            log_weight_B = torch.where(mask_B, log_weight_B, 0.0)
         # The clipping acts on the ratio to the proximal policy; the gain is weighted by that to the
         # collecting one.
         log_behavior_weight_B = log_weight_B if log_is_weight_B is None else log_weight_B + log_is_weight_B

@@ -267,6 +267,39 @@ def test_masked_env_states_are_left_out_as_in_stock(reduction):
     same(*both(actor, critic, reduction=reduction, clip_value=0.2), data)
 
 
+def test_rows_that_are_left_out_may_be_anything():
+    """Rows that pad a minibatch carry no policy's actions: their probability ratio overflows."""
+    actor, critic = networks()
+    loss, data = (
+        ClipPPOLoss(actor, critic, clip_value=0.2, normalize_advantage=True),
+        minibatch(actor, critic),
+    )
+    mask = torch.rand(64, 1) < 0.7
+    spoilt = data.clone()
+    for key, filler in (("action_log_prob", -1e3), ("advantage", 1e30), ("value_target", 1e30)):
+        left_out = ~mask.reshape(data[key].shape)
+        spoilt[key] = data[key].masked_fill(left_out, filler)
+    kept, spoilt["collector", "mask"] = data[mask.squeeze(-1)], mask
+    gradients = []
+    for batch in (kept, spoilt):
+        loss.zero_grad()
+        out = loss(batch)
+        sum(out[name] for name in LOSSES).backward()
+        gradients.append([out[name] for name in LOSSES] + [parameter.grad for parameter in loss.parameters()])
+    torch.testing.assert_close(gradients[1], gradients[0])
+
+
+def test_a_minibatch_in_which_no_row_counts_has_losses_and_gradients_of_zero():
+    actor, critic = networks()
+    loss, data = ClipPPOLoss(actor, critic, normalize_advantage=True), minibatch(actor, critic)
+    data["collector", "mask"] = torch.zeros(64, 1, dtype=torch.bool)
+    data["action_log_prob"] -= 1e3
+    out = loss(data)
+    sum(out[name] for name in LOSSES).backward()
+    assert all(out[name] == 0.0 for name in LOSSES)
+    assert all(parameter.grad.abs().max() == 0.0 for parameter in loss.parameters())
+
+
 @pytest.mark.parametrize("kind", list(ValueEstimators))
 def test_each_of_torchrls_value_estimators_may_make_the_advantage(kind):
     actor, critic = networks()

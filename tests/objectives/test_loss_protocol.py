@@ -228,6 +228,30 @@ def test_a_minibatch_in_which_no_row_counts_has_losses_and_gradients_of_zero(mak
 
 
 @each_loss
+@pytest.mark.parametrize("filler", [0.0, 1e15])
+def test_rows_that_are_left_out_may_be_anything(make, filler):
+    """Rows of zeros pad a minibatch, and those whose physics broke may hold any number."""
+    loss, data, mask = make(), minibatch(), torch.rand(BATCH) < 0.7
+    spoilt = data.apply(
+        lambda leaf: (
+            leaf
+            if leaf.dtype == torch.bool
+            else leaf.masked_fill(~mask.view(-1, *[1] * (leaf.ndim - 1)), filler)
+        )
+    )
+    spoilt[MASK_KEY] = mask[:, None]
+    found = []
+    for batch in (data.set(MASK_KEY, mask[:, None]), spoilt):
+        loss.zero_grad()
+        out = evaluated(loss, batch)
+        sum(out[name] for name in out.keys() if name.startswith("loss_")).backward()
+        found.append(
+            [out[name] for name in out.keys()] + [p.grad for p in loss.parameters() if p.requires_grad]
+        )
+    torch.testing.assert_close(found[1], found[0])
+
+
+@each_loss
 def test_moves_to_another_dtype(make):
     loss, data = make(), minibatch()
     expected = evaluated(loss, data.clone())["loss_qvalue"]
@@ -256,6 +280,11 @@ def test_distillation_trains_the_student_alone_leaves_the_data_and_ignores_explo
     for explored in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
         with set_exploration_type(explored):
             assert loss(data)["loss_distillation"] == expected["loss_distillation"]
+    student.zero_grad()
     data[MASK_KEY] = torch.zeros(6, 4, 1, dtype=torch.bool)
-    assert loss(data)["loss_distillation"] == 0.0
+    data["actor"].fill_(1e30)
+    out = loss(data)
+    out["loss_distillation"].backward()
+    assert out["loss_distillation"] == out["kl"] == 0.0
+    assert all(parameter.grad.abs().max() == 0.0 for parameter in student[0].module.trunk.parameters())
     assert not any(isinstance(module, nn.Dropout) for module in loss.modules())
