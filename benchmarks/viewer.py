@@ -111,7 +111,7 @@ class Alternate(Hook):
 
     def _wait(self, *, watched: bool) -> None:
         deadline = time.monotonic() + PATIENCE_S
-        while bool(self._given.interval) != watched:
+        while self._given.is_watched != watched:
             if time.monotonic() > deadline:
                 raise RuntimeError(f"the viewer did not become {'watched' if watched else 'alone'}")
             time.sleep(0.05)

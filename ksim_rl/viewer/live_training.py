@@ -35,20 +35,20 @@ class GiveWeights(Hook):
     """Writes the actor's weights for the viewer every `PERIOD_S`, while somebody watches."""
 
     def __init__(self, folder: Path) -> None:
-        self.interval, self._path = 0, folder / WEIGHTS
+        self.is_watched, self._every, self._path = False, 1, folder / WEIGHTS
         self._last: tuple[float, int] | None = None
 
-    def watched(self, is_watched: bool) -> None:
-        """Begin, or end; from any thread."""
-        self._last = None
-        self.interval = 1 if is_watched else 0
+    @property
+    def interval(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Iterations between two calls. Another thread says whether there are any, so it is never 0, as in `%`."""
+        return self._every if self.is_watched else sys.maxsize
 
     def __call__(self, trainer: Trainer) -> None:
         """Write them, and find out in how many iterations it is time again."""
         now = time.monotonic()
-        if self._last is not None and self.interval:
+        if self._last is not None:
             seconds, iterations = now - self._last[0], trainer.iteration - self._last[1]
-            self.interval = max(1, round(PERIOD_S * max(iterations, 1) / max(seconds, 1e-3)))
+            self._every = max(1, round(PERIOD_S * iterations / max(seconds, 1e-3)))
         self._last = now, trainer.iteration
         state = {name: tensor.cpu() for name, tensor in trainer.update.actor.state_dict().items()}
         with whole_file(self._path) as unfinished:
@@ -95,10 +95,10 @@ def _listen(child: "subprocess.Popen[str]", hook: GiveWeights, note: Callable[[s
     assert child.stdout is not None
     for line in child.stdout:
         if line.strip() in (_SOME, _NOBODY):
-            hook.watched(line.strip() == _SOME)
+            hook.is_watched = line.strip() == _SOME
         else:
             note(line.strip())
-    hook.watched(False)
+    hook.is_watched = False
 
 
 def main(folder: Path) -> None:
