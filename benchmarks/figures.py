@@ -36,6 +36,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "resume": (*STEP, *LEARN, "ksim_rl/trainers"),
     "rooms": (*STEP, *LEARN, *TASK),
     "scaling": (*STEP, *LEARN),
+    "sim2sim": (*STEP, "ksim_rl/export"),
     "tasks": (*STEP, *LEARN, *TASK),
     "terrain": STEP,
     "throughput": (*STEP, *LEARN, *TASK),

@@ -7,6 +7,7 @@ that follow from it.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -41,9 +42,7 @@ def find_causes(meta: Mapping[str, Any], trace: Arrays, replay: Arrays) -> list[
         evidence = f"{step_s:g} s in steps of {substep_s:g} s, trained with {recorded_s:g} s in steps of "
         found.append(Cause("rate", "env step", evidence + f"{float(trace['trace/dt']):g} s"))
 
-    def signal(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return _pairs(name, trace, replay)
-
+    signal = partial(_pairs, trace=trace, replay=replay)
     frames = _newest(meta, trace["trace/obs"])
     start, obs_differs = 0, False
     ours, theirs, episode = _pairs("obs", {**trace, "trace/obs": frames}, replay)
@@ -140,9 +139,8 @@ def _of_targets(ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray, joint
         return Cause("joint order", "targets", f"{', '.join(moved)} get those of other joints")
     if shift := _shift(ours, theirs, episode):
         return Cause("delay", "targets", f"they are those of {shift} steps ago")
-    middle = ours.mean(0), theirs.mean(0)
-    ratios = _ratios(ours - middle[0], theirs - middle[1])
-    if _error((ours - middle[0]) * ratios, theirs - middle[1]) <= LIKE:
+    if _unlike(ours, theirs) <= LIKE:
+        ratios = _ratios(ours - ours.mean(0), theirs - theirs.mean(0))
         if np.abs(ratios - 1.0).max() <= LIKE:
             return Cause("offset", "targets", "they move as ours do about another default pose")
         return Cause(
@@ -156,7 +154,7 @@ def _of_targets(ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray, joint
 def _pairs(name: str, trace: Arrays, replay: Arrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a signal as recorded and as replayed, [M, L] each, and the episode of each row.
 
-    Of the lags that an episode may have had, the one that fits is taken.
+    Of the lags that an episode may have had, the one that fits is taken, whatever the scale.
     """
     ours, theirs, episode = [], [], []
     lags = sorted({key.split("/")[0] for key in replay if "/" in key})
@@ -166,7 +164,7 @@ def _pairs(name: str, trace: Arrays, replay: Arrays) -> tuple[np.ndarray, np.nda
         flat = recorded[:length].reshape(min(length, len(recorded)), -1)
         found = [fit[: len(flat)].reshape(len(flat), -1) for fit in fits] or [flat]
         ours.append(flat)
-        theirs.append(min(found, key=lambda fit: _error(flat, fit)))
+        theirs.append(min(found, key=lambda fit: _unlike(flat, fit)))
         episode.append(np.full(len(flat), number))
     return np.concatenate(ours), np.concatenate(theirs), np.concatenate(episode)
 
@@ -187,6 +185,12 @@ def _error(ours: np.ndarray, theirs: np.ndarray) -> float:
     ours, theirs = ours.reshape(len(ours), -1), theirs.reshape(len(theirs), -1)
     size = np.abs(ours).mean() + 1e-6
     return float(np.abs(ours - theirs).mean(0).max() / size)
+
+
+def _unlike(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """Return the error that is left when each of our columns may be scaled and shifted."""
+    ours, theirs = ours - ours.mean(0), theirs - theirs.mean(0)
+    return _error(ours * _ratios(ours, theirs), theirs)
 
 
 def _ratios(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:

@@ -78,9 +78,9 @@ def points(term: Any, view: EnvView, positions: Node) -> Node:
     return into_root(term, view, positions)
 
 
-def joints(name: str, **parameters: Any) -> Callable[[Any, EnvView], Node]:
-    """Return the description of a quantity of joints."""
-    return lambda t, v: quantity(name, joints=joint_names(v, t.joints), **parameters)
+def joints(name: str, *fields: str) -> Callable[[Any, EnvView], Node]:
+    """Return the description of a quantity of joints, with some fields of the term."""
+    return lambda t, v: quantity(name, joints=joint_names(v, t.joints), **{f: getattr(t, f) for f in fields})
 
 
 def contact(term: Any, field: str) -> Node:
@@ -103,10 +103,6 @@ def sites(name: str, term: Any, view: EnvView) -> Node:
     return quantity(name, sites=names_of(view, "site", term.sites))
 
 
-def _biased(name: str) -> Callable[[Any, EnvView], Node]:
-    return lambda t, v: quantity(name, joints=joint_names(v, t.joints), biased=t.biased)
-
-
 def _framed(name: str) -> Callable[[Any, EnvView], Node]:
     """Describe a velocity of the root, in its own axes or the world's."""
     return lambda t, v: quantity(name, body=root(t, v), frame=t.frame)
@@ -120,12 +116,9 @@ def _gravity(term: mdp.ProjectedGravity, view: EnvView) -> Node:
 
 
 def _clock(term: mdp.Clock, _: EnvView) -> Node:
-    angle = op("multiply", 2.0 * math.pi, op("add", _cycles(term), list(term.phases)))
+    cycles = op("multiply", term.frequency, quantity("time"))
+    angle = op("multiply", 2.0 * math.pi, op("add", cycles, list(term.phases)))
     return op("concat", op("sin", angle), op("cos", angle))
-
-
-def _cycles(term: mdp.Clock) -> Node:
-    return op("multiply", term.frequency, quantity("time"))
 
 
 def _imu(term: mdp.ImuReading, _: EnvView) -> Node:
@@ -147,8 +140,8 @@ def _signed_log(term: Any, _: EnvView) -> Node:
     return op("multiply", op("sign", newtons), op("log1p", op("absolute", newtons)))
 
 
-_add(mdp.JointPos, _biased("joint_pos"))
-_add(mdp.JointPosRel, _biased("joint_pos_rel"))
+_add(mdp.JointPos, joints("joint_pos", "biased"))
+_add(mdp.JointPosRel, joints("joint_pos_rel", "biased"))
 _add(mdp.JointVel, joints("joint_vel"))
 _add(mdp.JointAcc, joints("joint_acc"))
 _add(mdp.JointEffort, joints("joint_effort"))
@@ -206,11 +199,6 @@ def some(node: Node, *indices: int) -> Node:
     return op("take", node, indices=list(indices))
 
 
-def planar(node: Node) -> Node:
-    """Return x and y of each vector."""
-    return op("take", node, indices=[0, 1], width=3)
-
-
 def rated(term: Any, squared_error: Node) -> Node:
     """Return exp(-error^2 / std^2)."""
     return op("exp", op("divide", squared_error, -(term.std**2)))
@@ -258,15 +246,9 @@ def table(term: Any, view: EnvView, field: str) -> list[float]:
     return [float(value) for value in values_by_name(field, getattr(term, field), names)]
 
 
-def soft_limits(term: Any, view: EnvView) -> tuple[list[float], list[float]]:
-    """Return the soft limits of a term's joints."""
-    low, high = view.joints(term.joints).soft_limits_L2.T.tolist()
-    return low, high
-
-
 def foot_velocity(term: Any, view: EnvView) -> Node:
     """Return the horizontal velocities of feet."""
-    return planar(sites("site_lin_vel", term, view))
+    return op("take", sites("site_lin_vel", term, view), indices=[0, 1], width=3)
 
 
 def _pose(t: mdp.Pose, v: EnvView) -> Node:
@@ -318,6 +300,11 @@ def _track_angular(t: mdp.TrackAngularVelocity, v: EnvView) -> Node:
     return rated(t, squared(difference(op("concat", [0.0, 0.0], some(asked, 2)), turns)))
 
 
+def _beyond_limits(t: mdp.JointPosLimits, v: EnvView) -> Node:
+    low, high = v.joints(t.joints).soft_limits_L2.T.tolist()
+    return total(beyond(joints("joint_pos")(t, v), low, high))
+
+
 def _action_rate(*_: Any) -> Node:
     return difference(quantity("action"), quantity("last_action"))
 
@@ -343,10 +330,7 @@ _add(
     lambda t, v: while_commanded(t, total(op("multiply", force(t), contact(t, "first_contact")))),
 )
 _add(mdp.FeetAirTime, _air_time)
-_add(
-    mdp.JointPosLimits,
-    lambda t, v: total(beyond(quantity("joint_pos", joints=joint_names(v, t.joints)), *soft_limits(t, v))),
-)
+_add(mdp.JointPosLimits, _beyond_limits)
 _add(mdp.JointDeviationL1, lambda t, v: total(op("absolute", _pos_rel(t, v))))
 _add(mdp.JointDeviationL2, lambda t, v: squared(_pos_rel(t, v)))
 _add(mdp.JointVelL2, lambda t, v: squared(_vel(t, v)))

@@ -43,38 +43,16 @@ The policy's actions equal the trained network's within {difference:.1e} on {che
 """
 
 
-def export(
-    run: Path,
-    folder: Path | None = None,
-    *,
-    episodes: int = 100,
-    seed: int | None = None,
-    device: str = "cpu",
-    note: Callable[[str], None] = print,
-) -> Path:
-    """Write the policy of a run into `folder`, `<run>/export` by default, and return it.
-
-    `episodes` are recorded from `seed` for `sim2sim` to compare with; 0 leaves them out. Raises ValueError where the
-    policy or an observation term cannot be written down, naming it and what to do, or the files differ from the policy.
-    """
-    if episodes < 0:
-        raise ValueError(f"--episodes {episodes}: expected 0 or more")
+def export(run: Path, folder: Path | None = None, *, device: str = "cpu", **options: Any) -> Path:
+    """Write the policy of a run into `folder`, `<run>/export` by default, and return it; see `export_policy`."""
     saved = checkpoint.load_latest(run)
     run_folder = saved.run_folder
     sessions = record.read(run_folder)
-    trained_with = {}
     if sessions:
         commit = sessions[-1].code.get("ksim_rl", {}).get("commit")
-        trained_with = {"commit": commit, "versions": dict(sessions[-1].versions)}
-    return export_policy(
-        policy_of(saved, device=device),
-        run_folder / "export" if folder is None else folder,
-        run_path=str(saved.path),
-        trained_with=trained_with,
-        episodes=episodes,
-        seed=seed,
-        note=note,
-    )
+        options["trained_with"] = {"commit": commit, "versions": dict(sessions[-1].versions)}
+    folder = run_folder / "export" if folder is None else folder
+    return export_policy(policy_of(saved, device=device), folder, run_path=str(saved.path), **options)
 
 
 def export_policy(
@@ -85,9 +63,17 @@ def export_policy(
     trained_with: Mapping[str, Any] | None = None,
     episodes: int = 100,
     seed: int | None = None,
+    noise: bool = True,
     note: Callable[[str], None] = print,
 ) -> Path:
-    """Write a policy into a folder; see `export`. `trained_with` holds commit and versions."""
+    """Write a policy into a folder, and return it; `trained_with` holds commit and versions.
+
+    `episodes` are recorded from `seed` for `sim2sim` to compare with, with or without `noise` of the sensors; 0 leaves
+    them out. Raises ValueError where the policy or an observation term cannot be written down, naming it and what to
+    do, or the files differ from the policy.
+    """
+    if episodes < 0:
+        raise ValueError(f"--episodes {episodes}: expected 0 or more")
     missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
     if missing:
         raise ValueError(f"no package {missing[0]!r}: pip install 'ksim_rl[export]'")
@@ -128,23 +114,19 @@ def export_policy(
     spec = build_spec(cfg.task.scene)
     cfg.task.sim.apply_to(spec)
     prepare_spec(spec, [])
-    mj_model = ours.world.mj_model
-    order = write_robot(
-        spec, mj_model, list(dict.fromkeys(by_joint.get(name, name) for name in asked)), folder / "robot.xml"
-    )
+    wanted = dict.fromkeys(by_joint.get(name, name) for name in asked)
+    order = write_robot(spec, ours.world.mj_model, list(wanted), folder / "robot.xml")
     states = [dataclasses.asdict(state) for state in exported.states]
     own = {"inputs": exported.input_names, "outputs": exported.output_names, "states": states}
     own |= {"num_actions": ours.action_manager.size, "obs_dim": exported.obs_dim, "difference": difference}
     meta |= {"policy": own, "task": cfg.task_name, "iteration": trained.iteration, "run_path": run_path}
-    meta |= {"commit": None, "versions": {}, **(trained_with or {}), "seed": seed, "ours": None}
+    meta |= {"commit": None, "versions": {}, **(trained_with or {})}
+    meta |= {"seed": seed, "ours": None, "noisy": noise}
+    env.train(noise)
     if episodes:
         note(f"recording {episodes} episodes for sim2sim")
-        shared: dict[str, Any] = {
-            "groups": groups,
-            "joints": meta["joints"]["names"],
-            "order": order,
-            "seed": seed,
-        }
+        shared: dict[str, Any] = {"groups": groups, "order": order, "seed": seed}
+        shared["joints"] = meta["joints"]["names"]
         shared["params"] = sorted({name for law in meta["actuators"] for name in law["numbers"]})
         actor, steps = trained.actor, ours.max_episode_length or UNLIMITED_EPISODE_STEPS
         recorded = Recording(env, ours, actor, steps=steps, **shared)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -39,6 +39,13 @@ class StateSpec:
     columns: tuple[int, int] | None = None
 
 
+def _state(name: str, shape: tuple[int, ...], columns: tuple[int, int] | None = None) -> StateSpec:
+    starts_with = "frame" if columns else "zeros"
+    return StateSpec(
+        input=f"{name}_in", output=f"{name}_out", shape=shape, starts_with=starts_with, columns=columns
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Column:
     """One term of what the policy reads: `size` numbers in a frame, of which `length` stand `stride` steps apart."""
@@ -67,27 +74,14 @@ class ExportedPolicy(nn.Module):
         for column in self.columns:
             if column.length > 1:
                 shape = ((column.length - 1) * column.stride, column.size)
-                name = f"history_{column.name}"
-                self.states.append(
-                    StateSpec(
-                        input=f"{name}_in",
-                        output=f"{name}_out",
-                        shape=shape,
-                        starts_with="frame",
-                        columns=(start, start + column.size),
-                    )
-                )
+                columns = (start, start + column.size)
+                self.states.append(_state(f"history_{column.name}", shape, columns))
             start += column.size
         self.obs_dim = start
         for part in self.parts:
             if isinstance(part, RecurrentModule):
                 shape = (part.cfg.num_layers, part.cfg.hidden_dim)
-                self.states += [
-                    StateSpec(
-                        input=f"{key[-1]}_in", output=f"{key[-1]}_out", shape=shape, starts_with="zeros"
-                    )
-                    for key in part.state_keys
-                ]
+                self.states += [_state(key[-1], shape) for key in part.state_keys]
 
     @property
     def columns(self) -> list[Column]:
@@ -158,8 +152,12 @@ def _parts(module: Any) -> Iterator[Any]:
 def _best(part: Any, values: dict[Any, Tensor]) -> list[Tensor]:
     """Return the deterministic action of each distribution, as `ExplorationType.DETERMINISTIC` does."""
     if mixed := _mixed_head(part):
-        heads = zip(mixed.action_keys, mixed.heads, strict=True)
-        return [_of_head(head, values, (PARAMETERS, *_path(key))) for key, head in heads]
+        found, heads = [], cast(Any, mixed.heads)
+        for key, head in zip(mixed.action_keys, heads, strict=True):
+            path = (PARAMETERS, key) if isinstance(key, str) else (PARAMETERS, *key)
+            parameters = {name: values[(*path, name)] for name in head.parameter_names}
+            found.append(head.distribution(**parameters).deterministic_sample)
+        return found
     parameters = {str(key): values[key] for key in part.in_keys}
     return [part.distribution_class(**parameters, **part.distribution_kwargs).deterministic_sample]
 
@@ -167,16 +165,6 @@ def _best(part: Any, values: dict[Any, Tensor]) -> list[Tensor]:
 def _mixed_head(part: Any) -> MixedHead | None:
     owner = getattr(getattr(part, "distribution_class", None), "__self__", None)
     return owner if isinstance(owner, MixedHead) else None
-
-
-def _of_head(head: Any, values: dict[Any, Tensor], path: tuple[Any, ...]) -> Tensor:
-    return head.distribution(
-        **{name: values[(*path, name)] for name in head.parameter_names}
-    ).deterministic_sample
-
-
-def _path(key: Any) -> tuple[Any, ...]:
-    return (key,) if isinstance(key, str) else tuple(key)
 
 
 def _row(action: Tensor) -> Tensor:
@@ -218,8 +206,10 @@ def write(policy: ExportedPolicy, folder: Path) -> None:
     # Two rows: a batch of one would be taken for a constant.
     example = (torch.zeros(2, policy.obs_dim), *(torch.zeros(2, *state.shape) for state in policy.states))
     batch = torch.export.Dim("batch", min=1, max=2**20)
+    # One entry per parameter of `forward`; the states are a tuple of their own.
+    shapes: tuple[Any, ...] = ({0: batch}, tuple({0: batch} for _ in policy.states))
     with torch.no_grad(), _quiet():
-        program = torch.export.export(policy, example, dynamic_shapes=_dynamic(policy, batch))
+        program = torch.export.export(policy, example, dynamic_shapes=shapes if policy.states else shapes[:1])
         torch.export.save(program, folder / "policy.pt2")
         onnx = torch.onnx.export(
             program,
@@ -232,12 +222,6 @@ def write(policy: ExportedPolicy, folder: Path) -> None:
         )
         assert onnx is not None
         onnx.save(folder / "policy.onnx")
-
-
-def _dynamic(policy: ExportedPolicy, batch: Any) -> tuple[Any, ...]:
-    # One entry per parameter of `forward`; the states are a tuple of their own.
-    states = tuple({0: batch} for _ in policy.states)
-    return ({0: batch}, states) if states else ({0: batch},)
 
 
 @contextmanager
@@ -285,8 +269,9 @@ def greatest_difference(policy: ExportedPolicy, path: Path, *, seed: int = 0) ->
             asked[group] = torch.from_numpy(np.concatenate(terms, -1))
         for part in policy.parts:
             if isinstance(part, RecurrentModule):
-                for key, zero in zip(part.state_keys, _zeros(part), strict=True):
-                    asked[key] = carried.get(key, zero)
+                zeros = torch.zeros(ROWS, part.cfg.num_layers, part.cfg.hidden_dim)
+                for key in part.state_keys:
+                    asked[key] = carried.get(key, zeros)
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             answer = policy.actor(asked)
         carried = {
@@ -318,7 +303,3 @@ def _first(state: StateSpec, frame: np.ndarray) -> np.ndarray:
     if state.columns is None:
         return np.zeros((len(frame), *state.shape), np.float32)
     return np.repeat(frame[:, None, slice(*state.columns)], state.shape[0], 1)
-
-
-def _zeros(part: RecurrentModule) -> list[Tensor]:
-    return [torch.zeros(ROWS, part.cfg.num_layers, part.cfg.hidden_dim) for _ in part.state_keys]

@@ -21,12 +21,16 @@ TABLE = ("return", "length", "fell", "reward/", "metric/", "torque/", "contact/"
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Means over episodes, recorded (`ours`) and on MuJoCo's C engine (`theirs`), and why they differ."""
+    """Means over episodes, recorded (`ours`) and on MuJoCo's C engine (`theirs`), and why they differ.
+
+    `standard_error` is that of `return_ratio`, by the pairs of episodes that began alike.
+    """
 
     task: str
     episodes: int
     ours: Mapping[str, float]
     theirs: Mapping[str, float]
+    standard_error: float
     causes: Sequence[Cause]
     left_out: Sequence[str]
 
@@ -45,9 +49,14 @@ class Report:
                 share = f"{value / own - 1.0:+.1%}" if abs(own) > 1e-6 else f"{value - own:+.3g}"
                 lines.append(f"{name:<44}{own:>12.4g}{value:>12.4g}{share:>12}")
         lines += [f"left out, since it has no description: {name}" for name in self.left_out]
+        lines.append(f"return ratio {self.return_ratio:.4f} +- {self.standard_error:.4f} (standard error)")
         lines += ["likely causes:", *(f"  {cause}" for cause in self.causes)] if self.causes else []
         if not self.causes:
-            lines.append("single steps agree: what differs above is chance; more episodes make it smaller")
+            beyond = abs(self.return_ratio - 1.0) > 3.0 * self.standard_error + 1e-3
+            what = "but the returns differ by more than chance" if beyond else "what differs above is chance"
+            lines.append(
+                f"single steps agree: {what}; export with --no-noise compares without the sensors' noise"
+            )
         return "\n".join(lines)
 
 
@@ -63,7 +72,7 @@ def sim2sim(
         raise ValueError(f"--episodes {episodes}: expected at least 1")
     meta = read_json(folder / "export.json")
     ours = meta.get("ours")
-    if not isinstance(ours, dict) or "return" not in ours:
+    if not isinstance(ours, dict) or not ours.get("return"):
         raise ValueError(
             f"{folder}: exported without episodes: export the run once more, with --episodes 100"
         )
@@ -84,21 +93,27 @@ def sim2sim(
             causes = find_causes(meta, read_arrays(folder / "trace.npz"), read_arrays(replay))
         except (KeyError, IndexError, TypeError) as error:
             raise ValueError(f"{folder}: trace.npz does not fit export.json: {error!r}") from error
-    count = len(ours["return"])
-    kept = min(count, episodes)
+    # The same episodes on both sides, in pairs.
+    pairs = np.arange(episodes) % len(ours["return"])
+    own = {name: np.array(values)[pairs] for name, values in ours.items() if name.startswith(TABLE)}
+    theirs = {name: np.array([one[name] for one in found]) for name in found[0] if name.startswith(TABLE)}
     return Report(
         task=str(meta["task"]),
         episodes=episodes,
-        # The same episodes on both sides.
-        ours={name: float(np.mean(values[:kept])) for name, values in ours.items() if _in_table(name)},
-        theirs={name: float(np.mean([one[name] for one in found])) for name in found[0] if _in_table(name)},
+        ours={name: float(values.mean()) for name, values in own.items()},
+        theirs={name: float(values.mean()) for name, values in theirs.items()},
+        standard_error=ratio_error(own["return"], theirs["return"]),
         causes=causes,
         left_out=meta["left_out"],
     )
 
 
-def _in_table(name: str) -> bool:
-    return name.startswith(TABLE)
+def ratio_error(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """Return the standard error of mean(theirs) / mean(ours) of pairs [N]; NaN for fewer than two, or a mean of 0."""
+    mean = float(ours.mean())
+    if len(ours) < 2 or mean == 0.0:
+        return float("nan")
+    return float(np.std(theirs - ours * theirs.mean() / mean, ddof=1) / np.sqrt(len(ours)) / abs(mean))
 
 
 def run_export(arguments: Sequence[str]) -> int:
@@ -111,10 +126,12 @@ def run_export(arguments: Sequence[str]) -> int:
     parser.add_argument("--episodes", type=int, default=100, help="to record for sim2sim; 0 for none")
     parser.add_argument("--seed", type=int, help="of the recorded episodes; default: that of evaluations")
     parser.add_argument("--device", default="cpu", help="of the recorded episodes: cpu, cuda or auto")
-    options: Any = parser.parse_args(arguments)
-    folder = export(
-        options.run, options.output, episodes=options.episodes, seed=options.seed, device=options.device
+    parser.add_argument(
+        "--no-noise", dest="noise", action="store_false", help="record without sensors' noise"
     )
+    options: Any = parser.parse_args(arguments)
+    how = {"episodes": options.episodes, "seed": options.seed, "noise": options.noise}
+    folder = export(options.run, options.output, device=options.device, **how)
     print(f"{folder}: see README.md in it; next: ksim-rl sim2sim {folder}")
     return 0
 

@@ -24,6 +24,7 @@ from ksim_rl.envs.contract import part  # noqa: E402
 from ksim_rl.envs.term import ObservationTerm  # noqa: E402
 from ksim_rl.envs.view import EnvView  # noqa: E402
 from ksim_rl.export import controls, export_policy, sim2sim  # noqa: E402
+from ksim_rl.export.sim2sim import ratio_error  # noqa: E402
 from ksim_rl.export.standalone.runner import Runner, read_arrays  # noqa: E402
 from ksim_rl.modules import update_normalizers  # noqa: E402
 from ksim_rl.trainers.algorithm import make_policy  # noqa: E402
@@ -74,11 +75,22 @@ def test_cartpole_earns_the_same_from_the_folder_alone(cartpole):
     report = report_of(cartpole, episodes=4)
     assert report.causes == []
     assert report.return_ratio == pytest.approx(1.0, abs=1e-3)
+    assert report.standard_error < 1e-3 and "+- 0.0000 (standard error)" in report.table()
     names = {path.name for path in cartpole.iterdir()}
     assert names >= {"policy.onnx", "policy.pt2", "robot.xml", "export.json", "runner.py", "README.md"}
     stored = {entry.key: entry.value for entry in onnx.load(cartpole / "policy.onnx").metadata_props}
     assert stored["observation_names"] == "position,velocity"
     assert float(stored["step_dt"]) == pytest.approx(0.01)
+
+
+def test_the_ratio_has_the_error_of_pairs():
+    draws = np.random.default_rng(0)
+    ours = 10.0 + 5.0 * draws.standard_normal((2000, 50))
+    theirs = 0.9 * ours + draws.standard_normal(ours.shape)
+    spread = (theirs.mean(1) / ours.mean(1)).std()
+    found = np.mean([ratio_error(*pair) for pair in zip(ours, theirs, strict=True)])
+    assert found == pytest.approx(spread, rel=0.1)
+    assert np.isnan(ratio_error(ours[0, :1], theirs[0, :1]))
 
 
 def test_runner_needs_neither_torch_nor_this_library(cartpole, tmp_path):

@@ -67,7 +67,7 @@ class Runner(Signals):
     def __init__(self, folder: str | Path, seed: int = 0) -> None:
         super().__init__(folder, seed)
         meta = self.meta
-        self.policy, self.noisy = Policy(self.folder, meta), True
+        self.policy, self.noisy = Policy(self.folder, meta), bool(meta.get("noisy", True))
         self.lags: list[Lag] = []
         self.noises: list[Noise] = []
         self.terms = [self._term(spec) for spec in meta["observations"]]
@@ -378,13 +378,10 @@ def _run(number: int) -> dict[str, float]:
 def _replay(runner: Runner, path: Path) -> None:
     record = read_arrays(runner.folder / "trace.npz")
     found = {"dt": np.array(runner.model.opt.timestep), "decimation": np.array(runner.decimation)}
-    pairs = [
-        pair for law in runner.meta["actuators"] for pair in zip(law["joints"], law["actuators"], strict=True)
-    ]
-    drives = [runner.model.joint(int(runner.model.actuator(a).trnid[0])).name for _, a in pairs]
-    found["crossed"] = np.array(
-        [joint != driven for (joint, _), driven in zip(pairs, drives, strict=True)], bool
-    )
+    laws, joint = runner.meta["actuators"], runner.model.joint
+    pairs = [pair for law in laws for pair in zip(law["joints"], law["actuators"], strict=True)]
+    drives = [joint(int(runner.model.actuator(name).trnid[0])).name for _, name in pairs]
+    found["crossed"] = np.array([own != d for (own, _), d in zip(pairs, drives, strict=True)], bool)
     for lag in range(1 + max((delay.most for delay in runner.lags), default=0)):
         for number in range(len(record["trace/done"])):
             replayed = runner.replay(record, number, lag)
