@@ -25,6 +25,7 @@ ROOMS_AROUND = {
     "cli": 900,
     "diagnosis": 800,
     "export": 2_620,
+    "ranks": 900,
     "runs": 800,
     "suites": 1_500,
     "tables": 600,

@@ -133,7 +133,13 @@ class DatasetUpdate(RolloutUpdate):
         self._recurrent = recurrent_modules(*networks.values())
         sampler = None
         if self._recurrent:
-            sampler = SequenceSampler(sequence_length=data.sequence_length, burn_in=data.burn_in, seed=seed)
+            sampler = SequenceSampler(
+                sequence_length=data.sequence_length,
+                burn_in=data.burn_in,
+                seed=seed,
+                shards=data.shards,
+                num_minibatches=data.num_minibatches,
+            )
         self.dataset = DatasetBuffer(
             data, keys=loss.dataset_keys, seed=seed, sampler=sampler, device=self.device
         )

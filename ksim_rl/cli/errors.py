@@ -51,8 +51,9 @@ def interruption(stopped: KeyboardInterrupt) -> signal.Signals:
 
 
 def say(text: str) -> None:
-    """Print one line of the program's own on stderr."""
-    print(f"ksim-rl: {text}", file=sys.stderr)
+    """Print one line of the program's own on stderr, and which of several ranks says it."""
+    rank = f"rank {os.environ['RANK']}: " if os.environ.get("WORLD_SIZE", "1") != "1" else ""
+    print(f"ksim-rl: {rank}{text}", file=sys.stderr)
 
 
 class OneLineParser(argparse.ArgumentParser):

@@ -2,6 +2,7 @@
 
 import gc
 import importlib
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -95,7 +96,11 @@ def _dispatch(arguments: list[str]) -> int:
     with gc_disabled():
         run = getattr(importlib.import_module(module), function)
         importlib.import_module("ksim_rl.config.plugins").load(names)
-    return run(rest)
+    if int(os.environ.get("WORLD_SIZE") or 1) == 1:
+        return run(rest)
+    with importlib.import_module("ksim_rl.ranks").joined(command):
+        code = run(rest)
+    return 0 if code == 1 else code  # not solved is no failure of a rank, which torchrun would start again
 
 
 def _without_plugins(arguments: list[str]) -> tuple[list[str], list[str]]:

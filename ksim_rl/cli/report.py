@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from ksim_rl import envs
+from ksim_rl import envs, ranks
 from ksim_rl.cli.errors import interruption
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.diagnosis.diagnose import one_line
@@ -30,11 +30,16 @@ FAR = 4
 
 def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None = None) -> int:
     """Train with progress on the terminal, say how it ended, and return the exit code."""
+    folder = Path(ranks.from_first(str(folder)))
     done = 0 if resume_from is None else resume_from.iteration
     progress = RunProgress(cfg.trainer.num_iterations, done=done)
     length = cfg.data.rollout_length(cfg.num_envs)
+    each, size = cfg.num_envs * length, ranks.size()
+    all_ranks = (
+        f" on each of {size} ranks, {cfg.num_envs * size} envs and {each * size} in all" if size > 1 else ""
+    )
     progress.note(
-        f"{cfg.task_name}: {cfg.num_envs} envs x {length} steps = {cfg.num_envs * length} env states per iteration, "
+        f"{cfg.task_name}: {cfg.num_envs} envs x {length} steps = {each} env states per iteration{all_ranks}, "
         f"on {cfg.device}; run folder {shown(folder)}"
     )
     if own := _far_from(cfg, length):
@@ -48,7 +53,7 @@ def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None 
         number = interruption(stopped)
         progress.note(f"{number.name}: {_what_is_saved(folder)}")
         return 128 + int(number)
-    for line in _summary(cfg, outcome, folder):
+    for line in () if ranks.rank() else _summary(cfg, outcome, folder):
         progress.note(line)
     if outcome.interrupted_by is not None:
         return 128 + int(outcome.interrupted_by)

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import torch
 
-from ksim_rl import conf, envs
+from ksim_rl import conf, envs, ranks
 from ksim_rl.cli.errors import OneLineParser, say
 from ksim_rl.cli.report import run_and_report, shown_working, verdict
 from ksim_rl.cli.runs import print_table
 from ksim_rl.config.plain_data import check_links
+from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.contract import part
 from ksim_rl.scene.robots import analyse
 from ksim_rl.scene.robots.analysis import TRIAL_S
@@ -58,7 +59,7 @@ def resume(arguments: list[str]) -> int:
         (cfg,) = conf.check_command_line(overrides, name=conf.RUN_AGAIN, multirun=False, values=True)
     else:
         cfg = RunCfg.from_tree(tree)
-    cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
+    cfg = dataclasses.replace(_on_these_ranks(cfg, saved), device=str(cfg.resolved_device()))
     if cfg.trainer.num_iterations < saved.iteration:
         raise ValueError(
             f"trainer.num_iterations={cfg.trainer.num_iterations}: expected at least {saved.iteration}, those that are "
@@ -66,6 +67,22 @@ def resume(arguments: list[str]) -> int:
         )
     check_sources(cfg, resumes=True)
     return run_and_report(cfg, folder.resolve(), resume_from=saved)
+
+
+def _on_these_ranks(cfg: RunCfg, saved: checkpoint.Checkpoint) -> RunCfg:
+    """Share the envs out anew where a run goes on with another number of ranks: the dataset of all stays as large."""
+    before, now = saved.state.get(checkpoint.RANKS, {"size": 1})["size"], ranks.size()
+    if before == now:
+        return cfg
+    size = cfg.data.num_env_states_per_minibatch
+    if not isinstance(cfg.data, DatasetCfg) or cfg.num_envs * before % now or size * before % now:
+        raise ValueError(
+            f"the run was trained on {before} ranks with num_envs={cfg.num_envs} and minibatches of {size}, which "
+            f"{now} ranks cannot share equally, and a replay not at all: resume it on {before}"
+        )
+    shards = max(1, cfg.data.shards * before // now)
+    data = dataclasses.replace(cfg.data, num_env_states_per_minibatch=size * before // now, shards=shards)
+    return dataclasses.replace(cfg, num_envs=cfg.num_envs * before // now, data=data)
 
 
 def evaluate(arguments: list[str]) -> int:

@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import os
 import sys
+import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from ksim_rl import conf
+from ksim_rl import conf, ranks
 from ksim_rl.cli.errors import report
 from ksim_rl.cli.report import run_and_report
 from ksim_rl.cli.upstream import parse_flags
@@ -63,6 +64,12 @@ def train(arguments: list[str]) -> int:
     # A run folder is data: Hydra must not look for configs in it. The last of two folders counts.
     away = ["--config-dir", str(Path(conf.__file__).parent)] if name == conf.RUN_AGAIN else []
     overrides = list(flags.overrides)
+    if ranks.size() > 1 and flags.multirun:
+        raise ValueError(
+            "--multirun starts several runs, and torchrun several ranks of one: use one of the two"
+        )
+    if ranks.rank():  # rank 0 has the run's folder
+        overrides.append(f"hydra.run.dir={tempfile.mkdtemp(prefix='ksim-rl-rank-')}")
     if flags.multirun:  # jobs are named by what they differ in
         same = ",".join(f"'{key}'" for key in conf.without_sweeps(overrides))
         overrides.append(f"hydra.job.config.override_dirname.exclude_keys=[{same}]")

@@ -25,13 +25,15 @@ class DatasetCfg(Checked):
     """How many env states one RL update uses, and in how many gradient steps an epoch splits them.
 
     Recurrent networks learn on `sequence_length` successive steps of an env, None for the whole rollout, whose first
-    state is the stored one, or renewed by `burn_in` steps before it.
+    state is the stored one, or renewed by `burn_in` steps before it. With several ranks all sizes are those of each.
+    With `shards`, one process draws its minibatches from so many equal parts of its envs, as so many ranks would.
     """
 
     num_env_states_per_minibatch: Count
     num_minibatches: Count
     sequence_length: Count | None = None
     burn_in: WholeNumber = 0
+    shards: Count = 1
 
     @property
     def num_env_states(self) -> int:
@@ -39,7 +41,13 @@ class DatasetCfg(Checked):
         return self.num_env_states_per_minibatch * self.num_minibatches
 
     def rollout_length(self, num_envs: int) -> int:
-        """Return T for so many parallel environments; see `rollout_length`."""
+        """Return T for so many parallel environments; see `rollout_length`. Envs and minibatches have equal shards."""
+        size = self.num_env_states_per_minibatch
+        if num_envs % self.shards or size % self.shards:
+            raise ValueError(
+                f"shards={self.shards} does not divide num_envs={num_envs} and num_env_states_per_minibatch={size}: "
+                f"use a divisor of {math.gcd(num_envs, size)}"
+            )
         return rollout_length(self.num_env_states_per_minibatch, self.num_minibatches, num_envs)
 
     def with_rollout_length(self, length: int, num_envs: int) -> "DatasetCfg":
@@ -116,7 +124,9 @@ class DatasetBuffer(ReplayBuffer):
         self._dataset = DatasetStorage(cfg.num_env_states, device=device)
         super().__init__(
             storage=self._dataset,
-            sampler=EpochSampler(seed=seed) if sampler is None else sampler,
+            sampler=EpochSampler(seed=seed, shards=cfg.shards, num_minibatches=cfg.num_minibatches)
+            if sampler is None
+            else sampler,
             writer=DatasetWriter(),
             batch_size=cfg.num_env_states_per_minibatch,
         )

@@ -22,13 +22,25 @@ class EpochSampler(Sampler):
     A drop-in for TorchRL's `SamplerWithoutReplacement` in any replay buffer. The order is the rank of counter-based
     random keys, so it needs no generator, makes no host sync, can be captured in a CUDA graph (the epoch counter is a
     device tensor; capture whole epochs), and resumes from four integers.
+
+    With `shards`, it draws as so many ranks would: what is stored is so many equal parts, one after the other, and each
+    of the `num_minibatches` of an epoch has as many elements of each.
     """
 
     # Whether the last minibatch was the last of its epoch; iterating over the buffer stops there.
     ran_out: bool = False  # pyright: ignore[reportIncompatibleMethodOverride]
 
-    def __init__(self, *, seed: int = 0, shuffle: bool = True, drop_last: bool = False) -> None:
+    def __init__(
+        self,
+        *,
+        seed: int = 0,
+        shuffle: bool = True,
+        drop_last: bool = False,
+        shards: int = 1,
+        num_minibatches: int = 1,
+    ) -> None:
         self.seed, self.shuffle, self.drop_last = seed, shuffle, drop_last
+        self.shards, self.num_minibatches = shards, num_minibatches
         self._size = self._position = self._first_epoch = 0
         # Device tensors: epochs started so far, and the order of the present one.
         self._epoch: Tensor | None = None
@@ -85,13 +97,19 @@ class EpochSampler(Sampler):
         return index
 
     def _next_order(self, size: int, device: torch.device) -> Tensor:
-        if not self.shuffle:
-            return torch.arange(size, device=device)
         if self._epoch is None or self._epoch.device != device:
             self._epoch = torch.full((), self._first_epoch, dtype=torch.int64, device=device)
-        order_D = permutation(self.seed, self._epoch, size)
-        self._epoch.add_(1)
+        order_D = self._order(self._epoch, size)
+        self._epoch.add_(self.shuffle)
         return order_D
+
+    def _order(self, epoch: Tensor, size: int) -> Tensor:
+        """Return the order of an epoch: a random one unless `shuffle` is off, minibatch by minibatch."""
+        whole = torch.arange(size, device=epoch.device)
+        order_D = permutation(self.seed, epoch, size, shards=self.shards) if self.shuffle else whole
+        if self.shards == 1:
+            return order_D
+        return order_D.view(self.shards, self.num_minibatches, -1).transpose(0, 1).reshape(-1)
 
     def state_dict(self) -> dict[str, int]:
         """Return the integers from which the orders continue exactly (reads the epoch counter on the host)."""
@@ -109,8 +127,7 @@ class EpochSampler(Sampler):
             self._epoch.fill_(self._first_epoch)
         if self._position > 0:
             previous = torch.full((), self._first_epoch - 1, dtype=torch.int64, device=device)
-            unshuffled = torch.arange(self._size, device=device)
-            self._order_D = permutation(self.seed, previous, self._size) if self.shuffle else unshuffled
+            self._order_D = self._order(previous, self._size)
 
     def dumps(self, path: str | Path) -> None:
         """Write the state as JSON into the folder `path`."""
@@ -136,14 +153,20 @@ def stored(storage: Storage) -> int:
     return size
 
 
-def permutation(seed: int, epoch: Int64[Tensor, ""], size: int) -> Int64[Tensor, " D"]:
-    """Return a random permutation of `range(size)`, on the epoch's device, that depends on `seed` and `epoch` only."""
+def permutation(seed: int, epoch: Int64[Tensor, ""], size: int, *, shards: int = 1) -> Int64[Tensor, " D"]:
+    """Return a random permutation of `range(size)`, on the epoch's device, that depends on `seed` and `epoch` only.
+
+    With several ranks, each has its own; with `shards`, so many equal parts are permuted each as a rank would.
+    """
     seed_tensor = torch.full((), seed, dtype=torch.int64, device=epoch.device)
     keys = random.row_keys(seed_tensor, _STREAM, epoch, size)
     keys_D = random.integers(keys, 1, 0, 2**31 - 1).squeeze(1).to(torch.int32)
     # Of 100 000 keys of 31 bits about two pairs are equal. They keep their order, so it is still a permutation, and the
     # sort takes half the passes that it takes for 64 bits.
-    return torch.argsort(keys_D, stable=True)
+    if shards == 1:
+        return torch.argsort(keys_D, stable=True)
+    begin_S1 = torch.arange(0, size, size // shards, device=epoch.device)[:, None]
+    return (begin_S1 + torch.argsort(keys_D.view(shards, -1), stable=True)).flatten()
 
 
 BURN_IN_KEY = "burn_in"
@@ -175,8 +198,10 @@ class SequenceSampler(EpochSampler):
         rollout_length: int | None = None,
         seed: int = 0,
         shuffle: bool = True,
+        shards: int = 1,
+        num_minibatches: int = 1,
     ) -> None:
-        super().__init__(seed=seed, shuffle=shuffle)
+        super().__init__(seed=seed, shuffle=shuffle, shards=shards, num_minibatches=num_minibatches)
         self.sequence_length, self.burn_in, self.rollout_length = sequence_length, burn_in, rollout_length
 
     def begin(self, batch_size_ET: torch.Size, *, batch_size: int) -> None:

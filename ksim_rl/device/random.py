@@ -20,6 +20,7 @@ import warp as wp
 from jaxtyping import Float32, Int, Int64
 from torch import Tensor
 
+from ksim_rl import ranks
 from ksim_rl.device.quick_launch import QuickLaunch, as_operator
 
 DRAWS = r"""
@@ -98,6 +99,7 @@ class RowKeys(NamedTuple):
     stream: int
     counter: Tensor
     num_rows: int
+    first_row: int
 
 
 def stream_id(name: str) -> int:
@@ -105,12 +107,20 @@ def stream_id(name: str) -> int:
     return zlib.crc32(name.encode()) & 0x7FFFFFFF
 
 
-def row_keys(seed: Int64[Tensor, ""], stream: int, counter: Int[Tensor, "*rows"], num_rows: int) -> RowKeys:
-    """Name the coordinates of one draw for each env row.
+def row_keys(
+    seed: Int64[Tensor, ""],
+    stream: int,
+    counter: Int[Tensor, "*rows"],
+    num_rows: int,
+    *,
+    shared: bool = False,
+) -> RowKeys:
+    """Name the coordinates of one draw for each env row; with several ranks, rows are counted over all of them.
 
     Two streams (see `stream_id`) never share numbers. The counter has shape [] (all rows at the same count) or [E].
+    What is `shared` is drawn alike by all ranks.
     """
-    return RowKeys(seed, stream, counter, num_rows)
+    return RowKeys(seed, stream, counter, num_rows, 0 if shared else ranks.first_row(num_rows))
 
 
 def uniform(
@@ -156,6 +166,7 @@ class _Fill:
     span: wp.int64
     stream: wp.uint32
     counter_stride: int
+    first_row: int
     seed: wp.uint64
     counter: wp.uint64
     out: wp.uint64
@@ -168,17 +179,17 @@ class _Fill:
     const long long seed = *(const long long*)a.seed;
     const long long* __restrict__ counter = (const long long*)a.counter;
     const int begin_row = part * a.rows, begin = chunk * a.columns, n = a.n, stride = a.counter_stride;
-    const int end_row = begin_row + a.rows, end = begin + a.columns;
+    const int first = a.first_row, end_row = begin_row + a.rows, end = begin + a.columns;
     const unsigned stream = a.stream;
     auto fill = [&](auto write) {
         for (int row = begin_row; row < end_row; ++row) {
-            const RowKey key = key_of(seed, stream, counter[row * stride], row);
+            const RowKey key = key_of(seed, stream, counter[row * stride], first + row);
             for (int i = begin; i < end; ++i) write((long long)row * n + i, bits_of(key, (unsigned)i));
         }
     };
     auto fill_one_each = [&](auto write) {
         for (int row = begin_row; row < end_row; ++row)
-            write(row, bits_of(key_of(seed, stream, counter[row * stride], row), 0u));
+            write(row, bits_of(key_of(seed, stream, counter[row * stride], first + row), 0u));
     };
     auto run = [&](auto write) { n == 1 ? fill_one_each(write) : fill(write); };
     float* __restrict__ reals = (float*)a.out;
@@ -208,6 +219,7 @@ def _draw_now(
     stream: int,
     counter: Tensor,
     num_rows: int,
+    first_row: int,
     n: int,
     kind: int,
     low: float,
@@ -226,13 +238,20 @@ def _draw_now(
     rows, columns = (num_rows, n) if seed.device.type == "cpu" else (1, 1)
     dim = (num_rows // max(rows, 1), n // max(columns, 1))
     addresses = seed.data_ptr(), counter.data_ptr(), out_EL.data_ptr()
-    layout = rows, columns, n, kind, low, high, start, span, stream, counter.ndim
+    layout = rows, columns, n, kind, low, high, start, span, stream, counter.ndim, first_row
     _launch(seed.device, dim, *layout, *addresses)
     return out_EL
 
 
 def _draw_empty(
-    seed: Tensor, stream: int, counter: Tensor, num_rows: int, n: int, kind: int, *options: float
+    seed: Tensor,
+    stream: int,
+    counter: Tensor,
+    num_rows: int,
+    first_row: int,
+    n: int,
+    kind: int,
+    *options: float,
 ) -> Tensor:
     return seed.new_empty((num_rows, n), dtype=torch.int64 if kind == _INTEGER else torch.float32)
 

@@ -1,10 +1,10 @@
 """This module keeps an exact running mean and variance, in one process or over all ranks."""
 
 import torch
-import torch.distributed as dist
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from ksim_rl import ranks
 from ksim_rl.checks import check_in_range
 
 
@@ -19,7 +19,7 @@ class RunningMoments(nn.Module):
     `var`: bit-identical everywhere, and equal to one process that saw all the rows.
 
     `mean` and `var`, float32 [L], of all ranks, are 0 and 1 before the first `publish`; `count`, int64 [], is the rows
-    counted so far on this rank, which stops counting at `until`.
+    counted so far on this rank, which stops counting at `until` by the number of ranks.
     """
 
     mean: Tensor
@@ -74,7 +74,7 @@ class RunningMoments(nn.Module):
                 )
             valid_N = valid_N & valid.reshape(-1)
         if self.until is not None:
-            valid_N = valid_N & (self.count < self.until)
+            valid_N = valid_N & (self.count < self.until / ranks.size())
 
         exact_NL = torch.where(valid_N[:, None], values_NL, 0.0).to(torch.float64)
         weight_N = valid_N.to(torch.float64)
@@ -95,24 +95,17 @@ class RunningMoments(nn.Module):
     def publish(self) -> None:
         """Set `mean` and `var` from all that was counted; with several ranks all of them have to call it."""
         moments = self.count, self.exact_mean, self.exact_sum_of_squares
-        if has_ranks():
+        if ranks.size() > 1:
             own = torch.cat(
                 (self.count.to(torch.float64).reshape(1), self.exact_mean, self.exact_sum_of_squares)
             )
-            parts = [torch.empty_like(own) for _ in range(dist.get_world_size())]
-            dist.all_gather(parts, own)
-            split = [part.split((1, self.dim, self.dim)) for part in parts]
+            split = [part.split((1, self.dim, self.dim)) for part in ranks.gather(own)]
             moments = split[0][0][0], split[0][1], split[0][2]
             for count, mean, sum_of_squares in split[1:]:
                 moments = _merge(moments, (count[0], mean, sum_of_squares))
         count, mean, sum_of_squares = moments
         self.mean.copy_(mean)
         self.var.copy_(torch.where(count > 0, sum_of_squares / count.clamp_min(1), 1.0))
-
-
-def has_ranks() -> bool:
-    """Whether several processes train together."""
-    return dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1
 
 
 Moments = tuple[Tensor, Tensor, Tensor]

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ksim_rl import ranks
 from ksim_rl.checked import Count, NonNegative, Range, Share, WholeNumber, Within
 from ksim_rl.checks import check_in_range, unknown_name
 from ksim_rl.envs.term import CurriculumTerm
@@ -48,7 +49,7 @@ class LinearLevel(LevelCurriculum):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         share = (view.step_count - self.begin_step) / (self.end_step - self.begin_step)
         level = self.initial_level + (1.0 - self.initial_level) * share.clamp(0.0, 1.0)
-        view.level.copy_(torch.where(mask_E.any(), level.to(torch.float32), view.level))
+        view.level.copy_(torch.where(ranks.any_of(mask_E), level.to(torch.float32), view.level))
         return view.level.clone()
 
 
@@ -78,8 +79,10 @@ class SteppedLevel(LevelCurriculum):
         ended_E = mask_E & (view.episode_step_E > 0)
         held_2 = view.shared("episodes_and_score_2", (0.0, 0.0))
         ended_E2 = torch.stack((torch.ones_like(ended_E, dtype=torch.float32), self.score(view)), dim=-1)
-        total_2 = held_2 + torch.where(ended_E[:, None], ended_E2, 0.0).sum(0)
-        is_enough = total_2[0] >= (self.min_episodes or view.num_envs)
+        added_2 = torch.where(ended_E[:, None], ended_E2, 0.0).sum(0)
+        ranks.sum_([added_2])
+        total_2 = held_2 + added_2
+        is_enough = total_2[0] >= (self.min_episodes or view.num_envs * ranks.size())
         mean = total_2[1] / total_2[0].clamp(min=1.0)
         level = moved_level(view.level, mean, 1.0 / self.num_levels, self.raise_above, self.lower_below)
         view.level.copy_(torch.where(is_enough, level, view.level))
@@ -182,7 +185,7 @@ class RewardWeight(CurriculumTerm):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         held = view.reward_weights[self.reward]
-        held.copy_(torch.where(mask_E.any(), self.weight(view, held), held))
+        held.copy_(torch.where(ranks.any_of(mask_E), self.weight(view, held), held))
         return held.clone()
 
 
@@ -238,10 +241,10 @@ class CommandRangesByStage(CurriculumTerm):
                 pair_2 = constant(pair, view.device)
                 wanted[field] = torch.where(view.step_count >= step, pair_2, wanted[field])
         for field, held_2 in held.items():
-            held_2.copy_(torch.where(mask_E.any(), wanted[field], held_2))
+            held_2.copy_(torch.where(ranks.any_of(mask_E), wanted[field], held_2))
         stage = (view.step_count >= constant(sorted(self.stages), view.device)).sum().to(torch.float32)
         held_stage = view.shared("stage", 0.0)
-        held_stage.copy_(torch.where(mask_E.any(), stage, held_stage))
+        held_stage.copy_(torch.where(ranks.any_of(mask_E), stage, held_stage))
         return held_stage.clone()
 
 
@@ -264,7 +267,7 @@ class CommandRangesByLevel(CurriculumTerm):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         for field, held_2 in _ranges_of(view, self.command, self.start).items():
             start_2, end_2 = constant(self.start[field], view.device), constant(self.end[field], view.device)
-            held_2.copy_(torch.where(mask_E.any(), by_level(start_2, end_2, view.level), held_2))
+            held_2.copy_(torch.where(ranks.any_of(mask_E), by_level(start_2, end_2, view.level), held_2))
         return view.level.clone()
 
 

@@ -10,6 +10,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
+from ksim_rl import ranks
+
 
 class ExploringPolicy(TensorDictModuleBase):
     """Lets a policy act with noise on its actions, and before learning starts with random actions instead.
@@ -48,9 +50,9 @@ class ExploringPolicy(TensorDictModuleBase):
         action = acting.get("action")
         if self.noise_max > 0.0:
             half_range = (self._high_L - self._low_L) / 2
-            noise = torch.randn_like(action) * self.noise_scale_E1 * half_range
+            noise = ranks.randn(action.shape, device=action.device) * self.noise_scale_E1 * half_range
             action = torch.maximum(torch.minimum(action + noise, self._high_L), self._low_L)
-        anything = self._low_L + torch.rand_like(action) * (self._high_L - self._low_L)
+        anything = self._low_L + ranks.rand(action.shape, device=action.device) * (self._high_L - self._low_L)
         return tensordict.set("action", torch.where(self.random, anything, action))
 
     @torch.no_grad()
@@ -64,7 +66,7 @@ class ExploringPolicy(TensorDictModuleBase):
         return {"random": self.random, "noise_scale": self.noise_scale_E1}
 
     def _draw_scales(self, num_envs: int) -> Tensor:
-        unit_E1 = torch.rand(num_envs, 1, device=self._low_L.device)
+        unit_E1 = ranks.rand((num_envs, 1), device=self._low_L.device)
         return self.noise_min + (self.noise_max - self.noise_min) * unit_E1
 
 
@@ -105,6 +107,6 @@ class MixedPolicy(TensorDictModuleBase):
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             shown = self.teacher(seen).get("action")
         action = acted.get("action")
-        helped_E = torch.rand(acted.batch_size, device=action.device) < self.share
+        helped_E = ranks.rand(acted.batch_size, device=action.device) < self.share
         helped = helped_E.reshape(*acted.batch_size, *[1] * (action.ndim - acted.batch_dims))
         return acted.set("action", torch.where(helped, shown, action))

@@ -14,6 +14,8 @@ from torch.distributions import Distribution, constraints, kl_divergence, regist
 from torch.nn import functional
 from torch.special import log_ndtr, ndtri
 
+from ksim_rl import ranks
+
 _HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
 # Below it exp() underflows in float32, and the inverse of the distribution function is found in another way.
 _LOG_TINY = -80.0
@@ -106,7 +108,7 @@ class DiagonalGaussian(VectorDistribution):
     def rsample(self, sample_shape: Any = ()) -> Float[Tensor, "*shape L"]:
         """Draw by reparametrization: gradients reach `loc` and `scale`."""
         shape = torch.Size(sample_shape) + self.loc.shape
-        noise = torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device)
+        noise = ranks.randn(shape, dim=len(sample_shape), dtype=self.loc.dtype, device=self.loc.device)
         return self.loc + self.scale * noise
 
     def log_prob(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*shape"]:
@@ -234,7 +236,8 @@ class TruncatedGaussian(BoundedDistribution):
         with torch.no_grad():
             a, b = self._a, self._b
             eps = torch.finfo(self.loc.dtype).eps
-            share = torch.rand(shape, dtype=self.loc.dtype, device=self.loc.device).clamp_min(eps)
+            share = ranks.rand(shape, dim=len(sample_shape), dtype=self.loc.dtype, device=self.loc.device)
+            share = share.clamp_min(eps)
             cdf_ratio = (self._log_cdf_a - self._log_cdf_b).exp()
             log_cdf = self._log_cdf_b + (share + (1.0 - share) * cdf_ratio).log()
             z = torch.minimum(torch.maximum(_inverse_log_ndtr(log_cdf), a), b)
@@ -359,7 +362,8 @@ class Categorical(Distribution):
         with torch.no_grad():
             for log_probs in self._log_probs:
                 shape = torch.Size(sample_shape) + log_probs.shape
-                waiting = torch.empty(shape, dtype=log_probs.dtype, device=log_probs.device).exponential_()
+                like = {"dtype": log_probs.dtype, "device": log_probs.device}
+                waiting = ranks.exponential(shape, dim=len(sample_shape), **like)
                 chosen.append((log_probs - waiting.log()).argmax(-1))
         return self._as_value(chosen)
 

@@ -11,6 +11,7 @@ from torch.distributions import Distribution
 from torchrl import objectives
 from torchrl.modules.distributions.utils import has_analytic_entropy, sample_and_log_prob
 
+from ksim_rl import ranks
 from ksim_rl.objectives.masked import standardized
 from ksim_rl.objectives.policy_kl import (
     distribution_keys,
@@ -189,8 +190,9 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
 
     def _standardize_advantage(self, advantage: Tensor, tensordict: TensorDictBase) -> Tensor:
         mask_B = self._mask(tensordict, advantage)
-        if mask_B is None or self.normalize_advantage_exclude_dims:
+        if self.normalize_advantage_exclude_dims or mask_B is None and ranks.size() == 1:
             return super()._standardize_advantage(advantage, tensordict)
+        mask_B = torch.ones_like(advantage, dtype=torch.bool) if mask_B is None else mask_B
         # The bound is that of TorchRL.
         return standardized(advantage, mask_B, lowest_std=torch.finfo(torch.float32).resolution)
 

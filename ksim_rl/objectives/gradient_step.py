@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
+from ksim_rl import ranks
 from ksim_rl.objectives.algorithm_cfg import GradientCfg, OnPolicyCfg
 
 
@@ -160,16 +161,36 @@ def descend_together(
 
     No loss may reach a parameter of another's optimizer.
     """
+    go_back(losses, optimizers)
+    return {name: step(optimizers[name], loss, max_grad_norm=max_grad_norm) for name, loss in losses.items()}
+
+
+def go_back(
+    losses: Mapping[str, Float[Tensor, ""]],
+    optimizers: Mapping[str, torch.optim.Optimizer],
+    *,
+    beside: Iterable[Float[Tensor, ""]] = (),
+) -> None:
+    """Compute the gradients of each loss, means over all ranks; losses and what is `beside` become means in place."""
     for name in losses:
         optimizers[name].zero_grad(set_to_none=True)
     torch.autograd.backward(list(losses.values()))
-    steps = {}
-    for name, loss in losses.items():
-        optimizer = optimizers[name]
-        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-        grad_norm, found_inf = clip_and_guard(parameters, max_grad_norm, loss=loss.detach())
-        # Fused optimizers read these two, which torch's GradScaler sets as well, and skip the step on the device.
-        optimizer.grad_scale, optimizer.found_inf = None, found_inf  # type: ignore[attr-defined]
-        optimizer.step()
-        steps[name] = grad_norm, found_inf
-    return steps
+    if ranks.size() > 1:
+        learnt = [parameter.grad for name in losses for parameter in _parameters(optimizers[name])]
+        gradients = [gradient for gradient in learnt if gradient is not None]
+        ranks.mean_([*gradients, *(value.detach() for value in (*losses.values(), *beside))])
+
+
+def step(
+    optimizer: torch.optim.Optimizer, loss: Float[Tensor, ""], *, max_grad_norm: float | None
+) -> tuple[Float32[Tensor, ""], Float32[Tensor, ""]]:
+    """Make the gradient step whose gradients are there; see `descend`."""
+    grad_norm, found_inf = clip_and_guard(_parameters(optimizer), max_grad_norm, loss=loss.detach())
+    # Fused optimizers read these two, which torch's GradScaler sets as well, and skip the step on the device.
+    optimizer.grad_scale, optimizer.found_inf = None, found_inf  # type: ignore[attr-defined]
+    optimizer.step()
+    return grad_norm, found_inf
+
+
+def _parameters(optimizer: torch.optim.Optimizer) -> list[nn.Parameter]:
+    return [parameter for group in optimizer.param_groups for parameter in group["params"]]

@@ -6,6 +6,8 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from ksim_rl import ranks
+
 # Where TorchRL's losses look for rows to leave out (`LossModule.loss_mask_key`), stock ones included.
 MASK_KEY: NestedKey = ("collector", "mask")
 
@@ -25,8 +27,11 @@ def masked_mean(values: Float[Tensor, "*batch"], mask: Bool[Tensor, "*batch"]) -
 def standardized(
     values: Float[Tensor, "*batch"], mask: Bool[Tensor, "*batch"], *, lowest_std: float
 ) -> Float[Tensor, "*batch"]:
-    """Shift and scale values to mean 0 and standard deviation 1 (or divide by `lowest_std`) over those in `mask`."""
+    """Shift and scale to mean 0 and standard deviation 1, or divide by `lowest_std`, over all that masks mark."""
     zero, count = torch.zeros_like(values), mask.sum()
-    error = values - torch.where(mask, values, zero).sum() / count.clamp_min(1)
-    variance = torch.where(mask, error, zero).square().sum() / (count - 1).clamp_min(1)
-    return error / variance.sqrt().clamp_min(lowest_std)
+    total = torch.where(mask, values, zero).sum()
+    ranks.sum_([total, count])
+    error = values - total / count.clamp_min(1)
+    squares = torch.where(mask, error, zero).square().sum()
+    ranks.sum_([squares])
+    return error / (squares / (count - 1).clamp_min(1)).sqrt().clamp_min(lowest_std)

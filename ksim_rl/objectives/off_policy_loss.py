@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import LossModule
 
+from ksim_rl import ranks
 from ksim_rl.checked import Share, check_value
 from ksim_rl.checks import check_in_range
 from ksim_rl.device.running_moments import RunningMoments
@@ -314,7 +315,7 @@ class TD3Loss(OffPolicyLoss):
         with torch.no_grad():
             following = tensordict.get("next").select(*self.actor_network.in_keys)
             action = self.actor_network(following).get(self.tensor_keys.action)
-            noise = (torch.randn_like(action) * self.target_noise).clamp(
+            noise = (ranks.randn(action.shape, device=action.device) * self.target_noise).clamp(
                 -self.target_noise_clip, self.target_noise_clip
             )
             action = action + noise * (self.high_L - self.low_L) / 2

@@ -16,7 +16,7 @@ from torch import Tensor
 from ksim_rl.objectives.advantage_estimators import GAE, RolloutEstimator, TDLambda, VTrace
 from ksim_rl.objectives.algorithm_cfg import OnPolicyCfg, PPOCfg
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
-from ksim_rl.objectives.gradient_step import StepGuard, adapt_learning_rate_, descend
+from ksim_rl.objectives.gradient_step import StepGuard, adapt_learning_rate_, go_back, step
 from ksim_rl.objectives.symmetry import Loss, SymmetricAugmentation, mirror_loss
 from ksim_rl.transforms import MirrorMap
 
@@ -121,20 +121,22 @@ def ppo_step(
     losses = loss(minibatch_B)
     total = reduce(add, [value for name, value in losses.items() if name.startswith("loss_")])
     learning_rate = optimizer.param_groups[0]["lr"]
+    measured = {name: value.detach() for name, value in losses.items() if isinstance(value, Tensor)}
+    go_back({"loss": total}, {"loss": optimizer}, beside=measured.values())
     if cfg.schedule == "adaptive":
         adapt_learning_rate_(
             learning_rate,
-            losses["kl"],
+            measured["kl"],
             desired_kl=cfg.desired_kl,
             lr_min=cfg.learning_rate_min,
             lr_max=cfg.learning_rate_max,
         )
-    grad_norm, found_inf = descend(total, optimizer, max_grad_norm=cfg.max_grad_norm)
+    grad_norm, found_inf = step(optimizer, total, max_grad_norm=cfg.max_grad_norm)
     if guard is not None:
         guard.count_(found_inf)
     return {
-        # Several actions have an entropy each, in a TensorDict beside their sum.
-        **{name: value.detach() for name, value in losses.items() if isinstance(value, Tensor)},
+        # Without the entropies of several actions, in a TensorDict beside their sum.
+        **measured,
         "loss": total.detach(),
         "grad_norm": grad_norm,
         "learning_rate": learning_rate.clone(),

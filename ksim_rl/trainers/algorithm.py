@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from ksim_rl import ranks
 from ksim_rl.data import DatasetCfg, ReplayCfg
 from ksim_rl.device.state_tree import State
 from ksim_rl.objectives import AlgorithmCfg
@@ -90,6 +91,7 @@ class Algorithm:
     policy: Callable[[RunCfg, EnvBase], TensorDictModuleBase]  # its weights: `update/actor` of a checkpoint
     data: DatasetCfg | ReplayCfg  # what `objective=<name>` chooses beside its settings, as are the modules
     modules: ModulesCfg = field(default_factory=ModulesCfg)
+    on_ranks: bool = False  # whether several ranks may train with it: its update takes means over them
 
 
 def algorithm_of(cfg: RunCfg) -> Algorithm:
@@ -99,7 +101,10 @@ def algorithm_of(cfg: RunCfg) -> Algorithm:
 
 def make_update(cfg: RunCfg, env: EnvBase, *, resumed: Mapping[str, Any] | None = None) -> Update:
     """Build everything that learns in a run, with all its memory allocated; see `Algorithm.update`."""
-    return algorithm_of(cfg).update(cfg, env, resumed)
+    algorithm = algorithm_of(cfg)
+    if ranks.size() > 1 and not algorithm.on_ranks:
+        raise ValueError(f"objective={algorithm.name} trains on one rank only: start it without torchrun")
+    return algorithm.update(cfg, env, resumed)
 
 
 def make_policy(cfg: RunCfg, env: EnvBase) -> TensorDictModuleBase:

@@ -9,7 +9,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from ksim_rl import envs
+from ksim_rl import envs, ranks
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.modules import RecurrentStatePrimer, recurrent_transforms, state_spec
@@ -72,7 +72,7 @@ def build(
         trainer.load_state_dict(resume_from.state)
     elif cfg.checkpoint is not None:
         trainer.load_weights(Path(cfg.checkpoint))
-    if run_folder is not None:
+    if run_folder is not None and ranks.rank() == 0:
         # Last, because a run that cannot be built must not show up anywhere.
         trainer.loggers = make_loggers(cfg.logger, run_folder, config=trainer.config)
     return trainer
@@ -108,7 +108,8 @@ def build_evaluator(
     """
     seed = cfg.seed + EVALUATION_SEED_OFFSET if seed is None else seed
     cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, curriculum={}))
-    env = build_env(cfg, num_envs=episodes or cfg.trainer.eval_episodes, seed=seed)
+    all_ranks = episodes or cfg.trainer.eval_episodes
+    env = build_env(cfg, num_envs=-(-all_ranks // ranks.size()), seed=seed)
     env.eval()
     clock = part(env, EpisodeClock)
     max_steps = (clock and clock.max_episode_length) or UNLIMITED_EPISODE_STEPS

@@ -9,6 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from ksim_rl import ranks
 from ksim_rl.device.capture import Captured
 from ksim_rl.envs.signal_keys import signal_keys
 
@@ -25,7 +26,7 @@ class Evaluation:
 
 
 class Evaluator:
-    """Runs the first episode of each env from the same seed, with the policy's deterministic action.
+    """Runs the first episode of each env from the same seed, with the policy's deterministic action; all ranks share.
 
     The envs `["E"]` are stepped by nothing else. Their own `max_episode_length` is the natural `max_steps`.
     After a call `length_E`, float64 [E], has the steps of each episode.
@@ -49,13 +50,15 @@ class Evaluator:
                 if stop():
                     return None
                 self._step()
-        std, mean = torch.std_mean(self._return_E, correction=0)
-        figures = torch.stack([mean, std, self.length_E.mean(), self._running_E.sum().to(torch.float64)])
+        own = self._return_E, self.length_E, self._running_E.to(torch.float64)
+        return_E, length_E, running_E = (torch.cat(ranks.gather(figure_E)) for figure_E in own)
+        std, mean = torch.std_mean(return_E, correction=0)
+        figures = torch.stack([mean, std, length_E.mean(), running_E.sum()])
         *means, unfinished = figures.tolist()
         names = ("return_mean", "return_std", "length_mean")
         return Evaluation(
             **dict(zip(names, means, strict=True)),
-            episodes=self._return_E.numel(),
+            episodes=return_E.numel(),
             unfinished=int(unfinished),
         )
 

@@ -12,10 +12,13 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from ksim_rl import ranks
+
 # What is shown, in this order, where the run has it: metric, label, format.
 SHOWN = (
     ("env_states", "env states", "{:,.0f}"),
     ("throughput/env_states_per_s", "env states/s", "{:,.0f}"),
+    ("throughput/slowest_rank", "slowest rank", "{:.0f}"),
     ("episode/return", "return", "{:.3g}"),
     ("episode/length", "episode length", "{:.4g}"),
     ("loss/policy", "policy loss", "{:.2g}"),
@@ -56,7 +59,7 @@ class RunProgress:
     ) -> None:
         self.total, self.done = total, done
         self.console = console or _OwnConsole(highlight=False)
-        self._enabled = enabled
+        self._enabled = enabled and ranks.rank() == 0
         self._status = ""
         self._metrics: dict[str, float] = {}
         self._live: Live | None = None
@@ -103,7 +106,9 @@ class RunProgress:
             self.note(f"iteration {iteration}/{self.total}: {shown}, left {left}")
 
     def note(self, text: str) -> None:
-        """Print one line that stays."""
+        """Print one line that stays; of several ranks only rank 0 says what is alike on all."""
+        if ranks.rank() and not text.startswith("NaN guard"):
+            return
         self._spoken = time.monotonic()
         self.console.print(text, markup=False, soft_wrap=True)
 

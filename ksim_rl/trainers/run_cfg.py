@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 import torch
 
+from ksim_rl import ranks
 from ksim_rl.checked import Checked, Count, Positive, WholeNumber, Within
 from ksim_rl.checks import near
 from ksim_rl.collectors import CollectorCfg
@@ -234,10 +235,9 @@ class RunCfg(TrainingCfg):
         return {**tree, PLUGINS: list(dict.fromkeys(needed))} if needed else tree
 
     def resolved_device(self) -> torch.device:
-        """Return the device that "auto" stands for here."""
-        if self.device == "auto":
-            return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        return torch.device(self.device)
+        """Return the device that "auto" stands for here, with several ranks the own GPU of this one."""
+        auto = "cuda" if torch.cuda.is_available() else "cpu"
+        return torch.device(ranks.device(auto if self.device == "auto" else self.device))
 
 
 def check_run_tree(tree: Mapping[str, Any], where: Path, *, given: Collection[str] = ()) -> None:

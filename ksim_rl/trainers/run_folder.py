@@ -10,6 +10,7 @@ from pathlib import Path
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
+from ksim_rl import ranks
 from ksim_rl.config.class_paths import loading_notes
 from ksim_rl.config.plugins import load as load_plugins
 from ksim_rl.device import state_tree
@@ -25,7 +26,7 @@ from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build, build_env
 from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_cfg import RunCfg
-from ksim_rl.trainers.trainer import Hook, Outcome
+from ksim_rl.trainers.trainer import Hook, Outcome, Trainer
 from ksim_rl.transforms import observation_columns
 
 EVALUATION, CURVES, VIDEO = "evaluation.json", "curves.png", "video.mp4"
@@ -54,6 +55,9 @@ def run(
     the folder, the checkpoint to resume or start from belongs to another config, or memory does not suffice; OSError
     when the folder is deleted or moved meanwhile, or the end cannot be saved.
     """
+    ranks.check_same({**cfg.to_tree(), "device": cfg.resolved_device().type}, what="config")
+    if ranks.rank():
+        return _follow(cfg, run_folder, progress, hooks, resume_from)
     run_folder.mkdir(parents=True, exist_ok=True)
     try:
         with locked(run_folder, note=progress.note), threads_that_fail(progress.note):
@@ -62,6 +66,21 @@ def run(
         with suppress(OSError):
             run_folder.rmdir()  # only where nothing is in it yet
         raise
+
+
+def _follow(
+    cfg: RunCfg,
+    run_folder: Path,
+    progress: RunProgress,
+    hooks: Sequence[Hook],
+    resume_from: checkpoint.Checkpoint | None,
+) -> Outcome:
+    """Train as one of several ranks, and leave all writing to rank 0."""
+    with memory_for(cfg.num_envs, cfg.resolved_device()):
+        trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
+    outcome = trainer.train(progress)
+    _close(trainer)
+    return outcome
 
 
 def _run_locked(
@@ -99,10 +118,14 @@ def _run_locked(
         if cfg.trainer.video and outcome.interrupted_by is None:
             path = run_folder / VIDEO
             record_video(cfg, trainer.update.actor, path, note=progress.note, status=progress.status)
+    _close(trainer)
+    return outcome
+
+
+def _close(trainer: Trainer) -> None:
     for owner in (trainer.collector, trainer.evaluator):
         if owner is not None:
             owner.env.close(raise_if_closed=False)
-    return outcome
 
 
 def load_policy(path: Path, *, device: str = "auto", plugins: Sequence[str] = ()) -> Policy:

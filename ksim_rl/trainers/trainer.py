@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from ksim_rl import ranks
 from ksim_rl.checks import near
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.envs.contract import EpisodeClock, EpisodeSums, missing_parts, part
@@ -20,6 +21,7 @@ from ksim_rl.trainers.metrics import (
     PendingMetrics,
     episode_means,
     explain_physics,
+    over_ranks,
     read_episode_sums,
     read_physics,
     start_copy,
@@ -28,6 +30,8 @@ from ksim_rl.trainers.metrics import (
 from ksim_rl.trainers.progress import RunClock, RunProgress
 from ksim_rl.trainers.run_cfg import TrainerCfg
 from ksim_rl.transforms import observation_columns
+
+INTERRUPTED = "sum/interrupted"  # how many ranks were asked to stop
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,9 +92,9 @@ class EvaluationHook(Hook):
 
     def __call__(self, trainer: "Trainer") -> None:
         """Evaluate, unless a signal asks to stop meanwhile."""
-        episodes = self.evaluator.env.batch_size[0]
+        episodes = self.evaluator.env.batch_size[0] * ranks.size()
         with trainer.clock.paused(), trainer.progress.busy(f"evaluating over {episodes} episodes"):
-            evaluation = self.evaluator(stop=trainer.interrupt.__bool__)
+            evaluation = self.evaluator(stop=lambda: ranks.size() == 1 and bool(trainer.interrupt))
         if evaluation is None:
             return
         trainer.evaluation, self._evaluated_at = evaluation, trainer.iteration
@@ -98,7 +102,7 @@ class EvaluationHook(Hook):
 
     def at_end(self, trainer: "Trainer") -> None:
         """Evaluate the final policy, once."""
-        if not trainer.interrupt and self._evaluated_at != trainer.iteration:
+        if not trainer.interrupted and self._evaluated_at != trainer.iteration:
             self(trainer)
 
 
@@ -169,14 +173,26 @@ class Trainer:
         self._hooks = (*judge, *hooks, CheckpointHook(interval=cfg.checkpoint_interval))
         self._overlaps = update.device.type == "cuda" if cfg.overlap is None else cfg.overlap
         self._unread: list[tuple[int, PendingMetrics]] = []
+        self.collecting = ranks.Timing(update.device)
         self._target_met = False
         self._warned: set[str] = set()
         self._non_finite_terms = 0.0
+        self._told_to_end = False  # by any rank
 
     @property
     def env_states(self) -> int:
         """Env states collected so far."""
-        return self.iteration * self.update.num_env_states
+        return self.iteration * self.num_env_states
+
+    @property
+    def num_env_states(self) -> int:
+        """Env states of an iteration, of all ranks."""
+        return self.update.num_env_states * ranks.size()
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether a signal asks to stop; with several ranks, whether all of them know of one."""
+        return self._told_to_end if ranks.size() > 1 else bool(self.interrupt)
 
     @property
     def solved(self) -> bool | None:
@@ -201,6 +217,7 @@ class Trainer:
                     for hook in self._hooks:
                         if hook.interval and self.iteration % hook.interval == 0:
                             self.settle()
+                            ranks.at(f"in {type(hook).__name__} after iteration {self.iteration}")
                             hook(self)
                 self.settle()
                 why = self._why_it_is_over()
@@ -226,12 +243,17 @@ class Trainer:
 
     def iterate(self) -> None:
         """Collect a rollout, learn from it, and report what happened: where iterations overlap, in the one before."""
+        self.collecting.begin(self.iteration + 1)
         rollout_ET = self.collector.collect()
+        self.collecting.end()
         self.update(rollout_ET)
         self.iteration += 1
         self.watch()
         env = self.collector.env
         metrics = read_episode_sums(env, rollout_ET) | read_physics(env) | self.update.metrics()
+        if ranks.size() > 1:
+            asked = torch.full((), float(bool(self.interrupt)), device=self.update.device)
+            metrics = over_ranks(metrics | {INTERRUPTED: asked})
         self._unread.append((self.iteration, start_copy(metrics, device=self.update.device)))
         self._report(all_but=1 if self._overlaps else 0)
 
@@ -246,7 +268,7 @@ class Trainer:
         self._look_at_target()
 
     def _is_over(self) -> bool:
-        ended = self._target_met or bool(self.interrupt) or bool(self.cfg.stop_when_solved and self.solved)
+        ended = self._target_met or self.interrupted or bool(self.cfg.stop_when_solved and self.solved)
         return ended or self.iteration >= self.cfg.num_iterations
 
     def _why_it_is_over(self) -> str:
@@ -269,6 +291,9 @@ class Trainer:
 
     def _report_iteration(self, iteration: int, read: dict[str, float]) -> None:
         env, seconds = self.collector.env, self.clock.lap()
+        if read.pop(INTERRUPTED, 0.0):
+            self._told_to_end = True
+            self.interrupt.signal = self.interrupt.signal or signal.SIGTERM
         clock = part(env, EpisodeClock)
         physics = explain_physics(env, read)
         for text in physics.saved:
@@ -281,14 +306,15 @@ class Trainer:
         self.metrics |= physics.metrics | {
             "iteration": iteration,
             "seconds": self.clock.total,
-            "throughput/env_states_per_s": self.update.num_env_states / seconds,
+            "throughput/env_states_per_s": self.num_env_states / seconds,
+            **self.collecting.slowest(),
         }
         if iteration % self.cfg.log_interval == 0 or iteration == self.cfg.num_iterations:
             self._write(self.metrics, iteration)
         self._look_at_target()
 
     def _write(self, metrics: dict[str, float], iteration: int) -> None:
-        env_states = iteration * self.update.num_env_states
+        env_states = iteration * self.num_env_states
         for logger in self.loggers:
             self._ask(logger, logger.log_metrics, metrics, env_states)
         self.progress.update(
@@ -345,7 +371,7 @@ class Trainer:
                 self.progress.note(f"warning: {text} (iteration {iteration}; said once)")
 
     def save(self) -> Path:
-        """Write a checkpoint of everything that the next iteration depends on; see `checkpoint.save`."""
+        """Write a checkpoint of everything that the next iteration depends on, of all ranks; see `checkpoint.save`."""
         assert self.folder is not None
         self.watch()
         with self.clock.paused():
@@ -402,6 +428,7 @@ class Trainer:
             )
         # A first reset allocates what the collector and the transforms keep, before the saved values go in.
         self.collector.reset()
+        state = checkpoint.own_part(state, self.state_dict)
         self.update.load_state_dict(state["update"])
         try:
             self.collector.env.load_state_dict(state["env"])

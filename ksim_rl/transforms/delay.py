@@ -91,12 +91,13 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
             return
         self.step_count.add_(1)
         # A shared lag is drawn once: a single row broadcasts over all.
-        num_rows, age = (self.num_rows, self.age_E + 1) if delay.per_env else (1, self.shared_age.add_(1))
+        age = self.age_E + 1 if delay.per_env else self.shared_age.add_(1)
+        one = not delay.per_env
         due = age % delay.resample_every == 0
         if delay.hold_probability:
-            chance = random.uniform(self._step_keys("step/hold", num_rows), 1)[:, 0]
+            chance = random.uniform(self._step_keys("step/hold", shared=one), 1)[:, 0]
             due = due & (chance >= delay.hold_probability)
-        self.lag_E.copy_(torch.where(due, self._draw(self._step_keys("step/lag", num_rows)), self.lag_E))
+        self.lag_E.copy_(torch.where(due, self._draw(self._step_keys("step/lag", shared=one)), self.lag_E))
 
     def _rows_that_reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
         """Return which rows reset, bool [E], with what the rings do not do as these rows begin."""
@@ -112,7 +113,8 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
         together = mask_E.all()
         self.shared_count.add_(together)
         self.shared_age.mul_(~together)
-        keys = random.row_keys(self.seed_value, self._stream_ids["reset/lag"], self.shared_count, 1)
+        stream = self._stream_ids["reset/lag"]
+        keys = random.row_keys(self.seed_value, stream, self.shared_count, 1, shared=True)
         self.lag_E.copy_(torch.where(together, self._draw(keys), self.lag_E))
         return mask_E
 

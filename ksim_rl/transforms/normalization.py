@@ -8,8 +8,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Composite, Unbounded
 
-from ksim_rl import checks
-from ksim_rl.device.running_moments import RunningMoments, has_ranks
+from ksim_rl import checks, ranks
+from ksim_rl.device.running_moments import RunningMoments
 from ksim_rl.transforms import upstream
 from ksim_rl.transforms.row_transform import Keys, RowTransform
 from ksim_rl.transforms.specs import Device
@@ -20,7 +20,7 @@ class ObservationNormalization(RowTransform):
 
     Each env state counts once: the one that a step reaches at that step, and a reset observation at its reset, for the
     rows that reset. Statistics are per element and float64 (`RunningMoments`); states that are not finite do not count.
-    After `until` env states (on each rank) they stay. The default `eps` bounds the standard deviation below by 0.01.
+    After `until` env states (of all ranks) they stay. The default `eps` bounds the standard deviation below by 0.01.
 
     `env.eval()` freezes the statistics and `env.train()` goes on, `enable_` does the same for one transform; both write
     a device flag, so a captured or compiled step follows. With `torch.distributed`, the ranks merge their statistics in
@@ -95,7 +95,7 @@ class ObservationNormalization(RowTransform):
         for values_EL, moments in self._flat(tensordict_reset, self.num_rows):
             moments.count_rows(values_EL, mask_E & self.updating)
             # Ranks reset at different times, so they cannot merge here.
-            if not has_ranks():
+            if ranks.size() == 1:
                 moments.publish()
         return self._normalize(tensordict_reset)
 
@@ -103,7 +103,7 @@ class ObservationNormalization(RowTransform):
         self._sized()
         for values_EL, moments in self._flat(next_tensordict, self.num_rows):
             moments.count_rows(values_EL, self.updating.expand(self.num_rows))
-            if self._collective or not has_ranks():
+            if self._collective or ranks.size() == 1:
                 moments.publish()
         return self._normalize(next_tensordict)
 

@@ -13,6 +13,7 @@ import warp as wp
 from jaxtyping import Bool, Int32, Int64, Shaped
 from torch import Tensor
 
+from ksim_rl import ranks
 from ksim_rl.device.quick_launch import QuickLaunch, address, as_operator
 from ksim_rl.device.random import DRAWS
 
@@ -28,6 +29,7 @@ class _Ring:
     stride: int
     num_parts: int
     counts: int
+    first_row: int
     stream: wp.uint32
     lowest: int
     span: int
@@ -61,7 +63,8 @@ class _Ring:
     if (lane == 0 && writes && a.counts) *age = now;
     if (lane == 0 && resets && writes && a.draw_count) {
         const long long count = ++((long long*)a.draw_count)[row];
-        const unsigned long long bits = bits_of(key_of(*(const long long*)a.seed, a.stream, count, row), 0u);
+        const RowKey key = key_of(*(const long long*)a.seed, a.stream, count, a.first_row + row);
+        const unsigned long long bits = bits_of(key, 0u);
         ((long long*)a.lag)[row] = a.lowest + (long long)((bits * (unsigned)a.span) >> 32);
     }
     // Whole numbers of 32 bits divide much faster.
@@ -222,7 +225,8 @@ def _launch(
         width = 16 if bits % 16 == 0 else 4 if bits % 4 == 0 else 1
         lanes = _LANES if num_frames * num_bytes <= 32 * _LANES * width * num_parts else _MANY_LANES
     layout = width, lanes, num_bytes, value_stride, num_slots, num_frames, stride, num_parts, counts
-    draws = stream, lowest, highest - lowest + 1, address(seed), address(draw_count_E)
+    first_row = ranks.first_row(num_rows)
+    draws = first_row, stream, lowest, highest - lowest + 1, address(seed), address(draw_count_E)
     tensors = age_E.data_ptr(), address(lag_E), address(mask_E), address(parts), value
     _quick(device, (num_rows, lanes), *layout, *draws, *tensors, ring_EM.data_ptr(), out_EL.data_ptr())
     return out_EL

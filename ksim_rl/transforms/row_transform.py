@@ -279,9 +279,9 @@ class KeyedTransform(RowTransform):
         self.reset_count_E.add_(mask_E)
         return mask_E
 
-    def _step_keys(self, purpose: str, num_rows: int | None = None) -> random.RowKeys:
-        rows = self.num_rows if num_rows is None else num_rows
-        return random.row_keys(self.seed_value, self._stream_ids[purpose], self.step_count, rows)
+    def _step_keys(self, purpose: str, *, shared: bool = False) -> random.RowKeys:
+        stream, rows = self._stream_ids[purpose], 1 if shared else self.num_rows
+        return random.row_keys(self.seed_value, stream, self.step_count, rows, shared=shared)
 
     def _reset_keys(self, purpose: str) -> random.RowKeys:
         return random.row_keys(self.seed_value, self._stream_ids[purpose], self.reset_count_E, self.num_rows)

@@ -11,6 +11,7 @@ from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from ksim_rl import ranks
 from ksim_rl.algorithms.gradient_steps import (
     RolloutUpdate,
     StepMeans,
@@ -138,10 +139,9 @@ class AMPUpdate(RolloutUpdate):
         self.replay.extend(rollout_ET.select(*self._features, *STANDARD.following))
         net, made, shown = self.discriminator, [], []
         for minibatch_B in self.replay.minibatches(self.cfg.num_discriminator_steps):
-            drawn_B = torch.randint(
-                len(self.reference_N2L), minibatch_B.batch_size, device=self.reference_N2L.device
-            )
-            reference_B2L = self.reference_N2L[drawn_B]
+            shown_N2L = self.reference_N2L
+            drawn_B = ranks.randint(len(shown_N2L), minibatch_B.batch_size, device=shown_N2L.device)
+            reference_B2L = shown_N2L[drawn_B]
             policy_B2L = _transitions(minibatch_B, *self._features)
             loss, logged = discriminator_loss(
                 net.judge,

@@ -6,4 +6,6 @@ from ksim_rl.objectives import PPOCfg
 from ksim_rl.trainers.algorithm import Algorithm
 
 DATA = DatasetCfg(num_env_states_per_minibatch=4096, num_minibatches=4)
-PPO = Algorithm(name="ppo", cfg=PPOCfg, update=make_ppo_update, policy=make_ppo_policy, data=DATA)
+PPO = Algorithm(
+    name="ppo", cfg=PPOCfg, update=make_ppo_update, policy=make_ppo_policy, data=DATA, on_ranks=True
+)

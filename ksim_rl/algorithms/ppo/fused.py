@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor, nn
 
+from ksim_rl import ranks
 from ksim_rl.data import DatasetBuffer, EpochSampler
-from ksim_rl.device.running_moments import has_ranks
 from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, ValueNetwork
 from ksim_rl.modules.actor import MIN_STD, GaussianHead
 from ksim_rl.modules.network import side_by_side
@@ -35,7 +35,7 @@ def make_fused_ppo(
     """Build the fused gradient steps of a run, or return why torch has to make them."""
     if device.type != "cuda" or importlib.util.find_spec("triton") is None:
         return "they need CUDA and Triton"
-    if has_ranks():
+    if ranks.size() > 1:
         return "several ranks train together"
     if type(dataset.sampler) is not EpochSampler:
         return f"minibatches come from a {type(dataset.sampler).__name__}"

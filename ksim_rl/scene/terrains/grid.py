@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from ksim_rl import ranks
 from ksim_rl.checked import Count, Positive, WholeNumber
 from ksim_rl.checks import check_count, check_in_range
 from ksim_rl.scene.state.ground import Ground
@@ -162,9 +163,11 @@ class PatchedGround(Ground):
         self._columns_P = torch.tensor(mj_model.hfield_ncol[patches], dtype=torch.int64, device=device)
         self._spawn_heights_P = torch.tensor(spawn_heights, dtype=torch.float32, device=device)
 
-        place_E = torch.arange(view.num_envs, device=device)
-        self._column_E = place_E * self._num_columns // view.num_envs
-        first_E = torch.searchsorted(self._column_E, self._column_E)
+        # By an env's place among those of all ranks.
+        place_E = torch.arange(view.num_envs, device=device) + ranks.first_row(view.num_envs)
+        num_places = view.num_envs * ranks.size()
+        self._column_E = place_E * self._num_columns // num_places
+        first_E = -(-self._column_E * num_places // self._num_columns)
         self._first_level_E = (place_E - first_E) % (max_initial_level + 1)
         self._types_E = torch.tensor([kinds.index(kind) for kind in grid.columns], device=device)[
             self._column_E

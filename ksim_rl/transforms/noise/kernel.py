@@ -10,6 +10,7 @@ import warp as wp
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
+from ksim_rl import ranks
 from ksim_rl.device.quick_launch import QuickLaunch, address, as_operator
 from ksim_rl.device.random import DRAWS
 
@@ -32,6 +33,7 @@ class _Noise:
     n: int
     mode: int
     features: int
+    first_row: int
     stream: wp.uint32
     seed: wp.uint64
     counter: wp.uint64
@@ -70,7 +72,7 @@ _COLUMNS = r"""
     const float levelled = enabled * *(const float*)a.level;
     const bool resets = mode == 2;
 
-    const RowKey key = key_of(seed, a.stream, count, row);
+    const RowKey key = key_of(seed, a.stream, count, a.first_row + row);
     auto bits = [=](unsigned index) { return bits_of(key, index); };
     auto sample = [&](int i, unsigned index, int parameter, bool is_normal, int features) {
         const unsigned b = bits(index);
@@ -212,7 +214,8 @@ def _launch(
     state = seed, counter, enabled, level, mask_E, table_PL, flags_L
     tensors = *state, clean_EL, bias_EL, walk_EL, last_EL, out_EL
     dim = (num_rows, 1 if device.type == "cpu" else _LANES)
-    _quick(device, dim, num_columns, moment, features, stream, *map(address, tensors))
+    layout = num_columns, moment, features, ranks.first_row(num_rows), stream
+    _quick(device, dim, *layout, *map(address, tensors))
     return out_EL
 
 

@@ -1,0 +1,36 @@
+"""Several processes train together here: each is a rank with envs of its own, started by torchrun, one per GPU.
+
+All numbers are drawn by an env's place among those of all ranks, means are over all ranks, and rank 0 writes. A process
+that was not started so is one of one, for which nothing here does anything.
+"""
+
+from ksim_rl.ranks.draws import exponential, rand, randint, randn
+from ksim_rl.ranks.group import first_row, rank, size
+from ksim_rl.ranks.heartbeat import at
+from ksim_rl.ranks.reduce import any_of, gather, mean_, sum_
+from ksim_rl.ranks.shards import dealt, gathered
+from ksim_rl.ranks.start import check_same, device, from_first, joined, launched
+from ksim_rl.ranks.timing import Timing
+
+__all__ = [
+    "Timing",
+    "any_of",
+    "at",
+    "check_same",
+    "dealt",
+    "device",
+    "exponential",
+    "first_row",
+    "from_first",
+    "gather",
+    "gathered",
+    "joined",
+    "launched",
+    "mean_",
+    "rand",
+    "randint",
+    "randn",
+    "rank",
+    "size",
+    "sum_",
+]

@@ -1,0 +1,43 @@
+"""Torch's random numbers are drawn here, by each rank the rows that are its own.
+
+All ranks draw the rows of all, in step, so that their generators stay alike, and keep theirs: what one process with as
+many rows as all ranks together would see there. With one rank these are torch's functions. Rows are those of the dim
+`dim`; `options` are torch's dtype and device.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Shaped
+from torch import Tensor
+
+from ksim_rl.ranks.group import first_row, size
+
+
+def rand(shape: Sequence[int], *, dim: int = 0, **options: Any) -> Shaped[Tensor, "*shape"]:
+    """Draw from the uniform distribution on [0, 1)."""
+    return _own(torch.rand, shape, dim, options)
+
+
+def randn(shape: Sequence[int], *, dim: int = 0, **options: Any) -> Shaped[Tensor, "*shape"]:
+    """Draw from the standard normal distribution."""
+    return _own(torch.randn, shape, dim, options)
+
+
+def randint(high: int, shape: Sequence[int], *, dim: int = 0, **options: Any) -> Shaped[Tensor, "*shape"]:
+    """Draw integers from {0, ..., high - 1}, each with the same probability."""
+    return _own(lambda whole, **options: torch.randint(high, whole, **options), shape, dim, options)
+
+
+def exponential(shape: Sequence[int], *, dim: int = 0, **options: Any) -> Shaped[Tensor, "*shape"]:
+    """Draw from the exponential distribution of mean 1."""
+    return _own(lambda whole, **options: torch.empty(whole, **options).exponential_(), shape, dim, options)
+
+
+def _own(draw: Callable[..., Tensor], shape: Sequence[int], dim: int, options: dict[str, Any]) -> Tensor:
+    if size() == 1:
+        return draw(shape, **options)
+    whole = list(shape)
+    whole[dim] *= size()
+    return draw(whole, **options).narrow(dim, first_row(shape[dim]), shape[dim])

@@ -1,0 +1,18 @@
+"""This module says which of several processes this one is, and which rows of their envs and draws are its own."""
+
+import torch.distributed as dist
+
+
+def size() -> int:
+    """Return how many ranks train together."""
+    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
+
+
+def rank() -> int:
+    """Return which of the ranks this process is, from 0 on."""
+    return dist.get_rank() if dist.is_available() and dist.is_initialized() else 0
+
+
+def first_row(num_rows: int) -> int:
+    """Return the place of this rank's first row among those of all ranks, each of which has `num_rows`."""
+    return rank() * num_rows

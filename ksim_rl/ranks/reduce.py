@@ -1,0 +1,60 @@
+"""Sums and means over all ranks are taken here, of many tensors in one collective, without a host sync.
+
+Each rank sees the same bits. With one rank nothing is copied or computed. NCCL's collectives are captured in CUDA
+graphs like any other kernel.
+"""
+
+from collections.abc import Sequence
+
+import torch
+import torch.distributed as dist
+from jaxtyping import Bool, Float, Num, Shaped
+from torch import Tensor
+
+from ksim_rl.ranks.group import size
+
+
+def sum_(tensors: Sequence[Num[Tensor, "*?shape"]]) -> None:
+    """Replace each tensor by its sum over the ranks, in place: one collective for each dtype."""
+    _reduce_(tensors, 1)
+
+
+def mean_(tensors: Sequence[Float[Tensor, "*?shape"]]) -> None:
+    """Replace each tensor by its mean over the ranks, in place: one collective for each dtype."""
+    _reduce_(tensors, size())
+
+
+@torch.no_grad()
+def _reduce_(tensors: Sequence[Tensor], parts: int) -> None:
+    if size() == 1:
+        return
+    by_dtype: dict[torch.dtype, list[Tensor]] = {}
+    for tensor in tensors:
+        by_dtype.setdefault(tensor.dtype, []).append(tensor)
+    for group in by_dtype.values():
+        flat = torch.cat([tensor.reshape(-1) for tensor in group])
+        if parts > 1:  # before they are added, so that sums of large gradients stay finite
+            flat.div_(parts)
+        dist.all_reduce(flat)
+        pieces = flat.split([tensor.numel() for tensor in group])
+        torch._foreach_copy_(
+            group, [piece.view_as(tensor) for piece, tensor in zip(pieces, group, strict=True)]
+        )
+
+
+def gather(tensor: Shaped[Tensor, "*shape"]) -> list[Shaped[Tensor, "*shape"]]:
+    """Return the tensors of all ranks, which have the same shape, in their order."""
+    if size() == 1:
+        return [tensor]
+    parts = [torch.empty_like(tensor) for _ in range(size())]
+    dist.all_gather(parts, tensor.contiguous())
+    return parts
+
+
+def any_of(mask: Bool[Tensor, "*rows"]) -> Bool[Tensor, ""]:
+    """Return whether any row of any rank is marked, on the device."""
+    if size() == 1:
+        return mask.any()
+    count = mask.sum()
+    sum_([count])
+    return count > 0

@@ -1,0 +1,113 @@
+"""A checkpoint of several ranks is gathered and dealt out here: each tensor once, or once per rank where they differ.
+
+The same number of ranks gets its own tensors back, bit for bit. Another number is dealt the same envs anew, by their
+place among those of all ranks: 1 to 2 to 1 is the run without a break.
+"""
+
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from jaxtyping import Shaped
+from torch import Tensor
+
+from ksim_rl.ranks.group import rank, size
+
+Tensors = dict[str, Shaped[Tensor, "*?leaf"]]
+# The parts of `RunningMoments`: of the observations that a rank has seen itself.
+_COUNT, _MEAN, _SQUARES = "count", "exact_mean", "exact_sum_of_squares"
+
+
+def gathered(own: Mapping[str, Shaped[Tensor, "*?leaf"]]) -> dict[str, Any]:
+    """Return the number of ranks and, by rank, the tensors of the others that differ from rank 0's: on rank 0.
+
+    All ranks call it with tensors on the host, of the same names and shapes.
+    """
+    names = sorted(own)
+    digests_N = torch.tensor([zlib.crc32(_bytes(own[name]).numpy()) for name in names], dtype=torch.int64)
+    parts = [torch.empty_like(digests_N) for _ in range(size())]
+    dist.all_gather(parts, digests_N)
+    differs_N = torch.stack(parts).ne(parts[0]).any(0).tolist()
+    differing = [name for name, differs in zip(names, differs_N, strict=True) if differs]
+    found: dict[str, Any] = {"size": size(), "parts": {}}
+    if not differing:
+        return found
+    flat = torch.cat([_bytes(own[name]) for name in differing])
+    flats = [torch.empty_like(flat) for _ in range(size())] if rank() == 0 else None
+    dist.gather(flat, flats, dst=0)
+    for index, other in enumerate(flats or ()):
+        if index:
+            pieces = other.split([_bytes(own[name]).numel() for name in differing])
+            found["parts"][str(index)] = {
+                name: piece.clone().view(own[name].dtype).reshape(own[name].shape)
+                for name, piece in zip(differing, pieces, strict=True)
+            }
+    return found
+
+
+def dealt(
+    first: Mapping[str, Shaped[Tensor, "*?leaf"]],
+    saved: Mapping[str, Any] | None,
+    live: Mapping[str, Shaped[Tensor, "*?leaf"]],
+) -> Tensors:
+    """Return this rank's tensors of a checkpoint: rank 0's, changed by what `gathered` returned; None is of one rank.
+
+    `live` are those that this run has now, and whose shapes tell where the envs are. A ValueError says how many envs
+    fit.
+    """
+    before = 1 if saved is None else int(saved["size"])
+    parts = [dict(first)] + [
+        {**first, **(saved or {})["parts"].get(str(index), {})} for index in range(1, before)
+    ]
+    if before == size():
+        return parts[rank()]
+    return {name: _dealt_one(name, parts, live.get(name)) for name in first}
+
+
+def _dealt_one(name: str, parts: list[Tensors], live: Tensor | None) -> Tensor:
+    tensors = [part[name] for part in parts]
+    shape = tensors[0].shape
+    if live is not None and live.shape != shape:
+        dim = next(
+            (dim for dim in range(min(live.ndim, len(shape))) if live.shape[dim] != shape[dim]), len(shape)
+        )
+        if live.ndim != len(shape) or shape[dim] * len(parts) != live.shape[dim] * size():
+            raise ValueError(
+                f"{name} is {list(shape)} in the checkpoint of {len(parts)} ranks and {list(live.shape)} in this run "
+                f"of {size()}: all ranks together must have as many envs as before"
+            )
+        return torch.cat(tensors, dim).narrow(dim, rank() * live.shape[dim], live.shape[dim]).clone()
+    room, _, leaf = name.rpartition("/")
+    stem = leaf.rpartition(".")[0]
+    prefix = f"{room}/{stem}." if stem else f"{room}/"
+    if all(f"{prefix}{part}" in parts[0] for part in (_COUNT, _MEAN, _SQUARES)):
+        return (
+            _merged_moments(prefix, parts)[name.removeprefix(prefix)]
+            if name.startswith(prefix)
+            else tensors[0]
+        )
+    return tensors[0]
+
+
+def _merged_moments(prefix: str, parts: list[Tensors]) -> Tensors:
+    """Give rank 0 what all ranks have counted, and the others nothing; `mean` and `var` are those of all already."""
+    merged = {
+        leaf.removeprefix(prefix): tensor for leaf, tensor in parts[0].items() if leaf.startswith(prefix)
+    }
+    if rank():
+        zeros = {name: torch.zeros_like(merged[name]) for name in (_COUNT, _MEAN, _SQUARES)}
+        return merged | zeros
+    for part in parts[1:]:
+        count, added = merged[_COUNT].double(), part[f"{prefix}{_COUNT}"].double()
+        share = added / (count + added).clamp_min(1)
+        delta = part[f"{prefix}{_MEAN}"] - merged[_MEAN]
+        merged[_SQUARES] = merged[_SQUARES] + part[f"{prefix}{_SQUARES}"] + delta.square() * share * count
+        merged[_MEAN] = merged[_MEAN] + delta * share
+        merged[_COUNT] = merged[_COUNT] + part[f"{prefix}{_COUNT}"]
+    return merged
+
+
+def _bytes(tensor: Tensor) -> Tensor:
+    return tensor.contiguous().reshape(-1).view(torch.uint8)

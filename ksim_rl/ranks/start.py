@@ -1,0 +1,171 @@
+"""A process joins the others of its run here, as torchrun's environment says, or is refused in one line."""
+
+import json
+import os
+import platform
+import socket
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from datetime import timedelta
+from typing import Any
+
+import torch
+import torch.distributed as dist
+
+from ksim_rl.ranks import group, heartbeat
+
+# What torchrun sets; `python -m torch.distributed.run` is the same.
+VARIABLES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
+# For a rank to start: imports take long where many processes share few cores.
+JOIN_S = 300.0
+COMMANDS = ("train", "resume")
+
+
+def launched() -> bool:
+    """Whether several processes were started together, as torchrun does."""
+    return int(os.environ.get("WORLD_SIZE", "1") or 1) > 1
+
+
+def device(name: str) -> str:
+    """Return a device's name as this rank's own: "cuda" is the GPU of its local rank."""
+    return f"cuda:{os.environ['LOCAL_RANK']}" if group.size() > 1 and name.startswith("cuda") else name
+
+
+@contextmanager
+def joined(command: str) -> Iterator[None]:
+    """Join the other ranks for a command, and watch over them; nothing happens in a process that is alone.
+
+    Raises ValueError where torchrun's environment is incomplete, ranks would share a GPU, or the command is for one
+    process; RuntimeError where the others cannot be reached.
+    """
+    if not launched():
+        yield
+        return
+    if command not in COMMANDS:
+        raise ValueError(
+            f"{command} is for one process: start it without torchrun ({' and '.join(COMMANDS)} take it)"
+        )
+    missing = [name for name in VARIABLES if name not in os.environ]
+    if missing:
+        raise ValueError(
+            f"WORLD_SIZE is set and {missing[0]} is not: start the ranks by torchrun, which sets both"
+        )
+    backend = _backend()
+    address = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
+    try:
+        dist.init_process_group(backend, timeout=timedelta(minutes=30))
+        store = _client()
+    except (RuntimeError, OSError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        if "EADDRINUSE" in reason or "address already in use" in reason.lower():
+            raise ValueError(
+                f"port {os.environ['MASTER_PORT']} is in use: give torchrun another one, --master-port=PORT, "
+                "or --rdzv-backend=c10d --rdzv-endpoint=localhost:0"
+            ) from error
+        raise RuntimeError(f"the other ranks cannot be reached at {address}: {reason}") from error
+    if backend != "gloo":
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+    heart = heartbeat.Heartbeat(store)
+    same = {"ksim_rl": _version(), "torch": torch.__version__, "Python": platform.python_version()}
+    try:
+        check_same(same, what="version")
+        _check_gpus(backend)
+        with heart:
+            yield
+            heart.done()
+    except BaseException as error:
+        heart.ended(error)
+        raise
+    dist.destroy_process_group()
+
+
+def check_same(values: Mapping[str, Any], *, what: str) -> None:
+    """Refuse, on all ranks, values that are not those of rank 0; the first that differs is named, by dotted path."""
+    if group.size() == 1:
+        return
+    own = _flat(values)
+    parts: list[Any] = [None] * group.size()
+    dist.all_gather_object(parts, own, group=_on_host())
+    for rank, part in enumerate(parts):
+        for name in {**parts[0], **part}:
+            ours, theirs = parts[0].get(name, "nothing"), part.get(name, "nothing")
+            if ours != theirs:
+                raise ValueError(
+                    f"rank {rank} has another {what}: {name} is {theirs} there and {ours} on rank 0; "
+                    "start all ranks by the same command, in the same environment"
+                )
+
+
+def from_first(value: str) -> str:
+    """Return the text that rank 0 has."""
+    if group.size() == 1:
+        return value
+    texts = [value]
+    dist.broadcast_object_list(texts, src=0, group=_on_host())
+    return texts[0]
+
+
+_host_groups: list[Any] = []
+
+
+def _on_host() -> Any:
+    """Return a group of all ranks whose collectives need no GPU."""
+    if dist.get_backend() == "gloo":
+        return None
+    if not _host_groups:
+        _host_groups.append(dist.new_group(backend="gloo"))
+    return _host_groups[0]
+
+
+def _backend() -> str:
+    if not torch.cuda.is_available():
+        return "gloo"
+    local, count = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
+    if local >= count:
+        raise ValueError(
+            f"rank {os.environ['RANK']} has no GPU of its own: this machine has {count}, and torchrun started at least "
+            f"{local + 1} ranks here: use --nproc-per-node={count}"
+        )
+    if not dist.is_nccl_available():
+        raise ValueError(
+            "this torch has no NCCL, without which GPUs cannot train together: install a CUDA build"
+        )
+    return "cpu:gloo,cuda:nccl"
+
+
+def _check_gpus(backend: str) -> None:
+    """Refuse two ranks on one GPU, which NCCL answers with an error that names neither."""
+    if backend == "gloo":
+        return
+    uuid = torch.cuda.get_device_properties(torch.cuda.current_device()).uuid
+    places: list[Any] = [None] * group.size()
+    dist.all_gather_object(places, f"{socket.gethostname()} {uuid}", group=_on_host())
+    for rank, place in enumerate(places):
+        if places.index(place) != rank:
+            raise ValueError(
+                f"ranks {places.index(place)} and {rank} share one GPU ({place}): give each its own"
+            )
+
+
+def _client() -> dist.TCPStore:
+    """Return a connection of our own to the store of the run, for threads beside the collectives."""
+    host, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+    return dist.TCPStore(host, port, is_master=False, timeout=timedelta(seconds=JOIN_S))
+
+
+def _version() -> str:
+    from ksim_rl import __version__
+
+    return __version__
+
+
+def _flat(tree: Mapping[str, Any], path: str = "") -> dict[str, str]:
+    found: dict[str, str] = {}
+    for name, value in tree.items():
+        where = f"{path}{name}"
+        found |= (
+            _flat(value, f"{where}.")
+            if isinstance(value, Mapping)
+            else {where: json.dumps(value, default=str)}
+        )
+    return found

@@ -1,0 +1,54 @@
+"""Each rank times its rollouts, which wait for nobody, so that rank 0 can say which rank holds up the others."""
+
+import time
+
+import torch
+
+from ksim_rl.ranks import heartbeat
+from ksim_rl.ranks.group import rank, size
+
+
+class Timing:
+    """Times blocks, on CUDA by events, whose times are read by `slowest` only when they have passed."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device, self._passed = device, [0.0]
+        self._events: list[tuple[torch.cuda.Event, torch.cuda.Event]] = []
+
+    def begin(self, iteration: int) -> None:
+        """Begin to collect."""
+        if size() == 1:
+            return
+        heartbeat.at(f"in iteration {iteration}")
+        self._began = time.perf_counter()
+        if self._device.type == "cuda":
+            events = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+            events[0].record(torch.cuda.current_stream(self._device))
+            self._events.append(events)
+
+    def end(self) -> None:
+        """Stop the time that `begin` began to take."""
+        if size() == 1:
+            return
+        if self._device.type == "cuda":
+            self._events[-1][1].record(torch.cuda.current_stream(self._device))
+        else:
+            self._passed.append(time.perf_counter() - self._began)
+
+    def slowest(self) -> dict[str, float]:
+        """Return which rank's last rollout took the longest, and how many seconds; nothing with one rank.
+
+        On CUDA it is called after the work of the iteration is done. What other ranks took comes with their heartbeats.
+        """
+        if size() == 1:
+            return {}
+        while self._events and self._events[0][1].query():
+            begin, end = self._events.pop(0)
+            self._passed.append(begin.elapsed_time(end) / 1000.0)
+        del self._passed[:-1]
+        heartbeat.took[rank()] = self._passed[-1]
+        slowest = max(heartbeat.took, key=lambda index: heartbeat.took[index])
+        return {
+            "throughput/slowest_rank": float(slowest),
+            "throughput/slowest_rollout_s": heartbeat.took[slowest],
+        }

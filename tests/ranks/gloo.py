@@ -1,0 +1,22 @@
+"""Tests of several ranks run here as forked processes of one machine, joined by gloo."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.multiprocessing as mp
+
+
+def _run_one(rank: int, size: int, folder: str, function: Callable[..., Any], arguments: tuple) -> None:
+    torch.set_num_threads(1)
+    torch.distributed.init_process_group("gloo", f"file://{folder}/store", rank=rank, world_size=size)
+    torch.save(function(*arguments), f"{folder}/{rank}.pt")
+    torch.distributed.destroy_process_group()
+
+
+def results(function: Callable[..., Any], *arguments: Any, size: int, folder: Path) -> list[Any]:
+    """Call `function` on each of `size` ranks, and return what it returned there."""
+    folder.mkdir(exist_ok=True)
+    mp.start_processes(_run_one, (size, str(folder), function, arguments), nprocs=size, start_method="fork")
+    return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in range(size)]

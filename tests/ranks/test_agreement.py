@@ -1,0 +1,84 @@
+"""Several ranks learn what one process with as many envs and shards learns: gloo, on the CPU."""
+
+import pytest
+import torch
+
+from ksim_rl import conf
+from ksim_rl.device import state_tree
+from ksim_rl.trainers import build
+from tests.ranks.gloo import results
+
+SMALL = [
+    "task=cartpole_balance",
+    "device=cpu",
+    "logger=none",
+    "task.episode_length_s=0.1",
+    "trainer.num_threads=1",
+    "trainer.num_iterations=2",
+    "trainer.eval_episodes=0",
+    "trainer.checkpoint_interval=0",
+]
+NETWORKS = ["modules.actor.hidden_dims=[8]", "modules.critic.hidden_dims=[8]"]
+RECURRENT = [
+    *NETWORKS,
+    "modules=lstm",
+    "modules.recurrent_actor.hidden_dim=6",
+    "modules.recurrent_critic.hidden_dim=6",
+    "data.num_minibatches=2",
+]
+ALGORITHMS = {
+    "ppo": [*NETWORKS, "data.num_minibatches=2"],
+    "ppo_minibatch_advantages": [
+        *NETWORKS,
+        "data.num_minibatches=2",
+        "objective.normalize_advantage=minibatch",
+    ],
+    "lstm": RECURRENT,
+    "gru": [*RECURRENT, "modules=gru", "data.sequence_length=4", "data.burn_in=2"],
+}
+
+
+def trained(overrides, num_envs, minibatch, shards):
+    """Return the tensors of an update, and where the envs stand, after two iterations."""
+    sizes = [
+        f"num_envs={num_envs}",
+        f"data.num_env_states_per_minibatch={minibatch}",
+        f"data.shards={shards}",
+    ]
+    trainer = build(conf.compose([*SMALL, *overrides, *sizes]))
+    trainer.train()
+    learnt, _ = state_tree.split(trainer.update.state_dict())
+    envs, _ = state_tree.split(trainer.collector.state_dict())
+    return learnt, envs, trainer.metrics
+
+
+def check(name, size, folder):
+    overrides = ALGORITHMS[name]
+    learnt, envs, metrics = trained(overrides, 4 * size, 16 * size, size)
+    parts = results(trained, overrides, 4, 16, 1, size=size, folder=folder)
+    worst = 0.0
+    for key, expected in learnt.items():
+        # Each rank has the sums of its own observations.
+        own = key.endswith(("normalizer.count", "exact_mean", "exact_sum_of_squares"))
+        if own or not expected.numel():
+            continue
+        shared = expected.shape == parts[0][0][key].shape
+        found = [part[0][key] for part in parts] if shared else [torch.cat([part[0][key] for part in parts])]
+        worst = max([worst, *((one.double() - expected.double()).abs().max().item() for one in found)])
+    print(f"{name}, {size} ranks: {len(learnt)} tensors, largest difference {worst:.2g}")
+    assert worst <= 1e-6
+    for key, expected in envs.items():
+        found = torch.cat([part[1][key] for part in parts])
+        torch.testing.assert_close(found, expected, rtol=0.0, atol=1e-4)
+    return metrics, [part[2] for part in parts]
+
+
+def test_two_ranks_learn_ppo_as_one_process_does(tmp_path):
+    check("ppo", 2, tmp_path)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("size", [2, 4])
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_ranks_learn_what_one_process_learns(name, size, tmp_path):
+    check(name, size, tmp_path)

@@ -1,0 +1,78 @@
+"""A checkpoint of several ranks goes on bit for bit on as many, and is dealt out anew to others."""
+
+import pytest
+import torch
+
+from ksim_rl import conf, ranks
+from ksim_rl.device import state_tree
+from ksim_rl.trainers import build
+from tests.ranks.gloo import results
+from tests.ranks.test_agreement import NETWORKS, SMALL
+
+
+def train(folder, num_envs, shards, iterations, resume):
+    """Train up to so many iterations, from the newest checkpoint if `resume`, and return all tensors of the end."""
+    sizes = [f"num_envs={num_envs}", f"data.num_env_states_per_minibatch={4 * num_envs}", f"data.shards={shards}"]
+    overrides = [*SMALL, *NETWORKS, "data.num_minibatches=2", *sizes, f"trainer.num_iterations={iterations}"]
+    trainer = build(conf.compose(overrides))
+    trainer.folder = folder
+    if resume:
+        trainer.load(folder)
+    trainer.train()
+    return state_tree.split(trainer.state_dict())[0]
+
+
+@pytest.mark.full
+def test_two_ranks_go_on_bit_for_bit(tmp_path):
+    whole = results(train, tmp_path / "a", 4, 1, 3, False, size=2, folder=tmp_path / "whole")
+    results(train, tmp_path / "b", 4, 1, 2, False, size=2, folder=tmp_path / "first")
+    parts = results(train, tmp_path / "b", 4, 1, 3, True, size=2, folder=tmp_path / "second")
+    for expected, found in zip(whole, parts, strict=True):
+        assert all(torch.equal(found[name], tensor) for name, tensor in expected.items())
+
+
+@pytest.mark.full
+def test_one_to_two_to_one_is_the_run_without_a_break(tmp_path):
+    whole = train(tmp_path / "whole", 8, 2, 3, False)
+    train(tmp_path / "run", 8, 2, 1, False)
+    results(train, tmp_path / "run", 4, 1, 2, True, size=2, folder=tmp_path / "two")
+    found = train(tmp_path / "run", 8, 2, 3, True)
+    worst = max(
+        (found[name].double() - tensor.double()).abs().max().item()
+        for name, tensor in whole.items()
+        if name.startswith("/update/") and tensor.numel()
+    )
+    print(f"1 to 2 to 1: largest difference {worst:.2g}")
+    assert worst <= 1e-6
+
+
+def merged(index):
+    own = {
+        "/env/level": torch.tensor([0.5]),
+        "/env/state_E": torch.arange(2) + 2 * index,
+        "/env/moments.0.count": torch.tensor(4 + index),
+        "/env/moments.0.exact_mean": torch.tensor([1.0 + index], dtype=torch.float64),
+        "/env/moments.0.exact_sum_of_squares": torch.tensor([2.0], dtype=torch.float64),
+    }
+    return ranks.gathered(own), own
+
+
+def test_checkpoints_are_gathered_and_dealt_out(tmp_path):
+    (saved, own), (nothing, second) = results(merged, 0, size=2, folder=tmp_path / "same")
+    assert saved == {"size": 2, "parts": {}} == nothing
+    (saved, own), (_, second) = results(different, size=2, folder=tmp_path / "different")
+    assert "/env/level" not in saved["parts"]["1"], "what is alike is kept once"
+    live = own | {"/env/state_E": torch.zeros(4, dtype=torch.int64)}
+    found = ranks.dealt(own, saved, live)
+    assert found["/env/state_E"].tolist() == [0, 1, 2, 3]
+    # Four values of mean 1 and five of mean 2.
+    assert found["/env/moments.0.count"] == 9
+    torch.testing.assert_close(found["/env/moments.0.exact_mean"], torch.tensor([14.0 / 9.0]).double())
+    expected = torch.tensor([4.0 + 20.0 / 9.0]).double()
+    torch.testing.assert_close(found["/env/moments.0.exact_sum_of_squares"], expected)
+    with pytest.raises(ValueError, match="as many envs as before"):
+        ranks.dealt(own, saved, own | {"/env/state_E": torch.zeros(6, dtype=torch.int64)})
+
+
+def different():
+    return merged(ranks.rank())
