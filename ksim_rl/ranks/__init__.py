@@ -9,13 +9,14 @@ from ksim_rl.ranks.group import first_row, rank, size
 from ksim_rl.ranks.heartbeat import at
 from ksim_rl.ranks.reduce import any_of, gather, mean_, sum_
 from ksim_rl.ranks.shards import dealt, gathered
-from ksim_rl.ranks.start import check_same, device, from_first, joined, launched
+from ksim_rl.ranks.start import by_first, check_same, device, from_first, joined, restarted, run_folder
 from ksim_rl.ranks.timing import Timing
 
 __all__ = [
     "Timing",
     "any_of",
     "at",
+    "by_first",
     "check_same",
     "dealt",
     "device",
@@ -25,12 +26,13 @@ __all__ = [
     "gather",
     "gathered",
     "joined",
-    "launched",
     "mean_",
     "rand",
     "randint",
     "randn",
     "rank",
+    "restarted",
+    "run_folder",
     "size",
     "sum_",
 ]

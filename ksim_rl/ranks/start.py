@@ -4,7 +4,7 @@ import json
 import os
 import platform
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import timedelta
 from typing import Any
@@ -54,7 +54,7 @@ def joined(command: str) -> Iterator[None]:
     address = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
     try:
         dist.init_process_group(backend, timeout=timedelta(minutes=30))
-        store = _client()
+        _stores[:] = [_client()]
     except (RuntimeError, OSError, ValueError) as error:
         reason = " ".join(str(error).split())
         if "EADDRINUSE" in reason or "address already in use" in reason.lower():
@@ -65,7 +65,7 @@ def joined(command: str) -> Iterator[None]:
         raise RuntimeError(f"the other ranks cannot be reached at {address}: {reason}") from error
     if backend != "gloo":
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
-    heart = heartbeat.Heartbeat(store)
+    heart = heartbeat.Heartbeat(_client())
     same = {"ksim_rl": _version(), "torch": torch.__version__, "Python": platform.python_version()}
     try:
         check_same(same, what="version")
@@ -98,13 +98,45 @@ def check_same(values: Mapping[str, Any], *, what: str) -> None:
 
 def from_first(value: str) -> str:
     """Return the text that rank 0 has."""
+    return by_first(lambda: value)
+
+
+def by_first(function: Callable[[], str]) -> str:
+    """Return what a function returns on rank 0, which alone calls it; an OSError there is raised on all ranks."""
     if group.size() == 1:
-        return value
-    texts = [value]
+        return function()
+    texts = ["", ""]
+    if group.rank() == 0:
+        try:
+            texts[0] = function()
+        except OSError as error:
+            texts[1] = str(error) or type(error).__name__
     dist.broadcast_object_list(texts, src=0, group=_on_host())
+    if texts[1]:
+        raise OSError(texts[1])
     return texts[0]
 
 
+def run_folder(own: str) -> str:
+    """Return the folder of rank 0, or that of the attempt before, where torchrun has started the ranks again."""
+    if group.size() == 1:
+        return own
+    key = f"ksim_rl/{os.environ.get('TORCHELASTIC_RUN_ID', '')}/folder"
+
+    def kept() -> str:
+        if not _stores[0].check([key]):
+            _stores[0].set(key, own)
+        return _stores[0].get(key).decode()
+
+    return by_first(kept)
+
+
+def restarted() -> bool:
+    """Whether torchrun has started these ranks again, after one of them had failed."""
+    return group.size() > 1 and int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0
+
+
+_stores: list[dist.TCPStore] = []
 _host_groups: list[Any] = []
 
 

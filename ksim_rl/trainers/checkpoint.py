@@ -19,7 +19,6 @@ from typing import Any
 
 import safetensors.torch
 from safetensors import SafetensorError
-from torch import Tensor
 
 from ksim_rl import ranks
 from ksim_rl.config import plain_data
@@ -64,41 +63,14 @@ def save(
 
     With several ranks it has the state of all, which all of them pass here, and rank 0 writes.
     """
-    tensors, values = state_tree.split(state)
-    if ranks.size() == 1:
-        return _write(folder, tensors, values, iteration=iteration, config=config, keep=keep)
-    parts = state_tree.split({RANKS: ranks.gathered(tensors)})
-    written = f"{folder}: rank 0 could not write there"
-    try:
-        if ranks.rank() == 0:
-            both = (tensors | parts[0], values | parts[1])
-            written = str(_write(folder, *both, iteration=iteration, config=config, keep=keep))
-    finally:
-        written = ranks.from_first(written)
-    if written.endswith("write there"):
-        raise OSError(written)
-    return Path(written)
-
-
-def own_part(state: Mapping[str, Any], live: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Return what of a checkpoint's state is this rank's; `live` gives the state of the run that takes it."""
-    if RANKS not in state and ranks.size() == 1:
-        return state
-    tensors, values = state_tree.split({name: part for name, part in state.items() if name != RANKS})
-    return state_tree.join(ranks.dealt(tensors, state.get(RANKS), state_tree.split(live())[0]), values)
-
-
-def _write(
-    folder: Path,
-    tensors: Mapping[str, Tensor],
-    values: Mapping[str, Any],
-    *,
-    iteration: int,
-    config: Mapping[str, Any],
-    keep: int,
-) -> Path:
+    if ranks.size() > 1 and RANKS not in state:
+        whole = {**state, RANKS: ranks.gathered(state_tree.split(state)[0])}
+        return Path(
+            ranks.by_first(lambda: str(save(folder, whole, iteration=iteration, config=config, keep=keep)))
+        )
     folder.mkdir(exist_ok=True)
-    tensor_bytes = safetensors.torch.save(dict(tensors))
+    tensors, values = state_tree.split(state)
+    tensor_bytes = safetensors.torch.save(tensors)
     manifest_bytes = _seal(
         {
             "format_version": checkpoint_formats.FORMAT_VERSION,
@@ -130,6 +102,14 @@ def _write(
         os.replace(old, discarded)
         shutil.rmtree(discarded)
     return folder / name
+
+
+def own_part(state: Mapping[str, Any], live: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Return what of a checkpoint's state is this rank's; `live` gives the state of the run that takes it."""
+    if RANKS not in state and ranks.size() == 1:
+        return state
+    tensors, values = state_tree.split({name: part for name, part in state.items() if name != RANKS})
+    return state_tree.join(ranks.dealt(tensors, state.get(RANKS), state_tree.split(live())[0]), values)
 
 
 def load(path: Path) -> Checkpoint:

@@ -12,7 +12,11 @@ from tests.ranks.test_agreement import NETWORKS, SMALL
 
 def train(folder, num_envs, shards, iterations, resume):
     """Train up to so many iterations, from the newest checkpoint if `resume`, and return all tensors of the end."""
-    sizes = [f"num_envs={num_envs}", f"data.num_env_states_per_minibatch={4 * num_envs}", f"data.shards={shards}"]
+    sizes = [
+        f"num_envs={num_envs}",
+        f"data.num_env_states_per_minibatch={4 * num_envs}",
+        f"data.shards={shards}",
+    ]
     overrides = [*SMALL, *NETWORKS, "data.num_minibatches=2", *sizes, f"trainer.num_iterations={iterations}"]
     trainer = build(conf.compose(overrides))
     trainer.folder = folder

@@ -10,7 +10,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor, nn
 
-from ksim_rl import ranks
 from ksim_rl.data import DatasetBuffer, EpochSampler
 from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, ValueNetwork
 from ksim_rl.modules.actor import MIN_STD, GaussianHead
@@ -35,8 +34,8 @@ def make_fused_ppo(
     """Build the fused gradient steps of a run, or return why torch has to make them."""
     if device.type != "cuda" or importlib.util.find_spec("triton") is None:
         return "they need CUDA and Triton"
-    if ranks.size() > 1:
-        return "several ranks train together"
+    if dataset.cfg.shards > 1:
+        return "minibatches come from shards"
     if type(dataset.sampler) is not EpochSampler:
         return f"minibatches come from a {type(dataset.sampler).__name__}"
     networks = fused_networks(actor, critic)

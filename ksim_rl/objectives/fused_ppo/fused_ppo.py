@@ -16,6 +16,7 @@ from jaxtyping import Float, Int64
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from ksim_rl import ranks
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
 from ksim_rl.objectives.fused_ppo.dataset import FusedDataset, Observe
 from ksim_rl.objectives.fused_ppo.layout import (
@@ -29,7 +30,7 @@ from ksim_rl.objectives.fused_ppo.layout import (
 )
 from ksim_rl.objectives.fused_ppo.mlp_kernels import minibatch_gradients, state_values, weight_gradients
 from ksim_rl.objectives.fused_ppo.step_kernels import SUMMARY, adam_step, sum_gradients
-from ksim_rl.objectives.gradient_step import StepGuard
+from ksim_rl.objectives.gradient_step import StepGuard, adapt_learning_rate_
 
 # Sums that each block leaves beside its gradients.
 NUM_STATISTICS = 16
@@ -257,11 +258,13 @@ class FusedPPO:
             OUT=layout.out_width,
             LOG_STD=self.networks.log_std,
             MIN_STD=self.networks.min_std,
-            ADAPTIVE=cfg.schedule == "adaptive",
+            ADAPTIVE=cfg.schedule == "adaptive" and ranks.size() == 1,
             SIZE=tuning.size,
             COLUMNS=tuning.columns,
             ROWS=tuning.rows,
         )
+        if ranks.size() > 1:
+            self._take_means(self._summary[step], group["lr"])
         beta1, beta2 = cfg.betas
         launch(
             adam_step,
@@ -289,6 +292,18 @@ class FusedPPO:
             CLIP=cfg.max_grad_norm is not None,
             BLOCK=tuning.size,
         )
+
+    def _take_means(self, summary: Tensor, learning_rate: Tensor) -> None:
+        """Take the means over all ranks of the gradients and of what the step measured, and adapt the learning rate."""
+        cfg = self.cfg
+        ranks.mean_([self._gradients, summary])
+        self._squares.zero_()
+        self._squares[0].copy_(self._gradients.square().sum())
+        if cfg.schedule == "adaptive":
+            bounds = {"lr_min": cfg.learning_rate_min, "lr_max": cfg.learning_rate_max}
+            kl = summary[SUMMARY.index("kl")]
+            adapt_learning_rate_(learning_rate, kl, desired_kl=cfg.desired_kl, **bounds)
+            summary[SUMMARY.index("learning_rate")].copy_(learning_rate)
 
     def _evaluate(self, obs_DL: Tensor, values_D: Tensor) -> None:
         launch(

@@ -1,0 +1,93 @@
+"""The command line under torchrun: whole runs, on two ranks and on two times two, and what kills one."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+pytestmark = pytest.mark.full
+
+RUN = [
+    "task=cartpole_balance",
+    "device=cpu",
+    "num_envs=8",
+    "data.num_env_states_per_minibatch=64",
+    "data.num_minibatches=2",
+    "modules.actor.hidden_dims=[8]",
+    "modules.critic.hidden_dims=[8]",
+    "task.episode_length_s=0.2",
+    "trainer.num_threads=1",
+    "trainer.eval_episodes=3",
+    "trainer.video=false",
+    "trainer.stop_when_solved=false",
+]
+
+
+def torchrun(*arguments, folder, options=("--nproc-per-node=2",), endpoint="localhost:0"):
+    command = [sys.executable, "-m", "torch.distributed.run", "--rdzv-backend=c10d"]
+    command += [f"--rdzv-endpoint={endpoint}", *options, "-m", "ksim_rl.cli.main", *arguments]
+    return subprocess.Popen(
+        command,
+        cwd=folder,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def finished(process):
+    text, _ = process.communicate(timeout=600)
+    assert process.returncode == 0, text
+    return text
+
+
+def test_rank_0_writes_one_run_which_goes_on_in_one_process(tmp_path):
+    text = finished(torchrun("train", *RUN, "trainer.num_iterations=2", folder=tmp_path))
+    assert "on each of 2 ranks, 16 envs and 256 in all" in text
+    assert text.count("iteration 1/2:") == 1
+    assert "evaluation over 4 episodes" in text, "three do not share out equally"
+    (run,) = (tmp_path / "runs" / "cartpole_balance").iterdir()
+    rows = (run / "metrics.csv").read_text().splitlines()
+    header = rows[0].split(",")
+    assert "throughput/slowest_rank" in header
+    text = finished(torchrun("resume", str(run), "--num-iterations=3", folder=tmp_path))
+    assert "iteration 3/3: env states 768" in text
+    alone = subprocess.run(
+        [sys.executable, "-m", "ksim_rl.cli.main", "resume", str(run), "--num-iterations=4", "--device=cpu"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert "16 envs x 16 steps = 256 env states" in alone.stdout, alone.stdout + alone.stderr
+    assert json.loads((run / "evaluation.json").read_text())["iteration"] == 4
+
+
+def test_two_nodes_of_two_ranks_are_one_run(tmp_path):
+    options = ("--nnodes=2", "--nproc-per-node=2", "--rdzv-id=nodes")
+    with_port = {"folder": tmp_path, "options": options, "endpoint": "localhost:29617"}
+    nodes = [torchrun("train", *RUN, "trainer.num_iterations=1", **with_port) for _ in range(2)]
+    texts = [finished(node) for node in nodes]
+    assert sum("on each of 4 ranks, 32 envs and 512 in all" in text for text in texts) == 1
+
+
+def test_a_killed_rank_ends_the_others_with_its_cause(tmp_path):
+    process = torchrun("train", *RUN, "trainer.num_iterations=100000", folder=tmp_path)
+    lines = []
+    while not lines or "iteration 2/" not in lines[-1]:
+        lines.append(process.stdout.readline())
+        assert lines[-1], "".join(lines)
+    ranks = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True, check=True)
+    killed = int(ranks.stdout.split()[1])
+    os.kill(killed, signal.SIGKILL)
+    began = time.monotonic()
+    text, _ = process.communicate(timeout=60)
+    print(f"all ranks had ended {time.monotonic() - began:.1f} s after one was killed")
+    assert process.returncode != 0
+    assert "exitcode  : -9" in text
