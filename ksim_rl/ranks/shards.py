@@ -26,7 +26,9 @@ def gathered(own: Mapping[str, Shaped[Tensor, "*?leaf"]]) -> dict[str, Any]:
     All ranks call it with tensors on the host, of the same names and shapes.
     """
     names = sorted(own)
-    digests_N = torch.tensor([zlib.crc32(_bytes(own[name]).numpy()) for name in names], dtype=torch.int64)
+    digests_N = torch.tensor(
+        [zlib.crc32(memoryview(_bytes(own[name]).numpy())) for name in names], dtype=torch.int64
+    )
     parts = [torch.empty_like(digests_N) for _ in range(size())]
     dist.all_gather(parts, digests_N)
     differs_N = torch.stack(parts).ne(parts[0]).any(0).tolist()
