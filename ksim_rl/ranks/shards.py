@@ -27,7 +27,7 @@ def gathered(own: Mapping[str, Shaped[Tensor, "*?leaf"]]) -> dict[str, Any]:
     """
     names = sorted(own)
     digests_N = torch.tensor(
-        [zlib.crc32(memoryview(_bytes(own[name]).numpy())) for name in names], dtype=torch.int64
+        [zlib.crc32(_bytes(own[name]).numpy().tobytes()) for name in names], dtype=torch.int64
     )
     parts = [torch.empty_like(digests_N) for _ in range(size())]
     dist.all_gather(parts, digests_N)

@@ -56,8 +56,12 @@ def run(
     when the folder is deleted or moved meanwhile, or the end cannot be saved.
     """
     ranks.check_same({**cfg.to_tree(), "device": cfg.resolved_device().type}, what="config")
-    if ranks.rank():
-        return _follow(cfg, run_folder, progress, hooks, resume_from)
+    if ranks.rank():  # rank 0 writes for all
+        with memory_for(cfg.num_envs, cfg.resolved_device()):
+            trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
+        outcome = trainer.train(progress)
+        _close(trainer)
+        return outcome
     run_folder.mkdir(parents=True, exist_ok=True)
     try:
         with locked(run_folder, note=progress.note), threads_that_fail(progress.note):
@@ -66,21 +70,6 @@ def run(
         with suppress(OSError):
             run_folder.rmdir()  # only where nothing is in it yet
         raise
-
-
-def _follow(
-    cfg: RunCfg,
-    run_folder: Path,
-    progress: RunProgress,
-    hooks: Sequence[Hook],
-    resume_from: checkpoint.Checkpoint | None,
-) -> Outcome:
-    """Train as one of several ranks, and leave all writing to rank 0."""
-    with memory_for(cfg.num_envs, cfg.resolved_device()):
-        trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
-    outcome = trainer.train(progress)
-    _close(trainer)
-    return outcome
 
 
 def _run_locked(
