@@ -15,12 +15,23 @@ def test_its_config_survives_yaml(name):
     assert from_tree(ManagerBasedRlEnvCfg, yaml.safe_load(text)) == cfg
 
 
-# Suites of other packages have tests of their own; these run two of them here, the others in full ones.
-QUICK = ("dm_control_cartpole_balance", "playground_pendulum_swingup")
-NAMES = [
-    pytest.param(name, marks=pytest.mark.full) if envs.task(name).suite and name not in QUICK else name
-    for name in envs.names()
-]
+# One of each kind of robot, ground and suite; the others, which compile kernels of their own, run in full tests.
+QUICK = (
+    "arm_push",
+    "cartpole_swingup",
+    "dm_control_cartpole_balance",
+    "go1_velocity_flat",
+    "go1_velocity_rough",
+    "humanoid_get_up",
+    "playground_pendulum_swingup",
+    "quadruped_velocity_flat",
+    "walker_walk",
+)
+NAMES = [name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in envs.names()]
+
+
+def test_the_quick_ones_are_tasks():
+    assert set(QUICK) <= set(envs.names())
 
 
 @pytest.mark.parametrize("name", NAMES)
