@@ -5,6 +5,7 @@ To write it anew: python -m tests.docs.test_tasks. It builds every task once, fo
 
 import json
 import os
+import statistics
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -57,6 +58,17 @@ All tasks that come with the package: `ksim-rl train task=<task>`, or `envs.make
 TAIL = f"""The last four columns are measured on an H200: `python -m benchmarks.tasks device=cuda num_envs={NUM_ENVS}`.
 Rows whose ratio is below 1 were measured before this package had a constraint solver of its own: they are slower than
 what you will see."""
+
+
+LEARNED = """## What was learned
+
+By training runs on one H200 that are committed in `benchmarks/results/learning_*.json`: the env states of a run, its
+seconds with the first iteration, the mean return of the training episodes at its end (medians over the seeds), and the
+commit that it was made of. Each row is of its own commit, and most tasks have no committed run of this kind yet.
+
+| task | objective | env states | seconds | return | seeds | commit |
+|---|---|---|---|---|---|---|
+"""
 
 
 def robots(scene: SceneCfg) -> str:
@@ -125,7 +137,25 @@ def own_tasks() -> list[str]:
 def page(sizes: Mapping[str, Mapping[str, str]], saved: Mapping[str, Any]) -> str:
     head = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
     rows = [row(name, sizes[name], saved) for name in own_tasks()]
-    return f"{HEAD}\n" + "\n".join([*head, *rows]) + f"\n\n{TAIL}\n"
+    after = "\n".join(line for name in own_tasks() for line in learned(name))
+    return f"{HEAD}\n" + "\n".join([*head, *rows]) + f"\n\n{TAIL}\n\n{LEARNED}{after}\n"
+
+
+def learned(name: str) -> list[str]:
+    """The rows of a task: for each kind of GPU run the medians over its seeds of the last points of the curves."""
+    rows = []
+    for path in sorted(report.RESULTS.glob(f"learning_{name}*.json")):
+        saved = json.loads(path.read_text())
+        objective = path.stem.removeprefix(f"learning_{name}").lstrip("_") or "ppo"
+        curves = saved.get("curves", {}).items()
+        if ends := [points[-1] for label, points in curves if label.startswith(f"h200/{name}/")]:
+            states, seconds, reward = (
+                statistics.median(end[key] for end in ends)
+                for key in ("env_states", "seconds", "episode/return")
+            )
+            cells = f"{states / 1e6:.1f} million", f"{seconds:.0f}", f"{reward:.1f}", f"{len(ends)}"
+            rows.append(" | ".join((f"| `{name}`", objective, *cells, f"{saved['commit']} |")))
+    return rows or [f"| `{name}` | {NOTHING} | not measured" + f" | {NOTHING}" * 4 + " |"]
 
 
 def built_sizes() -> dict[str, dict[str, str]]:
@@ -141,7 +171,7 @@ def built_sizes() -> dict[str, dict[str, str]]:
 def written_sizes() -> dict[str, dict[str, str]]:
     """The sizes that the page gives."""
     found = {}
-    for line in PAGE.read_text().splitlines():
+    for line in PAGE.read_text().split("## What was learned")[0].splitlines():
         if line.startswith("| `"):
             cells = [cell.strip() for cell in line.strip("|").split(" | ")]
             found[cells[0].strip("`")] = {column: cells[COLUMNS.index(column)] for column in SIZES}
