@@ -18,6 +18,7 @@ from typing import Any
 import torch
 
 from benchmarks import command_line, report
+from ksim_rl.modules import ObservationNormalizer
 from ksim_rl.runs.csv_table import read_table
 from ksim_rl.tables.levels import thinned
 from ksim_rl.trainers import Hook, RunProgress, Trainer, build
@@ -37,7 +38,8 @@ KEPT = (
 LOCAL = (
     "device=cpu",
     "logger=local",
-    "trainer.eval_episodes=0",
+    "trainer.eval_episodes=8",
+    "trainer.eval_interval=5",
     "trainer.checkpoint_interval=0",
     "trainer.video=false",
 )
@@ -132,6 +134,26 @@ class Contrary(Hook):
         bias.neg_()
 
 
+def killed_units(trainer: Trainer) -> None:
+    """Push three quarters of the first layers' units below the threshold of the ReLU for good."""
+    with torch.no_grad():
+        for name, parameter in [
+            *trainer.update.actor.named_parameters(),
+            *_critic(trainer).named_parameters(),
+        ]:
+            if name.endswith((".0.bias", ".2.bias")):
+                parameter[: 3 * len(parameter) // 4] = -1e3
+
+
+def frozen_normalizers(trainer: Trainer) -> None:
+    """Let the normalizers keep statistics of observations that were far smaller."""
+    for network in (trainer.update.actor, _critic(trainer)):
+        for module in network.modules():
+            if isinstance(module, ObservationNormalizer):
+                module.update(0.1 * torch.randn(1000, module.dim))
+                module.until = 1
+
+
 def _critic(trainer: Trainer) -> Any:
     update: Any = trainer.update
     return update.critic
@@ -170,6 +192,13 @@ FAULTS: dict[str, tuple[tuple[str, ...], tuple[Hook, ...], Sabotage | None]] = {
     ),
     "episodes_end_at_once": ((*QUADRUPED, "task.terminations.fell_over.limit_angle=0.02"), (), None),
     "penalty_outweighs": ((*QUADRUPED, "task.rewards.action_rate_l2.weight=-10.0"), (), None),
+    "saturated_actions": ((*SWING_UP, "modules.actor.init_std=50.0"), (), None),
+    "dead_units": (
+        (*SWING_UP, "modules.actor.activation=relu", "modules.critic.activation=relu"),
+        (),
+        killed_units,
+    ),
+    "stale_normalizer": (SWING_UP, (), frozen_normalizers),
 }
 
 
@@ -182,12 +211,17 @@ def main() -> None:
         kept = train(*found)
         report.write(
             "diagnosis",
-            figures={f"cpu/{name}/reward": float(kept["metrics"]["rollout/reward"].split()[-1])},
+            figures={f"cpu/{name}/reward": float(_last(kept["metrics"]["rollout/reward"]))},
             device=torch.device("cpu"),
             module="benchmarks.diagnosis",
             **{given["runs"]: {name: kept}},
         )
-        print(name, {metric: row.split()[-1] for metric, row in kept["metrics"].items()}, flush=True)
+        print(name, {metric: _last(row) for metric, row in kept["metrics"].items()}, flush=True)
+
+
+def _last(text: str) -> str:
+    """Return the last number, which some rows do not have."""
+    return next((word for word in reversed(text.split()) if word != "-"), "-")
 
 
 def train(overrides: tuple[str, ...], hooks: tuple[Hook, ...], sabotage: Sabotage | None) -> dict[str, Any]:

@@ -41,6 +41,10 @@ class Curves:
         """Return the median of a metric's last values, or None where there are too few of them."""
         return _median(self.values(name)[-self._span :])
 
+    def last(self, name: str) -> float | None:
+        """Return a metric's last value, which is all there may be of one that evaluations log."""
+        return next(reversed(self.values(name)), None)
+
     def names(self, room: str) -> list[str]:
         """Return the metrics `<room>/<name>`."""
         return [name for name in self.columns if name.startswith(f"{room}/")]

@@ -116,10 +116,44 @@ def penalty_outweighs(curves: Curves) -> str | None:
     return f"{worst} is {terms[worst]:.3g}, and all rewards together {earned:.2g}"
 
 
+def saturated_actions(curves: Curves) -> str | None:
+    """Nearly all actions lie on or beyond their bounds, where changing them changes nothing.
+
+    Lower modules.actor.init_std or modules.actor.output_gain, raise the scale of the action term, or use
+    modules.actor.distribution=tanh_gaussian.
+    """
+    share = curves.last("rollout/saturated_actions")
+    return f"rollout/saturated_actions is {share:.0%}" if _above(share, 0.95) else None
+
+
+def dead_units(curves: Curves) -> str | None:
+    """Most hidden units say the same in every state: the networks are smaller than they look.
+
+    Use modules.actor.activation=elu (or layer_norm=true off policy), lower the learning rate, and normalize the
+    observations (obs_normalization=true).
+    """
+    share = curves.last("policy/dead_units")
+    return f"policy/dead_units is {share:.0%}" if _above(share, 0.5) else None
+
+
+def stale_normalizer(curves: Curves) -> str | None:
+    """Normalized observations are far from the size 1 that they should have: the statistics are of other observations.
+
+    Let the normalizers go on learning, look for an observation that jumps or grows without bound, and do not begin from
+    the checkpoint of a task with other observations.
+    """
+    size = curves.last("policy/observation_rms")
+    off = size is not None and not 0.2 < size < 4.0
+    return f"policy/observation_rms is {size:.2g}" if off else None
+
+
 FAULTS: tuple[Fault, ...] = (
     episodes_end_at_once,
+    stale_normalizer,
     std_at_floor,
     entropy_collapsed,
+    saturated_actions,
+    dead_units,
     kl_far_off,
     most_ratios_clipped,
     value_error_exploding,
@@ -135,7 +169,14 @@ EXPLAINS: Mapping[Fault, tuple[Fault, ...]] = {
     std_at_floor: (entropy_collapsed, kl_far_off, most_ratios_clipped),
     entropy_collapsed: (kl_far_off, most_ratios_clipped),
     # Steps that are too long spoil whatever the networks know.
-    kl_far_off: (most_ratios_clipped, value_error_exploding, negative_explained_variance),
+    kl_far_off: (
+        saturated_actions,
+        most_ratios_clipped,
+        value_error_exploding,
+        negative_explained_variance,
+        dead_units,
+    ),
+    stale_normalizer: (dead_units, kl_far_off, most_ratios_clipped, negative_explained_variance),
 }
 """What follows from a fault, and is not said beside it."""
 

@@ -11,6 +11,8 @@ import torch
 from ksim_rl import ranks
 from ksim_rl.checks import near
 from ksim_rl.collectors import RolloutCollector
+from ksim_rl.diagnosis.iteration_warnings import warnings_of
+from ksim_rl.diagnosis.probes import probed
 from ksim_rl.envs.contract import EpisodeClock, EpisodeSums, missing_parts, part
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.algorithm import HasNotes, Update
@@ -84,7 +86,7 @@ class Hook:
 
 
 class EvaluationHook(Hook):
-    """Judges the policy in envs of its own, and logs the figures."""
+    """Judges the policy in envs of its own, probes the networks in the last rollout, and logs the figures."""
 
     def __init__(self, evaluator: Evaluator, *, interval: int) -> None:
         self.evaluator, self.interval = evaluator, interval
@@ -98,7 +100,8 @@ class EvaluationHook(Hook):
         if evaluation is None:
             return
         trainer.evaluation, self._evaluated_at = evaluation, trainer.iteration
-        trainer.log({f"evaluation/{name}": value for name, value in asdict(evaluation).items()})
+        figures = {f"evaluation/{name}": value for name, value in asdict(evaluation).items()}
+        trainer.log(figures | probed(trainer.update, trainer.collector.env, trainer.rollout_ET))
 
     def at_end(self, trainer: "Trainer") -> None:
         """Evaluate the final policy, once."""
@@ -163,6 +166,7 @@ class Trainer:
         self.loggers, self.folder, self.config = loggers, folder, dict(config or {})
         self.iteration, self.saved_at = 0, -1
         self.metrics: dict[str, float] = {}
+        self.rollout_ET: Any = None  # the last one
         self.evaluation: Evaluation | None = None
         self.interrupt = InterruptRequest()
         self.clock = RunClock()
@@ -244,7 +248,7 @@ class Trainer:
     def iterate(self) -> None:
         """Collect a rollout, learn from it, and report what happened: where iterations overlap, in the one before."""
         self.collecting.begin(self.iteration + 1)
-        rollout_ET = self.collector.collect()
+        self.rollout_ET = rollout_ET = self.collector.collect()
         self.collecting.end()
         self.update(rollout_ET)
         self.iteration += 1
@@ -351,16 +355,7 @@ class Trainer:
 
     def _warn(self, losses: Sequence[str], metrics: Mapping[str, float], iteration: int) -> None:
         """Say what went wrong in this iteration, each kind once; the counts stay in the metrics."""
-        texts = {
-            text.split(":")[0].split(" needed")[0]: f"PHYSICS LOST CONTACTS OR CONSTRAINTS: {text}"
-            for text in losses
-        }
-        if failed := metrics.get("sum/termination/non_finite"):
-            texts["non_finite"] = (
-                f"{failed:.0f} envs ended with non-finite physics or actions; they were reset"
-            )
-        if skipped := metrics["update/skipped_steps"]:
-            texts["skipped"] = f"{skipped:.0f} gradient steps were not finite and were skipped"
+        texts = warnings_of(losses, metrics)
         if (found := metrics.get("sum/non_finite_terms", 0.0)) > self._non_finite_terms:
             self._non_finite_terms = found
             terms = part(self.collector.env, EpisodeSums)
