@@ -29,7 +29,7 @@ def built(tmp_path_factory):
     return sdist, wheel
 
 
-def sources(folder, suffixes=(".py", ".yaml", ".xml")):
+def sources(folder, suffixes=(".py", ".yaml", ".xml", ".json", ".onnx", ".safetensors")):
     return {
         path.relative_to(ROOT).as_posix()
         for path in (ROOT / folder).rglob("*")

@@ -20,6 +20,8 @@ usage: ksim-rl <command> [arguments]
   play     record a video:          ksim-rl play RUN --seconds 10
            watch and drive it:      ksim-rl play RUN --live
            without a policy:        ksim-rl play task=cartpole_swingup --agent random --live
+  demo     a policy of the zoo, without training: ksim-rl demo [--live]
+  zoo      list those that come along:   ksim-rl zoo; ksim-rl play zoo:reacher
   runs     list runs, with return and speed:  ksim-rl runs [FOLDER]
   compare  a table and a picture:   ksim-rl compare RUN1 RUN2
   export   a folder that runs elsewhere:  ksim-rl export RUN
@@ -47,6 +49,8 @@ COMMANDS = {
     "resume": "ksim_rl.cli.run_commands:resume",
     "eval": "ksim_rl.cli.run_commands:evaluate",
     "play": "ksim_rl.viewer.play_command:play",
+    "demo": "ksim_rl.viewer.play_command:demo",
+    "zoo": "ksim_rl.zoo.command:zoo",
     "runs": "ksim_rl.cli.runs:runs",
     "compare": "ksim_rl.cli.runs:compare",
     "export": "ksim_rl.export.sim2sim:run_export",

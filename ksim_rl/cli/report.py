@@ -55,6 +55,10 @@ def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None 
         number = interruption(stopped)
         progress.note(f"{number.name}: {_what_is_saved(folder)}")
         return 128 + int(number)
+    if cfg.logger.wandb is not None and not ranks.rank():
+        from ksim_rl.zoo.wandb_runs import upload  # it writes ONNX files, which most runs do not
+
+        upload(cfg.logger.wandb, folder, note=progress.note)
     for line in () if ranks.rank() else _summary(cfg, outcome, folder):
         progress.note(line)
     if outcome.interrupted_by is not None:

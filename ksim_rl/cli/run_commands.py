@@ -19,6 +19,7 @@ from ksim_rl.trainers.build import build_evaluator, solved_at
 from ksim_rl.trainers.run_cfg import check_run_tree
 from ksim_rl.trainers.run_folder import policy_of
 from ksim_rl.trainers.sources import check_sources
+from ksim_rl.zoo import locate
 
 # What a checkpoint is of, and a resumed run cannot change.
 KEPT = ("task_name", "num_envs", "seed", "modules", "checkpoint")
@@ -94,7 +95,8 @@ def evaluate(arguments: list[str]) -> int:
     if options.episodes is not None and options.episodes < 1:
         raise ValueError(f"--episodes {options.episodes}: expected at least 1")
     with shown_working("evaluating"):
-        policy = policy_of(checkpoint.load_latest(options.run, note=say), device=options.device)
+        run = locate(options.run, note=say)
+        policy = policy_of(checkpoint.load_latest(run, note=say), device=options.device)
         episodes = options.episodes or policy.cfg.trainer.eval_episodes or 100
         evaluate = build_evaluator(policy.cfg, policy.actor, episodes=episodes, seed=options.seed)
         evaluation = evaluate()

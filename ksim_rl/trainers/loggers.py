@@ -52,14 +52,14 @@ class WandbCfg(Checked):
 
 def open_wandb(cfg: WandbCfg, run_folder: Path, config: Mapping[str, Any]) -> MetricLogger:
     """Begin the run with the config of a training run, or continue that of a resumed one."""
-    kept_id = run_folder / "wandb" / "run_id"
-    if not kept_id.exists():
-        kept_id.parent.mkdir(parents=True, exist_ok=True)
-        kept_id.write_text(uuid.uuid4().hex)
+    path = run_folder / "wandb" / "run_id"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(uuid.uuid4().hex)
     logger = WandbLogger(
         cfg.name or run_folder.name,
         save_dir=run_folder,
-        id=_kept_id(kept_id),
+        id=kept_id(run_folder),
         project=cfg.project,
         entity=cfg.entity,
         tags=list(cfg.tags),
@@ -70,8 +70,9 @@ def open_wandb(cfg: WandbCfg, run_folder: Path, config: Mapping[str, Any]) -> Me
     return logger
 
 
-def _kept_id(path: Path) -> str:
-    """Return the id in a file of a run folder, which becomes part of paths and addresses."""
+def kept_id(run_folder: Path, logger: str = "wandb") -> str:
+    """Return the id that a run folder keeps of its run elsewhere, which becomes part of paths and addresses."""
+    path = run_folder / logger / "run_id"
     text = plain_data.read_bytes(path, limit=100).decode(errors="replace")
     if not re.fullmatch(r"[\w-]+", text, re.ASCII):
         raise ValueError(f"{path}: {text!r} is not the id of a run: letters, digits, _ and -")
@@ -113,17 +114,17 @@ def open_mlflow(cfg: MLflowCfg, run_folder: Path, config: Mapping[str, Any]) -> 
 
     folder = run_folder / "mlflow"
     folder.mkdir(parents=True, exist_ok=True)
-    kept_id = folder / "run_id"
-    resumes = kept_id.exists()
+    path = folder / "run_id"
+    resumes = path.exists()
     if resumes:
         # `mlflow.start_run`, which the logger calls without one, takes the id from here.
-        os.environ["MLFLOW_RUN_ID"] = _kept_id(kept_id)
+        os.environ["MLFLOW_RUN_ID"] = kept_id(run_folder, "mlflow")
     own = f"sqlite:///{(folder / 'mlflow.db').resolve()}"
     uri = cfg.tracking_uri or os.environ.get("MLFLOW_TRACKING_URI") or own
     artifacts = (folder / "artifacts").resolve().as_uri() if uri == own else None
     logger = _Run(cfg.experiment, uri, artifact_location=artifacts)
     if not resumes:
-        kept_id.write_text(logger.experiment.info.run_id)
+        path.write_text(logger.experiment.info.run_id)
         mlflow.set_tag("mlflow.runName", cfg.name or run_folder.name)
         params = list(_flat(config))
         for first in range(0, len(params), _MAX_PARAMS):

@@ -20,7 +20,9 @@ from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, record_video
 from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.run_folder import policy_of, without_nan_guard
 from ksim_rl.viewer.session import AGENTS, Conditions, Session, UntrainedAgent
+from ksim_rl.zoo import locate
 
+DEMO = "zoo:reacher"
 VIDEO_SUFFIXES = (".mp4", ".gif")
 
 
@@ -59,6 +61,11 @@ def play(arguments: list[str]) -> int:
     finally:
         session.close()
     return 0
+
+
+def demo(arguments: list[str]) -> int:
+    """Play a policy of the zoo: nothing is trained or fetched."""
+    return play([DEMO, *arguments])
 
 
 def session_of(played: Played, *, num_envs: int, seed: int) -> Session:
@@ -109,7 +116,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "what",
         nargs="+",
-        metavar="RUN | task=NAME | field=value",
+        metavar="RUN | zoo:NAME | task=NAME | field=value",
         help="a run folder or one of its checkpoints, or with --agent a task; then fields of its config to change",
     )
     parser.add_argument(
@@ -166,7 +173,7 @@ def _find(options: argparse.Namespace) -> Played:
             )
         return _without_policy(conf.compose([*options.what, f"device={options.device}"]), options.agent)
     changed = None
-    saved = checkpoint.load_latest(Path(first))
+    saved = checkpoint.load_latest(locate(first))
     if overrides:
         conf.register_run(saved.run_folder, conf.fields_of(overrides))
         composed = conf.check_command_line(overrides, name=conf.RUN_AGAIN, multirun=False, values=True)

@@ -74,9 +74,10 @@ def test_an_archive_that_unpacks_to_more_than_it_may_is_refused(tmp_path, monkey
 
 @pytest.mark.parametrize("text", ["../../elsewhere", "a b", "", "x" * 200])
 def test_the_id_of_a_run_is_no_path(tmp_path, text):
-    (tmp_path / "run_id").write_text(text)
+    (tmp_path / "wandb").mkdir()
+    (tmp_path / "wandb" / "run_id").write_text(text)
     with pytest.raises(ValueError, match=r"run_id"):
-        loggers._kept_id(tmp_path / "run_id")
+        loggers.kept_id(tmp_path)
 
 
 @pytest.mark.parametrize(

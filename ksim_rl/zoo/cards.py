@@ -1,0 +1,75 @@
+"""This module reads and writes what the zoo consists of: a card, a checkpoint and an ONNX file for each policy.
+
+An entry is a folder `policies/<name>`: `card.json`, `policy.onnx`, and `checkpoint/<iteration>` with the actor alone.
+All of it is data, and is read by the rules for run folders of strangers: checked by hash, never executed.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ksim_rl.checked import Checked, WholeNumber
+from ksim_rl.checks import near
+from ksim_rl.config import plain_data
+from ksim_rl.runs import record
+
+FOLDER = Path(__file__).parent / "policies"
+CARD, ONNX, CHECKPOINT = "card.json", "policy.onnx", "checkpoint"
+MOST_BYTES = 200_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Card(Checked):
+    """What is known of a policy: how it was trained, what it earns, and the SHA-256 of its files.
+
+    `curve` has pairs of env states and mean return of training episodes; `sim2sim` what MuJoCo's C engine earned of
+    the recorded return (`return_ratio`), its standard error and the episodes.
+    """
+
+    name: str
+    task: str
+    commit: str
+    seed: WholeNumber
+    num_envs: WholeNumber
+    iteration: WholeNumber
+    env_states: WholeNumber
+    return_mean: float | None = None
+    curve: Sequence[tuple[int, float]] = ()
+    sim2sim: Mapping[str, float] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)
+
+
+def cards(folder: Path = FOLDER) -> list[Card]:
+    """Return the cards of all entries, by name."""
+    return [read_card(name, folder) for name in _names(folder)]
+
+
+def _names(folder: Path) -> list[str]:
+    return sorted(path.parent.name for path in folder.glob(f"*/{CARD}"))
+
+
+def read_card(name: str, folder: Path = FOLDER) -> Card:
+    """Return an entry's card, after its files were compared with it; a ValueError names what is missing or differs."""
+    if name not in (known := _names(folder)):
+        raise ValueError(f"zoo:{name}: no such policy: {near(name, known)}")
+    path = folder / name / CARD
+    try:
+        tree = json.loads(plain_data.read_bytes(path, limit=MOST_BYTES))
+        plain: Any = {key: record.printable(v) if isinstance(v, str) else v for key, v in tree.items()}
+        card = Card(**plain)
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path}: no card: {record.printable(str(error))}") from error
+    if card.name != name or hashes(path.parent) != dict(card.files):
+        raise ValueError(f"{path.parent}: its files are not those of its card: install the package once more")
+    return card
+
+
+def hashes(entry: Path) -> dict[str, str]:
+    """Return the SHA-256 of each file but the card; a ValueError refuses links and large files."""
+    paths = [path for path in sorted(entry.rglob("*")) if path.is_symlink() or not path.is_dir()]
+    files = {str(path.relative_to(entry)): plain_data.read_bytes(path, limit=MOST_BYTES) for path in paths}
+    files.pop(CARD, None)
+    return {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}

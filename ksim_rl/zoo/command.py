@@ -1,0 +1,43 @@
+"""This module is the command `ksim-rl zoo`, which lists the policies that come with the package and adds one."""
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from ksim_rl.zoo import adding
+from ksim_rl.zoo.cards import FOLDER, cards, read_card
+
+ROW = "{:<20}{:<26}{:>12}{:>16}{:>10}  {}"
+
+
+def zoo(arguments: Sequence[str]) -> int:
+    """List the policies, show one's card, or make an entry out of a run."""
+    parser = argparse.ArgumentParser(prog="ksim-rl zoo", description="List or add policies of the package.")
+    parser.add_argument(
+        "words", nargs="*", metavar="NAME | add RUN NAME", help="show a card, or make an entry"
+    )
+    parser.add_argument("--folder", type=Path, default=FOLDER, help="of the zoo; default: the package's own")
+    parser.add_argument(
+        "--episodes", type=int, default=100, help="of `add`, in our physics and in MuJoCo's C engine"
+    )
+    options: Any = parser.parse_args(arguments)
+    match options.words:
+        case []:
+            print(ROW.format("name", "task", "env states", "return", "C engine", "commit"))
+            for card in cards(options.folder):
+                earned = "-" if card.return_mean is None else f"{card.return_mean:.4g}"
+                ratio = f"x {card.sim2sim.get('return_ratio', float('nan')):.3f}"
+                row = (card.name, card.task, f"{card.env_states:,}", earned, ratio, card.commit[:7])
+                print(ROW.format(*row))
+            return 0
+        case ["add", run, name]:
+            card = adding.add(Path(run), name, folder=options.folder, episodes=options.episodes)
+        case [name]:
+            card = read_card(name, options.folder)
+        case words:
+            raise ValueError(f"{' '.join(words)}: expected NAME, or add RUN NAME")
+    print(json.dumps(asdict(card), indent=1))
+    return 0

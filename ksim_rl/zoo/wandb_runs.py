@@ -1,0 +1,73 @@
+"""This module sends what a run leaves to Weights & Biases, and fetches it from there."""
+
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from ksim_rl.config import plain_data
+from ksim_rl.export import export
+from ksim_rl.trainers import checkpoint
+from ksim_rl.trainers.loggers import LoggerCfg, WandbCfg, check_installed, kept_id
+
+KIND = "ksim_rl_run"
+ADDRESS = re.compile(r"[\w.-]+/[\w.-]+/[\w-]+", re.ASCII)
+FILES = re.compile(r"(config\.yaml|video\.mp4|policy\.onnx|checkpoint/\d+/[a-z]+\.(json|safetensors))")
+
+
+def upload(cfg: WandbCfg, run: Path, *, note: Callable[[str], None]) -> None:
+    """Add a run's newest checkpoint, config, video and ONNX file to its run on Weights & Biases, as one artifact.
+
+    What cannot be sent is said in a line: the training stands without it.
+    """
+    try:
+        import wandb  # an extra
+
+        files = {name: run / name for name in ("config.yaml", "video.mp4") if (run / name).is_file()}
+        newest = checkpoint.latest(run, note=note)
+        files |= {f"checkpoint/{newest.name}/{path.name}": path for path in newest.iterdir()}
+        mode = "offline" if cfg.offline else None
+        with tempfile.TemporaryDirectory() as temporary:
+            try:
+                export(run, Path(temporary), episodes=0, note=lambda _: None)
+                files["policy.onnx"] = Path(temporary) / "policy.onnx"
+            except ValueError as error:
+                note(f"no policy.onnx for Weights & Biases: {error}")
+            own = kept_id(run)
+            account = {"project": cfg.project, "entity": cfg.entity, "id": own, "resume": "allow"}
+            session = wandb.init(dir=str(run), mode=mode, **account)
+            artifact = wandb.Artifact(f"run-{own}", type=KIND)
+            for name, path in files.items():
+                artifact.add_file(str(path), name=name)
+            session.log_artifact(artifact)
+            if "video.mp4" in files:
+                session.log({"video": wandb.Video(str(files["video.mp4"]), format="mp4")})
+            session.finish()
+    except Exception as error:  # a service has errors of its own
+        note(f"warning: nothing was sent to Weights & Biases: {type(error).__name__}: {error}")
+
+
+def download(address: str, folder: Path, *, note: Callable[[str], None]) -> Path:
+    """Fetch the newest artifact of a run `ENTITY/PROJECT/RUN` into a run folder in `folder`, and return it.
+
+    Raises ValueError for another address, a run without one, and files that no run of ours has.
+    """
+    if not ADDRESS.fullmatch(address):
+        raise ValueError(f"wandb:{address}: expected wandb:ENTITY/PROJECT/RUN, RUN is the run's id")
+    check_installed(LoggerCfg(wandb=WandbCfg()))
+    try:
+        import wandb  # an extra
+
+        found = [entry for entry in wandb.Api().run(address).logged_artifacts() if entry.type == KIND]
+    except Exception as error:
+        raise ValueError(f"wandb:{address}: {type(error).__name__}: {error}") from error
+    if not found:
+        raise ValueError(f"wandb:{address}: no checkpoint was uploaded: train with logger=wandb")
+    for name in found[-1].manifest.entries:
+        if not FILES.fullmatch(name):
+            raise ValueError(f"wandb:{address}: {name!r} is no file of a run")
+    target = folder / address.replace("/", "_")
+    found[-1].download(root=str(target))
+    plain_data.check_links(target, below=("checkpoint",))
+    note(f"wandb:{address}: copied to {target}")
+    return target

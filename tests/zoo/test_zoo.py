@@ -1,0 +1,192 @@
+"""Policies of the zoo are whole, small, and read as data; those of Weights & Biases come through a stub of its API."""
+
+import json
+import shutil
+import sys
+import types
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+
+import pytest
+
+from ksim_rl.cli.main import main
+from ksim_rl.trainers import checkpoint
+from ksim_rl.trainers.loggers import WandbCfg
+from ksim_rl.zoo import cards, locate, read_card, wandb_runs
+from ksim_rl.zoo.cards import FOLDER, MOST_BYTES
+
+NAMES = [card.name for card in cards()]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_entry_is_small_and_says_where_it_comes_from(name):
+    card = read_card(name)
+    files = [path for path in (FOLDER / name).rglob("*") if path.is_file()]
+    assert {path.name for path in files} == {
+        "card.json",
+        "policy.onnx",
+        "manifest.json",
+        "tensors.safetensors",
+    }
+    assert sum(path.stat().st_size for path in files) <= MOST_BYTES
+    assert len(card.commit) == 40 and card.env_states > 0 and len(card.curve) > 5
+    assert abs(card.sim2sim["return_ratio"] - 1.0) < 0.03
+    saved = checkpoint.load_latest(FOLDER / name)
+    assert saved.iteration == card.iteration and saved.config["task_name"] == card.task
+    assert set(saved.state) == {"observation_columns", "update"}
+
+
+def test_one_is_copied_into_a_run_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = []
+    copy = locate(f"zoo:{NAMES[0]}", note=said.append)
+    assert copy == Path("runs/zoo") / NAMES[0]
+    assert checkpoint.load_latest(copy).iteration == read_card(NAMES[0]).iteration
+    assert "copied to runs/zoo" in said[0]
+    assert locate(f"zoo:{NAMES[0]}", note=said.append) == copy
+    assert locate("runs/mine") == Path("runs/mine")
+
+
+@pytest.fixture
+def zoo(tmp_path):
+    shutil.copytree(FOLDER / NAMES[0], tmp_path / NAMES[0])
+    return tmp_path
+
+
+def test_changed_files_are_refused(zoo):
+    read_card(NAMES[0], zoo)
+    with open(zoo / NAMES[0] / "policy.onnx", "ab") as file:
+        file.write(b"more")
+    with pytest.raises(ValueError, match="are not those of its card"):
+        read_card(NAMES[0], zoo)
+
+
+def test_links_and_strangers_cards_are_refused(zoo):
+    card = zoo / NAMES[0] / "card.json"
+    tree = json.loads(card.read_text())
+    card.write_text(json.dumps(tree | {"seed": "one"}))
+    with pytest.raises(ValueError, match=r"no card: seed='one'"):
+        read_card(NAMES[0], zoo)
+    card.write_text(json.dumps(tree | {"more": 1}))
+    with pytest.raises(ValueError, match="no card: .*more"):
+        read_card(NAMES[0], zoo)
+    card.write_text(json.dumps(tree))
+    (zoo / NAMES[0] / "policy.onnx").unlink()
+    (zoo / NAMES[0] / "policy.onnx").symlink_to("/etc/hostname")
+    with pytest.raises(ValueError, match="cannot be read"):
+        read_card(NAMES[0], zoo)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["play", "zoo:../../secret"], "no such policy"),
+        (["play", f"zoo:{NAMES[0]}e"], f"did you mean '{NAMES[0]}'"),
+        (["eval", "wandb:../secret"], "expected wandb:ENTITY/PROJECT/RUN"),
+        (["zoo", "add", "runs/x"], "expected NAME, or add RUN NAME"),
+        (["zoo", "add", "runs/x", "../x"], "lower-case letters"),
+    ],
+)
+def test_wrong_names_are_refused_in_one_line(words, said, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+def test_the_list_names_all(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["zoo"])
+    assert ended.value.code == 0
+    assert all(name in capsys.readouterr().out for name in NAMES)
+
+
+# -- Weights & Biases --------------------------------------------------------------------------------------------
+
+
+class Artifact:
+    """What `wandb.Artifact` is to us: files by name, which are downloaded into a folder."""
+
+    def __init__(self, name, type):
+        self.name, self.type, self.files = name, type, {}
+
+    @property
+    def manifest(self):
+        return types.SimpleNamespace(
+            entries={name: types.SimpleNamespace(size=len(content)) for name, content in self.files.items()}
+        )
+
+    def add_file(self, path, name):
+        self.files[name] = Path(path).read_bytes()
+
+    def download(self, root):
+        for name, content in self.files.items():
+            (Path(root) / name).parent.mkdir(parents=True, exist_ok=True)
+            (Path(root) / name).write_bytes(content)
+
+
+class Stub(types.ModuleType):
+    """A `wandb` that keeps what it is sent."""
+
+    def __init__(self):
+        super().__init__("wandb")
+        self.__spec__ = ModuleSpec("wandb", None)
+        self.kept, self.began, self.logged = [], {}, []
+        self.Artifact, self.Video = Artifact, lambda path, format: path
+
+    def init(self, **options):
+        self.began = options
+        return types.SimpleNamespace(
+            log_artifact=self.kept.append, log=self.logged.append, finish=lambda: None
+        )
+
+    def Api(self):
+        return types.SimpleNamespace(run=lambda _: types.SimpleNamespace(logged_artifacts=lambda: self.kept))
+
+
+@pytest.fixture
+def wandb(monkeypatch):
+    stub = Stub()
+    monkeypatch.setitem(sys.modules, "wandb", stub)
+    return stub
+
+
+def test_a_run_is_sent_to_wandb_and_comes_back(wandb, zoo, tmp_path, monkeypatch):
+    run = zoo / NAMES[0]
+    (run / "wandb").mkdir()
+    (run / "wandb" / "run_id").write_text("abc123")
+    (run / "video.mp4").write_bytes(b"frames")
+    monkeypatch.setattr(
+        wandb_runs, "export", lambda run, folder, **_: (folder / "policy.onnx").write_bytes(b"net")
+    )
+    said = []
+    wandb_runs.upload(WandbCfg(project="robots"), run, note=said.append)
+    assert said == [] and wandb.began["id"] == "abc123" and wandb.began["project"] == "robots"
+    newest = checkpoint.latest(run).name
+    assert set(wandb.kept[0].files) == {
+        "video.mp4",
+        "policy.onnx",
+        f"checkpoint/{newest}/manifest.json",
+        f"checkpoint/{newest}/tensors.safetensors",
+    }
+    assert "video" in wandb.logged[0]
+    fetched = wandb_runs.download("me/robots/abc123", tmp_path / "fetched", note=said.append)
+    assert fetched == tmp_path / "fetched" / "me_robots_abc123"
+    assert checkpoint.load_latest(fetched).iteration == read_card(NAMES[0]).iteration
+
+
+def test_a_service_that_fails_costs_no_training(wandb, zoo, monkeypatch):
+    monkeypatch.setattr(wandb_runs, "export", lambda *_, **__: None)
+    said = []
+    wandb_runs.upload(WandbCfg(), zoo / NAMES[0], note=said.append)  # the folder has no id
+    assert len(said) == 1 and "nothing was sent to Weights & Biases" in said[0]
+
+
+@pytest.mark.parametrize("name", ["../../secret", "checkpoint/1/evil.py", "/etc/passwd", "config.yaml/../x"])
+def test_an_artifact_with_other_files_is_refused(wandb, name, tmp_path):
+    artifact = Artifact("run-x", wandb_runs.KIND)
+    artifact.files[name] = b"x"
+    wandb.kept.append(artifact)
+    with pytest.raises(ValueError, match="is no file of a run"):
+        wandb_runs.download("me/robots/abc123", tmp_path / "fetched", note=print)
+    assert not (tmp_path / "fetched").exists()
