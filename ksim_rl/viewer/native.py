@@ -15,8 +15,8 @@ from ksim_rl.viewer.browser_scene import draw
 from ksim_rl.viewer.session import SPEEDS, Session
 
 FRAME_S = 1.0 / 60.0
-HELP = "space pauses, N steps, Backspace resets, P pushes, [ and ] change the speed, , and . the env"
-_SPACE, _BACKSPACE = 32, 259
+# MuJoCo's window itself takes all letters, to switch what it draws.
+HELP = "space pauses, right steps, Backspace resets, Enter pushes, - and = set the speed, up and down the env"
 
 
 def check_display() -> None:
@@ -72,12 +72,12 @@ def _keys(session: Session) -> dict[int, Callable[[], None]]:
         session.choose((session.env_index + change) % session.ours.num_envs)
 
     return {
-        _SPACE: lambda: session.play(not session.playing),
-        ord("N"): session.step_once,
-        _BACKSPACE: session.reset,
-        ord("P"): lambda: session.push(1.0),
-        ord("["): lambda: speed(-1),
-        ord("]"): lambda: speed(1),
-        ord(","): lambda: env(-1),
-        ord("."): lambda: env(1),
+        glfw.KEY_SPACE: lambda: session.play(not session.playing),
+        glfw.KEY_RIGHT: session.step_once,
+        glfw.KEY_BACKSPACE: session.reset,
+        glfw.KEY_ENTER: lambda: session.push(1.0),
+        glfw.KEY_MINUS: lambda: speed(-1),
+        glfw.KEY_EQUAL: lambda: speed(1),
+        glfw.KEY_DOWN: lambda: env(-1),
+        glfw.KEY_UP: lambda: env(1),
     }
