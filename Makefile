@@ -10,7 +10,7 @@ ARGS ?=
 # Whole files go to one worker, since their tests share envs and compiled kernels.
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: setup train check lint types imports house docs test test-full dist figures clean
+.PHONY: setup train check lint types imports house docs test test-full test-oldest test-newest dist figures clean
 
 setup: $(STAMP)
 
@@ -50,6 +50,13 @@ test: setup check docs
 
 test-full: setup check docs
 	$(BIN)/python -m pytest $(PARALLEL) -m "full or not full" --cov --cov-report=term $(ARGS)
+
+# The tests with the oldest, or with the newest, versions that pyproject.toml allows, in a venv of their own.
+test-oldest test-newest: test-%:
+	@test -x .venv-$*/bin/python || $(PYTHON) -m venv .venv-$*
+	.venv-$*/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager $(if $(filter oldest,$*),-c constraints-oldest.txt) -e ".[dev]"
+	.venv-$*/bin/python -m pip freeze
+	.venv-$*/bin/python -m pytest $(PARALLEL) $(ARGS)
 
 # sdist and wheel, under dist/.
 dist: setup

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.version import Version
 
 import ksim_rl
 
@@ -49,6 +51,7 @@ def test_the_sdist_has_the_package_the_tests_and_what_builds_them(built):
         "LICENSE",
         "Makefile",
         "constraints.txt",
+        "constraints-oldest.txt",
         "pyproject.toml",
     } <= names
     assert not [name for name in names if name.split("/")[0] in ("envs", "objectives", ".venv", "runs")]
@@ -118,6 +121,21 @@ def test_each_dependency_is_pinned_for_the_tested_environment():
     assert not [line for line in lines if "/" in line or "@" in line or "+" in line]
 
 
+def test_the_oldest_versions_that_are_tried_are_the_lower_bounds():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    integrations = {entry for name, entries in extras.items() if name != "dev" for entry in entries}
+    wanted = [
+        Requirement(entry) for entry in {*project["dependencies"], *(integrations & set(extras["dev"]))}
+    ]
+    lows = {each.name: part.version for each in wanted for part in each.specifier if part.operator == ">="}
+    lines = (ROOT / "constraints-oldest.txt").read_text().splitlines()
+    pinned = dict(line.split("==") for line in lines if not line.startswith("#"))
+    assert {name: Version(low) for name, low in lows.items()} == {
+        name: Version(version) for name, version in pinned.items()
+    }
+
+
 def test_the_citation_is_of_this_version():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert citation["version"] == ksim_rl.__version__
@@ -142,6 +160,10 @@ def test_the_workflow_and_the_hooks_run_what_make_runs():
     jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
     commands = [step.get("run", "") for job in jobs.values() for step in job["steps"]]
     assert ".ci/run" in commands and os.access(ROOT / ".ci" / "run", os.X_OK)
+    (bounds,) = yaml.safe_load((ROOT / ".github" / "workflows" / "versions.yml").read_text())["jobs"].values()
+    tried = {f"test-{each['versions']}" for each in bounds["strategy"]["matrix"]["include"]}
+    assert f"{' '.join(sorted(tried, reverse=True))}: test-%:" in (ROOT / "Makefile").read_text()
+    assert bounds["steps"][-1]["run"].startswith("make test-${{ matrix.versions }}")
     (local,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
     makefile = (ROOT / "Makefile").read_text()
     for hook in local["hooks"]:

@@ -63,7 +63,9 @@ def test_workers_know_their_number():
     assert [number for _, number in found] == [0, 1, 0], moved
     # The same state of torch's generator and the same number give the same seed; another number gives another one.
     assert found[0] == found[2] and found[0][0] != found[1][0], moved
-    for function in (batched_envs._run_worker_pipe_shared_mem, _runner._main_async_collector_impl):
+    # Its name since TorchRL 0.14.1.
+    collect = getattr(_runner, "_main_async_collector_impl", _runner._main_async_collector)
+    for function in (batched_envs._run_worker_pipe_shared_mem, collect):
         assert {"worker_idx", "idx"} & set(inspect.signature(function).parameters), (
             f"TorchRL: {function.__name__}"
         )
