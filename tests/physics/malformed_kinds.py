@@ -3,6 +3,7 @@
 `python -m tests.physics.malformed_kinds [NAME ...]` prints the figures; `figures()` returns them.
 """
 
+import faulthandler
 import os
 import resource
 import signal
@@ -278,6 +279,7 @@ def load_apart(write: Writes, *, load: Callable[[Path], object] = load_model) ->
 
 def _load_and_say(load: Callable[[Path], object], path: Path, pipe: int) -> None:
     """Leave the process with what came of it in the pipe; the child of a test runner must not return."""
+    faulthandler.disable()  # what the test runner has enabled would print a traceback for each crash that is counted
     try:
         resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES))
         # Processor time, since other programs may hold the machine up; wall time only ends what waits for ever.
