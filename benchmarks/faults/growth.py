@@ -23,7 +23,7 @@ SETTLED = 0.4
 
 
 def memory(kind: str = "RssAnon") -> int:
-    """Return the memory of this process in bytes: its own, or with the pages of libraries, which are files ("VmRSS")."""
+    """Return the memory of this process in bytes: its own, or with the pages of libraries ("VmRSS")."""
     (kilobytes,) = re.findall(rf"^{kind}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
     return int(kilobytes) * 1024
 
