@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
@@ -15,6 +16,9 @@ from benchmarks.faults.row import EXACTLY, Figures, Row
 from ksim_rl import conf
 from ksim_rl.scene.rendering import rendering
 from ksim_rl.trainers.build import build
+
+# What runs as `ksim-rl` in a process of its own.
+PROGRAM = ("-m", "ksim_rl.cli.main")
 
 
 def no_gpu(folder: Path) -> Figures:
@@ -60,7 +64,39 @@ def headless(folder: Path) -> Figures:
     return {"platforms": 2, "picked": picked, "error_with_the_fix": all(word in message for word in words)}
 
 
+def caches(folder: Path) -> Figures:
+    """Train where nothing can be written at home, where Warp's cache cannot be made, and without a HOME."""
+    places = {"home": {"HOME": "/dev/null"}, "warp": {"WARP_CACHE_PATH": "/dev/null/cache"}, "none": {}}
+    kept = {
+        key: value for key, value in os.environ.items() if key not in ("WARP_CACHE_PATH", "XDG_CACHE_HOME")
+    }
+    told, codes = 0, {}
+    for name, changed in places.items():
+        environment = {**kept, **changed}
+        if name == "none":
+            environment.pop("HOME", None)
+        command = [sys.executable, *PROGRAM, "train", *children.SMALLEST]
+        command += ["trainer.num_iterations=1", "trainer.eval_episodes=0", f"hydra.run.dir={folder / name}"]
+        ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=1800)
+        codes[name] = ended.returncode
+        lines = [line for line in ended.stderr.splitlines() if line.startswith("ksim-rl: error")]
+        told += len(lines) == 1 and "WARP_CACHE_PATH" in lines[0] and "Traceback" not in ended.stderr
+    refused = sum(codes[name] == 2 for name in ("home", "warp"))
+    return {"refused": refused, "one_line_with_the_fix": told, "runs_without_home": codes["none"] in (0, 1)}
+
+
 ROWS = {
+    "caches": Row(
+        fault="HOME or Warp's cache cannot be written; HOME is not set",
+        must="refused in one line that names WARP_CACHE_PATH, exit code 2; without HOME it trains",
+        limits={
+            "refused": (EXACTLY, 2),
+            "one_line_with_the_fix": (EXACTLY, 2),
+            "runs_without_home": (EXACTLY, 1),
+        },
+        measure=caches,
+        files=("ksim_rl/device/streams.py",),
+    ),
     "no_gpu": Row(
         fault="a GPU is asked for where there is none",
         must="refused in one line that names the CPU; `device=auto` takes the CPU",

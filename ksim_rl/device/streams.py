@@ -28,10 +28,11 @@ def start_warp() -> None:
     """Start Warp, without its complaint about an absent NVIDIA driver where torch finds no GPU either.
 
     A run on the CPU is no fault, and who asks for CUDA there is refused by name. The complaint is written by native
-    code, so it can be told from other messages only on the file descriptor.
+    code, so it can be told from other messages only on the file descriptor. A ValueError where Warp has no folder for
+    its kernels.
     """
     if torch.cuda.is_available():
-        wp.init()
+        _init()
         return
     sys.stderr.flush()
     stderr = os.dup(2)
@@ -39,7 +40,7 @@ def start_warp() -> None:
         with tempfile.TemporaryFile() as caught:
             os.dup2(caught.fileno(), 2)
             try:
-                wp.init()
+                _init()
             finally:
                 os.dup2(stderr, 2)
             caught.seek(0)
@@ -47,6 +48,15 @@ def start_warp() -> None:
     finally:
         os.close(stderr)
     sys.stderr.writelines(line for line in lines if ABSENT_DRIVER not in line)
+
+
+def _init() -> None:
+    try:
+        wp.init()
+    except OSError as error:
+        raise ValueError(
+            f"Warp has no folder for its kernels: {error}; set WARP_CACHE_PATH to a folder of yours"
+        ) from error
 
 
 def checked_device(device: str | torch.device) -> torch.device:

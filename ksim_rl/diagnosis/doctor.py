@@ -94,7 +94,7 @@ def _look_at_caches(report: Report) -> bool:
     try:
         start_warp()
     except Exception as error:  # Warp raises whatever the file system does
-        wrong = f"{type(error).__name__}: {error}; set WARP_CACHE_PATH to a folder of yours"
+        wrong = f"{type(error).__name__}: {error}"
         report.say("Warp", f"does not start: {wrong}", wrong=True)
     for name, variable, folder in _caches(warp_starts=wrong is None):
         refusal = _refusal(folder)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from benchmarks import report
-from benchmarks.faults import children, page
+from benchmarks.faults import children, machine, page
 from benchmarks.faults.row import Row
 from benchmarks.faults.rows import ROWS
 from ksim_rl.cli import errors
@@ -182,6 +182,15 @@ def pickles_are_loaded(patch):
 def as_mujoco_takes_them(patch):
     patch.setattr(load, "check_meant", lambda *_, **__: None)
     patch.setattr(load, "check_finite", lambda *_, **__: None)
+
+
+@sabotage("caches")
+def errors_as_warp_raises_them(patch):
+    program = (
+        "import sys, warp; from ksim_rl.device import streams; streams._init = warp.init; "
+        "from ksim_rl.cli.main import main; sys.exit(main())"
+    )
+    patch.setattr(machine, "PROGRAM", ("-c", program))
 
 
 @sabotage("no_gpu")
