@@ -35,9 +35,8 @@ class CsvTable:
         new_columns = [name for name in row if name not in self._columns]
         same_row = bool(self._rows) and int(self._rows[-1][STEP]) == step
         if same_row:
-            self._rows[-1] |= row
-        else:
-            self._rows.append(row)
+            row = self._rows.pop() | row
+        self._rows.append(row)
         self._columns += new_columns
         # None until the row is written, so that after a failure the next row copies the table.
         begins, self._last_begins = self._last_begins, None
@@ -46,7 +45,7 @@ class CsvTable:
         else:
             with open(self.path, "r+", newline="") as file:
                 begins = file.seek(begins) if same_row else file.seek(0, io.SEEK_END)
-                self._writer(file).writerow(self._rows[-1])
+                self._writer(file).writerow(row)
                 file.truncate()
         self._last_begins = begins
         del self._rows[:-1]
@@ -80,10 +79,8 @@ def read_table(path: Path) -> tuple[list[str], list[dict[str, str]]]:
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[list[str], Iterator[dict[str, str]]]]:
     """Give the columns of a table, and its whole rows one by one; of no file, those of a new table."""
-    if not path.exists():
-        yield [STEP], iter(())
-        return
-    with io.TextIOWrapper(open_regular(path, limit=MOST_DATA_BYTES), errors="replace", newline="") as file:
+    content = open_regular(path, limit=MOST_DATA_BYTES) if path.exists() else io.BytesIO()
+    with io.TextIOWrapper(content, errors="replace", newline="") as file:
         reader = csv.DictReader(line for line in file if line.endswith("\n"))
         rows = (row for row in reader if row.get(STEP) and None not in row.values())
         yield list(reader.fieldnames or [STEP]), rows
