@@ -25,22 +25,22 @@ _warp_streams: dict[tuple[int, int], tuple[torch.cuda.Stream, wp.Stream]] = {}
 
 @cache
 def start_warp() -> None:
-    """Start Warp, without its complaint about an absent NVIDIA driver where torch finds no GPU either.
+    """Start Warp, without its complaint about an absent NVIDIA driver; a ValueError where it has no folder for kernels.
 
     A run on the CPU is no fault, and who asks for CUDA there is refused by name. The complaint is written by native
-    code, so it can be told from other messages only on the file descriptor. A ValueError where Warp has no folder for
-    its kernels.
+    code, so it can be told from other messages only on the file descriptor.
     """
-    if torch.cuda.is_available():
-        _init()
-        return
     sys.stderr.flush()
     stderr = os.dup(2)
     try:
         with tempfile.TemporaryFile() as caught:
             os.dup2(caught.fileno(), 2)
             try:
-                _init()
+                wp.init()
+            except OSError as error:
+                raise ValueError(
+                    f"Warp's cache: {error}; set WARP_CACHE_PATH to a folder of yours"
+                ) from error
             finally:
                 os.dup2(stderr, 2)
             caught.seek(0)
@@ -48,15 +48,6 @@ def start_warp() -> None:
     finally:
         os.close(stderr)
     sys.stderr.writelines(line for line in lines if ABSENT_DRIVER not in line)
-
-
-def _init() -> None:
-    try:
-        wp.init()
-    except OSError as error:
-        raise ValueError(
-            f"Warp has no folder for its kernels: {error}; set WARP_CACHE_PATH to a folder of yours"
-        ) from error
 
 
 def checked_device(device: str | torch.device) -> torch.device:
