@@ -21,7 +21,7 @@ def upload(cfg: WandbCfg, run: Path, *, note: Callable[[str], None]) -> None:
     What cannot be sent is said in a line: the training stands without it.
     """
     try:
-        import wandb  # an extra
+        import wandb  # pyright: ignore[reportMissingImports]
 
         files = {name: run / name for name in ("config.yaml", "video.mp4") if (run / name).is_file()}
         newest = checkpoint.latest(run, note=note)
@@ -56,7 +56,7 @@ def download(address: str, folder: Path, *, note: Callable[[str], None]) -> Path
         raise ValueError(f"wandb:{address}: expected wandb:ENTITY/PROJECT/RUN, RUN is the run's id")
     check_installed(LoggerCfg(wandb=WandbCfg()))
     try:
-        import wandb  # an extra
+        import wandb  # pyright: ignore[reportMissingImports]
 
         found = [entry for entry in wandb.Api().run(address).logged_artifacts() if entry.type == KIND]
     except Exception as error:
