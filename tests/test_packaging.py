@@ -82,6 +82,7 @@ print(ksim_rl.__version__)
 """
 
 
+@pytest.mark.full
 def test_an_installed_wheel_imports_from_elsewhere(built, tmp_path):
     target = tmp_path / "site"
     install = [

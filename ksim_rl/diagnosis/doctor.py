@@ -21,7 +21,7 @@ from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.device.streams import start_warp, warp_device
 from ksim_rl.diagnosis.self_test import try_device
 from ksim_rl.runs import record
-from ksim_rl.scene.rendering.rendering import choose_gl_platform
+from ksim_rl.scene.rendering import rendering
 
 NVIDIA = Path("/proc/driver/nvidia/version")
 _DRAWS = """
@@ -174,7 +174,7 @@ def _look_at_gpus(report: Report) -> None:
 def _look_at_opengl(report: Report) -> None:
     """Report whether pictures can be drawn off screen, tried in a process of its own, since MuJoCo may abort it."""
     try:
-        platform = choose_gl_platform()
+        platform = rendering.choose_gl_platform()
     except RuntimeError as error:
         report.say("OpenGL", str(error), wrong=True)
         return

@@ -13,7 +13,12 @@ NAMES = list(OBJECTIVES)
 
 @pytest.mark.parametrize(
     ("name", "ends"),
-    [("sac", "truncation"), ("td3", "termination"), ("fast_sac", "termination"), ("fast_td3", "truncation")],
+    [
+        ("sac", "truncation"),
+        ("td3", "termination"),
+        pytest.param("fast_sac", "termination", marks=pytest.mark.full),
+        pytest.param("fast_td3", "truncation", marks=pytest.mark.full),
+    ],
 )
 def test_finds_the_best_actions_and_their_values(name, ends):
     env = make_env(32, terminate_at=1 if ends == "termination" else None)

@@ -119,6 +119,7 @@ def test_an_algorithm_from_another_package_trains_and_is_evaluated(site, tmp_pat
     assert "cartpole_balance, iteration 3: evaluation over 2 episodes" in judged.stdout, judged.stderr
 
 
+@pytest.mark.full
 def test_a_plugin_is_named_and_its_settings_are_varied_like_ours(tmp_path):
     site, named = write_package(tmp_path), ("--plugin", "my_learning")
     shown = ksim_rl(site, "train", *named, "objective=slow", *SMALL, "--cfg", "job", "--package", "objective")

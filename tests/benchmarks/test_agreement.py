@@ -24,7 +24,14 @@ def check(name: str, num_worlds: int) -> agreement.Agreement:
     return found
 
 
-@pytest.mark.parametrize("name", ["cartpole", "double_pendulum", "spinning_body"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "double_pendulum",
+        pytest.param("cartpole", marks=pytest.mark.full),
+        pytest.param("spinning_body", marks=pytest.mark.full),
+    ],
+)
 def test_smooth_models_agree_after_100_substeps(name):
     found = check(name, num_worlds=8)
     assert {"qpos", "qvel", "xpos", "sensordata"} <= found.errors.keys()

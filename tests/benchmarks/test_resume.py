@@ -51,6 +51,7 @@ def in_this_process(*words):
     assert stopped.value.code == 0
 
 
+@pytest.mark.full
 def test_a_run_resumed_by_the_command_in_a_new_process_is_bit_identical(tmp_path):
     small = (
         "task=quadruped_velocity_flat",

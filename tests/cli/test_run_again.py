@@ -165,6 +165,7 @@ def test_a_sweep_of_a_run_made_again(first, tmp_path):
     assert found == [(1, 0.1), (1, 0.2)]
 
 
+@pytest.mark.full
 def test_each_job_of_a_sweep_that_fails_says_so_and_the_others_run(first, tmp_path, capsys):
     widths = (f"checkpoint={first}", "modules.actor.hidden_dims=[8],[16],[9]")
     assert run("--multirun", *SMALL, *widths, f"hydra.sweep.dir={tmp_path / 'sweep'}") == 2

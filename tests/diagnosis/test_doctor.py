@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from ksim_rl.cli.main import main
+from ksim_rl.device import streams
 from ksim_rl.diagnosis import doctor, self_test
 
 
@@ -46,7 +47,8 @@ def test_warp_that_does_not_start_is_a_fault_and_ends_no_report(draws, monkeypat
     def refuse():
         raise PermissionError(13, "Permission denied", "/somewhere")
 
-    monkeypatch.setattr(doctor, "start_warp", refuse)
+    monkeypatch.setattr(streams.wp, "init", refuse)
+    monkeypatch.setattr(doctor, "start_warp", streams.start_warp.__wrapped__)
     report = doctor.examine()
     assert [fault.partition(":")[0] for fault in report.faults] == ["Warp"]
     assert "WARP_CACHE_PATH" in report.faults[0] and "OpenGL" in str(report)
@@ -60,6 +62,10 @@ def test_no_home_is_a_fault(draws, monkeypatch, home):
 
 
 def test_no_opengl_is_a_fault_with_what_to_install(monkeypatch):
+    # What another test of this process chose is kept.
+    monkeypatch.setattr(
+        doctor.rendering, "choose_gl_platform", doctor.rendering.choose_gl_platform.__wrapped__
+    )
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
     report = doctor.Report()
     doctor._look_at_opengl(report)

@@ -32,6 +32,7 @@ def commands(prefix: str) -> list[str]:
     return re.findall(rf"^    {prefix} (.*)$", (guide.DOCS / GUIDE).read_text(), re.MULTILINE)
 
 
+@pytest.mark.full
 def test_the_robot_stands_and_is_drawn(folder: Path) -> None:
     (script,) = commands("python")
     heights = re.findall(r"0\.\d+", run(folder, script).split("upright")[0])
@@ -59,6 +60,7 @@ def test_it_is_explained(folder: Path) -> None:
     assert "foot_clearance" in run(folder, "-m", "ksim_rl.cli.main", "envs", *command.split())
 
 
+@pytest.mark.full
 def test_the_report_is_what_the_guide_says(folder: Path) -> None:
     (command,) = commands("ksim-rl robot")
     out = run(folder, "-m", "ksim_rl.cli.main", "robot", *command.split())

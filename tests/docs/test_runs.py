@@ -26,6 +26,7 @@ def work(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.full
 def test_a_run_is_made_and_read_from_python(work):
     scope = execute("runs.md", "python")
     assert record.status(work / "runs" / "mine") == ("done", "all 2 iterations are done")

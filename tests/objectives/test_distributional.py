@@ -33,7 +33,9 @@ def _slow(probs, reward, discount):
 
 # tests/conftest.py turns Triton's interpreter on where there is no CUDA.
 @pytest.mark.parametrize("by_kernel", [False, True])
-@pytest.mark.parametrize("scale", [0.1, 1.0, 20.0])
+@pytest.mark.parametrize(
+    "scale", [1.0, *(pytest.param(scale, marks=pytest.mark.full) for scale in (0.1, 20.0))]
+)
 def test_projection_is_that_of_the_paper(scale, by_kernel):
     project, device = project_distribution, "cpu"
     if by_kernel:

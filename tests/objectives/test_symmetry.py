@@ -151,7 +151,7 @@ def test_for_symmetric_networks_images_change_no_loss_and_no_gradient():
             torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-5)
 
 
-@pytest.mark.parametrize("symmetry", ["augment", "loss"])
+@pytest.mark.parametrize("symmetry", ["loss", pytest.param("augment", marks=pytest.mark.full)])
 def test_makes_no_host_sync_and_no_compiler_break(symmetry):
     actor, critic = networks()
     data = minibatch(actor, critic)

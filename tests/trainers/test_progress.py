@@ -92,6 +92,7 @@ with RunProgress(10) as progress:
 """
 
 
+@pytest.mark.full
 def test_a_pipe_that_nobody_reads_does_not_end_the_run():
     done = subprocess.run([sys.executable, "-c", CLOSED], stderr=subprocess.PIPE, text=True)
     assert (done.returncode, done.stderr.count("nobody reads the output any more")) == (0, 1)
