@@ -52,7 +52,12 @@ def export(run: Path, folder: Path | None = None, *, device: str = "cpu", **opti
         commit = sessions[-1].code.get("ksim_rl", {}).get("commit")
         options["trained_with"] = {"commit": commit, "versions": dict(sessions[-1].versions)}
     folder = run_folder / "export" if folder is None else folder
-    return export_policy(policy_of(saved, device=device), folder, run_path=str(saved.path), **options)
+    return export_policy(
+        policy_of(saved, device=device),
+        folder,
+        run_path=str(saved.path.absolute().relative_to(saved.run_folder.parent)),
+        **options,
+    )
 
 
 def export_policy(

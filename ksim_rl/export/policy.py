@@ -210,6 +210,9 @@ def write(policy: ExportedPolicy, folder: Path) -> None:
     shapes: tuple[Any, ...] = ({0: batch}, tuple({0: batch} for _ in policy.states))
     with torch.no_grad(), _quiet():
         program = torch.export.export(policy, example, dynamic_shapes=shapes if policy.states else shapes[:1])
+        # They name the folders of this machine, in files that are made to be given away.
+        for node in program.graph.nodes:
+            node.meta.pop("stack_trace", None)
         torch.export.save(program, folder / "policy.pt2")
         onnx = torch.onnx.export(
             program,

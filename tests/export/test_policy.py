@@ -1,5 +1,8 @@
 """Policies of each kind are written, read by onnxruntime and by torch, and compared with the actor itself."""
 
+import zipfile
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -117,6 +120,14 @@ def test_pt2_and_onnx_carry_histories_and_memory_as_inputs_and_outputs(tmp_path)
     wanted = session.run(None, dict(zip(policy.input_names, feeds, strict=True)))
     for one, other in zip(found, wanted, strict=True):
         np.testing.assert_allclose(one.detach().numpy(), other, atol=1e-5)
+
+
+def test_the_files_do_not_name_folders_of_this_machine(tmp_path):
+    policies.write(ExportedPolicy(moved(KINDS["gaussian"]()), PLAIN), tmp_path)
+    with zipfile.ZipFile(tmp_path / "policy.pt2") as archive:
+        parts = [archive.read(name) for name in archive.namelist()]
+    here = str(Path(policies.__file__).parent).encode()
+    assert not any(here in part for part in (*parts, (tmp_path / "policy.onnx").read_bytes()))
 
 
 def test_a_wrong_file_is_seen(tmp_path):
