@@ -1,4 +1,4 @@
-"""How far two runs of the same worlds are apart, per quantity, relative to its scale."""
+"""This module measures how far two runs of the same worlds are apart, per quantity, relative to its scale."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""How fast the captured rollout is, beside TorchRL's own `Collector` on the same env.
+"""This benchmark times the captured rollout beside TorchRL's own `Collector` on the same env.
 
     python -m benchmarks.collector task=cartpole_balance num_envs=4096,64 device=cuda
 

@@ -1,4 +1,4 @@
-"""Which committed figures are older than the files that they measure, and how to renew them.
+"""This command lists the committed figures that are older than what they measure, and how to renew them.
 
     python -m benchmarks.figures
 

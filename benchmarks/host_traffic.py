@@ -1,4 +1,4 @@
-"""What the host does with the GPU in one iteration: waits and copies, as the profiler of CUDA saw them."""
+"""This module counts the waits and copies of one iteration between host and GPU, as CUDA's profiler saw them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a task is learned: trains it with some seeds, and keeps the curves.
+"""This benchmark trains a task with some seeds, and keeps the curves.
 
     python -m benchmarks.learning_curve task=go1_velocity_flat seeds=1,2,3 env_states=30e6 num_envs=4096 device=cuda
 

@@ -1,4 +1,4 @@
-"""How long training takes until the policy follows its command as well as the peer's does.
+"""This benchmark times training until the policy follows its command as well as the peer's does.
 
     python -m benchmarks.learning_time task=go1_velocity_flat seeds=1,2,3 env_states=60e6 device=cuda
 

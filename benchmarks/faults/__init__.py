@@ -1,1 +1,1 @@
-"""What happens when things go wrong: each fault is provoked, and what it did is compared with what it may do."""
+"""Each fault that can befall a run is provoked, and what it did is compared with what it may do."""

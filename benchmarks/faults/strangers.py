@@ -1,4 +1,4 @@
-"""What strangers send: payloads in run folders, pickles in data files, and models that are malformed."""
+"""These rows send what strangers may: payloads in run folders, pickles in data files, and malformed models."""
 
 from __future__ import annotations
 
