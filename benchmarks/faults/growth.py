@@ -20,6 +20,7 @@ from ksim_rl.trainers import Hook, RunProgress, Trainer, run_folder
 
 # Torch, Warp and the allocator settle within this share of a run.
 SETTLED = 0.4
+PICTURE = "faults_soak.png"
 
 
 def memory(kind: str = "RssAnon") -> int:
@@ -118,6 +119,11 @@ def figures_of(rows: list[dict[str, float]], *, iterations: int) -> Figures:
     }
 
 
+def _picture() -> Path:
+    report.RESULTS.mkdir(parents=True, exist_ok=True)
+    return report.RESULTS / PICTURE
+
+
 def draw(rows: list[dict[str, float]], picture: Path) -> None:
     """Plot memory, files, threads and logs over the iterations."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -159,7 +165,7 @@ ROWS = {
             "log_bytes_per_iteration": (AT_MOST, 5000),
         },
         measure=lambda folder, *, iterations, draws, **_: soak(
-            folder, iterations=iterations, picture=report.RESULTS / "faults_soak.png" if draws else None
+            folder, iterations=iterations, picture=_picture() if draws else None
         ),
         # Ten megabytes in a million iterations; in a short run the pages that Python takes count for more.
         amounts={"iterations": 10_000, "draws": 1, "most_bytes": 100, "most_blocks": 3},

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import shutil
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from benchmarks import report
+from benchmarks.faults.growth import PICTURE
 from benchmarks.faults.rows import ROWS
 
 PAGE = Path(__file__).parents[2] / "docs" / "reliability.md"
+COMMITTED = Path(__file__).parents[1] / "results"
 BEGIN, END = "<!-- table: python -m benchmarks.faults -->", "<!-- end of the table -->"
 NOT_MEASURED = "not measured: no CUDA device"
 
 
-def write_row(
-    name: str, figures: Mapping[str, float], *, passed: bool, folder: Path = report.RESULTS
-) -> None:
-    """Add what was measured of one row to the results, and make the table of the page anew."""
+def write_row(name: str, figures: Mapping[str, float], *, passed: bool, folder: Path | None = None) -> None:
+    """Add what was measured of one row to the results, and make the page's table anew where they are committed."""
     row = ROWS[name]
     device = torch.device(row.device)
     label = report.device_label(device)
@@ -29,13 +30,27 @@ def write_row(
         figures={f"{label}/{name}/{figure}": float(value) for figure, value in figures.items()},
         device=device,
         module="benchmarks.faults",
-        folder=folder,
+        folder=folder or report.RESULTS,
         passed={name: passed},
         limits={
             f"{label}/{name}/{figure}": f"{how} {row.amounts[limit] if isinstance(limit, str) else limit:g}"
             for figure, (how, limit) in row.limits.items()
         },
     )
+    _show(path)
+
+
+def merge(sources: Sequence[Path]) -> None:
+    """Merge the results of other folders into the results, with the soak's picture where there is one."""
+    path = report.merge("faults", sources, folder=report.RESULTS)
+    for source in sources:
+        if (source / PICTURE).exists():
+            shutil.copy(source / PICTURE, report.RESULTS / PICTURE)
+    _show(path)
+
+
+def _show(path: Path) -> None:
+    """Say of the rows without figures why, and make the table of the page if it shows these results."""
     saved = json.loads(path.read_text())
     saved["not_measured"] = {
         other: NOT_MEASURED
@@ -43,7 +58,7 @@ def write_row(
         if row.device == "cuda" and other not in saved["passed"]
     }
     report.replace(path, saved)
-    if folder == report.RESULTS:
+    if path.parent == COMMITTED:
         PAGE.write_text(with_table(PAGE.read_text(), saved))
 
 

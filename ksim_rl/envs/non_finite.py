@@ -56,9 +56,10 @@ class NonFiniteTerms:
 
     def __init__(self, num_envs: int, step_count: Int64[Tensor, ""]) -> None:
         self._num_envs, self._step, self._names = num_envs, step_count, []
+        self._device = step_count.device
         self._columns: dict[tuple[str, ...], Tensor] = {}
         self._is_learning = True
-        self._count_N = self._first_N = torch.zeros(0, dtype=torch.int64, device=step_count.device)
+        self._count_N = self._first_N = torch.zeros(0, dtype=torch.int64, device=self._device)
 
     def watch(
         self, kind: str, table_EL: Float[Tensor, "E L"], names: Sequence[str], widths: Sequence[int] = ()
@@ -69,24 +70,21 @@ class NonFiniteTerms:
             columns = [
                 len(self._names) + i for i, n in enumerate(widths or [1] * len(names)) for _ in range(n)
             ]
-            self._columns[key] = torch.tensor(columns, dtype=torch.int32, device=self._step.device)
+            self._columns[key] = torch.tensor(columns, dtype=torch.int32, device=self._device)
             self._names += [f"{kind} {name!r}" for name in names]
             return
-        tensors = (
-            table_EL.float().contiguous(),
-            self._columns[key],
-            self._step,
-            self._first_N,
-            self._count_N,
-        )
-        sizes = table_EL.shape[1], self._num_envs
-        _quick(table_EL.device, tuple(table_EL.shape), *sizes, *map(address, tensors))
+        if table_EL.dtype != torch.float32 or not table_EL.is_contiguous():
+            table_EL = table_EL.float().contiguous()
+        shape = table_EL.shape
+        _quick(self._device, shape, shape[1], self._num_envs, table_EL.data_ptr(), *self._addresses[key])
 
     def start(self) -> None:
         """Count from here: what terms give while an env is constructed is of no state that anybody sees."""
         self._is_learning = False
         self._count_N = self._count_N.new_zeros(len(self._names))
         self._first_N = torch.full_like(self._count_N, _NEVER)
+        rest = self._step, self._first_N, self._count_N
+        self._addresses = {key: tuple(map(address, (own, *rest))) for key, own in self._columns.items()}
 
     def num_terms(self) -> Float[Tensor, ""]:
         """Return how many terms have given such a number so far, on the device."""

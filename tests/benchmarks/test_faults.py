@@ -4,12 +4,15 @@ import contextlib
 import copy
 import json
 import os
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
 
 from benchmarks import report
+from benchmarks.faults import __main__ as command
 from benchmarks.faults import children, machine, page
 from benchmarks.faults.row import Row
 from benchmarks.faults.rows import ROWS
@@ -261,3 +264,43 @@ def test_a_figure_that_is_changed_fails_its_row():
     saved = copy.deepcopy(json.loads(RESULTS.read_text()))
     saved["figures"]["cpu/corruption/refused"] -= 1
     assert page.passed(saved)["corruption"] is False
+
+
+def test_rows_side_by_side_are_merged_and_the_page_waits_for_those_that_are_committed(tmp_path, monkeypatch):
+    committed, elsewhere = tmp_path / "results", tmp_path / "elsewhere"
+    made = json.loads(RESULTS.read_text())
+    label = "cpu/latest/"
+    of_latest = {name: value for name, value in made["figures"].items() if name.startswith(label)}
+
+    run = subprocess.run
+
+    def in_a_process(words, *, env=None, **options):
+        if env is None:
+            return run(words, **options)  # git
+        name, form = words[3:]
+        page.write_row(
+            name,
+            {key.removeprefix(label): value for key, value in of_latest.items()},
+            passed=name == "latest",
+            folder=Path(env["BENCHMARK_RESULTS"]),
+        )
+        assert env["CUDA_VISIBLE_DEVICES"] == "" and form == "form=long"
+        return subprocess.CompletedProcess(words, returncode=int(name != "latest"), stdout=f"{name}\n")
+
+    monkeypatch.setattr(command.subprocess, "run", in_a_process)
+    monkeypatch.setattr(page.report, "RESULTS", elsewhere)
+    monkeypatch.setattr(page, "PAGE", tmp_path / "page.md")
+    page.PAGE.write_text(f"{page.BEGIN}\n{page.END}")
+    monkeypatch.setattr(sys, "argv", ["faults", "latest", "kill9", "jobs=2"])
+    assert command.main() == 1
+    saved = json.loads((elsewhere / "faults.json").read_text())
+    assert saved["passed"] == {"latest": True, "kill9": False}
+    assert saved["figures"].items() >= of_latest.items()
+    assert "| `latest` |" not in page.PAGE.read_text()
+
+    monkeypatch.setattr(page, "COMMITTED", committed)
+    monkeypatch.setattr(page.report, "RESULTS", committed)
+    monkeypatch.setattr(sys, "argv", ["faults", f"merge={elsewhere}"])
+    assert command.main() == 0
+    assert json.loads((committed / "faults.json").read_text())["passed"] == saved["passed"]
+    assert "| `latest` |" in page.PAGE.read_text()

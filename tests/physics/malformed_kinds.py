@@ -281,7 +281,10 @@ def _load_and_say(load: Callable[[Path], object], path: Path, pipe: int) -> None
     """Leave the process with what came of it in the pipe; the child of a test runner must not return."""
     faulthandler.disable()  # what the test runner has enabled would print a traceback for each crash that is counted
     try:
-        resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES))
+        # On top of what the libraries have mapped, which is gigabytes where torch is built for CUDA.
+        mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        most = mapped + MOST_BYTES
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
         # Processor time, since other programs may hold the machine up; wall time only ends what waits for ever.
         for kind, number, seconds in (
             (signal.ITIMER_VIRTUAL, signal.SIGVTALRM, MOST_SECONDS),
