@@ -122,11 +122,11 @@ class DatasetBuffer(ReplayBuffer):
         device: torch.device | str = "auto",
     ) -> None:
         self._dataset = DatasetStorage(cfg.num_env_states, device=device)
+        if sampler is None:
+            sampler = EpochSampler(seed=seed, shards=cfg.shards, num_minibatches=cfg.num_minibatches)
         super().__init__(
             storage=self._dataset,
-            sampler=EpochSampler(seed=seed, shards=cfg.shards, num_minibatches=cfg.num_minibatches)
-            if sampler is None
-            else sampler,
+            sampler=sampler,
             writer=DatasetWriter(),
             batch_size=cfg.num_env_states_per_minibatch,
         )

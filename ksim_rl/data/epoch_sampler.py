@@ -154,10 +154,7 @@ def stored(storage: Storage) -> int:
 
 
 def permutation(seed: int, epoch: Int64[Tensor, ""], size: int, *, shards: int = 1) -> Int64[Tensor, " D"]:
-    """Return a random permutation of `range(size)`, on the epoch's device, that depends on `seed` and `epoch` only.
-
-    With several ranks, each has its own; with `shards`, so many equal parts are permuted each as a rank would.
-    """
+    """Return a random permutation of `range(size)` on the epoch's device, of each rank or shard its own."""
     seed_tensor = torch.full((), seed, dtype=torch.int64, device=epoch.device)
     keys = random.row_keys(seed_tensor, _STREAM, epoch, size)
     keys_D = random.integers(keys, 1, 0, 2**31 - 1).squeeze(1).to(torch.int32)

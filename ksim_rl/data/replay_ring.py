@@ -13,7 +13,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.data.replay_buffers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
-from ksim_rl import dims
+from ksim_rl import dims, ranks
 from ksim_rl.checked import Checked, Count, NonNegative, Share
 from ksim_rl.checks import check_count, check_in_range
 from ksim_rl.data.dataset_storage import Stateless
@@ -27,24 +27,32 @@ class ReplaySampler(Stateless, Sampler):
     A place is drawn among all that may hold an env state. Those that do not (terminal observations, env states that are
     not finite) are drawn again, up to `tries` times; what is left then is masked: with a share q of such places,
     q^tries of a minibatch. The first that holds one is taken, so what is drawn is exactly uniform over the env states.
-    Makes no host sync; numbers come from torch's default generator of the device.
+    Makes no host sync; numbers come from torch's default generator of the device. With `shards`, minibatches of
+    `minibatch` have as many of each of so many equal parts of the envs, as ranks would draw.
     """
 
-    def __init__(self, *, tries: int = 4) -> None:
+    def __init__(self, *, tries: int = 4, shards: int = 1, minibatch: int = 1) -> None:
         check_count("tries", tries)
-        self.tries = tries
+        self.tries, self.shards, self.minibatch = tries, shards, minibatch
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
         """Return indices [B] and an empty info dict."""
         assert isinstance(storage, ReplayStorage)
         shape, device = (self.tries, batch_size), storage.device
-        env = torch.randint(storage.num_envs, shape, device=device)
+        env = ranks.randint(storage.num_envs // self.shards, shape, dim=1, device=device)
+        if self.shards > 1:
+            first_S = torch.arange(0, storage.num_envs, storage.num_envs // self.shards, device=device)
+            env += first_S.repeat_interleave(batch_size // self.shards)
         # float64: float32 cannot tell the places of a ring of more than 2^24.
-        unit = torch.rand(shape, dtype=torch.float64, device=device)
-        age = 1 + (unit * storage.max_age.clamp_min(1)).to(torch.int64)
+        unit = ranks.rand(shape, dim=1, dtype=torch.float64, device=device)
+        age = 1 + (unit * ranks.most_of(storage.max_age).clamp_min(1)).to(torch.int64)
         index = storage.index(env, age)
         first = storage.available[index].to(torch.uint8).argmax(0, keepdim=True)
-        return index.gather(0, first).squeeze(0), {}
+        index_B = index.gather(0, first).squeeze(0)
+        if self.shards > 1:
+            in_shards = index_B.view(self.shards, -1, self.minibatch // self.shards)
+            index_B = in_shards.transpose(0, 1).reshape(-1)
+        return index_B, {}
 
 
 class PrioritySampler(SavedByStateDict, Sampler):
@@ -180,6 +188,9 @@ class ReplayCfg(Checked):
     priority_alpha: NonNegative = 0.6  # how strongly the error counts; 0 is uniform
     priority_beta: Share = 0.4  # how far the weights of the losses undo that; 1 is wholly
     save_replay: bool = True
+    shards: Count = (
+        1  # equal parts of the envs, from each of which minibatches have as many: what so many ranks do
+    )
 
     def __post_init__(self) -> None:
         """Refuse a ring that is too small for its rollouts."""
@@ -193,7 +204,13 @@ class ReplayCfg(Checked):
             )
 
     def rollout_length(self, num_envs: int) -> int:
-        """Return T, which does not depend on the number of envs."""
+        """Return T, which does not depend on the number of envs; these and minibatches have equal shards."""
+        if num_envs % self.shards or self.num_env_states_per_minibatch % self.shards:
+            raise ValueError(
+                f"shards={self.shards}: use a divisor of num_envs and num_env_states_per_minibatch"
+            )
+        if self.prioritized and self.shards * ranks.size() > 1:
+            raise ValueError("prioritized=True: priorities are compared in one process without shards only")
         return self.num_steps
 
     def with_rollout_length(self, length: int, num_envs: int) -> "ReplayCfg":
@@ -225,12 +242,13 @@ class ReplayRing(ReplayBuffer):
             gamma=gamma,
             device=device,
         )
-        priorities = PrioritySampler(
-            self._ring.max_size, alpha=cfg.priority_alpha, beta=cfg.priority_beta, device=device
-        )
+        sampler: Any = ReplaySampler(shards=cfg.shards, minibatch=cfg.num_env_states_per_minibatch)
+        if cfg.prioritized:
+            exponents = {"alpha": cfg.priority_alpha, "beta": cfg.priority_beta}
+            sampler = PrioritySampler(self._ring.max_size, device=device, **exponents)
         super().__init__(
             storage=self._ring,
-            sampler=priorities if cfg.prioritized else ReplaySampler(),
+            sampler=sampler,
             writer=ReplayWriter(),
             collate_fn=lambda data: data,
             batch_size=cfg.num_env_states_per_minibatch,

@@ -243,17 +243,9 @@ def _draw_now(
     return out_EL
 
 
-def _draw_empty(
-    seed: Tensor,
-    stream: int,
-    counter: Tensor,
-    num_rows: int,
-    first_row: int,
-    n: int,
-    kind: int,
-    *options: float,
-) -> Tensor:
-    return seed.new_empty((num_rows, n), dtype=torch.int64 if kind == _INTEGER else torch.float32)
+def _draw_empty(seed: Tensor, stream: int, counter: Tensor, num_rows: int, *others: float) -> Tensor:
+    _, n, kind, *_ = others
+    return seed.new_empty((num_rows, int(n)), dtype=torch.int64 if kind == _INTEGER else torch.float32)
 
 
 _drawn = as_operator("draw", _draw_now, _draw_empty)

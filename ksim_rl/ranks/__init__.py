@@ -7,7 +7,7 @@ that was not started so is one of one, for which nothing here does anything.
 from ksim_rl.ranks.draws import exponential, rand, randint, randn
 from ksim_rl.ranks.group import first_row, rank, size
 from ksim_rl.ranks.heartbeat import at
-from ksim_rl.ranks.reduce import any_of, gather, mean_, sum_
+from ksim_rl.ranks.reduce import any_of, combined, gather, mean_, most_of, sum_
 from ksim_rl.ranks.shards import dealt, gathered
 from ksim_rl.ranks.start import by_first, check_same, device, from_first, joined, restarted, run_folder
 from ksim_rl.ranks.timing import Timing
@@ -18,6 +18,7 @@ __all__ = [
     "at",
     "by_first",
     "check_same",
+    "combined",
     "dealt",
     "device",
     "exponential",
@@ -27,6 +28,7 @@ __all__ = [
     "gathered",
     "joined",
     "mean_",
+    "most_of",
     "rand",
     "randint",
     "randn",

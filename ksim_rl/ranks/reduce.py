@@ -4,7 +4,7 @@ Each rank sees the same bits. With one rank nothing is copied or computed. NCCL'
 graphs like any other kernel.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 import torch.distributed as dist
@@ -58,3 +58,21 @@ def any_of(mask: Bool[Tensor, "*rows"]) -> Bool[Tensor, ""]:
     count = mask.sum()
     sum_([count])
     return count > 0
+
+
+def most_of(number: Num[Tensor, ""]) -> Num[Tensor, ""]:
+    """Return the largest of all ranks' numbers."""
+    return number if size() == 1 else torch.stack(gather(number)).amax()
+
+
+def combined(
+    metrics: Mapping[str, Num[Tensor, ""]], *, added: tuple[str, ...], most: tuple[str, ...]
+) -> dict[str, Num[Tensor, ""]]:
+    """Return metrics of all ranks, by one collective: sums, or maxima, of names that begin so, and means else."""
+    values_M = torch.stack([value.detach().to(torch.float64).reshape(()) for value in metrics.values()])
+    values_RM = torch.stack(gather(values_M))
+    whole = {}
+    for name, column_R in zip(metrics, values_RM.unbind(1), strict=True):
+        largest_or_mean = column_R.amax() if name.startswith(most) else column_R.mean()
+        whole[name] = column_R.sum() if name.startswith(added) else largest_or_mean
+    return whole

@@ -10,13 +10,12 @@ from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl import ranks
 from ksim_rl.envs.contract import DifficultyLevels, EpisodeSums, SimulatedWorld, part
 from ksim_rl.envs.signal_keys import signal_keys
 
 _OVERFLOW, _NAN = "overflow/", "nan/worlds"
-# What is added up over the ranks, beside the sums over episodes; of overflows the most counts, else the mean.
-ADDED = ("sum/", _NAN, "update/non_finite_env_states")
+# Over the ranks these are added up, or the most of them counts; of all others it is the mean.
+ADDED, MOST = ("sum/", _NAN, "update/non_finite_env_states", "replay/"), (_OVERFLOW,)
 
 
 class PendingMetrics:
@@ -69,19 +68,6 @@ def read_episode_sums(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Num
         sums |= {f"curriculum/{name}": level for name, level in levels.curriculum_levels().items()}
         sums |= {f"command/{name}": level for name, level in levels.command_levels().items()}
     return sums
-
-
-def over_ranks(metrics: Mapping[str, Num[Tensor, ""]]) -> dict[str, Num[Tensor, ""]]:
-    """Return sums, maxima and means over all ranks, by one collective; with one rank the metrics themselves."""
-    if ranks.size() == 1:
-        return dict(metrics)
-    values_M = torch.stack([value.detach().to(torch.float64).reshape(()) for value in metrics.values()])
-    values_RM = torch.stack(ranks.gather(values_M))
-    whole = {}
-    for name, column_R in zip(metrics, values_RM.unbind(1), strict=True):
-        most = column_R.amax() if name.startswith(_OVERFLOW) else column_R.mean()
-        whole[name] = column_R.sum() if name.startswith(ADDED) else most
-    return whole
 
 
 def episode_means(sums: Mapping[str, float], *, max_episode_length_s: float) -> dict[str, float]:

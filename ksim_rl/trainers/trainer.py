@@ -20,10 +20,11 @@ from ksim_rl.trainers.evaluation import Evaluation, Evaluator
 from ksim_rl.trainers.interrupt import InterruptRequest
 from ksim_rl.trainers.loggers import MetricLogger
 from ksim_rl.trainers.metrics import (
+    ADDED,
+    MOST,
     PendingMetrics,
     episode_means,
     explain_physics,
-    over_ranks,
     read_episode_sums,
     read_physics,
     start_copy,
@@ -256,8 +257,8 @@ class Trainer:
         env = self.collector.env
         metrics = read_episode_sums(env, rollout_ET) | read_physics(env) | self.update.metrics()
         if ranks.size() > 1:
-            asked = torch.full((), float(bool(self.interrupt)), device=self.update.device)
-            metrics = over_ranks(metrics | {INTERRUPTED: asked})
+            metrics[INTERRUPTED] = torch.full((), float(bool(self.interrupt)), device=self.update.device)
+            metrics = ranks.combined(metrics, added=ADDED, most=MOST)
         self._unread.append((self.iteration, start_copy(metrics, device=self.update.device)))
         self._report(all_but=1 if self._overlaps else 0)
 

@@ -92,12 +92,12 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
         self.step_count.add_(1)
         # A shared lag is drawn once: a single row broadcasts over all.
         age = self.age_E + 1 if delay.per_env else self.shared_age.add_(1)
-        one = not delay.per_env
         due = age % delay.resample_every == 0
         if delay.hold_probability:
-            chance = random.uniform(self._step_keys("step/hold", shared=one), 1)[:, 0]
+            chance = random.uniform(self._step_keys("step/hold", shared=not delay.per_env), 1)[:, 0]
             due = due & (chance >= delay.hold_probability)
-        self.lag_E.copy_(torch.where(due, self._draw(self._step_keys("step/lag", shared=one)), self.lag_E))
+        drawn_E = self._draw(self._step_keys("step/lag", shared=not delay.per_env))
+        self.lag_E.copy_(torch.where(due, drawn_E, self.lag_E))
 
     def _rows_that_reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
         """Return which rows reset, bool [E], with what the rings do not do as these rows begin."""

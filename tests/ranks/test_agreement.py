@@ -26,6 +26,14 @@ RECURRENT = [
     "modules.recurrent_critic.hidden_dim=6",
     "data.num_minibatches=2",
 ]
+REPLAY = [
+    "data.num_minibatches=4",
+    "data.num_steps=4",
+    "data.capacity=32",
+    "data.learning_starts=4",
+    "modules.actor.hidden_dims=[8]",
+    "modules.critic.hidden_dims=[8]",
+]
 ALGORITHMS = {
     "ppo": [*NETWORKS, "data.num_minibatches=2"],
     "ppo_minibatch_advantages": [
@@ -35,6 +43,7 @@ ALGORITHMS = {
     ],
     "lstm": RECURRENT,
     "gru": [*RECURRENT, "modules=gru", "data.sequence_length=4", "data.burn_in=2"],
+    **{name: [f"objective={name}", *REPLAY] for name in ("sac", "td3", "fast_sac", "fast_td3")},
 }
 
 
@@ -58,8 +67,9 @@ def check(name, size, folder):
     parts = results(trained, overrides, 4, 16, 1, size=size, folder=folder)
     worst = 0.0
     for key, expected in learnt.items():
-        # Each rank has the sums of its own observations.
+        # Each rank has the sums of its own observations, and a replay of its own.
         own = key.endswith(("normalizer.count", "exact_mean", "exact_sum_of_squares"))
+        own |= key.startswith("/replay/")
         if own or not expected.numel():
             continue
         shared = expected.shape == parts[0][0][key].shape

@@ -39,5 +39,6 @@ FAST_SAC = Algorithm(
     update=make_off_policy_update,
     policy=make_off_policy_policy,
     data=MANY_ENVS,
+    on_ranks=True,
     modules=ModulesCfg(actor=ACTOR, critic=CRITIC),
 )

@@ -13,5 +13,6 @@ SAC = Algorithm(
     update=make_off_policy_update,
     policy=make_off_policy_policy,
     data=FEW_ENVS,
+    on_ranks=True,
     modules=ModulesCfg(actor=SquashedActorCfg(), critic=QNetworkCfg()),
 )

@@ -13,5 +13,6 @@ TD3 = Algorithm(
     update=make_off_policy_update,
     policy=make_off_policy_policy,
     data=FEW_ENVS,
+    on_ranks=True,
     modules=ModulesCfg(actor=DeterministicActorCfg(hidden_dims=(256, 256)), critic=QNetworkCfg()),
 )
