@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ksim_rl import conf
+from ksim_rl.config import plugins
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.runs import record
 from ksim_rl.runs.csv_table import read_table
@@ -99,6 +100,7 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
 
 def main(name: str, row: str, seed: str, result: str, run_folder: str, device: str, smoke: str = "") -> None:
     """Measure and write; the result appears whole or not at all."""
+    plugins.load([])  # those of KSIM_RL_PLUGINS, where `ksim-rl --plugin` has put its own
     found = measure(load(name).rows[row], int(seed), Path(run_folder), device=device, smoke=bool(smoke))
     path = Path(result)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -304,6 +304,7 @@ class VelocityTask(Task):
                 robot if isinstance(robot, ModelRobot) else analysis().robot, analysis()
             ),
             training=training(num_iterations=num_iterations),
+            other_trainings=(fast_sac_training(symmetry="none"),),  # left and right are seldom quite equal
         )
 
 
@@ -392,7 +393,7 @@ def training(*, num_iterations: int, entropy_coeff: float = 0.01) -> TrainingCfg
     )
 
 
-def fast_sac_training() -> TrainingCfg:
+def fast_sac_training(*, symmetry: Literal["none", "augment"] = "augment") -> TrainingCfg:
     """Return the training settings of FastSAC: 4 steps of 4096 envs and 48 gradient steps in turn.
 
     Rewards reach 0.12 per step, so that returns lie within the atoms: 0.12 / (1 - 0.97) = 4. Actions reach twice the
@@ -402,7 +403,7 @@ def fast_sac_training() -> TrainingCfg:
     million with 32 gradient steps of which the actor takes every fourth (a discount of 0.98, one seed each).
     """
     objective = FastSACCfg(
-        target_entropy_per_action=-1.0, policy_delay=2, symmetry="augment", autocast=True, compile=True
+        target_entropy_per_action=-1.0, policy_delay=2, symmetry=symmetry, autocast=True, compile=True
     )
     data = dataclasses.replace(_REPLAY, num_env_states_per_minibatch=8192, num_minibatches=48)
     return _off_policy(objective=objective, data=data, actor=fast_sac.ACTOR, critic=fast_sac.CRITIC)

@@ -5,8 +5,7 @@ humanoid are our own, with nothing to download; Go2's motors run PD control.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
 from ksim_rl import mdp
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
@@ -20,6 +19,7 @@ from ksim_rl.scene.robots.unitree_go import UnitreeGo1, UnitreeGo2
 from ksim_rl.scene.sensors import ContactSensor
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import velocity
+from ksim_rl.trainers import TrainingCfg
 from ksim_rl.transforms import ActionDelay, DelayCfg
 from ksim_rl.transforms.transform_cfg import TransformCfg
 
@@ -33,11 +33,15 @@ def _task(
     how: str = "on flat ground",
     *,
     num_iterations: int,
-    **others: Any,
+    others: Sequence[TrainingCfg] = (),
 ) -> Task:
-    description = f"{robot} follows a velocity command {how}"
-    training = velocity.training(num_iterations=num_iterations)
-    return Task(name=cfg.__name__, description=description, cfg=cfg, training=training, **others)
+    return Task(
+        name=cfg.__name__,
+        description=f"{robot} follows a velocity command {how}",
+        cfg=cfg,
+        training=velocity.training(num_iterations=num_iterations),
+        other_trainings=(velocity.fast_sac_training(), *others),
+    )
 
 
 # -- four legs ---------------------------------------------------------------------------------------------------
@@ -105,12 +109,8 @@ def quadruped_velocity_delayed() -> ManagerBasedRlEnvCfg:
     return dataclasses.replace(quadruped_velocity_flat(), transforms={"lag": lag})
 
 
-GO1 = _task(
-    go1_velocity_flat,
-    "Unitree Go1",
-    num_iterations=10_000,
-    other_trainings=(velocity.fast_sac_training(), velocity.fast_td3_training()),
-)
+TD3 = velocity.fast_td3_training()
+GO1 = _task(go1_velocity_flat, "Unitree Go1", num_iterations=10_000, others=(TD3,))
 GO2 = _task(go2_velocity_flat, "Unitree Go2", num_iterations=10_000)
 QUADRUPED = _task(quadruped_velocity_flat, "our quadruped", num_iterations=2_000)
 LATE = "with actions that arrive late"
@@ -231,12 +231,7 @@ def humanoid_velocity_flat() -> ManagerBasedRlEnvCfg:
     )
 
 
-G1 = _task(
-    g1_velocity_flat,
-    "Unitree G1",
-    num_iterations=30_000,
-    other_trainings=(velocity.fast_sac_training(),),
-)
+G1 = _task(g1_velocity_flat, "Unitree G1", num_iterations=30_000)
 T1 = _task(t1_velocity_flat, "Booster T1", num_iterations=30_000)
 HUMANOID = _task(humanoid_velocity_flat, "our humanoid", num_iterations=3_000)
 

@@ -7,6 +7,7 @@ import sys
 import pytest
 
 from ksim_rl.cli.main import main
+from ksim_rl.tables import measure as measuring
 from ksim_rl.tables import reproduce as reproduce_command
 from ksim_rl.tables import runner
 from ksim_rl.tables.measure import measure, run_cfg, settings
@@ -158,6 +159,21 @@ def test_a_seed_is_trained_and_its_final_policy_judged(tmp_path):
     assert 0.0 <= found["falls"] <= 1.0
     assert found["seconds"] == pytest.approx(found["curve"][-1]["seconds"], abs=0.01)
     assert found["seconds_before"] > 0.0 and len(found["commit"]) >= 7
+
+
+def test_a_row_may_name_the_task_of_a_plug_in(monkeypatch, tmp_path):
+    (tmp_path / "poles_of_mine.py").write_text(
+        "import dataclasses\n"
+        "from ksim_rl import envs\n"
+        "MINE = dataclasses.replace(envs.task('cartpole_balance'), name='balance_of_mine', solved_at=None)\n"
+    )
+    (tmp_path / "mine.yaml").write_text(TABLE.replace("task: reacher", "task: balance_of_mine"))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("KSIM_RL_PLUGINS", "poles_of_mine")
+    monkeypatch.setattr(measuring, "measure", lambda row, *_, **__: {"task": run_cfg(row, 1).task_name})
+    result = tmp_path / "out" / "seed_1.json"
+    measuring.main(str(tmp_path / "mine.yaml"), "ppo/Other", "1", str(result), str(tmp_path), "cpu")
+    assert json.loads(result.read_text()) == {"task": "balance_of_mine"}
 
 
 @pytest.mark.full

@@ -163,6 +163,7 @@ def test_the_code_builds_the_robot_that_was_proposed():
 @pytest.mark.parametrize("source", [biped(), Quadruped().spec()], ids=["biped", "quadruped"])
 def test_a_task_of_the_proposals_survives_the_way_through_a_file(source):
     task = VelocityTask.for_robot(source, name="mine")
+    assert [training.objective.symmetry for training in task.other_trainings] == ["none"]
     cfg = task.cfg()
     tree = yaml.safe_load(yaml.safe_dump(to_tree(cfg, ManagerBasedRlEnvCfg)))
     built = from_tree(ManagerBasedRlEnvCfg, tree)
