@@ -41,6 +41,8 @@ def test_steps_and_resets_do_not_synchronize_and_replay_as_they_ran(kind):
             assert torch.equal(value, roots[0][name]), (step, name)
 
     stream = torch.cuda.Stream()
+    # The resets above may still run on the stream before.
+    stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
         try:
             for step in range(3):

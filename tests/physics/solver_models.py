@@ -175,6 +175,9 @@ def check_cost(mj_model: mujoco.MjModel, num_envs: int, device: str = "cpu") -> 
             solve()
             found.append(costs(world))
     theirs, ours = found
+    # float32 has no solution for some worlds of the steepest ratios of masses in MuJoCo Warp's solver; ours has one.
+    assert np.isfinite(ours).all(), f"worlds {np.flatnonzero(~np.isfinite(ours))}"
+    theirs = np.where(np.isfinite(theirs), theirs, np.inf)
     diagonal = m.M_hinit_i.numpy() == m.M_colind.numpy()
     trace = d.M.numpy().reshape(num_envs, -1)[:, : diagonal.size][:, diagonal].sum(-1)
     slack = float(m.opt.tolerance.numpy()[0]) * trace + 1e-7 * np.abs(theirs)

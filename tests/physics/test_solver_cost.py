@@ -8,7 +8,8 @@ from benchmarks.agreement_models import QUADRUPED
 from ksim_rl.physics import load_model
 from tests.physics.solver_models import SYNTHETIC, check_cost
 
-# Of these, one has all kinds of rows, and one a ball a thousand times lighter than its links.
+# Of these, one has all kinds of rows, and one a ball a thousand times lighter than its links: rounding eats pivots of
+# the Hessian of its world 30.
 SHORT = (8, 16)
 ROBOTS = ("unitree_go1", "unitree_g1", "unitree_go2", "booster_t1", "unitree_a1", "robotis_op3")
 
@@ -17,7 +18,7 @@ ROBOTS = ("unitree_go1", "unitree_g1", "unitree_go2", "booster_t1", "unitree_a1"
     "index", [i if i in SHORT else pytest.param(i, marks=pytest.mark.full) for i in range(len(SYNTHETIC))]
 )
 def test_the_cost_on_synthetic_models(index):
-    check_cost(load_model(SYNTHETIC[index].xml()), num_envs=16)
+    check_cost(load_model(SYNTHETIC[index].xml()), num_envs=64)
 
 
 def test_the_cost_on_a_robot():

@@ -109,7 +109,8 @@ UNROLL
             }
             sync();
             require(column[pivot] > 0.0f, HESSIAN_IS_POSITIVE);
-            const float by_pivot = 1.0f / wp::max(column[pivot], TINY);
+            // A pivot that rounding has eaten says nothing about its direction: the search leaves it out.
+            const float by_pivot = column[pivot] > TINY ? 1.0f / column[pivot] : 0.0f;
 UNROLL
             for (int block = own; block < BLOCKS; ++block) {
                 const bool below = block > own || lane > pivot;
