@@ -31,7 +31,7 @@ README = """# {task}, iteration {iteration}
 
 | file | what is in it |
 |---|---|
-| `policy.onnx` | `obs` [batch, {obs_dim}] to `actions` [batch, {num_actions}], normalization inside{memory} |
+| `policy.onnx` | `obs` [batch, {obs_dim}] to `actions` [batch, {num_actions}], normalization inside{state} |
 | `policy.pt2` | the same for `torch.export.load` |
 | `robot.xml` | the robot's model; actuators stand in the order of the actions |
 | `export.json` | names, order, units, scales, gains, rates, noise, lags; how each observation and reward is computed |
@@ -149,7 +149,7 @@ def export_policy(
     (folder / "README.md").write_text(
         README.format(
             **{**meta, **own, "joints": ", ".join(meta["joint_names"])},
-            memory="; " + ", ".join(exported.input_names[1:]) + " carry its memory" if states else "",
+            state="; " + ", ".join(exported.input_names[1:]) + " carry its recurrent state" if states else "",
             checked=policy.CHECKED,
         )
     )
