@@ -46,6 +46,7 @@ Count = Annotated[int, Within(low=1)]
 WholeNumber = Annotated[int, Within(low=0)]
 Range = Annotated[tuple[float, float], Within(ordered=True)]
 NonNegativeRange = Annotated[tuple[float, float], Within(low=0.0, ordered=True)]
+Name = Annotated[str, "not empty"]
 
 
 class Checked:
@@ -86,6 +87,8 @@ def check_value(field: str, value: object, annotation: Any) -> None:
                 check_value(field, value, arguments[0])
             bound.check(field, value)
         check_value(field, value, arguments[0])
+        if annotation == Name and not value:
+            raise ValueError(f"{field}={value!r}: expected a name")
     elif origin in (typing.Union, types.UnionType):
         _check_union(field, value, arguments)
     elif origin is Literal:

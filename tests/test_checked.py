@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 import pytest
 
-from ksim_rl.checked import Checked, Count, Positive, Range, Share, Within
+from ksim_rl.checked import Checked, Count, Name, Positive, Range, Share, Within
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +23,7 @@ class Outer(Checked):
     ends: Annotated[tuple[float, float], Within(low=0.0)] = (1.0, 0.5)
     names: str | tuple[str, ...] = ".*"
     mode: Literal["add", "scale"] = "add"
+    title: Name = "run"
     flag: bool = False
     weights: Mapping[str, Positive] | None = None
     inner: Inner = Inner()
@@ -51,6 +52,8 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"names": 3}, r"names=3: expected a text; or names=3: expected a list"),
     ({"names": ("a", 3)}, r"names\[1\]=3: expected a text"),
     ({"mode": "scal"}, r"mode='scal': did you mean 'scale'\?"),
+    ({"title": ""}, r"title='': expected a name"),
+    ({"title": 3}, r"title=3: expected a text"),
     ({"flag": 1}, r"flag=1: expected true or false"),
     ({"weights": {"a": -1.0}}, r"weights.a=-1.0: expected a finite number in \(0.0, inf\)"),
     ({"weights": [1.0]}, r"weights=\[1.0\]: expected a mapping"),

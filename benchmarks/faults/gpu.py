@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import re
 import time
 from pathlib import Path
@@ -10,14 +11,20 @@ from pathlib import Path
 import torch
 
 from benchmarks.faults.growth import memory
+from benchmarks.faults.numbers import count_non_finite
 from benchmarks.faults.row import AT_LEAST, AT_MOST, EXACTLY, Figures, Row
 from benchmarks.faults.saving import same_bits
 from ksim_rl import conf
 from ksim_rl.trainers import Hook, RunProgress, Trainer, run_folder
-from ksim_rl.trainers.build import build
+from ksim_rl.trainers.build import build, build_env
 
 GO1 = ("task=go1_velocity_flat", "device=cuda", "trainer.eval_episodes=0", "trainer.video=false")
-ALGORITHMS = ("ppo", "sac", "fast_sac")
+ALGORITHMS = {
+    "ppo": ("collector.rollout_length=24",),
+    "sac": (),
+    "fast_sac": ("objective.compile=false",),  # which takes a minute each time
+}
+ROOM = 8 * 2**30
 # What "flat" allows while a run of minutes goes on, in bytes.
 FLAT = 16 * 2**20
 
@@ -34,8 +41,8 @@ class _Speed(Hook):
     def __call__(self, trainer: Trainer) -> None:
         now = time.monotonic()
         self.began = now if self.began is None else self.began
-        device = torch.cuda.memory_reserved()
-        self.rows.append((now - self.began, trainer.env_states, memory(), device))
+        free, total = torch.cuda.mem_get_info()
+        self.rows.append((now - self.began, trainer.env_states, memory(), total - free))
         if now - self.began > self.seconds:
             trainer.cfg = dataclasses.replace(trainer.cfg, num_iterations=trainer.iteration)
 
@@ -53,9 +60,11 @@ def gpu_soak(folder: Path, *, seconds: int) -> Figures:
     run_folder.run(cfg, folder / "run", progress=RunProgress(1, enabled=False), hooks=(watch,))
     part = min(60.0, seconds / 4)
     half = [row for row in watch.rows if row[0] >= seconds / 2]
+    last = watch.speed(seconds - part, seconds)
     return {
         "seconds": watch.rows[-1][0],
-        "last_speed_over_first": watch.speed(seconds - part, seconds) / watch.speed(0.0, part),
+        "last_speed_over_first": last / watch.speed(0.0, part),
+        "last_speed_over_second": last / watch.speed(part, 2 * part),  # the first one sees robots that fall
         "host_memory_rise": half[-1][2] - half[0][2],
         "device_memory_rise": half[-1][3] - half[0][3],
     }
@@ -64,22 +73,59 @@ def gpu_soak(folder: Path, *, seconds: int) -> Figures:
 def gpu_memory(folder: Path) -> Figures:
     """Ask for far more envs than fit, with three algorithms; then train with the number that the message names."""
     told = ran = 0
-    for name in ALGORITHMS:
-        overrides = [*GO1, f"objective={name}", "logger=none", "trainer.num_iterations=1"]
+    for name, own in ALGORITHMS.items():
+        overrides = [*GO1, f"objective={name}", "logger=none", "trainer.num_iterations=10", *own]
+        # A GPU of 8 GB, so that what fits is soon trained.
+        taken = torch.empty(max(0, torch.cuda.mem_get_info()[0] - ROOM), dtype=torch.uint8, device="cuda")
+        fits = None
         try:
-            cfg = conf.compose([*overrides, f"num_envs={2**22}"])
+            cfg = conf.compose([*overrides, f"num_envs={2**18}"])
             run_folder.run(cfg, folder / name, progress=RunProgress(1, enabled=False))
-        except (ValueError, RuntimeError) as error:
-            fits = re.search(r"enough for ([0-9]+)", str(error))
+        except ValueError as error:
+            fits = re.search(r"num_envs=([0-9]+) was tried and fits", str(error))
             told += "one env takes at least" in str(error) and "\n" not in str(error) and fits is not None
-            if fits is None:
-                continue
-            torch.cuda.empty_cache()
-            power = 2 ** (int(fits[1]).bit_length() - 1)  # of two, as the sizes of minibatches are
-            cfg = conf.compose([*overrides, f"num_envs={power}"])
+            print(f"{name}: {error}", flush=True)
+        gc.collect()
+        torch.cuda.empty_cache()
+        if fits is not None:
+            cfg = conf.compose([*overrides, f"num_envs={fits[1]}"])
             run_folder.run(cfg, folder / f"{name}_fits", progress=RunProgress(1, enabled=False))
             ran += 1
+        del taken
+        gc.collect()
+        torch.cuda.empty_cache()
     return {"algorithms": len(ALGORITHMS), "told": told, "that_number_runs": ran}
+
+
+def gpu_nan_worlds(folder: Path, *, envs: int, device: str = "cuda") -> Figures:
+    """Break the state of a third of the worlds of walking robots, beside two equal envs that are whole."""
+    cfg = conf.compose(["task=go1_velocity_flat", f"device={device}", f"num_envs={envs}"])
+    whole, twin, env = (build_env(cfg, num_envs=envs, seed=1) for _ in range(3))
+    broken_E = torch.arange(envs, device=device) % 3 == 0
+    roots = [each.reset() for each in (whole, twin, env)]
+    world = env.base_env.world
+    world.qvel_EL[broken_E, 0] = torch.tensor([torch.nan, torch.inf, -torch.inf], device=device).repeat(envs)[
+        : int(broken_E.sum())
+    ]
+    ended = non_finite = 0
+    for step in range(10):
+        for number, each in enumerate((whole, twin, env)):
+            action = torch.zeros_like(each.action_spec.rand())
+            state_E, roots[number] = each.step_and_maybe_reset(roots[number].set("action", action))
+        if step == 0:
+            ended = int(state_E["next", "terminated"][broken_E].sum())
+        non_finite += count_non_finite(state_E)
+    qpos_EL, twin_EL, other_EL = (each.base_env.world.qpos_EL[~broken_E] for each in (whole, twin, env))
+    # A contact that comes a step later in one world of a hundred says nothing.
+    twins, others = (float((a - qpos_EL).abs().amax(1).quantile(0.9)) for a in (twin_EL, other_EL))
+    return {
+        "broken": int(broken_E.sum()),
+        "not_ended_within_one_step": int(broken_E.sum()) - ended,
+        "non_finite_in_the_dataset": non_finite,
+        "others_differ_by": others,
+        "equal_envs_differ_by": twins,
+        "over_what_equal_envs_differ": others / max(twins, 1e-6),
+    }
 
 
 def gpu_same_seed(folder: Path, *, iterations: int) -> Figures:
@@ -118,6 +164,20 @@ ROWS = {
         measure=gpu_memory,
         device="cuda",
         files=("ksim_rl/device/memory.py",),
+    ),
+    "gpu_nan_worlds": Row(
+        fault="NaN and infinities in the physics of a third of the worlds, on a GPU",
+        must="these end within one step; nothing non-finite enters the dataset; the others differ from those beside "
+        "whole worlds by no more than two equal envs do, whose sums have no order",
+        limits={
+            "broken": (AT_LEAST, 4),
+            **dict.fromkeys(("not_ended_within_one_step", "non_finite_in_the_dataset"), (EXACTLY, 0)),
+            "over_what_equal_envs_differ": (AT_MOST, 10),
+        },
+        measure=gpu_nan_worlds,
+        amounts={"envs": 384},
+        device="cuda",
+        files=("ksim_rl/physics/world.py", "ksim_rl/envs/manager_based_rl_env.py"),
     ),
     "gpu_same_seed": Row(
         fault="the same seed twice on a GPU",

@@ -34,12 +34,12 @@ def nan_worlds(folder: Path, *, envs: int) -> Figures:
     ended = int(first_E["next", "terminated"][broken_E].sum())
     counted = float(env.episode_log()["termination/non_finite"])
     others = _differ(first_E[~broken_E], twin_E[~broken_E])
-    non_finite = _non_finite(first_E)
+    non_finite = count_non_finite(first_E)
     for _ in range(5):
         env_state_E, root_E = env.step_and_maybe_reset(root_E.set("action", push))
         twin_state_E, twin_root_E = twin.step_and_maybe_reset(twin_root_E.set("action", push))
         others += _differ(env_state_E[~broken_E], twin_state_E[~broken_E])
-        non_finite += _non_finite(env_state_E)
+        non_finite += count_non_finite(env_state_E)
     return {
         "broken": int(broken_E.sum()),
         "not_ended_within_one_step": int(broken_E.sum()) - ended,
@@ -73,7 +73,7 @@ def nan_actions(folder: Path) -> Figures:
         "wrong": len(wrong),
         "refused_before_physics": refused,
         "only_those_end": ended == [False, True, False, False, True, False],
-        "non_finite_in_next": _non_finite(made),
+        "non_finite_in_next": count_non_finite(made),
     }
 
 
@@ -186,7 +186,8 @@ def threads(folder: Path, *, iterations: int) -> Figures:
     return {"iterations": iterations, "differ": sum(same_bits(states[0], other) for other in states[1:])}
 
 
-def _non_finite(tensordict: Any) -> int:
+def count_non_finite(tensordict: Any) -> int:
+    """Return how many numbers of a TensorDict are not finite."""
     return sum(
         int((~leaf.isfinite()).sum()) for leaf in tensordict.values(True, True) if leaf.is_floating_point()
     )

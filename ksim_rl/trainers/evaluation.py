@@ -52,12 +52,12 @@ class Evaluator:
                 self._step()
         own = self._return_E, self.length_E, self._running_E.to(torch.float64)
         return_E, length_E, running_E = (torch.cat(ranks.gather(figure_E)) for figure_E in own)
-        std, mean = torch.std_mean(return_E, correction=0)
-        figures = torch.stack([mean, std, length_E.mean(), running_E.sum()])
-        *means, unfinished = figures.tolist()
-        names = ("return_mean", "return_std", "length_mean")
+        figures = torch.stack([*torch.std_mean(return_E, correction=0), length_E.mean(), running_E.sum()])
+        std, mean, length, unfinished = figures.tolist()
         return Evaluation(
-            **dict(zip(names, means, strict=True)),
+            return_mean=mean,
+            return_std=std,
+            length_mean=length,
             episodes=return_E.numel(),
             unfinished=int(unfinished),
         )

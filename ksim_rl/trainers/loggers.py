@@ -14,7 +14,7 @@ from torchrl.record.loggers import TensorboardLogger
 from torchrl.record.loggers.mlflow import MLFlowLogger
 from torchrl.record.loggers.wandb import WandbLogger
 
-from ksim_rl.checked import Checked
+from ksim_rl.checked import Checked, Name
 from ksim_rl.config import plain_data
 from ksim_rl.runs.csv_table import CsvTable
 from ksim_rl.runs.listing import METRICS
@@ -37,17 +37,11 @@ class MetricLogger(Protocol):
 class WandbCfg(Checked):
     """A run on Weights & Biases; by default of the account's entity, with the name of the run folder."""
 
-    project: str = "ksim_rl"
+    project: Name = "ksim_rl"
     entity: str | None = None
     name: str | None = None
     tags: tuple[str, ...] = ()
     offline: bool = False  # write into the run folder only; `wandb sync RUN/wandb/offline-*` sends it later
-
-    def __post_init__(self) -> None:
-        """Refuse a project without a name."""
-        super().__post_init__()
-        if not self.project:
-            raise ValueError(f"project={self.project!r}: expected a name")
 
 
 def open_wandb(cfg: WandbCfg, run_folder: Path, config: Mapping[str, Any]) -> MetricLogger:
@@ -87,15 +81,9 @@ class MLflowCfg(Checked):
     the run folder: `mlflow ui --backend-store-uri sqlite:///RUN/mlflow/mlflow.db` shows it.
     """
 
-    experiment: str = "ksim_rl"
+    experiment: Name = "ksim_rl"
     name: str | None = None
     tracking_uri: str | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse an experiment without a name."""
-        super().__post_init__()
-        if not self.experiment:
-            raise ValueError(f"experiment={self.experiment!r}: expected a name")
 
 
 class _Run(MLFlowLogger):

@@ -5,6 +5,7 @@ import json
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from omegaconf import OmegaConf
@@ -56,15 +57,18 @@ def run(
     when the folder is deleted or moved meanwhile, or the end cannot be saved.
     """
     ranks.check_same({**cfg.to_tree(), "device": cfg.resolved_device().type}, what="config")
+    # The graphs that the first iterations record take memory as well. Several ranks cannot try on their own.
+    few = None if ranks.size() > 1 else partial(_first_iterations, cfg, progress)
+    explained = memory_for(cfg.num_envs, cfg.resolved_device(), few)
     if ranks.rank():  # rank 0 writes for all
-        with memory_for(cfg.num_envs, cfg.resolved_device()):
+        with explained:
             trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
         outcome = trainer.train(progress)
         _close(trainer)
         return outcome
     run_folder.mkdir(parents=True, exist_ok=True)
     try:
-        with locked(run_folder, note=progress.note), threads_that_fail(progress.note):
+        with locked(run_folder, note=progress.note), threads_that_fail(progress.note), explained:
             return _run_locked(cfg, run_folder, progress, hooks, resume_from)
     except BaseException:
         with suppress(OSError):
@@ -83,15 +87,13 @@ def _run_locked(
         progress.note(note)
     for folder in (run_folder, run_folder / "checkpoint"):
         checkpoint.remove_leftovers(folder)
-    # The graphs that the first iterations record take memory as well.
-    with memory_for(cfg.num_envs, cfg.resolved_device()):
-        with progress.busy("building envs and networks"):
-            trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
-        write_whole(run_folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
-        trainer.watch = watch(run_folder, holds=CONFIG, note=progress.note)
-        with recorded(run_folder, note=progress.note) as ended:
-            outcome = trainer.train(progress)
-            ended("done" if outcome.interrupted_by is None else "interrupted", outcome.why)
+    with progress.busy("building envs and networks"):
+        trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
+    write_whole(run_folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
+    trainer.watch = watch(run_folder, holds=CONFIG, note=progress.note)
+    with recorded(run_folder, note=progress.note) as ended:
+        outcome = trainer.train(progress)
+        ended("done" if outcome.interrupted_by is None else "interrupted", outcome.why)
     trainer.watch()
     if outcome.evaluation is not None:
         figures = {
@@ -109,6 +111,14 @@ def _run_locked(
             record_video(cfg, trainer.update.actor, path, note=progress.note, status=progress.status)
     _close(trainer)
     return outcome
+
+
+def _first_iterations(cfg: RunCfg, progress: RunProgress, num_envs: int) -> Trainer:
+    progress.note(f"memory does not suffice: trying num_envs={num_envs}")
+    trainer = build(dataclasses.replace(cfg, num_envs=num_envs))
+    for _ in range(8):  # the first ones run eagerly or fill a replay, the next ones record graphs
+        trainer.iterate()
+    return trainer
 
 
 def _close(trainer: Trainer) -> None:

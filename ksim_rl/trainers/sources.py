@@ -22,13 +22,10 @@ def check_sources(cfg: RunCfg, *, resumes: bool = False) -> None:
     Nothing is compiled or written. A run that `resumes` has in its checkpoint what it started from.
     """
     check_installed(cfg.logger)
-    named = {"checkpoint": cfg.checkpoint} if not resumes else {}
-    if not resumes:
-        named |= {
-            f"objective.{name}": getattr(cfg.objective, name) for name in cfg.objective.checkpoint_fields
-        }
+    named = {"checkpoint": cfg.checkpoint}
+    named |= {f"objective.{name}": getattr(cfg.objective, name) for name in cfg.objective.checkpoint_fields}
     for field, path in named.items():
-        if path is not None:
+        if path is not None and not resumes:
             try:
                 checkpoint.load_latest(Path(path))
             except checkpoint.CheckpointError as error:
