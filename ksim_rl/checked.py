@@ -1,7 +1,7 @@
 """Config dataclasses that inherit `Checked` hold, once built, what the annotations of their fields say.
 
 Bounds stand in the annotation: `stiffness: Positive`, `share: Share = 0.5`, `x: Annotated[float, Within(high=3.0)]`.
-Only what relates several fields to each other needs a `__post_init__`, which calls `super().__post_init__()` first.
+Only what relates several fields to each other needs code: a method `_check_fields`.
 """
 
 import types
@@ -57,10 +57,15 @@ class Checked:
     """
 
     def __post_init__(self) -> None:
-        """Check every field; a subclass that relates fields to each other does so after this."""
+        """Check every field, and then what each class, the bases first, says of several."""
         hints = _hints(type(self))
         for field in fields(typing.cast(Any, self)):
             check_value(field.name, getattr(self, field.name), hints[field.name])
+        for cls in reversed(type(self).__mro__):
+            vars(cls).get("_check_fields", Checked._check_fields)(self)
+
+    def _check_fields(self) -> None:
+        """Refuse fields that contradict each other; that of each base is called as well, without `super()`."""
 
 
 @cache

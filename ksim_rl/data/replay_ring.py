@@ -192,9 +192,8 @@ class ReplayCfg(Checked):
         1  # equal parts of the envs, from each of which minibatches have as many: what so many ranks do
     )
 
-    def __post_init__(self) -> None:
+    def _check_fields(self) -> None:
         """Refuse a ring that is too small for its rollouts."""
-        super().__post_init__()
         # A rollout whose episodes all end at once takes two places per env state, and must not overwrite itself.
         least = 2 * self.num_steps + self.n_step
         if self.capacity < least:

@@ -52,8 +52,7 @@ class ManagerBasedRlEnvCfg(Checked):
     scale_rewards_by_dt: bool = True  # rewards are per second and are multiplied by the env step's seconds
     transforms: Mapping[str, TransformCfg] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if self.viewer.env_index >= self.scene.num_envs:
             raise ValueError(
                 f"viewer.env_index={self.viewer.env_index}: expected less than scene.num_envs={self.scene.num_envs}"

@@ -86,8 +86,7 @@ class EventTerm(Term):
     mode: Literal["startup", "reset", "interval", "step"] = "reset"
     interval_range_s: NonNegativeRange | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if (self.mode == "interval") != (self.interval_range_s is not None):
             raise ValueError(
                 f"interval_range_s={self.interval_range_s!r} with mode={self.mode!r}: give a pair of seconds with "

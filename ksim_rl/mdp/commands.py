@@ -34,8 +34,7 @@ class OfTarget(InFrame):
     body: str | None = None
     site: str | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if (self.body is None) == (self.site is None):
             raise ValueError(f"body={self.body!r}, site={self.site!r}: name exactly one of the two")
 
@@ -302,8 +301,7 @@ class SinusoidalGaitCommand(CommandTerm):
     offsets: tuple[float, ...]
     resampling_time_range_s: NonNegativeRange | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not self.offsets:
             raise ValueError("offsets=(): give one per foot, such as (0.0, 0.5)")
 
@@ -353,8 +351,7 @@ class JoystickCommand(CommandTerm):
     axes: Mapping[str, Range]
     resampling_time_range_s: NonNegativeRange | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not self.axes:
             raise ValueError("axes={}: name at least one, such as {'vx': (-1.0, 1.0)}")
         if self.resampling_time_range_s is not None:

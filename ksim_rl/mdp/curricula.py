@@ -42,8 +42,7 @@ class LinearLevel(LevelCurriculum):
     begin_step: WholeNumber = 0
     end_step: int
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         check_in_range("end_step", self.end_step, low=self.begin_step, low_open=True)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
@@ -66,8 +65,7 @@ class SteppedLevel(LevelCurriculum):
     num_levels: Count = 10
     min_episodes: Count | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if self.lower_below is not None:
             check_in_range("lower_below", self.lower_below, high=self.raise_above)
 
@@ -195,8 +193,7 @@ class RewardWeightByStage(RewardWeight):
 
     stages: Mapping[WholeNumber, float]
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         _check_some("stages", self.stages, "give at least one, by the env step at which it begins")
 
     def weight(self, view: EnvView, held: Float[Tensor, ""]) -> Float[Tensor, ""]:
@@ -227,8 +224,7 @@ class CommandRangesByStage(CurriculumTerm):
     command: str
     stages: Mapping[WholeNumber, Ranges]
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         _check_some("stages", self.stages, "give at least one, by the env step at which it begins")
         for step, ranges in self.stages.items():
             _check_some(f"stages.{step}", ranges, "name at least one field of the command")
@@ -256,8 +252,7 @@ class CommandRangesByLevel(CurriculumTerm):
     start: Ranges
     end: Ranges
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         _check_some("start", self.start, "name at least one field of the command")
         if self.start.keys() != self.end.keys():
             raise ValueError(

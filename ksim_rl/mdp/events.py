@@ -50,8 +50,7 @@ class ResetJoints(JointReset):
     velocity_range: tuple[float, float] = (0.0, 0.0)
     distribution: Literal["uniform", "gaussian"] = "uniform"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         for name in ("position_range", "velocity_range"):
             if self.distribution == "uniform":
                 check_pair(name, getattr(self, name))
@@ -165,8 +164,7 @@ class PushByForce(EventTerm):
     duration_s: NonNegativeRange
     mode: Literal["startup", "reset", "interval", "step"] = "interval"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if self.mode != "interval":
             raise ValueError(f"mode={self.mode!r}: expected 'interval', which also says when a push ends")
 

@@ -126,8 +126,7 @@ class Success(MetricTerm):
     terminations: tuple[str, ...]
     reduce: Literal["mean", "last", "max", "sum"] = "last"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not self.terminations:
             raise ValueError("terminations=(): name at least one, such as ('time_out',)")
 

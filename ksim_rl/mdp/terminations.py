@@ -84,8 +84,7 @@ class RootVelocityAbove(OfEntity, TerminationTerm):
     linear: Positive | None = None
     angular: Positive | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if self.linear is None and self.angular is None:
             raise ValueError("linear=None, angular=None: give at least one limit")
 

@@ -56,9 +56,8 @@ class ActorCfg(OnPolicyNetworkCfg):
     state_dependent_std: bool = False
     output_gain: NonNegative = 0.01
 
-    def __post_init__(self) -> None:
+    def _check_fields(self) -> None:
         """Refuse a bound that does nothing."""
-        super().__post_init__()
         if self.action_bound is not None and self.distribution not in ("tanh_gaussian", "truncated_gaussian"):
             raise ValueError(
                 f"action_bound={self.action_bound!r} does nothing with distribution={self.distribution!r}: "

@@ -44,9 +44,7 @@ class SquashedActorCfg(BoundedActorCfg):
     log_std_min: float = -5.0
     log_std_max: float = 2.0
 
-    def __post_init__(self) -> None:
-        """Refuse an empty range."""
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if self.log_std_min >= self.log_std_max:
             raise ValueError(
                 f"log_std_min={self.log_std_min!r} is not below log_std_max={self.log_std_max!r}"

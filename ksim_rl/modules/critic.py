@@ -59,9 +59,7 @@ class QNetworkCfg(OffPolicyNetworkCfg):
     v_min: float = -10.0
     v_max: float = 10.0
 
-    def __post_init__(self) -> None:
-        """Refuse an empty range of values."""
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if self.v_min >= self.v_max:
             raise ValueError(f"v_min={self.v_min!r} is not below v_max={self.v_max!r}")
 

@@ -117,9 +117,7 @@ class NetworkCfg(Checked):
     activation: str = "elu"
     obs_normalization: bool = True
 
-    def __post_init__(self) -> None:
-        """Check the fields, and keep what is hashable."""
-        super().__post_init__()
+    def _check_fields(self) -> None:
         object.__setattr__(self, "hidden_dims", tuple(self.hidden_dims))
         check_choice("activation", self.activation, ACTIVATIONS)
 
@@ -130,9 +128,7 @@ class OnPolicyNetworkCfg(NetworkCfg):
 
     in_keys: tuple[ObservationKey, ...] = ("actor",)
 
-    def __post_init__(self) -> None:
-        """Check the fields, and keep what is hashable."""
-        super().__post_init__()
+    def _check_fields(self) -> None:
         object.__setattr__(self, "in_keys", checked_keys(self.in_keys))
 
 
@@ -173,9 +169,7 @@ class SharedTrunkCfg(OnPolicyNetworkCfg):
 
     hidden_dims: tuple[Count, ...] = (512, 256)
 
-    def __post_init__(self) -> None:
-        """Refuse values out of range, naming the field."""
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not self.hidden_dims:
             raise ValueError("hidden_dims=(): expected at least one width")
 

@@ -50,9 +50,7 @@ class GradientCfg(AlgorithmCfg):
     max_grad_norm: Positive | None = None
     max_skipped_steps: Count = 100
 
-    def __post_init__(self) -> None:
-        """Check all fields, and the bound of the betas, which is open."""
-        super().__post_init__()
+    def _check_fields(self) -> None:
         object.__setattr__(self, "betas", tuple(self.betas))
         if not all(0.0 <= beta < 1.0 for beta in self.betas):
             raise ValueError(f"betas={self.betas!r}: expected two numbers in [0, 1)")
@@ -76,9 +74,7 @@ class OnPolicyCfg(GradientCfg):
     learning_rate_max: Positive = 1e-2
     max_grad_norm: Positive | None = 1.0
 
-    def __post_init__(self) -> None:
-        """Check all fields, and refuse a schedule that contradicts itself."""
-        super().__post_init__()
+    def _check_fields(self) -> None:
         low, high = self.learning_rate_min, self.learning_rate_max
         if low > high:
             raise ValueError(f"learning_rate_min={low!r} exceeds learning_rate_max={high!r}")
@@ -172,9 +168,7 @@ class AMPCfg(PPOCfg):
         """The group that is compared."""
         return (self.style_group,)
 
-    def __post_init__(self) -> None:
-        """Check all fields, and that there are motions."""
-        super().__post_init__()
+    def _check_fields(self) -> None:
         for field in ("motions", "discriminator_hidden_dims"):
             object.__setattr__(self, field, tuple(getattr(self, field)))
         if not self.motions:
@@ -201,9 +195,7 @@ class DistillationCfg(OnPolicyCfg):
     teacher_share: Share = 0.0
     teacher_share_decay: Share = 0.95
 
-    def __post_init__(self) -> None:
-        """Check all fields, and that there is a teacher."""
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not self.teacher:
             raise ValueError("teacher='': name a run folder or a checkpoint, objective.teacher=RUN")
 
@@ -260,7 +252,5 @@ class TD3Cfg(OffPolicyCfg):
     target_noise: NonNegative = 0.2
     target_noise_clip: NonNegative = 0.5
 
-    def __post_init__(self) -> None:
-        """Check all fields, and the order of the two bounds."""
-        super().__post_init__()
+    def _check_fields(self) -> None:
         check_in_range("exploration_noise_max", self.exploration_noise_max, low=self.exploration_noise_min)

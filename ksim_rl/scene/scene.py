@@ -23,8 +23,7 @@ class Placement(Checked):
     pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not math.isclose(math.hypot(*self.quat), 1.0, abs_tol=1e-3):
             raise ValueError(f"quat={self.quat!r}: expected a unit quaternion (w, x, y, z)")
 
@@ -98,8 +97,7 @@ class SceneCfg(Checked):
     spacing: NonNegative = 2.0  # m between neighbouring envs when several are drawn in one picture
     soft_joint_pos_limit_factor: Share = 1.0  # of each joint's range, about its middle: the soft limits
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not self.robots:
             raise ValueError("robots={}: name at least one robot")
         for name in self.objects:

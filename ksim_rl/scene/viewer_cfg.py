@@ -26,8 +26,7 @@ class ViewerCfg(Checked):
     num_envs: Count = 1  # drawn in one picture, `scene.spacing` apart, from `env_index` on
     draw: tuple[str, ...] = (".*",)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         for index, pattern in enumerate(self.draw):
             try:
                 re.compile(pattern)

@@ -47,8 +47,7 @@ class Row(Checked):
     published: Mapping[str, float] = field(default_factory=dict)
     against: str = ""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds={self.seeds!r}: expected at least one, and each once")
         if (self.measure == "seconds") != bool(self.levels):

@@ -88,9 +88,8 @@ class ModulesCfg(Checked):
     recurrent_actor: RecurrentCfg | None = None
     recurrent_critic: RecurrentCfg | None = None
 
-    def __post_init__(self) -> None:
+    def _check_fields(self) -> None:
         """Refuse a trunk that a network does not read, and features that nothing writes."""
-        super().__post_init__()
         for name, cfg in (("actor", self.actor), ("critic", self.critic)):
             if (FEATURES in self._read_by(name)) != (self.trunk is not None):
                 raise ValueError(
@@ -150,9 +149,8 @@ class TrainingCfg(Checked):
     collector: CollectorCfg = field(default_factory=lambda: CollectorCfg(stagger_episodes=True))
     trainer: TrainerCfg = field(default_factory=TrainerCfg)
 
-    def __post_init__(self) -> None:
+    def _check_fields(self) -> None:
         """Let the size of the data follow from `collector.rollout_length`, where that is given."""
-        super().__post_init__()
         if self.collector.rollout_length is not None:
             data = self.data.with_rollout_length(self.collector.rollout_length, self.num_envs)
             object.__setattr__(self, "data", data)
@@ -169,9 +167,8 @@ class RunCfg(TrainingCfg):
     logger: LoggerCfg = field(default_factory=LoggerCfg)
     viewer: BrowserCfg = field(default_factory=BrowserCfg)
 
-    def __post_init__(self) -> None:
+    def _check_fields(self) -> None:
         """Refuse values that no run can have, before any model is compiled."""
-        super().__post_init__()
         if not TASK_NAME.fullmatch(self.task_name):
             raise ValueError(
                 f"task_name={self.task_name!r}: expected letters, digits and _.+-, as it names a folder"

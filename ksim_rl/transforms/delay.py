@@ -38,8 +38,7 @@ class DelayCfg(Checked):
     hold_probability: Share = 0.0
     by_level: bool = False
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if self.min_lag > self.max_lag:
             raise ValueError(f"min_lag={self.min_lag} exceeds max_lag={self.max_lag}")
         if self.hold_probability and not self.resample_every:

@@ -205,8 +205,7 @@ class Clock(ObservationTerm):
     frequency: Positive
     phases: tuple[float, ...] = (0.0,)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not self.phases:
             raise ValueError("phases=(): give at least one, such as (0.0,)")
 

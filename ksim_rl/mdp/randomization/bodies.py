@@ -29,11 +29,9 @@ class RandomizeBodyField(RandomizeModelField):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeBodyMass(RandomizeBodyField):
+class RandomizeBodyMass(RandomizeBodyField, field="body_mass", lowest=_LEAST_MASS):
     """Mass of bodies, kg, at constant shape: the inertia about the centre of mass grows in proportion."""
 
-    field: ClassVar[str] = "body_mass"
-    lowest: ClassVar[float | None] = _LEAST_MASS
     per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_inertia")
     operation: Operation = "scale"
 
@@ -47,15 +45,12 @@ class RandomizeBodyMass(RandomizeBodyField):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeBodyCom(RandomizeBodyField):
+class RandomizeBodyCom(RandomizeBodyField, field="body_ipos", columns=3):
     """Centre of mass of bodies in the body's frame, m; columns x, y, z. The inertia about it does not change."""
-
-    field: ClassVar[str] = "body_ipos"
-    columns: ClassVar[int] = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeBodyInertia(RandomizeBodyField):
+class RandomizeBodyInertia(RandomizeBodyField, field="body_inertia", columns=3, lowest=0.0):
     """Inertia of bodies at constant mass: how far the mass spreads along each principal axis (columns x, y, z).
 
     Drawn are factors on the second moments of mass, whose sums by pairs are the principal moments, so that these
@@ -63,9 +58,6 @@ class RandomizeBodyInertia(RandomizeBodyField):
     body's present mass: let `RandomizeBodyMass` of the same bodies run before it, in the same mode.
     """
 
-    field: ClassVar[str] = "body_inertia"
-    columns: ClassVar[int] = 3
-    lowest: ClassVar[float | None] = 0.0
     per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_inertia")
     operation: Literal["scale"] = "scale"
 
@@ -120,8 +112,7 @@ class RandomizePseudoInertia(Randomize):
     operation: Literal["add"] = "add"
     distribution: Literal["uniform", "gaussian"] = "uniform"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         for name in ("alpha", "stretch", "shear", "shift"):
             self.check_range(name, getattr(self, name))
 
@@ -168,11 +159,9 @@ def _upper_triangle(diagonal: Tensor, shear: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGravity(RandomizeModelField):
+class RandomizeGravity(RandomizeModelField, field="gravity", columns=3):
     """Gravity of each world, m/s^2, by axis x, y, z. Projected gravity, a direction, stays that of the -z axis."""
 
-    field: ClassVar[str] = "gravity"
-    columns: ClassVar[int] = 3
     operation: Operation = "add"
 
     def ids(self, view: EnvView) -> tuple[int, ...]:
@@ -193,32 +182,24 @@ NUM_SIZES = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGeomFriction(RandomizeModelField):
+class RandomizeGeomFriction(RandomizeModelField, field="geom_friction", columns=3, lowest=0.0):
     """Friction of geoms; columns: 0 sliding, 1 torsional (m), 2 rolling (m)."""
 
     geoms: Patterns
-    field: ClassVar[str] = "geom_friction"
-    columns: ClassVar[int] = 3
-    lowest: ClassVar[float | None] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizePairFriction(RandomizeModelField):
+class RandomizePairFriction(RandomizeModelField, field="pair_friction", columns=5, lowest=0.0):
     """Friction of contact pairs (`<pair name=...>`); columns: 0, 1 sliding, 2 torsional (m), 3, 4 rolling (m)."""
 
     pairs: Patterns
-    field: ClassVar[str] = "pair_friction"
-    columns: ClassVar[int] = 5
-    lowest: ClassVar[float | None] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGeomSize(RandomizeModelField):
+class RandomizeGeomSize(RandomizeModelField, field="geom_size", columns=3):
     """Sizes of primitive geoms by MuJoCo's columns, m; bounding boxes and spheres follow, mass and inertia do not."""
 
     geoms: Patterns
-    field: ClassVar[str] = "geom_size"
-    columns: ClassVar[int] = 3
 
     def _check_reach(self, view: EnvView, nominal: np.ndarray, pairs: Mapping[int, Pair]) -> None:
         model = view.world.mj_model

@@ -25,10 +25,8 @@ from ksim_rl.scene.names import Patterns, scalar_joint_ids
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointField(OfJoints, RandomizeModelField):
+class RandomizeJointField(OfJoints, RandomizeModelField, lowest=0.0):
     """Draw entries of a field of hinges and slides per world."""
-
-    lowest: ClassVar[float | None] = 0.0
 
     def ids(self, view: EnvView) -> tuple[int, ...]:
         """Return rows by joint, degree of freedom or generalized position, as the field's name says."""
@@ -40,39 +38,29 @@ class RandomizeJointField(OfJoints, RandomizeModelField):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointDamping(RandomizeJointField):
+class RandomizeJointDamping(RandomizeJointField, field="dof_damping"):
     """Viscous damping of joints, N m s / rad or N s / m."""
 
-    field: ClassVar[str] = "dof_damping"
-
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointArmature(RandomizeJointField):
+class RandomizeJointArmature(RandomizeJointField, field="dof_armature"):
     """Inertia that joints feel of their motors, kg m^2 or kg."""
 
-    field: ClassVar[str] = "dof_armature"
-
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointFrictionLoss(RandomizeJointField):
+class RandomizeJointFrictionLoss(RandomizeJointField, field="dof_frictionloss"):
     """Dry friction of joints, N m or N."""
 
-    field: ClassVar[str] = "dof_frictionloss"
-
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointStiffness(RandomizeJointField):
+class RandomizeJointStiffness(RandomizeJointField, field="jnt_stiffness"):
     """Stiffness of the springs in joints, N m / rad or N / m; they pull towards the model's `springref`."""
 
-    field: ClassVar[str] = "jnt_stiffness"
-
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointRange(RandomizeJointField):
+class RandomizeJointRange(RandomizeJointField, field="jnt_range", columns=2):
     """Limits of joints that have any, rad or m; columns: 0 lower, 1 upper. Soft limits stay those of the model."""
 
-    field: ClassVar[str] = "jnt_range"
-    columns: ClassVar[int] = 2
     operation: Operation = "add"
 
     def _check_reach(self, view: EnvView, nominal: np.ndarray, pairs: Mapping[int, Pair]) -> None:
@@ -90,48 +78,37 @@ class RandomizeJointRange(RandomizeJointField):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointZero(RandomizeJointField):
+class RandomizeJointZero(RandomizeJointField, field="qpos0", lowest=None):
     """Where joints read zero (MuJoCo's `qpos0`), rad or m, by errors of assembly; bodies move by minus the change."""
 
-    field: ClassVar[str] = "qpos0"
-    lowest: ClassVar[float | None] = None
     operation: Operation = "add"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeTendonField(RandomizeModelField):
+class RandomizeTendonField(RandomizeModelField, lowest=0.0):
     """Draw a field of tendons (names or patterns) per world."""
 
     tendons: Patterns
-    lowest: ClassVar[float | None] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeTendonStiffness(RandomizeTendonField):
+class RandomizeTendonStiffness(RandomizeTendonField, field="tendon_stiffness"):
     """Stiffness of tendons, N / m, or N m / rad of fixed tendons of hinges; they pull to the model's spring length."""
 
-    field: ClassVar[str] = "tendon_stiffness"
-
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeTendonDamping(RandomizeTendonField):
+class RandomizeTendonDamping(RandomizeTendonField, field="tendon_damping"):
     """Viscous damping of tendons, N s / m or N m s / rad."""
 
-    field: ClassVar[str] = "tendon_damping"
-
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeTendonFrictionLoss(RandomizeTendonField):
+class RandomizeTendonFrictionLoss(RandomizeTendonField, field="tendon_frictionloss"):
     """Dry friction of tendons, N or N m."""
 
-    field: ClassVar[str] = "tendon_frictionloss"
-
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeTendonArmature(RandomizeTendonField):
+class RandomizeTendonArmature(RandomizeTendonField, field="tendon_armature"):
     """Inertia against a change of tendons' lengths, kg or kg m^2."""
-
-    field: ClassVar[str] = "tendon_armature"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,8 +195,7 @@ class RandomizeActuatorGains(RandomizeActuator):
     damping: Pair | None = None
     per_world_fields: ClassVar[tuple[str, ...]] = ("actuator_gainprm", "actuator_biasprm")
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         for name in ("stiffness", "damping"):
             if getattr(self, name) is not None:
                 self.check_range(name, getattr(self, name))

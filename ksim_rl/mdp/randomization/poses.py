@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from dataclasses import field as default
-from typing import ClassVar, Literal, get_args
+from typing import Literal, get_args
 
 import mujoco
 from jaxtyping import Bool
@@ -25,15 +25,14 @@ Angle = Literal["roll", "pitch", "yaw"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizePos(RandomizeModelField):
+class RandomizePos(RandomizeModelField, columns=3):
     """Position of elements in the frame of their body, m; columns x, y, z."""
 
-    columns: ClassVar[int] = 3
     operation: Operation = "add"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeTurn(RandomizeField):
+class RandomizeTurn(RandomizeField, columns=4):
     """Orientation of elements in the frame of their body: turned about their own axes by `ranges`, rad.
 
     The turn is Rz(yaw) Ry(pitch) Rx(roll), after the model's own orientation ("add"), or in its place ("abs").
@@ -42,10 +41,7 @@ class RandomizeTurn(RandomizeField):
     ranges: Mapping[Angle, Pair] = default(default_factory=dict)
     operation: Literal["abs", "add"] = "add"
 
-    columns: ClassVar[int] = 4
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         for angle, pair in self.ranges.items():
             self.check_range(f"ranges.{angle}", pair)
         missing = [angle for angle in get_args(Angle) if angle not in self.ranges]
@@ -84,83 +80,70 @@ class OfBodies(RandomizeField):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeBodyPos(OfBodies, RandomizePos):
+class RandomizeBodyPos(OfBodies, RandomizePos, field="body_pos"):
     """Position of bodies in the frame of their parents, m; columns x, y, z. What hangs on them moves along."""
 
-    field: ClassVar[str] = "body_pos"
-
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeBodyQuat(OfBodies, RandomizeTurn):
+class RandomizeBodyQuat(OfBodies, RandomizeTurn, field="body_quat"):
     """Orientation of bodies in their parents, rad by angle, about their own axes. What hangs on them turns along."""
 
-    field: ClassVar[str] = "body_quat"
-
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGeomPos(RandomizePos):
+class RandomizeGeomPos(RandomizePos, field="geom_pos"):
     """Position of geoms in the frame of their body, m; columns x, y, z. The body's inertia does not change."""
 
     geoms: Patterns
-    field: ClassVar[str] = "geom_pos"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGeomQuat(RandomizeTurn):
+class RandomizeGeomQuat(RandomizeTurn, field="geom_quat"):
     """Orientation of geoms in their body, rad by angle, about their own axes. The body's inertia does not change."""
 
     geoms: Patterns
-    field: ClassVar[str] = "geom_quat"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeSitePos(RandomizePos):
+class RandomizeSitePos(RandomizePos, field="site_pos"):
     """Position of sites in the frame of their body, m; columns x, y, z. Their sensors and forces move along."""
 
     sites: Patterns
-    field: ClassVar[str] = "site_pos"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeSiteQuat(RandomizeTurn):
+class RandomizeSiteQuat(RandomizeTurn, field="site_quat"):
     """Orientation of sites in their body, rad by angle, about their own axes: an IMU that is mounted askew, say."""
 
     sites: Patterns
-    field: ClassVar[str] = "site_quat"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeCameraPos(RandomizePos):
+class RandomizeCameraPos(RandomizePos, field="cam_pos"):
     """Position of the model's cameras in the frame of their body, m; columns x, y, z."""
 
     cameras: Patterns
-    field: ClassVar[str] = "cam_pos"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeCameraQuat(RandomizeTurn):
+class RandomizeCameraQuat(RandomizeTurn, field="cam_quat"):
     """Orientation of the model's cameras in their body, rad by angle, about their own axes; they look along -z."""
 
     cameras: Patterns
-    field: ClassVar[str] = "cam_quat"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeLightPos(RandomizePos):
+class RandomizeLightPos(RandomizePos, field="light_pos"):
     """Position of lights in the frame of their body, m; columns x, y, z."""
 
     lights: Patterns
-    field: ClassVar[str] = "light_pos"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeLightDir(RandomizeTurn):
+class RandomizeLightDir(RandomizeTurn, field="light_dir", columns=3):
     """Direction of lights in the frame of their body, turned about its axes, rad by angle."""
 
     lights: Patterns
     operation: Literal["add"] = "add"
-    field: ClassVar[str] = "light_dir"
-    columns: ClassVar[int] = 3
 
     def _turned(self, own_1NC: Tensor, turn_EN4: Tensor) -> Tensor:
         return quaternion.rotate(turn_EN4, own_1NC)

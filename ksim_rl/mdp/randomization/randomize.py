@@ -6,7 +6,7 @@ Each draw starts from the model's own values, so that neither the order of reset
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -100,8 +100,7 @@ class RandomizeNumber(Randomize):
 
     ranges: Pair
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         self.check_range("ranges", self.ranges)
 
 
@@ -111,6 +110,12 @@ class RandomizeField(Randomize):
 
     field: ClassVar[str]
     columns: ClassVar[int] = 1
+
+    def __init_subclass__(cls, **constants: Any) -> None:
+        """Take constants of a class from its statement: `class BodyMass(RandomizeBodyField, field="body_mass")`."""
+        super().__init_subclass__()
+        for name, value in constants.items():
+            setattr(cls, name, value)
 
     @property
     def kind(self) -> str:
@@ -146,8 +151,7 @@ class RandomizeModelField(RandomizeField):
     lowest: ClassVar[float | None] = None  # what a value must at least be to make sense
     highest: ClassVar[float | None] = None  # and at most
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not isinstance(self.ranges, Mapping):
             self.check_range("ranges", self.ranges)
             return

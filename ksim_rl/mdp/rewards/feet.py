@@ -110,8 +110,7 @@ class FeetAirTime(RewardWhileCommanded):
     threshold_min: float
     threshold_max: float
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         check_in_range("threshold_max", self.threshold_max, low=self.threshold_min)
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:

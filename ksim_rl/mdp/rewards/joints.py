@@ -189,8 +189,7 @@ class Symmetry(RewardTerm):
     right: Patterns
     signs: Mapping[str, float] = field(default_factory=lambda: {".*": 1.0})
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         for pattern, sign in self.signs.items():
             check_choice(f"signs[{pattern!r}]", sign, (1.0, -1.0))
 

@@ -192,8 +192,7 @@ class Pose(OfJoints, RewardTerm):
     walking_threshold: float
     running_threshold: float
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         check_in_range("running_threshold", self.running_threshold, low=self.walking_threshold)
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:

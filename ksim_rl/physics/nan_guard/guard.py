@@ -40,8 +40,7 @@ class NanGuardCfg(Checked):
     history: Count = 20
     max_files: Count = 4
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not self.folder:
             raise ValueError(f"folder={self.folder!r}: expected the path of a folder")
 

@@ -118,8 +118,7 @@ class GeneralActuator(BuiltinActuator):
     ctrlrange: Range | None = None
     actrange: Range | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         for name in ("gainprm", "biasprm", "dynprm"):
             numbers = getattr(self, name)
             if len(numbers) > _NUM_PARAMETERS:

@@ -95,8 +95,7 @@ class DelayedActuator(Actuator):
     min_lag: WholeNumber = 0
     max_lag: WholeNumber
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if self.min_lag > self.max_lag:
             raise ValueError(f"min_lag={self.min_lag} exceeds max_lag={self.max_lag}")
 

@@ -149,8 +149,7 @@ class MLPActuator(NetActuator):
     activation: Literal["elu", "relu", "softsign", "tanh"] | None = None
     input_lags: tuple[int, ...] | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if self.input_lags is not None:
             _check_lags("input_lags", self.input_lags)
 

@@ -45,8 +45,7 @@ class CameraSensor(Sensor):
     textures: bool = True
     shadows: bool = False
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not (self.rgb or self.depth or self.segmentation):
             raise ValueError("rgb=False, depth=False, segmentation=False: draw at least one of them")
 

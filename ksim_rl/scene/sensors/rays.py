@@ -44,8 +44,7 @@ class GridPattern(RayPattern):
     height: float = 0.0
     direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not any(self.direction):
             raise ValueError(f"direction={self.direction!r}: expected a vector that is not zero")
 
@@ -84,8 +83,7 @@ class RingPattern(RayPattern):
     num_rays: Count = 36
     elevations: tuple[Annotated[float, Within(low=-90.0, high=90.0)], ...] = (0.0,)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not self.elevations:
             raise ValueError("elevations=(): give at least one ring, such as (0.0,)")
 

@@ -81,8 +81,7 @@ class MountedSensor(Sensor, ABC):
     body: str | None = None
     pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if (self.site is None) == (self.body is None):
             raise ValueError(f"site={self.site!r}, body={self.body!r}: give exactly one of them")
         if self.site is not None and any(self.pos):

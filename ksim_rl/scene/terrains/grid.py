@@ -59,8 +59,7 @@ class TerrainGrid(Terrain):
     seed: WholeNumber = 0
     friction: Friction = (1.0, 0.005, 0.0001)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not self.patches:
             raise ValueError("patches={}: name at least one kind of ground")
         check_count("num_columns", self.num_columns, low=len(self.patches))

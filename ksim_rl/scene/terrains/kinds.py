@@ -39,8 +39,7 @@ class Waves(TerrainPatch):
     wave_length: float = 2.0
     cell: Cell = 0.2
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         check_in_range("wave_length", self.wave_length, low=4 * self.cell)
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
@@ -81,8 +80,7 @@ class PyramidStairs(TerrainPatch):
     inverted: bool = False
     cell: Cell = 0.05
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         check_in_range("step_width", self.step_width, low=2 * self.cell)
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
@@ -128,8 +126,7 @@ class SteppingStones(TerrainPatch):
     platform_width: NonNegative = 1.5
     cell: Cell = 0.05
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         Within(low=self.cell).check("stone_width", self.stone_width)
         Within(low=2 * self.cell).check("gap", self.gap)
 
@@ -163,8 +160,7 @@ class Gaps(TerrainPatch):
     platform_width: Positive = 1.5
     cell: Cell = 0.05
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         Within(low=2 * self.cell).check("width", self.width)
         check_in_range("spacing", self.spacing, low=self.cell)
 

@@ -90,8 +90,7 @@ class Offset(ObservationTerm):
     frame: str = ""
     axes: str = AXES
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         for point in (*self.ends, *filter(None, (self.start, self.frame))):
             if point.partition(":")[0] not in POINTS:
                 raise ValueError(
@@ -179,8 +178,7 @@ class ToleranceProduct(RewardTerm):
 
     factors: Mapping[str, Factor]
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not self.factors:
             raise ValueError("factors={}: name at least one factor")
 

@@ -39,8 +39,7 @@ class ObservationTermCfg(Checked):
     delay: DelayCfg | None = None
     history: int | HistoryCfg | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not callable(self.term):
             raise ValueError(f"term={self.term!r}: expected a callable that reads the env's view")
         if self.clip is not None:
@@ -73,8 +72,7 @@ class ObservationGroupCfg(Checked):
     delay: DelayCfg | None = None
     history: int | HistoryCfg | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if not self.terms:
             raise ValueError("terms={}: expected at least one term")
         history_cfg(self.history)

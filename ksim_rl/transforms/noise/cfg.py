@@ -49,8 +49,7 @@ class NoiseCfg(Checked, ABC):
     lost: Literal["last", "zero"] = "last"
     by_level: bool = False
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         if self.bias is not None:
             for field in ("bias", "walk_std", "resolution", "dropout", "by_level"):
                 if getattr(self.bias, field) not in (None, 0.0):
@@ -70,8 +69,7 @@ class UniformNoise(NoiseCfg):
     low: PerDim
     high: PerDim
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_fields(self) -> None:
         low, high = _numbers(self.low), _numbers(self.high)
         if not low or not high or (len(low) != len(high) and 1 not in (len(low), len(high))):
             raise ValueError(f"low has {len(low)} numbers and high has {len(high)}: give as many, or one")
