@@ -1,9 +1,11 @@
 """Config dataclasses that inherit `Checked` hold, once built, what the annotations of their fields say.
 
 Bounds stand in the annotation: `stiffness: Positive`, `share: Share = 0.5`, `x: Annotated[float, Within(high=3.0)]`.
-Only what relates several fields to each other needs code: a method `_check_fields`.
+Only what relates several fields to each other needs code: a method `_check_fields`. Constants of a class, which its
+bases declare, may stand in its statement: `class Cartpole(ShippedModel, name="cartpole")`.
 """
 
+import inspect
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -55,6 +57,14 @@ class Checked:
     Raises:
         ValueError: naming the field, the value and what would be valid.
     """
+
+    def __init_subclass__(cls, **constants: Any) -> None:
+        """Take the constants of the class's statement, each declared by a base."""
+        super().__init_subclass__()
+        for name, value in constants.items():
+            if not any(name in inspect.get_annotations(base) for base in cls.__mro__):
+                raise TypeError(f"class {cls.__name__}: no base of it declares {name!r}")
+            setattr(cls, name, value)
 
     def __post_init__(self) -> None:
         """Check every field, and then what each class, the bases first, says of several."""

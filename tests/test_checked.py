@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import pytest
 
@@ -87,3 +87,40 @@ def test_whole_numbers_with_two_bounds_are_whole(group):
     assert Groups(group=5).group == 5
     with pytest.raises(ValueError, match="group="):
         Groups(group=group)
+
+
+def test_constants_stand_in_the_statement_of_a_class():
+    class Named(Checked):
+        name: ClassVar[str]
+
+    class Ball(Named, name="ball"):
+        pass
+
+    assert Ball.name == "ball"
+    with pytest.raises(TypeError, match="no base of it declares 'nmae'"):
+
+        class _Wrong(Named, nmae="ball"):
+            pass
+
+
+def test_what_each_class_says_of_several_fields_is_asked_of_all_bases():
+    @dataclass(frozen=True, kw_only=True)
+    class Span(Checked):
+        low: float = 0.0
+        high: float = 1.0
+
+        def _check_fields(self) -> None:
+            if self.low > self.high:
+                raise ValueError("low exceeds high")
+
+    @dataclass(frozen=True, kw_only=True)
+    class Even(Span):
+        def _check_fields(self) -> None:
+            if self.high % 2:
+                raise ValueError("high is odd")
+
+    with pytest.raises(ValueError, match="low exceeds high"):
+        Even(low=3.0, high=2.0)
+    with pytest.raises(ValueError, match="high is odd"):
+        Even()
+    assert Even(high=2.0).high == 2.0

@@ -57,14 +57,12 @@ class GradientCfg(AlgorithmCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnPolicyCfg(GradientCfg):
+class OnPolicyCfg(GradientCfg, learns_on_sequences=True):
     """What the algorithms share that pass over each rollout `num_epochs` times, with one Adam.
 
     The "adaptive" schedule changes the learning rate before each gradient step, within its bounds, so that the
     divergence of the policy from the one that collected the rollout stays near `desired_kl` nats.
     """
-
-    learns_on_sequences: ClassVar[bool] = True
 
     num_epochs: Count = 1
     learning_rate: Positive = 1e-3
@@ -176,7 +174,7 @@ class AMPCfg(PPOCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistillationCfg(OnPolicyCfg):
+class DistillationCfg(OnPolicyCfg, checkpoint_fields=("teacher",)):
     """A student learns to act as a teacher (a run folder or a checkpoint) does, in the states that the student visits.
 
     That is DAgger (Ross et al., arXiv 1011.0686) without its aggregate of all data: the newest rollout of thousands of
@@ -186,8 +184,6 @@ class DistillationCfg(OnPolicyCfg):
     the teacher acts instead of the student, in each env state of the first rollout; it decays from rollout to rollout
     by a factor.
     """
-
-    checkpoint_fields: ClassVar[tuple[str, ...]] = ("teacher",)
 
     teacher: str = ""
     loss: DistillationKind = "kl"

@@ -6,7 +6,7 @@ Joints and actuators have one column each in the order of the term's patterns.
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float, Shaped
@@ -231,14 +231,12 @@ class ImuReading(ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraImage(ObservationTerm):
+class CameraImage(ObservationTerm, is_image=True):
     """What a `CameraSensor` sees of the current state (position stage); the only term of its observation group.
 
     "rgb" (uint8 [E, H, W, 3]), "depth" (m, float32 [E, H, W]) or "segmentation" (ids of geoms, -1 for none, int32
     [E, H, W]).
     """
-
-    is_image: ClassVar[bool] = True
 
     sensor: str
     output: Literal["rgb", "depth", "segmentation"] = "rgb"

@@ -6,7 +6,7 @@ Each draw starts from the model's own values, so that neither the order of reset
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -110,12 +110,6 @@ class RandomizeField(Randomize):
 
     field: ClassVar[str]
     columns: ClassVar[int] = 1
-
-    def __init_subclass__(cls, **constants: Any) -> None:
-        """Take constants of a class from its statement: `class BodyMass(RandomizeBodyField, field="body_mass")`."""
-        super().__init_subclass__()
-        for name, value in constants.items():
-            setattr(cls, name, value)
 
     @property
     def kind(self) -> str:

@@ -108,17 +108,13 @@ class Actuator(Checked, ABC):
     """
 
     is_explicit: ClassVar[bool] = False
-    _takes: ClassVar[frozenset[TargetKind]] = frozenset()
+    takes: ClassVar[frozenset[TargetKind]] = frozenset()
+    """The kinds of target that have an effect."""
 
     @property
     @abstractmethod
     def driven(self) -> Patterns:
         """The names or patterns of the joints."""
-
-    @property
-    def takes(self) -> frozenset[TargetKind]:
-        """The kinds of target that have an effect."""
-        return self._takes
 
     @property
     def params(self) -> Mapping[str, float]:
@@ -172,14 +168,12 @@ class JointActuator(Actuator):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExplicitActuator(JointActuator):
+class ExplicitActuator(JointActuator, is_explicit=True):
     """A plain motor whose effort a law of ours computes before each substep, and keeps inside `effort_limit`.
 
     The law sees the state of the substep's start, so its damping is integrated explicitly: keep
     `damping * timestep` well below the inertia that the joint feels, or use a built-in actuator.
     """
-
-    is_explicit: ClassVar[bool] = True
 
     @property
     def params(self) -> Mapping[str, float]:

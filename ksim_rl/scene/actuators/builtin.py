@@ -8,7 +8,7 @@ MuJoCo's effort is `gain * ctrl + bias`, clamped to `forcerange`, times the gear
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import mujoco
 from torch import Tensor
@@ -35,7 +35,7 @@ class BuiltinActuator(JointActuator):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PositionActuator(BuiltinActuator):
+class PositionActuator(BuiltinActuator, takes=frozenset({"pos"})):
     """MuJoCo's position servo: effort = stiffness * (target - position) - damping * velocity; SI units.
 
     The control range that it writes is what can still change the effort at a joint limit, and does not clip: a clipped
@@ -67,8 +67,6 @@ class PositionActuator(BuiltinActuator):
             damping=2.0 * damping_ratio * armature * 2.0 * math.pi * natural_frequency,
         )
 
-    _takes: ClassVar[frozenset[TargetKind]] = frozenset({"pos"})
-
     def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
         super().configure(actuator, joint)
         actuator.set_to_position(kp=self.stiffness, kv=self.damping)
@@ -78,12 +76,10 @@ class PositionActuator(BuiltinActuator):
 
 
 @dataclass(frozen=True, kw_only=True)
-class VelocityActuator(BuiltinActuator):
+class VelocityActuator(BuiltinActuator, takes=frozenset({"vel"})):
     """MuJoCo's velocity servo: effort = damping * (target - velocity), with damping in N m s / rad or N s / m."""
 
     damping: Positive
-
-    _takes: ClassVar[frozenset[TargetKind]] = frozenset({"vel"})
 
     def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
         super().configure(actuator, joint)
@@ -91,10 +87,8 @@ class VelocityActuator(BuiltinActuator):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotorActuator(BuiltinActuator):
+class MotorActuator(BuiltinActuator, takes=frozenset({"effort"})):
     """MuJoCo's motor: effort = target; its control range is its effort limit."""
-
-    _takes: ClassVar[frozenset[TargetKind]] = frozenset({"effort"})
 
     def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
         super().configure(actuator, joint)

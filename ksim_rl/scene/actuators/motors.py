@@ -16,7 +16,7 @@ from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKin
 
 
 @dataclass(frozen=True, kw_only=True)
-class IdealPDActuator(ExplicitActuator):
+class IdealPDActuator(ExplicitActuator, takes=frozenset({"pos", "vel", "effort"})):
     """Effort = stiffness * (position error) + damping * (velocity error) + effort target, within the effort limit.
 
     `stiffness` is in N m / rad or N / m, `damping` in N m s / rad or N s / m.
@@ -24,8 +24,6 @@ class IdealPDActuator(ExplicitActuator):
 
     stiffness: NonNegative
     damping: NonNegative
-
-    _takes: ClassVar[frozenset[TargetKind]] = frozenset({"pos", "vel", "effort"})
 
     @property
     def params(self) -> Mapping[str, float]:

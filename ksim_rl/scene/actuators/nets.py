@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -19,7 +19,7 @@ from torch.nn import functional
 from ksim_rl.checks import check_choice, check_in_range, near
 from ksim_rl.config.plain_data import MOST_DATA_BYTES, read_bytes
 from ksim_rl.scene.actuators.actuator import Drive, ExplicitActuator, Law, SubstepRing
-from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKind
+from ksim_rl.scene.state.joint_targets import JointState, JointTarget
 
 ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "softsign": nn.Softsign, "tanh": nn.Tanh}
 _SCALES = ("position_scale", "velocity_scale", "effort_scale")
@@ -76,7 +76,7 @@ class NetFile:
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetActuator(ExplicitActuator):
+class NetActuator(ExplicitActuator, takes=frozenset({"pos"})):
     """A motor whose effort a small network predicts from position errors and velocities, joint by joint.
 
     One network serves all joints of the entry, as in Hwangbo et al., "Learning agile and dynamic motor skills for
@@ -88,8 +88,6 @@ class NetActuator(ExplicitActuator):
         position_scale, velocity_scale: multiply position errors (target - position, rad or m) and velocities (rad/s or
             m/s) on their way in, `effort_scale` the output, which gives N m or N. None: the file's metadata, else 1.
     """
-
-    _takes: ClassVar[frozenset[TargetKind]] = frozenset({"pos"})
 
     file: str
     sha256: str | None = None

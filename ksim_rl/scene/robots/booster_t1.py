@@ -82,7 +82,7 @@ def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoosterT1(MenagerieRobot):
+class BoosterT1(MenagerieRobot, name="t1", root_body="Trunk", joint_names=JOINTS, model="booster_t1/t1"):
     """The facts of the robot, and `spec()`, the model that they describe, with bent knees and hanging arms."""
 
     init_pos: tuple[float, float, float] = (0.0, 0.0, 0.665)
@@ -92,15 +92,11 @@ class BoosterT1(MenagerieRobot):
     action_scale: Mapping[str, float] = field(default_factory=lambda: spread(ACTION_SCALE, JOINTS))
     actuators: tuple[Actuator, ...] = SERVOS
 
-    name: ClassVar[str] = "t1"
-    root_body: ClassVar[str] = "Trunk"
-    joint_names: ClassVar[tuple[str, ...]] = JOINTS
     foot_bodies: ClassVar[tuple[str, ...]] = tuple(f"{side.lower()}_foot_link" for side in SIDES)
     foot_geoms: ClassVar[tuple[str, ...]] = tuple(
         f"{side.lower()}_foot{number}_collision" for side in SIDES for number in (1, 2)
     )
     foot_sites: ClassVar[tuple[str, ...]] = tuple(f"{side.lower()}_foot" for side in SIDES)
-    model: ClassVar[str] = "booster_t1/t1"
     collision_geoms: ClassVar[tuple[CollisionGeom, ...]] = (
         capsule("trunk_collision", "Trunk", 0.1, (0.06, 0.0, 0.03, 0.06, 0.0, 0.17), **_SMOOTH),
         sphere("head_collision", "H2", 0.08, (0.01, 0.0, 0.11), **_SMOOTH),

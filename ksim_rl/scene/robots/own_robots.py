@@ -18,13 +18,12 @@ _LEG = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Quadruped(ShippedModel):
+class Quadruped(ShippedModel, name="quadruped"):
     """12 kg on four legs with three joints each, called `<front|rear>_<left|right>_<roll|hip|knee>`."""
 
     action_scale: Mapping[str, float] = field(default_factory=lambda: {".*_roll": 0.2, ".*_(hip|knee)": 0.3})
     soft_joint_pos_limit_factor: Share = 0.9
 
-    name: ClassVar[str] = "quadruped"
     root_body: ClassVar[str] = "trunk"
     joint_names: ClassVar[tuple[str, ...]] = tuple(
         f"{leg}_{kind}" for leg in LEGS for kind in ("roll", "hip", "knee")
@@ -34,13 +33,12 @@ class Quadruped(ShippedModel):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Humanoid(ShippedModel):
+class Humanoid(ShippedModel, name="humanoid"):
     """0.95 m, 19 kg, 19 joints, called `<left|right>_<kind>`, but for `waist_yaw`; fields as of `LeggedRobot`."""
 
     action_scale: Mapping[str, float] = field(default_factory=lambda: {".*": 0.3})
     soft_joint_pos_limit_factor: Share = 0.9
 
-    name: ClassVar[str] = "humanoid"
     root_body: ClassVar[str] = "pelvis"
     torso_body: ClassVar[str] = "torso"
     joint_names: ClassVar[tuple[str, ...]] = (

@@ -112,7 +112,7 @@ def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class UnitreeG1(MenagerieRobot):
+class UnitreeG1(MenagerieRobot, name="g1", root_body="pelvis", joint_names=JOINTS, model="unitree_g1/g1"):
     """The facts of the robot, and `spec()`, the model that they describe; it stands with bent knees.
 
     Contacts of the robot with itself are frictionless: fewer dimensions cost less.
@@ -125,17 +125,13 @@ class UnitreeG1(MenagerieRobot):
     action_scale: Mapping[str, float] = field(default_factory=lambda: spread(ACTION_SCALE, JOINTS))
     actuators: tuple[Actuator, ...] = SERVOS
 
-    name: ClassVar[str] = "g1"
-    root_body: ClassVar[str] = "pelvis"
+    imu: ClassVar[str] = "imu_in_pelvis"
     torso_body: ClassVar[str] = "torso_link"
-    joint_names: ClassVar[tuple[str, ...]] = JOINTS
     foot_bodies: ClassVar[tuple[str, ...]] = tuple(f"{side}_ankle_roll_link" for side in SIDES)
     foot_geoms: ClassVar[tuple[str, ...]] = tuple(
         f"{side}_foot{number}_collision" for side in SIDES for number in range(1, 8)
     )
     foot_sites: ClassVar[tuple[str, ...]] = tuple(f"{side}_foot" for side in SIDES)
-    model: ClassVar[str] = "unitree_g1/g1"
-    imu: ClassVar[str] = "imu_in_pelvis"
     collision_geoms: ClassVar[tuple[CollisionGeom, ...]] = (
         sphere("pelvis_collision", "pelvis", 0.07, (0.0, 0.0, -0.08), condim=1),
         capsule("torso_collision", "torso_link", 0.09, (0.01, 0.0, 0.08, 0.01, 0.0, 0.2), condim=1),

@@ -26,14 +26,12 @@ _GO2_SMOOTH: dict[str, Any] = _GO1_SMOOTH | {"priority": 1}
 
 
 @dataclass(frozen=True, kw_only=True)
-class UnitreeQuadruped(MenagerieRobot):
+class UnitreeQuadruped(MenagerieRobot, joint_names=JOINTS, foot_sites=LEGS):
     """What Go1 and Go2 share; fields as of `MenagerieRobot`."""
 
     default_joint_pos: Mapping[str, float] = field(default_factory=lambda: spread(STANCE, JOINTS))
 
-    joint_names: ClassVar[tuple[str, ...]] = JOINTS
     foot_geoms: ClassVar[tuple[str, ...]] = tuple(f"{leg}_foot_collision" for leg in LEGS)
-    foot_sites: ClassVar[tuple[str, ...]] = LEGS
 
 
 ROTOR_INERTIA = 0.000111842
@@ -81,16 +79,13 @@ _GO1_TRUNK = CollisionGeom(
 
 
 @dataclass(frozen=True, kw_only=True)
-class UnitreeGo1(UnitreeQuadruped):
+class UnitreeGo1(UnitreeQuadruped, name="go1", root_body="trunk", model="unitree_go1/go1"):
     """Go1's facts, with reflected motor inertia and position servos, and `spec()`, the model that they describe."""
 
     init_pos: tuple[float, float, float] = (0.0, 0.0, 0.278)
     action_scale: Mapping[str, float] = field(default_factory=lambda: spread(GO1_ACTION_SCALE, JOINTS))
     actuators: tuple[Actuator, ...] = GO1_SERVOS
 
-    name: ClassVar[str] = "go1"
-    root_body: ClassVar[str] = "trunk"
-    model: ClassVar[str] = "unitree_go1/go1"
     collision_geoms: ClassVar[tuple[CollisionGeom, ...]] = (
         _GO1_TRUNK,
         sphere("head_collision", "trunk", 0.06, (0.24, 0.0, 0.0), **_GO1_SMOOTH),
@@ -138,16 +133,13 @@ _GO2_BASE = CollisionGeom(
 
 
 @dataclass(frozen=True, kw_only=True)
-class UnitreeGo2(UnitreeQuadruped):
+class UnitreeGo2(UnitreeQuadruped, name="go2", root_body="base", model="unitree_go2/go2"):
     """Go2's facts, with plain torque motors under PD control, and `spec()`, the model that they describe."""
 
     init_pos: tuple[float, float, float] = (0.0, 0.0, 0.29)
     action_scale: Mapping[str, float] = field(default_factory=lambda: spread({".*": 0.25}, JOINTS))
     actuators: tuple[Actuator, ...] = GO2_MOTORS
 
-    name: ClassVar[str] = "go2"
-    root_body: ClassVar[str] = "base"
-    model: ClassVar[str] = "unitree_go2/go2"
     collision_geoms: ClassVar[tuple[CollisionGeom, ...]] = (
         _GO2_BASE,
         sphere("head_collision", "base", 0.06, (0.29, 0.0, -0.02), **_GO2_SMOOTH),
