@@ -1,5 +1,6 @@
 """Enforces shape annotations while the tests run, and keeps runs small and repeatable."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -25,10 +26,14 @@ if _MENAGERIE.is_dir():
 # Before any test imports the package.
 shapes.install()
 
+_THREADS = torch.get_num_threads()
+
 
 @pytest.fixture(autouse=True)
 def _fresh_torch():
-    """Start each test from the same torch seed, with nothing compiled: tests share code, which compiles a few times."""
+    """Start each test from the same seed and threads, with nothing compiled: tests share code that compiles."""
+    if torch.get_num_threads() != _THREADS:
+        torch.set_num_threads(_THREADS)
     torch.manual_seed(0)
     torch.compiler.reset()
 
@@ -40,3 +45,9 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if item.get_closest_marker("gpu"):
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
+
+
+def pytest_collection_finish():
+    """Leave what was imported out of garbage collections: `check_env` makes two for each env."""
+    gc.collect()
+    gc.freeze()

@@ -12,7 +12,7 @@ import sys
 import tokenize
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 from tests import signatures
@@ -152,6 +152,7 @@ class House:
                         yield target
 
 
+@cache
 def words_of_code(text: str) -> int:
     """Return the number of names, keywords, numbers and strings, without comments and docstrings."""
     docstrings = {

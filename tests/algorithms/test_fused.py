@@ -122,8 +122,8 @@ def assert_equal_states(one, other, *, atol=1e-4):
             },
             {"std_type": "log", "init_std": 0.6, "obs_normalization": False},
         ),
-        ({}, {"activation": "relu"}),
-        ({}, {"activation": "tanh"}),
+        pytest.param({}, {"activation": "relu"}, marks=pytest.mark.full),
+        pytest.param({}, {"activation": "tanh"}, marks=pytest.mark.full),
     ],
 )
 def test_updates_equal_those_of_torch(fused_ppo, options, actor_options):

@@ -14,7 +14,7 @@ NAMES = list(OBJECTIVES)
 @pytest.mark.parametrize(
     ("name", "ends"),
     [
-        ("sac", "truncation"),
+        pytest.param("sac", "truncation", marks=pytest.mark.full),
         ("td3", "termination"),
         pytest.param("fast_sac", "termination", marks=pytest.mark.full),
         pytest.param("fast_td3", "truncation", marks=pytest.mark.full),
@@ -140,8 +140,15 @@ def test_a_delay_must_divide_the_gradient_steps():
         make_trainer("fast_sac", data={"num_minibatches": 7})
 
 
-@pytest.mark.parametrize("name", ["sac", "fast_td3"])
-@pytest.mark.parametrize("prioritized", [False, True])
+@pytest.mark.parametrize(
+    ("name", "prioritized"),
+    [
+        ("sac", False),
+        ("fast_td3", True),
+        pytest.param("sac", True, marks=pytest.mark.full),
+        pytest.param("fast_td3", False, marks=pytest.mark.full),
+    ],
+)
 def test_a_resumed_run_is_the_same_run(name, prioritized, tmp_path):
     options = {"data": {"prioritized": prioritized, "n_step": 2}, "objective": None}
     if name == "sac":

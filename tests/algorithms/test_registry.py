@@ -109,10 +109,15 @@ def ksim_rl(site, *arguments):
     )
 
 
-def test_an_algorithm_from_another_package_trains_and_is_evaluated(site, tmp_path):
+def test_an_algorithm_from_another_package_trains(site, tmp_path):
     done = ksim_rl(site, "train", "objective=mine", *SMALL, f"hydra.run.dir={tmp_path / 'run'}")
     assert done.returncode in (0, 1), done.stderr
     assert "2 iterations" in done.stdout
+
+
+@pytest.mark.full
+def test_a_run_of_another_package_is_resumed_and_evaluated(site, tmp_path):
+    ksim_rl(site, "train", "objective=mine", *SMALL, f"hydra.run.dir={tmp_path / 'run'}")
     resumed = ksim_rl(site, "resume", str(tmp_path / "run"), "--num-iterations", "3")
     assert resumed.returncode in (0, 1) and "3 iterations" in resumed.stdout, resumed.stderr
     judged = ksim_rl(site, "eval", str(tmp_path / "run"), "--episodes", "2")

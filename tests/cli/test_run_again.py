@@ -148,6 +148,7 @@ def test_a_run_names_its_teacher_so_that_it_is_found_from_anywhere(tmp_path, mon
     assert seen[0].objective.teacher == str(tmp_path / "runs" / "expert")
 
 
+@pytest.mark.full
 def test_a_run_is_made_again_from_its_own_weights(first, tmp_path):
     code = run("--config-dir", str(first), f"checkpoint={first}", "seed=5", f"hydra.run.dir={tmp_path}")
     config = checkpoint.load(checkpoint.latest(tmp_path)).config

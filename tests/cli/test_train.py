@@ -3,7 +3,6 @@
 import csv
 import json
 import signal
-import subprocess
 import sys
 
 import imageio.v2 as imageio
@@ -11,7 +10,7 @@ import pytest
 
 from ksim_rl.cli import main
 from ksim_rl.runs import record
-from ksim_rl.trainers import checkpoint
+from ksim_rl.trainers import Trainer, checkpoint
 
 SMALL = (
     "num_envs=16",
@@ -128,18 +127,19 @@ def test_a_damaged_checkpoint_is_one_line(trained, capsys, tmp_path):
     assert "damaged" in capsys.readouterr().err
 
 
-def test_ctrl_c_saves_and_exits_with_130(tmp_path):
-    command = [sys.executable, "-m", "ksim_rl.cli.main", "train", *SMALL, "trainer.num_iterations=100000"]
-    process = subprocess.Popen(
-        [*command, "trainer.eval_interval=0", f"hydra.run.dir={tmp_path}"], stdout=subprocess.PIPE, text=True
-    )
-    for line in process.stdout:
-        if line.startswith("iteration 2/"):
-            process.send_signal(signal.SIGINT)
-            break
-    rest = process.stdout.read()
-    assert process.wait(timeout=60) == 130
-    assert "SIGINT: everything is saved; continue with: ksim-rl resume" in rest
+def test_ctrl_c_saves_and_exits_with_130(tmp_path, monkeypatch, capsys):
+    endless = ("trainer.num_iterations=100000", "trainer.eval_interval=0", f"hydra.run.dir={tmp_path}")
+    iterate = Trainer.iterate
+
+    def iterate_until_ctrl_c(trainer):
+        iterate(trainer)
+        if trainer.iteration == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Trainer, "iterate", iterate_until_ctrl_c)
+    monkeypatch.setattr(sys, "argv", ["ksim-rl", "train", *SMALL, *endless])
+    assert run("train", *SMALL, *endless) == 130
+    assert "SIGINT: everything is saved; continue with: ksim-rl resume" in capsys.readouterr().out
     assert checkpoint.load(checkpoint.latest(tmp_path)).iteration >= 2
     (session,) = record.read(tmp_path)
     assert (session.status, session.why) == ("interrupted", "SIGINT")

@@ -76,6 +76,7 @@ def test_a_velocity_task_takes_at_most_40_lines() -> None:
     )
 
 
+@pytest.mark.full
 def test_the_robot_made_by_hand_weighs_what_its_model_does(folder: Path) -> None:
     script = (
         "from stool.by_hand import TASK, ROBOT; TASK.cfg(); print(ROBOT.spec().compile().body_subtreemass[0])"

@@ -38,6 +38,7 @@ def test_a_pendulum_is_swung_up_and_held():
     assert reward_after("pendulum_swingup", 120, *SMALL, "objective.lmbda=0.9") > 0.55
 
 
+@pytest.mark.full
 def test_a_hanging_pole_begins_to_swing_up():
     # The start of what takes 20 times as long (below). An untrained policy gets 0.001 at first, 0.03 after some steps.
     assert reward_after("cartpole_swingup", 25, *SMALL) > 0.12

@@ -117,7 +117,7 @@ def trained(kind, **sequences):
     [
         pytest.param("lstm", {}, marks=pytest.mark.full),
         pytest.param("gru", {}, marks=pytest.mark.full),
-        ("lstm", {"sequence_length": 4}),
+        pytest.param("lstm", {"sequence_length": 4}, marks=pytest.mark.full),
         ("gru", {"sequence_length": 4, "burn_in": 2}),
     ],
 )

@@ -17,7 +17,13 @@ from ksim_rl.testing import check_env, count_syncs
 E, T = 4, 16
 EPISODE_STEPS = 6  # short, so that each rollout holds several resets
 # One of each kind; every registered task is checked in tests/tasks.
-TASKS = ("cartpole_balance", "go1_velocity_flat", "go1_velocity_rough", "quadruped_velocity_flat", "arm_push")
+TASKS = (
+    "cartpole_balance",
+    pytest.param("go1_velocity_flat", marks=pytest.mark.full),
+    "go1_velocity_rough",
+    "quadruped_velocity_flat",
+    pytest.param("arm_push", marks=pytest.mark.full),
+)
 
 
 def made(task: str) -> envs.MaskedTransformedEnv:

@@ -61,8 +61,15 @@ def value():
     return ValueOperator(nn.Sequential(nn.Linear(1, 16), nn.ELU(), nn.Linear(16, 1)), in_keys=["critic"])
 
 
-@pytest.mark.parametrize("kind", RECURRENT)
-@pytest.mark.parametrize("data", [{}, {"sequence_length": 4, "burn_in": 4}], ids=["rollouts", "sequences"])
+@pytest.mark.parametrize(
+    ("kind", "data"),
+    [
+        ("lstm", {}),
+        ("gru", {"sequence_length": 4, "burn_in": 4}),
+        pytest.param("lstm", {"sequence_length": 4, "burn_in": 4}, marks=pytest.mark.full),
+        pytest.param("gru", {}, marks=pytest.mark.full),
+    ],
+)
 def test_torchrls_recurrent_modules_learn_on_sequences(kind, data):
     torch.manual_seed(0)
     env, recurrent, actor = recurrent_problem(kind)

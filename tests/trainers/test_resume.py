@@ -54,6 +54,7 @@ trainer.train()
 """
 
 
+@pytest.mark.full
 def test_a_run_resumed_in_a_new_process_is_bit_identical(tmp_path):
     straight = trained(iterations=4)
     trained(tmp_path, iterations=2)

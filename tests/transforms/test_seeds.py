@@ -92,7 +92,7 @@ full = pytest.mark.full
 @pytest.mark.parametrize(
     ("start", "seeding"),
     [
-        ("fork", "manual_seed"),
+        pytest.param("fork", "manual_seed", marks=full),
         pytest.param("fork", "set_seed", marks=full),
         pytest.param("spawn", "manual_seed", marks=full),
         pytest.param("spawn", "set_seed", marks=full),
