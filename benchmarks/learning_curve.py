@@ -55,8 +55,12 @@ def main() -> None:
         Path(own["points"]).write_text(json.dumps(train_one(cfg)))
         return
     seeds = chosen_seeds(own, overrides)
-    curves = train_and_keep(seeds, cfg=cfg, overrides=overrides, module="benchmarks.learning_curve")
-    fail_without(seeds, curves)
+    curves = train_and_keep(seeds, cfg=cfg, overrides=overrides)
+    failed = [str(seed) for seed in seeds if seed not in curves]
+    if failed:
+        raise SystemExit(
+            f"no medians, since the runs of seeds {','.join(failed)} failed; the others are kept"
+        )
 
 
 def chosen_seeds(own: dict[str, str], overrides: list[str]) -> list[int]:
@@ -71,9 +75,7 @@ def chosen_seeds(own: dict[str, str], overrides: list[str]) -> list[int]:
     return command_line.whole_numbers("seeds", own["seeds"], least=0)
 
 
-def train_and_keep(
-    seeds: list[int], *, cfg: RunCfg, overrides: list[str], module: str
-) -> dict[int, list[Point]]:
+def train_and_keep(seeds: list[int], *, cfg: RunCfg, overrides: list[str]) -> dict[int, list[Point]]:
     """Train all seeds, keep the curve of each when it is done, print, write and draw all; return the curves.
 
     Without the seeds that failed, and without any medians if there are such.
@@ -88,7 +90,7 @@ def train_and_keep(
             "_".join(["learning", cfg.task_name, *others]),
             figures=figures,
             device=device,
-            module=module,
+            module="benchmarks.learning_curve",
             curves={f"{label}/seed_{seed}": thinned(points, KEPT_POINTS) for seed, points in curves.items()},
         )
 
@@ -105,15 +107,6 @@ def train_and_keep(
     draw(curves, path.with_suffix(".png"), task_name=cfg.task_name, learner=learner, num_envs=cfg.num_envs)
     print(f"written to {path}")
     return curves
-
-
-def fail_without(seeds: list[int], curves: dict[int, list[Point]]) -> None:
-    """End the command if a seed has no curve."""
-    failed = [str(seed) for seed in seeds if seed not in curves]
-    if failed:
-        raise SystemExit(
-            f"no medians, since the runs of seeds {','.join(failed)} failed; the others are kept"
-        )
 
 
 def other_choices(overrides: list[str]) -> list[str]:

@@ -29,12 +29,13 @@ from rich.table import Table
 
 from benchmarks import command_line, report
 from benchmarks.host_traffic import host_traffic
-from benchmarks.learning_time import LEVELS
 from ksim_rl import conf, ranks
+from ksim_rl.tables.table import load
 from ksim_rl.trainers import build
 
 TASKS = "go1_velocity_flat:16384,go1_velocity_flat:4096,g1_velocity_flat:4096"
 OPTIONS = {"tasks": TASKS, "seeds": "1,2,3,4,5", "ranks": "0", "device": "cuda", "env_states": "60e6"}
+LEVELS = load("velocity").rows["ppo/go1"].levels
 NVLS = {"NCCL_NVLS_ENABLE": "0"}
 WARMUP, TIMED = {"cuda": 12, "cpu": 1}, {"cuda": 20, "cpu": 2}
 

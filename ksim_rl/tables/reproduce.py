@@ -61,14 +61,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("table", help=f"one of {', '.join(shipped())}, or a YAML file of yours")
     parser.add_argument("--rows", default=".*", help="regular expression of rows, such as 'ppo/Walker.*'")
-    parser.add_argument("--seeds", type=_seeds, default=[], help="some of the table's, such as 1,2")
+    parser.add_argument(
+        "--seeds",
+        type=lambda text: [int(word) for word in text.split(",")],
+        default=[],
+        help="some of the table's, such as 1,2",
+    )
     parser.add_argument("--device", default="cuda", help="cpu, or cuda where there is a GPU")
     parser.add_argument("--output", type=Path, help="default: benchmarks/results/tables, or tables elsewhere")
     parser.add_argument("--runs", type=Path, default=Path("runs/tables"), help="where the runs lie")
     parser.add_argument("--minutes", type=float, default=math.inf, help="end then; 0 writes what is there")
     parser.add_argument("--smoke", action="store_true", help="two iterations each: does it run at all?")
     return parser
-
-
-def _seeds(text: str) -> list[int]:
-    return [int(word) for word in text.split(",")]
