@@ -90,8 +90,9 @@ def of_task(name: str) -> mujoco.MjModel:
 
 # One for each robot of the tasks.
 TASKS = (
-    "arm_push cheetah_run g1_velocity_flat go1_velocity_flat go2_velocity_flat hopper_hop humanoid_get_up "
-    "humanoid_velocity_flat quadruped_get_up quadruped_velocity_flat reacher t1_velocity_flat walker_walk"
+    "arm_push cartpole_swingup cheetah_run g1_velocity_flat go1_velocity_flat go2_velocity_flat hopper_hop humanoid_get_up "
+    "humanoid_velocity_flat pendulum_swingup quadruped_get_up quadruped_velocity_flat reacher t1_velocity_flat "
+    "walker_walk"
 )
 CASES = (
     Case(name="cartpole", load=lambda: load_model(CARTPOLE), substeps=100, start="anywhere"),
@@ -201,7 +202,7 @@ def agrees(case: Case, found: Errors) -> bool:
 
 
 def chosen_cases(names: list[str] | None) -> list[Case]:
-    """Return the cases of these names and files, or all; robots with files only where MENAGERIE_ROOT names a folder.
+    """Return the cases of these names, tasks and files, or all of ours; menagerie robots only with a MENAGERIE_ROOT.
 
     Raises ValueError where a name is unknown, or one of them is named and there is no such folder.
     """
@@ -215,12 +216,12 @@ def chosen_cases(names: list[str] | None) -> list[Case]:
         if path.suffix in SUFFIXES:
             called = path.parent.resolve().name if path.stem == "scene" else path.stem
             chosen.append(Case(name=called, load=partial(load_model, path)))
-        elif name not in cases:
-            raise unknown_name("--models", name, cases)
+        elif name not in cases and name not in envs.names():
+            raise unknown_name("--models", name, [*cases, *envs.names()])
         elif _needs_menagerie(name) and "MENAGERIE_ROOT" not in os.environ:
             raise ValueError(f"--models {name}: set MENAGERIE_ROOT to the folder of this robot")
         else:
-            chosen.append(cases[name])
+            chosen.append(cases.get(name) or Case(name=name, load=partial(of_task, name)))
     return chosen
 
 
@@ -235,7 +236,9 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--worlds", type=int, default=64)
-    parser.add_argument("--models", nargs="+", metavar="MODEL", help="names of models, or MJCF files")
+    parser.add_argument(
+        "--models", nargs="+", metavar="MODEL", help="names of models or tasks, or MJCF files"
+    )
     options = parser.parse_args(arguments)
     device = checked_device(options.device)
     cases = chosen_cases(options.models)

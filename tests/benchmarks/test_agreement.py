@@ -1,10 +1,11 @@
+import json
 import os
 
 import numpy as np
 import pytest
 import torch
 
-from benchmarks import agreement
+from benchmarks import agreement, report
 from benchmarks.agreement_errors import compare, errors
 from ksim_rl.physics import load_model
 
@@ -61,6 +62,18 @@ def test_robots_agree_as_they_train(name):
     check(name, num_worlds=64)
 
 
+def test_what_is_committed_is_within_the_limits_for_every_robot():
+    figures = json.loads((report.RESULTS / "agreement.json").read_text())["figures"]
+    measured = {name.split("/")[0] for name in figures if "/as_trained/" in name}
+    assert "cpu" in measured
+    for device in measured:
+        for each in agreement.CASES:
+            figure = f"{device}/{each.name}/qpos/as_trained"
+            assert figures[f"{figure}/share_within_1e_3"] >= 0.95, figure
+            assert figures[f"{figure}/share_within_1e_2"] >= 0.99, figure
+            assert figures[f"{figure}/median"] <= 1e-5, figure
+
+
 def test_any_file_is_a_model(tmp_path, monkeypatch):
     monkeypatch.delenv("MENAGERIE_ROOT", raising=False)
     path = tmp_path / "ball.xml"
@@ -68,6 +81,8 @@ def test_any_file_is_a_model(tmp_path, monkeypatch):
     (chosen,) = agreement.chosen_cases([str(path)])
     assert chosen.name == "ball" and chosen.load().nv == 6
     assert chosen.states(chosen.load(), 2).qpos_EL.shape == (2, 7)
+    (of_task,) = agreement.chosen_cases(["pendulum_swingup"])
+    assert of_task.name == "pendulum_swingup" and of_task.start == "thrown"
     with pytest.raises(ValueError, match="did you mean 'quadruped'"):
         agreement.chosen_cases(["quadrupe"])
     with pytest.raises(ValueError, match="--models unitree_g1: set MENAGERIE_ROOT"):

@@ -1,8 +1,11 @@
 """`ksim-rl robot` prints what `analyse` finds, as a table or as code, and says by its code whether the robot stands."""
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from ksim_rl.cli import main
+from ksim_rl.scene.rendering import rendering
 from ksim_rl.tasks.velocity import VelocityTask
 from tests.scene.robots.test_analysis import biped
 
@@ -46,6 +49,20 @@ def test_a_robot_that_cannot_stand_says_so_by_the_exit_code(run):
     weak = '<motor joint="left_knee" ctrlrange="-1 1"/><motor joint="right_knee" ctrlrange="-1 1"/>'
     code, out, _ = run(xml=biped(actuators=weak))
     assert code == 1 and "stands 0." in out
+
+
+def test_the_picture_shows_the_robot_on_its_floor(run, tmp_path):
+    try:
+        rendering.choose_gl_platform()
+    except RuntimeError as error:
+        pytest.skip(f"no OpenGL here: {error}")
+    path = tmp_path / "stance.png"
+    assert run("--picture", str(path))[0] == 0
+    picture = np.asarray(Image.open(path), dtype=float)
+    assert picture.shape[:2] == (480, 640)
+    # It stands in the middle, where the picture differs from column to column; the sides show ground alone.
+    middle, side = picture[:, 240:400], picture[:, :40]
+    assert middle.std(axis=1).mean() > 3.0 * side.std(axis=1).mean()
 
 
 def test_mistakes_are_one_line(run):

@@ -12,7 +12,9 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import LossModule
 
+from ksim_rl import objectives
 from ksim_rl.data import MASK_KEY
 from ksim_rl.modules import (
     DeterministicActorCfg,
@@ -22,7 +24,7 @@ from ksim_rl.modules import (
     make_q_network,
     make_squashed_actor,
 )
-from ksim_rl.objectives import DistillationLoss, SACLoss, TD3Loss
+from ksim_rl.objectives import ClipPPOLoss, DistillationLoss, OffPolicyLoss, SACLoss, TD3Loss
 from tests.objectives.problems import networks
 
 BATCH, OBS, ACTION = 32, 5, 3
@@ -73,6 +75,12 @@ def minibatch():
 def evaluated(loss, data):
     torch.manual_seed(2)
     return loss(data)
+
+
+def test_no_loss_is_left_out():
+    public = {value for value in vars(objectives).values() if isinstance(value, type)}
+    losses = {cls for cls in public if issubclass(cls, LossModule)} - {OffPolicyLoss}  # the base of two
+    assert losses == {type(make()) for make in LOSSES.values()} | {ClipPPOLoss}
 
 
 @each_loss
