@@ -90,9 +90,9 @@ def of_task(name: str) -> mujoco.MjModel:
 
 # One for each robot of the tasks.
 TASKS = (
-    "arm_push cartpole_swingup cheetah_run g1_velocity_flat go1_velocity_flat go2_velocity_flat hopper_hop humanoid_get_up "
-    "humanoid_velocity_flat pendulum_swingup quadruped_get_up quadruped_velocity_flat reacher t1_velocity_flat "
-    "walker_walk"
+    "arm_push cartpole_swingup cheetah_run g1_velocity_flat go1_velocity_flat go2_velocity_flat hopper_hop "
+    "humanoid_get_up humanoid_velocity_flat pendulum_swingup quadruped_get_up quadruped_velocity_flat reacher "
+    "t1_velocity_flat walker_walk"
 )
 CASES = (
     Case(name="cartpole", load=lambda: load_model(CARTPOLE), substeps=100, start="anywhere"),
