@@ -20,7 +20,8 @@ from ksim_rl.tables.table import load, shipped
 def reproduce(arguments: Sequence[str]) -> int:
     """Run the command; the code is 1 where a row does not reach its goal or has no result, 0 else."""
     options = _parser().parse_args(arguments)
-    began, smoke, seeds, table = time.monotonic(), options.smoke, options.seeds, load(options.table)
+    began, smoke, table = time.monotonic(), options.smoke, load(options.table)
+    seeds = [int(word) for word in options.seeds.split(",") if word]
     rows = {name: row for name, row in table.rows.items() if re.fullmatch(options.rows, name)}
     known = sorted({seed for row in rows.values() for seed in row.seeds})
     if not rows:
@@ -61,12 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("table", help=f"one of {', '.join(shipped())}, or a YAML file of yours")
     parser.add_argument("--rows", default=".*", help="regular expression of rows, such as 'ppo/Walker.*'")
-    parser.add_argument(
-        "--seeds",
-        type=lambda text: [int(word) for word in text.split(",")],
-        default=[],
-        help="some of the table's, such as 1,2",
-    )
+    parser.add_argument("--seeds", default="", help="some of the table's, such as 1,2")
     parser.add_argument("--device", default="cuda", help="cpu, or cuda where there is a GPU")
     parser.add_argument("--output", type=Path, help="default: benchmarks/results/tables, or tables elsewhere")
     parser.add_argument("--runs", type=Path, default=Path("runs/tables"), help="where the runs lie")
