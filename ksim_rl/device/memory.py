@@ -31,7 +31,9 @@ def memory_for(
             raise
         taken = 0 if free is None else max(0, free - (_free_bytes(device) or 0))
         per_env = max(1, (taken + asked) // num_envs)
-        fits = "" if free is None else f" of {free / 1e9:.1f} GB that were free, enough for {free // per_env}"
+        fits = (
+            "" if free is None else f" of {free / 1e9:.1f} GB that were free: at most {free // per_env} fit"
+        )
         traceback.clear_frames(error.__traceback__)  # they hold what was built
         while work is not None and (fewer := fewer // 2):
             gc.collect()
@@ -39,7 +41,7 @@ def memory_for(
             with suppress(RuntimeError, ValueError):  # too many as well, or they do not divide the data
                 held = work(fewer), (_free_bytes(device) or 0) >= (free or 0) / 10
                 if held[1]:
-                    fits += f" at most; num_envs={fewer} was tried and fits"
+                    fits += f"; num_envs={fewer} was tried and fits"
                     break
             held = None
         raise ValueError(

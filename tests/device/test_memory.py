@@ -33,7 +33,7 @@ def test_the_number_that_fits_follows_from_what_was_taken(monkeypatch):
     free = iter((10_000_000_000, 4_000_000_000))
     monkeypatch.setattr(memory, "_free_bytes", lambda device: next(free))
     # 6 GB were taken when 10 GB more were asked for, for 1000 envs: 16 MB each, of which 10 GB hold 625.
-    said = r"num_envs=1000: .* 16,000,000 bytes of 10\.0 GB .* enough for 625"
+    said = r"num_envs=1000: .* 16,000,000 bytes of 10\.0 GB .*: at most 625 fit"
     with pytest.raises(ValueError, match=said), memory_for(1000, CUDA):
         raise RuntimeError("Failed to allocate 10000000000 bytes on device 'cuda:0'")
 
@@ -120,6 +120,8 @@ def test_a_run_whose_envs_do_not_fit_names_a_number_that_it_trained(tmp_path, mo
     cfg = conf.compose(
         [*SMALL, "num_envs=8", "data.num_env_states_per_minibatch=16", "trainer.eval_episodes=0"]
     )
-    with pytest.raises(ValueError, match=r"num_envs=8: out of memory .* num_envs=4 was tried and fits"):
+    with pytest.raises(
+        ValueError, match=r"num_envs=8: out of memory .* bytes; num_envs=4 was tried and fits"
+    ):
         run_folder.run(cfg, tmp_path / "run", progress=progress)
     assert built == [4] and said[-1] == "memory does not suffice: trying num_envs=4"
