@@ -2,6 +2,8 @@
 
 import itertools
 from collections.abc import Iterator, Sequence
+from functools import cache
+from typing import Any
 
 import hydra
 from hydra.core.config_loader import ConfigLoader
@@ -119,9 +121,18 @@ def _check_names(overrides: Sequence[Override], loader: ConfigLoader, name: str)
             choices.append(f"{added}{override.key_or_group}={_values(override)[0]}")
         elif not override.is_hydra_override():
             fields.append(override)
-    tree = OmegaConf.to_container(hydra.compose(name, overrides=choices))
+    sources = tuple(element.path or "" for element in loader.get_search_path().get_path())
+    # The primary config of a run that is made again is another one each time.
+    tree = (_names.__wrapped__ if name == RUN_AGAIN else _names)(name, tuple(choices), sources)
+    check_parsed({**dict.fromkeys(groups), **tree}, fields)
+
+
+@cache
+def _names(name: str, choices: tuple[str, ...], sources: tuple[str, ...]) -> dict[str, Any]:
+    """Compose what overrides are checked against: choices of groups from these sources, which stay in a process."""
+    tree = OmegaConf.to_container(hydra.compose(name, overrides=list(choices)))
     assert isinstance(tree, dict)
-    check_parsed({**dict.fromkeys(groups), **{str(key): value for key, value in tree.items()}}, fields)
+    return {str(key): value for key, value in tree.items()}
 
 
 def _groups(loader: ConfigLoader) -> list[str]:

@@ -120,7 +120,9 @@ def parts(trainer):
     return tensors, values
 
 
-@pytest.mark.parametrize("networks", [["modules=lstm"], SEQUENCES], ids=["lstm", "gru"])
+@pytest.mark.parametrize(
+    "networks", [pytest.param(["modules=lstm"], marks=pytest.mark.full), SEQUENCES], ids=["lstm", "gru"]
+)
 def test_a_resumed_run_is_bit_identical(networks, tmp_path):
     straight = make(*networks, iterations=4)
     straight.train()

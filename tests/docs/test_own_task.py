@@ -45,6 +45,7 @@ def test_its_unit_test_passes(installed: Installed) -> None:
     assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout + done.stderr
 
 
+@pytest.mark.full
 def test_training_takes_overrides_of_its_terms_and_its_own_configs(installed: Installed) -> None:
     done = installed.ksim_rl(
         "train", "task=puck_center", "+experiment=heavy", "task.rewards.near_center.std=0.3", "--cfg", "job"

@@ -1,5 +1,6 @@
 """PPO on cartpole_balance with TorchRL's own parts only: collector, GAE, replay buffer, sampler, loss."""
 
+import pytest
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
@@ -34,6 +35,7 @@ def stock_actor_and_critic(env):
     return actor, ValueOperator(critic, in_keys=["critic"])
 
 
+@pytest.mark.full
 def test_stock_ppo_learns_to_balance():
     torch.manual_seed(0)
     env = TransformedEnv(
