@@ -30,6 +30,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "diagnosis": ("ksim_rl/diagnosis", *LEARN),
     "humanoids": (*STEP, *LEARN, *TASK),
     "learning": (*STEP, *LEARN, *TASK),
+    "nan_names": ("ksim_rl/envs/non_finite.py", "ksim_rl/device/quick_launch.py"),
     "num_envs": (*STEP, *LEARN),
     "off_policy_update": (*LEARN, "ksim_rl/device"),
     "peers": (*STEP, *LEARN, *TASK),
