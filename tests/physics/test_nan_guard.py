@@ -1,5 +1,8 @@
 """Worlds that blow up: what is saved, what the replay says, and what the others notice (nothing)."""
 
+import dataclasses
+import os
+
 import mujoco
 import numpy as np
 import pytest
@@ -196,6 +199,73 @@ def test_other_files_are_refused(tmp_path, content, capsys):
     path.write_bytes(content)
     assert replay.main([str(path)]) == 1
     assert "not a file of the NaN guard" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def failure_file(tmp_path_factory):
+    world = sleds(tmp_path_factory.mktemp("run"))
+    push(world, row=1, light=1e9)
+    return world.nan_report().files[0]
+
+
+WRONG = {
+    "a world below zero": ("world=-1", lambda failure: {"world": -1}),
+    "a counter that is none": ("substep=True", lambda failure: {"substep": True}),
+    "more substeps than there were": ("1 substeps are kept of 0|substep=0", lambda failure: {"substep": 0}),
+    "no substeps": (
+        "0 substeps are kept",
+        lambda failure: {"states": {name: rows[:0] for name, rows in failure.states.items()}},
+    ),
+    "a state of another model": (
+        r"state/qpos is float32 \(1, 8\): expected float32 \(1, 9\)",
+        lambda failure: {"states": {**failure.states, "qpos": failure.states["qpos"][:, :-1]}},
+    ),
+    "states of other lengths": (
+        "state/ctrl",
+        lambda failure: {"states": {**failure.states, "ctrl": np.repeat(failure.states["ctrl"], 2, axis=0)}},
+    ),
+    "another dtype": (
+        "state/ctrl is float64",
+        lambda failure: {"states": {**failure.states, "ctrl": failure.states["ctrl"].astype(np.float64)}},
+    ),
+    "a state that no substep has": (
+        "expected .*it has .*state/odd",
+        lambda failure: {"states": {**failure.states, "odd": failure.states["time"]}},
+    ),
+    "no end": ("expected .*reached/qvel", lambda failure: {"reached": {"qpos": failure.reached["qpos"]}}),
+    "no positions": ("'qpos' is missing", lambda failure: {"states": {"time": failure.states["time"]}}),
+    "a field that no world has": (
+        "field/nq, float32",
+        lambda failure: {"fields": {"nq": np.zeros(1, np.float32)}},
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_values_that_no_failure_has_are_refused_by_name(failure_file, tmp_path, wrong):
+    message, change = WRONG[wrong]
+    failure = nan_file.read(failure_file)
+    nan_file.write(tmp_path / "file", dataclasses.replace(failure, **change(failure)))
+    with pytest.raises(ValueError, match=f"file: {message}" if message[0].isalpha() else message) as refused:
+        nan_file.read(tmp_path / "file")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_file_that_was_damaged_is_refused(failure_file, tmp_path):
+    whole, path = failure_file.read_bytes(), tmp_path / "file"
+    for place in range(len(whole) // 3, len(whole), len(whole) // 7):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        with pytest.raises(ValueError, match="file: damaged"):
+            nan_file.read(path)
+        path.write_bytes(whole[:place])
+        with pytest.raises(ValueError, match="file: damaged"):
+            nan_file.read(path)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="no such file"):
+        nan_file.read(tmp_path / "pipe")
 
 
 @pytest.mark.parametrize(
