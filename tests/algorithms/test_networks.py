@@ -82,6 +82,7 @@ def test_mixed_actions_learn():
     assert 0.0 < metrics["policy/std"] < 2.0
 
 
+@pytest.mark.full
 def test_modules_that_are_not_ours_learn():
     torch.manual_seed(0)
     env = make_env()

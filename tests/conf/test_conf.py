@@ -60,7 +60,15 @@ def test_each_task_composes_with_its_training(name):
         assert getattr(cfg, field.name) == getattr(training, field.name), field.name
 
 
-@pytest.mark.parametrize("name", NAMES)
+# All of those with such settings in full runs.
+TRAINED_OTHERWISE = [
+    name if name in ("go1_velocity_flat", "walker_walk") else pytest.param(name, marks=pytest.mark.full)
+    for name in envs.names()
+    if envs.task(name).other_trainings
+]
+
+
+@pytest.mark.parametrize("name", TRAINED_OTHERWISE)
 def test_each_task_composes_with_its_training_by_other_algorithms(name):
     for training in envs.task(name).other_trainings:
         objective = algorithms.registry.serving(type(training.objective)).name

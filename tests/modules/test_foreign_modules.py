@@ -64,7 +64,7 @@ def value():
 @pytest.mark.parametrize(
     ("kind", "data"),
     [
-        ("lstm", {}),
+        pytest.param("lstm", {}, marks=pytest.mark.full),
         ("gru", {"sequence_length": 4, "burn_in": 4}),
         pytest.param("lstm", {"sequence_length": 4, "burn_in": 4}, marks=pytest.mark.full),
         pytest.param("gru", {}, marks=pytest.mark.full),

@@ -103,6 +103,7 @@ def test_shared_parameters_are_optimized_once_and_observations_counted_once(oper
     assert int(operator.module[0].module.normalizer.count) == 24
 
 
+@pytest.mark.full
 def test_no_host_sync_and_compiles_without_a_break(operator):
     actor = operator.get_policy_operator()
     loss = make_loss(PPOCfg(), actor, operator.get_value_operator())

@@ -114,10 +114,18 @@ SPINNING_TIES = """
 """
 
 
+CONNECT, WELD = 'connect body1="one" body2="two" anchor="0.5 0 0"', 'weld body1="one" body2="two"'
+
+
 @pytest.mark.parametrize(
-    "tie", ['connect body1="one" body2="two" anchor="0.5 0 0"', 'weld body1="one" body2="two"']
+    ("tie", "one_kernel_solver"),
+    [
+        (CONNECT, True),
+        (WELD, False),
+        pytest.param(CONNECT, False, marks=pytest.mark.full),
+        pytest.param(WELD, True, marks=pytest.mark.full),
+    ],
 )
-@pytest.mark.parametrize("one_kernel_solver", [True, False])
 def test_ties_of_fast_bodies_follow_the_c_engine(tie, one_kernel_solver):
     mj_model = load_model(SPINNING_TIES.format(tie=tie))
     world = World(mj_model, num_envs=1, sim=SimCfg(one_kernel_solver=one_kernel_solver, tolerance=1e-8))
