@@ -98,7 +98,9 @@ def _apart(names: Sequence[str], *, form: str, jobs: int) -> Iterator[int]:
                 for row in as_completed([pool.submit(measure, name) for name in group]):
                     results, ended = row.result()
                     print(ended.stdout, end="", flush=True)
-                    if results.exists():
+                    if ended.returncode not in (0, 1):
+                        print(f"{results.name}: FAILS: ended with exit code {ended.returncode}", flush=True)
+                    if (results / "faults.json").exists():
                         page.merge([results])
                     yield ended.returncode
 
