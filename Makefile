@@ -1,6 +1,6 @@
 # make train: from a fresh clone to a trained policy. make test: everything that CI checks. make test-full: the long
 # tests too, and how much of the package they run.
-# ARGS passes overrides on: make train ARGS="task=cartpole_swingup seed=2"
+# ARGS passes overrides on: make train ARGS="task=cartpole_balance seed=2"
 
 PYTHON ?= python3
 VENV := .venv
@@ -24,7 +24,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 train: setup
-	$(BIN)/ksim-rl train $(ARGS)
+	$(BIN)/ksim-rl train $(if $(findstring task=,$(ARGS)),,task=pendulum_swingup) $(ARGS)
 
 check: lint types imports house
 

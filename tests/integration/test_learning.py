@@ -5,19 +5,7 @@ import pytest
 from ksim_rl import conf
 from ksim_rl.trainers import build
 
-# Small enough for a minute on two cores: 64 envs, 32 steps per rollout, 24 gradient steps.
-SMALL = (
-    "device=cpu",
-    "logger=none",
-    "trainer.eval_episodes=0",
-    "num_envs=64",
-    "data.num_env_states_per_minibatch=512",
-    "data.num_minibatches=4",
-    "objective.num_epochs=6",
-    "objective.learning_rate=2e-3",
-    "objective.gamma=0.98",
-    "objective.entropy_coeff=0.0",
-)
+SMALL = ("device=cpu", "logger=none", "trainer.eval_episodes=0")
 
 
 def reward_after(task, iterations, *overrides):
@@ -31,19 +19,6 @@ def reward_after(task, iterations, *overrides):
     return sum(rewards[-3:]) / 3
 
 
-@pytest.mark.full
-def test_a_pendulum_is_swung_up_and_held():
-    # Upright and at rest pays 1 per step. An untrained policy gets 0.23 at first, and 0.07 after some steps; five seeds
-    # of this one got 0.74 to 0.94.
-    assert reward_after("pendulum_swingup", 120, *SMALL, "objective.lmbda=0.9") > 0.55
-
-
-@pytest.mark.full
-def test_a_hanging_pole_begins_to_swing_up():
-    # The start of what takes 20 times as long (below). An untrained policy gets 0.001 at first, 0.03 after some steps.
-    assert reward_after("cartpole_swingup", 25, *SMALL) > 0.12
-
-
 NETWORKS = ("modules.actor.hidden_dims=[64,64]", "modules.critic.hidden_dims=[64,64]")
 
 
@@ -51,7 +26,7 @@ NETWORKS = ("modules.actor.hidden_dims=[64,64]", "modules.critic.hidden_dims=[64
 def test_a_hopper_learns_to_get_up_and_stand():
     # 250 thousand env states give 0.29 per step. An untrained policy falls at once and then gets 0.03 at most.
     sizes = ("num_envs=64", "data.num_env_states_per_minibatch=1024", "data.num_minibatches=4")
-    overrides = (*SMALL[:3], *sizes, *NETWORKS, "objective.learning_rate=1e-3")
+    overrides = (*SMALL, *sizes, *NETWORKS, "objective.learning_rate=1e-3")
     assert reward_after("hopper_stand", 60, *overrides) > 0.15
 
 
@@ -59,7 +34,7 @@ def test_a_hopper_learns_to_get_up_and_stand():
 def test_our_quadruped_learns_to_keep_its_feet():
     # 140 thousand env states give -0.02 per step: it stands and acts calmly. An untrained policy thrashes: -3.1.
     sizes = ("num_envs=64", "data.num_env_states_per_minibatch=384", "data.num_minibatches=4")
-    assert reward_after("quadruped_velocity_flat", 90, *SMALL[:3], *sizes, *NETWORKS) > -0.1
+    assert reward_after("quadruped_velocity_flat", 90, *SMALL, *sizes, *NETWORKS) > -0.1
 
 
 @pytest.mark.full
