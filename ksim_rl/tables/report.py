@@ -103,7 +103,7 @@ def _cells(row: Row, results: Results) -> list[str]:
         return ["", "0", "", "", "not run"]
     value, returns = value_of(row, results), [r["evaluation"]["return_mean"] for r in results]
     spread = f" ± {statistics.stdev(returns):.0f}" if len(returns) > 1 else ""
-    ours = f"{value:.0f}{spread}"
+    ours = "" if value is None else f"{value:.0f}{spread}"
     if row.measure == "seconds":
         falls = f"falls {100 * max(result['falls'] for result in results):.1f} %"
         ours = f"{'not reached' if value is None else f'{value:.1f} s'}, {falls}"

@@ -134,6 +134,14 @@ def test_without_time_nothing_runs_and_the_table_is_of_what_is_there(reproduce):
     assert (code, started, list(table["figures"])) == (1, [], ["poles/ppo/Balance"])
 
 
+def test_a_row_whose_levels_no_seed_reaches_is_in_the_table(reproduce):
+    row = "Other: {task: reacher, measure: seconds, levels: {episode/return: 5}, within_s: 9}"
+    text = TABLE.replace("Other: {task: reacher}", row)
+    code, _, table = reproduce("--rows", "ppo/Other", "--seeds", "1", text=text)
+    assert code == 1 and table["figures"] == {"poles/ppo/Other/falls": 0.0}
+    assert "not reached, falls 0.0 %" in (reproduce.folder / "poles.md").read_text()
+
+
 def test_unknown_rows_and_seeds_are_refused(reproduce, capsys):
     assert reproduce("--rows", "ppo/Balanc")[:2] == (2, [])
     assert "'ppo/Balance'" in capsys.readouterr().err
