@@ -20,7 +20,7 @@ from ksim_rl.checks import check_in_range, unknown_name
 from ksim_rl.envs.term import CurriculumTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
-from ksim_rl.mdp.fields import OfEntity, distance_from_origin
+from ksim_rl.mdp.fields import OfCommand, OfEntity, distance_from_origin
 from ksim_rl.transforms.row_transform import by_level, moved_level
 
 
@@ -133,7 +133,7 @@ def _longest_E(view: EnvView) -> Tensor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TerrainLevels(OfEntity, CurriculumTerm):
+class TerrainLevels(OfCommand, OfEntity, CurriculumTerm):
     """Moves the envs whose episodes ended to other levels of `scene.terrain`, a `TerrainGrid`; reports the mean level.
 
     An env moves up one level when its robot got at least `up_distance` away from its origin (horizontally, at the end
@@ -145,7 +145,6 @@ class TerrainLevels(OfEntity, CurriculumTerm):
     edge.
     """
 
-    command: str
     up_distance: Annotated[float, Within(low=0.0, high=1.0, low_open=True)] = 0.8
     down_share: NonNegative = 0.5
 
@@ -214,14 +213,13 @@ class RewardWeightByLevel(RewardWeight):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CommandRangesByStage(CurriculumTerm):
+class CommandRangesByStage(OfCommand, CurriculumTerm):
     """Gives a command other ranges from certain env steps on; until the first stage it has its own.
 
     Stages begin at env steps since the env was seeded; a field of the command that a stage leaves out stays as it is.
     The reported level is the number of stages that have begun.
     """
 
-    command: str
     stages: Mapping[WholeNumber, Ranges]
 
     def _check_fields(self) -> None:
@@ -245,10 +243,9 @@ class CommandRangesByStage(CurriculumTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CommandRangesByLevel(CurriculumTerm):
+class CommandRangesByLevel(OfCommand, CurriculumTerm):
     """Moves the ranges of a command linearly from `start` at `view.level` 0, which is also reported, to `end` at 1."""
 
-    command: str
     start: Ranges
     end: Ranges
 

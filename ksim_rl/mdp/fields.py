@@ -38,6 +38,20 @@ class OfJoints(Term):
 
 
 @dataclass(frozen=True, kw_only=True)
+class OfCommand(Term):
+    """A term of a command, by its name in `commands`."""
+
+    command: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfSensor(Term):
+    """A term of a sensor of `scene.sensors`, or of one of the model's, by its name."""
+
+    sensor: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class SiteAndBody(Term):
     """A term of where a site is and where a body's origin."""
 
@@ -50,18 +64,16 @@ class SiteAndBody(Term):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfContacts(Term):
-    """A term of where the net force on a sensor of `scene.sensors` exceeds a threshold, N, at the last substep."""
+class OfContacts(OfSensor):
+    """A term of where the net force on a contact sensor exceeds a threshold, N, at the last substep."""
 
-    sensor: str
     threshold: NonNegative
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfFeet(Term):
+class OfFeet(OfSensor):
     """A term of how feet (sites) move, and of a contact sensor with one geom or body per foot in the same order."""
 
-    sensor: str
     sites: Patterns
 
     def contact(self, view: EnvView) -> ContactState:
@@ -121,10 +133,9 @@ class FramedObservation(InFrame, ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RewardWhileCommanded(RewardTerm):
+class RewardWhileCommanded(OfCommand, RewardTerm):
     """A reward that is 0 unless the speed that a velocity command asks for exceeds a threshold."""
 
-    command: str
     command_threshold: NonNegative
 
     def while_commanded(self, view: EnvView, value_E: Float[Tensor, " E"]) -> Float[Tensor, " E"]:

@@ -16,15 +16,21 @@ from ksim_rl.checks import unknown_name
 from ksim_rl.envs.term import MetricTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.commands import OfTarget
-from ksim_rl.mdp.fields import OfEntity, OfFeet, OfJoints, contact_force, mechanical_power
+from ksim_rl.mdp.fields import (
+    OfCommand,
+    OfEntity,
+    OfFeet,
+    OfJoints,
+    OfSensor,
+    contact_force,
+    mechanical_power,
+)
 from ksim_rl.scene.names import Patterns
 
 
 @dataclass(frozen=True, kw_only=True)
-class LinearVelocityError(OfEntity, MetricTerm):
+class LinearVelocityError(OfCommand, OfEntity, MetricTerm):
     """|c_xy - v_xy| of a command (vx, vy, wz) and the root velocity, both in the root's frame, m/s; velocity stage."""
-
-    command: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         error_E2 = view.command(self.command)[:, :2] - view.entity(self.entity).root_lin_vel_b_EL[:, :2]
@@ -32,10 +38,8 @@ class LinearVelocityError(OfEntity, MetricTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AngularVelocityError(OfEntity, MetricTerm):
+class AngularVelocityError(OfCommand, OfEntity, MetricTerm):
     """|c_z - w_z| of a command (vx, vy, wz) and the root velocity, both in the root's frame, rad/s; velocity stage."""
-
-    command: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return (view.command(self.command)[:, 2] - view.entity(self.entity).root_ang_vel_b_EL[:, 2]).abs()
@@ -75,10 +79,9 @@ class PeakFootHeight(MetricTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PeakContactForce(MetricTerm):
+class PeakContactForce(OfSensor, MetricTerm):
     """Greatest net contact force, N, [E], sampled at each env step's last substep; by default its peak so far."""
 
-    sensor: str
     reduce: Literal["mean", "last", "max", "sum"] = "max"
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checked import Positive, Within
-from ksim_rl.envs.term import EventTerm, ObservationTerm, TerminationTerm
+from ksim_rl.envs.term import EventTerm, ObservationTerm, Term, TerminationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.fields import GaussianReward, OfJoints
 from ksim_rl.scene import quaternion
@@ -28,10 +28,28 @@ from ksim_rl.scene.state.motion_clock import (
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionPhase(ObservationTerm):
-    """Sine and cosine of 2 pi t / cycle, `t` the time in the motion, [E, 2]; a cycle of None is the whole motion."""
+class OfMotion(Term):
+    """A term of a reference motion."""
 
     file: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfMotionBodies(OfMotion):
+    """A term of bodies in a reference motion."""
+
+    bodies: Patterns
+
+    def offset(self, view: EnvView) -> Float[Tensor, "E N 3"]:
+        """Return the motion's positions of the bodies minus their own, world frame, m; position stage."""
+        pos_EN3, _ = motion_bodies(view, self.file, self.bodies)
+        return pos_EN3 - view.bodies(self.bodies).pos_EN3
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionPhase(OfMotion, ObservationTerm):
+    """Sine and cosine of 2 pi t / cycle, `t` the time in the motion, [E, 2]; a cycle of None is the whole motion."""
+
     cycle_s: Positive | None = None
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
@@ -41,10 +59,9 @@ class MotionPhase(ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionJoints(OfJoints, ObservationTerm):
+class MotionJoints(OfMotion, OfJoints, ObservationTerm):
     """Positions (rad or m), then velocities (per s), that joints have in the motion `ahead_s` from now, [E, 2L]."""
 
-    file: str
     ahead_s: float = 0.0
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
@@ -55,21 +72,16 @@ class MotionJoints(OfJoints, ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionBodyOffset(ObservationTerm):
+class MotionBodyOffset(OfMotionBodies, ObservationTerm):
     """Where bodies are in the motion minus where they are, world frame, m, [E, 3N]; position stage."""
 
-    file: str
-    bodies: Patterns
-
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
-        return _body_offset(view, self.file, self.bodies).flatten(start_dim=1)
+        return self.offset(view).flatten(start_dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackMotionJointPos(OfJoints, GaussianReward):
+class TrackMotionJointPos(OfMotion, OfJoints, GaussianReward):
     """exp(-sum_j (q_j - qref_j)^2 / std^2), rad or m, [E]; position stage."""
-
-    file: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         pos_EL, _ = motion_joints(view, self.file, self.joints)
@@ -78,10 +90,8 @@ class TrackMotionJointPos(OfJoints, GaussianReward):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackMotionJointVel(OfJoints, GaussianReward):
+class TrackMotionJointVel(OfMotion, OfJoints, GaussianReward):
     """exp(-sum_j (v_j - vref_j)^2 / std^2), rad/s or m/s, [E]; velocity stage."""
-
-    file: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         _, vel_EL = motion_joints(view, self.file, self.joints)
@@ -90,22 +100,16 @@ class TrackMotionJointVel(OfJoints, GaussianReward):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackMotionBodyPos(GaussianReward):
+class TrackMotionBodyPos(OfMotionBodies, GaussianReward):
     """exp(-sum_b |p_b - pref_b|^2 / std^2), world frame, m, [E]; position stage."""
 
-    file: str
-    bodies: Patterns
-
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        return self.rate(_body_offset(view, self.file, self.bodies).square().sum((-2, -1)))
+        return self.rate(self.offset(view).square().sum((-2, -1)))
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackMotionBodyQuat(GaussianReward):
+class TrackMotionBodyQuat(OfMotionBodies, GaussianReward):
     """exp(-sum_b a_b^2 / std^2), `a` the angle of a body from its orientation in the motion, rad, [E]."""
-
-    file: str
-    bodies: Patterns
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         _, quat_EN4 = motion_bodies(view, self.file, self.bodies)
@@ -114,23 +118,20 @@ class TrackMotionBodyQuat(GaussianReward):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FarFromMotion(TerminationTerm):
+class FarFromMotion(OfMotionBodies, TerminationTerm):
     """A body is further than `distance` (m) from where it is in the motion, world frame; position stage."""
 
-    file: str
-    bodies: Patterns
     distance: Positive
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
-        offset_EN3 = _body_offset(view, self.file, self.bodies)
+        offset_EN3 = self.offset(view)
         return (torch.linalg.vector_norm(offset_EN3, dim=-1) > self.distance).any(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionFinished(TerminationTerm):
+class MotionFinished(OfMotion, TerminationTerm):
     """The motion's last frame is reached: there is nothing more to follow."""
 
-    file: str
     time_out: bool = True
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
@@ -138,20 +139,13 @@ class MotionFinished(TerminationTerm):
         return motion_time(view, self.file) > view.motion(self.file).duration_s - 0.5 * view.step_dt
 
 
-def _body_offset(view: EnvView, file: str, bodies: Patterns) -> Tensor:
-    """Return the motion's positions of bodies minus their own, world frame, m, [E, N, 3]."""
-    pos_EN3, _ = motion_bodies(view, file, bodies)
-    return pos_EN3 - view.bodies(bodies).pos_EN3
-
-
 @dataclass(frozen=True, kw_only=True)
-class ResetToMotion(EventTerm):
+class ResetToMotion(OfMotion, EventTerm):
     """Put the whole scene into a state of a reference motion, and remember its time for `motion.motion_time`.
 
     Episodes begin in `start_range`, shares of its duration. On a terrain all free roots move with the env's origin.
     """
 
-    file: str
     start_range: Annotated[tuple[float, float], Within(low=0.0, high=1.0, ordered=True)] = (0.0, 1.0)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:

@@ -15,7 +15,7 @@ from ksim_rl.checked import NonNegative
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.commands import OfTarget
-from ksim_rl.mdp.fields import FramedObservation, OfContacts, SiteAndBody, contact_force
+from ksim_rl.mdp.fields import FramedObservation, OfContacts, OfSensor, SiteAndBody, contact_force
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
 
@@ -115,10 +115,9 @@ class Contact(OfContacts, ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ContactForce(FramedObservation):
+class ContactForce(OfSensor, FramedObservation):
     """Net contact forces, N, [E, 3N]; acceleration stage. MuJoCo's sign: what weighs on the ground reads negative z."""
 
-    sensor: str
     frame: Literal["root", "world"] = "world"
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
@@ -146,34 +145,28 @@ class FootHeight(ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FootAirTime(ObservationTerm):
+class FootAirTime(OfSensor, ObservationTerm):
     """Seconds since each foot left the ground, 0 while it touches, [E, F]; acceleration stage."""
-
-    sensor: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.contact(self.sensor).air_time_EN
 
 
 @dataclass(frozen=True, kw_only=True)
-class FootContact(ObservationTerm):
+class FootContact(OfSensor, ObservationTerm):
     """1 where a foot touches the ground, else 0, [E, F]; acceleration stage."""
-
-    sensor: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.contact(self.sensor).found_EN
 
 
 @dataclass(frozen=True, kw_only=True)
-class FootContactForces(ObservationTerm):
+class FootContactForces(OfSensor, ObservationTerm):
     """Net force of each foot on the ground, world frame, sign(f) log(1 + |f|) of newtons, [E, 3F]; acceleration stage.
 
     MuJoCo's sign: a foot that stands presses down, z is negative.
     The logarithm keeps an impact of hundreds of newtons in the range of the other observations.
     """
-
-    sensor: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         force_EL = view.contact(self.sensor).force_EN3.flatten(start_dim=1)

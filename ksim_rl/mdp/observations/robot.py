@@ -16,7 +16,7 @@ from ksim_rl.checked import NonNegative, Positive, Range, Within
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
-from ksim_rl.mdp.fields import InFrame, OfEntity, OfJoints
+from ksim_rl.mdp.fields import InFrame, OfCommand, OfEntity, OfJoints, OfSensor
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.sensors.rays import grid_points
 from ksim_rl.transforms.trackers import time_left
@@ -150,10 +150,8 @@ class ProjectedGravity(OfEntity, ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SensorReading(ObservationTerm):
+class SensorReading(OfSensor, ObservationTerm):
     """The reading of an MJCF sensor by name, [E, dim]; a gyro's is in its site's frame, at the velocity stage."""
-
-    sensor: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.sensor(self.sensor)
@@ -168,10 +166,8 @@ class LastAction(ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Command(ObservationTerm):
+class Command(OfCommand, ObservationTerm):
     """A command by name, [E, K]."""
-
-    command: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.command(self.command)
@@ -216,14 +212,13 @@ class Clock(ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImuReading(ObservationTerm):
+class ImuReading(OfSensor, ObservationTerm):
     """One quantity of an `ImuSensor` of `scene.sensors`, in its own axes, float32 [E, 3], or [E, 4] for "quat".
 
     "ang_vel" (rad/s; velocity stage), "lin_acc" (m/s^2, +9.81 upwards at rest; acceleration stage), "quat" ((w, x, y,
     z), to the world; position stage) or "projected_gravity" (unit vector; position stage).
     """
 
-    sensor: str
     quantity: Literal["ang_vel", "lin_acc", "quat", "projected_gravity"] = "ang_vel"
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
@@ -231,14 +226,13 @@ class ImuReading(ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraImage(ObservationTerm, is_image=True):
+class CameraImage(OfSensor, ObservationTerm, is_image=True):
     """What a `CameraSensor` sees of the current state (position stage); the only term of its observation group.
 
     "rgb" (uint8 [E, H, W, 3]), "depth" (m, float32 [E, H, W]) or "segmentation" (ids of geoms, -1 for none, int32
     [E, H, W]).
     """
 
-    sensor: str
     output: Literal["rgb", "depth", "segmentation"] = "rgb"
 
     def __call__(self, view: EnvView) -> Shaped[Tensor, " E *image"]:
@@ -247,23 +241,20 @@ class CameraImage(ObservationTerm, is_image=True):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RayDistance(ObservationTerm):
+class RayDistance(OfSensor, ObservationTerm):
     """Distances to what the rays hit, m, the sensor's `max_distance` where they hit nothing, [E, N]; position stage."""
-
-    sensor: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.rays(self.sensor).state.distance_EN
 
 
 @dataclass(frozen=True, kw_only=True)
-class RayHeight(ObservationTerm):
+class RayHeight(OfSensor, ObservationTerm):
     """How far the ends of the rays are below the sensor, minus `offset`, clipped, m, [E, N]; position stage.
 
     With a `GridPattern` that starts well above the robot it is a height scan that sees everything, not only terrain.
     """
 
-    sensor: str
     offset: float = 0.0
     clip: Range = (-1.0, 1.0)
 

@@ -13,7 +13,7 @@ from ksim_rl.checked import NonNegative, Positive
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.fields import OfContacts, OfFeet, RewardWhileCommanded, contact_force
+from ksim_rl.mdp.fields import OfContacts, OfFeet, OfSensor, RewardWhileCommanded, contact_force
 from ksim_rl.scene.names import Patterns
 
 
@@ -92,10 +92,8 @@ class FootSlip(OfFeet, RewardWhileCommanded):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SoftLanding(RewardWhileCommanded):
+class SoftLanding(OfSensor, RewardWhileCommanded):
     """active * sum_f landed_f * |force_f|, N, [E]; the net contact force at the end of the step of touch-down."""
-
-    sensor: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         landed_EF = view.contact(self.sensor).first_contact_EN
@@ -103,10 +101,9 @@ class SoftLanding(RewardWhileCommanded):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FeetAirTime(RewardWhileCommanded):
+class FeetAirTime(OfSensor, RewardWhileCommanded):
     """active * number of feet whose present flight has lasted between two thresholds (s), [E]."""
 
-    sensor: str
     threshold_min: float
     threshold_max: float
 
@@ -120,11 +117,10 @@ class FeetAirTime(RewardWhileCommanded):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GaitPhase(RewardWhileCommanded):
+class GaitPhase(OfSensor, RewardWhileCommanded):
     """Fraction of feet that swing where the sine of `gait`, a `SinusoidalGaitCommand`, is positive, else stand; [E]."""
 
     gait: str
-    sensor: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         touches_EF, phase_EL = view.contact(self.sensor).found_EN > 0, view.command(self.gait)

@@ -18,8 +18,10 @@ from ksim_rl.mdp.constants import constant, values_by_name
 from ksim_rl.mdp.fields import (
     GaussianReward,
     InFrame,
+    OfCommand,
     OfEntity,
     OfJoints,
+    OfSensor,
     SiteAndBody,
     commanded_speed,
     is_commanded,
@@ -57,10 +59,8 @@ def tolerance(
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackLinearVelocity(OfEntity, GaussianReward):
+class TrackLinearVelocity(OfCommand, OfEntity, GaussianReward):
     """exp(-(|c_xy - v_xy|^2 + v_z^2) / std^2), `v` the root's linear velocity in its own frame, m/s, [E]."""
-
-    command: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         vel_E3 = view.entity(self.entity).root_lin_vel_b_EL
@@ -69,10 +69,8 @@ class TrackLinearVelocity(OfEntity, GaussianReward):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackAngularVelocity(OfEntity, GaussianReward):
+class TrackAngularVelocity(OfCommand, OfEntity, GaussianReward):
     """exp(-((c_z - w_z)^2 + |w_xy|^2) / std^2), `w` the root's angular velocity in its own frame, rad/s, [E]."""
-
-    command: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         vel_E3 = view.entity(self.entity).root_ang_vel_b_EL
@@ -81,10 +79,8 @@ class TrackAngularVelocity(OfEntity, GaussianReward):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackRootHeight(OfEntity, GaussianReward):
+class TrackRootHeight(OfCommand, OfEntity, GaussianReward):
     """exp(-(c - h)^2 / std^2), `h` the root frame's height above ground, m, [E], `c` such as `BaseHeightCommand`."""
-
-    command: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         error_E = view.command(self.command)[:, 0] - root_height(view, self.entity)
@@ -108,10 +104,9 @@ class TrackPosition(OfTarget, GaussianReward):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackOrientation(InFrame, GaussianReward):
+class TrackOrientation(OfCommand, InFrame, GaussianReward):
     """exp(-a^2 / std^2), `a` the angle, rad, of a body to that of `command` (`CartesianCommand`), in `frame`."""
 
-    command: str
     body: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
@@ -126,10 +121,8 @@ class TrackOrientation(InFrame, GaussianReward):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackJointPosition(OfJoints, GaussianReward):
+class TrackJointPosition(OfCommand, OfJoints, GaussianReward):
     """exp(-mean_j((c_j - q_j)^2) / std^2), rad or m, [E], `c` such as `JointPositionCommand`; position stage."""
-
-    command: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         error_EL = view.command(self.command) - view.joints(self.joints).pos_EL
@@ -177,7 +170,7 @@ class RootHeightL2(OfEntity, RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pose(OfJoints, RewardTerm):
+class Pose(OfCommand, OfJoints, RewardTerm):
     """exp(-mean_j((q_j - q0_j)^2 / std_j^2)) about the default pose, [E]; position stage.
 
     How far a joint may stray depends on the commanded speed s = |c_xy| + |c_z|: standing below `walking_threshold`,
@@ -185,7 +178,6 @@ class Pose(OfJoints, RewardTerm):
     that match each of `joints` once.
     """
 
-    command: str
     std_standing: Mapping[str, Positive]
     std_walking: Mapping[str, Positive]
     std_running: Mapping[str, Positive]
@@ -237,10 +229,8 @@ class BodyAngularVelocity(RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AngularMomentum(RewardTerm):
+class AngularMomentum(OfSensor, RewardTerm):
     """|L|^2 of a `subtreeangmom` sensor, about the subtree's centre of mass, (kg m^2/s)^2, [E]; velocity stage."""
-
-    sensor: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return view.sensor(self.sensor).square().sum(-1)
@@ -265,10 +255,9 @@ class LinkAccelerationL2(RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionlessAtRest(OfJoints, RewardTerm):
+class MotionlessAtRest(OfCommand, OfJoints, RewardTerm):
     """Sum of squared joint velocities, (rad/s)^2 or (m/s)^2, while no commanded speed exceeds a threshold, else 0."""
 
-    command: str
     command_threshold: NonNegative
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
