@@ -3,11 +3,9 @@
 from dataclasses import dataclass
 
 from ksim_rl.algorithms.off_policy import MANY_ENVS
-from ksim_rl.algorithms.off_policy.wiring import make_off_policy_policy, make_off_policy_update
+from ksim_rl.algorithms.off_policy.wiring import off_policy_algorithm
 from ksim_rl.modules import QNetworkCfg, SquashedActorCfg
 from ksim_rl.objectives import SACCfg
-from ksim_rl.trainers.algorithm import Algorithm
-from ksim_rl.trainers.run_cfg import ModulesCfg
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,12 +31,4 @@ CRITIC = QNetworkCfg(
     v_min=-20.0,
     v_max=20.0,
 )
-FAST_SAC = Algorithm(
-    name="fast_sac",
-    cfg=FastSACCfg,
-    update=make_off_policy_update,
-    policy=make_off_policy_policy,
-    data=MANY_ENVS,
-    on_ranks=True,
-    modules=ModulesCfg(actor=ACTOR, critic=CRITIC),
-)
+FAST_SAC = off_policy_algorithm("fast_sac", FastSACCfg, data=MANY_ENVS, actor=ACTOR, critic=CRITIC)

@@ -3,11 +3,9 @@
 from dataclasses import dataclass
 
 from ksim_rl.algorithms.off_policy import MANY_ENVS
-from ksim_rl.algorithms.off_policy.wiring import make_off_policy_policy, make_off_policy_update
+from ksim_rl.algorithms.off_policy.wiring import off_policy_algorithm
 from ksim_rl.modules import DeterministicActorCfg, QNetworkCfg
 from ksim_rl.objectives import TD3Cfg
-from ksim_rl.trainers.algorithm import Algorithm
-from ksim_rl.trainers.run_cfg import ModulesCfg
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,12 +22,4 @@ class FastTD3Cfg(TD3Cfg):
 
 ACTOR = DeterministicActorCfg()
 CRITIC = QNetworkCfg(hidden_dims=(1024, 512, 256), num_atoms=101)
-FAST_TD3 = Algorithm(
-    name="fast_td3",
-    cfg=FastTD3Cfg,
-    update=make_off_policy_update,
-    policy=make_off_policy_policy,
-    data=MANY_ENVS,
-    on_ranks=True,
-    modules=ModulesCfg(actor=ACTOR, critic=CRITIC),
-)
+FAST_TD3 = off_policy_algorithm("fast_td3", FastTD3Cfg, data=MANY_ENVS, actor=ACTOR, critic=CRITIC)

@@ -20,8 +20,29 @@ from ksim_rl.modules import (
     make_squashed_actor,
 )
 from ksim_rl.modules.bounded_actors import BoundedActor
-from ksim_rl.objectives import OffPolicyLoss, SACCfg, SACLoss, TD3Loss
-from ksim_rl.trainers.run_cfg import RunCfg
+from ksim_rl.objectives import OffPolicyCfg, OffPolicyLoss, SACCfg, SACLoss, TD3Loss
+from ksim_rl.trainers.algorithm import Algorithm
+from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg
+
+
+def off_policy_algorithm(
+    name: str,
+    cfg: type[OffPolicyCfg],
+    *,
+    data: ReplayCfg,
+    actor: DeterministicActorCfg | SquashedActorCfg,
+    critic: QNetworkCfg,
+) -> Algorithm:
+    """Return an algorithm with these settings and, beside them, the data and networks that suit it."""
+    return Algorithm(
+        name=name,
+        cfg=cfg,
+        update=make_off_policy_update,
+        policy=make_off_policy_policy,
+        data=data,
+        on_ranks=True,
+        modules=ModulesCfg(actor=actor, critic=critic),
+    )
 
 
 def make_off_policy_update(
