@@ -41,6 +41,13 @@ class Within:
             check_in_range(field, value, low=self.low, high=self.high, low_open=self.low_open)
 
 
+@dataclass(frozen=True)
+class Filled:
+    """Says that a text, a sequence or a mapping is not empty, with the `advice` of what to give."""
+
+    advice: str
+
+
 Positive = Annotated[float, Within(low=0.0, low_open=True)]
 NonNegative = Annotated[float, Within(low=0.0)]
 Share = Annotated[float, Within(low=0.0, high=1.0)]
@@ -48,7 +55,7 @@ Count = Annotated[int, Within(low=1)]
 WholeNumber = Annotated[int, Within(low=0)]
 Range = Annotated[tuple[float, float], Within(ordered=True)]
 NonNegativeRange = Annotated[tuple[float, float], Within(low=0.0, ordered=True)]
-Name = Annotated[str, "not empty"]
+Name = Annotated[str, Filled("expected a name")]
 
 
 class Checked:
@@ -102,8 +109,9 @@ def check_value(field: str, value: object, annotation: Any) -> None:
                 check_value(field, value, arguments[0])
             bound.check(field, value)
         check_value(field, value, arguments[0])
-        if annotation == Name and not value:
-            raise ValueError(f"{field}={value!r}: expected a name")
+        for extra in arguments[1:]:
+            if isinstance(extra, Filled) and not value:
+                raise ValueError(f"{field}={value!r}: {extra.advice}")
     elif origin in (typing.Union, types.UnionType):
         _check_union(field, value, arguments)
     elif origin is Literal:

@@ -4,14 +4,14 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ksim_rl.checked import NonNegative, NonNegativeRange, Range, Share
+from ksim_rl.checked import Filled, NonNegative, NonNegativeRange, Range, Share
 from ksim_rl.envs.term import CommandTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
@@ -298,12 +298,8 @@ class SinusoidalGaitCommand(CommandTerm):
     """
 
     frequency: NonNegativeRange
-    offsets: tuple[float, ...]
+    offsets: Annotated[tuple[float, ...], Filled("give one per foot, such as (0.0, 0.5)")]
     resampling_time_range_s: NonNegativeRange | None = None
-
-    def _check_fields(self) -> None:
-        if not self.offsets:
-            raise ValueError("offsets=(): give one per foot, such as (0.0, 0.5)")
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:

@@ -8,14 +8,14 @@ ranges of commands and weights of rewards by stages of env steps, or move envs o
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl import ranks
-from ksim_rl.checked import Count, NonNegative, Range, Share, WholeNumber, Within
+from ksim_rl.checked import Count, Filled, NonNegative, Range, Share, WholeNumber, Within
 from ksim_rl.checks import check_in_range, unknown_name
 from ksim_rl.envs.term import CurriculumTerm
 from ksim_rl.envs.view import EnvView
@@ -163,7 +163,8 @@ class TerrainLevels(OfCommand, OfEntity, CurriculumTerm):
         return terrain.levels_E.to(torch.float32).mean()
 
 
-Ranges = Mapping[str, Range]
+Ranges = Annotated[Mapping[str, Range], Filled("name at least one field of the command")]
+SOME_STAGE = Filled("give at least one, by the env step at which it begins")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,10 +191,7 @@ class RewardWeight(CurriculumTerm):
 class RewardWeightByStage(RewardWeight):
     """Gives a reward other weights from certain env steps (since the env was seeded) on; until then it has its own."""
 
-    stages: Mapping[WholeNumber, float]
-
-    def _check_fields(self) -> None:
-        _check_some("stages", self.stages, "give at least one, by the env step at which it begins")
+    stages: Annotated[Mapping[WholeNumber, float], SOME_STAGE]
 
     def weight(self, view: EnvView, held: Float[Tensor, ""]) -> Float[Tensor, ""]:
         for step, value in sorted(self.stages.items()):
@@ -220,12 +218,7 @@ class CommandRangesByStage(OfCommand, CurriculumTerm):
     The reported level is the number of stages that have begun.
     """
 
-    stages: Mapping[WholeNumber, Ranges]
-
-    def _check_fields(self) -> None:
-        _check_some("stages", self.stages, "give at least one, by the env step at which it begins")
-        for step, ranges in self.stages.items():
-            _check_some(f"stages.{step}", ranges, "name at least one field of the command")
+    stages: Annotated[Mapping[WholeNumber, Ranges], SOME_STAGE]
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         held = _ranges_of(view, self.command, {field for ranges in self.stages.values() for field in ranges})
@@ -250,7 +243,6 @@ class CommandRangesByLevel(OfCommand, CurriculumTerm):
     end: Ranges
 
     def _check_fields(self) -> None:
-        _check_some("start", self.start, "name at least one field of the command")
         if self.start.keys() != self.end.keys():
             raise ValueError(
                 f"start has the fields {sorted(self.start)} and end {sorted(self.end)}: give the same"
@@ -261,11 +253,6 @@ class CommandRangesByLevel(OfCommand, CurriculumTerm):
             start_2, end_2 = constant(self.start[field], view.device), constant(self.end[field], view.device)
             held_2.copy_(torch.where(ranks.any_of(mask_E), by_level(start_2, end_2, view.level), held_2))
         return view.level.clone()
-
-
-def _check_some(where: str, entries: Mapping[Any, object], advice: str) -> None:
-    if not entries:
-        raise ValueError(f"{where}={{}}: {advice}")
 
 
 def _ranges_of(view: EnvView, command: str, fields: Iterable[str]) -> dict[str, Tensor]:

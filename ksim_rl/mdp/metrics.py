@@ -4,14 +4,14 @@ Poses and velocities are of the current state, contacts and forces of the last p
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checked import Positive
+from ksim_rl.checked import Filled, Positive
 from ksim_rl.checks import unknown_name
 from ksim_rl.envs.term import MetricTerm
 from ksim_rl.envs.view import EnvView
@@ -126,12 +126,8 @@ class Success(MetricTerm):
     With the time-out it is the share of episodes that survived. Envs that are not made of terms have `SuccessTracker`.
     """
 
-    terminations: tuple[str, ...]
+    terminations: Annotated[tuple[str, ...], Filled("name at least one, such as ('time_out',)")]
     reduce: Literal["mean", "last", "max", "sum"] = "last"
-
-    def _check_fields(self) -> None:
-        if not self.terminations:
-            raise ValueError("terminations=(): name at least one, such as ('time_out',)")
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         for name in self.terminations:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Composite
 
-from ksim_rl.checked import Checked, Count, NonNegative
+from ksim_rl.checked import Checked, Count, Filled, NonNegative
 from ksim_rl.checks import check_choice, check_in_range
 from ksim_rl.device.running_moments import RunningMoments
 from ksim_rl.modules.mlp import ACTIVATIONS, Device, mlp
@@ -167,11 +167,7 @@ FEATURES = "features"
 class SharedTrunkCfg(OnPolicyNetworkCfg):
     """Layers below actor and critic, which read what they write: the key "features"."""
 
-    hidden_dims: tuple[Count, ...] = (512, 256)
-
-    def _check_fields(self) -> None:
-        if not self.hidden_dims:
-            raise ValueError("hidden_dims=(): expected at least one width")
+    hidden_dims: Annotated[tuple[Count, ...], Filled("expected at least one width")] = (512, 256)
 
 
 class LayeredNetwork(ObservingNetwork):

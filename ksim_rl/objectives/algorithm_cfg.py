@@ -4,12 +4,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
-from ksim_rl.checked import Checked, Count, NonNegative, Positive, Share, Within
+from ksim_rl.checked import Checked, Count, Filled, NonNegative, Positive, Share, Within
 from ksim_rl.checks import check_in_range
 
 PositiveShare = Annotated[float, Within(low=0.0, high=1.0, low_open=True)]
 Schedule = Literal["adaptive", "fixed"]
 DistillationKind = Literal["kl", "mse"]
+A_MOTION = "name at least one reference motion, such as [walker_walk]"
 ValueReduction = Literal["min", "mean"]
 
 
@@ -146,7 +147,9 @@ class AMPCfg(PPOCfg):
     and as many of the policy, from the last `replay_rollouts` rollouts.
     """
 
-    motions: tuple[str, ...] = ()  # by name or file; the env sees their states in `style_group`
+    motions: Annotated[
+        tuple[str, ...], Filled(A_MOTION)
+    ] = ()  # by name or file; the env sees their states in `style_group`
     style_group: str = "style"
     task_coeff: NonNegative = 0.5
     style_coeff: NonNegative = 0.5
@@ -169,8 +172,6 @@ class AMPCfg(PPOCfg):
     def _check_fields(self) -> None:
         for field in ("motions", "discriminator_hidden_dims"):
             object.__setattr__(self, field, tuple(getattr(self, field)))
-        if not self.motions:
-            raise ValueError("motions=(): name at least one reference motion, such as [walker_walk]")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,15 +186,11 @@ class DistillationCfg(OnPolicyCfg, checkpoint_fields=("teacher",)):
     by a factor.
     """
 
-    teacher: str = ""
+    teacher: Annotated[str, Filled("name a run folder or a checkpoint, objective.teacher=RUN")] = ""
     loss: DistillationKind = "kl"
     num_epochs: Count = 2
     teacher_share: Share = 0.0
     teacher_share_decay: Share = 0.95
-
-    def _check_fields(self) -> None:
-        if not self.teacher:
-            raise ValueError("teacher='': name a run folder or a checkpoint, objective.teacher=RUN")
 
 
 @dataclass(frozen=True, kw_only=True)

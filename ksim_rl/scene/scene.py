@@ -3,12 +3,12 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Annotated, Protocol, runtime_checkable
 
 import mujoco
 import numpy as np
 
-from ksim_rl.checked import Checked, Count, NonNegative, Share
+from ksim_rl.checked import Checked, Count, Filled, NonNegative, Share
 from ksim_rl.checks import near
 from ksim_rl.physics import load_model, load_spec
 from ksim_rl.scene.actuators import Actuator, set_actuators
@@ -88,7 +88,7 @@ class SceneCfg(Checked):
     `view.contact(name)` and its kin; those of the MJCF need no entry here.
     """
 
-    robots: Mapping[str, Robot]
+    robots: Annotated[Mapping[str, Robot], Filled("name at least one robot")]
     objects: Mapping[str, Robot] = field(default_factory=dict)
     placements: Mapping[str, Placement] = field(default_factory=dict)
     terrain: Terrain | None = None  # None: the robot's own model has what it needs
@@ -98,8 +98,6 @@ class SceneCfg(Checked):
     soft_joint_pos_limit_factor: Share = 1.0  # of each joint's range, about its middle: the soft limits
 
     def _check_fields(self) -> None:
-        if not self.robots:
-            raise ValueError("robots={}: name at least one robot")
         for name in self.objects:
             if name in self.robots:
                 raise ValueError(f"objects: {name!r} is the name of a robot: give it another")

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from ksim_rl.checked import NonNegative, Positive, Range, Within
+from ksim_rl.checked import Filled, NonNegative, Positive, Range, Within
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
@@ -199,11 +199,7 @@ class Clock(ObservationTerm):
     """sin, then cos, of 2 pi (frequency t + phase), `t` the episode's time, [E, 2P]; Hz, and cycles, one per foot."""
 
     frequency: Positive
-    phases: tuple[float, ...] = (0.0,)
-
-    def _check_fields(self) -> None:
-        if not self.phases:
-            raise ValueError("phases=(): give at least one, such as (0.0,)")
+    phases: Annotated[tuple[float, ...], Filled("give at least one, such as (0.0,)")] = (0.0,)
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         offsets_P = constant([2.0 * math.pi * phase for phase in self.phases], view.device)

@@ -9,6 +9,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import mujoco
 import mujoco_warp as mjw
@@ -20,7 +21,7 @@ from jaxtyping import Int, Shaped
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from ksim_rl.checked import Checked, Count
+from ksim_rl.checked import Checked, Count, Filled
 from ksim_rl.physics.fields import GRAVITY
 from ksim_rl.physics.model_checks import model_bytes
 from ksim_rl.physics.upstream import per_world_fields
@@ -39,13 +40,9 @@ class NanGuardCfg(Checked):
     world and substep). Of one world batch at most `max_files` failures are saved; further ones are only counted.
     """
 
-    folder: str
+    folder: Annotated[str, Filled("expected the path of a folder")]
     history: Count = 20
     max_files: Count = 4
-
-    def _check_fields(self) -> None:
-        if not self.folder:
-            raise ValueError(f"folder={self.folder!r}: expected the path of a folder")
 
 
 @dataclass(frozen=True, kw_only=True)

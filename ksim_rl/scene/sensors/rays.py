@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ksim_rl.checked import Checked, Count, Positive, Within
+from ksim_rl.checked import Checked, Count, Filled, Positive, Within
 from ksim_rl.physics.ray_casting import RayBatch
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.sensor import GeomGroup, MountedSensor, SensorTracker
@@ -73,6 +73,9 @@ class PinholePattern(RayPattern):
         return _from_origin(np.stack((np.ones_like(left_N), left_N, up_N), axis=-1))
 
 
+Elevation = Annotated[float, Within(low=-90.0, high=90.0)]
+
+
 @dataclass(frozen=True, kw_only=True)
 class RingPattern(RayPattern):
     """The rays of a turning lidar: rings about z, one after the other, each from +x to the left all around.
@@ -81,11 +84,7 @@ class RingPattern(RayPattern):
     """
 
     num_rays: Count = 36
-    elevations: tuple[Annotated[float, Within(low=-90.0, high=90.0)], ...] = (0.0,)
-
-    def _check_fields(self) -> None:
-        if not self.elevations:
-            raise ValueError("elevations=(): give at least one ring, such as (0.0,)")
+    elevations: Annotated[tuple[Elevation, ...], Filled("give at least one ring, such as (0.0,)")] = (0.0,)
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
         around = 2 * np.pi * np.arange(self.num_rays) / self.num_rays

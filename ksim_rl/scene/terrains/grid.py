@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import mujoco
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from ksim_rl import ranks
-from ksim_rl.checked import Count, Positive, WholeNumber
+from ksim_rl.checked import Count, Filled, Positive, WholeNumber
 from ksim_rl.checks import check_count, check_in_range
 from ksim_rl.scene.state.ground import Ground
 from ksim_rl.scene.state.world_view import WorldView
@@ -50,7 +51,7 @@ class TerrainGrid(Terrain):
         spawn_width: edge of the square about the centre in which envs start, level with its highest point, m.
     """
 
-    patches: Mapping[str, TerrainPatch]
+    patches: Annotated[Mapping[str, TerrainPatch], Filled("name at least one kind of ground")]
     num_levels: Count = 10
     num_columns: int = 10
     size: Positive = 8.0
@@ -60,8 +61,6 @@ class TerrainGrid(Terrain):
     friction: Friction = (1.0, 0.005, 0.0001)
 
     def _check_fields(self) -> None:
-        if not self.patches:
-            raise ValueError("patches={}: name at least one kind of ground")
         check_count("num_columns", self.num_columns, low=len(self.patches))
         check_in_range("spawn_width", self.spawn_width, low=0.0, high=self.size)
 

@@ -3,14 +3,14 @@
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 from jaxtyping import Float32, Num
 from tensordict import NestedKey
 from torch import Tensor
 from torchrl.envs.transforms import RenameTransform, Transform
 
-from ksim_rl.checked import Checked
+from ksim_rl.checked import Checked, Filled
 from ksim_rl.transforms.delay import DelayCfg, ObservationDelay
 from ksim_rl.transforms.elementwise import ObservationClip, ObservationScale, check_clip, check_scale
 from ksim_rl.transforms.groups.groups import ObservationGroups
@@ -66,15 +66,13 @@ class ObservationGroupCfg(Checked):
     lag. A history with `flat=False` stacks the last vectors to [E, N, L]. `enable_noise=False` leaves out all noise.
     """
 
-    terms: Mapping[str, ObservationTermCfg]
+    terms: Annotated[Mapping[str, ObservationTermCfg], Filled("expected at least one term")]
     keep_terms: bool = False
     enable_noise: bool = True
     delay: DelayCfg | None = None
     history: int | HistoryCfg | None = None
 
     def _check_fields(self) -> None:
-        if not self.terms:
-            raise ValueError("terms={}: expected at least one term")
         history_cfg(self.history)
         images = [name for name, cfg in self.terms.items() if cfg.is_image]
         if images and len(self.terms) > 1:
