@@ -187,7 +187,7 @@ def make_networks(device: torch.device) -> Networks:
 
 
 def make_rollout(
-    actor: ProbabilisticTensorDictSequential, *, num_envs: int, device: torch.device
+    actor: ProbabilisticTensorDictSequential, *, num_envs: int, device: torch.device, obs: int = OBS
 ) -> TensorDict:
     """Return random env states `["E","T"]` in time-major memory, 2 percent of which end an episode."""
     generator = torch.Generator(device).manual_seed(0)
@@ -198,10 +198,10 @@ def make_rollout(
     terminated, truncated = draw(1) > 2.33, draw(1) > 2.33
     rollout_TE = TensorDict(
         {
-            "actor": draw(OBS),
-            "critic": draw(OBS),
+            "actor": draw(obs),
+            "critic": draw(obs),
             "next": {
-                "critic": draw(OBS),
+                "critic": draw(obs),
                 "reward": draw(1),
                 "terminated": terminated,
                 "truncated": truncated & ~terminated,

@@ -15,12 +15,12 @@ from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
 from ksim_rl.envs.signal_keys import STANDARD, SignalKeys
 from ksim_rl.modules import burnt_in, recurrent_modules
-from ksim_rl.objectives import NonFiniteStepsError, StepGuard, load_optimizer_state_, make_optimizer, ppo_step
+from ksim_rl.objectives import NonFiniteStepsError, StepGuard, make_optimizer, ppo_step
 
 
 def in_columns(steps: Sequence[Mapping[str, Num[Tensor, ""]]]) -> dict[str, Num[Tensor, " steps"]]:
     """Return what steps measured, each quantity as a tensor [steps]."""
-    return {name: torch.stack([step[name] for step in steps]) for name in steps[0]}
+    return {name: torch.stack([step[name].detach() for step in steps]) for name in steps[0]}
 
 
 class StepMeans(dict[str, Tensor]):
@@ -47,7 +47,7 @@ class RolloutUpdate(ABC):
     On CUDA the first updates run eagerly and the next is captured. So each rollout must be the same memory, which is
     what `RolloutCollector` gives. The `networks` are all that learn, by the names that a checkpoint gives them; so many
     as `max_skipped_steps` in a row that are not finite, which `guard` counts, end the run. The env's own keys of reward
-    and flags are `signals`; see `signal_keys`.
+    and flags are `signals`; see `signal_keys`. The `logged` are names of logged means, by the names that steps measure.
     """
 
     def __init__(
@@ -56,19 +56,37 @@ class RolloutUpdate(ABC):
         *,
         max_skipped_steps: int,
         device: torch.device | str,
+        logged: Mapping[str, str],
         signals: SignalKeys = STANDARD,
     ) -> None:
         self.device, self.networks, self.signals = torch.device(device), networks, signals
-        self.guard = StepGuard(device=self.device)
+        self.guard, self._means = StepGuard(device=self.device), StepMeans(logged)
         self._max_skipped_steps = max_skipped_steps
         self._rollout_ET: TensorDictBase | None = None
         self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
         self._run = Captured(self._update, device=self.device)
+        self._work = [self._run]  # all that is captured
 
     def __call__(self, rollout_ET: TensorDictBase) -> None:
         """Learn from a rollout `["E","T"]` of the dataset's size."""
         self._rollout_ET = rollout_ET
         self._run()
+
+    def warm_up(self, rollout_ET: TensorDictBase) -> None:
+        """Compile and capture what updates run, on a made-up rollout, which leaves no trace.
+
+        Networks, optimizers, data and counters are afterwards what they were, and draws did not count. On CUDA the
+        rollout must be in the memory of those that follow, whose updates then replay graphs from the first.
+        """
+        kept = state_tree.join(*state_tree.split(self.state_dict()))
+        self._rollout_ET = rollout_ET
+        with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
+            for work in self._work:
+                for _ in range(work.warmup + 1):
+                    work()
+        self.load_state_dict(kept)
+        for tensor in (*self._means.values(), self._longest_skip):
+            tensor.zero_()
 
     def check(self, metrics: Mapping[str, float]) -> None:
         """Raise NonFiniteStepsError where `metrics()`, on the host, say that too many steps in a row were skipped."""
@@ -91,6 +109,10 @@ class RolloutUpdate(ABC):
     def _update(self) -> None:
         """Learn from `rollout_ET`."""
 
+    def _measure_(self, steps: Mapping[str, Tensor]) -> None:
+        self._means.take_(steps)
+        self._longest_skip.copy_(steps["skipped_in_a_row"].max())
+
     def state_dict(self) -> state_tree.State:
         """Return everything that the next update depends on."""
         networks = {name: network.state_dict() for name, network in self.networks.items()}
@@ -111,7 +133,7 @@ class DatasetUpdate(RolloutUpdate):
     """What the updates have in common that make epochs of gradient steps on the dataset of each rollout.
 
     The loss says which leaves the dataset keeps; recurrent networks learn on sequences. The `seed` is of the order of
-    the env states in the minibatches; `logged` are names of logged means, by the names that `ppo_step` gives them.
+    the env states in the minibatches; `shared` are the other arguments of `RolloutUpdate`.
     """
 
     def __init__(
@@ -122,11 +144,9 @@ class DatasetUpdate(RolloutUpdate):
         networks: Mapping[str, TensorDictModuleBase],
         data: DatasetCfg,
         seed: int,
-        device: torch.device | str,
-        signals: SignalKeys,
-        logged: Mapping[str, str],
+        **shared: Any,
     ) -> None:
-        super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, device=device, signals=signals)
+        super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, **shared)
         self.cfg, self.loss = cfg, loss
         self.num_env_states = data.num_env_states
         self.optimizer = make_optimizer(cfg, *networks.values())
@@ -143,7 +163,6 @@ class DatasetUpdate(RolloutUpdate):
         self.dataset = DatasetBuffer(
             data, keys=loss.dataset_keys, seed=seed, sampler=sampler, device=self.device
         )
-        self._means = StepMeans(logged)
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
@@ -164,10 +183,6 @@ class DatasetUpdate(RolloutUpdate):
             steps.append(step | {"skipped_in_a_row": self.guard.skipped_in_a_row.clone()})
         return steps
 
-    def _measure_(self, steps: Mapping[str, Tensor]) -> None:
-        self._means.take_(steps)
-        self._longest_skip.copy_(steps["skipped_in_a_row"].max())
-
     def state_dict(self) -> state_tree.State:
         """Return networks, optimizer, sampler and counters."""
         return {
@@ -187,28 +202,31 @@ class DatasetUpdate(RolloutUpdate):
 
 def optimizer_state(optimizer: torch.optim.Optimizer) -> state_tree.State:
     """Return learning rate and moments; a parameter that no loss has reached has an empty entry."""
-    state = optimizer.state_dict()
-    group = state["param_groups"][0]
-    moments = {index: state["state"].get(index, {}) for index in range(len(group["params"]))}
+    group = optimizer.param_groups[0]
+    moments = {index: dict(optimizer.state.get(own, {})) for index, own in enumerate(group["params"])}
     return {"learning_rate": group["lr"], "moments": moments}
 
 
 def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, Any], *, what: str) -> None:
-    """Continue where `optimizer_state` was taken; a ValueError names what does not fit this optimizer's parameters."""
+    """Continue where `optimizer_state` was taken, at the same addresses; a ValueError names what does not fit."""
     parameters = optimizer.param_groups[0]["params"]
     moments = {int(index): entry for index, entry in state["moments"].items()}
     if set(moments) != set(range(len(parameters))):
         raise ValueError(
             f"{what}: {len(moments)} parameters in the checkpoint, {len(parameters)} in this run"
         )
-    moments = {index: entry for index, entry in moments.items() if entry}
-    for index, entry in moments.items():
-        for name in ("exp_avg", "exp_avg_sq"):
-            if entry[name].shape != parameters[index].shape:
+    for index, parameter in enumerate(parameters):
+        for name in ("exp_avg", "exp_avg_sq") if moments[index] else ():
+            if moments[index][name].shape != parameter.shape:
                 raise ValueError(
-                    f"{what}: {name} of parameter {index} has shape {list(entry[name].shape)} in the checkpoint and "
-                    f"{list(parameters[index].shape)} in this run"
+                    f"{what}: {name} of parameter {index} has shape {list(moments[index][name].shape)} in the "
+                    f"checkpoint and {list(parameter.shape)} in this run"
                 )
-    groups = optimizer.state_dict()["param_groups"]
-    groups[0] = groups[0] | {"lr": state["learning_rate"]}
-    load_optimizer_state_(optimizer, {"state": moments, "param_groups": groups})
+    optimizer.param_groups[0]["lr"].copy_(torch.as_tensor(state["learning_rate"]))
+    for index, parameter in enumerate(parameters):
+        own = optimizer.state[parameter]
+        for name, tensor in moments[index].items():
+            own.setdefault(name, torch.empty_like(tensor, device=parameter.device)).copy_(tensor)
+        # Moments begin as zeros. Those that are there may belong to a graph.
+        for name in own.keys() - moments[index].keys():
+            own[name].zero_()

@@ -93,6 +93,20 @@ class RolloutCollector:
         rollout_ET = self._storage_TE.transpose(0, 1)
         return dims.name(rollout_ET, dims.E, dims.T)
 
+    @torch.no_grad()
+    def made_up_rollout(self) -> TensorDict:
+        """Return a rollout of the policy's answers to observations that are zero, in the memory that `collect` fills.
+
+        The env makes no step, and draws of the policy do not count.
+        """
+        device = self._run.device
+        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+            env_state_E = self.policy(self.env.fake_tensordict())
+        for t in range(self.rollout_length):
+            self._store(t, env_state_E)
+        assert self._storage_TE is not None
+        return dims.name(self._storage_TE.transpose(0, 1), dims.E, dims.T)
+
     def __iter__(self) -> Iterator[TensorDict]:
         """Collect rollouts without end."""
         while True:

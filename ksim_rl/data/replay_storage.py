@@ -178,15 +178,20 @@ class ReplayStorage(SavedByStateDict, Storage):
                 f"{self.max_size}: num_envs and data.capacity must be those of the checkpoint"
             )
         content = {tuple(name.split("/")): leaf for name, leaf in state_dict["content"].items()}
-        if self.content is None and content:
+        if not content:
+            self._empty()
+        elif self.content is None:
             self.content = allocated(content, self.max_size, batch_dims=1, device=self.device)
         own = self.state_dict()
-        copy_into(own.pop("content"), state_dict["content"], what="the replay's content")
+        leaves = own.pop("content")
+        if content:
+            copy_into(leaves, state_dict["content"], what="the replay's content")
         copy_into(own, {name: state_dict[name] for name in own}, what="the replay")
 
     @torch.no_grad()
     def _empty(self) -> None:
-        for tensor in (self.available, self.head_E, self.filled_E):
+        content = () if self.content is None else self.content.values(True, True)
+        for tensor in (self.available, self.head_E, self.filled_E, *content):
             tensor.zero_()
 
     def _allocate(self, rollout_ET: TensorDictBase) -> None:

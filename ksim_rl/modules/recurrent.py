@@ -363,6 +363,9 @@ class CarriedState:
             self._state_E.setdefault(keys[name], torch.empty_like(state[name], device=device))
         if state:
             copy_into(self.state_dict(), state, what="recurrent state")
+        else:
+            for state_E in self._state_E.values():
+                state_E.zero_()
 
 
 @torch.no_grad()

@@ -21,7 +21,6 @@ from ksim_rl.objectives.gradient_step import (
     clip_and_guard,
     descend,
     descend_together,
-    load_optimizer_state_,
     make_adamw,
     make_optimizer,
 )
@@ -72,7 +71,6 @@ __all__ = [
     "in_precision",
     "distribution_keys",
     "kl_divergence",
-    "load_optimizer_state_",
     "make_adamw",
     "make_advantage",
     "make_loss",

@@ -1,8 +1,7 @@
 """This module makes gradient steps without host syncs, skips what is not finite, and adapts the learning rate."""
 
-import copy
 from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Float32
@@ -40,12 +39,6 @@ class StepGuard(nn.Module):
         skipped = found_inf.to(torch.int64)
         self.skipped.add_(skipped)
         self.skipped_in_a_row.add_(skipped).mul_(skipped)
-
-    def check(self, limit: int) -> None:
-        """Raise `NonFiniteStepsError` if the last `limit` steps or more were skipped; reads the counter on the host."""
-        in_a_row = int(self.skipped_in_a_row)
-        if in_a_row >= limit:
-            raise NonFiniteStepsError(in_a_row, limit=limit, skipped=int(self.skipped))
 
 
 @torch.no_grad()
@@ -129,16 +122,6 @@ def _fused(
         fused=True,
         capturable=device.type == "cuda",
     )
-
-
-def load_optimizer_state_(optimizer: torch.optim.Optimizer, state_dict: dict[str, Any]) -> None:
-    """Load a state dict; the learning rate stays a tensor on the parameters' device, at its address."""
-    learning_rates = [group["lr"] for group in optimizer.param_groups]
-    # torch takes over the tensors of the state dict themselves, and steps would change them in place.
-    optimizer.load_state_dict(copy.deepcopy(state_dict))
-    for group, learning_rate in zip(optimizer.param_groups, learning_rates, strict=True):
-        if isinstance(learning_rate, Tensor):
-            group["lr"] = learning_rate.copy_(torch.as_tensor(group["lr"]))
 
 
 def descend(

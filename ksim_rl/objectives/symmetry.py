@@ -55,7 +55,7 @@ class SymmetricAugmentation:
             raise ValueError(f"symmetry={symmetry!r} needs the mirror image of {missing}: add it to the maps")
         return cls(maps or {}, device=device)
 
-    def image_of(self, key: NestedKey, leaf_BL: Float[Tensor, "B L"]) -> Float[Tensor, "B L"]:
+    def image_of(self, key: NestedKey, leaf_BL: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch L"]:
         """Return the mirror image of vectors of a kind that has a map."""
         return image(leaf_BL, *self._images[key])
 

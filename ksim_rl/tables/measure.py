@@ -40,7 +40,8 @@ def run_cfg(row: Row, seed: int, *, device: str = "auto", smoke: bool = False) -
     per_iteration = cfg.num_envs * cfg.data.rollout_length(cfg.num_envs)
     num_iterations = 2 if smoke else max(1, int(row.env_states // per_iteration))
     quick = {"compile": False} if smoke and hasattr(cfg.objective, "compile") else {}
-    trainer = replace(cfg.trainer, num_iterations=num_iterations, video=False)
+    compiles = getattr(cfg.objective, "compile", False) and not smoke
+    trainer = replace(cfg.trainer, num_iterations=num_iterations, video=False, warm_up=compiles)
     return replace(cfg, trainer=trainer, objective=replace(cfg.objective, **quick))
 
 

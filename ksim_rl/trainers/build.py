@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -68,6 +69,11 @@ def build(
         folder=run_folder / "checkpoint" if run_folder else None,
         config=cfg.to_tree(),
     )
+    if cfg.trainer.warm_up and (warm_up := getattr(update, "warm_up", None)) is not None:
+        # Before anything is loaded: a replay need not be kept apart meanwhile.
+        began = time.monotonic()
+        warm_up(collector.made_up_rollout())
+        trainer.warm_up_s = time.monotonic() - began
     if resume_from is not None:
         trainer.load_state_dict(resume_from.state)
     elif cfg.checkpoint is not None:

@@ -180,6 +180,10 @@ class RunClock:
         self._laps: deque[float] = deque(maxlen=20)
         self._created = time.monotonic()
 
+    def begin(self) -> None:
+        """Begin the first iteration now."""
+        self._created, self._last = time.monotonic(), None
+
     def lap(self) -> float:
         """End an iteration, and return its seconds."""
         now = time.monotonic()

@@ -168,6 +168,7 @@ class Trainer:
         self.iteration, self.saved_at = 0, -1
         self.metrics: dict[str, float] = {}
         self.rollout_ET: Any = None  # the last one
+        self.warm_up_s = 0.0  # of compiling and capturing before training; not in `clock.total`
         self.evaluation: Evaluation | None = None
         self.interrupt = InterruptRequest()
         self.clock = RunClock()
@@ -216,6 +217,9 @@ class Trainer:
             notes = self.update.notes if isinstance(self.update, HasNotes) else ()
             for text in (*missing_parts(self.collector.env), *notes):
                 self.progress.note(text)
+            if self.warm_up_s:
+                self.progress.note(f"compiled and captured in {self.warm_up_s:.1f} s, before training")
+            self.clock.begin()
             try:
                 while not self._is_over():
                     self.iterate()
@@ -311,6 +315,7 @@ class Trainer:
         self.metrics |= physics.metrics | {
             "iteration": iteration,
             "seconds": self.clock.total,
+            **({"warm_up_s": self.warm_up_s} if self.warm_up_s else {}),
             "throughput/env_states_per_s": self.num_env_states / seconds,
             **self.collecting.slowest(),
         }

@@ -11,8 +11,9 @@ from ksim_rl.algorithms.ppo.fused import fused_networks, make_fused_ppo, observe
 from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.data import DatasetCfg
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
-from ksim_rl.objectives import PPOCfg
+from ksim_rl.objectives import PPOCfg, StepGuard, SymmetricAugmentation
 from ksim_rl.objectives.fused_ppo import FusedLayout, Tuning, why_not_fused
+from ksim_rl.transforms import MirrorMap
 
 ENVS, STEPS, ACTIONS, ACTOR_OBS, CRITIC_OBS = 8, 6, 3, 20, 24
 SIZES = {"num_env_states_per_minibatch": 24, "num_minibatches": 2}
@@ -20,6 +21,13 @@ DATA = DatasetCfg(**SIZES)
 HIDDEN = (32, 32, 16)
 # Blocks that do not divide the 24 rows of a minibatch or the layers; few, since the interpreter is slow.
 TUNING = Tuning(block=16, chunk=16, stages=1, depth=16, tile=32, tile_stages=1, splits=2, size=1024)
+# A layer is a grid of programs; few of them are still more than one in each direction.
+LAYERED = Tuning(block=32, stages=1, depth=32, tile=32, tile_stages=1, splits=2, size=4096)
+MIRROR = {
+    "actor": MirrorMap(source=(1, 0, *range(2, ACTOR_OBS)), signs=(1, 1, -1, *[1] * (ACTOR_OBS - 3))),
+    "critic": MirrorMap(source=(*range(CRITIC_OBS - 2), CRITIC_OBS - 1, CRITIC_OBS - 2)),
+    "action": MirrorMap(source=(1, 0, 2), signs=(-1, -1, -1)),
+}
 
 needs_interpreter = pytest.mark.skipif(
     torch.cuda.is_available(), reason="tests/gpu runs the kernels themselves"
@@ -35,12 +43,14 @@ def fused_ppo():
     return FusedPPO
 
 
-def networks(*, action_dim=ACTIONS, **actor_options):
+def networks(*, action_dim=ACTIONS, hidden=HIDDEN, critic=None, actor_obs=ACTOR_OBS, **actor_options):
     torch.manual_seed(3)
     activation = actor_options.pop("activation", "elu")
-    cfg = ActorCfg(hidden_dims=HIDDEN, activation=activation, output_gain=0.5, **actor_options)
-    actor = make_actor(cfg, obs_dim=ACTOR_OBS, action_dim=action_dim)
-    return actor, make_critic(CriticCfg(hidden_dims=HIDDEN, activation=activation), obs_dim=CRITIC_OBS)
+    cfg = ActorCfg(hidden_dims=hidden, activation=activation, output_gain=0.5, **actor_options)
+    actor = make_actor(cfg, obs_dim=actor_obs, action_dim=action_dim)
+    return actor, make_critic(
+        CriticCfg(hidden_dims=critic or hidden, activation=activation), obs_dim=CRITIC_OBS
+    )
 
 
 def rollout(actor, *, seed=0):
@@ -50,7 +60,7 @@ def rollout(actor, *, seed=0):
     terminated, truncated = torch.rand(*shape, 1) < 0.1, torch.rand(*shape, 1) < 0.1
     data = TensorDict(
         {
-            "actor": torch.randn(*shape, ACTOR_OBS) * 2.0 + 1.0,
+            "actor": torch.randn(*shape, actor[0].module.trunk[0].in_features) * 2.0 + 1.0,
             "critic": torch.randn(*shape, CRITIC_OBS),
             "next": {
                 "critic": torch.randn(*shape, CRITIC_OBS),
@@ -69,19 +79,24 @@ def rollout(actor, *, seed=0):
 
 
 def update(cfg, actor, critic, fused_ppo=None, *, data=DATA):
-    made = PPOUpdate(cfg, actor=copy.deepcopy(actor), critic=copy.deepcopy(critic), data=data, seed=5)
+    copies = {"actor": copy.deepcopy(actor), "critic": copy.deepcopy(critic)}
+    made = PPOUpdate(cfg, **copies, data=data, seed=5, mirror=MIRROR)
     if fused_ppo is not None:
+        description = fused_networks(made.actor, made.critic)
+        chained = description.chained and cfg.symmetry != "loss"
         made.fused = fused_ppo(
             cfg,
-            fused_networks(made.actor, made.critic),
+            description,
+            mirror=None if cfg.symmetry == "none" else SymmetricAugmentation(MIRROR),
             observe_actor=observer(made.actor[0]),
             observe_critic=observer(made.critic),
             optimizer=made.optimizer,
             guard=made.guard,
             num_env_states_per_minibatch=DATA.num_env_states_per_minibatch,
             num_minibatches=DATA.num_minibatches,
-            tuning=TUNING,
+            tuning=TUNING if chained else LAYERED,
         )
+        assert made.fused.layout.chained == chained
     return made
 
 
@@ -104,6 +119,10 @@ def assert_equal_states(one, other, *, atol=1e-4):
         )
 
 
+def full(*values):
+    return pytest.param(*values, marks=pytest.mark.full)
+
+
 @needs_interpreter
 @pytest.mark.parametrize(
     ("options", "actor_options"),
@@ -122,8 +141,26 @@ def assert_equal_states(one, other, *, atol=1e-4):
             },
             {"std_type": "log", "init_std": 0.6, "obs_normalization": False},
         ),
-        pytest.param({}, {"activation": "relu"}, marks=pytest.mark.full),
-        pytest.param({}, {"activation": "tanh"}, marks=pytest.mark.full),
+        # Each layer in kernels of its own. The schedule is fixed, since a divergence of zero is not one of 1e-9 to it.
+        (
+            {"entropy_coeff": 0.3, "schedule": "fixed"},
+            {"hidden": (48,), "critic": (40,), "activation": "silu", "state_dependent_std": True},
+        ),
+        full(
+            {"symmetry": "loss", "symmetry_coeff": 0.7},
+            {
+                "hidden": (16, 32, 16, 16),
+                "activation": "tanh",
+                "state_dependent_std": True,
+                "std_type": "log",
+            },
+        ),
+        full({}, {"activation": "relu"}),
+        full({}, {"activation": "tanh"}),
+        full({"symmetry": "augment"}, {}),
+        full({"symmetry": "augment"}, {"hidden": (48, 16), "activation": "relu"}),
+        full({"symmetry": "loss"}, {}),
+        full({}, {"hidden": (16, 16), "actor_obs": 298}),
     ],
 )
 def test_updates_equal_those_of_torch(fused_ppo, options, actor_options):
@@ -139,6 +176,7 @@ def test_updates_equal_those_of_torch(fused_ppo, options, actor_options):
     assert ours.keys() == theirs.keys()
     assert ours["update/non_finite_env_states"] == 4
     assert 0.0 <= ours["update/clip_fraction"] < 1.0
+    assert ("loss/mirror" in ours) == (cfg.symmetry == "loss")
     # Torch's has other numbers in the place of the env states that are left out, and takes their variance too.
     for name in theirs.keys() - {"update/explained_variance"}:
         torch.testing.assert_close(
@@ -221,8 +259,11 @@ def test_steps_that_are_not_finite_change_nothing_and_are_counted(fused_ppo):
     assert all(value.isfinite() for value in metrics.values())
 
 
-def test_layout_places_every_parameter_once():
-    made = fused_networks(*networks())
+@pytest.mark.parametrize(
+    "options", [{}, {"hidden": (40, 70), "critic": (100, 16), "state_dependent_std": True, "actor_obs": 298}]
+)
+def test_layout_places_every_parameter_once(options):
+    made = fused_networks(*networks(**options))
     layout = FusedLayout(made)
     index = layout.padded_index(made)
     assert len(index) == layout.num_flat == sum(parameter.numel() for parameter in made.parameters)
@@ -238,7 +279,27 @@ def test_layout_places_every_parameter_once():
     assert index[-1] == last_bias
 
 
+def made_columns(made):
+    layout = FusedLayout(made)
+    return max(layout.inputs, layout.gradients)
+
+
+def test_a_symmetry_without_a_mirror_is_refused(fused_ppo):
+    with pytest.raises(ValueError, match="symmetry=.loss. needs one"):
+        fused_ppo(
+            PPOCfg(symmetry="loss"),
+            fused_networks(*networks()),
+            observe_actor=lambda td: td["actor"],
+            observe_critic=lambda td: td["critic"],
+            optimizer=torch.optim.Adam([torch.zeros(1)]),
+            guard=StepGuard(),
+            num_env_states_per_minibatch=8,
+            num_minibatches=1,
+        )
+
+
 def test_what_the_kernels_cannot_do_is_said():
+    bounded = ActorCfg(distribution="tanh_gaussian", action_bound=1.0)
     actor, critic = networks()
     made = fused_networks(actor, critic)
     assert why_not_fused(PPOCfg(precision="bfloat16"), made, **SIZES) is None
@@ -246,18 +307,25 @@ def test_what_the_kernels_cannot_do_is_said():
     for option in (
         {"kernels": "torch"},
         {"advantage": "vtrace"},
-        {"symmetry": "loss"},
         {"estimate_each_epoch": True},
         {"normalize_advantage": "minibatch"},
     ):
         cfg = PPOCfg(precision="bfloat16", **option)
         assert next(iter(option)) in why_not_fused(cfg, made, **SIZES)
     assert "['GELU'], and not all one of" in fused_networks(*networks(activation="gelu"))
-    assert "std" in fused_networks(*networks(state_dependent_std=True))
-    other = make_actor(ActorCfg(hidden_dims=(32, 32)), obs_dim=ACTOR_OBS, action_dim=ACTIONS)
-    assert "hidden layers" in why_not_fused(
-        PPOCfg(precision="bfloat16"), fused_networks(other, critic), **SIZES
-    )
+    assert "Gaussian" in fused_networks(make_actor(bounded, obs_dim=ACTOR_OBS, action_dim=ACTIONS), critic)
+    cfg = PPOCfg(precision="bfloat16")
+    for options, reason in (
+        ({"critic": (32, 32)}, "hidden layers of [32, 32, 16] and [32, 32]"),
+        ({"hidden": (16, 1040)}, "wider than 1024"),
+        ({"action_dim": 65}, "more than 64 actions"),
+    ):
+        assert reason in why_not_fused(cfg, fused_networks(*networks(**options)), **SIZES)
+    assert "too many" in why_not_fused(cfg, made, num_env_states_per_minibatch=2**24, num_minibatches=2)
+    # Symmetry doubles the rows of a minibatch.
+    rows = {"num_env_states_per_minibatch": 2**31 // (2 * made_columns(made)) + 1, "num_minibatches": 1}
+    assert why_not_fused(cfg, made, **rows) is None
+    assert "too many" in why_not_fused(PPOCfg(precision="bfloat16", symmetry="augment"), made, **rows)
     assert isinstance(fused_networks(actor, torch.nn.Identity()), str)
     assert update(PPOCfg(), actor, critic).metrics()["update/fused"] == 0.0
 
@@ -265,16 +333,7 @@ def test_what_the_kernels_cannot_do_is_said():
 def test_on_the_cpu_torch_makes_the_steps():
     actor, critic = networks()
     made = update(PPOCfg(), actor, critic)
-    reason = make_fused_ppo(
-        PPOCfg(),
-        actor=actor,
-        critic=critic,
-        optimizer=made.optimizer,
-        guard=made.guard,
-        dataset=made.dataset,
-        device=torch.device("cpu"),
-    )
-    assert reason == made.fused == "they need CUDA and Triton"
+    assert make_fused_ppo(made) == made.fused == "they need CUDA and Triton"
     assert made.notes == []
     made.device = torch.device("cuda")
     assert made.notes == ["torch makes the gradient steps, not the fused kernels: they need CUDA and Triton"]

@@ -11,6 +11,7 @@ from ksim_rl.data import DatasetCfg
 from ksim_rl.device.capture import Captured
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
 from ksim_rl.objectives import PPOCfg
+from ksim_rl.transforms import MirrorMap
 from tests.gpu.no_syncs import no_syncs
 
 pytestmark = pytest.mark.gpu
@@ -18,17 +19,32 @@ ENVS, STEPS, OBS = 256, 24, 48
 DEVICE = torch.device("cuda")
 
 
-def networks(*, hidden_dims=(512, 256, 128), action_dim=12, **actor_options):
+def networks(*, hidden_dims=(512, 256, 128), action_dim=12, obs=OBS, activation="elu", **actor_options):
     torch.manual_seed(2)
-    actor_cfg = ActorCfg(hidden_dims=hidden_dims, **actor_options)
-    actor = make_actor(actor_cfg, obs_dim=OBS, action_dim=action_dim, device=DEVICE)
-    return actor, make_critic(CriticCfg(hidden_dims=hidden_dims), obs_dim=OBS, device=DEVICE)
+    actor_cfg = ActorCfg(hidden_dims=hidden_dims, activation=activation, **actor_options)
+    actor = make_actor(actor_cfg, obs_dim=obs, action_dim=action_dim, device=DEVICE)
+    critic_cfg = CriticCfg(hidden_dims=hidden_dims, activation=activation)
+    return actor, make_critic(critic_cfg, obs_dim=obs, device=DEVICE)
+
+
+def mirror(obs, actions):
+    def swapped(size):
+        return MirrorMap(source=(1, 0, *range(2, size)), signs=(-1, -1, *[1] * (size - 2)))
+
+    return {"actor": swapped(obs), "critic": swapped(obs), "action": swapped(actions)}
 
 
 def update(actor, critic, *, minibatches=4, **options):
     data = DatasetCfg(num_env_states_per_minibatch=ENVS * STEPS // minibatches, num_minibatches=minibatches)
     cfg = PPOCfg(**({"precision": "bfloat16"} | options))
-    return PPOUpdate(cfg, actor=copy.deepcopy(actor), critic=copy.deepcopy(critic), data=data, device=DEVICE)
+    network = actor[0].module
+    maps = (
+        mirror(network.trunk[0].in_features, network.head.loc.out_features)
+        if cfg.symmetry != "none"
+        else None
+    )
+    copies = {"actor": copy.deepcopy(actor), "critic": copy.deepcopy(critic)}
+    return PPOUpdate(cfg, **copies, data=data, device=DEVICE, mirror=maps)
 
 
 def moments(made):
@@ -41,19 +57,27 @@ def parameters(made):
 
 
 @pytest.mark.parametrize(
-    "network_options",
+    ("network_options", "symmetry"),
     [
-        {},
-        {"hidden_dims": (256, 128, 64), "action_dim": 29, "std_type": "log"},
-        {"hidden_dims": (48, 32, 16), "action_dim": 1},
+        ({}, "none"),
+        ({}, "augment"),
+        ({"hidden_dims": (256, 128, 64), "action_dim": 29, "std_type": "log"}, "none"),
+        ({"hidden_dims": (48, 32, 16), "action_dim": 1}, "none"),
+        ({}, "loss"),
+        ({"hidden_dims": (1024, 1024), "activation": "relu", "obs": 298}, "none"),
+        ({"hidden_dims": (512, 512, 256, 128), "activation": "silu", "state_dependent_std": True}, "augment"),
+        (
+            {"hidden_dims": (80, 48), "activation": "tanh", "state_dependent_std": True, "std_type": "log"},
+            "loss",
+        ),
     ],
 )
-def test_the_gradient_is_that_of_exact_products(network_options):
+def test_the_gradient_is_that_of_exact_products(network_options, symmetry):
     actor, critic = networks(**network_options)
-    rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE)
+    rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE, obs=network_options.get("obs", OBS))
     rollout_ET["next", "reward"][3, 4] = float("nan")
     # One step, not clipped: the mean of Adam is then a tenth of the gradient.
-    one = {"minibatches": 1, "num_epochs": 1, "max_grad_norm": None}
+    one = {"minibatches": 1, "num_epochs": 1, "max_grad_norm": None, "symmetry": symmetry}
     fused = update(actor, critic, **one)
     exact = update(actor, critic, precision="float32", **one)
     assert fused.metrics()["update/fused"] == 1.0
@@ -84,8 +108,9 @@ def test_the_fused_kernels_equal_torch_in_bfloat16():
         torch.testing.assert_close(fused.metrics()[name], plain.metrics()[name], atol=0.01, rtol=0.03)
 
 
-def test_captured_steps_are_the_eager_ones_bit_for_bit():
-    actor, critic = networks()
+@pytest.mark.parametrize("hidden_dims", [(512, 256, 128), (512, 256)])
+def test_captured_steps_are_the_eager_ones_bit_for_bit(hidden_dims):
+    actor, critic = networks(hidden_dims=hidden_dims)
     rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE)
     eager, captured = update(actor, critic), update(actor, critic)
     eager._rollout_ET = captured._rollout_ET = rollout_ET
@@ -101,8 +126,9 @@ def test_captured_steps_are_the_eager_ones_bit_for_bit():
     assert captured.metrics()["update/skipped_steps"] == 0
 
 
-def test_no_host_sync():
-    actor, critic = networks()
+@pytest.mark.parametrize("hidden_dims", [(512, 256, 128), (512, 256)])
+def test_no_host_sync(hidden_dims):
+    actor, critic = networks(hidden_dims=hidden_dims)
     rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE)
     made = update(actor, critic)
     made._rollout_ET = rollout_ET

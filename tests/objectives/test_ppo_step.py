@@ -5,12 +5,12 @@ import torch
 from tensordict import TensorDict
 from torchrl import objectives
 
+from ksim_rl.algorithms.gradient_steps import load_optimizer_state, optimizer_state
 from ksim_rl.data import DatasetBuffer, DatasetCfg
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic, update_normalizers
 from ksim_rl.objectives import (
     PPOCfg,
     StepGuard,
-    load_optimizer_state_,
     make_advantage,
     make_loss,
     make_optimizer,
@@ -150,7 +150,7 @@ def test_optimizer_state_continues_exactly():
     ppo_step(loss, optimizer, first, cfg=cfg)
     resumed = make_optimizer(dataclasses.replace(cfg, learning_rate=9e-3), actor, critic)
     rate = resumed.param_groups[0]["lr"]
-    load_optimizer_state_(resumed, optimizer.state_dict())
+    load_optimizer_state(resumed, optimizer_state(optimizer), what="optimizer")
     assert resumed.param_groups[0]["lr"] is rate
     assert rate == optimizer.param_groups[0]["lr"]
     assert rate.data_ptr() != optimizer.param_groups[0]["lr"].data_ptr()

@@ -12,13 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl import ranks
-from ksim_rl.algorithms.gradient_steps import (
-    RolloutUpdate,
-    StepMeans,
-    in_columns,
-    load_optimizer_state,
-    optimizer_state,
-)
+from ksim_rl.algorithms.gradient_steps import RolloutUpdate, in_columns, load_optimizer_state, optimizer_state
 from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.algorithms.ppo.wiring import make_ppo_update
 from ksim_rl.data import ReplayCfg, ReplayRing
@@ -74,9 +68,8 @@ class AMPUpdate(RolloutUpdate):
             device=ppo.device,
         )
         networks = {"discriminator": self.discriminator}
-        super().__init__(
-            networks, max_skipped_steps=cfg.max_skipped_steps, device=ppo.device, signals=ppo.signals
-        )
+        options: Any = {"device": ppo.device, "signals": ppo.signals, "logged": LOGGED}
+        super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, **options)
         # So that the first scores are of features in a fitting range.
         self.discriminator.normalizer.update(self.reference_N2L)
         own = {
@@ -93,7 +86,6 @@ class AMPUpdate(RolloutUpdate):
             capacity=cfg.replay_rollouts * num_steps,
         )
         self.replay = ReplayRing(kept, num_envs=num_envs, observations=[cfg.style_group], device=self.device)
-        self._means = StepMeans(LOGGED)
         self._style = torch.zeros((), device=self.device)
 
     @property
@@ -159,9 +151,7 @@ class AMPUpdate(RolloutUpdate):
             shown += [reference_B2L, policy_B2L]
         # Only now, so that all steps see the statistics that the rollout was scored with.
         net.normalizer.update(torch.cat(shown))
-        steps = in_columns(made)
-        self._means.take_(steps)
-        self._longest_skip.copy_(steps["skipped_in_a_row"].max())
+        self._measure_(in_columns(made))
 
     def state_dict(self) -> state_tree.State:
         """Return PPO's state, and beside it the discriminator with its optimizer and its replay."""

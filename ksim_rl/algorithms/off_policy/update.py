@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
-from ksim_rl.algorithms.gradient_steps import RolloutUpdate, load_optimizer_state, optimizer_state
+from ksim_rl.algorithms.gradient_steps import RolloutUpdate, in_columns, load_optimizer_state, optimizer_state
 from ksim_rl.data import ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
@@ -31,13 +31,14 @@ from ksim_rl.objectives import (
 from ksim_rl.transforms import MirrorMap
 
 # Names of the logged means, by the names that the losses give them.
-OF_CRITIC_STEPS = {
+LOGGED = {
     "loss_qvalue": "loss/value",
     "value": "update/q_value",
     "td_error": "update/td_error",
     "critic_grad_norm": "update/critic_grad_norm",
+    "loss_actor": "loss/policy",
+    "actor_grad_norm": "update/actor_grad_norm",
 }
-OF_ACTOR_STEPS = {"loss_actor": "loss/policy", "actor_grad_norm": "update/actor_grad_norm"}
 OF_TEMPERATURE = {"entropy": "loss/entropy", "alpha": "update/alpha"}
 
 
@@ -72,7 +73,9 @@ class OffPolicyUpdate(RolloutUpdate):
             "critic": loss.critic_network,
             "target_critic": loss.target_critic_network,
         }
-        super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, device=device, signals=signals)
+        logged = LOGGED | (OF_TEMPERATURE if isinstance(loss, SACLoss) else {})
+        shared: Any = {"device": device, "signals": signals, "logged": logged}
+        super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, **shared)
         self.cfg, self.loss, self.data = cfg, loss, data
         self.actor: TensorDictModuleBase = loss.actor_network
         self.critic = loss.critic_network
@@ -99,10 +102,10 @@ class OffPolicyUpdate(RolloutUpdate):
             rate = cfg.alpha_learning_rate
             self.optimizers["alpha"] = make_adamw(cfg, [loss.log_alpha], learning_rate=rate, weight_decay=0.0)
         self.steps_made = 0
-        logged = OF_CRITIC_STEPS | OF_ACTOR_STEPS | (OF_TEMPERATURE if isinstance(loss, SACLoss) else {})
-        self._sums = {name: torch.zeros((), device=self.device) for name in logged.values()}
-        self._counts = {name: torch.zeros((), device=self.device) for name in ("critic", "actor")}
+        # Zero until learning starts.
+        self._means.update({name: torch.zeros((), device=self.device) for name in logged.values()})
         self._store_only = Captured(self._store, device=self.device)
+        self._work.insert(0, self._store_only)
 
     @property
     def rollout_keys(self) -> list[Any]:
@@ -120,12 +123,8 @@ class OffPolicyUpdate(RolloutUpdate):
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
-        means = {
-            name: total / self._counts["critic" if name in OF_CRITIC_STEPS.values() else "actor"].clamp_min(1)
-            for name, total in self._sums.items()
-        }
         return {
-            **means,
+            **self._means,
             **self._skipped(),
             "replay/env_states": self.replay.num_stored,
             "update/non_finite_env_states": self.replay.non_finite_count,
@@ -140,53 +139,42 @@ class OffPolicyUpdate(RolloutUpdate):
 
     def _update(self) -> None:
         self._store()
-        for tensor in (*self._sums.values(), *self._counts.values(), self._longest_skip):
-            tensor.zero_()
         minibatches = self.replay.minibatches(self.data.num_minibatches, change_=self._reflect_)
+        of_critic, of_actor, in_a_row = [], [], []
         for step, minibatch_B in enumerate(minibatches, start=1):
-            skipped = self._improve_critic(minibatch_B)
+            of_critic.append(self._improve_critic(minibatch_B))
+            skipped = of_critic[-1]["skipped"]
             if step % self.cfg.policy_delay == 0:
-                skipped = torch.maximum(skipped, self._improve_actor(minibatch_B))
+                of_actor.append(self._improve_actor(minibatch_B))
+                skipped = torch.maximum(skipped, of_actor[-1]["skipped"])
             self.loss.update_target_(self.cfg.tau)
             self.guard.count_(skipped)
-            torch.maximum(self._longest_skip, self.guard.skipped_in_a_row, out=self._longest_skip)
+            in_a_row.append(self.guard.skipped_in_a_row.clone())
+        self._measure_(in_columns(of_critic) | {"skipped_in_a_row": torch.stack(in_a_row)})
+        self._means.take_(in_columns(of_actor))
 
-    def _improve_critic(self, minibatch_B: TensorDictBase) -> Tensor:
-        """Make one gradient step of the critics, and return 1 if it was skipped, else 0."""
+    def _improve_critic(self, minibatch_B: TensorDictBase) -> dict[str, Tensor]:
+        """Make one gradient step of the critics; return what it measured, and `skipped`, 0 or 1."""
         with self._precision():
             loss, logged = self._critic_loss(minibatch_B)
-        norm, skipped = self._descend({"critic": loss})["critic"]
+        limit = self.cfg.max_grad_norm
+        norm, skipped = descend_together({"critic": loss}, self.optimizers, max_grad_norm=limit)["critic"]
         if self.data.prioritized:
             self.replay.update_priority(minibatch_B.get("index"), minibatch_B.get("td_error"))
-        logged = logged | {"loss_qvalue": loss, "critic_grad_norm": norm}
-        self._measure("critic", logged, OF_CRITIC_STEPS, skipped)
-        return skipped
+        return logged | {"loss_qvalue": loss, "critic_grad_norm": norm, "skipped": skipped}
 
-    def _improve_actor(self, minibatch_B: TensorDictBase) -> Tensor:
-        """Make one gradient step of the actor and the temperature, and return 1 if it was skipped, else 0."""
+    def _improve_actor(self, minibatch_B: TensorDictBase) -> dict[str, Tensor]:
+        """Make one gradient step of the actor and the temperature; return what `_improve_critic` does."""
         # Frozen here as well, where the compiler does not follow.
         with self._precision(), frozen(self.critic):
             losses, logged = self._actor_losses(minibatch_B)
         learning = [name for name in ("actor", "alpha") if name in self.optimizers]
-        steps = self._descend({name: losses[f"loss_{name}"] for name in learning})
+        losses_of = {name: losses[f"loss_{name}"] for name in learning}
+        steps = descend_together(losses_of, self.optimizers, max_grad_norm=self.cfg.max_grad_norm)
         norm, skipped = steps["actor"]
         if "alpha" in steps:
             skipped = torch.maximum(skipped, steps["alpha"][1])
-        logged = logged | {"loss_actor": losses["loss_actor"], "actor_grad_norm": norm}
-        self._measure("actor", logged, OF_ACTOR_STEPS | OF_TEMPERATURE, skipped)
-        return skipped
-
-    def _descend(self, losses: Mapping[str, Tensor]) -> dict[str, tuple[Tensor, Tensor]]:
-        return descend_together(losses, self.optimizers, max_grad_norm=self.cfg.max_grad_norm)
-
-    def _measure(
-        self, which: str, measured: Mapping[str, Tensor], names: Mapping[str, str], skipped: Tensor
-    ) -> None:
-        made = skipped == 0.0
-        self._counts[which].add_(made)
-        for name, value in measured.items():
-            # A skipped step is counted; its numbers would spoil the means.
-            self._sums[names[name]].add_(torch.where(made, value.detach(), 0.0))
+        return logged | {"loss_actor": losses["loss_actor"], "actor_grad_norm": norm, "skipped": skipped}
 
     def _precision(self) -> AbstractContextManager[Any]:
         # The cache of casted weights would outlive the steps that change them in a captured graph.

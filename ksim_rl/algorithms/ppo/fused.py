@@ -1,47 +1,38 @@
 """This module says whether the gradient steps of a PPO run can be fused kernels, and builds these for it."""
 
 import importlib.util
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, cast
 
-import torch
 from jaxtyping import Float
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor, nn
 
-from ksim_rl.data import DatasetBuffer, EpochSampler
+from ksim_rl.algorithms.gradient_steps import DatasetUpdate
+from ksim_rl.data import EpochSampler
 from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, ValueNetwork
 from ksim_rl.modules.actor import MIN_STD, GaussianHead
-from ksim_rl.modules.network import side_by_side
-from ksim_rl.objectives import PPOCfg, StepGuard
+from ksim_rl.objectives import SymmetricAugmentation
 from ksim_rl.objectives.fused_ppo import ACTIVATIONS, FusedNetworks, why_not_fused
+from ksim_rl.transforms import MirrorMap
 
 if TYPE_CHECKING:
     from ksim_rl.objectives.fused_ppo.fused_ppo import FusedPPO
 
 
-def make_fused_ppo(
-    cfg: PPOCfg,
-    *,
-    actor: ProbabilisticTensorDictSequential,
-    critic: TensorDictModuleBase,
-    optimizer: torch.optim.Adam,
-    guard: StepGuard,
-    dataset: DatasetBuffer,
-    device: torch.device,
-) -> "FusedPPO | str":
-    """Build the fused gradient steps of a run, or return why torch has to make them."""
-    if device.type != "cuda" or importlib.util.find_spec("triton") is None:
+def make_fused_ppo(update: DatasetUpdate, mirror: Mapping[Any, MirrorMap] | None = None) -> "FusedPPO | str":
+    """Build the fused gradient steps of a PPO update, or return why torch has to make them."""
+    if update.device.type != "cuda" or importlib.util.find_spec("triton") is None:
         return "they need CUDA and Triton"
-    if dataset.cfg.shards > 1:
+    if update.dataset.cfg.shards > 1:
         return "minibatches come from shards"
-    if type(dataset.sampler) is not EpochSampler:
-        return f"minibatches come from a {type(dataset.sampler).__name__}"
-    networks = fused_networks(actor, critic)
-    sizes: Any = {
-        name: getattr(dataset.cfg, name) for name in ("num_env_states_per_minibatch", "num_minibatches")
-    }
+    if type(update.dataset.sampler) is not EpochSampler:
+        return f"minibatches come from a {type(update.dataset.sampler).__name__}"
+    cfg: Any = update.cfg
+    actor, critic = [cast(Any, update.networks[name]) for name in ("actor", "critic")]
+    networks, data = fused_networks(actor, critic), update.dataset.cfg
+    sizes: Any = {name: getattr(data, name) for name in ("num_env_states_per_minibatch", "num_minibatches")}
     reason = networks if isinstance(networks, str) else why_not_fused(cfg, networks, **sizes)
     if reason is not None:
         return reason
@@ -49,13 +40,17 @@ def make_fused_ppo(
     # Triton is there only where CUDA is.
     from ksim_rl.objectives.fused_ppo.fused_ppo import FusedPPO
 
+    read = [*actor[0].in_keys, *critic.in_keys]
     return FusedPPO(
         cfg,
         networks,
+        mirror=None
+        if cfg.symmetry == "none"
+        else SymmetricAugmentation.of(mirror, read=read, device=update.device),
         observe_actor=observer(actor[0]),
         observe_critic=observer(critic),
-        optimizer=optimizer,
-        guard=guard,
+        optimizer=update.optimizer,
+        guard=update.guard,
         **sizes,
     )
 
@@ -68,16 +63,16 @@ def fused_networks(
     if type(policy) is not PolicyNetwork or type(value) is not ValueNetwork:
         return "the networks are not those of make_actor and make_critic"
     head = policy.head
-    if type(head) is not GaussianHead or head.std is None:
-        return f"the policy is not a {DiagonalGaussian.__name__} whose std is the same in every state"
+    if type(head) is not GaussianHead:
+        return f"the policy is not a {DiagonalGaussian.__name__}"
     layers = [*_layers(policy.trunk), head.loc], _layers(value.layers)
     activations = {type(part) for part in (*policy.trunk, *value.layers)} - {nn.Linear}
     if len(activations) != 1 or not activations <= {*ACTIVATIONS}:
         names = [sorted(kind.__name__ for kind in kinds) for kinds in (activations, ACTIVATIONS)]
         return f"the activations are {names[0]}, and not all one of {names[1]}"
     (activation,) = activations
-    std = {"std_A": head.std, "log_std": head.std_type == "log", "min_std": MIN_STD}
-    return FusedNetworks(actor=layers[0], critic=layers[1], activation=activation, **std)
+    std: Any = {"std_A": head.std, "std_layer": head.std_layer, "log_std": head.std_type == "log"}
+    return FusedNetworks(actor=layers[0], critic=layers[1], activation=activation, min_std=MIN_STD, **std)
 
 
 def _layers(network: nn.Sequential) -> list[nn.Linear]:
@@ -88,9 +83,4 @@ def observer(module: Any) -> Callable[[TensorDictBase], Float[Tensor, "B L"]]:
     """Return what gives the input of the first layer of a network from `make_actor` or `make_critic`."""
     network: PolicyNetwork | ValueNetwork = module.module
     keys = list(module.in_keys)
-
-    def observe(env_states: TensorDictBase) -> Float[Tensor, "*batch L"]:
-        obs = side_by_side([env_states.get(key) for key in keys])
-        return obs if network.normalizer is None else network.normalizer(obs)
-
-    return observe
+    return lambda env_states: network.observe(*(env_states.get(key) for key in keys))

@@ -82,15 +82,7 @@ class PPOUpdate(DatasetUpdate):
         # The rollouts hold the recurrent states of the actor, and not those of the critic.
         self._carried = CarriedState(critic, acting=actor)
         # The kernels that make the gradient steps, or why torch makes them.
-        self.fused = make_fused_ppo(
-            cfg,
-            actor=actor,
-            critic=critic,
-            optimizer=self.optimizer,
-            guard=self.guard,
-            dataset=self.dataset,
-            device=self.device,
-        )
+        self.fused = make_fused_ppo(self, mirror)
         self._is_fused = torch.tensor(float(not isinstance(self.fused, str)), device=self.device)
         self._std = torch.zeros((), device=self.device)
         self._scale_keys = [key for key in distribution_keys(actor) if key == "scale" or key[-1] == "scale"]

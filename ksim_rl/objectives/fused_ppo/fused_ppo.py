@@ -1,4 +1,4 @@
-"""This module makes all gradient steps of a PPO update in four Triton kernels each, for most runs' networks.
+"""This module makes all gradient steps of a PPO update in a few Triton kernels each, for most runs' networks.
 
 It computes what `GAE`, `ClipPPOLoss` and `ppo_step` compute for an actor and a critic of `FusedNetworks`, from the same
 config, in the same order of env states, and on the state of the same optimizer: a run can change from one to the other
@@ -7,22 +7,27 @@ bits where they are multiplied; parameters, sums, losses and Adam stay float32. 
 moved the gradient of each parameter by 0.2 to 0.6 percent of its norm, where torch's TF32 moves it by 0.05 to 0.5.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int64
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn import functional
 
 from ksim_rl import ranks
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
 from ksim_rl.objectives.fused_ppo.dataset import FusedDataset, Observe
+from ksim_rl.objectives.fused_ppo.layer_kernels import layer, output_gradients
 from ksim_rl.objectives.fused_ppo.layout import (
     ACTIVATIONS,
     FusedLayout,
     FusedNetworks,
+    LayerPlace,
     Tuning,
     launch,
     parts,
@@ -31,6 +36,7 @@ from ksim_rl.objectives.fused_ppo.layout import (
 from ksim_rl.objectives.fused_ppo.mlp_kernels import minibatch_gradients, state_values, weight_gradients
 from ksim_rl.objectives.fused_ppo.step_kernels import SUMMARY, adam_step, sum_gradients
 from ksim_rl.objectives.gradient_step import StepGuard, adapt_learning_rate_
+from ksim_rl.objectives.symmetry import SymmetricAugmentation
 
 # Sums that each block leaves beside its gradients.
 NUM_STATISTICS = 16
@@ -56,11 +62,14 @@ class FusedParameters:
         device = self._parameters[0].device
         # Parameters, and the optimizer's means and variances, each [N].
         self.flat = [torch.zeros(layout.num_flat, device=device) for _ in range(3)]
-        self._views = [layout.flat_views(flat, networks) for flat in self.flat]
+        sizes, shapes = zip(*((own.numel(), own.shape) for own in self._parameters), strict=True)
+        self._views = [list(map(Tensor.view, flat.split(sizes), shapes)) for flat in self.flat]
         self.places = layout.padded_index(networks).to(device)
         # The parameters in padded form, in float32 and in the dtype of the products.
         self.exact = torch.zeros(2, layout.num_padded, device=device)
         self.weights = torch.zeros(2, layout.num_padded, dtype=dtype, device=device)
+        # The biases of both networks in float32; rows are as far apart as those of `exact`.
+        self.biases_2N = self.exact[:, layout.num_weights :]
         # The optimizer's number of steps before the first gradient step of the update, and after each.
         self.steps = torch.zeros(num_steps + 1, device=device)
         for parameter in self._parameters:
@@ -70,12 +79,6 @@ class FusedParameters:
                     "exp_avg": torch.zeros_like(parameter),
                     "exp_avg_sq": torch.zeros_like(parameter),
                 }
-        self._num_weights = layout.num_weights
-
-    @property
-    def biases_2N(self) -> Float[Tensor, "2 N"]:
-        """The biases of both networks in float32; rows are as far apart as those of `exact`."""
-        return self.exact[:, self._num_weights :]
 
     @torch.no_grad()
     def load(self) -> None:
@@ -105,7 +108,8 @@ class FusedPPO:
     """Makes the gradient steps of one update after another; all memory is allocated once, and nothing syncs.
 
     `why_not_fused` has no reason against its config. The first layers take what `observe_actor` and `observe_critic`
-    give, [..., L]. Moments, step counts and learning rate are those of `optimizer`, from `make_optimizer`.
+    give, [..., L]. Moments, step counts and learning rate are those of `optimizer`, from `make_optimizer`. A symmetry
+    of the config needs the `mirror`; else a ValueError is raised.
     """
 
     def __init__(
@@ -119,14 +123,20 @@ class FusedPPO:
         guard: StepGuard,
         num_env_states_per_minibatch: int,
         num_minibatches: int,
+        mirror: SymmetricAugmentation | None = None,
         tuning: Tuning | None = None,
     ) -> None:
+        if (mirror is None) != (cfg.symmetry == "none"):
+            raise ValueError(f"mirror={mirror}: symmetry={cfg.symmetry!r} needs one, and 'none' has none")
         self.cfg, self.networks, self.optimizer, self.guard = cfg, networks, optimizer, guard
-        self.layout = layout = FusedLayout(networks)
+        self._mirrored = cfg.symmetry == "loss"
+        self.layout = layout = FusedLayout(networks, chained=networks.chained and not self._mirrored)
         self.tuning = tuning = tuning or Tuning.of(layout)
         self.batch = num_env_states_per_minibatch
+        # With the mirror images behind.
+        rows = self.batch if mirror is None else 2 * self.batch
         num_steps = cfg.num_epochs * num_minibatches
-        device, dtype = networks.std_A.device, getattr(torch, cfg.precision)
+        device, dtype = networks.parameters[0].device, getattr(torch, cfg.precision)
         self.parameters = FusedParameters(
             networks, layout, optimizer=optimizer, dtype=dtype, num_steps=num_steps
         )
@@ -138,21 +148,71 @@ class FusedPPO:
             size=num_env_states_per_minibatch * num_minibatches,
             dtype=dtype,
             device=device,
+            mirror=mirror,
         )
 
-        zeros = partial(torch.zeros, device=device)
+        self._summary = torch.zeros(num_steps, power_of_two(len(SUMMARY)), device=device)
+        self._arguments = self._all_arguments(rows, mirror)
 
-        self._blocks = parts(self.batch, tuning.block)
-        self._tiles = layout.weight_tiles(tuning.tile).to(device)
-        # Tiles at the edge read past the last row.
-        self._inputs = zeros(2 * self.batch * layout.input_columns + tuning.tile, dtype=dtype)
-        self._slopes = zeros(2 * self.batch * layout.gradient_columns + tuning.tile, dtype=dtype)
-        self._weight_partials = zeros(tuning.splits, 2, layout.num_weights)
-        self._block_partials = zeros(self._blocks, 2, layout.num_biases + NUM_STATISTICS)
-        self._gradients = zeros(2, layout.num_padded)
+    def _all_arguments(self, rows: int, mirror: SymmetricAugmentation | None) -> dict[str, Any]:
+        """Return what kernels get in every step, by the names of their parameters; `rows` are those of a minibatch."""
+        cfg, layout, tuning = self.cfg, self.layout, self.tuning
+        dataset, parameters = self.dataset, self.parameters
+        zeros = partial(torch.zeros, device=dataset.records.device)
+        blocks, dtype = parts(rows, tuning.block), dataset.obs.dtype
         programs = parts(layout.num_weights, tuning.size) + parts(layout.num_biases, tuning.columns)
-        self._squares = zeros(2 * programs)
-        self._summary = zeros(num_steps, power_of_two(len(SUMMARY)))
+        # Where the image of each action comes from, counted from 1, times its sign; see `output_gradients`.
+        image_of = torch.arange(1, layout.out + 1, device=dataset.records.device, dtype=torch.int32)
+        if mirror is not None:
+            actions = image_of[None, : layout.actions].to(torch.float32)
+            image_of[: layout.actions] = mirror.image_of("action", actions)[0]
+        clip_value = cfg.clip_epsilon if cfg.clip_value is True else float(cfg.clip_value)
+        described = (self.networks, layout, tuning)
+        return {
+            **vars(cfg),
+            **{name.upper(): value for part in described for name, value in vars(part).items()},
+            **dict(zip(("H1", "H2", "H3"), layout.hidden, strict=False)),
+            **dict(zip(("parameters", "means", "variances"), parameters.flat, strict=True)),
+            **dict(zip(("beta1", "beta2"), cfg.betas, strict=True)),
+            **{
+                f"log_beta{i}": math.log(beta) if beta > 0.0 else -math.inf
+                for i, beta in enumerate(cfg.betas, 1)
+            },
+            "places": parameters.places,
+            "weights": parameters.weights,
+            "exact_weights": parameters.exact,
+            "biases": parameters.biases_2N,
+            "obs": dataset.obs,
+            "records": dataset.records,
+            "num_obs": len(dataset.records),
+            "num_rows": rows,
+            "tiles": layout.weight_tiles(tuning.tile).to(dataset.records.device),
+            # Tiles at the edge read past the last row.
+            "inputs": zeros(2 * rows * layout.inputs + tuning.tile, dtype=dtype),
+            "slopes": zeros(2 * rows * layout.gradients + tuning.tile, dtype=dtype),
+            "weight_partials": zeros(tuning.splits, 2, layout.num_weights),
+            "block_partials": zeros(blocks, 2, layout.num_biases + NUM_STATISTICS),
+            "gradients": zeros(2, layout.num_padded),
+            "squares": zeros(2 * programs),
+            "image_of": image_of,
+            "skipped": self.guard.skipped,
+            "skipped_in_a_row": self.guard.skipped_in_a_row,
+            "clip_value": clip_value,
+            "log_ratio_low": math.log1p(-cfg.clip_epsilon) if cfg.clip_epsilon < 1.0 else -math.inf,
+            "log_ratio_high": math.log1p(cfg.clip_epsilon),
+            "max_grad_norm": cfg.max_grad_norm or 0.0,
+            "ACTIVATION": ACTIVATIONS.index(self.networks.activation),
+            "STATE_STD": self.networks.std_layer is not None,
+            "RECORD": dataset.records.shape[1],
+            "NUM_STATISTICS": NUM_STATISTICS,
+            "NUM_SQUARES": 2 * programs,
+            "SQUARES": power_of_two(2 * programs),
+            "BLOCKS": blocks,
+            "MIRROR": self._mirrored,
+            "CLIP_VALUE": clip_value > 0.0,
+            "ADAPTIVE": cfg.schedule == "adaptive" and ranks.size() == 1,
+            "CLIP": cfg.max_grad_norm is not None,
+        }
 
     def __call__(
         self, rollout_ET: TensorDictBase, orders: Sequence[Int64[Tensor, " D"]]
@@ -171,134 +231,83 @@ class FusedPPO:
             # From env by env to step by step.
             index_D = (order_D % length) * num_envs + order_D.div(length, rounding_mode="floor")
             for index_B in index_D.to(torch.int32).split(self.batch):
+                if len(self.dataset.records) > self.dataset.size:
+                    index_B = torch.cat([index_B, index_B + self.dataset.size])
                 self._multiply(index_B)
                 self._improve(step)
                 step += 1
         self.parameters.store()
-        return dict(zip(SUMMARY, self._summary.unbind(1), strict=False)), left_out
+        names = SUMMARY if self._mirrored else SUMMARY[:-1]
+        return dict(zip(names, self._summary.unbind(1), strict=False)), left_out
 
     def _multiply(self, index_B: Tensor) -> None:
         """Run a minibatch through both networks and back, up to the gradients of the weights, in parts."""
-        cfg, layout, tuning = self.cfg, self.layout, self.tuning
-        clip_value = cfg.clip_epsilon if cfg.clip_value is True else float(cfg.clip_value)
-        launch(
-            minibatch_gradients,
-            (self._blocks, 2),
-            self.dataset.obs,
-            self.dataset.records,
-            index_B,
-            self.parameters.weights,
-            self.parameters.biases_2N,
-            self._inputs,
-            self._slopes,
-            self._block_partials,
-            self.batch,
-            self.dataset.records.shape[0],
-            math.log1p(-cfg.clip_epsilon) if cfg.clip_epsilon < 1.0 else -math.inf,
-            math.log1p(cfg.clip_epsilon),
-            clip_value,
-            cfg.entropy_coeff,
-            cfg.critic_coeff,
-            NUM_PADDED=layout.num_padded,
-            NUM_BIASES=layout.num_biases,
-            NUM_STATISTICS=NUM_STATISTICS,
-            RECORD=self.dataset.records.shape[1],
-            INPUTS=layout.input_columns,
-            GRADIENTS=layout.gradient_columns,
-            ACTIONS=layout.action_dim,
-            LOG_STD=self.networks.log_std,
-            MIN_STD=self.networks.min_std,
-            CLIP_VALUE=clip_value > 0.0,
-            num_warps=tuning.warps,
-            **self._sizes,
+        tuning, rows, given = self.tuning, len(index_B), self._arguments
+        if self.layout.chained:
+            grid = given["BLOCKS"], 2
+            launch(minibatch_gradients, grid, given, num_warps=tuning.warps, order=index_B)
+        else:
+            self._multiply_by_layers(index_B)
+        grid, split = (
+            (len(given["tiles"]), tuning.splits),
+            parts(rows, tuning.splits * tuning.depth) * tuning.depth,
         )
-        launch(
-            weight_gradients,
-            (len(self._tiles), tuning.splits),
-            self._tiles,
-            self._inputs,
-            self._slopes,
-            self._weight_partials,
-            self.batch,
-            NUM_WEIGHTS=layout.num_weights,
-            INPUTS=layout.input_columns,
-            GRADIENTS=layout.gradient_columns,
-            ROWS=parts(self.batch, tuning.splits * tuning.depth) * tuning.depth,
-            TILE=tuning.tile,
-            DEPTH=tuning.depth,
-            STAGES=tuning.tile_stages,
-            num_warps=tuning.tile_warps,
-        )
+        launch(weight_gradients, grid, given, num_warps=tuning.tile_warps, ROWS=split)
+
+    def _multiply_by_layers(self, index_B: Tensor) -> None:
+        """Leave what `minibatch_gradients` leaves, with kernels of each layer."""
+        layout, tuning, rows, given = self.layout, self.tuning, len(index_B), self._arguments
+        weights, biases = self.parameters.weights, self.parameters.biases_2N
+        seen = given["inputs"][: 2 * rows * layout.inputs].view(2, rows, -1)
+        seen[..., : layout.obs] = self.dataset.obs[:, index_B]
+
+        def run(at: LayerPlace, following: LayerPlace, *, forward: bool) -> None:
+            own = at if forward else following
+            grid = given["BLOCKS"], parts(at.fan_out, tuning.tile), 2
+            places = {
+                "weights": weights[:, own.weight :],
+                "biases": biases[:, at.gradient :],
+                "width": at.fan_out,
+                "length": at.fan_in if forward else following.fan_out,
+                "read_at": at.input if forward else following.gradient,
+                "slope_at": at.gradient,
+                "output_at": following.input,
+            }
+            launch(layer, grid, given, num_warps=tuning.tile_warps, FORWARD=forward, **places)
+
+        pairs = list(itertools.pairwise(layout.places))
+        for at, following in pairs:
+            run(at, following, forward=True)
+        last = layout.places[-1]
+        places = {
+            "weights": weights[:, last.weight :],
+            "biases": biases[:, last.gradient :],
+            "fan_in": last.fan_in,
+            "input_at": last.input,
+            "slope_at": last.gradient,
+        }
+        grid = given["BLOCKS"], 2
+        launch(output_gradients, grid, given, num_warps=tuning.tile_warps, order=index_B, **places)
+        for at, following in reversed(pairs):
+            run(at, following, forward=False)
 
     def _improve(self, step: int) -> None:
         """Add the parts up, and make the step of the optimizer."""
-        cfg, layout, tuning = self.cfg, self.layout, self.tuning
-        group = self.optimizer.param_groups[0]
-        launch(
-            sum_gradients,
-            (len(self._squares) + 1,),
-            self._weight_partials,
-            self._block_partials,
-            self._gradients,
-            self._squares,
-            self.parameters.biases_2N,
-            group["lr"],
-            self._summary[step],
-            cfg.entropy_coeff,
-            cfg.critic_coeff,
-            cfg.desired_kl,
-            cfg.learning_rate_min,
-            cfg.learning_rate_max,
-            SPLITS=tuning.splits,
-            BLOCKS=self._blocks,
-            NUM_WEIGHTS=layout.num_weights,
-            NUM_BIASES=layout.num_biases,
-            NUM_STATISTICS=NUM_STATISTICS,
-            ACTIONS=layout.action_dim,
-            OUT=layout.out_width,
-            LOG_STD=self.networks.log_std,
-            MIN_STD=self.networks.min_std,
-            ADAPTIVE=cfg.schedule == "adaptive" and ranks.size() == 1,
-            SIZE=tuning.size,
-            COLUMNS=tuning.columns,
-            ROWS=tuning.rows,
-        )
+        summary, given = self._summary[step], self._arguments
+        rate = self.optimizer.param_groups[0]["lr"]
+        launch(sum_gradients, (len(given["squares"]) + 1,), given, learning_rate=rate, summary=summary)
         if ranks.size() > 1:
-            self._take_means(self._summary[step], group["lr"])
-        beta1, beta2 = cfg.betas
-        launch(
-            adam_step,
-            (parts(layout.num_flat, tuning.size),),
-            *self.parameters.flat,
-            self.parameters.places,
-            self._gradients,
-            self.parameters.weights,
-            self.parameters.exact,
-            self._squares,
-            self._summary[step],
-            self.parameters.steps[step:],
-            self.guard.skipped,
-            self.guard.skipped_in_a_row,
-            beta1,
-            beta2,
-            _log(beta1),
-            _log(beta2),
-            cfg.adam_eps,
-            cfg.weight_decay,
-            cfg.max_grad_norm or 0.0,
-            SIZE=layout.num_flat,
-            NUM_SQUARES=len(self._squares),
-            SQUARES=power_of_two(len(self._squares)),
-            CLIP=cfg.max_grad_norm is not None,
-            BLOCK=tuning.size,
-        )
+            self._take_means(summary, rate)
+        sizes = {"SIZE": self.layout.num_flat, "BLOCK": self.tuning.size}
+        grid = (parts(self.layout.num_flat, self.tuning.size),)
+        launch(adam_step, grid, given, summary=summary, steps=self.parameters.steps[step:], **sizes)
 
     def _take_means(self, summary: Tensor, learning_rate: Tensor) -> None:
         """Take the means over all ranks of the gradients and of what the step measured, and adapt the learning rate."""
-        cfg = self.cfg
-        ranks.mean_([self._gradients, summary])
-        self._squares.zero_()
-        self._squares[0].copy_(self._gradients.square().sum())
+        cfg, gradients, squares = self.cfg, self._arguments["gradients"], self._arguments["squares"]
+        ranks.mean_([gradients, summary])
+        squares.zero_()
+        squares[0].copy_(gradients.square().sum())
         if cfg.schedule == "adaptive":
             bounds = {"lr_min": cfg.learning_rate_min, "lr_max": cfg.learning_rate_max}
             kl = summary[SUMMARY.index("kl")]
@@ -306,30 +315,16 @@ class FusedPPO:
             summary[SUMMARY.index("learning_rate")].copy_(learning_rate)
 
     def _evaluate(self, obs_DL: Tensor, values_D: Tensor) -> None:
-        launch(
-            state_values,
-            (parts(len(values_D), self.tuning.block),),
-            obs_DL,
-            self.parameters.weights[1],
-            self.parameters.biases_2N[1],
-            values_D,
-            len(values_D),
-            num_warps=self.tuning.warps,
-            **self._sizes,
-        )
-
-    @property
-    def _sizes(self) -> dict[str, int]:
-        layout, tuning = self.layout, self.tuning
-        first, second, third = layout.hidden
-        widths = {"H1": first, "H2": second, "H3": third}
-        widths |= {
-            "ACTIVATION": ACTIVATIONS.index(self.networks.activation),
-            "OBS": layout.obs_width,
-            "OUT": layout.out_width,
-        }
-        return widths | {"BLOCK": tuning.block, "CHUNK": tuning.chunk, "STAGES": tuning.stages}
-
-
-def _log(beta: float) -> float:
-    return math.log(beta) if beta > 0.0 else -math.inf
+        if self.layout.chained:
+            given = self._arguments | {"obs": obs_DL, "values": values_D, "num_rows": len(values_D)}
+            own = {"weights": self.parameters.weights[1], "biases": self.parameters.biases_2N[1]}
+            grid = (parts(len(values_D), self.tuning.block),)
+            launch(state_values, grid, given, num_warps=self.tuning.warps, **own)
+            return
+        *layers, last = self.networks.critic
+        activation = self.networks.activation()
+        hidden_DL = obs_DL[:, : self.layout.obs_dims[1]]
+        for below in layers:
+            weight, bias = below.weight.to(obs_DL.dtype), below.bias.to(obs_DL.dtype)
+            hidden_DL = activation(functional.linear(hidden_DL, weight, bias))
+        values_D.copy_(last(hidden_DL.to(values_D.dtype)).squeeze(-1))

@@ -1,7 +1,8 @@
 """This module says where the parameters of fused networks are, how work is cut, and what cannot be fused."""
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,19 +15,28 @@ from ksim_rl.objectives.algorithm_cfg import PPOCfg
 # The smallest dim that a tensor core multiplies.
 MIN_WIDTH = 16
 # In the order in which the kernels number them.
-ACTIVATIONS = (nn.ELU, nn.ReLU, nn.Tanh)
+ACTIVATIONS = (nn.ELU, nn.ReLU, nn.Tanh, nn.SiLU)
+# What a program of the chained kernels holds in registers as a whole: the observation, and the second hidden layer.
+CHAINED_OBS = 256
+CHAINED_SECOND = (16, 32, 64, 128, 256)
+MAX_WIDTH = 1024
+MAX_ACTIONS = 64
+MAX_PLACES = 2**31
 
 
 @dataclass(frozen=True, kw_only=True)
 class FusedNetworks:
-    """What the kernels need to know of an actor and a critic: two MLPs of the same hidden widths, and a gaussian.
+    """What the kernels need to know of an actor and a critic: two MLPs of as many layers, and a gaussian.
 
-    The activation follows each linear layer but the last. The gradient passes the bound `min_std`.
+    The activation follows each linear layer but the last. The standard deviations, or their logarithms, are a parameter
+    `std_A`, or what a `std_layer` makes of the last hidden layer: logarithms, or what a softplus makes positive. The
+    gradient passes the bound `min_std`.
     """
 
     actor: Sequence[nn.Linear]
     critic: Sequence[nn.Linear]
-    std_A: Float[Tensor, " A"]  # the parameter of the standard deviations, or their logarithms
+    std_A: Float[Tensor, " A"] | None = None
+    std_layer: nn.Linear | None = None
     log_std: bool
     min_std: float
     activation: type[nn.Module] = nn.ELU
@@ -36,7 +46,34 @@ class FusedNetworks:
         """All parameters, in the order of the flat form: of each layer weight and bias, of the actor then the std."""
         actor = [parameter for layer in self.actor for parameter in (layer.weight, layer.bias)]
         critic = [parameter for layer in self.critic for parameter in (layer.weight, layer.bias)]
-        return [*actor, self.std_A, *critic]
+        layer = self.std_layer
+        std = [self.std_A] if self.std_A is not None else [layer.weight, layer.bias] if layer else []
+        return [*actor, *std, *critic]
+
+    @property
+    def chained(self) -> bool:
+        """Whether one program can take env states through all layers; else each layer is a kernel."""
+        hidden = [layer.out_features for layer in self.actor[:-1]]
+        return (
+            self.std_layer is None
+            and self.activation is not nn.SiLU
+            and hidden == [layer.out_features for layer in self.critic[:-1]]
+            and len(hidden) == 3
+            and hidden[1] in CHAINED_SECOND
+            and not any(width % MIN_WIDTH for width in hidden)
+            and max(self.actor[0].in_features, self.critic[0].in_features) <= CHAINED_OBS
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayerPlace:
+    """Where a layer is: its first weight, and its first columns among layer inputs, and among gradients and biases."""
+
+    fan_in: int
+    fan_out: int
+    weight: int
+    input: int
+    gradient: int
 
 
 class FusedLayout:
@@ -44,47 +81,50 @@ class FusedLayout:
 
     There are two forms. The flat one, [N], has the parameters end to end as they are, which is what the optimizer
     works on. The padded one, [2, P], has a row for the actor and one for the critic, each with first all weights and
-    then all biases and the std, in blocks whose sizes are the same in both rows: the observation is padded to
-    `obs_width` and the outputs to `out_width`, both powers of two. Padding is zero, and so is its gradient.
+    then all biases and the std, in blocks whose sizes are the same in both rows: the outputs are padded to `out`,
+    a power of two, and so is the observation to `obs` where the kernels are `chained`; what else differs between
+    both, or is no multiple of 16, is padded to one. The outputs of a `std_layer` follow those of the last layer, and
+    its biases are in the place of the std. Padding is zero, and so is its gradient.
     """
 
-    def __init__(self, networks: FusedNetworks) -> None:
-        self.hidden = tuple(layer.out_features for layer in networks.actor[:-1])
-        self.action_dim = networks.actor[-1].out_features
+    def __init__(self, networks: FusedNetworks, *, chained: bool | None = None) -> None:
+        self.chained = networks.chained if chained is None else chained
+        pairs = zip(networks.actor[:-1], networks.critic[:-1], strict=True)
+        self.hidden = tuple(_multiple(max(layer.out_features for layer in pair)) for pair in pairs)
+        self.actions = networks.actor[-1].out_features
         self.obs_dims = networks.actor[0].in_features, networks.critic[0].in_features
-        self.obs_width = _width(max(self.obs_dims))
-        self.out_width = _width(self.action_dim)
-        widths = (self.obs_width, *self.hidden, self.out_width)
-        self.layers = list(zip(widths[:-1], widths[1:], strict=True))
-        self.num_weights = sum(fan_in * fan_out for fan_in, fan_out in self.layers)
-        self.num_biases = sum(self.hidden) + 2 * self.out_width
+        self.obs = (power_of_two if self.chained else _multiple)(max(*self.obs_dims, MIN_WIDTH))
+        self.out = power_of_two(max(self.actions, MIN_WIDTH))
+        outputs = self.out if networks.std_layer is None else 2 * self.out
+        widths = (self.obs, *self.hidden, outputs)
+        self.places: list[LayerPlace] = []
+        weight = column = gradient = 0
+        for fan_in, fan_out in itertools.pairwise(widths):
+            at = {"weight": weight, "input": column, "gradient": gradient}
+            self.places.append(LayerPlace(fan_in=fan_in, fan_out=fan_out, **at))
+            weight, column, gradient = weight + fan_in * fan_out, column + fan_in, gradient + fan_out
+        self.num_weights = weight
+        self.num_biases = sum(self.hidden) + 2 * self.out
         self.num_padded = self.num_weights + self.num_biases
         self.num_flat = sum(parameter.numel() for parameter in networks.parameters)
         # Columns of a row of all layer inputs (observation first), and of all gradients of layer outputs.
-        self.input_columns = sum(widths[:-1])
-        self.gradient_columns = sum(widths[1:])
-
-    def flat_views(
-        self, flat_N: Float[Tensor, " N"], networks: FusedNetworks
-    ) -> list[Float[Tensor, "*?shape"]]:
-        """Return the views of a flat tensor that correspond to `networks.parameters`."""
-        sizes = [parameter.numel() for parameter in networks.parameters]
-        pieces = zip(flat_N.split(sizes), networks.parameters, strict=True)
-        return [piece.view(parameter.shape) for piece, parameter in pieces]
+        self.inputs, self.gradients = column, gradient
 
     def padded_index(self, networks: FusedNetworks) -> Int32[Tensor, " N"]:
         """Return for each element of the flat form its place in the padded one, on the CPU."""
         places = torch.arange(2 * self.num_padded, dtype=torch.int32).view(2, self.num_padded)
         index: list[Tensor] = []
+        std_at, actions = self.num_padded - self.out, self.actions
         for row, layers in zip(places, (networks.actor, networks.critic), strict=True):
-            weight_at, bias_at = 0, self.num_weights
-            for layer, (fan_in, fan_out) in zip(layers, self.layers, strict=True):
-                block = row[weight_at : weight_at + fan_in * fan_out].view(fan_out, fan_in)
+            for layer, at in zip(layers, self.places, strict=True):
+                block = row[at.weight :][: at.fan_in * at.fan_out].view(at.fan_out, at.fan_in)
                 index.append(block[: layer.out_features, : layer.in_features])
-                index.append(row[bias_at : bias_at + layer.out_features])
-                weight_at, bias_at = weight_at + fan_in * fan_out, bias_at + fan_out
+                index.append(row[self.num_weights + at.gradient :][: layer.out_features])
             if layers is networks.actor:
-                index.append(row[bias_at : bias_at + self.action_dim])
+                if networks.std_layer is not None:
+                    rows = block[self.out : self.out + actions, : layer.in_features]
+                    index.append(rows)
+                index.append(row[std_at : std_at + actions])
         return torch.cat([places.reshape(-1) for places in index])
 
     def weight_tiles(self, tile: int) -> Int32[Tensor, "tiles 8"]:
@@ -95,20 +135,17 @@ class FusedLayout:
         """
         tiles = []
         for network in range(2):
-            input_at = gradient_at = weight_at = 0
-            for fan_in, fan_out in self.layers:
-                for row in range(0, fan_out, tile):
-                    for column in range(0, fan_in, tile):
-                        place = weight_at + row * fan_in + column
-                        used = min(tile, fan_in - column), min(tile, fan_out - row)
-                        tiles.append([network, input_at + column, gradient_at + row, place, fan_in, *used, 0])
-                input_at, gradient_at = input_at + fan_in, gradient_at + fan_out
-                weight_at += fan_in * fan_out
+            for at in self.places:
+                for row in range(0, at.fan_out, tile):
+                    for column in range(0, at.fan_in, tile):
+                        first = network, at.input + column, at.gradient + row
+                        used = min(tile, at.fan_in - column), min(tile, at.fan_out - row)
+                        tiles.append([*first, at.weight + row * at.fan_in + column, at.fan_in, *used, 0])
         return torch.tensor(tiles, dtype=torch.int32)
 
 
-def _width(dim: int) -> int:
-    return max(MIN_WIDTH, power_of_two(dim))
+def _multiple(dim: int) -> int:
+    return parts(dim, MIN_WIDTH) * MIN_WIDTH
 
 
 def power_of_two(number: int) -> int:
@@ -118,14 +155,14 @@ def power_of_two(number: int) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class Tuning:
-    """How the work is cut. The defaults were the fastest on an H200 for layers of 512, 256 and 128."""
+    """How the work is cut. The defaults were the fastest on an H200 for chained layers of 512, 256 and 128."""
 
-    block: int = 64  # rows of a minibatch that one program takes through a network
+    block: int = 64  # rows of a minibatch that one program takes through a network, or through one layer
     chunk: int = 32  # columns of the widest layer that exist at a time
     stages: int = 3  # how far loads of weights run ahead
     warps: int = 4
-    tile: int = 128  # rows and columns of the weights whose gradient one program computes
-    depth: int = 64  # rows of a minibatch that it multiplies at a time
+    tile: int = 128  # rows and columns of the weights whose gradient one program computes; outputs of a layer
+    depth: int = 64  # rows of a minibatch, or inputs of a layer, that it multiplies at a time
     tile_stages: int = 3
     tile_warps: int = 8
     splits: int = 8  # programs that share a tile, each with a part of the minibatch
@@ -135,16 +172,10 @@ class Tuning:
 
     @classmethod
     def of(cls, layout: FusedLayout) -> "Tuning":
-        """Return what suits a layout: the first and the third width must be whole numbers of chunks."""
+        """Return what suits a layout: chained, the first and the third width must be whole numbers of chunks."""
+        if not layout.chained:
+            return cls(block=128)
         return cls(chunk=math.gcd(cls.chunk, layout.hidden[0], layout.hidden[2]))
-
-
-MAX_OBS = 256
-MAX_ACTIONS = 64
-# The second hidden layer is held in registers as a whole; the others are computed in chunks.
-SECOND_WIDTHS = (16, 32, 64, 128, 256)
-WIDTH_STEP = 16
-MAX_PLACES = 2**31
 
 
 def why_not_fused(
@@ -159,36 +190,32 @@ def why_not_fused(
     refused = {
         "advantage": cfg.advantage != "gae",
         "estimate_each_epoch": cfg.estimates_each_epoch,
-        "symmetry": cfg.symmetry != "none",
         "normalize_advantage": cfg.normalize_advantage == "minibatch",
     }
     for field, is_set in refused.items():
         if is_set:
             return f"{field}={getattr(cfg, field)!r}"
-    columns = sum(layer.out_features for layer in networks.actor) + MAX_OBS
-    places = num_env_states_per_minibatch * max(columns, num_minibatches * MAX_OBS)
+    hidden = [[layer.out_features for layer in layers[:-1]] for layers in (networks.actor, networks.critic)]
+    if len(hidden[0]) != len(hidden[1]) or not hidden[0]:
+        return f"actor and critic have hidden layers of {hidden[0]} and {hidden[1]}, not one or more, and as many"
+    if max(map(max, hidden)) > MAX_WIDTH or networks.actor[-1].out_features > MAX_ACTIONS:
+        return f"a hidden layer is wider than {MAX_WIDTH}, or there are more than {MAX_ACTIONS} actions"
+    layout = FusedLayout(networks)
+    rows = num_env_states_per_minibatch * (1 if cfg.symmetry == "none" else 2)
+    columns = max(layout.inputs, layout.gradients, num_minibatches * layout.obs)
     too_many = f"{num_env_states_per_minibatch} env states in a minibatch are too many"
-    return _shape_reason(networks) or (too_many if places >= MAX_PLACES else None)
+    return too_many if rows * columns >= MAX_PLACES else None
 
 
-def _shape_reason(networks: FusedNetworks) -> str | None:
-    hidden = [layer.out_features for layer in networks.actor[:-1]]
-    if hidden != [layer.out_features for layer in networks.critic[:-1]] or len(hidden) != 3:
-        return "actor and critic do not both have the same three hidden layers"
-    if hidden[1] not in SECOND_WIDTHS or any(width % WIDTH_STEP for width in hidden):
-        return (
-            f"hidden_dims={tuple(hidden)}: the second must be one of {SECOND_WIDTHS}, the others multiples "
-            f"of {WIDTH_STEP}"
-        )
-    widest = max(networks.actor[0].in_features, networks.critic[0].in_features)
-    if widest > MAX_OBS or networks.actor[-1].out_features > MAX_ACTIONS:
-        return f"there are more than {MAX_OBS} observations or {MAX_ACTIONS} actions"
-    return None
+def launch(
+    kernel: Any, grid: tuple[int, ...], arguments: Mapping[str, Any], *, num_warps: int = 4, **changes: Any
+) -> None:
+    """Run `grid` programs of a Triton kernel, whose signature type checkers cannot read, on the current stream.
 
-
-def launch(kernel: Any, grid: tuple[int, ...], *args: Any, **options: Any) -> None:
-    """Run `grid` programs of a Triton kernel, whose signature type checkers cannot read, on the current stream."""
-    kernel[grid](*args, **options)
+    It gets those of the `arguments`, and of their `changes`, that are named as its parameters.
+    """
+    given = {**arguments, **changes}
+    kernel[grid](**{name: given[name] for name in kernel.arg_names}, num_warps=num_warps)
 
 
 def parts(total: int, size: int) -> int:

@@ -1,7 +1,7 @@
 """This module has generalized advantages, and the clipped losses of PPO with their gradients, as Triton functions.
 
-The losses are those of `ClipPPOLoss`, for a diagonal gaussian whose standard deviations do not depend on the state; the
-gradients are of the sum over the env states, not of the mean. `docs/fused_ppo.md` derives them.
+The losses are those of `ClipPPOLoss`, for a diagonal gaussian; the gradients are of the sum over the env states, not of
+the mean. `docs/fused_ppo.md` derives them.
 
 What is known of an env state is one record: `OUT` columns each of the action, of the old mean and of the old standard
 deviation, then `LOG_PROB`, `ADVANTAGE`, `VALUE`, `TARGET` and `MASK`, counted from column 3 OUT.
@@ -33,11 +33,13 @@ def policy_gradient(
     OUT: tl.constexpr,
     LOG_STD: tl.constexpr,
     MIN_STD: tl.constexpr,
+    STATE_STD: tl.constexpr,
 ):
-    """Return the gradient of the policy loss and the entropy loss at `loc` [rows, OUT].
+    """Return the gradient of the policy loss and the entropy loss at `loc` and at `raw_std`, both [rows, OUT].
 
-    Writes that at the parameter of the std to `d_std_at` [OUT], and to `statistics` the sums of mask, policy loss,
-    divergence and clipped ratios.
+    Writes the sum of the latter to `d_std_at` [OUT], and to `statistics` the sums of mask, policy loss, divergence and
+    clipped ratios. With STATE_STD `raw_std` has a row for each of `loc`, and the sum of entropies is written, too; else
+    it is [1, OUT].
     """
     output = tl.arange(0, OUT)[None, :]
     action_dims = output < ACTIONS
@@ -49,8 +51,13 @@ def policy_gradient(
     advantage = tl.load(record + (3 * OUT + ADVANTAGE), mask=valid, other=0.0)
     mask = tl.load(record + (3 * OUT + MASK), mask=valid, other=0.0)
 
-    std = tl.exp(raw_std) if LOG_STD else raw_std
-    bounded = tl.maximum(std, MIN_STD)[None, :]
+    if LOG_STD:
+        std = tl.exp(raw_std)
+    elif STATE_STD:
+        std = tl.maximum(raw_std, 0.0) + tl.log(1.0 + tl.exp(-tl.abs(raw_std)))
+    else:
+        std = raw_std
+    bounded = tl.maximum(std, MIN_STD)
     inverse = 1.0 / bounded
     log_scale = tl.log(bounded)
     error = (action - loc) * inverse
@@ -68,8 +75,11 @@ def policy_gradient(
     error = tl.where(counts[:, None], error, 0.0)
     d_std = (slope[:, None] * (error * error - 1.0) - entropy_coeff * mask[:, None]) * inverse
     if LOG_STD:
-        d_std = d_std * std[None, :]
-    tl.store(d_std_at + tl.arange(0, OUT), tl.sum(tl.where(action_dims, d_std, 0.0), 0))
+        d_std = d_std * std
+    elif STATE_STD:
+        d_std = d_std * tl.sigmoid(raw_std)
+    d_std = tl.where(action_dims, d_std, 0.0)
+    tl.store(d_std_at + tl.arange(0, OUT), tl.sum(d_std, 0))
 
     log_std_ratio = tl.where(counts[:, None], tl.log(scale_old) - log_scale, 0.0)
     drift = tl.where(counts[:, None], (loc_old - loc) * inverse, 0.0)
@@ -78,7 +88,10 @@ def policy_gradient(
     tl.store(statistics + 1, -tl.sum(tl.minimum(gain, clipped_gain) * mask))
     tl.store(statistics + 2, tl.sum(tl.sum(tl.where(action_dims, divergence, 0.0), 1) * mask))
     tl.store(statistics + 3, tl.sum(tl.where(inside, 0.0, mask)))
-    return tl.where(action_dims, slope[:, None] * error * inverse, 0.0)
+    if STATE_STD:
+        entropy = tl.sum(tl.where(action_dims, log_scale + (0.5 + HALF_LOG_2_PI), 0.0), 1)
+        tl.store(statistics + 4, tl.sum(entropy * mask))
+    return tl.where(action_dims, slope[:, None] * error * inverse, 0.0), d_std
 
 
 @triton.jit

@@ -15,19 +15,22 @@ from ksim_rl.objectives.fused_ppo.loss_kernels import policy_gradient, value_gra
 
 
 @triton.jit
-def _activate(value, ACTIVATION: tl.constexpr):
+def activate(value, ACTIVATION: tl.constexpr):
+    """Return the activation at `value`."""
     if ACTIVATION == 0:
         value = tl.where(value > 0.0, value, tl.exp(value) - 1.0)
     elif ACTIVATION == 1:
         value = tl.maximum(value, 0.0)
-    else:
+    elif ACTIVATION == 2:
         value = 2.0 * tl.sigmoid(2.0 * value) - 1.0
+    else:
+        value = value * tl.sigmoid(value)
     return value
 
 
 @triton.jit
-def _slope(value, ACTIVATION: tl.constexpr):
-    # From the output alone, so that the input of an activation is never stored.
+def slope_of(value, ACTIVATION: tl.constexpr):
+    """Return the slope of the activation whose output is `value`; SiLU has none, since two inputs have one output."""
     if ACTIVATION == 0:
         slope = tl.where(value > 0.0, 1.0, value + 1.0)
     elif ACTIVATION == 1:
@@ -45,18 +48,18 @@ def _outputs(
     inputs,
     input_rows,
     keep,
-    OBS: tl.constexpr,
     H1: tl.constexpr,
     H2: tl.constexpr,
     H3: tl.constexpr,
     OUT: tl.constexpr,
-    BLOCK: tl.constexpr,
     CHUNK: tl.constexpr,
     STAGES: tl.constexpr,
     ACTIVATION: tl.constexpr,
     STORE: tl.constexpr,
 ):
     """Return the outputs [BLOCK, OUT] for `observed` [BLOCK, OBS]; STORE keeps the hidden layers in `inputs`."""
+    BLOCK: tl.constexpr = observed.shape[0]
+    OBS: tl.constexpr = observed.shape[1]
     SECOND_AT: tl.constexpr = H1 * OBS
     THIRD_AT: tl.constexpr = SECOND_AT + H2 * H1
     OUT_AT: tl.constexpr = THIRD_AT + H3 * H2
@@ -69,11 +72,11 @@ def _outputs(
         weight1 = tl.load(weights + ((first + column)[None, :] * OBS + obs_column[:, None]))
         weight2 = tl.load(weights + (SECOND_AT + column2[None, :] * H1 + (first + column)[:, None]))
         hidden = tl.dot(observed, weight1) + tl.load(biases + first + column)[None, :]
-        hidden = _activate(hidden, ACTIVATION).to(observed.dtype)
+        hidden = activate(hidden, ACTIVATION).to(observed.dtype)
         if STORE:
             tl.store(inputs + (input_rows + (OBS + first + column[None, :])), hidden, mask=keep)
         acc = tl.dot(hidden, weight2, acc)
-    second = _activate(acc + tl.load(biases + H1 + column2)[None, :], ACTIVATION).to(observed.dtype)
+    second = activate(acc + tl.load(biases + H1 + column2)[None, :], ACTIVATION).to(observed.dtype)
     if STORE:
         tl.store(inputs + (input_rows + (OBS + H1 + column2[None, :])), second, mask=keep)
     out = tl.zeros((BLOCK, OUT), dtype=tl.float32)
@@ -81,7 +84,7 @@ def _outputs(
         weight3 = tl.load(weights + (THIRD_AT + (first + column)[None, :] * H2 + column2[:, None]))
         weight4 = tl.load(weights + (OUT_AT + output[None, :] * H3 + (first + column)[:, None]))
         hidden = tl.dot(second, weight3) + tl.load(biases + H1 + H2 + first + column)[None, :]
-        hidden = _activate(hidden, ACTIVATION).to(observed.dtype)
+        hidden = activate(hidden, ACTIVATION).to(observed.dtype)
         if STORE:
             tl.store(inputs + (input_rows + (OBS + H1 + H2 + first + column[None, :])), hidden, mask=keep)
         out = tl.dot(hidden, weight4, out)
@@ -111,22 +114,7 @@ def state_values(
     keep = valid[:, None]
     observed = tl.load(obs + (rows[:, None] * OBS + tl.arange(0, OBS)[None, :]), mask=keep, other=0.0)
     out = _outputs(
-        observed,
-        weights,
-        biases,
-        values,
-        rows,
-        keep,
-        OBS,
-        H1,
-        H2,
-        H3,
-        OUT,
-        BLOCK,
-        CHUNK,
-        STAGES,
-        ACTIVATION,
-        False,
+        observed, weights, biases, values, rows, keep, H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, False
     )
     tl.store(values + rows, tl.sum(tl.where(tl.arange(0, OUT)[None, :] == 0, out, 0.0), 1), mask=valid)
 
@@ -139,8 +127,8 @@ def minibatch_gradients(
     weights,
     biases,
     inputs,
-    gradients,
-    partials,
+    slopes,
+    block_partials,
     num_rows,
     num_obs,
     log_ratio_low,
@@ -194,30 +182,15 @@ def minibatch_gradients(
     biases += network * NUM_PADDED
     obs += wide * num_obs * OBS
     inputs += wide * num_rows * INPUTS
-    gradients += wide * num_rows * GRADIENTS
-    partials += (block * 2 + network) * (NUM_BIASES + NUM_STATISTICS)
+    slopes += wide * num_rows * GRADIENTS
+    partials = block_partials + (block * 2 + network) * (NUM_BIASES + NUM_STATISTICS)
     input_rows = rows[:, None] * INPUTS
     gradient_rows = rows[:, None] * GRADIENTS
 
     observed = tl.load(obs + (index[:, None] * OBS + obs_column[None, :]), mask=keep, other=0.0)
     tl.store(inputs + (input_rows + obs_column[None, :]), observed, mask=keep)
     out = _outputs(
-        observed,
-        weights,
-        biases,
-        inputs,
-        input_rows,
-        keep,
-        OBS,
-        H1,
-        H2,
-        H3,
-        OUT,
-        BLOCK,
-        CHUNK,
-        STAGES,
-        ACTIVATION,
-        True,
+        observed, weights, biases, inputs, input_rows, keep, H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, True
     )
 
     record = records + index.to(tl.int64) * RECORD
@@ -226,10 +199,10 @@ def minibatch_gradients(
     if network == 0:
         raw_std = tl.load(
             biases + H1 + H2 + H3 + OUT + output, mask=output < ACTIONS, other=0.0 if LOG_STD else 1.0
-        )
-        d_out = policy_gradient(
+        )[None, :]
+        d_out, _ = policy_gradient(
             out, raw_std, record, valid, d_std_at, statistics, log_ratio_low, log_ratio_high, entropy_coeff,
-            ACTIONS, OUT, LOG_STD, MIN_STD
+            ACTIONS, OUT, LOG_STD, MIN_STD, False
         )  # fmt: skip
     else:
         d_out = value_gradient(out, record, valid, statistics, clip_value, critic_coeff, OUT, CLIP_VALUE)
@@ -237,7 +210,7 @@ def minibatch_gradients(
 
     tl.store(partials + H1 + H2 + H3 + output, tl.sum(d_out, 0))
     d_out = d_out.to(observed.dtype)
-    tl.store(gradients + (gradient_rows + (H1 + H2 + H3 + output[None, :])), d_out, mask=keep)
+    tl.store(slopes + (gradient_rows + (H1 + H2 + H3 + output[None, :])), d_out, mask=keep)
     # From here on threads read hidden layers that others of the block have written.
     tl.debug_barrier()
     acc = tl.zeros((BLOCK, H2), dtype=tl.float32)
@@ -247,30 +220,30 @@ def minibatch_gradients(
         hidden = tl.load(
             inputs + (input_rows + (OBS + H1 + H2 + first + column[None, :])), mask=keep, other=0.0
         )
-        slope = tl.dot(d_out, weight4) * _slope(hidden.to(tl.float32), ACTIVATION)
+        slope = tl.dot(d_out, weight4) * slope_of(hidden.to(tl.float32), ACTIVATION)
         tl.store(partials + H1 + H2 + first + column, tl.sum(slope, 0))
         slope = slope.to(observed.dtype)
-        tl.store(gradients + (gradient_rows + (H1 + H2 + first + column[None, :])), slope, mask=keep)
+        tl.store(slopes + (gradient_rows + (H1 + H2 + first + column[None, :])), slope, mask=keep)
         acc = tl.dot(slope, weight3, acc)
     middle = tl.load(inputs + (input_rows + (OBS + H1 + column2[None, :])), mask=keep, other=0.0)
-    second = acc * _slope(middle.to(tl.float32), ACTIVATION)
+    second = acc * slope_of(middle.to(tl.float32), ACTIVATION)
     tl.store(partials + H1 + column2, tl.sum(second, 0))
     second = second.to(observed.dtype)
-    tl.store(gradients + (gradient_rows + (H1 + column2[None, :])), second, mask=keep)
+    tl.store(slopes + (gradient_rows + (H1 + column2[None, :])), second, mask=keep)
     for first in tl.range(0, H1, CHUNK, num_stages=STAGES):
         weight2 = tl.load(weights + (SECOND_AT + column2[:, None] * H1 + (first + column)[None, :]))
         hidden = tl.load(inputs + (input_rows + (OBS + first + column[None, :])), mask=keep, other=0.0)
-        slope = tl.dot(second, weight2) * _slope(hidden.to(tl.float32), ACTIVATION)
+        slope = tl.dot(second, weight2) * slope_of(hidden.to(tl.float32), ACTIVATION)
         tl.store(partials + first + column, tl.sum(slope, 0))
-        tl.store(gradients + (gradient_rows + (first + column[None, :])), slope.to(observed.dtype), mask=keep)
+        tl.store(slopes + (gradient_rows + (first + column[None, :])), slope.to(observed.dtype), mask=keep)
 
 
 @triton.jit
 def weight_gradients(
     tiles,
     inputs,
-    gradients,
-    partials,
+    slopes,
+    weight_partials,
     num_rows,
     NUM_WEIGHTS: tl.constexpr,
     INPUTS: tl.constexpr,
@@ -278,7 +251,7 @@ def weight_gradients(
     ROWS: tl.constexpr,
     TILE: tl.constexpr,
     DEPTH: tl.constexpr,
-    STAGES: tl.constexpr,
+    TILE_STAGES: tl.constexpr,
 ):
     """Multiply gradients by layer inputs: program (i, s) computes tile i of `FusedLayout.weight_tiles` over split s.
 
@@ -298,13 +271,13 @@ def weight_gradients(
     lane = tl.arange(0, TILE)
     # Columns past the tile's own belong to the next layer or row: they are multiplied, and not stored.
     inputs += network.to(tl.int64) * num_rows * INPUTS + first_input
-    gradients += network.to(tl.int64) * num_rows * GRADIENTS + first_gradient
+    slopes += network.to(tl.int64) * num_rows * GRADIENTS + first_gradient
     acc = tl.zeros((TILE, TILE), dtype=tl.float32)
-    for first in tl.range(0, ROWS, DEPTH, num_stages=STAGES):
+    for first in tl.range(0, ROWS, DEPTH, num_stages=TILE_STAGES):
         rows = (split * ROWS + first + row)[:, None]
         layer_input = tl.load(inputs + (rows * INPUTS + lane[None, :]), mask=rows < num_rows, other=0.0)
-        gradient = tl.load(gradients + (rows * GRADIENTS + lane[None, :]), mask=rows < num_rows, other=0.0)
+        gradient = tl.load(slopes + (rows * GRADIENTS + lane[None, :]), mask=rows < num_rows, other=0.0)
         acc = tl.dot(tl.trans(gradient), layer_input, acc)
     at = (split * 2 + network).to(tl.int64) * NUM_WEIGHTS + place
     keep = (lane[:, None] < gradient_columns) & (lane[None, :] < input_columns)
-    tl.store(partials + at + (lane[:, None] * stride + lane[None, :]), acc, mask=keep)
+    tl.store(weight_partials + at + (lane[:, None] * stride + lane[None, :]), acc, mask=keep)

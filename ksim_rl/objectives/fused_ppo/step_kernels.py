@@ -20,10 +20,12 @@ SUMMARY = (
     "grad_norm",
     "skipped",
     "skipped_in_a_row",
+    "loss_mirror",
 )
 LOSS = tl.constexpr(SUMMARY.index("loss"))
 LEARNING_RATE = tl.constexpr(SUMMARY.index("learning_rate"))
 GRAD_NORM = tl.constexpr(SUMMARY.index("grad_norm"))
+LOSS_MIRROR = tl.constexpr(SUMMARY.index("loss_mirror"))
 # As in TorchRL's explained variance: the resolution of float32.
 EPS = tl.constexpr(1.1920929e-07)
 
@@ -90,6 +92,8 @@ def sum_gradients(
     OUT: tl.constexpr,
     LOG_STD: tl.constexpr,
     MIN_STD: tl.constexpr,
+    STATE_STD: tl.constexpr,
+    MIRROR: tl.constexpr,
     ADAPTIVE: tl.constexpr,
     SIZE: tl.constexpr,
     COLUMNS: tl.constexpr,
@@ -107,9 +111,8 @@ def sum_gradients(
     program = tl.program_id(0)
     statistic = tl.arange(0, NUM_STATISTICS)
     # The first statistic of both networks is the number of env states that take part. It may be none.
-    sums = _block_sums(
-        block_partials, NUM_BIASES + statistic, statistic < 4, WIDTH, BLOCKS, ROWS, NUM_STATISTICS
-    )
+    of_policy = statistic < (6 if STATE_STD or MIRROR else 4)
+    sums = _block_sums(block_partials, NUM_BIASES + statistic, of_policy, WIDTH, BLOCKS, ROWS, NUM_STATISTICS)
     count = tl.maximum(_column(sums, 0, NUM_STATISTICS), 1.0)
     if program < 2 * WEIGHT_PROGRAMS:
         network = program // WEIGHT_PROGRAMS
@@ -146,14 +149,17 @@ def sum_gradients(
         of_values = block_partials + WIDTH
         target_variance = _variance(of_values, NUM_BIASES + 2, NUM_BIASES, target, count, WIDTH, BLOCKS, ROWS)
         error_variance = _variance(of_values, NUM_BIASES + 4, NUM_BIASES, error, count, WIDTH, BLOCKS, ROWS)
-        output = tl.arange(0, OUT)
-        raw = tl.load(
-            biases + (NUM_BIASES - OUT + output), mask=output < ACTIONS, other=0.0 if LOG_STD else 1.0
-        )
-        std = tl.maximum(tl.exp(raw) if LOG_STD else raw, MIN_STD)
-        entropy = tl.sum(tl.where(output < ACTIONS, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0))
-        # The mean over no env state is zero, as that of all losses.
-        entropy = tl.where(_column(sums, 0, NUM_STATISTICS) > 0.0, entropy, 0.0)
+        if STATE_STD:
+            entropy = _column(policy, 4, NUM_STATISTICS)
+        else:
+            output = tl.arange(0, OUT)
+            raw = tl.load(
+                biases + (NUM_BIASES - OUT + output), mask=output < ACTIONS, other=0.0 if LOG_STD else 1.0
+            )
+            std = tl.maximum(tl.exp(raw) if LOG_STD else raw, MIN_STD)
+            entropy = tl.sum(tl.where(output < ACTIONS, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0))
+            # The mean over no env state is zero, as that of all losses.
+            entropy = tl.where(_column(sums, 0, NUM_STATISTICS) > 0.0, entropy, 0.0)
         rate = tl.load(learning_rate)
         if ADAPTIVE:
             # As `adapt_learning_rate_`; comparisons with NaN are False.
@@ -168,7 +174,12 @@ def sum_gradients(
         tl.store(summary + 3, kl)
         tl.store(summary + 4, _column(policy, 3, NUM_STATISTICS))
         tl.store(summary + 5, 1.0 - error_variance / (target_variance + EPS))
-        tl.store(summary + LOSS, objective + critic - entropy_coeff * entropy)
+        loss = objective + critic - entropy_coeff * entropy
+        if MIRROR:
+            mirror = _column(policy, 5, NUM_STATISTICS)
+            tl.store(summary + LOSS_MIRROR, mirror)
+            loss += mirror
+        tl.store(summary + LOSS, loss)
         tl.store(summary + LEARNING_RATE, rate)
 
 
@@ -190,7 +201,7 @@ def adam_step(
     beta2,
     log_beta1,
     log_beta2,
-    eps,
+    adam_eps,
     weight_decay,
     max_grad_norm,
     SIZE: tl.constexpr,
@@ -230,7 +241,7 @@ def adam_step(
     gradient += weight_decay * parameter
     new_mean = mean + (gradient - mean) * (1.0 - beta1)
     new_variance = beta2 * variance + (1.0 - beta2) * gradient * gradient
-    change = (rate / correction1) * new_mean / (tl.sqrt(new_variance) / tl.sqrt(correction2) + eps)
+    change = (rate / correction1) * new_mean / (tl.sqrt(new_variance) / tl.sqrt(correction2) + adam_eps)
     parameter = tl.where(made, parameter - change, parameter)
     tl.store(parameters + at, parameter, mask=inside)
     tl.store(means + at, tl.where(made, new_mean, mean), mask=inside)
