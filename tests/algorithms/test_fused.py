@@ -321,7 +321,7 @@ def test_what_the_kernels_cannot_do_is_said():
         ({"action_dim": 65}, "more than 64 actions"),
     ):
         assert reason in why_not_fused(cfg, fused_networks(*networks(**options)), **SIZES)
-    assert "too many" in why_not_fused(cfg, made, num_env_states_per_minibatch=2**24, num_minibatches=2)
+    assert "too many" in why_not_fused(cfg, made, num_env_states_per_minibatch=2**25, num_minibatches=2)
     # Symmetry doubles the rows of a minibatch.
     rows = {"num_env_states_per_minibatch": 2**31 // (2 * made_columns(made)) + 1, "num_minibatches": 1}
     assert why_not_fused(cfg, made, **rows) is None
