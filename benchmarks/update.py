@@ -1,17 +1,19 @@
 """What one PPO update costs, beside the same update made of TorchRL's own parts.
 
     python -m benchmarks.update device=cuda num_envs=4096,16384
+    python -m benchmarks.update device=cuda num_envs=4096 hidden_dims=1024,512,256,128
 
-Networks of 512, 256 and 128, rollouts of 24 steps of random env states of Go1's sizes (48 observations, 12 actions), 5
-epochs of 4 minibatches. Ours is timed eager and captured in float32 (TF32 on CUDA), and captured with
-`precision=bfloat16`, which takes the fused kernels where they fit: `update_ms`. The stock side is TorchRL's `GAE`,
-`ClipPPOLoss`, `ReplayBuffer` and torch's Adam on the same data and networks, in the same order of env states (our
-sampler in its buffer). The same capture is tried on it, and what stops it is written down. `parameter_difference` is
-that between ours and the stock side after one update in full float32, relative to the way that the parameters went.
-`stock_eager_over_update` is what all of ours saves together, bfloat16 included; on the CPU, where nothing is captured
-and all is float32, `update_ms` is `ours_eager_ms`.
+Networks of 512, 256 and 128 or of `hidden_dims`, rollouts of 24 steps of random env states of Go1's sizes (48
+observations, 12 actions), 5 epochs of 4 minibatches. Ours is timed eager and captured in float32 (TF32 on CUDA), and
+captured with `precision=bfloat16`, which takes the fused kernels where they fit: `update_ms`. The stock side is
+TorchRL's `GAE`, `ClipPPOLoss`, `ReplayBuffer` and torch's Adam on the same data and networks, in the same order of env
+states (our sampler in its buffer). The same capture is tried on it, and what stops it is written down.
+`parameter_difference` is that between ours and the stock side after one update in full float32, relative to the way
+that the parameters went. `stock_eager_over_update` is what all of ours saves together, bfloat16 included; on the CPU,
+where nothing is captured and all is float32, `update_ms` is `ours_eager_ms`.
 
-Figures go to benchmarks/results/update.json, as `<device>/<env states>/<figure>`.
+Figures go to benchmarks/results/update.json, as `<device>/<env states>/<figure>`; those of other widths, as
+`<device>/<env states>/<widths between x>/<figure>`.
 """
 
 from __future__ import annotations
@@ -40,6 +42,7 @@ from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
 from ksim_rl.objectives import PPOCfg
 
 STEPS, OBS, ACTIONS, MINIBATCHES = 24, 48, 12, 4
+HIDDEN_DIMS = (512, 256, 128)
 # Of the dataset whose `update_ms` on a GPU stands in the results by that name alone.
 TARGET_STATES = 98304
 # The stock side has no schedule that follows the divergence without a host sync at each step.
@@ -52,14 +55,17 @@ Networks = tuple[ProbabilisticTensorDictSequential, TensorDictModule]
 
 def main() -> None:
     """Time all sides for each number of envs, print the figures, and write them."""
-    defaults = {"device": "cuda" if torch.cuda.is_available() else "cpu", "num_envs": ""}
+    defaults = {"device": "cuda" if torch.cuda.is_available() else "cpu", "num_envs": "", "hidden_dims": ""}
     given = command_line.options(sys.argv[1:], defaults)
     device = checked_device(given["device"])
     sizes = given["num_envs"] or ("4096,16384" if device.type == "cuda" else "64")
+    default = ",".join(map(str, HIDDEN_DIMS))
+    hidden_dims = tuple(command_line.whole_numbers("hidden_dims", given["hidden_dims"] or default))
+    widths = "" if hidden_dims == HIDDEN_DIMS else "/" + "x".join(map(str, hidden_dims))
     figures, notes = {}, {}
     for num_envs in command_line.whole_numbers("num_envs", sizes):
-        label = f"{report.device_label(device)}/{num_envs * STEPS}"
-        found, note = compare(num_envs, device=device)
+        label = f"{report.device_label(device)}/{num_envs * STEPS}{widths}"
+        found, note = compare(num_envs, device=device, hidden_dims=hidden_dims)
         figures |= {f"{label}/{name}": value for name, value in found.items()}
         notes |= {f"{label}/{name}": text for name, text in note.items()}
     target = f"{report.device_label(device)}/{TARGET_STATES}/update_ms"
@@ -73,9 +79,11 @@ def main() -> None:
     print(f"written to {path}")
 
 
-def compare(num_envs: int, *, device: torch.device) -> tuple[dict[str, float], dict[str, str]]:
+def compare(
+    num_envs: int, *, device: torch.device, hidden_dims: tuple[int, ...] = HIDDEN_DIMS
+) -> tuple[dict[str, float], dict[str, str]]:
     """Return the figures of one dataset's size, and why some are missing."""
-    networks = make_networks(device)
+    networks = make_networks(device, hidden_dims=hidden_dims)
     rollout_ET = make_rollout(networks[0], num_envs=num_envs, device=device)
     figures = {"parameter_difference": parameter_difference(networks, rollout_ET)}
     notes = {}
@@ -179,11 +187,12 @@ def why_not_captured(stock: StockUpdate, rollout_ET: TensorDict, *, device: torc
         return f"not captured: {str(error).splitlines()[0]}"
 
 
-def make_networks(device: torch.device) -> Networks:
+def make_networks(device: torch.device, *, hidden_dims: tuple[int, ...] = HIDDEN_DIMS) -> Networks:
     """Return actor and critic, the same for one seed."""
     torch.manual_seed(0)
-    actor = make_actor(ActorCfg(), obs_dim=OBS, action_dim=ACTIONS, device=device)
-    return actor, make_critic(CriticCfg(), obs_dim=OBS, device=device)
+    actor_cfg, critic_cfg = ActorCfg(hidden_dims=hidden_dims), CriticCfg(hidden_dims=hidden_dims)
+    actor = make_actor(actor_cfg, obs_dim=OBS, action_dim=ACTIONS, device=device)
+    return actor, make_critic(critic_cfg, obs_dim=OBS, device=device)
 
 
 def make_rollout(
