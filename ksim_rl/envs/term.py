@@ -108,11 +108,12 @@ class CommandTerm(Term):
     """A generator of commands with a per-env clock that resamples; None as its range draws at resets only."""
 
     resampling_time_range_s: NonNegativeRange | None
+    drawn: ClassVar[tuple[str, ...]] = ()  # the fields with the ranges
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
         """The ranges by field that `resample` draws from and that a curriculum may change: see `shared_ranges`."""
-        return {}
+        return {name: getattr(self, name) for name in self.drawn}
 
     def shared_ranges(self, view: EnvView) -> Float[Tensor, "2 N"]:
         """Return the present ranges, (low, high) [2, N] in the order of `ranges`; they start at those."""

@@ -89,14 +89,10 @@ class HeldCommand(CommandTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BaseHeightCommand(OfEntity, HeldCommand):
+class BaseHeightCommand(OfEntity, HeldCommand, drawn=("height",)):
     """A height of the root body's frame above the ground, m, [E, 1], drawn uniformly."""
 
     height: Range
-
-    @property
-    def ranges(self) -> Mapping[str, tuple[float, float]]:
-        return {"height": self.height}
 
     def held(self, view: EnvView) -> Float[Tensor, "E 1"]:
         return view.buffer("height_E1", 1)
@@ -112,15 +108,11 @@ class BaseHeightCommand(OfEntity, HeldCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointPositionCommand(HeldCommand):
+class JointPositionCommand(HeldCommand, drawn=("offset",)):
     """Positions of joints, rad or m, [E, N]: the default pose plus a uniform offset, kept inside the soft limits."""
 
     joints: Patterns
     offset: Range
-
-    @property
-    def ranges(self) -> Mapping[str, tuple[float, float]]:
-        return {"offset": self.offset}
 
     def held(self, view: EnvView) -> Float[Tensor, "E N"]:
         return view.buffer("pos_EN", len(view.joints(self.joints)))
@@ -210,11 +202,12 @@ def _axes(quat_4: Tensor) -> np.ndarray:
 
 
 _COMMANDED: Rgba = (0.2, 0.6, 0.2, 0.8)
+VELOCITY = ("lin_vel_x", "lin_vel_y", "ang_vel_z", "heading")
 _REACHED: Rgba = (0.2, 0.3, 0.8, 0.8)
 
 
 @dataclass(frozen=True, kw_only=True)
-class UniformVelocityCommand(OfEntity, CommandTerm):
+class UniformVelocityCommand(OfEntity, CommandTerm, drawn=VELOCITY):
     """A planar velocity (vx, vy, wz) in the root's frame, m/s and rad/s, [E, 3], drawn uniformly.
 
     Each resampling makes some envs special, independently of each other:
@@ -236,10 +229,6 @@ class UniformVelocityCommand(OfEntity, CommandTerm):
     rel_heading_envs: Share = 0.0
     rel_forward_envs: Share = 0.0
     forward_min_speed: NonNegative = 0.3
-
-    @property
-    def ranges(self) -> Mapping[str, Range]:
-        return {name: getattr(self, name) for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z", "heading")}
 
     def shared_ranges(self, view: EnvView) -> Float[Tensor, "2 7"]:
         """Return the present ranges, and after them three of [0, 1) for the kinds, (low, high) [2, 7]."""
@@ -288,7 +277,7 @@ class UniformVelocityCommand(OfEntity, CommandTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SinusoidalGaitCommand(CommandTerm):
+class SinusoidalGaitCommand(CommandTerm, drawn=("frequency",)):
     """sin and cos of each foot's phase angle: all sines, then all cosines, [E, 2F].
 
     The angle of foot f is 2 pi (the integral of the frequency since the start of the episode + offset_f); a foot whose
@@ -300,10 +289,6 @@ class SinusoidalGaitCommand(CommandTerm):
     frequency: NonNegativeRange
     offsets: Annotated[tuple[float, ...], Filled("give one per foot, such as (0.0, 0.5)")]
     resampling_time_range_s: NonNegativeRange | None = None
-
-    @property
-    def ranges(self) -> Mapping[str, tuple[float, float]]:
-        return {"frequency": self.frequency}
 
     def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         held_E3 = self._held(view)

@@ -25,6 +25,7 @@ from ksim_rl.mdp.fields import (
     contact_force,
     mechanical_power,
 )
+from ksim_rl.mdp.rewards.joints import change
 from ksim_rl.scene.names import Patterns
 
 
@@ -50,11 +51,7 @@ class ActionAcceleration(MetricTerm):
     """Mean over columns of |a_t - 2 a_{t-1} + a_{t-2}|; actions before an episode are 0."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        rate_EL = view.action_EL - view.last_action_EL
-        last_rate_EL = view.buffer("last_rate_EL", rate_EL.shape[-1])
-        acceleration_E = (rate_EL - last_rate_EL).abs().mean(-1)
-        last_rate_EL.copy_(rate_EL)
-        return acceleration_E
+        return change(view, "last_rate_EL", view.action_EL - view.last_action_EL).abs().mean(-1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -358,9 +358,4 @@ AMP = Task(
     training=training(num_iterations=400),
     other_trainings=(training(num_iterations=400, objective=AS_RECORDED),),
 )
-TRACK = Task(
-    name="walker_track",
-    description="a planar biped follows a walk",
-    cfg=walker_track,
-    training=training(num_iterations=400),
-)
+TRACK = _task(walker_track, "a planar biped follows a walk", 400)

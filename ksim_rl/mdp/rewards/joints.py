@@ -157,7 +157,7 @@ class ActionAccelerationL2(RewardTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         rate_EL = view.action_EL - view.last_action_EL
-        return _change(view, "last_rate_EL", rate_EL).square().sum(-1)
+        return change(view, "last_rate_EL", rate_EL).square().sum(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,11 +165,11 @@ class ActionJerkL2(RewardTerm):
     """|a_t - 3 a_{t-1} + 3 a_{t-2} - a_{t-3}|^2 of the policy's raw actions, [E]; actions before an episode are 0."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        acceleration_EL = _change(view, "last_rate_EL", view.action_EL - view.last_action_EL)
-        return _change(view, "last_acceleration_EL", acceleration_EL).square().sum(-1)
+        acceleration_EL = change(view, "last_rate_EL", view.action_EL - view.last_action_EL)
+        return change(view, "last_acceleration_EL", acceleration_EL).square().sum(-1)
 
 
-def _change(view: EnvView, name: str, value_EL: Tensor) -> Tensor:
+def change(view: EnvView, name: str, value_EL: Float[Tensor, "E L"]) -> Float[Tensor, "E L"]:
     """Return the change of a value since the last step, and remember the value."""
     last_EL = view.buffer(name, value_EL.shape[-1])
     change_EL = value_EL - last_EL
