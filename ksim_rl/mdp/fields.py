@@ -52,6 +52,13 @@ class OfSensor(Term):
 
 
 @dataclass(frozen=True, kw_only=True)
+class OfSites(Term):
+    """A term of sites, by names or regular expressions."""
+
+    sites: Patterns
+
+
+@dataclass(frozen=True, kw_only=True)
 class SiteAndBody(Term):
     """A term of where a site is and where a body's origin."""
 
@@ -71,10 +78,8 @@ class OfContacts(OfSensor):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfFeet(OfSensor):
+class OfFeet(OfSites, OfSensor):
     """A term of how feet (sites) move, and of a contact sensor with one geom or body per foot in the same order."""
-
-    sites: Patterns
 
     def contact(self, view: EnvView) -> ContactState:
         """Return the state of the contact sensor; one element alone would count for all feet, and is refused."""

@@ -22,11 +22,11 @@ from ksim_rl.mdp.fields import (
     OfFeet,
     OfJoints,
     OfSensor,
+    OfSites,
     contact_force,
     mechanical_power,
 )
 from ksim_rl.mdp.rewards.joints import change
-from ksim_rl.scene.names import Patterns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,10 +65,9 @@ class FootSlipSpeed(OfFeet, MetricTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PeakFootHeight(MetricTerm):
+class PeakFootHeight(OfSites, MetricTerm):
     """Height of the highest foot above the ground below it, m, [E]; by default its greatest value in the episode."""
 
-    sites: Patterns
     reduce: Literal["mean", "last", "max", "sum"] = "max"
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:

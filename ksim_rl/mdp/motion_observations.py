@@ -13,16 +13,15 @@ from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.registry import build
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.motion_tracking import OfMotion
 from ksim_rl.scene.motions.motion import load_motion
 from ksim_rl.scene.state.motion_clock import motion_start_time
 from ksim_rl.scene.terrains import PlaneTerrain
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlayMotion(EventTerm):
+class PlayMotion(OfMotion, EventTerm):
     """Put env e into the state that a motion has after e env steps."""
-
-    file: str
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         start_E = motion_start_time(view, self.file)

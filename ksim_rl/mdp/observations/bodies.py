@@ -15,7 +15,7 @@ from ksim_rl.checked import NonNegative
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.commands import OfTarget
-from ksim_rl.mdp.fields import FramedObservation, OfContacts, OfSensor, SiteAndBody, contact_force
+from ksim_rl.mdp.fields import FramedObservation, OfContacts, OfSensor, OfSites, SiteAndBody, contact_force
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
 
@@ -125,20 +125,16 @@ class ContactForce(OfSensor, FramedObservation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FootPos(FramedObservation):
+class FootPos(OfSites, FramedObservation):
     """Positions of sites, m, [E, 3F]; position stage."""
-
-    sites: Patterns
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return self.points(view, view.sites(self.sites).pos_EN3)
 
 
 @dataclass(frozen=True, kw_only=True)
-class FootHeight(ObservationTerm):
+class FootHeight(OfSites, ObservationTerm):
     """Heights of sites above the ground right below them, m, [E, F]; position stage."""
-
-    sites: Patterns
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.sites(self.sites).height_EN

@@ -13,8 +13,7 @@ from ksim_rl.checked import NonNegative, Positive
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.fields import OfContacts, OfFeet, OfSensor, RewardWhileCommanded, contact_force
-from ksim_rl.scene.names import Patterns
+from ksim_rl.mdp.fields import OfContacts, OfFeet, OfSensor, OfSites, RewardWhileCommanded, contact_force
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,10 +51,9 @@ class SelfCollision(OfContacts, RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FootClearance(RewardWhileCommanded):
+class FootClearance(OfSites, RewardWhileCommanded):
     """active * sum_f |height_f - target_height| * |v_xy,f|, m^2/s, [E]: above the ground, and in the world's axes."""
 
-    sites: Patterns
     target_height: float
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
