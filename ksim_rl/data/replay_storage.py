@@ -190,7 +190,7 @@ class ReplayStorage(SavedByStateDict, Storage):
 
     @torch.no_grad()
     def _empty(self) -> None:
-        content = () if self.content is None else self.content.values(True, True)
+        content: Any = () if self.content is None else self.content.values(True, True)
         for tensor in (self.available, self.head_E, self.filled_E, *content):
             tensor.zero_()
 
