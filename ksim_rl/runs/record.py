@@ -161,8 +161,8 @@ def _code(folder: Path, session: int) -> dict[str, dict[str, str]]:
                 (folder / kept).unlink(missing_ok=True)
                 (folder / kept).write_bytes(changes)
             found[name]["changed"] = kept if len(changes) <= MOST_DIFF_BYTES else "too much to keep"
-        if new := (_git(top, "ls-files", "--others", "--exclude-standard") or b"").decode(errors="replace"):
-            found[name]["not in git"] = ", ".join(new.splitlines()[:20])
+        if new := _git(top, "ls-files", "--others", "--exclude-standard", "--exclude=__pycache__"):
+            found[name]["not in git"] = ", ".join(new.decode(errors="replace").splitlines()[:20])
     return found
 
 
