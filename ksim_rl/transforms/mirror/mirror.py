@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float32, Int64, Num
+from jaxtyping import Float32, Int64, Shaped
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
@@ -48,7 +48,7 @@ class MirrorMap:
         """Number of columns."""
         return len(self.source)
 
-    def __call__(self, vector: Num[Tensor, "*batch L"]) -> Num[Tensor, "*batch L"]:
+    def __call__(self, vector: Shaped[Tensor, "*batch L"]) -> Shaped[Tensor, "*batch L"]:
         """Return the mirror image of vectors [..., L]."""
         return image(vector, *self.tensors(vector.device))
 
@@ -62,8 +62,8 @@ class MirrorMap:
 
 
 def image(
-    vector: Num[Tensor, "*batch L"], source_L: Int64[Tensor, " L"] | None, signs_L: Float32[Tensor, " L"]
-) -> Num[Tensor, "*batch L"]:
+    vector: Shaped[Tensor, "*batch L"], source_L: Int64[Tensor, " L"] | None, signs_L: Float32[Tensor, " L"]
+) -> Shaped[Tensor, "*batch L"]:
     """Return the mirror image of vectors [..., L]; a `source_L` of None leaves the columns in place."""
     columns = vector if source_L is None else vector.index_select(-1, source_L)
     return columns * signs_L.to(vector.dtype)
