@@ -1,4 +1,4 @@
-"""How much faster training is on several GPUs of a machine than on one.
+"""This benchmark compares training on several GPUs of a machine with training on one.
 
     python -m benchmarks.ranks
 

@@ -1,4 +1,4 @@
-"""What a policy earns on MuJoCo's C engine, as a share of what it earns in our physics, from the same starts.
+"""This benchmark compares a policy's return on MuJoCo's C engine with that in our physics, from the same starts.
 
     python -m benchmarks.sim2sim task=go1_velocity_flat policy=standing noise=false
     python -m benchmarks.sim2sim task=go1_velocity_flat policy=RUN

@@ -1,4 +1,4 @@
-"""What each registered task is and costs: `check_env`, sizes, env states/s beside raw physics, and host syncs.
+"""This benchmark checks and times each registered task: `check_env`, sizes, speed beside raw physics, host syncs.
 
     python -m benchmarks.tasks device=cuda num_envs=4096 [tasks=a,b] [shard=0/4] [check_device=cpu] [results=DIR]
 

@@ -1,4 +1,4 @@
-"""How fast training is, beside the physics that it cannot do without.
+"""This benchmark times training, beside the physics that it cannot do without.
 
     python -m benchmarks.throughput task=go1_velocity_flat num_envs=4096 device=cuda
 

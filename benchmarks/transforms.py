@@ -1,4 +1,4 @@
-"""What each transform costs, beside the nearest one of TorchRL's own, and the usual chain in a robot's control step.
+"""This benchmark times each transform beside the nearest one of TorchRL's own, and the usual chain in a control step.
 
     MENAGERIE_ROOT=... python -m benchmarks.transforms device=cuda num_envs=4096
 

@@ -1,4 +1,4 @@
-"""What a viewer on a running training costs: the speed of a run while a browser is connected, beside the same run.
+"""This benchmark compares the speed of a run while a browser is connected with that of the same run without one.
 
     python -m benchmarks.viewer task=go1_velocity_flat num_envs=4096 device=cuda
 
