@@ -5,22 +5,3 @@ from ksim_rl.data.dataset_storage import MASK_KEY, DatasetStorage, DatasetWriter
 from ksim_rl.data.epoch_sampler import BURN_IN_KEY, EpochSampler, SequenceSampler, sequence_length
 from ksim_rl.data.replay_ring import PrioritySampler, ReplayCfg, ReplayRing, ReplaySampler
 from ksim_rl.data.replay_storage import ReplayStorage, ReplayWriter
-
-__all__ = [
-    "BURN_IN_KEY",
-    "MASK_KEY",
-    "DatasetBuffer",
-    "DatasetCfg",
-    "DatasetStorage",
-    "DatasetWriter",
-    "EpochSampler",
-    "PrioritySampler",
-    "ReplayCfg",
-    "ReplayRing",
-    "ReplaySampler",
-    "ReplayStorage",
-    "ReplayWriter",
-    "SequenceSampler",
-    "rollout_length",
-    "sequence_length",
-]

@@ -1,7 +1,4 @@
 """The env, its terms, its transforms and its tasks."""
-# ruff: noqa: F401
-
-from types import ModuleType
 
 from ksim_rl.config.config_tree import from_tree, to_tree
 from ksim_rl.config.plugins import allow_package
@@ -36,9 +33,3 @@ from ksim_rl.scene.terrains import PlaneTerrain, TerrainGrid
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.transforms.transform_cfg import TransformCfg
-
-__all__ = sorted(
-    name
-    for name, value in globals().items()
-    if name[0] != "_" and value is not ModuleType and not isinstance(value, ModuleType)
-)  # pyright: ignore

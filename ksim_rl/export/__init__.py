@@ -1,5 +1,4 @@
 """This room takes a trained policy out of the library: into a folder that runs with numpy, onnxruntime and MuJoCo."""
-# ruff: noqa: F401
 
 from ksim_rl.export import describe_tasks
 from ksim_rl.export.describe import NotDescribedError, describe, op, quantity

@@ -2,7 +2,6 @@
 
 A term is public once it is imported here.
 """
-# ruff: noqa: F401
 
 from ksim_rl.mdp.actions import (
     ActuatorAction,

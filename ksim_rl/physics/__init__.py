@@ -9,17 +9,3 @@ from ksim_rl.physics.nan_guard.guard import NanGuardCfg, NanReport
 from ksim_rl.physics.overflow import OverflowReport
 from ksim_rl.physics.sim_cfg import SimCfg
 from ksim_rl.physics.world import World
-
-__all__ = [
-    "Captured",
-    "NanGuardCfg",
-    "NanReport",
-    "OverflowReport",
-    "SimCfg",
-    "World",
-    "capture",
-    "compile_notice",
-    "load_model",
-    "load_spec",
-    "prepare_spec",
-]

@@ -11,30 +11,3 @@ from ksim_rl.ranks.reduce import any_of, combined, gather, mean_, most_of, sum_
 from ksim_rl.ranks.shards import dealt, gathered
 from ksim_rl.ranks.start import by_first, check_same, device, from_first, joined, restarted, run_folder
 from ksim_rl.ranks.timing import Timing
-
-__all__ = [
-    "Timing",
-    "any_of",
-    "at",
-    "by_first",
-    "check_same",
-    "combined",
-    "dealt",
-    "device",
-    "exponential",
-    "first_row",
-    "from_first",
-    "gather",
-    "gathered",
-    "joined",
-    "mean_",
-    "most_of",
-    "rand",
-    "randint",
-    "randn",
-    "rank",
-    "restarted",
-    "run_folder",
-    "size",
-    "sum_",
-]

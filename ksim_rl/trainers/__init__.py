@@ -1,5 +1,4 @@
 """This room holds the training loop and what surrounds it: evaluation, checkpoints, logs, progress, pictures."""
-# ruff: noqa: F401
 
 import importlib
 from typing import Any

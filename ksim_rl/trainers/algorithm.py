@@ -76,6 +76,20 @@ class HasNotes(Protocol):
     def notes(self) -> Sequence[str]: ...  # noqa: D102
 
 
+@runtime_checkable
+class HasWarmUp(Protocol):
+    """An update that can compile and capture its work before the first env step, on a made-up rollout `["E","T"]`."""
+
+    def warm_up(self, rollout_ET: TensorDictBase) -> None: ...  # noqa: D102
+
+
+def notes_of(update: Update, *, warm_up: bool) -> list[str]:
+    """Return what is to be said of an update at the start of a run, one line each."""
+    lacks = f"trainer.warm_up=true does nothing here: {type(update).__name__} has no warm_up(rollout_ET)"
+    own = update.notes if isinstance(update, HasNotes) else ()
+    return [*own, lacks] if warm_up and not isinstance(update, HasWarmUp) else [*own]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Algorithm:
     """How the parts of an algorithm are made for a run and its env, and which data and networks suit it.

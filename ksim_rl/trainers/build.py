@@ -14,7 +14,7 @@ from ksim_rl import envs, ranks
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.modules import RecurrentStatePrimer, recurrent_transforms, state_spec
-from ksim_rl.trainers.algorithm import make_update
+from ksim_rl.trainers.algorithm import HasWarmUp, make_update
 from ksim_rl.trainers.checkpoint import Checkpoint
 from ksim_rl.trainers.evaluation import Evaluator
 from ksim_rl.trainers.loggers import check_installed, make_loggers
@@ -69,10 +69,10 @@ def build(
         folder=run_folder / "checkpoint" if run_folder else None,
         config=cfg.to_tree(),
     )
-    if cfg.trainer.warm_up and (warm_up := getattr(update, "warm_up", None)) is not None:
+    if cfg.trainer.warm_up and isinstance(update, HasWarmUp):
         # Before anything is loaded: a replay need not be kept apart meanwhile.
         began = time.monotonic()
-        warm_up(collector.made_up_rollout())
+        update.warm_up(collector.made_up_rollout())
         trainer.warm_up_s = time.monotonic() - began
     if resume_from is not None:
         trainer.load_state_dict(resume_from.state)

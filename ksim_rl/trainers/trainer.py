@@ -15,7 +15,7 @@ from ksim_rl.diagnosis.iteration_warnings import warnings_of
 from ksim_rl.diagnosis.probes import probed
 from ksim_rl.envs.contract import EpisodeClock, EpisodeSums, missing_parts, part
 from ksim_rl.trainers import checkpoint
-from ksim_rl.trainers.algorithm import HasNotes, Update
+from ksim_rl.trainers.algorithm import Update, notes_of
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
 from ksim_rl.trainers.interrupt import InterruptRequest
 from ksim_rl.trainers.loggers import MetricLogger
@@ -214,7 +214,7 @@ class Trainer:
         """
         self.progress = progress or self.progress
         with self.interrupt, self.progress:
-            notes = self.update.notes if isinstance(self.update, HasNotes) else ()
+            notes = notes_of(self.update, warm_up=self.cfg.warm_up)
             for text in (*missing_parts(self.collector.env), *notes):
                 self.progress.note(text)
             if self.warm_up_s:

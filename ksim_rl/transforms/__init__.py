@@ -2,7 +2,6 @@
 
 A transform is public once it is imported here.
 """
-# ruff: noqa: F401
 
 from types import ModuleType
 

@@ -2,6 +2,5 @@
 
 `Session` steps an env at the pace of the clock and takes requests; a display (`browser`, `native`) shows it.
 """
-# ruff: noqa: F401
 
 from ksim_rl.viewer.session import Conditions, Session

@@ -1,5 +1,4 @@
 """This room keeps trained policies that come with the package, and fetches those that lie elsewhere."""
-# ruff: noqa: F401
 
 from ksim_rl.zoo.cards import Card, cards, read_card
 from ksim_rl.zoo.sources import locate

@@ -110,9 +110,13 @@ def ksim_rl(site, *arguments):
 
 
 def test_an_algorithm_from_another_package_trains(site, tmp_path):
-    done = ksim_rl(site, "train", "objective=mine", *SMALL, f"hydra.run.dir={tmp_path / 'run'}")
+    words = (*SMALL, "trainer.warm_up=true", f"hydra.run.dir={tmp_path / 'run'}")
+    done = ksim_rl(site, "train", "objective=mine", *words)
     assert done.returncode in (0, 1), done.stderr
     assert "2 iterations" in done.stdout
+    assert (
+        done.stdout.count("MineUpdate has no warm_up(rollout_ET)") == 1
+    )  # an option that does nothing says so
 
 
 @pytest.mark.full

@@ -3,7 +3,6 @@
 A robot lists entries in its `actuators`, puts them into its model by `set_actuators(spec, self.actuators)`, and each
 entry says by name or pattern which joints it drives.
 """
-# ruff: noqa: F401
 
 from ksim_rl.scene.actuators.actuator import Actuator
 from ksim_rl.scene.actuators.builtin import (

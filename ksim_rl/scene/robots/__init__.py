@@ -1,5 +1,4 @@
 """The robots that come with this package, and how MJCF files of others are edited."""
-# ruff: noqa: F401
 
 from ksim_rl.scene.robots import edit
 from ksim_rl.scene.robots.analysis import JointAnalysis, RobotAnalysis, analyse

@@ -1,5 +1,4 @@
 """This package has the sensors of a scene, one file each; terms read them by name through the view."""
-# ruff: noqa: F401
 
 from ksim_rl.scene.sensors.camera import CameraSensor, CameraTracker
 from ksim_rl.scene.sensors.contact import ContactSensor, ContactState, ContactTracker

@@ -1,5 +1,4 @@
 """The DeepMind Control Suite on dm_control's own models, as dm_control and as MuJoCo Playground have it."""
-# ruff: noqa: F401
 
 from ksim_rl.suites.dm_control.models import DmControlModel
 from ksim_rl.suites.dm_control.quantities import (
