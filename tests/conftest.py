@@ -38,6 +38,14 @@ def _fresh_torch():
     torch.compiler.reset()
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _small_heap():
+    """Leave what a file's tests keep for good, such as compiled code, out of the garbage collections of later files."""
+    yield
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_collection_modifyitems(items):
     """Skip tests that need a GPU where there is none."""
     if torch.cuda.is_available():
