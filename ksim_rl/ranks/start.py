@@ -64,7 +64,7 @@ def joined(command: str) -> Iterator[None]:
     same = {"ksim_rl": _version(), "torch": torch.__version__, "Python": platform.python_version()}
     try:
         check_same(same, what="version")
-        _check_gpus(backend)
+        check_gpus(backend)
         with heart:
             yield
             heart.done()
@@ -167,7 +167,7 @@ def _backend() -> str:
     return "cpu:gloo,cuda:nccl"
 
 
-def _check_gpus(backend: str) -> None:
+def check_gpus(backend: str) -> None:
     """Refuse two ranks on one GPU, which NCCL answers with an error that names neither."""
     if backend == "gloo":
         return

@@ -58,7 +58,7 @@ def trained(overrides, num_envs, minibatch, shards):
     trainer.train()
     learnt, _ = state_tree.split(trainer.update.state_dict())
     envs, _ = state_tree.split(trainer.collector.state_dict())
-    return learnt, envs, trainer.metrics
+    return learnt, envs
 
 
 def largest_difference(learnt, parts):
@@ -76,17 +76,21 @@ def largest_difference(learnt, parts):
     return worst
 
 
-def check(name, size, folder):
+def compared(name, size, folder):
+    """Train on ranks and in one process; return how many tensors were compared, and their largest difference."""
     overrides = ALGORITHMS[name]
-    learnt, envs, metrics = trained(overrides, 4 * size, 16 * size, size)
+    learnt, envs = trained(overrides, 4 * size, 16 * size, size)
     parts = results(trained, overrides, 4, 16, 1, size=size, folder=folder)
-    worst = largest_difference(learnt, [part[0] for part in parts])
-    print(f"{name}, {size} ranks: {len(learnt)} tensors, largest difference {worst:.2g}")
-    assert worst <= 1e-6
     for key, expected in envs.items():
         found = torch.cat([part[1][key] for part in parts])
         torch.testing.assert_close(found, expected, rtol=0.0, atol=1e-4)
-    return metrics, [part[2] for part in parts]
+    return len(learnt), largest_difference(learnt, [part[0] for part in parts])
+
+
+def check(name, size, folder):
+    tensors, worst = compared(name, size, folder)
+    print(f"{name}, {size} ranks: {tensors} tensors, largest difference {worst:.2g}")
+    assert worst <= 1e-6
 
 
 def test_two_ranks_learn_ppo_as_one_process_does(tmp_path):

@@ -32,16 +32,25 @@ def learnt(name, num_envs, shards):
     return state_tree.split(trainer.update.state_dict())[0]
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_two_ranks_learn_what_one_process_learns(name, tmp_path):
-    whole = learnt(name, 32, 2)
-    parts = results(learnt, name, 16, 1, size=2, folder=tmp_path)
-    worst = largest_difference(whole, parts)
-    print(f"{name}, 2 ranks: {len(whole)} tensors, largest difference {worst:.2g}")
-    assert worst <= 1e-6
+def compared(name, size, folder):
+    """Train on ranks and in one process; return how many tensors were compared, and their largest difference."""
+    whole = learnt(name, 16 * size, size)
+    parts = results(learnt, name, 16, 1, size=size, folder=folder)
     if name == "amp":
         count = "/discriminator/normalizer.count"
         assert sum(part[count] for part in parts) == whole[count], "each counts its share of the motions"
+    return len(whole), largest_difference(whole, parts)
+
+
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [(name, 2) for name in ALGORITHMS]
+    + [pytest.param(name, 4, marks=pytest.mark.full) for name in ALGORITHMS],
+)
+def test_ranks_learn_what_one_process_learns(name, size, tmp_path):
+    tensors, worst = compared(name, size, tmp_path)
+    print(f"{name}, {size} ranks: {tensors} tensors, largest difference {worst:.2g}")
+    assert worst <= 1e-6
 
 
 def test_shards_of_another_size_are_refused():

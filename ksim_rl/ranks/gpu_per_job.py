@@ -1,0 +1,46 @@
+"""A run has a GPU to itself here, among those that a launcher starts side by side: `ksim-rl train --multirun`."""
+
+import fcntl
+import itertools
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+_taken: list[int] = []  # open, and so locked, until the process ends
+
+
+class GpuPerJob(Callback):
+    """Gives each process that runs jobs of a multirun a GPU of its own; Hydra calls it before each job."""
+
+    def on_job_start(self, config: DictConfig, **_: Any) -> None:
+        """Take a GPU, unless the config names one."""
+        if config.hydra.mode == RunMode.MULTIRUN and config.get("device") in ("auto", "cuda"):
+            take_gpu(Path(config.hydra.sweep.dir))
+
+
+def take_gpu(sweep: Path) -> None:
+    """Let this process see one GPU only, which no other job of the sweep has, until the process ends.
+
+    A process takes the first slot of the sweep's folder that is free; slot s has GPU s modulo their number, so that
+    more jobs than GPUs share them equally. Nothing happens with less than two GPUs, or once CUDA is in use.
+    """
+    count = torch.cuda.device_count()
+    if _taken or count < 2 or torch.cuda.is_initialized():
+        return
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(count)))
+    sweep.mkdir(parents=True, exist_ok=True)
+    for slot in itertools.count():
+        file = os.open(sweep / f".gpu-{slot}", os.O_CREAT | os.O_RDWR)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(file)
+            continue
+        _taken.append(file)
+        os.environ["CUDA_VISIBLE_DEVICES"] = visible.split(",")[slot % count]
+        return
