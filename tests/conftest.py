@@ -1,6 +1,8 @@
 """Enforces shape annotations while the tests run, and keeps runs small and repeatable."""
 
+import functools
 import gc
+import importlib.metadata
 import os
 from pathlib import Path
 
@@ -22,6 +24,9 @@ _MENAGERIE = Path(__file__).parents[2] / "shared" / "menagerie"
 if _MENAGERIE.is_dir():
     os.environ.setdefault("MENAGERIE_ROOT", str(_MENAGERIE))
 
+
+# MuJoCo Warp reads a version from its file six times for each env, a seventh of the time that a small one takes.
+importlib.metadata.version = functools.cache(importlib.metadata.version)
 
 # Before any test imports the package.
 shapes.install()

@@ -1,5 +1,6 @@
 """This module finds the tasks by name, for Python and for the Hydra config group `task`, and builds their envs."""
 
+import dataclasses
 import importlib
 import pkgutil
 from collections.abc import Iterator, Sequence
@@ -89,6 +90,8 @@ def make_cfg(name: str, overrides: Sequence[str] = ()) -> ManagerBasedRlEnvCfg:
     A ValueError names the task or field that does not exist, or the value that is not valid, before any model is
     compiled.
     """
+    if not overrides:
+        return task(name).cfg()
     check_overrides({"task": _tree(name)}, overrides)
     register_configs()
     with initialize(version_base="1.3", config_path=None):
@@ -139,5 +142,7 @@ def make(
     `seed` is of all draws; None keeps the task's own, and if that is None too, draws one. `overrides` are Hydra's, of
     the task's config. A ValueError names the task, field or value that is wrong and what would be valid.
     """
-    given = [f"task.scene.num_envs={num_envs}"] + ([] if seed is None else [f"task.seed={seed}"])
-    return build(make_cfg(name, [*overrides, *given]), device=device, render_mode=render_mode)
+    cfg = make_cfg(name, overrides)
+    scene = dataclasses.replace(cfg.scene, num_envs=num_envs)
+    cfg = dataclasses.replace(cfg, scene=scene, seed=cfg.seed if seed is None else seed)
+    return build(cfg, device=device, render_mode=render_mode)

@@ -20,7 +20,9 @@ EPISODE_STEPS = 6  # short, so that each rollout holds several resets
 TASKS = (
     "cartpole_balance",
     pytest.param("go1_velocity_flat", marks=pytest.mark.full),
-    "go1_velocity_rough",
+    pytest.param(
+        "go1_velocity_rough", marks=pytest.mark.full
+    ),  # tests/scene/terrains has an env on rough ground
     "quadruped_velocity_flat",
     pytest.param("arm_push", marks=pytest.mark.full),
 )

@@ -117,7 +117,7 @@ def test_no_host_sync(name):
     [
         pytest.param("tanh_gaussian", marks=pytest.mark.full),
         pytest.param("truncated_gaussian", marks=pytest.mark.full),
-        "several one_hot",
+        pytest.param("several one_hot", marks=pytest.mark.full),
         "mixed",
     ],
 )

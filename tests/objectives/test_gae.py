@@ -190,7 +190,7 @@ def test_keys_can_be_renamed():
     torch.testing.assert_close(gae(data)["gain"], expected)
 
 
-@pytest.mark.parametrize("normalize", [False, True])
+@pytest.mark.parametrize("normalize", [pytest.param(False, marks=pytest.mark.full), True])
 def test_no_host_sync_and_no_compiler_break(normalize):
     actor, critic = networks()
     data = rollout(actor)

@@ -208,7 +208,7 @@ def test_keys_can_be_renamed():
     assert "error" in renamed.keys() and ("next", "gain") in loss.in_keys
 
 
-@pytest.mark.parametrize("num_atoms", [1, 11])
+@pytest.mark.parametrize("num_atoms", [pytest.param(1, marks=pytest.mark.full), 11])
 def test_the_compiler_follows_the_losses_in_one_graph(num_atoms):
     actor, critic = networks(num_atoms)
     loss = SACLoss(actor, critic, target_entropy=-3.0, support_A=critic.module.support)
