@@ -2,7 +2,7 @@
 
 Bounds stand in the annotation: `stiffness: Positive`, `share: Share = 0.5`, `x: Annotated[float, Within(high=3.0)]`.
 Only what relates several fields to each other needs code: a method `_check_fields`. Constants of a class, which its
-bases declare, may stand in its statement: `class Cartpole(ShippedModel, name="cartpole")`.
+bases declare, and other defaults for their fields may stand in its statement: `class Jump(EventTerm, mode="interval")`.
 """
 
 import inspect
@@ -65,12 +65,17 @@ class Checked:
         ValueError: naming the field, the value and what would be valid.
     """
 
-    def __init_subclass__(cls, **constants: Any) -> None:
-        """Take the constants of the class's statement, each declared by a base."""
+    def __init_subclass__(cls, **given: Any) -> None:
+        """Take the constants and defaults of the class's statement, each declared by a base."""
         super().__init_subclass__()
-        for name, value in constants.items():
-            if not any(name in inspect.get_annotations(base) for base in cls.__mro__):
+        declared: dict[str, Any] = {}
+        for base in reversed(cls.__mro__):
+            declared |= inspect.get_annotations(base)
+        for name, value in given.items():
+            if name not in declared:
                 raise TypeError(f"class {cls.__name__}: no base of it declares {name!r}")
+            # Declared anew, so that `dataclass` takes the value as the field's default.
+            cls.__annotations__[name] = declared[name]
             setattr(cls, name, value)
 
     def __post_init__(self) -> None:

@@ -34,7 +34,8 @@ def noise(cfg: NoiseCfg | None, size: int) -> Plain | None:
     if cfg is None:
         return None
     offset, spread = cfg.affine(size)
-    found = {"draw": cfg.draw.value, "offset": offset, "spread": spread, "operation": cfg.operation}
+    draw = "gaussian" if cfg.is_gaussian else "uniform" if any(spread) else "none"
+    found = {"draw": draw, "offset": offset, "spread": spread, "operation": cfg.operation}
     walk, grain = (per_dim(name, getattr(cfg, name), size) for name in ("walk_std", "resolution"))
     errors = {"walk_std": walk, "resolution": grain, "dropout": cfg.dropout, "lost": cfg.lost}
     return {**found, "bias": noise(cfg.bias, size), **errors}

@@ -138,11 +138,10 @@ class ResetHeight(OfFreeRoot, EventTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PushByVelocity(OfFreeRoot, EventTerm):
+class PushByVelocity(OfFreeRoot, EventTerm, mode="interval"):
     """Kick the free root body: add a uniform draw to its velocity (m/s and rad/s, world frame), whatever its mass."""
 
     velocity_range: Ranges
-    mode: Literal["startup", "reset", "interval", "step"] = "interval"
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         body = self.root_of(view)
@@ -152,7 +151,7 @@ class PushByVelocity(OfFreeRoot, EventTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PushByForce(EventTerm):
+class PushByForce(EventTerm, mode="interval"):
     """Press on a body for a while with a constant wrench at its centre of mass; both are drawn when the interval ends.
 
     A push that is due while another lasts replaces it. Several of these events on one body add up. `wrench_range` is by
@@ -162,7 +161,6 @@ class PushByForce(EventTerm):
     body: str
     wrench_range: Ranges
     duration_s: NonNegativeRange
-    mode: Literal["startup", "reset", "interval", "step"] = "interval"
 
     def _check_fields(self) -> None:
         if self.mode != "interval":
@@ -183,11 +181,10 @@ class PushByForce(EventTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Jump(OfFreeRoot, EventTerm):
+class Jump(OfFreeRoot, EventTerm, mode="interval"):
     """Throw the free root body up: add the velocity sqrt(2 g h) that carries it a drawn height h (m) in free flight."""
 
     height_range: NonNegativeRange
-    mode: Literal["startup", "reset", "interval", "step"] = "interval"
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         body = self.root_of(view)

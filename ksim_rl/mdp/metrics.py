@@ -4,7 +4,7 @@ Poses and velocities are of the current state, contacts and forces of the last p
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -65,20 +65,16 @@ class FootSlipSpeed(OfFeet, MetricTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PeakFootHeight(OfSites, MetricTerm):
+class PeakFootHeight(OfSites, MetricTerm, reduce="max"):
     """Height of the highest foot above the ground below it, m, [E]; by default its greatest value in the episode."""
-
-    reduce: Literal["mean", "last", "max", "sum"] = "max"
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return view.sites(self.sites).height_EN.amax(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class PeakContactForce(OfSensor, MetricTerm):
+class PeakContactForce(OfSensor, MetricTerm, reduce="max"):
     """Greatest net contact force, N, [E], sampled at each env step's last substep; by default its peak so far."""
-
-    reduce: Literal["mean", "last", "max", "sum"] = "max"
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return contact_force(view, self.sensor).amax(-1)
@@ -93,7 +89,7 @@ class Power(OfJoints, MetricTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CostOfTransport(OfJoints, OfEntity, MetricTerm):
+class CostOfTransport(OfJoints, OfEntity, MetricTerm, reduce="last"):
     """Energy / (weight * distance) since the start of the episode, no unit; it needs gravity.
 
     Energy is the integral of `Power`; distance is the length of the root's path over the ground; the weight is that of
@@ -102,7 +98,6 @@ class CostOfTransport(OfJoints, OfEntity, MetricTerm):
     """
 
     min_distance: Positive = 0.1
-    reduce: Literal["mean", "last", "max", "sum"] = "last"
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         robot, model = view.entity(self.entity), view.world.mj_model
@@ -116,14 +111,13 @@ class CostOfTransport(OfJoints, OfEntity, MetricTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Success(MetricTerm):
+class Success(MetricTerm, reduce="last"):
     """1 where the episode ends by one of the named `terminations` of the env and by no other, else 0, [E].
 
     With the time-out it is the share of episodes that survived. Envs that are not made of terms have `SuccessTracker`.
     """
 
     terminations: Annotated[tuple[str, ...], Filled("name at least one, such as ('time_out',)")]
-    reduce: Literal["mean", "last", "max", "sum"] = "last"
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         for name in self.terminations:
@@ -138,7 +132,7 @@ class Success(MetricTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TargetReached(OfTarget, MetricTerm):
+class TargetReached(OfTarget, MetricTerm, reduce="last"):
     """1 while a body or site is within `tolerance` (m) of the position that a `CartesianCommand` asks for, else 0.
 
     Position stage, with the command that the policy saw. `reduce="last"` (the default) asks whether it is there in the
@@ -146,7 +140,6 @@ class TargetReached(OfTarget, MetricTerm):
     """
 
     tolerance: Positive
-    reduce: Literal["mean", "last", "max", "sum"] = "last"
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return (self.distance(view) <= self.tolerance).to(torch.float32)

@@ -22,10 +22,8 @@ from ksim_rl.mdp.fields import (
 
 
 @dataclass(frozen=True, kw_only=True)
-class TimeOut(TerminationTerm):
+class TimeOut(TerminationTerm, time_out=True):
     """The episode has lasted `episode_length_s`: a truncation, not a failure."""
-
-    time_out: bool = True
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         return view.episode_step_E + view.time_out_offset_E >= view.max_episode_length
@@ -63,13 +61,12 @@ class FarFromOrigin(OfEntity, TerminationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OutsideTerrain(OfEntity, TerminationTerm):
+class OutsideTerrain(OfEntity, TerminationTerm, time_out=True):
     """The root is beyond the edge of its env's ground, if it has one, or closer to it than a margin (m): a truncation.
 
     Robots whose feet must not step over the edge need a margin of about their own reach.
     """
 
-    time_out: bool = True
     margin: NonNegative = 0.5
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:

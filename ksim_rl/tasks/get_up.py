@@ -8,7 +8,6 @@ something only as far as the robot is up. Falling over ends nothing.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -68,14 +67,13 @@ class Standing(RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stands(MetricTerm):
+class Stands(MetricTerm, reduce="last"):
     """1 where the root is at 85 % of the standing height at least and tilted by at most 0.35 rad, else 0, [E].
 
     `reduce="last"` (the default) asks whether it stands in the end.
     """
 
     standing_height: float
-    reduce: Literal["mean", "last", "max", "sum"] = "last"
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         is_high_E = root_height(view) > 0.85 * self.standing_height

@@ -43,8 +43,8 @@ class CheckedKeys(Transform):
         is_paired: bool = True,
     ) -> None:
         keys, keys_inv = as_keys(in_keys or []), as_keys(in_keys_inv or [])
-        out = _checked_out_keys(keys, out_keys, is_paired)
-        super().__init__(keys, out, keys_inv, _checked_out_keys(keys_inv, out_keys_inv, is_paired))
+        out = checked_out_keys(keys, out_keys, is_paired)
+        super().__init__(keys, out, keys_inv, checked_out_keys(keys_inv, out_keys_inv, is_paired))
 
     def set_container(self, container: Transform | EnvBase) -> None:
         super().set_container(container)
@@ -370,7 +370,10 @@ def as_keys(keys: Keys) -> list[NestedKey]:
     return [key[0] if isinstance(key, tuple) and len(key) == 1 else key for key in listed]
 
 
-def _checked_out_keys(in_keys: list[NestedKey], out_keys: Keys | None, is_paired: bool) -> list[NestedKey]:
+def checked_out_keys(
+    in_keys: Sequence[NestedKey], out_keys: Keys | None, is_paired: bool = True
+) -> list[NestedKey]:
+    """Return out keys, by default the in keys; a ValueError where their number differs (if paired) or one repeats."""
     out = list(in_keys) if out_keys is None else as_keys(out_keys)
     if is_paired and len(out) != len(in_keys):
         raise ValueError(f"out_keys={out} has {len(out)} keys for the {len(in_keys)} of in_keys={in_keys}")

@@ -13,7 +13,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from ksim_rl import checks
 from ksim_rl.transforms import upstream
 from ksim_rl.transforms.innermost import EpisodeLimit, innermost
-from ksim_rl.transforms.row_transform import Keys, RowTransform, as_keys
+from ksim_rl.transforms.row_transform import Keys, RowTransform, as_keys, checked_out_keys
 from ksim_rl.transforms.specs import leaf_spec, set_leaf_spec
 from ksim_rl.transforms.tally import tally
 
@@ -73,15 +73,8 @@ class EpisodeTracker(_Tracker):
         length_key: NestedKey | None = "episode_length",
     ) -> None:
         in_keys, returns = as_keys(in_keys), as_keys(out_keys)
-        if len(in_keys) != len(returns):
-            raise ValueError(
-                f"out_keys={returns} has {len(returns)} keys for the {len(in_keys)} of in_keys={in_keys}"
-            )
+        checked_out_keys(in_keys, returns)
         lengths: list[NestedKey] = [] if length_key is None else [length_key]
-        if len(set(returns + lengths)) != len(returns + lengths):
-            raise ValueError(
-                f"out_keys={returns} and length_key={length_key!r} repeat a key: each needs its own place"
-            )
         super().__init__(in_keys, returns + lengths, is_paired=False)
         self._register_rows("step_E", *self._per_key("return"))
         self.length_key = length_key

@@ -5,7 +5,6 @@ elements; poses and velocities are of the current state.
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -115,10 +114,8 @@ class Contact(OfContacts, ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ContactForce(OfSensor, FramedObservation):
+class ContactForce(OfSensor, FramedObservation, frame="world"):
     """Net contact forces, N, [E, 3N]; acceleration stage. MuJoCo's sign: what weighs on the ground reads negative z."""
-
-    frame: Literal["root", "world"] = "world"
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return self.vectors(view, view.contact(self.sensor).force_EN3)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant, index_constant
-from ksim_rl.mdp.randomization.randomize import Operation, Pair, Randomize, RandomizeModelField, write_entries
+from ksim_rl.mdp.randomization.randomize import Pair, Randomize, RandomizeModelField, write_entries
 from ksim_rl.physics.principal_axes import principal_axes
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
@@ -29,11 +29,10 @@ class RandomizeBodyField(RandomizeModelField):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeBodyMass(RandomizeBodyField, field="body_mass", lowest=_LEAST_MASS):
+class RandomizeBodyMass(RandomizeBodyField, field="body_mass", lowest=_LEAST_MASS, operation="scale"):
     """Mass of bodies, kg, at constant shape: the inertia about the centre of mass grows in proportion."""
 
     per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_inertia")
-    operation: Operation = "scale"
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         super().__call__(view, mask_E)
@@ -159,10 +158,8 @@ def _upper_triangle(diagonal: Tensor, shear: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGravity(RandomizeModelField, field="gravity", columns=3):
+class RandomizeGravity(RandomizeModelField, field="gravity", columns=3, operation="add"):
     """Gravity of each world, m/s^2, by axis x, y, z. Projected gravity, a direction, stays that of the -z axis."""
-
-    operation: Operation = "add"
 
     def ids(self, view: EnvView) -> tuple[int, ...]:
         return (0,)

@@ -14,7 +14,6 @@ from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant, constant, index_constant
 from ksim_rl.mdp.fields import OfJoints
 from ksim_rl.mdp.randomization.randomize import (
-    Operation,
     Pair,
     Randomize,
     RandomizeModelField,
@@ -58,10 +57,8 @@ class RandomizeJointStiffness(RandomizeJointField, field="jnt_stiffness"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointRange(RandomizeJointField, field="jnt_range", columns=2):
+class RandomizeJointRange(RandomizeJointField, field="jnt_range", columns=2, operation="add"):
     """Limits of joints that have any, rad or m; columns: 0 lower, 1 upper. Soft limits stay those of the model."""
-
-    operation: Operation = "add"
 
     def _check_reach(self, view: EnvView, nominal: np.ndarray, pairs: Mapping[int, Pair]) -> None:
         lower = self.reach(nominal[:, 0], pairs[0])[1] if 0 in pairs else nominal[:, 0]
@@ -78,10 +75,8 @@ class RandomizeJointRange(RandomizeJointField, field="jnt_range", columns=2):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointZero(RandomizeJointField, field="qpos0", lowest=None):
+class RandomizeJointZero(RandomizeJointField, field="qpos0", lowest=None, operation="add"):
     """Where joints read zero (MuJoCo's `qpos0`), rad or m, by errors of assembly; bodies move by minus the change."""
-
-    operation: Operation = "add"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,14 +107,12 @@ class RandomizeTendonArmature(RandomizeTendonField, field="tendon_armature"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeDefaultJointPos(OfJoints, RandomizeNumber):
+class RandomizeDefaultJointPos(OfJoints, RandomizeNumber, operation="add"):
     """The default pose, rad or m: what resets, position actions and relative joint positions start from.
 
     The model's own value is that of its first keyframe or, without one, `qpos0`. In mode "reset" let it run before the
     event that resets the joints.
     """
-
-    operation: Operation = "add"
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         joints, model = view.joints(self.joints).index, view.world.mj_model
@@ -149,10 +142,8 @@ _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPA
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeActuator(OfJoints, Randomize):
+class RandomizeActuator(OfJoints, Randomize, operation="scale"):
     """What the events of this file share; `joints` are those that are driven."""
-
-    operation: Operation = "scale"
 
     def _draw_explicit(
         self, view: EnvView, mask_E: Tensor, name: str, pair: Pair, finite: bool = False

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from ksim_rl.mdp.randomization.randomize import Operation, RandomizeModelField
+from ksim_rl.mdp.randomization.randomize import RandomizeModelField
 from ksim_rl.scene.names import Patterns
 
 
@@ -15,11 +15,10 @@ class RandomizeCameraFieldOfView(RandomizeModelField, field="cam_fovy", lowest=1
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeCameraIntrinsic(RandomizeModelField, field="cam_intrinsic", columns=4):
+class RandomizeCameraIntrinsic(RandomizeModelField, field="cam_intrinsic", columns=4, operation="scale"):
     """Lenses of the model's cameras, m; columns: focal lengths x and y, principal point x and y."""
 
     cameras: Patterns
-    operation: Operation = "scale"
 
 
 @dataclass(frozen=True, kw_only=True)

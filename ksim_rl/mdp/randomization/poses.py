@@ -12,7 +12,6 @@ from torch import Tensor
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant
 from ksim_rl.mdp.randomization.randomize import (
-    Operation,
     Pair,
     RandomizeField,
     RandomizeModelField,
@@ -25,10 +24,8 @@ Angle = Literal["roll", "pitch", "yaw"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizePos(RandomizeModelField, columns=3):
+class RandomizePos(RandomizeModelField, columns=3, operation="add"):
     """Position of elements in the frame of their body, m; columns x, y, z."""
-
-    operation: Operation = "add"
 
 
 @dataclass(frozen=True, kw_only=True)

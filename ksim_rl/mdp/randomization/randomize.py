@@ -20,7 +20,6 @@ from ksim_rl.mdp.constants import array_constant, constant, index_constant
 from ksim_rl.scene.names import Patterns
 
 Pair = tuple[float, float]
-Mode = Literal["startup", "reset", "interval", "step"]
 Operation = Literal["abs", "add", "scale"]
 Distribution = Literal["uniform", "log_uniform", "gaussian"]
 # Where a gaussian draw is cut, in standard deviations, so that its reach can be checked.
@@ -29,7 +28,7 @@ _KINDS = {"cam": "camera", "mat": "material", **dict.fromkeys(("jnt", "dof", "qp
 
 
 @dataclass(frozen=True, kw_only=True)
-class Randomize(EventTerm):
+class Randomize(EventTerm, mode="startup"):
     """Draw values per world: once at startup, for the rows that reset, or at intervals.
 
     Attributes:
@@ -42,7 +41,6 @@ class Randomize(EventTerm):
     operation: Operation = "abs"
     distribution: Distribution = "uniform"
     shared: bool = False
-    mode: Mode = "startup"
 
     def check_range(self, name: str, pair: object) -> None:
         """Raise a ValueError for a range that the distribution cannot draw from."""

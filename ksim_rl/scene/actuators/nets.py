@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -16,6 +16,7 @@ from safetensors.torch import load
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ksim_rl.checked import Filled, WholeNumber, check_value
 from ksim_rl.checks import check_choice, check_in_range, near
 from ksim_rl.config.plain_data import MOST_DATA_BYTES, read_bytes
 from ksim_rl.scene.actuators.actuator import Drive, ExplicitActuator, Law, SubstepRing
@@ -25,6 +26,7 @@ ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "softsign": nn.Softsign, "tanh": 
 _SCALES = ("position_scale", "velocity_scale", "effort_scale")
 _LSTM_PARTS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 
+Lags = Annotated[tuple[WholeNumber, ...], Filled("expected whole numbers of substeps of at least 0")]
 Predictor = Callable[[Float[Tensor, "E N"], Float[Tensor, "E N"]], Float[Tensor, "E N"]]
 """A network at work: efforts [E, N] from position errors [E, N] and velocities [E, N]."""
 
@@ -145,11 +147,7 @@ class MLPActuator(NetActuator):
     """
 
     activation: Literal["elu", "relu", "softsign", "tanh"] | None = None
-    input_lags: tuple[int, ...] | None = None
-
-    def _check_fields(self) -> None:
-        if self.input_lags is not None:
-            _check_lags("input_lags", self.input_lags)
+    input_lags: Lags | None = None
 
     def load(self, net: NetFile, drive: Drive) -> Predictor:
         lags = self._lags(net)
@@ -175,14 +173,8 @@ class MLPActuator(NetActuator):
                 raise ValueError(
                     f"{name}={lags!r} in its metadata: expected a list such as [0, 2, 4]"
                 ) from None
-            _check_lags(name, lags)
+            check_value(name, lags, Lags)
         return lags
-
-
-def _check_lags(name: str, lags: tuple[int, ...]) -> None:
-    whole = all(isinstance(lag, int) and not isinstance(lag, bool) and lag >= 0 for lag in lags)
-    if not lags or not whole:
-        raise ValueError(f"{name}={lags!r}: expected whole numbers of substeps of at least 0")
 
 
 def _layers(net: NetFile, num_inputs: int, activation: type[nn.Module]) -> nn.Sequential:

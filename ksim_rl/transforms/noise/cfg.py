@@ -3,7 +3,6 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
 from typing import Annotated, ClassVar, Literal
 
 from ksim_rl.checked import Checked, Share, Within
@@ -11,14 +10,6 @@ from ksim_rl.checked import Checked, Share, Within
 PerDim = float | tuple[float, ...]
 """One number, or one per element of the (flattened) observation."""
 NonNegativePerDim = Annotated[PerDim, Within(low=0.0)]
-
-
-class Draw(Enum):
-    """What a noise is made from: u on [0, 1), a standard normal, or nothing."""
-
-    UNIFORM = "uniform"
-    GAUSSIAN = "gaussian"
-    NONE = "none"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +29,8 @@ class NoiseCfg(Checked, ABC):
         lost: what stands in for a lost reading: "last" is the one of the step before, "zero" is 0.
     """
 
-    draw: ClassVar[Draw]
-    """What the sample is made from."""
+    is_gaussian: ClassVar[bool] = False
+    """Whether draws are standard normal, else uniform on [0, 1)."""
 
     operation: Literal["add", "multiply"] = "add"
     bias: "NoiseCfg | None" = None
@@ -64,8 +55,6 @@ class NoiseCfg(Checked, ABC):
 class UniformNoise(NoiseCfg):
     """Noise uniform on [low, high)."""
 
-    draw: ClassVar = Draw.UNIFORM
-
     low: PerDim
     high: PerDim
 
@@ -83,10 +72,8 @@ class UniformNoise(NoiseCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GaussianNoise(NoiseCfg):
+class GaussianNoise(NoiseCfg, is_gaussian=True):
     """Normal noise."""
-
-    draw: ClassVar = Draw.GAUSSIAN
 
     std: NonNegativePerDim
     mean: PerDim = 0.0
@@ -98,8 +85,6 @@ class GaussianNoise(NoiseCfg):
 @dataclass(frozen=True, kw_only=True)
 class ConstantNoise(NoiseCfg):
     """The same value always; the default suits a sensor that only drifts, rounds or loses readings."""
-
-    draw: ClassVar = Draw.NONE
 
     value: PerDim = 0.0
 

@@ -12,7 +12,7 @@ from torchrl.data import Composite, TensorSpec
 from ksim_rl.transforms import upstream
 from ksim_rl.transforms.columns import side_by_side, split
 from ksim_rl.transforms.noise import kernel as noise_kernel
-from ksim_rl.transforms.noise.cfg import Draw, NoiseCfg, per_dim
+from ksim_rl.transforms.noise.cfg import NoiseCfg, per_dim
 from ksim_rl.transforms.noise.kernel import HAS_BIAS, HAS_DROPOUT, HAS_WALK, NoiseState, add_noise
 from ksim_rl.transforms.row_transform import (
     FollowsLevel,
@@ -245,7 +245,7 @@ def _flags(cfg: NoiseCfg) -> int:
 
 
 def _is_gaussian(cfg: NoiseCfg | None) -> bool:
-    return cfg is not None and cfg.draw is Draw.GAUSSIAN
+    return cfg is not None and cfg.is_gaussian
 
 
 def widen(
@@ -274,7 +274,7 @@ def _noisy(
 ) -> tuple[Tensor, Tensor]:
     """Return the bounds after a noise of any strength from none to full."""
     low, high = ends
-    if cfg.draw is Draw.GAUSSIAN:
+    if cfg.is_gaussian:
         reach = torch.where(spread > 0, torch.inf, 0.0)
         noise = (offset - reach).expand(low.shape), (offset + reach).expand(low.shape)
     else:
