@@ -10,7 +10,6 @@ from ksim_rl.cli.errors import OneLineParser, say
 from ksim_rl.cli.report import run_and_report, shown_working, verdict
 from ksim_rl.cli.runs import print_table
 from ksim_rl.config.plain_data import check_links
-from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.contract import part
 from ksim_rl.scene.robots import analyse
 from ksim_rl.scene.robots.analysis import TRIAL_S
@@ -76,10 +75,10 @@ def _on_these_ranks(cfg: RunCfg, saved: checkpoint.Checkpoint) -> RunCfg:
     if before == now:
         return cfg
     size = cfg.data.num_env_states_per_minibatch
-    if not isinstance(cfg.data, DatasetCfg) or cfg.num_envs * before % now or size * before % now:
+    if "replay" in saved.state["update"] or cfg.num_envs * before % now or size * before % now:
         raise ValueError(
             f"the run was trained on {before} ranks with num_envs={cfg.num_envs} and minibatches of {size}, which "
-            f"{now} ranks cannot share equally, and a replay not at all: resume it on {before}"
+            f"{now} ranks cannot share equally, nor a replay: resume it on {before}"
         )
     shards = max(1, cfg.data.shards * before // now)
     data = dataclasses.replace(cfg.data, num_env_states_per_minibatch=size * before // now, shards=shards)

@@ -1,9 +1,12 @@
 """A checkpoint of several ranks goes on bit for bit on as many, and is dealt out anew to others."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
 from ksim_rl import conf, ranks
+from ksim_rl.cli import run_commands
 from ksim_rl.device import state_tree
 from ksim_rl.trainers import build
 from tests.ranks.gloo import results
@@ -48,6 +51,15 @@ def test_one_to_two_to_one_is_the_run_without_a_break(tmp_path):
     )
     print(f"1 to 2 to 1: largest difference {worst:.2g}")
     assert worst <= 1e-6
+
+
+@pytest.mark.parametrize(("ranks_before", "update"), [(2, {"replay": {}}), (3, {})])
+def test_a_replay_and_envs_that_cannot_be_shared_out_are_refused(ranks_before, update, monkeypatch):
+    monkeypatch.setattr(ranks, "size", lambda: 2 if ranks_before == 3 else 1)
+    cfg = conf.compose([*SMALL, "num_envs=5", "data.num_env_states_per_minibatch=20"])
+    saved = SimpleNamespace(state={"ranks": {"size": ranks_before}, "update": update})
+    with pytest.raises(ValueError, match=f"trained on {ranks_before} ranks .* resume it on {ranks_before}"):
+        run_commands._on_these_ranks(cfg, saved)
 
 
 def merged(index):
