@@ -1,6 +1,7 @@
 """This module writes files that appear under their own names only once they are whole."""
 
 import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -11,9 +12,8 @@ WRITING = ".writing-"  # what a name begins with until then; a run that goes on 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """Give a path to write to, which becomes `path` at the end; where writing fails, `path` stays as it was."""
-    temporary = path.with_name(f"{WRITING}{path.name}")
+    temporary = path.with_name(f"{WRITING}{secrets.token_hex(4)}-{path.name}")  # another writer has another
     try:
-        temporary.unlink(missing_ok=True)  # a link that a stranger left is not followed
         yield temporary
         os.replace(temporary, path)
     except BaseException:

@@ -66,3 +66,13 @@ def test_a_file_is_there_only_when_it_is_whole(tmp_path):
     with whole_file(path) as temporary:
         temporary.write_text("new")
     assert path.read_text() == "new"
+
+
+def test_two_that_write_one_file_at_once_both_leave_it_whole(tmp_path):
+    path = tmp_path / "a.txt"
+    with whole_file(path) as first:
+        first.write_text("first")
+        with whole_file(path) as second:
+            second.write_text("second")
+        assert path.read_text() == "second"
+    assert path.read_text() == "first" and [entry.name for entry in tmp_path.iterdir()] == ["a.txt"]

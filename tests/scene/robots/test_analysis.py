@@ -107,7 +107,11 @@ def test_robots_of_the_menagerie_stand_on_what_is_proposed(source):
     assert found.robot.name == source.rpartition("/")[2] and found.robot.model == source
 
 
-@pytest.mark.parametrize("robot", [Quadruped(), Humanoid()], ids=lambda robot: robot.name)
+@pytest.mark.parametrize(
+    "robot",
+    [Quadruped(), pytest.param(Humanoid(), marks=pytest.mark.full)],
+    ids=lambda robot: robot.name,
+)
 def test_a_spec_is_analysed_like_a_file(robot):
     check_proposals(analyse(robot.spec()), len(robot.foot_sites))
 
