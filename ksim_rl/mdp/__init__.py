@@ -1,219 +1,39 @@
 """The term library holds what observations, rewards, events and the rest of a task are put together from.
 
-A term is public once it is imported here.
+Each term of these modules is public. The bases that terms share are not: they do nothing when called, or are abstract,
+or draw a field that they do not name.
 """
 
-from ksim_rl.mdp.actions import (
-    ActuatorAction,
-    JointEffortAction,
-    JointPositionAction,
-    JointPositionVelocityAction,
-    JointVelocityAction,
-    RelativeJointPositionAction,
-)
-from ksim_rl.mdp.commands import (
-    BaseHeightCommand,
-    CartesianCommand,
-    JointPositionCommand,
-    JoystickCommand,
-    SinusoidalGaitCommand,
-    StartPoseCommand,
-    UniformVelocityCommand,
-)
-from ksim_rl.mdp.curricula import (
-    CommandRangesByLevel,
-    CommandRangesByStage,
-    DistanceLevel,
-    EpisodeLengthLevel,
-    LinearLevel,
-    RewardWeightByLevel,
-    RewardWeightByStage,
-    SaturationLevel,
-    TerrainLevels,
-)
-from ksim_rl.mdp.events import (
-    Jump,
-    PushByForce,
-    PushByVelocity,
-    ResetHeading,
-    ResetHeight,
-    ResetJoints,
-    ResetJointsByScale,
-    ResetRootUniform,
-)
-from ksim_rl.mdp.metrics import (
-    ActionAcceleration,
-    AngularVelocityError,
-    CostOfTransport,
-    FootSlipSpeed,
-    LinearVelocityError,
-    PeakContactForce,
-    PeakFootHeight,
-    Power,
-    Success,
-    TargetReached,
-)
-from ksim_rl.mdp.motion_tracking import (
-    FarFromMotion,
-    MotionBodyOffset,
-    MotionFinished,
-    MotionJoints,
-    MotionPhase,
-    ResetToMotion,
-    TrackMotionBodyPos,
-    TrackMotionBodyQuat,
-    TrackMotionJointPos,
-    TrackMotionJointVel,
-)
-from ksim_rl.mdp.observations.bodies import (
-    BodyAngVel,
-    BodyLinVel,
-    BodyPos,
-    BodyQuat,
-    BodyRotation6d,
-    CenterOfMassPos,
-    CenterOfMassVel,
-    Contact,
-    ContactForce,
-    FootAirTime,
-    FootContact,
-    FootContactForces,
-    FootHeight,
-    FootPos,
-    OffsetToBody,
-    OffsetToCommand,
-)
-from ksim_rl.mdp.observations.robot import (
-    ActuatorForce,
-    CameraImage,
-    Clock,
-    Command,
-    EpisodeTime,
-    HeightScan,
-    ImuReading,
-    JointAcc,
-    JointEffort,
-    JointPos,
-    JointPosRel,
-    JointVel,
-    LastAction,
-    ProjectedGravity,
-    RayDistance,
-    RayHeight,
-    RemainingTime,
-    RootAngVel,
-    RootLinVel,
-    RootPos,
-    RootQuat,
-    RootRotation6d,
-    SensorReading,
-)
-from ksim_rl.mdp.randomization.bodies import (
-    RandomizeBodyCom,
-    RandomizeBodyInertia,
-    RandomizeBodyMass,
-    RandomizeGeomFriction,
-    RandomizeGeomSize,
-    RandomizeGravity,
-    RandomizePairFriction,
-    RandomizePseudoInertia,
-)
-from ksim_rl.mdp.randomization.joints import (
-    RandomizeActuatorGains,
-    RandomizeDefaultJointPos,
-    RandomizeEffortLimit,
-    RandomizeEncoderBias,
-    RandomizeJointArmature,
-    RandomizeJointDamping,
-    RandomizeJointFrictionLoss,
-    RandomizeJointRange,
-    RandomizeJointStiffness,
-    RandomizeJointZero,
-    RandomizeTendonArmature,
-    RandomizeTendonDamping,
-    RandomizeTendonFrictionLoss,
-    RandomizeTendonStiffness,
-)
-from ksim_rl.mdp.randomization.looks import (
-    RandomizeCameraFieldOfView,
-    RandomizeCameraIntrinsic,
-    RandomizeGeomColor,
-    RandomizeLightColor,
-    RandomizeMaterialColor,
-    RandomizeMaterialShine,
-)
-from ksim_rl.mdp.randomization.poses import (
-    RandomizeBodyPos,
-    RandomizeBodyQuat,
-    RandomizeCameraPos,
-    RandomizeCameraQuat,
-    RandomizeGeomPos,
-    RandomizeGeomQuat,
-    RandomizeLightDir,
-    RandomizeLightPos,
-    RandomizeSitePos,
-    RandomizeSiteQuat,
-)
-from ksim_rl.mdp.rewards.feet import (
-    ContactForceAbove,
-    FeetAirTime,
-    FootClearance,
-    FootSlip,
-    FootSwingHeight,
-    GaitPhase,
-    SelfCollision,
-    SoftLanding,
-    UndesiredContacts,
-)
-from ksim_rl.mdp.rewards.joints import (
-    ActionAccelerationL2,
-    ActionJerkL2,
-    ActionRateL2,
-    ActionSymmetryL2,
-    ActuatorForceL2,
-    Alive,
-    Energy,
-    JointAccL2,
-    JointDeviationL1,
-    JointDeviationL2,
-    JointEffortL2,
-    JointEffortLimits,
-    JointPosLimits,
-    JointSymmetryL2,
-    JointVelL2,
-    JointVelLimits,
-    Terminated,
-)
-from ksim_rl.mdp.rewards.tracking import (
-    AngularMomentum,
-    AngVelXYL2,
-    BodyAngularVelocity,
-    LinkAccelerationL2,
-    LinVelZL2,
-    MotionlessAtRest,
-    NearBody,
-    Pose,
-    RootHeightL2,
-    TiltL2,
-    TrackAngularVelocity,
-    TrackJointPosition,
-    TrackLinearVelocity,
-    TrackOrientation,
-    TrackPosition,
-    TrackRootHeight,
-    Upright,
-)
-from ksim_rl.mdp.terminations import (
-    BadOrientation,
-    FarFromOrigin,
-    IllegalContact,
-    JointLimitViolated,
-    JointVelocityAbove,
-    NonFiniteState,
-    OutsideTerrain,
-    RootHeightBelow,
-    RootVelocityAbove,
-    TimeOut,
-)
+import inspect
 
-__all__ = sorted(name for name, value in globals().items() if isinstance(value, type))  # pyright: ignore
+from ksim_rl.mdp.actions import *  # noqa: F403
+from ksim_rl.mdp.commands import *  # noqa: F403
+from ksim_rl.mdp.curricula import *  # noqa: F403
+from ksim_rl.mdp.events import *  # noqa: F403
+from ksim_rl.mdp.metrics import *  # noqa: F403
+from ksim_rl.mdp.motion_tracking import *  # noqa: F403
+from ksim_rl.mdp.observations.bodies import *  # noqa: F403
+from ksim_rl.mdp.observations.robot import *  # noqa: F403
+from ksim_rl.mdp.randomization.bodies import *  # noqa: F403
+from ksim_rl.mdp.randomization.joints import *  # noqa: F403
+from ksim_rl.mdp.randomization.looks import *  # noqa: F403
+from ksim_rl.mdp.randomization.poses import *  # noqa: F403
+from ksim_rl.mdp.randomization.randomize import RandomizeField
+from ksim_rl.mdp.rewards.feet import *  # noqa: F403
+from ksim_rl.mdp.rewards.joints import *  # noqa: F403
+from ksim_rl.mdp.rewards.tracking import *  # noqa: F403
+from ksim_rl.mdp.terminations import *  # noqa: F403
+
+
+def _is_public(value: object) -> bool:
+    if not isinstance(value, type) or not value.__module__.startswith(__name__):
+        return False
+    has_no_field = issubclass(value, RandomizeField) and not hasattr(value, "field")
+    return "__call__" in dir(value) and not inspect.isabstract(value) and not has_no_field
+
+
+__all__ = sorted(name for name, value in globals().items() if _is_public(value))  # pyright: ignore
+
+
+def __dir__() -> list[str]:
+    return __all__
