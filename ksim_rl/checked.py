@@ -96,11 +96,7 @@ def _hints(cls: type) -> dict[str, Any]:
 
 
 def check_value(field: str, value: object, annotation: Any) -> None:
-    """Refuse a value that is not what an annotation says; protocols, callables and `Any` take everything.
-
-    Raises:
-        ValueError: naming the field, the value and what would be valid.
-    """
+    """Refuse a value that is not what an annotation says, as `checks` do; protocols, callables and `Any` take all."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if annotation is Any:  # a class since Python 3.11, but none to ask `isinstance` of
         return

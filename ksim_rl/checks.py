@@ -1,4 +1,4 @@
-"""Errors for users: each names the field, the value and what would be valid."""
+"""These checks refuse values by a ValueError, which names the field, the value and what would be valid."""
 
 import difflib
 from collections.abc import Iterable
@@ -31,11 +31,7 @@ def check_in_range(
     high: float | None = None,
     low_open: bool = False,
 ) -> None:
-    """Refuse a number that is not finite or lies outside `[low, high]` (`(low, high]` with `low_open`).
-
-    Raises:
-        ValueError: naming the field, the value and the valid range.
-    """
+    """Refuse a number that is not finite or lies outside `[low, high]` (`(low, high]` with `low_open`)."""
     bounds = f"{'(' if low_open or low is None else '['}{'-inf' if low is None else low}, "
     bounds += f"{'inf' if high is None else high}{')' if high is None else ']'}"
     if isinstance(value, bool) or not isinstance(value, Real):
@@ -48,21 +44,13 @@ def check_in_range(
 
 
 def check_count(field: str, value: object, *, low: int = 1) -> None:
-    """Refuse what is no whole number, or one below `low`.
-
-    Raises:
-        ValueError: naming the field, the value and the bound.
-    """
+    """Refuse what is no whole number, or one below `low`."""
     if isinstance(value, bool) or not isinstance(value, int) or value < low:
         raise ValueError(f"{field}={value!r}: expected a whole number >= {low}")
 
 
 def check_choice(field: str, value: object, choices: Iterable[object]) -> None:
-    """Refuse a value that is none of `choices`.
-
-    Raises:
-        ValueError: naming the field, the value and the near or valid choices.
-    """
+    """Refuse a value that is none of `choices`; the error has the near ones."""
     choices = list(choices)
     if value not in choices:
         hint = near(str(value), [str(choice) for choice in choices])
@@ -70,11 +58,7 @@ def check_choice(field: str, value: object, choices: Iterable[object]) -> None:
 
 
 def check_pair(field: str, value: object, *, low: float | None = None, high: float | None = None) -> None:
-    """Refuse a range that is not a pair of finite, ordered numbers within `[low, high]`.
-
-    Raises:
-        ValueError: naming the field, the value and what a valid range looks like.
-    """
+    """Refuse a range that is not a pair of finite, ordered numbers within `[low, high]`."""
     if not isinstance(value, (tuple, list)) or len(value) != 2:
         raise ValueError(f"{field}={value!r}: expected a pair (low, high)")
     for index, number in enumerate(value):

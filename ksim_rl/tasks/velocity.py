@@ -314,13 +314,11 @@ def _proposed_cfg(proposed: ModelRobot, analysis: RobotAnalysis) -> ManagerBased
     moving = analysis.by_joint(0.35, 0.15, 0.15) if biped else analysis.by_joint(0.6, 0.3, 0.15)
     pose = PoseStd(standing={".*": 0.05}, walking=moving, running=analysis.by_joint(0.6, 0.3, 0.4))
     foot_height = round(min(0.1, 0.3 * height), 3)
-    earned = rewards(robot, pose=pose, foot_height=foot_height)
+    calm: dict[str, Any] = {"body_ang_vel": -0.05, "angular_momentum": -0.02} if biped else {}
+    earned = rewards(robot, pose=pose, foot_height=foot_height, **calm)
     # A leg's natural speed grows with the root of its length: 1 m/s is much for a leg of 0.25 m.
     speed = round(min(1.0, 0.5 * math.sqrt(9.81 * height)), 2) if biped else 1.0
     if biped:
-        earned = rewards(
-            robot, pose=pose, foot_height=foot_height, body_ang_vel=-0.05, angular_momentum=-0.02
-        )
         earned["self_collisions"] = mdp.SelfCollision(weight=-1.0, sensor=SELF, threshold=10.0)
     return velocity_cfg(
         robot,

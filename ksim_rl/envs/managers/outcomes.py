@@ -25,15 +25,16 @@ class _OutcomeManager:
     def _everybody_E(self) -> Tensor:
         return torch.ones(self._view.num_envs, dtype=torch.bool, device=self._view.device)
 
-    def _values(self) -> list[Tensor]:
-        """Return what each term says of the current state, [E] each."""
-        values = []
+    def _values(self, dtype: torch.dtype | None = None) -> list[Tensor]:
+        """Return what each term says of the current state, [E] each, in any dtype unless one is asked for."""
+        values, shape = [], (self._view.num_envs,)
         for name, term in self._terms.items():
             with self._driver.scope(f"{self.kind}s/{name}"):
                 value_E = term(self._view)
-            if value_E.shape != (self._view.num_envs,):
+            if value_E.shape != shape or dtype not in (None, value_E.dtype):
                 raise ValueError(
-                    f"{self.kind} term {name!r} returns shape {tuple(value_E.shape)}: expected ({self._view.num_envs},)"
+                    f"{self.kind} term {name!r} returns {value_E.dtype} {tuple(value_E.shape)}: expected "
+                    f"{dtype or 'any dtype'} {shape}"
                 )
             values.append(value_E)
         return values
@@ -101,17 +102,7 @@ class TerminationManager(_OutcomeManager):
 
         Rows whose physics failed are terminated.
         """
-        flags = []
-        for name, term in self._terms.items():
-            with self._driver.scope(f"terminations/{name}"):
-                flag_E = term(self._view)
-            if flag_E.shape != finite_E.shape or flag_E.dtype != torch.bool:
-                raise ValueError(
-                    f"termination term {name!r} returns {flag_E.dtype} {tuple(flag_E.shape)}: expected torch.bool "
-                    f"{tuple(finite_E.shape)}"
-                )
-            flags.append(flag_E)
-        self.flags_EK.copy_(torch.stack((*flags, ~finite_E), dim=-1))
+        self.flags_EK.copy_(torch.stack((*self._values(torch.bool), ~finite_E), dim=-1))
         timed_out_E = (self.flags_EK & self._time_out_K).any(-1)
         failed_E = (self.flags_EK & self._failure_K).any(-1)
         self._driver.readings.terminated_E.copy_(failed_E)
