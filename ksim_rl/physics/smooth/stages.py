@@ -1,0 +1,116 @@
+"""This module chooses which worlds have their smooth dynamics computed by one kernel, and launches it."""
+
+from collections.abc import Callable
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+
+from ksim_rl.physics.smooth.kernel import CUDA_THREADS, Problem, Shape, smooth_kernel
+from ksim_rl.physics.structs import filled
+
+# The shared memory that a block has without asking for more, in floats.
+SHARED_FLOATS = 48 * 1024 // 4
+LANES = (8, 16, 32)
+AFFINE = {
+    "actuator_trntype": (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT),
+    "actuator_dyntype": (
+        *(mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_INTEGRATOR),
+        *(mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT),
+    ),
+    "actuator_gaintype": (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE),
+    "actuator_biastype": (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE),
+}
+
+
+def unsuited(warp_model: mjw.Model) -> str | None:
+    """Return why the kernel cannot compute this model's smooth dynamics, or None where it can."""
+    m = warp_model
+    callbacks = [name for name, callback in vars(m.callback).items() if callback]
+    reasons = {
+        "there are flexes": m.nflex > 0,
+        "there are tendons": m.ntendon > 0,
+        "there are no degrees of freedom": m.nv == 0,
+        "bodies compensate gravity": bool(m.body_gravcomp.numpy().any()),
+        "there is a fluid": m.has_fluid,
+        "contacts adhere": bool(m.flg_adhesion),
+        "joints yield": bool(m.nplastic),
+        "a callback computes forces": bool({"passive", "control"} & set(callbacks)),
+        "its bodies do not fit shared memory": _lanes(_shape(m)) is None,
+    }
+    return next((reason for reason, holds in reasons.items() if holds), None)
+
+
+def has_affine_actuators(warp_model: mjw.Model) -> bool:
+    """Whether each actuator drives a hinge or a slide, at once, by what is affine in ctrl, length and velocity."""
+    m = warp_model
+    kinds = {name: getattr(m, name).numpy() for name in AFFINE}
+    if m.nhistory or any(not np.isin(kinds[name], values).all() for name, values in AFFINE.items()):
+        return False
+    hinges = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    return bool(np.isin(m.jnt_type.numpy()[m.actuator_trnid.numpy()[:, 0]], hinges).all())
+
+
+def smooth_dynamics(
+    warp_model: mjw.Model, warp_data_E: mjw.Data, *, lanes: int | None = None
+) -> Callable[[], None]:
+    """Return what launches the smooth dynamics of a model that is not `unsuited`, with arrays in their final place.
+
+    Positions, inertias, velocities, bias and passive forces, and where it `has_affine_actuators` the transmission,
+    actuator forces and `qfrc_smooth`. `lanes` is how many threads share a world on CUDA; None takes the fewest that fit.
+    """
+    m, d = warp_model, warp_data_E
+    shape, device = _shape(m), d.qpos.device
+    threads = CUDA_THREADS if device.is_cuda else 1
+    lanes = (lanes or _lanes(shape) or CUDA_THREADS) if device.is_cuda else 1
+    driven = m.jnt_dofadr.numpy()[m.actuator_trnid.numpy()[:, 0]] if shape.actuation else np.empty(0, int)
+    own = {
+        "moving_geoms": wp.array(_moving_geoms(m), dtype=int, device=device),
+        "first_driver": wp.array(np.searchsorted(np.sort(driven), range(m.nv + 1)), dtype=int, device=device),
+        "drivers": wp.array(np.argsort(driven, kind="stable"), dtype=int, device=device),
+    }
+    problem = filled(Problem, own, m, m.opt, d)
+    kernel = smooth_kernel(shape, lanes, threads)
+
+    def launch() -> None:
+        wp.launch(kernel, dim=(d.nworld, lanes), inputs=[problem], block_dim=threads)
+
+    return launch
+
+
+def _shape(m: mjw.Model) -> Shape:
+    flags, bits = int(m.opt.disableflags), mjw.DisableBit
+    return Shape(
+        num_bodies=m.nbody,
+        num_joints=m.njnt,
+        num_dofs=m.nv,
+        num_chains=m.nbranch,
+        num_moving_geoms=len(_moving_geoms(m)),
+        num_sites=m.nsite,
+        num_actuators=m.nactuator,
+        has_mocap=bool(m.nmocap),
+        has_activation=m.na > 0,
+        gravity=not flags & bits.GRAVITY,
+        springs=not flags & bits.SPRING,
+        dampers=not flags & bits.DAMPER,
+        clamps_ctrl=not flags & bits.CLAMPCTRL,
+        actuators_act=m.nactuator > 0 and not flags & bits.ACTUATION,
+        actuation=has_affine_actuators(m),
+    )
+
+
+def _lanes(shape: Shape) -> int | None:
+    """Return the fewest lanes for which the worlds of a warp fit shared memory together."""
+    fitting = (
+        lanes for lanes in LANES if shape.floats(lanes) * (CUDA_THREADS // lanes) <= SHARED_FLOATS
+    )
+    return next(fitting, None)
+
+
+def _moving_geoms(m: mjw.Model) -> np.ndarray:
+    """Return the geoms whose place `make_data` does not fix: all but those of the world and what is welded to it."""
+    body = m.geom_bodyid.numpy()
+    moves = m.body_weldid.numpy() != 0
+    moves |= m.body_mocapid.numpy()[m.body_rootid.numpy()] != -1
+    return np.flatnonzero(moves[body])
