@@ -21,87 +21,82 @@ auto activation_rate = [&](int actuator, float ctrl, float act) {
     return 0.0f;
 };
 
-if (ACTUATION) {
-    each(NUM_ACTUATORS, [&](int actuator) {
-        const int joint = problem.actuator_trnid.data[actuator][0], dof = problem.jnt_dofadr.data[joint];
-        const float gear = model_row(problem.actuator_gear)[actuator][0];
-        const float length = qpos[problem.jnt_qposadr.data[joint]] * gear, speed = gear * qvel[dof];
-        row_of(problem.actuator_length)[actuator] = length;
-        row_of(problem.actuator_velocity)[actuator] = speed;
-        row_of(problem.moment_rownnz)[actuator] = 1;
-        row_of(problem.moment_rowadr)[actuator] = actuator;
-        row_of(problem.moment_colind)[actuator] = dof;
-        row_of(problem.actuator_moment)[actuator] = gear;
-        float input = 0.0f, found = 0.0f;
-        const int address = problem.actuator_ctrladr.data[actuator];
-        if (problem.actuator_ctrlnum.data[actuator] > 0) {
-            const wp::vec2 range = model_row(problem.actuator_ctrlrange)[address];
-            input = row_of(problem.ctrl)[address];
-            if (CLAMPS_CTRL && problem.actuator_ctrllimited.data[address])
-                input = wp::clamp(input, range[0], range[1]);
-        }
-        const int last = problem.actuator_actadr.data[actuator] + problem.actuator_actnum.data[actuator] - 1;
-        if (HAS_ACTIVATION && problem.actuator_actadr.data[actuator] >= 0) {
-            const float rate = ACTUATORS_ACT ? activation_rate(actuator, input, row_of(problem.act)[last]) : 0.0f;
-            row_of(problem.act_dot)[last] = rate;
-            input = problem.actuator_actearly.data[actuator] ? next_activation(actuator, last, rate)
-                                                             : row_of(problem.act)[last];
-        }
-        if (ACTUATORS_ACT) {
-            auto affine = [&](const auto& factors) {
-                return factors[0] + factors[1] * length + factors[2] * speed;
-            };
-            const auto gain = model_row(problem.actuator_gainprm)[actuator];
-            const auto bias = model_row(problem.actuator_biasprm)[actuator];
-            found = (problem.actuator_gaintype.data[actuator] == AFFINE_GAIN ? affine(gain) : gain[0]) * input;
-            found += problem.actuator_biastype.data[actuator] == AFFINE_BIAS ? affine(bias) : 0.0f;
-            const wp::vec2 range = model_row(problem.actuator_forcerange)[actuator];
-            if (problem.actuator_forcelimited.data[actuator])
-                found = wp::clamp(found, range[0], range[1]);
-        }
-        row_of(problem.actuator_force)[actuator] = actuator_forces[actuator] = found;
-    });
-    // Forces that the user applies to bodies are rare: whether this lane sees one, and then whether any does.
-    bool sees_push = false;
-    each(6 * NUM_BODIES, [&](int place) {
-        sees_push |= !(((const float*)row_of(problem.xfrc_applied))[place] == 0.0f);
-    });
-    sync();
+each(NUM_ACTUATORS, [&](int actuator) {
+    const int joint = problem.actuator_trnid.data[actuator][0], dof = problem.jnt_dofadr.data[joint];
+    const float gear = model_row(problem.actuator_gear)[actuator][0];
+    const float length = qpos[problem.jnt_qposadr.data[joint]] * gear, speed = gear * qvel[dof];
+    row_of(problem.actuator_length)[actuator] = length;
+    row_of(problem.actuator_velocity)[actuator] = speed;
+    row_of(problem.moment_rownnz)[actuator] = 1;
+    row_of(problem.moment_rowadr)[actuator] = actuator;
+    row_of(problem.moment_colind)[actuator] = dof;
+    row_of(problem.actuator_moment)[actuator] = gear;
+    float input = 0.0f, found = 0.0f;
+    const int address = problem.actuator_ctrladr.data[actuator];
+    if (problem.actuator_ctrlnum.data[actuator] > 0) {
+        const wp::vec2 range = model_row(problem.actuator_ctrlrange)[address];
+        input = row_of(problem.ctrl)[address];
+        if (CLAMPS_CTRL && problem.actuator_ctrllimited.data[address])
+            input = wp::clamp(input, range[0], range[1]);
+    }
+    const int last = problem.actuator_actadr.data[actuator] + problem.actuator_actnum.data[actuator] - 1;
+    if (HAS_ACTIVATION && problem.actuator_actadr.data[actuator] >= 0) {
+        const float rate = ACTUATORS_ACT ? activation_rate(actuator, input, row_of(problem.act)[last]) : 0.0f;
+        row_of(problem.act_dot)[last] = rate;
+        input = problem.actuator_actearly.data[actuator] ? next_activation(actuator, last, rate)
+                                                         : row_of(problem.act)[last];
+    }
+    if (ACTUATORS_ACT) {
+        auto affine = [&](const auto& factors) {
+            return factors[0] + factors[1] * length + factors[2] * speed;
+        };
+        const auto gain = model_row(problem.actuator_gainprm)[actuator];
+        const auto bias = model_row(problem.actuator_biasprm)[actuator];
+        found = (problem.actuator_gaintype.data[actuator] == AFFINE_GAIN ? affine(gain) : gain[0]) * input;
+        found += problem.actuator_biastype.data[actuator] == AFFINE_BIAS ? affine(bias) : 0.0f;
+        const wp::vec2 range = model_row(problem.actuator_forcerange)[actuator];
+        if (problem.actuator_forcelimited.data[actuator])
+            found = wp::clamp(found, range[0], range[1]);
+    }
+    row_of(problem.actuator_force)[actuator] = actuator_forces[actuator] = found;
+});
+// Forces that the user applies to bodies are rare: whether this lane sees one, and then whether any does.
+bool sees_push = false;
+each(6 * NUM_BODIES, [&](int place) {
+    sees_push |= !(((const float*)row_of(problem.xfrc_applied))[place] == 0.0f);
+});
+sync();
 #if defined(__CUDA_ARCH__)
-    const unsigned own_lanes = (LANES == 32 ? 0xffffffffu : (1u << LANES) - 1u) << (threadIdx.x % 32 / LANES * LANES);
-    const bool is_pushed = __ballot_sync(own_lanes, sees_push) != 0;
+const unsigned own_lanes = (LANES == 32 ? 0xffffffffu : (1u << LANES) - 1u) << (threadIdx.x % 32 / LANES * LANES);
+const bool is_pushed = __ballot_sync(own_lanes, sees_push) != 0;
 #else
-    const bool is_pushed = sees_push;
+const bool is_pushed = sees_push;
 #endif
-    each(NUM_DOFS, [&](int dof) {
-        const int joint = problem.dof_jntid.data[dof], body = problem.dof_bodyid.data[dof];
-        const float bias = wp::dot(motion(dof), force(body));
-        float driven = 0.0f;
+each(NUM_DOFS, [&](int dof) {
+    const int joint = problem.dof_jntid.data[dof], body = problem.dof_bodyid.data[dof];
+    const float bias = wp::dot(motion(dof), force(body));
+    float driven = 0.0f;
 #pragma unroll 1
-        for (int i = problem.first_driver.data[dof]; i < problem.first_driver.data[dof + 1]; ++i) {
-            const int actuator = problem.drivers.data[i];
-            driven += model_row(problem.actuator_gear)[actuator][0] * actuator_forces[actuator];
-        }
-        if (ACTUATORS_ACT && problem.jnt_actfrclimited.data[joint]) {
-            const wp::vec2 range = model_row(problem.jnt_actfrcrange)[joint];
-            driven = wp::clamp(driven, range[0], range[1]);
-        }
-        float sum = passive[dof] - bias + driven + row_of(problem.qfrc_applied)[dof];
-        if (is_pushed) {
-            const vec3 spin = rotation_of(motion(dof)), origin = com(problem.body_rootid.data[body]);
+    for (int i = problem.first_driver.data[dof]; i < problem.first_driver.data[dof + 1]; ++i) {
+        const int actuator = problem.drivers.data[i];
+        driven += model_row(problem.actuator_gear)[actuator][0] * actuator_forces[actuator];
+    }
+    if (ACTUATORS_ACT && problem.jnt_actfrclimited.data[joint]) {
+        const wp::vec2 range = model_row(problem.jnt_actfrcrange)[joint];
+        driven = wp::clamp(driven, range[0], range[1]);
+    }
+    float sum = passive[dof] - bias + driven + row_of(problem.qfrc_applied)[dof];
+    if (is_pushed) {
+        const vec3 spin = rotation_of(motion(dof)), origin = com(problem.body_rootid.data[body]);
 #pragma unroll 1
-            for (int of = body; of < body + problem.body_subtreenum.data[body]; ++of) {
-                const spatial push = row_of(problem.xfrc_applied)[of];  // its translation comes first
-                const vec3 arm = row_of(problem.xipos)[of] - origin;
-                sum += wp::dot(translation_of(motion(dof)) + wp::cross(spin, arm), rotation_of(push));
-                sum += wp::dot(spin, translation_of(push));
-            }
+        for (int of = body; of < body + problem.body_subtreenum.data[body]; ++of) {
+            const spatial push = row_of(problem.xfrc_applied)[of];  // its translation comes first
+            const vec3 arm = row_of(problem.xipos)[of] - origin;
+            sum += wp::dot(translation_of(motion(dof)) + wp::cross(spin, arm), rotation_of(push));
+            sum += wp::dot(spin, translation_of(push));
         }
-        row_of(problem.qfrc_bias)[dof] = bias;
-        row_of(problem.qfrc_actuator)[dof] = driven;
-        row_of(problem.qfrc_smooth)[dof] = sum;
-    });
-} else
-    each(NUM_DOFS, [&](int dof) {
-        row_of(problem.qfrc_bias)[dof] = wp::dot(motion(dof), force(problem.dof_bodyid.data[dof]));
-    });
+    }
+    row_of(problem.qfrc_bias)[dof] = bias;
+    row_of(problem.qfrc_actuator)[dof] = driven;
+    row_of(problem.qfrc_smooth)[dof] = sum;
+});

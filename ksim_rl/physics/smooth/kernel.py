@@ -106,7 +106,6 @@ class Shape:
     dampers: bool
     clamps_ctrl: bool
     actuators_act: bool
-    actuation: bool
 
     @property
     def poses(self) -> int:

@@ -7,12 +7,14 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
+from ksim_rl.physics.sim_cfg import SimCfg
 from ksim_rl.physics.smooth.kernel import CUDA_THREADS, Problem, Shape, smooth_kernel
 from ksim_rl.physics.structs import filled
 
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
 LANES = (8, 16, 32)
+HINGES = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 AFFINE = {
     "actuator_trntype": (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT),
     "actuator_dyntype": (
@@ -32,24 +34,27 @@ def unsuited(warp_model: mjw.Model) -> str | None:
         "there are flexes": m.nflex > 0,
         "there are tendons": m.ntendon > 0,
         "there are no degrees of freedom": m.nv == 0,
-        "bodies compensate gravity": bool(m.body_gravcomp.numpy().any()),
+        "bodies compensate gravity": len(m.body_gravcomp) > 1 or bool(m.body_gravcomp.numpy().any()),
         "there is a fluid": m.has_fluid,
         "contacts adhere": bool(m.flg_adhesion),
         "joints yield": bool(m.nplastic),
         "a callback computes forces": bool({"passive", "control"} & set(callbacks)),
+        "an actuator is delayed": m.nhistory > 0,
+        "an actuator is not affine or drives no hinge or slide": not _has_affine_actuators(m),
         "its bodies do not fit shared memory": _lanes(_shape(m)) is None,
     }
     return next((reason for reason, holds in reasons.items() if holds), None)
 
 
-def has_affine_actuators(warp_model: mjw.Model) -> bool:
-    """Whether each actuator drives a hinge or a slide, at once, by what is affine in ctrl, length and velocity."""
-    m = warp_model
-    kinds = {name: getattr(m, name).numpy() for name in AFFINE}
-    if m.nhistory or any(not np.isin(kinds[name], values).all() for name, values in AFFINE.items()):
-        return False
-    hinges = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    return bool(np.isin(m.jnt_type.numpy()[m.actuator_trnid.numpy()[:, 0]], hinges).all())
+def one_kernel_dynamics_unavailable(
+    warp_model: mjw.Model, sim: SimCfg, *, solver_unavailable: str | None
+) -> str | None:
+    """Return why MuJoCo Warp's own kernels compute a model's smooth dynamics, or None where one kernel does."""
+    if not sim.one_kernel_dynamics:
+        return "sim.one_kernel_dynamics is False"
+    if solver_unavailable is not None:
+        return f"the constraints are not solved by one kernel ({solver_unavailable})"
+    return unsuited(warp_model)
 
 
 def smooth_dynamics(
@@ -57,14 +62,15 @@ def smooth_dynamics(
 ) -> Callable[[], None]:
     """Return what launches the smooth dynamics of a model that is not `unsuited`, with arrays in their final place.
 
-    Positions, inertias, velocities, bias and passive forces, and where it `has_affine_actuators` the transmission,
-    actuator forces and `qfrc_smooth`. `lanes` is how many threads share a world on CUDA; None takes the fewest that fit.
+    These are all that MuJoCo Warp's `fwd_position`, `fwd_velocity`, `fwd_actuation` and `fwd_acceleration` write, but
+    for cameras, lights, contacts, constraint rows and `qacc_smooth`. `lanes` is how many threads share a world on CUDA;
+    None takes the fewest that fit.
     """
     m, d = warp_model, warp_data_E
     shape, device = _shape(m), d.qpos.device
     threads = CUDA_THREADS if device.is_cuda else 1
     lanes = (lanes or _lanes(shape) or CUDA_THREADS) if device.is_cuda else 1
-    driven = m.jnt_dofadr.numpy()[m.actuator_trnid.numpy()[:, 0]] if shape.actuation else np.empty(0, int)
+    driven = m.jnt_dofadr.numpy()[m.actuator_trnid.numpy()[:, 0]]
     own = {
         "moving_geoms": wp.array(_moving_geoms(m), dtype=int, device=device),
         "first_driver": wp.array(np.searchsorted(np.sort(driven), range(m.nv + 1)), dtype=int, device=device),
@@ -96,15 +102,19 @@ def _shape(m: mjw.Model) -> Shape:
         dampers=not flags & bits.DAMPER,
         clamps_ctrl=not flags & bits.CLAMPCTRL,
         actuators_act=m.nactuator > 0 and not flags & bits.ACTUATION,
-        actuation=has_affine_actuators(m),
+    )
+
+
+def _has_affine_actuators(m: mjw.Model) -> bool:
+    drives = np.isin(m.jnt_type.numpy()[m.actuator_trnid.numpy()[:, 0]], HINGES)
+    return bool(drives.all()) and all(
+        np.isin(getattr(m, name).numpy(), kinds).all() for name, kinds in AFFINE.items()
     )
 
 
 def _lanes(shape: Shape) -> int | None:
     """Return the fewest lanes for which the worlds of a warp fit shared memory together."""
-    fitting = (
-        lanes for lanes in LANES if shape.floats(lanes) * (CUDA_THREADS // lanes) <= SHARED_FLOATS
-    )
+    fitting = (lanes for lanes in LANES if shape.floats(lanes) * (CUDA_THREADS // lanes) <= SHARED_FLOATS)
     return next(fitting, None)
 
 
