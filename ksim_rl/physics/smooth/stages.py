@@ -53,7 +53,7 @@ def one_kernel_dynamics_unavailable(
     if not sim.one_kernel_dynamics:
         return "sim.one_kernel_dynamics is False"
     if solver_unavailable is not None:
-        return f"the constraints are not solved by one kernel ({solver_unavailable})"
+        return "the constraints are not solved by one kernel"
     return unsuited(warp_model)
 
 
