@@ -1,27 +1,25 @@
 // Part 3: centres of mass, the axes of the degrees of freedom, and inertias, all at them (mj_comPos).
 
 const float* const mass = model_row(problem.body_mass);
-// Adds to each body's parent, from the last body to the first, what lies on the chip; a lane has a column of it.
-auto sum_subtrees = [&](int columns, auto column_of) {
-    each(columns, [&](int index) {
-        const auto column = column_of(index);
-#pragma unroll 1
-        for (int body = NUM_BODIES - 1; body > 0; --body) {
-            const int parent = problem.body_parentid.data[body];
-            if (parent >= column.first)
-                column.data[parent * column.stride] += column.data[body * column.stride];
-        }
-    });
-    sync();
-};
 struct Column {
     float* data;
-    int stride, first;
+    int stride;
+};
+// Adds to each body's parent, from the last body to the first, what lies on the chip; a lane has a column of it. The
+// parents are constants, so that sums stay in registers.
+auto sum_subtrees = [&](int columns, auto column_of) {
+    each(columns, [&](int index) {
+        const Column column = column_of(index);
+#pragma unroll UNROLLED_BODIES
+        for (int body = NUM_BODIES - 1; body > 0; --body)
+            column.data[PARENTS[body] * column.stride] += column.data[body * column.stride];
+    });
+    sync();
 };
 
 each(NUM_BODIES, [&](int body) { com(body) = mass[body] * center(body); });
 sync();
-sum_subtrees(3, [&](int index) { return Column {coms + index, 3, 0}; });
+sum_subtrees(3, [&](int index) { return Column {coms + index, 3}; });
 each(NUM_BODIES, [&](int body) {
     const float total = model_row(problem.body_subtreemass)[body];
     com(body) = total < TINY ? center(body) : com(body) / total;
@@ -30,9 +28,9 @@ sync();
 write(problem.subtree_com, NUM_BODIES, coms, 3);
 
 each(NUM_JOINTS, [&](int joint) {
-    const int body = problem.jnt_bodyid.data[joint], type = problem.jnt_type.data[joint];
-    int dof = problem.jnt_dofadr.data[joint];
-    const vec3 offset = com(problem.body_rootid.data[body]) - anchor(joint);
+    const int body = look_up(problem.jnt_bodyid, joint), type = look_up(problem.jnt_type, joint);
+    int dof = look_up(problem.jnt_dofadr, joint);
+    const vec3 offset = com(look_up(problem.body_rootid, body)) - anchor(joint);
     if (type == SLIDE)
         motion(dof) = spatial_of(vec3(), axis(joint));
     else if (type == HINGE)
@@ -53,7 +51,7 @@ write(problem.cdof, NUM_DOFS, motions, 6);
 each(NUM_BODIES, [&](int body) {
     const mat33 frame = inertial_frame(body);
     const vec3 moments = model_row(problem.body_inertia)[body];
-    const vec3 offset = center(body) - com(problem.body_rootid.data[body]);
+    const vec3 offset = center(body) - com(look_up(problem.body_rootid, body));
     auto turned = [&](int i, int j) {
         float sum = 0.0f;
         for (int k = 0; k < 3; ++k)

@@ -44,7 +44,7 @@ _ENUMS = {
     (
         "",
         mjw.Model,
-        "body_parentid body_rootid body_mocapid body_jntnum body_jntadr body_dofadr body_subtreenum body_branches "
+        "body_rootid body_mocapid body_jntnum body_jntadr body_dofadr body_subtreenum body_branches "
         "body_branch_start body_pos body_quat body_ipos body_iquat body_mass body_subtreemass body_inertia",
     ),
     (
@@ -92,7 +92,7 @@ class Problem:
 class Shape:
     """What of a model is compiled into its kernel: its sizes, and what it has of MuJoCo's features."""
 
-    num_bodies: int
+    parents: tuple[int, ...]
     num_joints: int
     num_dofs: int
     num_chains: int
@@ -106,6 +106,11 @@ class Shape:
     dampers: bool
     clamps_ctrl: bool
     actuators_act: bool
+
+    @property
+    def num_bodies(self) -> int:
+        """Bodies, with the world."""
+        return len(self.parents)
 
     @property
     def poses(self) -> int:
@@ -127,13 +132,12 @@ class Shape:
 @functools.cache
 def smooth_kernel(shape: Shape, lanes: int, threads: int) -> wp.Kernel:
     """Return the kernel of a `Problem`; launch it over (worlds, lanes) in blocks of `threads`."""
-    fields = {field.name: getattr(shape, field.name) for field in dataclasses.fields(shape)}
-    sizes = {"poses": shape.poses, "joints": shape.joints, "floats": shape.floats(lanes)}
-    constants = {"LANES": lanes, "THREADS": threads, **_ENUMS}
-    constants |= {name.upper(): value for name, value in (fields | sizes).items()}
-    snippet = (
-        "".join(f"constexpr int {name} = {int(value)};\n" for name, value in constants.items()) + _SOURCE
-    )
+    constants = {field.name: getattr(shape, field.name) for field in dataclasses.fields(shape)[1:]}
+    constants |= {"num_bodies": shape.num_bodies, "poses": shape.poses, "joints": shape.joints}
+    constants |= {"floats": shape.floats(lanes), "lanes": lanes, "threads": threads, **_ENUMS}
+    parents = ", ".join(map(str, shape.parents))
+    snippet = "".join(f"constexpr int {name.upper()} = {int(value)};\n" for name, value in constants.items())
+    snippet += f"constexpr int PARENTS[] = {{{parents}}};\n{_SOURCE}"
 
     @wp.func_native(snippet)
     def smooth_dynamics(world: int, lane: int, problem: Problem) -> None: ...

@@ -3,8 +3,7 @@
 
 const float* const qpos = row_of(problem.qpos);
 const float* const qpos0 = model_row(problem.qpos0);
-const int* const chains = problem.body_branches.data;
-const int* const chain_begin = problem.body_branch_start.data;
+auto first_link = [&](int chain) { return look_up(problem.body_branch_start, chain); };
 
 if (lane == 0) {
     position(0) = vec3();
@@ -14,11 +13,11 @@ each(NUM_CHAINS, [&](int chain) {
     vec3 pos;
     quat rot(1.0f, 0.0f, 0.0f, 0.0f);
 #pragma unroll 1
-    for (int link = chain_begin[chain]; link < chain_begin[chain + 1]; ++link) {
-        const int body = chains[link];
-        const int first = problem.body_jntadr.data[body], count = problem.body_jntnum.data[body];
-        if (count == 1 && problem.jnt_type.data[first] == FREE) {
-            const float* const q = qpos + problem.jnt_qposadr.data[first];
+    for (int link = first_link(chain); link < first_link(chain + 1); ++link) {
+        const int body = look_up(problem.body_branches, link);
+        const int first = look_up(problem.body_jntadr, body), count = look_up(problem.body_jntnum, body);
+        if (count == 1 && look_up(problem.jnt_type, first) == FREE) {
+            const float* const q = qpos + look_up(problem.jnt_qposadr, first);
             pos = vec3(q[0], q[1], q[2]);
             rot = unit_quat(q + 3);
             anchor(first) = pos;
@@ -26,7 +25,7 @@ each(NUM_CHAINS, [&](int chain) {
         } else {
             vec3 from_parent = model_row(problem.body_pos)[body];
             quat turn_of_parent = model_row(problem.body_quat)[body];
-            const int mocap = HAS_MOCAP ? problem.body_mocapid.data[body] : -1;
+            const int mocap = HAS_MOCAP ? look_up(problem.body_mocapid, body) : -1;
             if (mocap >= 0) {
                 from_parent = row_of(problem.mocap_pos)[mocap];
                 turn_of_parent = row_of(problem.mocap_quat)[mocap];
@@ -35,7 +34,7 @@ each(NUM_CHAINS, [&](int chain) {
             rot = product(rot, turn_of_parent);
 #pragma unroll 1
             for (int joint = first; joint < first + count; ++joint) {
-                const int type = problem.jnt_type.data[joint], address = problem.jnt_qposadr.data[joint];
+                const int type = look_up(problem.jnt_type, joint), address = look_up(problem.jnt_qposadr, joint);
                 const vec3 own_axis = model_row(problem.jnt_axis)[joint];
                 const vec3 own_anchor = model_row(problem.jnt_pos)[joint];
                 anchor(joint) = pos + rotate(own_anchor, rot);
@@ -78,19 +77,19 @@ auto inertial_frame = [&](int body) {
 compute_row(problem.xmat, NUM_BODIES, itself, [&](int body) { return matrix(turn(body)); });
 compute_row(problem.ximat, NUM_BODIES, itself, inertial_frame);
 // Geoms of the world stay where make_data has put them.
-auto geom_of = [&](int item) { return problem.moving_geoms.data[item]; };
+auto geom_of = [&](int item) { return look_up(problem.moving_geoms, item); };
 compute_row(problem.geom_xpos, NUM_MOVING_GEOMS, geom_of, [&](int item) {
-    const int geom = geom_of(item), body = problem.geom_bodyid.data[geom];
+    const int geom = geom_of(item), body = look_up(problem.geom_bodyid, geom);
     return position(body) + rotate(model_row(problem.geom_pos)[geom], turn(body));
 });
 compute_row(problem.geom_xmat, NUM_MOVING_GEOMS, geom_of, [&](int item) {
-    const int geom = geom_of(item), body = problem.geom_bodyid.data[geom];
+    const int geom = geom_of(item), body = look_up(problem.geom_bodyid, geom);
     return matrix(product(turn(body), model_row(problem.geom_quat)[geom]));
 });
 compute_row(problem.site_xpos, NUM_SITES, itself, [&](int site) {
-    const int body = problem.site_bodyid.data[site];
+    const int body = look_up(problem.site_bodyid, site);
     return position(body) + rotate(model_row(problem.site_pos)[site], turn(body));
 });
 compute_row(problem.site_xmat, NUM_SITES, itself, [&](int site) {
-    return matrix(product(turn(problem.site_bodyid.data[site]), model_row(problem.site_quat)[site]));
+    return matrix(product(turn(look_up(problem.site_bodyid, site)), model_row(problem.site_quat)[site]));
 });

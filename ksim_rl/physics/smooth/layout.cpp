@@ -19,6 +19,7 @@ using spatial = wp::vec_t<6, float>;
 using inertia10 = wp::vec_t<10, float>;
 
 constexpr float TINY = 1e-15f, PI = 3.14159265f;
+constexpr int UNROLLED_BODIES = NUM_BODIES <= 64 ? NUM_BODIES : 4;
 constexpr int POSE = 10;  // floats of a body: position, quaternion and centre of mass, then its inertia
 
 #if defined(__CUDA_ARCH__)
@@ -43,6 +44,14 @@ auto row_of = [=](auto& array) { return array.data + (size_t)world * array.shape
 // Of a field of the model, which has one row for each world or one for all.
 auto model_row = [=](auto& array) { return array.data + (array.shape[0] > 1 ? (size_t)world * array.shape[1] : 0); };
 auto of_world = [=](auto& array) { return array.data[array.shape[0] > 1 ? world : 0]; };
+// Of a table that no kernel writes, so that it may be read ahead of what is written.
+auto look_up = [](const auto& table, int item) {
+#if defined(__CUDA_ARCH__)
+    return __ldg(table.data + item);
+#else
+    return table.data[item];
+#endif
+};
 auto sync = [] {
 #if defined(__CUDA_ARCH__)
     __syncwarp();
@@ -57,7 +66,7 @@ auto each = [&](int count, auto body) {
 auto write = [&](auto& array, int count, const float* from, int stride) {
     constexpr int WIDTH = sizeof(*array.data) / sizeof(float);
     float* const to = (float*)row_of(array);
-#pragma unroll 1
+#pragma unroll 4
     for (int place = lane; place < count * WIDTH; place += LANES)
         to[place] = from[place / WIDTH * stride + place % WIDTH];
 };
@@ -71,7 +80,7 @@ auto compute_row = [&](auto& array, int count, auto place_of, auto compute) {
         const int items = wp::min(ROOM, count - first);
         each(items, [&](int item) { ((Value*)staged)[item] = compute(first + item); });
         sync();
-#pragma unroll 1
+#pragma unroll 4
         for (int place = lane; place < items * WIDTH; place += LANES)
             to[place_of(first + place / WIDTH) * WIDTH + place % WIDTH] = staged[place];
         sync();

@@ -8,14 +8,14 @@ auto rate_at = [](float linear, const wp::vec2& poly, float x) {
 };
 
 each(NUM_JOINTS, [&](int joint) {
-    const int type = problem.jnt_type.data[joint];
-    const int dof = problem.jnt_dofadr.data[joint], dofs = type == FREE ? 6 : type == BALL ? 3 : 1;
+    const int type = look_up(problem.jnt_type, joint);
+    const int dof = look_up(problem.jnt_dofadr, joint), dofs = type == FREE ? 6 : type == BALL ? 3 : 1;
     float spring[6] = {};
     const float stiffness = model_row(problem.jnt_stiffness)[joint];
     const wp::vec2 more_stiffness = model_row(problem.jnt_stiffnesspoly)[joint];
     if (SPRINGS && (stiffness != 0.0f || more_stiffness[0] != 0.0f || more_stiffness[1] != 0.0f)) {
-        const float* q = qpos + problem.jnt_qposadr.data[joint];
-        const float* rest = model_row(problem.qpos_spring) + problem.jnt_qposadr.data[joint];
+        const float* q = qpos + look_up(problem.jnt_qposadr, joint);
+        const float* rest = model_row(problem.qpos_spring) + look_up(problem.jnt_qposadr, joint);
         auto pull = [&](float* to, const vec3& away) {
             const float rate = rate_at(stiffness, more_stiffness, wp::length(away));
             for (int i = 0; i < 3; ++i)

@@ -88,7 +88,7 @@ def smooth_dynamics(
 def _shape(m: mjw.Model) -> Shape:
     flags, bits = int(m.opt.disableflags), mjw.DisableBit
     return Shape(
-        num_bodies=m.nbody,
+        parents=tuple(m.body_parentid.numpy().tolist()),
         num_joints=m.njnt,
         num_dofs=m.nv,
         num_chains=m.nbranch,

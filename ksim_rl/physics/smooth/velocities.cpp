@@ -12,12 +12,12 @@ if (lane == 0) {
 each(NUM_CHAINS, [&](int chain) {
     spatial moving, rising = from_gravity;
 #pragma unroll 1
-    for (int link = chain_begin[chain]; link < chain_begin[chain + 1]; ++link) {
-        const int body = chains[link], first = problem.body_jntadr.data[body];
-        int dof = problem.body_dofadr.data[body];
+    for (int link = first_link(chain); link < first_link(chain + 1); ++link) {
+        const int body = look_up(problem.body_branches, link), first = look_up(problem.body_jntadr, body);
+        int dof = look_up(problem.body_dofadr, body);
 #pragma unroll 1
-        for (int joint = first; joint < first + problem.body_jntnum.data[body]; ++joint) {
-            const int type = problem.jnt_type.data[joint];
+        for (int joint = first; joint < first + look_up(problem.body_jntnum, body); ++joint) {
+            const int type = look_up(problem.jnt_type, joint);
             // A free joint's first three axes are those of the world, which nothing turns.
             if (type == FREE)
                 for (const int end = dof + 3; dof < end; ++dof) {
@@ -48,37 +48,37 @@ each(NUM_BODIES, [&](int body) {
     force(body) = body == 0 ? spatial() : pushed + turned;
 });
 sync();
-// Inertias are not summed into the world's.
 sum_subtrees(16, [&](int index) {
-    return index < 10 ? Column {inertias + index, POSE, 1} : Column {forces + index - 10, 6, 0};
+    return index < 10 ? Column {inertias + index, POSE} : Column {forces + index - 10, 6};
 });
 write(problem.cfrc_int, NUM_BODIES, forces, 6);
 
 each(NUM_DOFS, [&](int dof) {
-    momentum(dof) = times_inertia(inertia(problem.dof_bodyid.data[dof]), motion(dof));
+    momentum(dof) = times_inertia(inertia(look_up(problem.dof_bodyid, dof)), motion(dof));
 });
 sync();
 // Calls body(actuator) for the actuators that add armature or damping to a joint: none, one, or (below -1) several.
 auto each_actuator_of = [&](int joint, auto body) {
-    const int only = problem.jnt_actuatorid.data[joint];
+    const int only = look_up(problem.jnt_actuatorid, joint);
     if (only >= 0)
         body(only);
     for (int actuator = 0; only < -1 && actuator < NUM_ACTUATORS; ++actuator) {
-        const int type = problem.actuator_trntype.data[actuator];
+        const int type = look_up(problem.actuator_trntype, actuator);
         if ((type == JOINT || type == JOINT_IN_PARENT) && problem.actuator_trnid.data[actuator][0] == joint)
             body(actuator);
     }
 };
-each(problem.M_hinit_i.shape[0], [&](int entry) {
-    const int row = problem.M_hinit_i.data[entry], column = problem.M_colind.data[entry];
+#pragma unroll 4
+for (int entry = lane; entry < problem.M_hinit_i.shape[0]; entry += LANES) {
+    const int row = look_up(problem.M_hinit_i, entry), column = look_up(problem.M_colind, entry);
     float found = wp::dot(motion(column), momentum(row));
     if (row == column) {
         float armature = model_row(problem.dof_armature)[row];
-        each_actuator_of(problem.dof_jntid.data[row], [&](int actuator) {
+        each_actuator_of(look_up(problem.dof_jntid, row), [&](int actuator) {
             const float gear = model_row(problem.actuator_gear)[actuator][0];
             armature += model_row(problem.actuator_armature)[actuator] * gear * gear;
         });
         found += armature;
     }
     row_of(problem.M)[entry] = found;
-});
+}
