@@ -85,12 +85,15 @@ class Substeps:
         No collision pass: contacts, forces and the sensors that read them stay as the last substep left them.
         """
         m, d = self._refresh_warp_model, self.warp_data_E
-        mjw.kinematics(m, d)
-        mjw.com_pos(m, d)
+        if self._dynamics is None:
+            mjw.kinematics(m, d)
+            mjw.com_pos(m, d)
+            mjw.flex(m, d)
+            mjw.tendon(m, d)
+            mjw.com_vel(m, d)
+        else:
+            self._dynamics(False)
         mjw.camlight(m, d)
-        mjw.flex(m, d)
-        mjw.tendon(m, d)
-        mjw.com_vel(m, d)
         needed = self.refreshed_on_demand
         if "M" in needed:
             mjw.crb(m, d)

@@ -106,7 +106,7 @@ def moved(**kwargs) -> World:
 
 def launch(world: World) -> None:
     with wp.ScopedDevice("cpu"):
-        stages.smooth_dynamics(world.warp_model, world.warp_data_E)()
+        stages.smooth_dynamics(world.warp_model, world.warp_data_E)(True)
 
 
 def in_c(world: World, mj_model: mujoco.MjModel, row: int) -> mujoco.MjData:
@@ -133,6 +133,22 @@ def test_all_it_computes_is_as_in_the_c_engine():
     launch(world)
     for row in range(NUM_ENVS):
         check_row(world, in_c(world, zoo(), row), row)
+
+
+def test_refresh_leaves_what_belongs_to_the_last_substep():
+    world = moved()
+    world.step(2)
+    kept = ("cacc", "cfrc_int", "qfrc_passive", "qfrc_actuator", "actuator_force", "act_dot")
+    before = {name: world.view(name).clone() for name in kept}
+    world.qpos_EL[:, 0] += 1.0
+    world.qvel_EL.mul_(2.0)
+    world.refresh()
+    for name, values in before.items():
+        assert torch.equal(world.view(name), values), name
+    expected = in_c(world, zoo(), 1)
+    for name in ("xpos", "geom_xmat", "subtree_com", "cdof", "cvel", "cdof_dot"):
+        theirs = np.asarray(getattr(expected, name)).ravel()
+        np.testing.assert_allclose(world.view(name)[1].numpy().ravel(), theirs, atol=3e-5, err_msg=name)
 
 
 def test_each_world_has_its_own_masses_dampers_and_springs():

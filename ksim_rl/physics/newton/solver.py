@@ -117,21 +117,22 @@ def step(
     warp_model: mjw.Model,
     warp_data_E: mjw.Data,
     solve: Callable[[], None],
-    dynamics: Callable[[], None] | None = None,
+    dynamics: Callable[[bool], None] | None = None,
     *,
     sensors: bool,
 ) -> None:
     """Launch a physics step: that of MuJoCo Warp, with this solver.
 
     The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
-    not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel.
+    not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel,
+    with forces or without.
     """
     m, d = warp_model, warp_data_E
     if dynamics is None:
         mjw.fwd_position(m, d, factorize=False)
         mjw.fwd_velocity(m, d)
     else:
-        dynamics()
+        dynamics(True)
         if sensors:
             mjw.camlight(m, d)
         if m.opt.run_collision_detection:

@@ -131,7 +131,10 @@ class Shape:
 
 @functools.cache
 def smooth_kernel(shape: Shape, lanes: int, threads: int) -> wp.Kernel:
-    """Return the kernel of a `Problem`; launch it over (worlds, lanes) in blocks of `threads`."""
+    """Return the kernel of a `Problem`; launch it over (worlds, lanes) in blocks of `threads`.
+
+    Its other argument says whether it goes on after the velocities, to the inertia matrix and the forces.
+    """
     constants = {field.name: getattr(shape, field.name) for field in dataclasses.fields(shape)[1:]}
     constants |= {"num_bodies": shape.num_bodies, "poses": shape.poses, "joints": shape.joints}
     constants |= {"floats": shape.floats(lanes), "lanes": lanes, "threads": threads, **_ENUMS}
@@ -140,13 +143,13 @@ def smooth_kernel(shape: Shape, lanes: int, threads: int) -> wp.Kernel:
     snippet += f"constexpr int PARENTS[] = {{{parents}}};\n{_SOURCE}"
 
     @wp.func_native(snippet)
-    def smooth_dynamics(world: int, lane: int, problem: Problem) -> None: ...
+    def smooth_dynamics(world: int, lane: int, forces_too: bool, problem: Problem) -> None: ...
 
     @wp.kernel(
         module="unique", enable_backward=False, grid_stride=False, module_options={"block_dim": threads}
     )
-    def kernel(problem: Problem):
+    def kernel(problem: Problem, forces_too: bool):
         world, lane = wp.tid()
-        smooth_dynamics(world, lane, problem)
+        smooth_dynamics(world, lane, forces_too, problem)
 
     return kernel

@@ -1,6 +1,6 @@
 // Part 1: where the numbers of a world lie, and how its lanes share the work.
 //
-// These parts are the body of the function smooth_dynamics(world, lane, problem), before which kernel.py puts the
+// These parts are the body of the function smooth_dynamics(world, lane, forces_too, problem), before which kernel.py puts the
 // constants of the kernel: the sizes of the model and what it has of MuJoCo's features. They follow MuJoCo's chapter on
 // computation (https://mujoco.readthedocs.io/en/stable/computation/index.html) and engine_core_smooth.c, stage by
 // stage, and add in one order whatever the number of lanes.

@@ -59,8 +59,10 @@ def one_kernel_dynamics_unavailable(
 
 def smooth_dynamics(
     warp_model: mjw.Model, warp_data_E: mjw.Data, *, lanes: int | None = None
-) -> Callable[[], None]:
+) -> Callable[[bool], None]:
     """Return what launches the smooth dynamics of a model that is not `unsuited`, with arrays in their final place.
+
+    It is called with whether to go on after positions and velocities, to the inertia matrix and forces.
 
     These are all that MuJoCo Warp's `fwd_position`, `fwd_velocity`, `fwd_actuation` and `fwd_acceleration` write, but
     for cameras, lights, contacts, constraint rows and `qacc_smooth`. `lanes` is how many threads share a world on CUDA;
@@ -79,8 +81,8 @@ def smooth_dynamics(
     problem = filled(Problem, own, m, m.opt, d)
     kernel = smooth_kernel(shape, lanes, threads)
 
-    def launch() -> None:
-        wp.launch(kernel, dim=(d.nworld, lanes), inputs=[problem], block_dim=threads)
+    def launch(forces_too: bool) -> None:
+        wp.launch(kernel, dim=(d.nworld, lanes), inputs=[problem, forces_too], block_dim=threads)
 
     return launch
 

@@ -40,6 +40,8 @@ each(NUM_CHAINS, [&](int chain) {
 });
 sync();
 write(problem.cvel, NUM_BODIES, velocities, 6);
+if (!forces_too)
+    return;
 write(problem.cacc, NUM_BODIES, forces, 6);
 sync();
 each(NUM_BODIES, [&](int body) {
