@@ -44,10 +44,11 @@ def main() -> None:
     num_envs = command_line.whole_number("num_envs", given["num_envs"])
     lanes = command_line.whole_numbers("lanes", given["lanes"])
     device = checked_device(given["device"])
+    decimation = envs.make_cfg(given["task"]).decimation
     env = envs.make(given["task"], num_envs=num_envs, device=device, seed=0)
     env.rollout(RANDOM_STEPS, break_when_any_done=False)
     world = innermost(env).world
-    figures = stages_ms(world, lanes) | substeps_ms(world, env.base_env.cfg.decimation)
+    figures = stages_ms(world, lanes) | substeps_ms(world, decimation)
     table = Table(title=f"{given['task']}, {num_envs} envs, {report.device_name(device)}")
     for column in ("", "ms"):
         table.add_column(column, justify="left" if not column else "right")

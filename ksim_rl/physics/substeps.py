@@ -10,7 +10,7 @@ import warp as wp
 
 from ksim_rl.physics import kernels, upstream
 from ksim_rl.physics.newton import solver as newton
-from ksim_rl.physics.smooth.stages import smooth_dynamics
+from ksim_rl.physics.smooth.stages import calls_back, smooth_dynamics
 
 # These read the contacts of the last substep's collision pass, which a reset empties.
 COLLISION_SENSORS = (
@@ -65,7 +65,9 @@ class Substeps:
 
     def advance(self, *, sensors: bool) -> None:
         """Launch one physics step. Sensors never change the state that it reaches."""
-        if self._ties_bodies and self._dynamics is None:
+        # Callbacks are set at any time, and stand between the stages of the kernel.
+        dynamics = None if calls_back(self.warp_model) else self._dynamics
+        if self._ties_bodies and dynamics is None:
             # The rows of connect and weld read body velocities before a step computes them.
             mjw.kinematics(self.warp_model, self.warp_data_E)
             mjw.com_pos(self.warp_model, self.warp_data_E)
@@ -74,8 +76,7 @@ class Substeps:
             sensors = sensors or self._always_senses
             opt = self._warp_model_of_solver.opt
             opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
-            stages = self._solve, self._dynamics
-            newton.step(self._warp_model_of_solver, self.warp_data_E, *stages, sensors=sensors)
+            newton.step(self._warp_model_of_solver, self.warp_data_E, self._solve, dynamics, sensors=sensors)
         else:
             mjw.step(self.warp_model if sensors else self._silent_warp_model, self.warp_data_E)
 

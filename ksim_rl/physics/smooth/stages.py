@@ -14,6 +14,7 @@ from ksim_rl.physics.structs import filled
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
 LANES = (8, 16, 32)
+FORCE_CALLBACKS = ("passive", "control", "act_dyn", "act_gain", "act_bias")
 HINGES = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 AFFINE = {
     "actuator_trntype": (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT),
@@ -29,7 +30,6 @@ AFFINE = {
 def unsuited(warp_model: mjw.Model) -> str | None:
     """Return why the kernel cannot compute this model's smooth dynamics, or None where it can."""
     m = warp_model
-    callbacks = [name for name, callback in vars(m.callback).items() if callback]
     reasons = {
         "there are flexes": m.nflex > 0,
         "there are tendons": m.ntendon > 0,
@@ -38,12 +38,16 @@ def unsuited(warp_model: mjw.Model) -> str | None:
         "there is a fluid": m.has_fluid,
         "contacts adhere": bool(m.flg_adhesion),
         "joints yield": bool(m.nplastic),
-        "a callback computes forces": bool({"passive", "control"} & set(callbacks)),
         "an actuator is delayed": m.nhistory > 0,
         "an actuator is not affine or drives no hinge or slide": not _has_affine_actuators(m),
         "its bodies do not fit shared memory": _lanes(_shape(m)) is None,
     }
     return next((reason for reason, holds in reasons.items() if holds), None)
+
+
+def calls_back(warp_model: mjw.Model) -> bool:
+    """Whether a callback of MuJoCo Warp has a part in the forces."""
+    return any(getattr(warp_model.callback, name) for name in FORCE_CALLBACKS)
 
 
 def one_kernel_dynamics_unavailable(
@@ -62,11 +66,10 @@ def smooth_dynamics(
 ) -> Callable[[bool], None]:
     """Return what launches the smooth dynamics of a model that is not `unsuited`, with arrays in their final place.
 
-    It is called with whether to go on after positions and velocities, to the inertia matrix and forces.
-
-    These are all that MuJoCo Warp's `fwd_position`, `fwd_velocity`, `fwd_actuation` and `fwd_acceleration` write, but
-    for cameras, lights, contacts, constraint rows and `qacc_smooth`. `lanes` is how many threads share a world on CUDA;
-    None takes the fewest that fit.
+    Called with True, it computes all that MuJoCo Warp's `fwd_position`, `fwd_velocity`, `fwd_actuation` and
+    `fwd_acceleration` do, but for cameras, lights, contacts, constraint rows and `qacc_smooth`; with False, of these
+    what positions and velocities alone decide. `lanes` is how many threads share a world on CUDA; None takes the
+    fewest that fit.
     """
     m, d = warp_model, warp_data_E
     shape, device = _shape(m), d.qpos.device
@@ -87,7 +90,8 @@ def smooth_dynamics(
     return launch
 
 
-def _shape(m: mjw.Model) -> Shape:
+def _shape(warp_model: mjw.Model) -> Shape:
+    m = warp_model
     flags, bits = int(m.opt.disableflags), mjw.DisableBit
     return Shape(
         parents=tuple(m.body_parentid.numpy().tolist()),
@@ -107,11 +111,11 @@ def _shape(m: mjw.Model) -> Shape:
     )
 
 
-def _has_affine_actuators(m: mjw.Model) -> bool:
-    drives = np.isin(m.jnt_type.numpy()[m.actuator_trnid.numpy()[:, 0]], HINGES)
-    return bool(drives.all()) and all(
-        np.isin(getattr(m, name).numpy(), kinds).all() for name, kinds in AFFINE.items()
-    )
+def _has_affine_actuators(warp_model: mjw.Model) -> bool:
+    m = warp_model
+    if not all(np.isin(getattr(m, name).numpy(), kinds).all() for name, kinds in AFFINE.items()):
+        return False
+    return bool(np.isin(m.jnt_type.numpy()[m.actuator_trnid.numpy()[:, 0]], HINGES).all())
 
 
 def _lanes(shape: Shape) -> int | None:
@@ -120,8 +124,9 @@ def _lanes(shape: Shape) -> int | None:
     return next(fitting, None)
 
 
-def _moving_geoms(m: mjw.Model) -> np.ndarray:
+def _moving_geoms(warp_model: mjw.Model) -> np.ndarray:
     """Return the geoms whose place `make_data` does not fix: all but those of the world and what is welded to it."""
+    m = warp_model
     body = m.geom_bodyid.numpy()
     moves = m.body_weldid.numpy() != 0
     moves |= m.body_mocapid.numpy()[m.body_rootid.numpy()] != -1
