@@ -7,7 +7,7 @@ import warp as wp
 
 from ksim_rl.physics import SimCfg, World
 from ksim_rl.physics.smooth import stages
-from tests.physics.test_smooth import GEOMS, PER_WORLD, WRITTEN, zoo
+from tests.physics.test_smooth import GEOMS, PER_WORLD, WRITTEN, mixed
 
 # Not a multiple of the worlds of a warp.
 NUM_ENVS = 301
@@ -16,7 +16,7 @@ LANES = (4, 8, 16, 32)
 
 def worlds() -> World:
     sim = SimCfg(njmax=16, nconmax=16, one_kernel_dynamics=True)
-    world = World(zoo(), num_envs=NUM_ENVS, sim=sim, device="cuda", per_world_fields=PER_WORLD)
+    world = World(mixed(), num_envs=NUM_ENVS, sim=sim, device="cuda", per_world_fields=PER_WORLD)
     generator = torch.Generator(device="cuda").manual_seed(0)
     for name in ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos"):
         row = world.view(name)
@@ -72,7 +72,7 @@ def test_captured_steps_reach_what_mujoco_warps_kernels_reach():
     reached = []
     for one_kernel_dynamics in (True, False):
         sim = SimCfg(njmax=16, nconmax=16, one_kernel_dynamics=one_kernel_dynamics)
-        world = World(zoo(), num_envs=NUM_ENVS, sim=sim, device="cuda")
+        world = World(mixed(), num_envs=NUM_ENVS, sim=sim, device="cuda")
         generator = torch.Generator(device="cuda").manual_seed(0)
         world.qvel_EL.copy_(0.1 * torch.randn(world.qvel_EL.shape, generator=generator, device="cuda"))
         for _ in range(4):

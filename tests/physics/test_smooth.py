@@ -18,7 +18,7 @@ from tests.physics.models import quadruped, standing_quadrupeds
 NUM_ENVS = 3
 # Joints of all types, several on a body, chains that share bodies, a welded and a carried body, springs and dampers
 # with and without higher orders, and actuators with and without activations, two of them on one joint.
-ZOO = """
+MIXED = """
 <mujoco>
   <option timestep="0.004" integrator="implicitfast" gravity="0.5 -1 -9"/>
   <compiler angle="radian"/>
@@ -87,15 +87,15 @@ GEOMS = ("geom_xpos", "geom_xmat")
 
 
 @functools.cache
-def zoo() -> mujoco.MjModel:
-    spec = mujoco.MjSpec.from_string(ZOO)
+def mixed() -> mujoco.MjModel:
+    spec = mujoco.MjSpec.from_string(MIXED)
     prepare_spec(spec, PER_WORLD)
     return spec.compile()
 
 
 def moved(**kwargs) -> World:
     """Worlds in other states each, the first of which is pushed by nothing."""
-    world = World(zoo(), num_envs=NUM_ENVS, sim=SimCfg(one_kernel_dynamics=True), **kwargs)
+    world = World(mixed(), num_envs=NUM_ENVS, sim=SimCfg(one_kernel_dynamics=True), **kwargs)
     generator = torch.Generator().manual_seed(0)
     for name in ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos"):
         row = world.view(name)
@@ -132,7 +132,7 @@ def test_all_it_computes_is_as_in_the_c_engine():
         world.last_substep(name).fill_(7.0)
     launch(world)
     for row in range(NUM_ENVS):
-        check_row(world, in_c(world, zoo(), row), row)
+        check_row(world, in_c(world, mixed(), row), row)
 
 
 def test_refresh_leaves_what_belongs_to_the_last_substep():
@@ -145,7 +145,7 @@ def test_refresh_leaves_what_belongs_to_the_last_substep():
     world.refresh()
     for name, values in before.items():
         assert torch.equal(world.view(name), values), name
-    expected = in_c(world, zoo(), 1)
+    expected = in_c(world, mixed(), 1)
     for name in ("xpos", "geom_xmat", "subtree_com", "cdof", "cvel", "cdof_dot"):
         theirs = np.asarray(getattr(expected, name)).ravel()
         np.testing.assert_allclose(world.view(name)[1].numpy().ravel(), theirs, atol=3e-5, err_msg=name)
@@ -160,7 +160,7 @@ def test_each_world_has_its_own_masses_dampers_and_springs():
     world.set_const(PER_WORLD)
     launch(world)
     for row in range(NUM_ENVS):
-        own = copy.copy(zoo())
+        own = copy.copy(mixed())
         for name in PER_WORLD:
             values = getattr(own, name)
             values[:] = world.field(name)[row].numpy().reshape(values.shape)
