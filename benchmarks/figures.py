@@ -36,6 +36,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "peers": (*STEP, *LEARN, *TASK),
     "profile": (*STEP, *LEARN),
     "randomization": STEP,
+    "ranks": (*STEP, *LEARN, "ksim_rl/ranks"),
     "resume": (*STEP, *LEARN, "ksim_rl/trainers"),
     "rooms": (*STEP, *LEARN, *TASK),
     "scaling": (*STEP, *LEARN),

@@ -4,15 +4,18 @@
 
 trains `TASKS` on one GPU and on all (or `ranks=N`), as torchrun does it, with as many envs per rank, and prints whole
 iterations in ms and env states/s of both, their ratio, and the host's waits and copies in one iteration of rank 0; then
-the seconds until Go1 follows its command on one GPU and on all, the median of `seeds` (1,2,3,4,5; none with
-`seeds=none`), without the first iteration; and the seconds until all ranks have ended after one was killed. With
-`tasks=go1_velocity_flat:4096` others are chosen, and `device=cpu` tries it out. Figures go to
-benchmarks/results/ranks.json. NVLink multicast is off (`NCCL_NVLS_ENABLE=0`), which the file records.
+the seconds until all ranks have ended after one was killed (`kill=no` leaves it out); and the seconds until Go1 follows
+its command on one GPU and on all, the median of `seeds` (1,2,3,4,5; none with `seeds=none`), without the first
+iteration. With `tasks=go1_velocity_flat:4096` others are chosen, and `device=cpu` tries it out.
+
+Figures go to benchmarks/results/ranks.json after each part, so that those of a part stay where a later one has no time
+left. All processes have the variables of `NCCL`, which leave NVLink multicast off and which the file records.
 """
 
 from __future__ import annotations
 
 import csv
+import gc
 import json
 import os
 import signal
@@ -21,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -34,37 +38,53 @@ from ksim_rl.tables.table import load
 from ksim_rl.trainers import build
 
 TASKS = "go1_velocity_flat:16384,go1_velocity_flat:4096,g1_velocity_flat:4096"
-OPTIONS = {"tasks": TASKS, "seeds": "1,2,3,4,5", "ranks": "0", "device": "cuda", "env_states": "60e6"}
+OPTIONS = {
+    "tasks": TASKS,
+    "seeds": "1,2,3,4,5",
+    "ranks": "0",
+    "device": "cuda",
+    "env_states": "60e6",
+    "kill": "yes",
+}
 LEVELS = load("velocity").rows["ppo/go1"].levels
-NVLS = {"NCCL_NVLS_ENABLE": "0"}
+# Each switches off what would use NVLink multicast, which not every machine allows.
+NCCL = {"NCCL_NVLS_ENABLE": "0", "TORCH_SYMM_MEM_DISABLE_MULTICAST": "1", "NVSHMEM_DISABLE_NVLS": "1"}
 WARMUP, TIMED = {"cuda": 12, "cpu": 1}, {"cuda": 20, "cpu": 2}
 
 
-def worker(overrides: list[str]) -> None:
-    """Measure whole iterations on this rank, and print the figures as JSON on rank 0."""
+def worker(device: str, tasks: str) -> None:
+    """Measure whole iterations of each task on this rank, and print the figures of each as JSON on rank 0."""
     with ranks.joined("train"):
-        cfg = conf.compose([*overrides, "logger=none", "trainer.eval_episodes=0"])
-        trainer = build(cfg)
-        device = trainer.update.device
+        for word in tasks.split(","):
+            figures = measured(device, *word.split(":"))
+            gc.collect()
+            if ranks.rank() == 0:
+                print(json.dumps(figures), flush=True)
 
-        def settled() -> float:
-            trainer.settle()
-            if device.type == "cuda":
-                torch.cuda.synchronize(device)
-            return time.perf_counter()
 
-        for _ in range(WARMUP[device.type]):
-            trainer.iterate()
-        began = settled()
-        for _ in range(TIMED[device.type]):
-            trainer.iterate()
-        seconds = (settled() - began) / TIMED[device.type]
-        figures = {"iteration_ms": seconds * 1000.0, "env_states_per_s": trainer.num_env_states / seconds}
-        if device.type == "cuda":
-            figures |= host_traffic(trainer.iterate)
-        settled()
-        if ranks.rank() == 0:
-            print(json.dumps(figures), flush=True)
+def measured(device: str, task: str, num_envs: str) -> dict[str, float]:
+    """Return what whole iterations of a task take."""
+    run = [f"task={task}", f"num_envs={num_envs}", f"device={device}", "collector.rollout_length=24"]
+    trainer = build(conf.compose([*run, "logger=none", "trainer.eval_episodes=0"]))
+    own = trainer.update.device
+
+    def settled() -> float:
+        trainer.settle()
+        if own.type == "cuda":
+            torch.cuda.synchronize(own)
+        return time.perf_counter()
+
+    for _ in range(WARMUP[own.type]):
+        trainer.iterate()
+    began = settled()
+    for _ in range(TIMED[own.type]):
+        trainer.iterate()
+    seconds = (settled() - began) / TIMED[own.type]
+    figures = {"iteration_ms": seconds * 1000.0, "env_states_per_s": trainer.num_env_states / seconds}
+    if own.type == "cuda":
+        figures |= host_traffic(trainer.iterate)
+    settled()
+    return figures
 
 
 def start(size: int, module: str, *arguments: str, folder: Path) -> subprocess.Popen[str]:
@@ -74,7 +94,7 @@ def start(size: int, module: str, *arguments: str, folder: Path) -> subprocess.P
         command += ["torch.distributed.run", "--rdzv-backend=c10d", "--rdzv-endpoint=localhost:0"]
         command += [f"--nproc-per-node={size}", "-m"]
     path = os.pathsep.join(filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", ""))))
-    env = os.environ | NVLS | {"PYTHONPATH": path, "PYTHONUNBUFFERED": "1"}
+    env = os.environ | NCCL | {"PYTHONPATH": path, "PYTHONUNBUFFERED": "1"}
     return subprocess.Popen(
         [*command, module, *arguments], cwd=folder, env=env, stdout=subprocess.PIPE, text=True
     )
@@ -119,10 +139,11 @@ def seconds_to_track(size: int, seed: str, *, env_states: float, device: str) ->
         return float(last["seconds"]) - float(rows[0]["seconds"])
 
 
-def seconds_to_end(size: int, *, device: str) -> float:
-    """Kill a rank, and return the seconds until all have ended."""
+def seconds_to_end(size: int, task: str, num_envs: str, *, device: str) -> float:
+    """Kill a rank of a run of a task, and return the seconds until all have ended."""
     with tempfile.TemporaryDirectory() as name:
-        run = ["task=cartpole_balance", f"device={device}", "num_envs=64", "trainer.num_iterations=1000000"]
+        run = [f"task={task}", f"device={device}", f"num_envs={num_envs}", "collector.rollout_length=24"]
+        run += ["trainer.num_iterations=1000000"]
         process = start(size, "ksim_rl.cli.main", "train", *run, "hydra.run.dir=run", folder=Path(name))
         assert process.stdout is not None
         for line in process.stdout:
@@ -138,7 +159,7 @@ def seconds_to_end(size: int, *, device: str) -> float:
 def main() -> None:
     """Measure all tasks, then learning, then a kill, and write the figures."""
     if sys.argv[1:2] == ["worker"]:
-        worker(sys.argv[2:])
+        worker(*sys.argv[2:])
         return
     own = command_line.options(sys.argv[1:], OPTIONS)
     device = torch.device(own["device"])
@@ -146,44 +167,46 @@ def main() -> None:
     if size < 2:
         raise ValueError(f"device={device} has {size} of it: ranks are measured on two or more")
     label = f"{report.device_label(device)}x{size}"
+    saved = partial(report.write, "ranks", device=device, module="benchmarks.ranks", environment=NCCL)
     table = Table("task", "envs", "1: ms", f"{size}: ms", "1: env states/s", f"{size}: env states/s", "ratio")
-    figures: dict[str, float] = {}
-    here = Path(__file__).parents[1]
-    for word in own["tasks"].split(","):
+    tasks, here = own["tasks"].split(","), Path(__file__).parents[1]
+    by_size: list[list[dict[str, float]]] = []
+    for count in (
+        1,
+        size,
+    ):  # all tasks in the same processes, whose start takes longer than what they measure
+        began = time.monotonic()
+        text = output(start(count, "benchmarks.ranks", "worker", own["device"], own["tasks"], folder=here))
+        by_size.append([json.loads(line) for line in text.splitlines() if line.startswith("{")])
+        print(f"{count} of {device.type}: {time.monotonic() - began:.0f} s", flush=True)
+    for word, one, all_ranks in zip(tasks, *by_size, strict=True):
         task, _, num_envs = word.partition(":")
-        run = (f"task={task}", f"num_envs={num_envs}", f"device={device}", "collector.rollout_length=24")
-        one, all_ranks = (
-            json.loads(output(start(count, "benchmarks.ranks", "worker", *run, folder=here)).splitlines()[-1])
-            for count in (1, size)
-        )
         ratio = all_ranks["env_states_per_s"] / one["env_states_per_s"]
         prefix = f"{label}/{task}/{num_envs}"
         name = {2: "two"}.get(size, str(size))
-        figures |= {f"{prefix}/{name}_over_one": round(ratio, 3)}
+        figures = {f"{prefix}/{name}_over_one": round(ratio, 3)}
         figures |= {f"{prefix}/one_{key}": round(value, 3) for key, value in one.items()}
         figures |= {f"{prefix}/all_{key}": round(value, 3) for key, value in all_ranks.items()}
+        saved(figures=figures)
         times = [f"{part['iteration_ms']:.1f}" for part in (one, all_ranks)]
         speeds = [f"{part['env_states_per_s']:,.0f}" for part in (one, all_ranks)]
         table.add_row(task, num_envs, *times, *speeds, f"{ratio:.3f}")
     Console().print(table)
-    seeds = [] if own["seeds"] == "none" else own["seeds"].split(",")
-    if seeds:
+    if own["kill"] == "yes":
+        killed = seconds_to_end(size, *tasks[-1].split(":"), device=own["device"])
+        print(f"all ranks had ended {killed:.1f} s after one was killed", flush=True)
+        saved(figures={f"{label}/killed/seconds_to_end": round(killed, 1)})
+    if own["seeds"] != "none":
         options = {"env_states": float(own["env_states"]), "device": own["device"]}
         medians = [
-            statistics.median(seconds_to_track(count, seed, **options) for seed in seeds)
+            statistics.median(seconds_to_track(count, seed, **options) for seed in own["seeds"].split(","))
             for count in (1, size)
         ]
         print(f"seconds to track on one and on {size}: {medians[0]:.1f}, {medians[1]:.1f}")
-        figures |= {
-            f"{label}/seconds_to_track/{count}": value
-            for count, value in zip((1, size), medians, strict=True)
-        }
-        figures[f"{label}/seconds_to_track/ratio"] = round(medians[1] / medians[0], 3)
-    killed = seconds_to_end(size, device=own["device"])
-    print(f"all ranks had ended {killed:.1f} s after one was killed")
-    figures[f"{label}/killed/seconds_to_end"] = round(killed, 1)
-    path = report.write("ranks", figures=figures, device=device, module="benchmarks.ranks", environment=NVLS)
-    print(f"written to {path}")
+        prefix = f"{label}/seconds_to_track"
+        seconds = {f"{prefix}/{count}": value for count, value in zip((1, size), medians, strict=True)}
+        saved(figures={**seconds, f"{prefix}/ratio": round(medians[1] / medians[0], 3)})
+    print(f"written to {report.RESULTS / 'ranks.json'}")
 
 
 if __name__ == "__main__":

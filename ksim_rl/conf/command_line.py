@@ -121,6 +121,8 @@ def _check_names(overrides: Sequence[Override], loader: ConfigLoader, name: str)
             choices.append(f"{added}{override.key_or_group}={_values(override)[0]}")
         elif not override.is_hydra_override():
             fields.append(override)
+    if not fields:
+        return
     sources = tuple(element.path or "" for element in loader.get_search_path().get_path())
     # The primary config of a run that is made again is another one each time.
     tree = (_names.__wrapped__ if name == RUN_AGAIN else _names)(name, tuple(choices), sources)

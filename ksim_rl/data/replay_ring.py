@@ -179,18 +179,14 @@ class ReplayCfg(Checked):
     num_env_states_per_minibatch: Count
     num_minibatches: Count  # per iteration
     num_steps: Count = 1  # of each env per iteration
-    capacity: Count = (
-        1024  # env states per env; an episode's end takes one more, for its terminal observation
-    )
+    capacity: Count = 1024  # env states per env; an episode's end takes one more, for what it ends with
     n_step: Count = 1  # rewards that a target sums before it bootstraps
     learning_starts: Count = 10  # steps of each env with random actions before the first gradient step
     prioritized: bool = False  # by the last temporal-difference error (Schaul et al., arXiv 1511.05952)
     priority_alpha: NonNegative = 0.6  # how strongly the error counts; 0 is uniform
     priority_beta: Share = 0.4  # how far the weights of the losses undo that; 1 is wholly
     save_replay: bool = True
-    shards: Count = (
-        1  # equal parts of the envs, from each of which minibatches have as many: what so many ranks do
-    )
+    shards: Count = 1  # equal parts of the envs, of which minibatches have as many each: what ranks do
 
     def _check_fields(self) -> None:
         """Refuse a ring that is too small for its rollouts."""
@@ -204,9 +200,10 @@ class ReplayCfg(Checked):
 
     def rollout_length(self, num_envs: int) -> int:
         """Return T, which does not depend on the number of envs; these and minibatches have equal shards."""
-        if num_envs % self.shards or self.num_env_states_per_minibatch % self.shards:
+        size = self.num_env_states_per_minibatch
+        if num_envs % self.shards or size % self.shards:
             raise ValueError(
-                f"shards={self.shards}: use a divisor of num_envs and num_env_states_per_minibatch"
+                f"shards={self.shards}: use a divisor of num_envs={num_envs} and of minibatches of {size}"
             )
         if self.prioritized and self.shards * ranks.size() > 1:
             raise ValueError("prioritized=True: priorities are compared in one process without shards only")

@@ -31,7 +31,7 @@ def at(place: str) -> None:
 
 
 class Store(Protocol):
-    """What is used of `torch.distributed.TCPStore`."""
+    """What is used of `torch.distributed.Store`: the part of this attempt, over a connection of the thread's own."""
 
     def set(self, key: str, value: str) -> None: ...  # noqa: D102
     def get(self, key: str) -> bytes: ...  # noqa: D102
@@ -42,8 +42,7 @@ class Heartbeat:
     """Beats while it is entered. `done` says that this rank may go silent, and `ended` why it went."""
 
     def __init__(self, store: Store) -> None:
-        restart = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
-        self._store, self._prefix = store, f"ksim_rl/{os.environ.get('TORCHELASTIC_RUN_ID', '')}/{restart}"
+        self._store = store
         self._hung_s = float(os.environ.get("KSIM_RL_RANK_TIMEOUT_S", HUNG_S))
         self._stop, self._lock = threading.Event(), threading.Lock()
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
@@ -65,10 +64,10 @@ class Heartbeat:
 
     def _tell(self, what: str, text: str) -> None:
         with suppress(Exception), self._lock:  # the store may have gone with the rank that kept it
-            self._store.set(f"{self._prefix}/{what}/{group.rank()}", text)
+            self._store.set(f"{what}/{group.rank()}", text)
 
     def _read(self, what: str, rank: int) -> str | None:
-        key = f"{self._prefix}/{what}/{rank}"
+        key = f"{what}/{rank}"
         with self._lock:
             return self._store.get(key).decode() if self._store.check([key]) else None
 

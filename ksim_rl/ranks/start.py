@@ -5,19 +5,17 @@ import os
 import platform
 import socket
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from typing import Any
 
 import torch
 import torch.distributed as dist
 
-from ksim_rl.ranks import group, heartbeat
+from ksim_rl.ranks import group, heartbeat, store
 
 # What torchrun sets; `python -m torch.distributed.run` is the same.
 VARIABLES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
-# For a rank to start: imports take long where many processes share few cores.
-JOIN_S = 300.0
 COMMANDS = ("train", "resume")
 
 
@@ -50,22 +48,19 @@ def joined(command: str) -> Iterator[None]:
         raise ValueError(
             f"WORLD_SIZE is set and {missing[0]} is not: start the ranks by torchrun, which sets both"
         )
-    backend = _backend()
-    address = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
+    backend, rank, size = _backend(), int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
+    _runs[:] = [store.of_run(store.connected(serves=store.is_served_by_rank()))]
     try:
-        dist.init_process_group(backend, timeout=timedelta(minutes=30))
-        _stores[:] = [_client()]
-    except (RuntimeError, OSError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        if "EADDRINUSE" in reason or "address already in use" in reason.lower():
-            raise ValueError(
-                f"port {os.environ['MASTER_PORT']} is in use: give torchrun another one, --master-port=PORT, "
-                "or --rdzv-backend=c10d --rdzv-endpoint=localhost:0"
-            ) from error
-        raise RuntimeError(f"the other ranks cannot be reached at {address}: {reason}") from error
+        _attempts[:] = [store.attempt(_runs[0], rank=rank, size=size)]
+        dist.init_process_group(
+            backend, store=_of_attempt(_runs[0]), rank=rank, world_size=size, timeout=timedelta(minutes=30)
+        )
+    except RuntimeError as error:
+        raise RuntimeError(f"the other ranks cannot be reached: {' '.join(str(error).split())}") from error
     if backend != "gloo":
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
-    heart = heartbeat.Heartbeat(_client())
+    # A connection of its own: its thread must not wait for another's key.
+    heart = heartbeat.Heartbeat(_of_attempt(store.of_run(store.connected())))
     same = {"ksim_rl": _version(), "torch": torch.__version__, "Python": platform.python_version()}
     try:
         check_same(same, what="version")
@@ -118,25 +113,32 @@ def by_first(function: Callable[[], str]) -> str:
 
 
 def run_folder(own: str) -> str:
-    """Return the folder of rank 0, or that of the attempt before, where torchrun has started the ranks again."""
+    """Return the folder of rank 0, or that of the attempt before, where torchrun has started the ranks again.
+
+    The own one is removed if it is another, and empty.
+    """
     if group.size() == 1:
         return own
-    key = f"ksim_rl/{os.environ.get('TORCHELASTIC_RUN_ID', '')}/folder"
 
     def kept() -> str:
-        if not _stores[0].check([key]):
-            _stores[0].set(key, own)
-        return _stores[0].get(key).decode()
+        if not _runs[0].check(["folder"]):
+            _runs[0].set("folder", own)
+        return _runs[0].get("folder").decode()
 
-    return by_first(kept)
+    folder = by_first(kept)
+    if folder != own:
+        with suppress(OSError):
+            os.rmdir(own)
+    return folder
 
 
 def restarted() -> bool:
     """Whether torchrun has started these ranks again, after one of them had failed."""
-    return group.size() > 1 and int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0
+    return group.size() > 1 and bool(_attempts) and _attempts[0] > 1
 
 
-_stores: list[dist.TCPStore] = []
+_runs: list[dist.PrefixStore] = []
+_attempts: list[int] = []
 _host_groups: list[Any] = []
 
 
@@ -179,10 +181,8 @@ def _check_gpus(backend: str) -> None:
             )
 
 
-def _client() -> dist.TCPStore:
-    """Return a connection of our own to the store of the run, for threads beside the collectives."""
-    host, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
-    return dist.TCPStore(host, port, is_master=False, timeout=timedelta(seconds=JOIN_S))
+def _of_attempt(run: dist.Store) -> dist.PrefixStore:
+    return dist.PrefixStore(f"attempt/{_attempts[0]}", run)
 
 
 def _version() -> str:

@@ -137,14 +137,14 @@ def linear_teacher(gain=-GAIN, *, key="privileged"):
     return Teacher(policy=actor.requires_grad_(False).eval())
 
 
-def make_distillation(folder=None, *, seed=0, iterations=6, teacher=None, num_envs=64, cfg=None):
+def make_distillation(folder=None, *, seed=0, iterations=6, teacher=None, num_envs=64, shards=1, cfg=None):
     torch.manual_seed(seed)
     env = DriftEnv(num_envs)
     env.set_seed(seed)
     student = make_actor(
         ActorCfg(hidden_dims=(), obs_normalization=False, init_std=0.5), obs_dim=len(BINS), action_dim=1
     )
-    data = DatasetCfg(num_env_states_per_minibatch=128, num_minibatches=4)
+    data = DatasetCfg(num_env_states_per_minibatch=2 * num_envs, num_minibatches=4, shards=shards)
     update = DistillationUpdate(
         DistillationCfg(**{"teacher": "toy", "learning_rate": 0.05, "num_epochs": 4, **(cfg or {})}),
         actor=student,
@@ -155,13 +155,13 @@ def make_distillation(folder=None, *, seed=0, iterations=6, teacher=None, num_en
     return _trainer(env, update, data, folder, iterations)
 
 
-def make_amp(folder=None, *, seed=0, iterations=6, num_envs=64, reference=None, cfg=None):
+def make_amp(folder=None, *, seed=0, iterations=6, num_envs=64, reference=None, shards=1, cfg=None):
     torch.manual_seed(seed)
     env = PlaneEnv(num_envs)
     env.set_seed(seed)
     actor = make_actor(ActorCfg(hidden_dims=(32, 32), init_std=0.4), obs_dim=2, action_dim=2)
     critic = make_critic(CriticCfg(hidden_dims=(32, 32)), obs_dim=2)
-    data = DatasetCfg(num_env_states_per_minibatch=256, num_minibatches=4)
+    data = DatasetCfg(num_env_states_per_minibatch=4 * num_envs, num_minibatches=4, shards=shards)
     fields = {
         "motions": ("circle",),
         "task_coeff": 0.0,
@@ -169,7 +169,7 @@ def make_amp(folder=None, *, seed=0, iterations=6, num_envs=64, reference=None, 
         "discriminator_hidden_dims": (64, 64),
         "discriminator_learning_rate": 1e-3,
         "gradient_penalty": 2.0,
-        "num_transitions_per_step": 256,
+        "num_transitions_per_step": 4 * num_envs,
         "num_discriminator_steps": 8,
         "num_epochs": 4,
         "gamma": 0.9,

@@ -61,10 +61,8 @@ def trained(overrides, num_envs, minibatch, shards):
     return learnt, envs, trainer.metrics
 
 
-def check(name, size, folder):
-    overrides = ALGORITHMS[name]
-    learnt, envs, metrics = trained(overrides, 4 * size, 16 * size, size)
-    parts = results(trained, overrides, 4, 16, 1, size=size, folder=folder)
+def largest_difference(learnt, parts):
+    """Compare all tensors of one process with those of each rank; rows that are shared out are put together."""
     worst = 0.0
     for key, expected in learnt.items():
         # Each rank has the sums of its own observations, and a replay of its own.
@@ -72,9 +70,17 @@ def check(name, size, folder):
         own |= key.startswith("/replay/")
         if own or not expected.numel():
             continue
-        shared = expected.shape == parts[0][0][key].shape
-        found = [part[0][key] for part in parts] if shared else [torch.cat([part[0][key] for part in parts])]
+        shared = expected.shape == parts[0][key].shape
+        found = [part[key] for part in parts] if shared else [torch.cat([part[key] for part in parts])]
         worst = max([worst, *((one.double() - expected.double()).abs().max().item() for one in found)])
+    return worst
+
+
+def check(name, size, folder):
+    overrides = ALGORITHMS[name]
+    learnt, envs, metrics = trained(overrides, 4 * size, 16 * size, size)
+    parts = results(trained, overrides, 4, 16, 1, size=size, folder=folder)
+    worst = largest_difference(learnt, [part[0] for part in parts])
     print(f"{name}, {size} ranks: {len(learnt)} tensors, largest difference {worst:.2g}")
     assert worst <= 1e-6
     for key, expected in envs.items():

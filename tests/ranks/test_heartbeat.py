@@ -43,7 +43,7 @@ def ended(monkeypatch):
 
 
 def key(what):
-    return f"ksim_rl//0/{what}/1"
+    return f"{what}/1"
 
 
 def test_a_rank_that_is_silent_ends_the_others(ended, monkeypatch, capsys):

@@ -2,10 +2,12 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from itertools import pairwise
 
 import pytest
 
@@ -77,15 +79,35 @@ def test_two_nodes_of_two_ranks_are_one_run(tmp_path):
     assert sum("on each of 4 ranks, 32 envs and 512 in all" in text for text in texts) == 1
 
 
-def test_a_killed_rank_ends_the_others_with_its_cause(tmp_path):
-    process = torchrun("train", *RUN, "trainer.num_iterations=100000", folder=tmp_path)
+def kill_rank_1(process, at):
+    """Kill it when the run says `at`, and return what was said until then."""
     lines = []
-    while not lines or "iteration 2/" not in lines[-1]:
+    while not lines or at not in lines[-1]:
         lines.append(process.stdout.readline())
         assert lines[-1], "".join(lines)
     ranks = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True, check=True)
-    killed = int(ranks.stdout.split()[1])
-    os.kill(killed, signal.SIGKILL)
+    os.kill(int(ranks.stdout.split()[1]), signal.SIGKILL)
+    return "".join(lines)
+
+
+def test_a_killed_rank_is_started_again_and_the_run_goes_on_from_its_newest_checkpoint(tmp_path):
+    options = ("--nproc-per-node=2", "--max-restarts=1")
+    run = [*RUN, "trainer.checkpoint_interval=4", "trainer.num_iterations=30"]
+    process = torchrun("train", *run, folder=tmp_path, options=options)
+    text = kill_rank_1(process, "iteration 6/") + finished(process)
+    numbers = [int(found) for found in re.findall(r"iteration (\d+)/30:.*slowest rank", text)]
+    again = next(i for i, (a, b) in enumerate(pairwise(numbers), 1) if b < a + 1)
+    print(f"killed after iteration {numbers[again - 1]}, went on with {numbers[again]}")
+    assert numbers[again] % 4 == 1 and numbers[again] > 1
+    assert numbers[again:] == list(range(numbers[again], 31))
+    (run,) = (tmp_path / "runs" / "cartpole_balance").iterdir()
+    rows = (run / "metrics.csv").read_text().splitlines()
+    assert [int(row.split(",")[0]) for row in rows[1:]] == list(range(256, 31 * 256, 256))
+
+
+def test_a_killed_rank_ends_the_others_with_its_cause(tmp_path):
+    process = torchrun("train", *RUN, "trainer.num_iterations=100000", folder=tmp_path)
+    kill_rank_1(process, "iteration 2/")
     began = time.monotonic()
     text, _ = process.communicate(timeout=60)
     print(f"all ranks had ended {time.monotonic() - began:.1f} s after one was killed")

@@ -70,8 +70,8 @@ class AMPUpdate(RolloutUpdate):
         networks = {"discriminator": self.discriminator}
         options: Any = {"device": ppo.device, "signals": ppo.signals, "logged": LOGGED}
         super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, **options)
-        # So that the first scores are of features in a fitting range.
-        self.discriminator.normalizer.update(self.reference_N2L)
+        # So that the first scores are of features in a fitting range. Ranks add up what they have counted.
+        self.discriminator.normalizer.update(self.reference_N2L[ranks.rank() :: ranks.size()])
         own = {
             "learning_rate": cfg.discriminator_learning_rate,
             "weight_decay": cfg.discriminator_weight_decay,
@@ -84,7 +84,9 @@ class AMPUpdate(RolloutUpdate):
             num_minibatches=cfg.num_discriminator_steps,
             num_steps=num_steps,
             capacity=cfg.replay_rollouts * num_steps,
+            shards=ppo.dataset.cfg.shards,
         )
+        kept.rollout_length(num_envs)  # which refuses shards that are not equal
         self.replay = ReplayRing(kept, num_envs=num_envs, observations=[cfg.style_group], device=self.device)
         self._style = torch.zeros((), device=self.device)
 
@@ -105,13 +107,12 @@ class AMPUpdate(RolloutUpdate):
         discriminator's steps.
         """
         metrics = self.ppo.metrics()
-        in_a_row = torch.maximum(metrics["update/skipped_in_a_row"], self._longest_skip)
         return {
             **metrics,
             **self._means,
             "style/reward": self._style,
             "update/skipped_steps": metrics["update/skipped_steps"] + self.guard.skipped,
-            "update/skipped_in_a_row": in_a_row,
+            "update/skipped_in_a_row": torch.maximum(metrics["update/skipped_in_a_row"], self._longest_skip),
         }
 
     def _update(self) -> None:
@@ -131,9 +132,8 @@ class AMPUpdate(RolloutUpdate):
         self.replay.extend(rollout_ET.select(*self._features, *STANDARD.following))
         net, made, shown = self.discriminator, [], []
         for minibatch_B in self.replay.minibatches(self.cfg.num_discriminator_steps):
-            shown_N2L = self.reference_N2L
-            drawn_B = ranks.randint(len(shown_N2L), minibatch_B.batch_size, device=shown_N2L.device)
-            reference_B2L = shown_N2L[drawn_B]
+            drawn_B = ranks.randint(len(self.reference_N2L), minibatch_B.batch_size, device=self.device)
+            reference_B2L = self.reference_N2L[drawn_B]
             policy_B2L = _transitions(minibatch_B, *self._features)
             loss, logged = discriminator_loss(
                 net.judge,
@@ -166,9 +166,7 @@ class AMPUpdate(RolloutUpdate):
         """Continue where `state_dict` was taken; see `RolloutUpdate`."""
         self.ppo.load_state_dict(state)
         super().load_weights(state)
-        load_optimizer_state(
-            self.optimizer, state["discriminator_optimizer"], what="optimizer of the discriminator"
-        )
+        load_optimizer_state(self.optimizer, state["discriminator_optimizer"], what="discriminator's Adam")
         guard = state["discriminator_guard"]
         state_tree.copy_into(self.guard.state_dict(), guard, what="guard of the discriminator")
         self.replay.load_state_dict(state["replay"])

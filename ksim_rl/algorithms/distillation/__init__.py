@@ -11,4 +11,5 @@ DISTILLATION = Algorithm(
     update=make_distillation_update,
     policy=ppo.make_ppo_policy,
     data=ppo.DATA,
+    on_ranks=True,
 )
