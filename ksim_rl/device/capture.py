@@ -6,7 +6,7 @@ Inside the body that is captured for torch, worlds issue live launches: a finish
 import gc
 import threading
 import warnings
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager, suppress
 
 import torch
@@ -88,8 +88,7 @@ class Captured:
     from then on each call replays it. So `body` must be fit for replay: it reads and writes tensors that stay where
     they are, allocates no size that depends on data, and neither syncs with the host nor branches on tensor values.
     What it does in Python happens only while it is eager or recorded. It may draw from the device's default random
-    generator and `generators`. With `require_graphs`, a CUDA device without graphs is refused instead of a warning and
-    eager calls.
+    generator. With `require_graphs`, a CUDA device without graphs is refused instead of a warning and eager calls.
     """
 
     def __init__(
@@ -99,7 +98,6 @@ class Captured:
         device: str | torch.device,
         warmup: int = 2,
         require_graphs: bool = False,
-        generators: Sequence[torch.Generator] = (),
     ) -> None:
         if warmup < 1:
             raise ValueError(
@@ -108,7 +106,6 @@ class Captured:
         self.body = body
         self.device = checked_device(device)
         self.warmup = warmup
-        self._generators = tuple(generators)
         self._calls = 0
         self._graph: torch.cuda.CUDAGraph | None = None
         self._warp_graph: wp.Graph | None = None
@@ -152,8 +149,6 @@ class Captured:
         warp_side = warp_stream(stream)
         torch.cuda.synchronize(self.device)
         graph = torch.cuda.CUDAGraph()
-        for generator in self._generators:
-            graph.register_generator_state(generator)
         with (
             no_collection(),
             torch.cuda.stream(stream),

@@ -215,21 +215,13 @@ class NoiseColumns(nn.Module):
 
 
 def _parameters(cfg: NoiseCfg, key: NestedKey, size: int) -> list[list[float]]:
-    """Return the parameters of one observation, one row per kind."""
+    """Return the parameters of one observation, in the order of the rows of `noise_kernel`'s table."""
     try:
         bias = cfg.bias.affine(size) if cfg.bias is not None else ([0.0] * size, [0.0] * size)
-        rows = {
-            noise_kernel.OFFSET: cfg.affine(size)[0],
-            noise_kernel.SPREAD: cfg.affine(size)[1],
-            noise_kernel.BIAS_OFFSET: bias[0],
-            noise_kernel.BIAS_SPREAD: bias[1],
-            noise_kernel.WALK_STD: per_dim("walk_std", cfg.walk_std, size),
-            noise_kernel.RESOLUTION: per_dim("resolution", cfg.resolution, size),
-            noise_kernel.DROPOUT: [cfg.dropout] * size,
-        }
+        walk, grain = (per_dim(name, getattr(cfg, name), size) for name in ("walk_std", "resolution"))
+        return [*cfg.affine(size), *bias, walk, grain, [cfg.dropout] * size]
     except ValueError as error:
         raise ValueError(f"{type(cfg).__name__} of {key!r}: {error}") from None
-    return [rows[row] for row in range(noise_kernel.NUM_PARAMETERS)]
 
 
 def _flags(cfg: NoiseCfg) -> int:
