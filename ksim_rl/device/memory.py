@@ -37,7 +37,10 @@ def memory_for(
         traceback.clear_frames(error.__traceback__)  # they hold what was built
         while work is not None and (fewer := fewer // 2):
             gc.collect()
-            torch.cuda.empty_cache()
+            if torch.cuda.is_initialized():
+                # A memory pool gives back what it does not use when the host waits.
+                torch.cuda.synchronize(device)
+                torch.cuda.empty_cache()
             with suppress(RuntimeError, ValueError):  # too many as well, or they do not divide the data
                 held = work(fewer), (_free_bytes(device) or 0) >= (free or 0) / 10
                 if held[1]:
