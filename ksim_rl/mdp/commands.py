@@ -329,12 +329,10 @@ class JoystickCommand(CommandTerm):
             are those of the command that it stands in for.
     """
 
-    axes: Mapping[str, Range]
+    axes: Annotated[Mapping[str, Range], Filled("name at least one, such as {'vx': (-1.0, 1.0)}")]
     resampling_time_range_s: NonNegativeRange | None = None
 
     def _check_fields(self) -> None:
-        if not self.axes:
-            raise ValueError("axes={}: name at least one, such as {'vx': (-1.0, 1.0)}")
         if self.resampling_time_range_s is not None:
             raise ValueError(
                 f"resampling_time_range_s={self.resampling_time_range_s!r}: it is set, never drawn; leave it out"

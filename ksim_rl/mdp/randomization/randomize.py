@@ -6,14 +6,15 @@ Each draw starts from the model's own values, so that neither the order of reset
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ksim_rl.checks import check_choice, check_in_range, check_pair
+from ksim_rl.checked import NonNegative, Positive, Range, Within, check_value
+from ksim_rl.checks import check_choice
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant, constant, index_constant
@@ -22,6 +23,11 @@ from ksim_rl.scene.names import Patterns
 Pair = tuple[float, float]
 Operation = Literal["abs", "add", "scale"]
 Distribution = Literal["uniform", "log_uniform", "gaussian"]
+_RANGES: Mapping[str, Any] = {
+    "uniform": Range,
+    "log_uniform": Annotated[tuple[Positive, Positive], Within(ordered=True)],
+    "gaussian": tuple[float, NonNegative],
+}
 # Where a gaussian draw is cut, in standard deviations, so that its reach can be checked.
 CUT = 3.0
 _KINDS = {"cam": "camera", "mat": "material", **dict.fromkeys(("jnt", "dof", "qpos0"), "joint")}
@@ -44,15 +50,7 @@ class Randomize(EventTerm, mode="startup"):
 
     def check_range(self, name: str, pair: object) -> None:
         """Raise a ValueError for a range that the distribution cannot draw from."""
-        if self.distribution == "gaussian":
-            check_pair(name, (0.0, 0.0) if _is_pair(pair) else pair)
-            mean, deviation = pair  # pyright: ignore[reportGeneralTypeIssues]
-            check_in_range(f"{name}[0] (mean)", mean)
-            check_in_range(f"{name}[1] (standard deviation)", deviation, low=0.0)
-            return
-        check_pair(name, pair)
-        if self.distribution == "log_uniform":
-            check_in_range(f"{name}[0] (log_uniform)", pair[0], low=0.0, low_open=True)  # pyright: ignore
+        check_value(f"{name} ({self.distribution})", pair, _RANGES[self.distribution])
 
     def draw(self, view: EnvView, count: int, pairs: Sequence[Pair]) -> Float[Tensor, "E N C"]:
         """Draw `count` rows per world, or one if shared, with one column per range."""
@@ -201,7 +199,3 @@ def write_entries(
     if isinstance(rows, Tensor) and isinstance(across, Tensor):
         rows = rows[:, None]
     entries_ERC[:, rows, across] = torch.where(mask_E[:, None, None], value_ENC, held_ENC)
-
-
-def _is_pair(value: object) -> bool:
-    return isinstance(value, (tuple, list)) and len(value) == 2
