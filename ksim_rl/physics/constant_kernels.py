@@ -17,6 +17,7 @@ import mujoco_warp as mjw
 import warp as wp
 
 from ksim_rl.physics.structs import struct_with
+from ksim_rl.physics.upstream import mul_quat, quat_to_mat, rot_vec_quat
 
 FREE = wp.constant(int(mujoco.mjtJoint.mjJNT_FREE))
 BALL = wp.constant(int(mujoco.mjtJoint.mjJNT_BALL))
@@ -58,33 +59,6 @@ class Constants:
 
 
 @wp.func
-def _multiply(a: wp.quat, b: wp.quat) -> wp.quat:
-    # MuJoCo's order, (w, x, y, z).
-    return wp.quat(
-        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-    )
-
-
-@wp.func
-def _rotate(q: wp.quat, v: wp.vec3) -> wp.vec3:
-    u = wp.vec3(q[1], q[2], q[3])
-    t = 2.0 * wp.cross(u, v)
-    return v + q[0] * t + wp.cross(u, t)
-
-
-@wp.func
-def _matrix(q: wp.quat) -> wp.mat33:
-    return wp.matrix_from_cols(
-        _rotate(q, wp.vec3(1.0, 0.0, 0.0)),
-        _rotate(q, wp.vec3(0.0, 1.0, 0.0)),
-        _rotate(q, wp.vec3(0.0, 0.0, 1.0)),
-    )
-
-
-@wp.func
 def _point_velocity(rotates: float, axis: wp.vec3, anchor: wp.vec3, point: wp.vec3) -> wp.vec3:
     """Velocity of a point when its dof moves at unit speed."""
     return rotates * wp.cross(axis, point - anchor) + (1.0 - rotates) * axis
@@ -101,8 +75,8 @@ def frames(c: Constants):
     for body in range(1, c.nbody):
         parent = c.body_parentid[body]
         turn = c.xquat[world, parent]
-        pos = c.xpos[world, parent] + _rotate(turn, c.body_pos[world % c.body_pos.shape[0], body])
-        quat = _multiply(turn, c.body_quat[world % c.body_quat.shape[0], body])
+        pos = c.xpos[world, parent] + rot_vec_quat(c.body_pos[world % c.body_pos.shape[0], body], turn)
+        quat = mul_quat(turn, c.body_quat[world % c.body_quat.shape[0], body])
         for joint in range(c.body_jntadr[body], c.body_jntadr[body] + c.body_jntnum[body]):
             kind = c.jnt_type[joint]
             dof = c.jnt_dofadr[joint]
@@ -121,23 +95,23 @@ def frames(c: Constants):
                     unit[i] = 1.0
                     c.axis[world, dof + i] = unit
                     c.anchor[world, dof + i] = pos
-                    c.axis[world, dof + 3 + i] = _rotate(quat, unit)
+                    c.axis[world, dof + 3 + i] = rot_vec_quat(unit, quat)
                     c.anchor[world, dof + 3 + i] = pos
             elif kind == BALL:
-                place = pos + _rotate(quat, pivot)
+                place = pos + rot_vec_quat(pivot, quat)
                 turned = wp.quat(
                     c.qpos0[row, q], c.qpos0[row, q + 1], c.qpos0[row, q + 2], c.qpos0[row, q + 3]
                 )
-                quat = _multiply(quat, wp.normalize(turned))
-                pos = place - _rotate(quat, pivot)
+                quat = mul_quat(quat, wp.normalize(turned))
+                pos = place - rot_vec_quat(pivot, quat)
                 for i in range(3):
                     unit = wp.vec3(0.0, 0.0, 0.0)
                     unit[i] = 1.0
-                    c.axis[world, dof + i] = _rotate(quat, unit)
+                    c.axis[world, dof + i] = rot_vec_quat(unit, quat)
                     c.anchor[world, dof + i] = place
             else:
-                c.anchor[world, dof] = pos + _rotate(quat, pivot)
-                c.axis[world, dof] = _rotate(quat, c.jnt_axis[world % c.jnt_axis.shape[0], joint])
+                c.anchor[world, dof] = pos + rot_vec_quat(pivot, quat)
+                c.axis[world, dof] = rot_vec_quat(c.jnt_axis[world % c.jnt_axis.shape[0], joint], quat)
         c.xpos[world, body] = pos
         c.xquat[world, body] = wp.normalize(quat)
 
@@ -152,10 +126,10 @@ def _add_up_body(world: int, body: int, c: Constants):
         c.body_subtreemass[world, body] = mass
     frame = world % c.xpos.shape[0]
     turn = c.xquat[frame, body]
-    c.xipos[world, body] = c.xpos[frame, body] + _rotate(
-        turn, c.body_ipos[world % c.body_ipos.shape[0], body]
+    c.xipos[world, body] = c.xpos[frame, body] + rot_vec_quat(
+        c.body_ipos[world % c.body_ipos.shape[0], body], turn
     )
-    axes = _matrix(_multiply(turn, c.body_iquat[world % c.body_iquat.shape[0], body]))
+    axes = quat_to_mat(mul_quat(turn, c.body_iquat[world % c.body_iquat.shape[0], body]))
     moments = c.body_inertia[world % c.body_inertia.shape[0], body]
     c.inertia[world, body] = axes @ wp.diag(moments) @ wp.transpose(axes)
 
@@ -328,7 +302,7 @@ def _references(world: int, body: int, target: int, pos: wp.vec3, c: Constants):
     """Return a place on a body from that body and from the centre of mass that it tracks, world axes, m."""
     frame = world % c.xpos.shape[0]
     tracked = wp.where(target < 0, body, target)
-    offset = _rotate(c.xquat[frame, body], pos)
+    offset = rot_vec_quat(pos, c.xquat[frame, body])
     return offset, c.xpos[frame, body] + offset - _subtree_com(world, tracked, c)
 
 
@@ -341,8 +315,8 @@ def _camera_reference(world: int, camera: int, c: Constants):
     turn = c.xquat[world % c.xpos.shape[0], body]
     c.cam_pos0[world % c.cam_pos0.shape[0], camera] = offset
     c.cam_poscom0[world % c.cam_poscom0.shape[0], camera] = from_com
-    c.cam_mat0[world % c.cam_mat0.shape[0], camera] = _matrix(
-        _multiply(turn, c.cam_quat[world % c.cam_quat.shape[0], camera])
+    c.cam_mat0[world % c.cam_mat0.shape[0], camera] = quat_to_mat(
+        mul_quat(turn, c.cam_quat[world % c.cam_quat.shape[0], camera])
     )
 
 
@@ -352,8 +326,8 @@ def _light_reference(world: int, light: int, c: Constants):
     body = c.light_bodyid[light]
     pos = c.light_pos[world % c.light_pos.shape[0], light]
     offset, from_com = _references(world, body, c.light_targetbodyid[light], pos, c)
-    direction = _rotate(
-        c.xquat[world % c.xpos.shape[0], body], c.light_dir[world % c.light_dir.shape[0], light]
+    direction = rot_vec_quat(
+        c.light_dir[world % c.light_dir.shape[0], light], c.xquat[world % c.xpos.shape[0], body]
     )
     c.light_pos0[world % c.light_pos0.shape[0], light] = offset
     c.light_poscom0[world % c.light_poscom0.shape[0], light] = from_com

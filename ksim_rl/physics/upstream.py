@@ -12,11 +12,15 @@ import numpy as np
 import warp as wp
 from jaxtyping import Float32
 
-# Building blocks of its contacts. A contact that another kernel appends has to look exactly like its own.
+# Building blocks of its contacts. A contact that another kernel appends has to look exactly like its own. And what it
+# does with quaternions.
 from mujoco_warp._src.bvh import build_hfield_bvh
 from mujoco_warp._src.collision_core import contact_params as contact_params
 from mujoco_warp._src.collision_core import write_contact as write_contact
 from mujoco_warp._src.math import make_frame as make_frame
+from mujoco_warp._src.math import mul_quat as mul_quat
+from mujoco_warp._src.math import quat_to_mat as quat_to_mat
+from mujoco_warp._src.math import rot_vec_quat as rot_vec_quat
 
 # What a step adds to the inertia matrix and to the bias forces for tendons.
 from mujoco_warp._src.smooth import tendon_armature as tendon_armature

@@ -38,6 +38,9 @@ def warp_model() -> mjw.Model:
     [
         ("bvh.build_hfield_bvh", "mjm hfieldid constructor leaf_size"),
         ("math.make_frame", "a"),
+        ("math.mul_quat", "u v"),
+        ("math.quat_to_mat", "quat"),
+        ("math.rot_vec_quat", "vec quat"),
         ("smooth.tendon_armature", "m d"),
         ("smooth.tendon_bias", "m d qfrc"),
         (

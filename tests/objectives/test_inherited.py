@@ -1,10 +1,13 @@
-"""This module lists what `objectives` uses of TorchRL and torch beyond their documented interfaces.
+"""What objectives uses of TorchRL and torch beyond their documents is still there; each failure names what moved.
 
-These are methods that losses inherit and override, so that they cannot be hidden behind functions.
-`tests/objectives/test_upstream.py` names the one that a new version moved. Checked with TorchRL 0.14.1 and torch 2.10
-to 2.13.
+These are methods that losses inherit and override, so that they cannot be hidden behind functions of the room. Checked
+with TorchRL 0.14.1 and torch 2.10 to 2.13.
 """
 
+import inspect
+
+import pytest
+import torch
 from torchrl import objectives
 from torchrl.objectives.common import LossModule
 
@@ -39,3 +42,18 @@ INHERITED: dict[type, dict[str, tuple[str, str]]] = {
 READ = ("_clip_bounds", "_cached_critic_network_params_detached")
 # torch's kernels over lists of tensors, which its own optimizers are made of: one launch for all leaves of a dtype.
 FOREACH = ("_foreach_copy_", "_foreach_lerp_", "_foreach_mul_")
+METHODS = [(kind, name) for kind, methods in INHERITED.items() for name in methods]
+
+
+@pytest.mark.parametrize(("kind", "name"), METHODS)
+def test_inherited_methods_take_the_same_arguments(kind, name):
+    arguments, _ = INHERITED[kind][name]
+    method = getattr(kind, name, None)
+    assert method is not None, f"{kind.__name__}.{name} is gone"
+    assert " ".join(inspect.signature(method).parameters) == arguments, f"{kind.__name__}.{name} changed"
+
+
+def test_properties_and_list_kernels_are_there():
+    gone = [name for name in READ if not isinstance(getattr(objectives.ClipPPOLoss, name, None), property)]
+    gone += [name for name in FOREACH if not hasattr(torch, name)]
+    assert not gone
