@@ -9,7 +9,7 @@ import inspect
 import types
 import typing
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from typing import Annotated, Any, Literal
 
@@ -68,14 +68,13 @@ class Checked:
     def __init_subclass__(cls, **given: Any) -> None:
         """Take the constants and defaults of the class's statement, each declared by a base."""
         super().__init_subclass__()
-        declared: dict[str, Any] = {}
-        for base in reversed(cls.__mro__):
-            declared |= inspect.get_annotations(base)
+        bases = filter(is_dataclass, reversed(cls.__mro__[1:]))
+        inherited = {field.name: field.type for base in bases for field in fields(base)}
         for name, value in given.items():
-            if name not in declared:
+            if not any(name in inspect.get_annotations(base) for base in cls.__mro__):
                 raise TypeError(f"class {cls.__name__}: no base of it declares {name!r}")
-            # Declared anew, so that `dataclass` takes the value as the field's default.
-            cls.__annotations__[name] = declared[name]
+            if name in inherited:  # declared anew, so that `dataclass` takes the value as its default
+                cls.__annotations__[name] = inherited[name]
             setattr(cls, name, value)
 
     def __post_init__(self) -> None:

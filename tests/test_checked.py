@@ -1,7 +1,7 @@
 """Fields of config dataclasses are checked against their annotations."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, ClassVar, Literal
 
 import pytest
@@ -101,6 +101,27 @@ def test_constants_stand_in_the_statement_of_a_class():
 
         class _Wrong(Named, nmae="ball"):
             pass
+
+
+def test_other_defaults_of_fields_stand_in_the_statement_of_a_class_too():
+    @dataclass(frozen=True, kw_only=True)
+    class Sample(Checked):
+        weight: Positive = 1.0
+        name: str = "sample"
+
+    @dataclass(frozen=True, kw_only=True)
+    class Placed(Checked):
+        place: str = "here"
+
+    @dataclass(frozen=True, kw_only=True)
+    class Heavy(Placed, Sample, weight=5.0):
+        pass
+
+    assert Heavy() == Heavy(weight=5.0, name="sample", place="here")
+    assert Sample().weight == 1.0
+    assert [field.name for field in fields(Heavy)] == ["weight", "name", "place"]
+    with pytest.raises(ValueError, match=r"weight=-1\.0"):
+        Heavy(weight=-1.0)
 
 
 def test_what_each_class_says_of_several_fields_is_asked_of_all_bases():
