@@ -3,7 +3,8 @@
 import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from operator import attrgetter
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Num
@@ -20,6 +21,7 @@ from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg
 
 # Imported by name when an algorithm is first asked for: the algorithms stand above this room and import it.
 REGISTRY = "ksim_rl.algorithms.registry"
+Part = TypeVar("Part")
 
 
 class Update(Protocol):
@@ -106,6 +108,17 @@ class Algorithm:
     data: DatasetCfg | ReplayCfg  # what `objective=<name>` chooses beside its settings, as are the modules
     modules: ModulesCfg = field(default_factory=ModulesCfg)
     on_ranks: bool = False  # whether several ranks may train with it: its update takes means over them
+
+
+def part_of(cfg: RunCfg, field: str, kind: type[Part]) -> Part:
+    """Return a part of a config by its dotted path; a ValueError refuses one of another class than is needed."""
+    value = attrgetter(field)(cfg)
+    if not isinstance(value, kind):
+        raise ValueError(
+            f"{field} is a {type(value).__name__}, and {type(cfg.objective).__name__} needs a {kind.__name__}: "
+            "the choice of objective=... brings what fits"
+        )
+    return value
 
 
 def algorithm_of(cfg: RunCfg) -> Algorithm:

@@ -21,7 +21,7 @@ from ksim_rl.modules import (
 )
 from ksim_rl.modules.bounded_actors import BoundedActor
 from ksim_rl.objectives import OffPolicyCfg, OffPolicyLoss, SACCfg, SACLoss, TD3Loss
-from ksim_rl.trainers.algorithm import Algorithm
+from ksim_rl.trainers.algorithm import Algorithm, part_of
 from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg
 
 
@@ -53,7 +53,7 @@ def make_off_policy_update(
     actor: Any = make_off_policy_policy(cfg, env)
     spec: Any = env.observation_spec
     critic = make_q_network(
-        _of_kind(cfg.modules.critic, QNetworkCfg, "modules.critic", cfg),
+        part_of(cfg, "modules.critic", QNetworkCfg),
         obs_dim=spec["critic"].shape[-1],
         action_dim=env.action_spec.shape[-1],
         device=cfg.resolved_device(),
@@ -86,7 +86,7 @@ def make_off_policy_update(
         objective,
         loss=loss,
         behavior=ExploringPolicy(actor, **bounds, num_envs=cfg.num_envs, **noise),
-        data=_of_kind(cfg.data, ReplayCfg, "data", cfg),
+        data=part_of(cfg, "data", ReplayCfg),
         num_envs=cfg.num_envs,
         device=cfg.resolved_device(),
         mirror=mirror_maps(env, loss.observation_keys) if objective.symmetry != "none" else None,
@@ -97,22 +97,13 @@ def make_off_policy_update(
 def make_off_policy_policy(cfg: RunCfg, env: EnvBase) -> TensorDictModuleBase:
     """Build the policy of a run: with SAC's settings one that draws its actions, with TD3's one that does not."""
     spec: Any = env.observation_spec
+    kind: Any
     kind, make = DeterministicActorCfg, make_deterministic_actor
     if isinstance(cfg.objective, SACCfg):
         kind, make = SquashedActorCfg, make_squashed_actor
     return make(
-        _of_kind(cfg.modules.actor, kind, "modules.actor", cfg),
+        part_of(cfg, "modules.actor", kind),
         obs_dim=spec["actor"].shape[-1],
         action_spec=env.action_spec,
         device=cfg.resolved_device(),
     )
-
-
-def _of_kind(value: Any, kind: type[Any], where: str, cfg: RunCfg) -> Any:
-    """Return `value`, a part of the config, or refuse one of another class than the algorithm needs."""
-    if not isinstance(value, kind):
-        raise ValueError(
-            f"{where} is a {type(value).__name__}, and {type(cfg.objective).__name__} needs a {kind.__name__}: "
-            "the choice of objective=... brings what fits"
-        )
-    return value

@@ -24,23 +24,20 @@ from ksim_rl.modules import (
     observation_dim,
 )
 from ksim_rl.objectives import PPOCfg, observation_keys
+from ksim_rl.trainers.algorithm import part_of
 from ksim_rl.trainers.run_cfg import RunCfg
 
 
 def make_ppo_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> PPOUpdate:
     """Build the PPO update of a run; one that is resumed is built like a new one."""
     assert isinstance(cfg.objective, PPOCfg)
-    if not isinstance(cfg.data, DatasetCfg):
-        raise ValueError(
-            f"data is a {type(cfg.data).__name__}, and PPO needs a DatasetCfg: use data=on_policy"
-        )
     actor, critic = build_networks(cfg, env)
     read = list(dict.fromkeys((*observation_keys(actor), *critic.in_keys)))
     return PPOUpdate(
         cfg.objective,
         actor=actor,
         critic=critic,
-        data=cfg.data,
+        data=part_of(cfg, "data", DatasetCfg),
         seed=cfg.seed,
         device=cfg.resolved_device(),
         mirror=mirror_maps(env, read) if cfg.objective.symmetry != "none" else None,
@@ -56,11 +53,8 @@ def make_ppo_policy(cfg: RunCfg, env: EnvBase) -> ProbabilisticTensorDictSequent
 def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
     """Build actor and critic for what an env observes and does; a ValueError refuses those of an off-policy method."""
     device, modules = cfg.resolved_device(), cfg.modules
-    if not isinstance(modules.actor, ActorCfg) or not isinstance(modules.critic, CriticCfg):
-        raise ValueError(
-            f"modules are {type(modules.actor).__name__} and {type(modules.critic).__name__}, and a state value needs "
-            "ActorCfg and CriticCfg: use modules=mlp"
-        )
+    actor_cfg = part_of(cfg, "modules.actor", ActorCfg)
+    critic_cfg = part_of(cfg, "modules.critic", CriticCfg)
     spec: Any = env.observation_spec
 
     trunk, shared = None, 0
@@ -76,9 +70,9 @@ def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSe
     # Behind a recurrent module, where there is one.
     new_actor = partial(make_recurrent_actor, m) if (m := modules.recurrent_actor) else make_actor
     new_critic = partial(make_recurrent_critic, m) if (m := modules.recurrent_critic) else make_critic
-    action_spec, obs_dim = env.full_action_spec, width(modules.actor.in_keys)
-    actor = new_actor(modules.actor, obs_dim=obs_dim, action_spec=action_spec, device=device)
-    critic = new_critic(modules.critic, obs_dim=width(modules.critic.in_keys), device=device)
+    action_spec, obs_dim = env.full_action_spec, width(actor_cfg.in_keys)
+    actor = new_actor(actor_cfg, obs_dim=obs_dim, action_spec=action_spec, device=device)
+    critic = new_critic(critic_cfg, obs_dim=width(critic_cfg.in_keys), device=device)
     if trunk is None:
         return actor, critic
     both = ActorValueOperator(trunk, actor, critic)
