@@ -1,6 +1,6 @@
 """This module makes the choices of the config groups from the dataclasses, and what each task sets over them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, get_type_hints
 
@@ -67,11 +67,7 @@ def store_choices() -> None:
         upstream.store_config("objective", name, partial(_objective, algorithm, chosen))
     for group, own in choices.items():
         for name, cfg in own.items():
-            upstream.store_config(group, name, _maker(group, cfg))
-
-
-def _maker(group: str, cfg: Any) -> Callable[[], dict[str, Any]]:
-    return lambda: to_tree(cfg, HINTS[group])
+            upstream.store_config(group, name, partial(to_tree, cfg, HINTS[group]))
 
 
 def _name_of(group: str, algorithm: Algorithm) -> str:

@@ -14,7 +14,7 @@ from ksim_rl.checked import Count, NonNegative
 from ksim_rl.modules.mlp import Device, mlp
 from ksim_rl.modules.network import (
     LayeredNetwork,
-    ObservationKey,
+    ObservationKeys,
     ObservationNormalizer,
     ObservingNetwork,
     OffPolicyNetworkCfg,
@@ -26,7 +26,7 @@ from ksim_rl.modules.network import (
 class CriticCfg(OnPolicyNetworkCfg):
     """The value network; `output_gain` scales the last layer's weights."""
 
-    in_keys: tuple[ObservationKey, ...] = ("critic",)
+    in_keys: ObservationKeys = ("critic",)
     output_gain: NonNegative = 1.0
 
 

@@ -11,29 +11,14 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Composite
 
-from ksim_rl.checked import Checked, Count, Filled, NonNegative
+from ksim_rl.checked import Checked, Count, Filled, Name, NonNegative
 from ksim_rl.checks import check_choice, check_in_range
 from ksim_rl.device.running_moments import RunningMoments
 from ksim_rl.modules.mlp import ACTIVATIONS, Device, mlp
 
 ObservationKey = str | tuple[str, ...]
-
-
-def checked_keys(keys: Sequence[ObservationKey]) -> tuple[ObservationKey, ...]:
-    """Return the keys as hashable ones, or raise ValueError where there is none, one is no name, or one comes twice."""
-    if isinstance(keys, str) or not keys:
-        raise ValueError(f"in_keys={keys!r}: expected a list of one observation group or more")
-    checked: list[ObservationKey] = []
-    for index, key in enumerate(keys):
-        names = (key,) if isinstance(key, str) else tuple(key)
-        if not names or not all(isinstance(name, str) and name for name in names):
-            raise ValueError(
-                f"in_keys[{index}]={key!r}: expected a name, or a list of names for a nested key"
-            )
-        checked.append(names[0] if len(names) == 1 else names)
-    if len(set(checked)) < len(checked):
-        raise ValueError(f"in_keys={tuple(checked)!r}: each key can be read once")
-    return tuple(checked)
+_NestedKey = Annotated[tuple[Name, ...], Filled("expected a name, or a list of names for a nested key")]
+ObservationKeys = Annotated[tuple[Name | _NestedKey, ...], Filled("expected one observation group or more")]
 
 
 def observation_dim(spec: Composite, keys: Sequence[ObservationKey]) -> int:
@@ -126,10 +111,15 @@ class NetworkCfg(Checked):
 class OnPolicyNetworkCfg(NetworkCfg):
     """The fields of networks that choose the observation groups they read, side by side; a list names a nested key."""
 
-    in_keys: tuple[ObservationKey, ...] = ("actor",)
+    in_keys: ObservationKeys = ("actor",)
 
     def _check_fields(self) -> None:
-        object.__setattr__(self, "in_keys", checked_keys(self.in_keys))
+        """Make the keys hashable, and refuse one that comes twice."""
+        names = [(key,) if isinstance(key, str) else tuple(key) for key in self.in_keys]
+        keys = tuple(parts[0] if len(parts) == 1 else parts for parts in names)
+        if len(set(keys)) < len(keys):
+            raise ValueError(f"in_keys={keys!r}: each key can be read once")
+        object.__setattr__(self, "in_keys", keys)
 
 
 @dataclass(frozen=True, kw_only=True)
