@@ -255,12 +255,7 @@ def carried_keys(module: nn.Module) -> list[NestedKey]:
     if not isinstance(module, TensorDictModuleBase):
         return []
     written = {unravel_key(key) for key in module.out_keys}
-    return [unravel_key(key) for key in module.in_keys if next_key(key) in written]
-
-
-def next_key(key: NestedKey) -> NestedKey:
-    """Return where the value of `key` after the step lies."""
-    return unravel_key(("next", key))
+    return [unravel_key(key) for key in module.in_keys if unravel_key(("next", key)) in written]
 
 
 def state_keys(cfg: RecurrentCfg, name: str) -> list[tuple[str, str, str]]:
@@ -386,7 +381,7 @@ def burnt_in(
         with set_recurrent_mode(True):
             unrolled_BT = module(before_BT.select(*module.in_keys))
         for state_key in carried_keys(module):
-            renewed_B = unrolled_BT.get(next_key(state_key))[:, -1]
+            renewed_B = unrolled_BT.get(unravel_key(("next", state_key)))[:, -1]
             state_B = torch.where(renewed_B1.unsqueeze(-1), renewed_B, before_BT.get(state_key)[:, 0])
             rest_BT.set(state_key, state_B.unsqueeze(1).expand_as(rest_BT.get(state_key)))
     return rest_BT
