@@ -1,12 +1,12 @@
 """This benchmark compares a policy's return on MuJoCo's C engine with that in our physics, from the same starts.
 
     python -m benchmarks.sim2sim task=go1_velocity_flat policy=standing noise=false
-    python -m benchmarks.sim2sim task=go1_velocity_flat policy=RUN
+    python -m benchmarks.sim2sim task=go1_velocity_flat policy=zoo:go1
 
-The policy is that of a run folder, or "standing": zero actions, which ask for the default pose. Starts, model
-parameters, commands and pushes are the recorded ones; with noise=true the sensors' noise is drawn anew, which a policy
-that is about to fall amplifies. Figures go to benchmarks/results/sim2sim.json: those of a run under the task's name,
-those of zero actions under <task>/standing, without noise under .../without_noise.
+The policy is that of a run folder or of the zoo, or "standing": zero actions, which ask for the default pose. Starts,
+model parameters, commands and pushes are the recorded ones; with noise=true the sensors' noise is drawn anew, which a
+policy that is about to fall amplifies. Figures go to benchmarks/results/sim2sim.json: those of a run under the task's
+name, those of zero actions under <task>/standing, without noise under .../without_noise.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from ksim_rl.export import export, export_policy, sim2sim
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.run_folder import Policy
+from ksim_rl.zoo import locate
 
 OPTIONS = {
     "task": "go1_velocity_flat",
@@ -48,7 +49,7 @@ def main() -> int:
             export_policy(standing(options["task"]), exported, episodes=episodes, noise=noise)
         else:
             export(
-                Path(options["policy"]), exported, device=options["device"], episodes=episodes, noise=noise
+                locate(options["policy"]), exported, device=options["device"], episodes=episodes, noise=noise
             )
         found = sim2sim(exported, episodes=episodes)
     print(found.table())

@@ -98,7 +98,8 @@ def test_the_list_names_all(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["zoo"])
     assert ended.value.code == 0
-    assert all(name in capsys.readouterr().out for name in NAMES)
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in NAMES)
 
 
 # -- Weights & Biases --------------------------------------------------------------------------------------------
