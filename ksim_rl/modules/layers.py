@@ -11,7 +11,7 @@ from torch.nn import functional
 
 Device = torch.device | str | None
 EPS = 1e-5  # of layer norms
-SPLITS = 8  # see `Product`
+SPLITS = 8  # see `_Product`
 
 
 class EnsembleLinear(nn.Module):
@@ -83,12 +83,16 @@ class Layers(nn.Sequential):
         alone = not isinstance(self[0], EnsembleLinear)
         out = features.reshape(1, -1, features.shape[-1]) if alone else features
         parts: list[Any] = list(self)
+        rounded = _rounded([part.weight for part in parts if isinstance(part, nn.Linear | EnsembleLinear)])
         while parts:
             layer = parts.pop(0)
             if not isinstance(layer, nn.Linear | EnsembleLinear):
                 out = layer(out)
                 continue
-            out = Product.apply(out, layer.weight.mT[None] if alone else layer.weight)
+            weight, of_product = layer.weight, rounded.pop(0)
+            if alone:
+                weight, of_product = weight.mT[None], of_product.mT[None]
+            out = _Product.apply(out, weight, of_product)
             if not parts or not isinstance(parts[0], nn.LayerNorm | EnsembleLayerNorm):
                 out = out + layer.bias.to(out.dtype)
                 continue
@@ -105,42 +109,50 @@ def rounds(features: Float[Tensor, "*batch L"]) -> bool:
     return features.is_cuda and torch.is_autocast_enabled("cuda")
 
 
-class Product(Function):
-    """The products [N, B, M] of features [N, B, K] and weights [N, K, M] in bfloat16.
+class _Product(Function):
+    """The products [N, B, M] of features [N, B, K] and weights [N, K, M], which are there `rounded` as well.
 
-    Tensor cores are fast with rows of whole 16 bytes: 315 inputs take three times as long as 320. The gradient of the
-    weights is a sum over env states in SPLITS parts, without which its few outputs would occupy a part of the GPU.
+    The gradient of the weights is a sum over env states in SPLITS parts: its outputs alone, which are few, would occupy
+    a part of the GPU.
     """
 
     @staticmethod
-    def forward(ctx: Any, features_NBK: Tensor, weight_NKM: Tensor) -> Tensor:
-        """Multiply."""
+    def forward(ctx: Any, features_NBK: Tensor, weight_NKM: Tensor, rounded: Tensor) -> Tensor:
         fan_in, fan_out = ctx.sizes = weight_NKM.shape[1:]
-        ctx.dtype = features_NBK.dtype
         features = _padded(features_NBK, -fan_in % 8)
-        weight = _padded(weight_NKM, -fan_out % 8, -fan_in % 8)
-        ctx.save_for_backward(features, weight)
-        return torch.bmm(features, weight)[..., :fan_out]
+        ctx.save_for_backward(features, rounded)
+        ctx.dtype = features_NBK.dtype
+        return torch.bmm(features, rounded)[..., :fan_out]
 
     @staticmethod
-    def backward(ctx: Any, d_out: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        """Return the gradients."""
-        features, weight = ctx.saved_tensors
+    def backward(ctx: Any, d_out: Tensor) -> tuple[Tensor | None, ...]:
+        features, rounded = ctx.saved_tensors
         fan_in, fan_out = ctx.sizes
         d_out = _padded(d_out, -fan_out % 8)
         d_features = d_weight = None
         if ctx.needs_input_grad[0]:
-            d_features = torch.bmm(d_out, weight.mT)[..., :fan_in].to(ctx.dtype)
+            d_features = torch.bmm(d_out, rounded.mT)[..., :fan_in].to(ctx.dtype)
         if ctx.needs_input_grad[1]:
             networks, rows = features.shape[:2]
             splits = math.gcd(SPLITS, rows)
             parts = [part.reshape(networks * splits, rows // splits, -1) for part in (features, d_out)]
             sums = torch.bmm(parts[0].mT, parts[1]).unflatten(0, (networks, splits))
             d_weight = sums.sum(1, dtype=torch.float32)[:, :fan_in, :fan_out]
-        return d_features, d_weight
+        return d_features, d_weight, None
 
 
-def _padded(values: Tensor, *sides: int) -> Tensor:
-    """Return values in bfloat16, with so many zeros behind the last dim, and behind the one before it."""
-    values = values.to(torch.bfloat16)
-    return functional.pad(values, [pad for side in sides for pad in (0, side)]) if any(sides) else values
+@torch.no_grad()
+def _rounded(weights: list[Tensor]) -> list[Tensor]:
+    """Return weights in bfloat16, padded to whole 16 bytes in each dim, all by one kernel of compiled code.
+
+    Tensor cores are fast with such rows: 315 inputs take three times as long as 320.
+    """
+    padded = [functional.pad(own, (0, -own.shape[-1] % 8, 0, -own.shape[-2] % 8)) for own in weights]
+    flat = torch.cat([own.reshape(-1) for own in padded]).to(torch.bfloat16)
+    parts = zip(flat.split([own.numel() for own in padded]), padded, strict=True)
+    return [part.view_as(own) for part, own in parts]
+
+
+def _padded(features: Tensor, columns: int) -> Tensor:
+    features = features.to(torch.bfloat16)
+    return functional.pad(features, (0, columns)) if columns else features
