@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Num
+from jaxtyping import Int64, Num
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
@@ -82,12 +82,12 @@ class OffPolicyUpdate(RolloutUpdate):
         self.critic = loss.critic_network
         self.behavior, self.num_env_states = behavior, num_envs * data.num_steps
         self._observations: list[Any] = loss.observation_keys
-        self._reflect_ = None
         compiles = cfg.compile and self.device.type == "cuda"
         compiled = partial(torch.compile, fullgraph=True, dynamic=False) if compiles else (lambda work: work)
+        self._images = None
         if cfg.symmetry == "augment":
-            images = SymmetricAugmentation.of(mirror, read=self._observations, device=self.device)
-            self._reflect_ = compiled(images.reflect_every_second_)
+            self._images = SymmetricAugmentation.of(mirror, read=self._observations, device=self.device)
+        self._read = compiled(self._stored)
         self._critic_loss, self._actor_losses = compiled(loss.critic_loss), compiled(loss.actor_losses)
         self.replay = ReplayRing(
             data, num_envs=num_envs, observations=self._observations, gamma=cfg.gamma, device=self.device
@@ -142,7 +142,7 @@ class OffPolicyUpdate(RolloutUpdate):
 
     def _update(self) -> None:
         self._store()
-        minibatches = self.replay.minibatches(self.data.num_minibatches, change_=self._reflect_)
+        minibatches = self.replay.minibatches(self.data.num_minibatches, read=self._read)
         of_critic, of_actor, delay = [], [], self.cfg.policy_delay
         for step, minibatch_B in enumerate(minibatches, start=1):
             of_critic.append(self._improve_critic(minibatch_B))
@@ -153,6 +153,13 @@ class OffPolicyUpdate(RolloutUpdate):
         skipped[delay - 1 :: delay] = torch.maximum(skipped[delay - 1 :: delay], of_actor["skipped"])
         self._measure_(made | {"skipped_in_a_row": self.guard.count_(skipped)})
         self._means.take_(of_actor)
+
+    def _stored(self, index_B: Int64[Tensor, " B"]) -> TensorDictBase:
+        """Return env states of the replay for their indices, every second one in the mirror with a symmetry."""
+        env_states_B = self.replay.storage.get(index_B)
+        if self._images is not None:
+            self._images.reflect_every_second_(env_states_B)
+        return env_states_B
 
     def _improve_critic(self, minibatch_B: TensorDictBase) -> dict[str, Tensor]:
         """Make one gradient step of critics and targets; return what it measured, and `skipped`, 0 or 1."""
