@@ -4,15 +4,12 @@ import math
 from collections.abc import Callable, Sequence
 from functools import partial
 
-import torch
-from jaxtyping import Float
-from torch import Tensor, nn
-from torch.nn import functional
+from torch import nn
 
 from ksim_rl.checked import Count, check_value
 from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.modules.layers import Device, EnsembleLayerNorm, EnsembleLinear, Layers
 
-Device = torch.device | str | None
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "elu": nn.ELU,
     "gelu": nn.GELU,
@@ -53,7 +50,7 @@ def mlp(
     norm: Callable[..., nn.Module] = nn.LayerNorm
     if num_networks is not None:
         layer, norm = partial(EnsembleLinear, num_networks), partial(EnsembleLayerNorm, num_networks)
-    layers, width = nn.Sequential(), input_dim
+    layers, width = nn.Sequential() if num_networks is None and not layer_norm else Layers(), input_dim
     for hidden_dim in hidden_dims:
         layers.append(layer(width, hidden_dim, gain=hidden_gain, device=device))
         if layer_norm:
@@ -72,65 +69,3 @@ def linear(input_dim: int, output_dim: int, *, gain: float, device: Device = Non
     nn.init.orthogonal_(layer.weight, gain)
     nn.init.zeros_(layer.bias)
     return layer.to(device)
-
-
-class EnsembleLinear(nn.Module):
-    """N linear layers as one batched product: [N, B, input_dim] to [N, B, output_dim].
-
-    Weights are orthogonal with scale `gain`, drawn on the CPU network by network, and biases zero.
-    """
-
-    def __init__(
-        self,
-        num_networks: int,
-        input_dim: int,
-        output_dim: int,
-        *,
-        gain: float,
-        device: Device = None,
-    ) -> None:
-        super().__init__()
-        self.gain = gain
-        self.weight = nn.Parameter(torch.empty(num_networks, input_dim, output_dim, device=device))
-        self.bias = nn.Parameter(torch.empty(num_networks, 1, output_dim, device=device))
-        self.reset_parameters()
-
-    @torch.no_grad()
-    def reset_parameters(self) -> None:
-        """Draw the weights anew."""
-        for network in self.weight:
-            network.copy_(nn.init.orthogonal_(torch.empty(network.shape[::-1]), self.gain).t())
-        self.bias.zero_()
-
-    def forward(self, features_NBL: Float[Tensor, "N B L"]) -> Float[Tensor, "N B M"]:
-        """Return what each layer gives for its own input."""
-        if not torch.is_autocast_enabled(features_NBL.device.type):
-            return torch.baddbmm(self.bias, features_NBL, self.weight)
-        # Tensor cores are fast with rows of whole 16 bytes: 315 inputs take three times as long as 320.
-        in_dim, out_dim = self.weight.shape[1:]
-        weight = functional.pad(self.weight, (0, -out_dim % 8, 0, -in_dim % 8))
-        out_NBM = torch.bmm(functional.pad(features_NBL, (0, -in_dim % 8)), weight)[..., :out_dim]
-        return out_NBM + self.bias.to(out_NBM.dtype)
-
-
-class EnsembleLayerNorm(nn.Module):
-    """N layer norms (Ba et al., arXiv 1607.06450) of the last dim, each with its own scale and offset."""
-
-    def __init__(self, num_networks: int, dim: int, *, device: Device = None) -> None:
-        super().__init__()
-        self.dim = dim
-        self.weight = nn.Parameter(torch.ones(num_networks, 1, dim, device=device))
-        self.bias = nn.Parameter(torch.zeros(num_networks, 1, dim, device=device))
-
-    def reset_parameters(self) -> None:
-        """Scale by one, and add nothing."""
-        nn.init.ones_(self.weight)
-        nn.init.zeros_(self.bias)
-
-    def forward(self, features_NBL: Float[Tensor, "N B L"]) -> Float[Tensor, "N B L"]:
-        """Normalize the last dim, and apply each network's own scale and offset."""
-        # Autocast would go on in float32 up to the next product, which moves twice the memory.
-        with torch.autocast(features_NBL.device.type, enabled=False):
-            normalized_NBL = functional.layer_norm(features_NBL, (self.dim,))
-            weight, bias = (parameter.to(features_NBL.dtype) for parameter in (self.weight, self.bias))
-            return torch.addcmul(bias, normalized_NBL, weight)

@@ -1,14 +1,13 @@
 """This module makes gradient steps without host syncs, skips what is not finite, and adapts the learning rate."""
 
 from collections.abc import Iterable, Mapping
-from typing import TypeVar
 
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int64
 from torch import Tensor, nn
 
 from ksim_rl import ranks
-from ksim_rl.objectives.algorithm_cfg import GradientCfg, OnPolicyCfg
+from ksim_rl.objectives.algorithm_cfg import OnPolicyCfg
 
 
 class NonFiniteStepsError(RuntimeError):
@@ -34,11 +33,19 @@ class StepGuard(nn.Module):
         self.register_buffer("skipped_in_a_row", torch.zeros((), dtype=torch.int64, device=device))
 
     @torch.no_grad()
-    def count_(self, found_inf: Float32[Tensor, ""]) -> None:
-        """Count one gradient step; `found_inf` is 1 if it was skipped, else 0. Makes no host sync."""
-        skipped = found_inf.to(torch.int64)
-        self.skipped.add_(skipped)
-        self.skipped_in_a_row.add_(skipped).mul_(skipped)
+    def count_(self, found_inf: Float32[Tensor, "*steps"]) -> Int64[Tensor, " steps"]:
+        """Count gradient steps; `found_inf` is 1 for each that was skipped, else 0. Makes no host sync.
+
+        Returned is how many were skipped in a row up to each.
+        """
+        skipped = found_inf.reshape(-1).to(torch.int64)
+        upto = skipped.cumsum(0)
+        # How many had been skipped when a step was last made.
+        at_last = torch.where(skipped > 0, -self.skipped_in_a_row, upto).cummax(0).values
+        in_a_row = upto - at_last
+        self.skipped.add_(upto[-1])
+        self.skipped_in_a_row.copy_(in_a_row[-1])
+        return in_a_row
 
 
 @torch.no_grad()
@@ -85,40 +92,19 @@ def adapt_learning_rate_(
     return lr.copy_(torch.where(too_far, slower, torch.where(too_near, faster, lr)))
 
 
-AnyAdam = TypeVar("AnyAdam", torch.optim.Adam, torch.optim.AdamW)
-
-
 def make_optimizer(cfg: OnPolicyCfg, *modules: nn.Module) -> torch.optim.Adam:
     """Build one fused Adam over the parameters of `modules`, each once, capturable on CUDA.
 
     `optimizer.param_groups[0]["lr"]` is a float32 tensor [] on the device that changes in place.
     """
-    parameters = dict.fromkeys(parameter for module in modules for parameter in module.parameters())
-    return _fused(torch.optim.Adam, cfg, parameters, cfg.learning_rate, cfg.weight_decay)
-
-
-def make_adamw(
-    cfg: GradientCfg, parameters: Iterable[nn.Parameter], *, learning_rate: float, weight_decay: float
-) -> torch.optim.AdamW:
-    """Build one fused AdamW (Loshchilov and Hutter, arXiv 1711.05101); else as `make_optimizer`."""
-    return _fused(torch.optim.AdamW, cfg, parameters, learning_rate, weight_decay)
-
-
-def _fused(
-    kind: type[AnyAdam],
-    cfg: GradientCfg,
-    parameters: Iterable[nn.Parameter],
-    rate: float,
-    weight_decay: float,
-) -> AnyAdam:
-    parameters = list(parameters)
+    parameters = list(dict.fromkeys(parameter for module in modules for parameter in module.parameters()))
     device = parameters[0].device
-    return kind(
+    return torch.optim.Adam(
         parameters,
-        lr=torch.tensor(rate, dtype=torch.float32, device=device),
+        lr=torch.tensor(cfg.learning_rate, dtype=torch.float32, device=device),
         betas=cfg.betas,
         eps=cfg.adam_eps,
-        weight_decay=weight_decay,
+        weight_decay=cfg.weight_decay,
         fused=True,
         capturable=device.type == "cuda",
     )
@@ -131,21 +117,8 @@ def descend(
 
     It can be captured in a CUDA graph. Returned are the norm before clipping, and 1 if the step was skipped, else 0.
     """
-    return descend_together({"loss": loss}, {"loss": optimizer}, max_grad_norm=max_grad_norm)["loss"]
-
-
-def descend_together(
-    losses: Mapping[str, Float[Tensor, ""]],
-    optimizers: Mapping[str, torch.optim.Optimizer],
-    *,
-    max_grad_norm: float | None,
-) -> dict[str, tuple[Float32[Tensor, ""], Float32[Tensor, ""]]]:
-    """Do what `descend` says with each loss and the optimizer of its name, and go back through them at once.
-
-    No loss may reach a parameter of another's optimizer.
-    """
-    go_back(losses, optimizers)
-    return {name: step(optimizers[name], loss, max_grad_norm=max_grad_norm) for name, loss in losses.items()}
+    go_back({"loss": loss}, {"loss": optimizer})
+    return step(optimizer, loss, max_grad_norm=max_grad_norm)
 
 
 def go_back(
@@ -154,7 +127,10 @@ def go_back(
     *,
     beside: Iterable[Float[Tensor, ""]] = (),
 ) -> None:
-    """Compute the gradients of each loss, means over all ranks; losses and what is `beside` become means in place."""
+    """Compute the gradients of each loss, means over all ranks; losses and what is `beside` become means in place.
+
+    No loss may reach a parameter of another's optimizer.
+    """
     for name in losses:
         optimizers[name].zero_grad(set_to_none=True)
     torch.autograd.backward(list(losses.values()))
