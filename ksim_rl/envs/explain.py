@@ -14,7 +14,6 @@ from torchrl.envs.transforms import Transform
 from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import EventTerm
-from ksim_rl.physics import World
 from ksim_rl.transforms.groups.group_cfg import compile_groups
 from ksim_rl.transforms.specs import spell
 from ksim_rl.transforms.transform_cfg import TransformCfg
@@ -53,15 +52,14 @@ def _summary(cfg: ManagerBasedRlEnvCfg, driver: EnvDriver) -> str:
         f"{driver.num_envs} envs on {driver.device}, "
         f"{driver.step_dt:g} s per step = {cfg.decimation} x {driver.physics_dt:g} s, "
         f"episodes of {length if driver.max_episode_length else 'any length'}\n"
-        f"constraints are solved by {_solver(driver.world)}"
+        f"constraints are solved by {_kernels(driver.world.one_kernel_unavailable, 'solver')}\n"
+        f"what precedes them is computed by {_kernels(driver.world.one_kernel_dynamics_unavailable, 'kernels')}"
         + "".join(f"\n{line}" for line in driver.non_finite.lines())
     )
 
 
-def _solver(world: World) -> str:
-    if world.one_kernel_unavailable is None:
-        return "one kernel"
-    return f"MuJoCo Warp's own solver, because {world.one_kernel_unavailable}"
+def _kernels(unavailable: str | None, theirs: str) -> str:
+    return "one kernel" if unavailable is None else f"MuJoCo Warp's own {theirs}, because {unavailable}"
 
 
 def _tables(

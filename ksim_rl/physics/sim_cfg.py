@@ -35,6 +35,10 @@ class SimCfg(Checked):
             "discrete", more than 64 degrees of freedom, more than 700 to 1700 constraint rows, flexes, sleeping,
             energies, noslip, no warm start, a dense Jacobian) and `deterministic` take MuJoCo Warp's own;
             `World.one_kernel_unavailable` says why.
+        one_kernel_dynamics: with the one-kernel solver, compute all that constraints have no part in (kinematics,
+            inertias, bias, passive and actuator forces) in one kernel instead of some 35. Results agree up to rounding.
+            Models out of its range (tendons, fluids, gravity compensation, muscles, delayed actuators, transmissions
+            other than to hinges and slides) take MuJoCo Warp's own; `World.one_kernel_dynamics_unavailable` says why.
         require_graphs: refuse to run where graphs are unavailable, instead of a warning and a slow run.
         nan_guard: where to save what led to a non-finite state; `None` keeps nothing and costs nothing.
 
@@ -57,6 +61,7 @@ class SimCfg(Checked):
     nconmax: Count | None = None
     deterministic: bool = False
     one_kernel_solver: bool = True
+    one_kernel_dynamics: bool = False
     require_graphs: bool = False
     nan_guard: NanGuardCfg | None = None
 

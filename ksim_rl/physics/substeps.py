@@ -10,6 +10,7 @@ import warp as wp
 
 from ksim_rl.physics import kernels, upstream
 from ksim_rl.physics.newton import solver as newton
+from ksim_rl.physics.smooth.stages import calls_back, smooth_dynamics
 
 # These read the contacts of the last substep's collision pass, which a reset empties.
 COLLISION_SENSORS = (
@@ -25,7 +26,8 @@ class Substeps:
     """Shallow variants of one Warp model, so that a stage is left out without touching the model itself.
 
     The variants share all arrays with `warp_model`. Build them once its arrays are in their final place. With
-    `one_kernel_solver`, `newton` solves, which must suit the model, instead of MuJoCo Warp's own solver.
+    `one_kernel_solver`, `newton` solves, which must suit the model, instead of MuJoCo Warp's own solver. Then, with
+    `one_kernel_dynamics`, which must suit it too, one kernel precedes the constraints.
     """
 
     def __init__(
@@ -35,6 +37,7 @@ class Substeps:
         warp_data_E: mjw.Data,
         *,
         one_kernel_solver: bool = False,
+        one_kernel_dynamics: bool = False,
     ) -> None:
         self.warp_model, self.warp_data_E = warp_model, warp_data_E
         sensor_type = mj_model.sensor_type
@@ -48,6 +51,7 @@ class Substeps:
             opt = dataclasses.replace(warp_model.opt, run_qacc_smooth=False)
             self._warp_model_of_solver = dataclasses.replace(warp_model, opt=opt)
             self._solve = newton.solver(self._warp_model_of_solver, warp_data_E)
+        self._dynamics = smooth_dynamics(warp_model, warp_data_E) if one_kernel_dynamics else None
         self._refresh_warp_model = upstream.with_refreshable_sensors(
             warp_model, skip=has_history | np.isin(sensor_type, COLLISION_SENSORS), sensor_type=sensor_type
         )
@@ -61,7 +65,9 @@ class Substeps:
 
     def advance(self, *, sensors: bool) -> None:
         """Launch one physics step. Sensors never change the state that it reaches."""
-        if self._ties_bodies:
+        # Callbacks are set at any time, and stand between the stages of the kernel.
+        dynamics = None if calls_back(self.warp_model) else self._dynamics
+        if self._ties_bodies and dynamics is None:
             # The rows of connect and weld read body velocities before a step computes them.
             mjw.kinematics(self.warp_model, self.warp_data_E)
             mjw.com_pos(self.warp_model, self.warp_data_E)
@@ -70,7 +76,7 @@ class Substeps:
             sensors = sensors or self._always_senses
             opt = self._warp_model_of_solver.opt
             opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
-            newton.step(self._warp_model_of_solver, self.warp_data_E, self._solve, sensors=sensors)
+            newton.step(self._warp_model_of_solver, self.warp_data_E, self._solve, dynamics, sensors=sensors)
         else:
             mjw.step(self.warp_model if sensors else self._silent_warp_model, self.warp_data_E)
 
@@ -80,12 +86,15 @@ class Substeps:
         No collision pass: contacts, forces and the sensors that read them stay as the last substep left them.
         """
         m, d = self._refresh_warp_model, self.warp_data_E
-        mjw.kinematics(m, d)
-        mjw.com_pos(m, d)
+        if self._dynamics is None:
+            mjw.kinematics(m, d)
+            mjw.com_pos(m, d)
+            mjw.flex(m, d)
+            mjw.tendon(m, d)
+            mjw.com_vel(m, d)
+        else:
+            self._dynamics(False)
         mjw.camlight(m, d)
-        mjw.flex(m, d)
-        mjw.tendon(m, d)
-        mjw.com_vel(m, d)
         needed = self.refreshed_on_demand
         if "M" in needed:
             mjw.crb(m, d)

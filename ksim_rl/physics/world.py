@@ -26,6 +26,7 @@ from ksim_rl.physics.nan_guard.guard import NanGuard, NanReport
 from ksim_rl.physics.newton.solver import one_kernel_unavailable, takes_conditional_nodes
 from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
 from ksim_rl.physics.sim_cfg import SimCfg
+from ksim_rl.physics.smooth.stages import one_kernel_dynamics_unavailable
 from ksim_rl.physics.substeps import Substeps
 
 
@@ -46,6 +47,8 @@ class World(views.DataViews):
         is_frozen: whether graphs may hold `refresh`, so that it computes nothing further.
         one_kernel_unavailable: why MuJoCo Warp's own solver solves the constraints, several times slower on CUDA; None
             where one kernel does (`SimCfg.one_kernel_solver`). That one computes no `qacc_smooth`, which stays zero.
+        one_kernel_dynamics_unavailable: why MuJoCo Warp's own kernels compute what precedes the constraints; None where
+            one kernel does (`SimCfg.one_kernel_dynamics`).
     """
 
     def __init__(
@@ -97,7 +100,14 @@ class World(views.DataViews):
             places = wp.array([row.ptr or 0 for row in rows], dtype=wp.uint64)
             self._zeroed_at_reset = places, wp.array(widths, dtype=int), max(widths)
             models = self.mj_model, self.warp_model, self.warp_data_E
-            self._substeps = Substeps(*models, one_kernel_solver=self.has_one_kernel_solver)
+            self.one_kernel_dynamics_unavailable = one_kernel_dynamics_unavailable(
+                self.warp_model, self.sim, solver_unavailable=self.one_kernel_unavailable
+            )
+            self._substeps = Substeps(
+                *models,
+                one_kernel_solver=self.has_one_kernel_solver,
+                one_kernel_dynamics=self.one_kernel_dynamics_unavailable is None,
+            )
             self._masked_constants = self._prepare_constants(expanded)
         self._reset_mask_E = wp.to_torch(self._reset_mask)
         self._fields = {name: wp.to_torch(getattr(self.warp_model, name)) for name in expanded}

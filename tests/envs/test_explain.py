@@ -32,7 +32,7 @@ def tables(text):
     """Return the tables by title, each a list of rows without its heads."""
     found: dict[str, list[str]] = {}
     title = ""
-    for line in text.splitlines()[2:]:
+    for line in text.splitlines()[3:]:
         if line and not line.startswith(" "):
             title = line
             found[title] = []
@@ -72,12 +72,15 @@ def test_the_first_line_says_how_many_and_how_long():
     assert puck_env(limit=None).explain().splitlines()[0].endswith("episodes of any length")
 
 
-def test_the_second_line_says_what_solves_the_constraints():
-    assert explained().splitlines()[1] == "constraints are solved by one kernel"
-    env = puck_env(limit=None, sim=SimCfg(solver="cg"))
-    assert env.explain().splitlines()[1] == (
-        "constraints are solved by MuJoCo Warp's own solver, because the solver is not Newton's"
-    )
+def test_the_next_lines_say_what_kernels_compute_physics():
+    assert explained().splitlines()[1:3] == [
+        "constraints are solved by one kernel",
+        "what precedes them is computed by MuJoCo Warp's own kernels, because sim.one_kernel_dynamics is False",
+    ]
+    env = puck_env(limit=None, sim=SimCfg(solver="cg", one_kernel_dynamics=True))
+    solver, kernels = env.explain().splitlines()[1:3]
+    assert solver == "constraints are solved by MuJoCo Warp's own solver, because the solver is not Newton's"
+    assert kernels.endswith("own kernels, because the constraints are not solved by one kernel")
 
 
 def test_an_empty_manager_says_none_and_lines_stay_within_the_width():

@@ -152,8 +152,10 @@ SIM = {
 
 
 def test_sim_fields_reach_the_physics():
-    # Those have their own tests, in tests/envs/test_nan_guard.py and tests/physics/test_newton.py.
-    assert {*SIM, "nan_guard", "one_kernel_solver"} == {field.name for field in dataclasses.fields(SimCfg)}
+    # These have their own tests, in tests/envs/test_nan_guard.py, tests/physics/test_newton.py and test_smooth.py.
+    assert {*SIM, "nan_guard", "one_kernel_solver", "one_kernel_dynamics"} == {
+        field.name for field in dataclasses.fields(SimCfg)
+    }
     world = made(*(f"task.sim.{name}={value}" for name, value in SIM.items())).base_env.world
     option, warp_option = world.mj_model.opt, world.warp_model.opt
     assert (option.timestep, option.impratio, option.ccd_iterations) == (0.002, 3.0, 7)

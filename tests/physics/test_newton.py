@@ -254,12 +254,12 @@ def test_models_out_of_range_take_the_solver_of_mujoco_warp():
 
 def test_a_step_calls_the_control_callback_as_mujoco_warp_does():
     reached = []
-    for one_kernel_solver in (True, False):
+    for sim in (SimCfg(one_kernel_dynamics=True), SimCfg(one_kernel_solver=False)):
         model = load_model(
             "<mujoco><worldbody><body><joint name='j' type='slide'/><geom size='0.1' mass='1'/></body></worldbody>"
             "<actuator><motor joint='j'/></actuator></mujoco>"
         )
-        world = World(model, num_envs=1, sim=SimCfg(one_kernel_solver=one_kernel_solver))
+        world = World(model, num_envs=1, sim=sim)
         world.gravity_EL.zero_()
         world.warp_model.callback.control = lambda m, d: d.ctrl.fill_(2.0)
         world.step(1)

@@ -113,24 +113,40 @@ def solver(
     return launch
 
 
-def step(warp_model: mjw.Model, warp_data_E: mjw.Data, solve: Callable[[], None], *, sensors: bool) -> None:
+def step(
+    warp_model: mjw.Model,
+    warp_data_E: mjw.Data,
+    solve: Callable[[], None],
+    dynamics: Callable[[bool], None] | None = None,
+    *,
+    sensors: bool,
+) -> None:
     """Launch a physics step: that of MuJoCo Warp, with this solver.
 
     The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
-    not, never change the state that is reached.
+    not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel,
+    with forces or without.
     """
     m, d = warp_model, warp_data_E
-    mjw.fwd_position(m, d, factorize=False)
+    if dynamics is None:
+        mjw.fwd_position(m, d, factorize=False)
+        mjw.fwd_velocity(m, d)
+    else:
+        dynamics(True)
+        if sensors:
+            mjw.camlight(m, d)
+        if m.opt.run_collision_detection:
+            mjw.collision(m, d)
+        mjw.make_constraint(m, d)
     if sensors:
         d.sensordata.zero_()
         mjw.sensor_pos(m, d)
-    mjw.fwd_velocity(m, d)
-    if sensors:
         mjw.sensor_vel(m, d)
-    if m.callback.control and not m.opt.disableflags & mjw.DisableBit.ACTUATION:
-        m.callback.control(m, d)
-    mjw.fwd_actuation(m, d)
-    mjw.fwd_acceleration(m, d, factorize=True)
+    if dynamics is None:
+        if m.callback.control and not m.opt.disableflags & mjw.DisableBit.ACTUATION:
+            m.callback.control(m, d)
+        mjw.fwd_actuation(m, d)
+        mjw.fwd_acceleration(m, d, factorize=True)
     solve()
     if m.opt.run_rne_postconstraint or (sensors and m.sensor_rne_postconstraint):
         mjw.rne_postconstraint(m, d)

@@ -1,0 +1,155 @@
+"""This module makes the one kernel of a substep's smooth dynamics: all of it that constraints have no part in.
+
+MuJoCo Warp launches some 35 kernels for it, each of which waits for its slowest world; here some lanes of a warp own a
+world from its positions to the sum of its forces, with its bodies on the chip. It is written in C++, as the solver's
+kernel is; the CPU compiles the same source, for one lane. Read its parts in their order: layout.cpp, kinematics.cpp,
+inertia.cpp, velocities.cpp, passive.cpp, actuation.cpp.
+
+Source of the algorithms: https://mujoco.readthedocs.io/en/stable/computation/index.html
+"""
+
+# Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
+# pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportInvalidTypeForm=false
+
+import dataclasses
+import functools
+from importlib.resources import files
+
+import mujoco
+import mujoco_warp as mjw
+import warp as wp
+
+from ksim_rl.physics.structs import struct_with
+
+CUDA_THREADS = 32
+_PARTS = ("layout", "kinematics", "inertia", "velocities", "passive", "actuation")
+_SOURCE = "".join(files("ksim_rl.physics.smooth").joinpath(f"{part}.cpp").read_text() for part in _PARTS)
+_ENUMS = {
+    "FREE": mujoco.mjtJoint.mjJNT_FREE,
+    "BALL": mujoco.mjtJoint.mjJNT_BALL,
+    "SLIDE": mujoco.mjtJoint.mjJNT_SLIDE,
+    "HINGE": mujoco.mjtJoint.mjJNT_HINGE,
+    "JOINT": mujoco.mjtTrn.mjTRN_JOINT,
+    "JOINT_IN_PARENT": mujoco.mjtTrn.mjTRN_JOINTINPARENT,
+    "INTEGRATOR": mujoco.mjtDyn.mjDYN_INTEGRATOR,
+    "FILTER": mujoco.mjtDyn.mjDYN_FILTER,
+    "FILTER_EXACT": mujoco.mjtDyn.mjDYN_FILTEREXACT,
+    "AFFINE_GAIN": mujoco.mjtGain.mjGAIN_AFFINE,
+    "AFFINE_BIAS": mujoco.mjtBias.mjBIAS_AFFINE,
+}
+
+
+@struct_with(
+    ("", mjw.Model, "qpos0 qpos_spring M_hinit_i M_colind"),
+    (
+        "",
+        mjw.Model,
+        "body_rootid body_mocapid body_jntnum body_jntadr body_dofadr body_subtreenum body_branches "
+        "body_branch_start body_pos body_quat body_ipos body_iquat body_mass body_subtreemass body_inertia",
+    ),
+    (
+        "",
+        mjw.Model,
+        "jnt_type jnt_qposadr jnt_dofadr jnt_bodyid jnt_pos jnt_axis jnt_actuatorid jnt_stiffness jnt_stiffnesspoly "
+        "jnt_actfrclimited jnt_actfrcrange dof_bodyid dof_jntid dof_armature dof_damping dof_dampingpoly",
+    ),
+    ("", mjw.Model, "geom_bodyid geom_pos geom_quat site_bodyid site_pos site_quat"),
+    (
+        "",
+        mjw.Model,
+        "actuator_trntype actuator_trnid actuator_gear actuator_armature actuator_damping actuator_dampingpoly "
+        "actuator_dyntype actuator_gaintype actuator_biastype actuator_dynprm actuator_gainprm actuator_biasprm "
+        "actuator_ctrladr actuator_ctrlnum actuator_ctrllimited actuator_ctrlrange actuator_actadr actuator_actnum "
+        "actuator_actlimited actuator_actrange actuator_actearly actuator_forcelimited actuator_forcerange",
+    ),
+    ("", mjw.Option, "gravity timestep"),
+    ("", mjw.Data, "qpos qvel act ctrl mocap_pos mocap_quat qfrc_applied xfrc_applied"),
+    (
+        "",
+        mjw.Data,
+        "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat subtree_com cdof cinert "
+        "cvel cdof_dot cacc cfrc_int M qfrc_bias qfrc_spring qfrc_damper qfrc_passive",
+    ),
+    (
+        "",
+        mjw.Data,
+        "actuator_length actuator_velocity moment_rownnz moment_rowadr moment_colind actuator_moment act_dot "
+        "actuator_force qfrc_actuator qfrc_smooth",
+    ),
+)
+class Problem:
+    """What the kernel reads of a model and its worlds, and what it writes.
+
+    Besides, the geoms that move, and by `first_driver` the actuators that drive each degree of freedom.
+    """
+
+    moving_geoms: wp.array[int]
+    first_driver: wp.array[int]
+    drivers: wp.array[int]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Shape:
+    """What of a model is compiled into its kernel: its sizes, and what it has of MuJoCo's features."""
+
+    parents: tuple[int, ...]
+    num_joints: int
+    num_dofs: int
+    num_chains: int
+    num_moving_geoms: int
+    num_sites: int
+    num_actuators: int
+    has_mocap: bool
+    has_activation: bool
+    gravity: bool
+    springs: bool
+    dampers: bool
+    clamps_ctrl: bool
+    actuators_act: bool
+
+    @property
+    def num_bodies(self) -> int:
+        """Bodies, with the world."""
+        return len(self.parents)
+
+    @property
+    def poses(self) -> int:
+        """Floats of the poses, then inertias, then sums of forces."""
+        return max(10 * self.num_bodies, self.num_actuators + self.num_dofs)
+
+    @property
+    def joints(self) -> int:
+        """Floats of the joints' frames, then of the bodies' velocities, then of momenta."""
+        return 6 * max(self.num_bodies, self.num_joints, self.num_dofs)
+
+    def floats(self, lanes: int) -> int:
+        """Return how many floats the lanes of a world share."""
+        needed = self.poses + self.joints + 9 * self.num_bodies + 6 * self.num_dofs
+        # Worlds of a warp begin in other banks: those of one lie side by side for its lanes.
+        return needed + (lanes - needed) % 32
+
+
+@functools.cache
+def smooth_kernel(shape: Shape, lanes: int, threads: int) -> wp.Kernel:
+    """Return the kernel of a `Problem`; launch it over (worlds, lanes) in blocks of `threads`.
+
+    Its other argument says whether it goes on after the velocities, to the inertia matrix and the forces.
+    """
+    constants = {field.name: getattr(shape, field.name) for field in dataclasses.fields(shape)[1:]}
+    constants |= {"num_bodies": shape.num_bodies, "poses": shape.poses, "joints": shape.joints}
+    constants |= {"floats": shape.floats(lanes), "lanes": lanes, "threads": threads, **_ENUMS}
+    parents = ", ".join(map(str, shape.parents))
+    snippet = "".join(f"constexpr int {name.upper()} = {int(value)};\n" for name, value in constants.items())
+    snippet += f"constexpr int PARENTS[] = {{{parents}}};\n{_SOURCE}"
+
+    @wp.func_native(snippet)
+    def smooth_dynamics(world: int, lane: int, forces_too: bool, problem: Problem) -> None: ...
+
+    @wp.kernel(
+        module="unique", enable_backward=False, grid_stride=False, module_options={"block_dim": threads}
+    )
+    def kernel(problem: Problem, forces_too: bool):
+        world, lane = wp.tid()
+        smooth_dynamics(world, lane, forces_too, problem)
+
+    return kernel

@@ -1,0 +1,86 @@
+// Part 4: velocities (mj_comVel), bias forces (mj_rne without accelerations) and the inertia matrix (mj_crb). A body
+// accelerates with the one before it and by the rates of the axes that its own velocity turns; gravity is an
+// acceleration of the world.
+
+const float* const qvel = row_of(problem.qvel);
+const spatial from_gravity = spatial_of(vec3(), GRAVITY ? -of_world(problem.gravity) : vec3());
+
+if (lane == 0) {
+    velocity(0) = spatial();
+    force(0) = from_gravity;
+}
+each(NUM_CHAINS, [&](int chain) {
+    spatial moving, rising = from_gravity;
+#pragma unroll 1
+    for (int link = first_link(chain); link < first_link(chain + 1); ++link) {
+        const int body = look_up(problem.body_branches, link), first = look_up(problem.body_jntadr, body);
+        int dof = look_up(problem.body_dofadr, body);
+#pragma unroll 1
+        for (int joint = first; joint < first + look_up(problem.body_jntnum, body); ++joint) {
+            const int type = look_up(problem.jnt_type, joint);
+            // A free joint's first three axes are those of the world, which nothing turns.
+            if (type == FREE)
+                for (const int end = dof + 3; dof < end; ++dof) {
+                    row_of(problem.cdof_dot)[dof] = spatial();
+                    moving = moving + motion(dof) * qvel[dof];
+                }
+            // The axes of a ball turn together, with the velocity before all three.
+            const int count = type == FREE || type == BALL ? 3 : 1;
+            const spatial before = moving;
+            for (const int end = dof + count; dof < end; ++dof) {
+                const spatial rate = cross_motion(before, motion(dof));
+                row_of(problem.cdof_dot)[dof] = rate;
+                rising = rising + rate * qvel[dof];
+                moving = moving + motion(dof) * qvel[dof];
+            }
+        }
+        velocity(body) = moving;
+        force(body) = rising;
+    }
+});
+sync();
+write(problem.cvel, NUM_BODIES, velocities, 6);
+if (!forces_too)
+    return;
+write(problem.cacc, NUM_BODIES, forces, 6);
+sync();
+each(NUM_BODIES, [&](int body) {
+    const spatial pushed = times_inertia(inertia(body), force(body));
+    const spatial turned = cross_force(velocity(body), times_inertia(inertia(body), velocity(body)));
+    force(body) = body == 0 ? spatial() : pushed + turned;
+});
+sync();
+sum_subtrees(16, [&](int index) {
+    return index < 10 ? Column {inertias + index, POSE} : Column {forces + index - 10, 6};
+});
+write(problem.cfrc_int, NUM_BODIES, forces, 6);
+
+each(NUM_DOFS, [&](int dof) {
+    momentum(dof) = times_inertia(inertia(look_up(problem.dof_bodyid, dof)), motion(dof));
+});
+sync();
+// Calls body(actuator) for the actuators that add armature or damping to a joint: none, one, or (below -1) several.
+auto each_actuator_of = [&](int joint, auto body) {
+    const int only = look_up(problem.jnt_actuatorid, joint);
+    if (only >= 0)
+        body(only);
+    for (int actuator = 0; only < -1 && actuator < NUM_ACTUATORS; ++actuator) {
+        const int type = look_up(problem.actuator_trntype, actuator);
+        if ((type == JOINT || type == JOINT_IN_PARENT) && problem.actuator_trnid.data[actuator][0] == joint)
+            body(actuator);
+    }
+};
+#pragma unroll 4
+for (int entry = lane; entry < problem.M_hinit_i.shape[0]; entry += LANES) {
+    const int row = look_up(problem.M_hinit_i, entry), column = look_up(problem.M_colind, entry);
+    float found = wp::dot(motion(column), momentum(row));
+    if (row == column) {
+        float armature = model_row(problem.dof_armature)[row];
+        each_actuator_of(look_up(problem.dof_jntid, row), [&](int actuator) {
+            const float gear = model_row(problem.actuator_gear)[actuator][0];
+            armature += model_row(problem.actuator_armature)[actuator] * gear * gear;
+        });
+        found += armature;
+    }
+    row_of(problem.M)[entry] = found;
+}
