@@ -18,6 +18,7 @@ from ksim_rl.config.plain_data import check_links
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, record_video
 from ksim_rl.trainers.build import build_env
+from ksim_rl.trainers.run_cfg import check_run_tree
 from ksim_rl.trainers.run_folder import policy_of, without_nan_guard
 from ksim_rl.viewer.session import AGENTS, Conditions, Session, UntrainedAgent
 from ksim_rl.zoo import locate
@@ -175,9 +176,11 @@ def _find(options: argparse.Namespace) -> Played:
     changed = None
     saved = checkpoint.load_latest(locate(first))
     if overrides:
-        conf.register_run(saved.run_folder, conf.fields_of(overrides))
-        composed = conf.check_command_line(overrides, name=conf.RUN_AGAIN, multirun=False, values=True)
-        changed = dataclasses.replace(composed[0], device=options.device)
+        check_run_tree(saved.config, saved.path, given=conf.fields_of(overrides))
+        conf.register()
+        conf.store_run({**saved.config, "device": options.device}, saved.path)
+        (changed,) = conf.check_command_line(overrides, name=conf.RUN_AGAIN, multirun=False, values=True)
+        changed = dataclasses.replace(changed, device=options.device)
     policy = policy_of(saved, device=options.device, cfg=changed)
     if options.agent is not None:
         return _without_policy(policy.cfg, options.agent)

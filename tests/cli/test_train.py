@@ -86,6 +86,15 @@ def test_play_records_a_video_or_says_why_not(trained, capsys, tmp_path):
         assert "MUJOCO_GL=" in output
 
 
+def test_a_run_of_another_device_plays_here_with_changes(trained, tmp_path, capsys):
+    saved = checkpoint.load_latest(trained[1])
+    elsewhere = {**saved.config, "device": "cuda:7"}
+    checkpoint.save(tmp_path / "checkpoint", saved.state, iteration=saved.iteration, config=elsewhere)
+    words = ("--device", "cpu", "--seconds", "0.1", "--output", str(tmp_path / "clip.mp4"))
+    assert run("play", str(tmp_path), "task.viewer.width=64", *words) in (0, 3)
+    assert "device=" not in capsys.readouterr().err
+
+
 def test_resume_continues_in_the_same_folder(trained):
     _, folder = trained
     assert run("resume", str(folder), "--num-iterations", "3") == 1
