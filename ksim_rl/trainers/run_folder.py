@@ -164,6 +164,7 @@ def record_video(
     note: Callable[[str], None],
     status: Callable[[str], None] = lambda _: None,
     seconds: float | None = None,
+    fps: float = video.FPS,
     seed: int = 0,
 ) -> Path | None:
     """Record the policy in one env; where that is impossible, say why and how to mend it, and return None."""
@@ -176,8 +177,8 @@ def record_video(
         with warnings.catch_warnings():
             # Each OpenGL platform that fails warns on its own; the error says it once, with the fix.
             warnings.filterwarnings("ignore", module="glfw")
-            fps = 1.0 / clock.step_dt
-            return video.record(env, actor, path, steps=steps, fps=fps, seed=seed, status=status)
+            how = {"steps": steps, "step_dt": clock.step_dt, "fps": fps, "seed": seed}
+            return video.record(env, actor, path, status=status, **how)
     except video.VideoUnavailableError as error:
         note(f"no video: {error}")
         return None

@@ -15,6 +15,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ksim_rl.envs.contract import Pictures, part
 from ksim_rl.runs.whole_file import whole_file
 
+# Pictures per second of simulated time. Software takes 50 to 90 ms for each, many times what a step of one env takes.
+FPS = 25.0
 # Why rendering failed in this process, once it did. MuJoCo aborts the process when it tries a second time without a
 # working OpenGL platform.
 _failed: list[str] = []
@@ -30,19 +32,22 @@ def record(
     path: Path,
     *,
     steps: int,
-    fps: float,
+    step_dt: float,
+    fps: float = FPS,
     seed: int = 0,
     status: Callable[[str], None] = lambda _: None,
 ) -> Path:
     """Let the policy act, deterministically, and write what a camera sees; return the file written.
 
     The env has the part `Pictures`, and `path` ends in `.mp4`; without a video encoder a `.gif` beside it is written
-    instead. There are `fps` pictures per second at real speed; more than 50 are thinned out. A VideoUnavailableError
-    says why nothing can be rendered, and the fix.
+    instead. It plays at real speed, `step_dt` being the seconds of an env step, with as near to `fps` pictures per
+    second as whole steps allow: at most one for each. A VideoUnavailableError says why nothing can be rendered, and the
+    fix.
     """
     if _failed:
         raise VideoUnavailableError(_failed[0])
-    every = max(1, round(fps / 50))
+    every = max(1, round(1.0 / (fps * step_dt)))
+    shown = 1.0 / (every * step_dt)
     acting = partial(_frames, env, policy, steps=steps, every=every, seed=seed, status=status)
     frames = acting()
     try:
@@ -54,11 +59,11 @@ def record(
         raise VideoUnavailableError(str(error)) from error
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        return _write(path, first, frames, fps=fps / every)
+        return _write(path, first, frames, fps=shown)
     except (ImportError, RuntimeError, OSError):
         # No ffmpeg for this platform: a GIF needs only Pillow. The frames begin anew, as the generator is spent.
         frames = acting()
-        return _write(path.with_suffix(".gif"), next(frames), frames, fps=min(fps / every, 25))
+        return _write(path.with_suffix(".gif"), next(frames), frames, fps=shown)
 
 
 def _write(path: Path, first: np.ndarray, rest: Iterator[np.ndarray], *, fps: float) -> Path:

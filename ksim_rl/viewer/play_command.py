@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import os
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,13 +14,14 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ksim_rl import conf
-from ksim_rl.checks import check_in_range
+from ksim_rl.checks import check_count, check_in_range
 from ksim_rl.config.plain_data import check_links
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, record_video
 from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.run_cfg import check_run_tree
 from ksim_rl.trainers.run_folder import policy_of, without_nan_guard
+from ksim_rl.trainers.video import FPS
 from ksim_rl.viewer.session import AGENTS, Conditions, Session, UntrainedAgent
 from ksim_rl.zoo import locate
 
@@ -83,14 +85,11 @@ def serve(session: Session, *, host: str, port: int, note: Callable[[str], None]
     """Serve a session to browsers until Ctrl-C."""
     from ksim_rl.viewer.browser import BrowserViewer
 
-    viewer = BrowserViewer(host=host, port=port, label=session.title)
-    try:
+    with closing(BrowserViewer(host=host, port=port, label=session.title)) as viewer:
         viewer.open(session)
         for line in addresses(viewer.address, viewer.pad_address):
             note(line)
         viewer.run()
-    finally:
-        viewer.close()
 
 
 def addresses(viewer: str, pad: str) -> list[str]:
@@ -141,6 +140,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--seconds", type=float, help="of a video, simulated time; default: as the run was configured"
     )
+    parser.add_argument("--fps", type=float, help=f"of a video, pictures per second; default: {FPS:g}")
     parser.add_argument(
         "--output", type=Path, help="of a video: an .mp4 or .gif file; default: play.mp4 in the run folder"
     )
@@ -148,10 +148,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _check(options: argparse.Namespace) -> None:
-    if options.seconds is not None:
-        check_in_range("--seconds", options.seconds, low=0.0, low_open=True)
-    if options.num_envs < 1:
-        raise ValueError(f"--num-envs {options.num_envs}: expected at least 1")
+    of_video = {"--seconds": options.seconds, "--fps": options.fps, "--output": options.output}
+    given = {name: value for name, value in of_video.items() if value is not None}
+    for name in ("--seconds", "--fps"):
+        check_in_range(name, given.get(name, 1.0), low=0.0, low_open=True)
+    check_count("--num-envs", options.num_envs)
     if options.output is not None and options.output.suffix not in VIDEO_SUFFIXES:
         raise ValueError(
             f"--output {options.output}: expected a file that ends in {' or '.join(VIDEO_SUFFIXES)}"
@@ -160,8 +161,8 @@ def _check(options: argparse.Namespace) -> None:
         check_viser()
     if options.viewer == "native":
         importlib.import_module("ksim_rl.viewer.native").check_display()
-    if options.viewer is not None and (options.output, options.seconds) != (None, None):
-        raise ValueError("--output and --seconds are of a video: leave them out, or leave out the viewer")
+    if options.viewer is not None and given:
+        raise ValueError(f"{', '.join(given)}: of a video: leave that out, or leave out the viewer")
 
 
 def _find(options: argparse.Namespace) -> Played:
@@ -195,15 +196,13 @@ def _without_policy(cfg: RunCfg, agent: str) -> Played:
 
 
 def _record(played: Played, options: argparse.Namespace, progress: RunProgress) -> int:
-    path = options.output
-    if path is None:
-        if played.actor is not None:
-            check_links(played.folder, below=())
-        path = played.folder / "play.mp4"
+    if options.output is None and played.actor is not None:
+        check_links(played.folder, below=())
+    path = options.output or played.folder / "play.mp4"
     probe = build_env(played.cfg, num_envs=1, seed=options.seed)
     actor = played.policy(probe)
     probe.close()
-    how = {"note": progress.note, "seconds": options.seconds, "seed": options.seed}
+    how = {"note": progress.note, "seconds": options.seconds, "fps": options.fps or FPS, "seed": options.seed}
     with progress.console.status("drawing the video") as spinner:
         status = spinner.update if progress.console.is_terminal else progress.status
         written = record_video(played.cfg, actor, path, status=status, **how)

@@ -43,7 +43,7 @@ class Camera:
 
 
 def test_an_mp4_has_a_frame_per_step(tmp_path):
-    path = record(filmed(Camera()), still(), tmp_path / "video.mp4", steps=10, fps=25.0)
+    path = record(filmed(Camera()), still(), tmp_path / "video.mp4", steps=10, step_dt=0.04)
     frames = imageio.mimread(path)
     assert path.name == "video.mp4"
     assert len(frames) == 10
@@ -51,11 +51,25 @@ def test_an_mp4_has_a_frame_per_step(tmp_path):
     assert frames[8].mean() > frames[0].mean() + 100
 
 
-def test_fast_steps_are_thinned_out_at_real_speed(tmp_path):
+@pytest.mark.parametrize(
+    ("step_dt", "fps", "drawn", "shown"),
+    [
+        (0.02, 25.0, 10, 25.0),
+        (0.02, 5.0, 2, 5.0),
+        (0.01, 50.0, 10, 50.0),
+        (0.04, 50.0, 20, 25.0),
+        (0.02, 20.0, 10, 25.0),
+        (0.02, 15.0, 7, 50 / 3),
+    ],
+    ids=["half", "a tenth", "fast steps", "slow steps", "between", "every third"],
+)
+def test_so_many_pictures_are_drawn_as_asked_at_real_speed(tmp_path, step_dt, fps, drawn, shown):
     camera = Camera()
-    path = record(filmed(camera), still(), tmp_path / "video.mp4", steps=20, fps=100.0)
-    assert camera.count == 10
-    assert imageio.get_reader(path).get_meta_data()["fps"] == pytest.approx(50.0)
+    path = record(filmed(camera), still(), tmp_path / "video.mp4", steps=20, step_dt=step_dt, fps=fps)
+    assert camera.count == drawn
+    told = imageio.get_reader(path).get_meta_data()
+    assert told["fps"] == pytest.approx(shown, rel=1e-3)
+    assert told["duration"] == pytest.approx(drawn / shown, abs=0.02)
 
 
 def test_without_an_encoder_there_is_a_gif(tmp_path, monkeypatch):
@@ -67,9 +81,10 @@ def test_without_an_encoder_there_is_a_gif(tmp_path, monkeypatch):
         return real(path, **options)
 
     monkeypatch.setattr(imageio, "get_writer", no_ffmpeg)
-    path = record(filmed(Camera()), still(), tmp_path / "video.mp4", steps=4, fps=25.0)
+    path = record(filmed(Camera()), still(), tmp_path / "video.mp4", steps=4, step_dt=0.04)
     assert path.name == "video.gif"
     assert len(imageio.mimread(path)) == 4
+    assert imageio.get_reader(path).get_meta_data()["duration"] == pytest.approx(40.0)
 
 
 def test_without_opengl_the_reason_and_the_fix_are_passed_on(tmp_path):
@@ -77,7 +92,7 @@ def test_without_opengl_the_reason_and_the_fix_are_passed_on(tmp_path):
         raise RuntimeError("no OpenGL platform for off-screen rendering. Fixes: ...")
 
     with pytest.raises(VideoUnavailableError, match="Fixes"):
-        record(filmed(blind), still(), tmp_path / "video.mp4", steps=4, fps=25.0)
+        record(filmed(blind), still(), tmp_path / "video.mp4", steps=4, step_dt=0.04)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -90,10 +105,10 @@ def test_a_platform_that_failed_is_not_tried_again(tmp_path):
 
     for _ in range(2):
         with pytest.raises(VideoUnavailableError, match="no OpenGL platform"):
-            record(filmed(blind), still(), tmp_path / "video.mp4", steps=4, fps=25.0)
+            record(filmed(blind), still(), tmp_path / "video.mp4", steps=4, step_dt=0.04)
     assert len(calls) == 1
 
 
 def test_an_env_without_render_mode_is_named(tmp_path):
     with pytest.raises(VideoUnavailableError, match="render_mode='rgb_array'"):
-        record(filmed(lambda: None), still(), tmp_path / "video.mp4", steps=4, fps=25.0)
+        record(filmed(lambda: None), still(), tmp_path / "video.mp4", steps=4, step_dt=0.04)

@@ -12,8 +12,11 @@ from ksim_rl.viewer.play_command import addresses
         (["task=cartpole_swingup"], "task=NAME with --agent zero or random"),
         (["num_envs=4", "--agent", "zero"], "'num_envs=4': expected a run folder, or task=NAME"),
         (["task=cartpole_swingupp", "--agent", "zero"], "did you mean 'cartpole_swingup'"),
-        (["RUN", "--live", "--seconds", "3"], "--output and --seconds are of a video"),
-        (["RUN", "--num-envs", "0"], "--num-envs 0: expected at least 1"),
+        (["RUN", "--live", "--seconds", "3"], "--seconds: of a video"),
+        (["RUN", "--live", "--fps", "3", "--output", "a.mp4"], "--fps, --output: of a video"),
+        (["RUN", "--fps", "0"], "--fps=0.0: expected a finite number in (0.0, inf)"),
+        (["RUN", "--seconds", "-1"], "--seconds=-1.0: expected a finite number in (0.0, inf)"),
+        (["RUN", "--num-envs", "0"], "--num-envs=0: expected a whole number >= 1"),
         (["RUN", "--output", "clip.avi"], "ends in .mp4 or .gif"),
     ],
 )
