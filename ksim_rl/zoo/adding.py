@@ -4,7 +4,7 @@ import json
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -15,15 +15,15 @@ from ksim_rl.trainers.run_cfg import check_run_tree
 from ksim_rl.zoo.cards import CARD, CHECKPOINT, FOLDER, MOST_BYTES, ONNX, Card, hashes, read_card
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_]*", re.ASCII)
-CURVE_POINTS = 24
+CURVE_POINTS, RETURN = 24, "episode/return"
 
 
 def add(
     run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100, note: Callable[[str], None] = print
 ) -> Card:
-    """Make an entry out of a run folder, and return its card.
+    """Make an entry out of a run folder, with `episodes` compared with MuJoCo's C engine, and return its card.
 
-    `episodes` are compared with MuJoCo's C engine. Raises ValueError for a wrong name, and more than 200 kB.
+    Raises ValueError for a wrong name, a run of code that is not in one commit, and more than 200 kB.
     """
     if not NAME.fullmatch(name):
         raise ValueError(f"{name!r}: expected lower-case letters, digits and _")
@@ -31,6 +31,7 @@ def add(
         raise ValueError(f"{folder / name} exists: delete it, or choose another name")
     saved = checkpoint.load_latest(run)
     check_run_tree(saved.config, saved.path)
+    card = _of_run(saved, name=name)
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder) as temporary:
         entry, exported = Path(temporary) / name, Path(temporary) / "export"
@@ -41,9 +42,8 @@ def add(
         actor = {"actor": saved.state["update"]["actor"]}
         state = {"observation_columns": saved.state["observation_columns"], "update": actor}
         checkpoint.save(entry / CHECKPOINT, state, iteration=saved.iteration, config=saved.config)
-        compared = {"return_ratio": report.return_ratio, "standard_error": report.standard_error}
-        card = _of_run(saved, name=name, compared={**compared, "episodes": float(episodes)})
-        card = replace(card, files=hashes(entry))
+        ratio = {"return_ratio": report.return_ratio, "standard_error": report.standard_error}
+        card = replace(card, sim2sim={**ratio, "episodes": float(episodes)}, files=hashes(entry))
         (entry / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n")
         size = sum(path.stat().st_size for path in entry.rglob("*") if path.is_file())
         if size > MOST_BYTES:
@@ -53,22 +53,25 @@ def add(
     return read_card(name, folder)
 
 
-def _of_run(saved: checkpoint.Checkpoint, *, name: str, compared: Mapping[str, float]) -> Card:
+def _of_run(saved: checkpoint.Checkpoint, *, name: str) -> Card:
     """Return the card of a run as its folder tells."""
-    summary, sessions = listing.summarize(saved.run_folder), record.read(saved.run_folder)
-    code = sessions[0].code.get("ksim_rl", {}) if sessions else {}
-    _, rows = csv_table.read_table(saved.run_folder / listing.METRICS)
-    earned = [row for row in rows if listing.numbers([row], "episode/return")]
-    curve = [(int(row[csv_table.STEP]), float(f"{float(row['episode/return']):.4g}")) for row in earned]
+    run, summary = saved.run_folder, listing.summarize(saved.run_folder)
+    codes = [session.code.get("ksim_rl", {}) for session in record.read(run)] or [{}]
+    made = {code.get("commit", "no commit") + " with changes" * ("changed" in code) for code in codes}
+    commit = " and ".join(sorted(made))
+    if not re.fullmatch("[0-9a-f]{40}", commit):
+        raise ValueError(f"{run}: made of {commit}: train in a clean clone of one commit, and add that run")
+    _, rows = csv_table.read_table(run / listing.METRICS)
+    earned = ((row[csv_table.STEP], value) for row in rows for value in listing.numbers([row], RETURN))
+    curve = [(int(env_states), float(f"{value:.4g}")) for env_states, value in earned]
     return Card(
         name=name,
         task=str(saved.config["task_name"]),
-        commit=code.get("commit", "unknown") + "-dirty" * ("changed" in code),
+        commit=commit,
         seed=int(saved.config["seed"]),
         num_envs=int(saved.config["num_envs"]),
         iteration=saved.iteration,
         env_states=summary.env_states or 0,
         return_mean=summary.evaluation,
         curve=tuple(curve[:: max(1, len(curve) // CURVE_POINTS)]),
-        sim2sim=compared,
     )

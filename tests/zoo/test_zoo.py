@@ -13,6 +13,7 @@ from ksim_rl.cli.main import main
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.loggers import WandbCfg
 from ksim_rl.zoo import cards, locate, read_card, wandb_runs
+from ksim_rl.zoo.adding import add
 from ksim_rl.zoo.cards import FOLDER, MOST_BYTES
 
 NAMES = [card.name for card in cards()]
@@ -75,6 +76,63 @@ def test_links_and_strangers_cards_are_refused(zoo):
     (zoo / NAMES[0] / "policy.onnx").symlink_to("/etc/hostname")
     with pytest.raises(ValueError, match="cannot be read"):
         read_card(NAMES[0], zoo)
+
+
+COMMIT = "0123456789abcdef" * 2 + "01234567"
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Return a function that gives a run folder of the zoo's reacher, and its record the code of its sessions."""
+    folder = tmp_path / "run"
+    shutil.copytree(FOLDER / "reacher" / "checkpoint", folder / "checkpoint")
+    (folder / "config.yaml").write_text("task_name: reacher\n")
+    rows = [f"{8192 * i},{i},{'' if i % 2 else i / 3}," + ("795.5" if i == 60 else "") for i in range(1, 61)]
+    (folder / "metrics.csv").write_text(
+        "\n".join(["env_states,iteration,episode/return,evaluation/return_mean", *rows, ""])
+    )
+
+    def of(*codes):
+        sessions = [{"began": "today", "command": "train", "code": {"ksim_rl": code}} for code in codes]
+        (folder / "run.json").write_text(json.dumps({"sessions": sessions}))
+        return folder
+
+    return of
+
+
+@pytest.mark.parametrize(
+    ("codes", "said"),
+    [
+        ([{"commit": COMMIT, "changed": "ksim_rl.diff"}], f"made of {COMMIT} with changes: train in a clean"),
+        ([{"commit": COMMIT}, {"commit": COMMIT, "changed": "x"}], f"made of {COMMIT} and {COMMIT} with"),
+        ([{"commit": COMMIT}, {"commit": COMMIT[::-1]}], f"made of {COMMIT} and {COMMIT[::-1]}: train"),
+        ([{"commit": "HEAD"}], "made of HEAD: train in a clean clone of one commit, and add that run"),
+        ([{}], "made of no commit: train in a clean clone"),
+        ([], "made of no commit: train in a clean clone"),
+    ],
+    ids=["changed", "changed later", "two commits", "a name", "outside of git", "no record"],
+)
+def test_a_run_of_code_that_no_commit_has_is_refused_in_one_line(run, codes, said, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["zoo", "add", str(run(*codes)), "mine", "--folder", str(tmp_path / "zoo")])
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert not (tmp_path / "zoo").exists()
+
+
+def test_an_entry_names_the_commit_of_its_run(run, tmp_path):
+    pytest.importorskip("onnxruntime")
+    card = add(
+        run({"commit": COMMIT}, {"commit": COMMIT}), "mine", folder=tmp_path / "zoo", episodes=2, note=print
+    )
+    assert card == read_card("mine", tmp_path / "zoo")
+    assert (card.commit, card.task, card.seed) == (COMMIT, "reacher", 1)
+    assert (card.env_states, card.return_mean) == (60 * 8192, 795.5)
+    assert card.curve[0] == [16384, 0.6667] and len(card.curve) == 30
+    assert card.sim2sim["episodes"] == 2.0 and abs(card.sim2sim["return_ratio"] - 1.0) < 0.03
+    again = checkpoint.load_latest(tmp_path / "zoo" / "mine")
+    assert again.state.keys() == checkpoint.load_latest(FOLDER / "reacher").state.keys()
 
 
 @pytest.mark.parametrize(
