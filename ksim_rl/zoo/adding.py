@@ -4,7 +4,6 @@ import json
 import re
 import shutil
 import tempfile
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -18,9 +17,7 @@ NAME = re.compile(r"[a-z0-9][a-z0-9_]*", re.ASCII)
 CURVE_POINTS, RETURN = 24, "episode/return"
 
 
-def add(
-    run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100, note: Callable[[str], None] = print
-) -> Card:
+def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> Card:
     """Make an entry out of a run folder, with `episodes` compared with MuJoCo's C engine, and return its card.
 
     Raises ValueError for a wrong name, a run of code that is not in one commit, and more than 200 kB.
@@ -35,8 +32,8 @@ def add(
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder) as temporary:
         entry, exported = Path(temporary) / name, Path(temporary) / "export"
-        export(run, exported, episodes=episodes, note=note)
-        report = sim2sim(exported, episodes=episodes, note=note)
+        export(run, exported, episodes=episodes, note=print)
+        report = sim2sim(exported, episodes=episodes, note=print)
         entry.mkdir()
         shutil.copyfile(exported / ONNX, entry / ONNX)
         actor = {"actor": saved.state["update"]["actor"]}

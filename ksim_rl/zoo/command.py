@@ -30,9 +30,8 @@ def zoo(arguments: Sequence[str]) -> int:
             for card in cards(options.folder):
                 earned = "-" if card.return_mean is None else f"{card.return_mean:.4g}"
                 ratio = f"x {card.sim2sim.get('return_ratio', float('nan')):.3f}"
-                print(
-                    ROW.format(card.name, card.task, f"{card.env_states:,}", earned, ratio, card.commit[:7])
-                )
+                row = (card.name, card.task, f"{card.env_states:,}", earned, ratio, card.commit[:7])
+                print(ROW.format(*row))
             return 0
         case ["add", run, name]:
             card = adding.add(Path(run), name, folder=options.folder, episodes=options.episodes)

@@ -123,9 +123,7 @@ def test_a_run_of_code_that_no_commit_has_is_refused_in_one_line(run, codes, sai
 
 def test_an_entry_names_the_commit_of_its_run(run, tmp_path):
     pytest.importorskip("onnxruntime")
-    card = add(
-        run({"commit": COMMIT}, {"commit": COMMIT}), "mine", folder=tmp_path / "zoo", episodes=2, note=print
-    )
+    card = add(run({"commit": COMMIT}, {"commit": COMMIT}), "mine", folder=tmp_path / "zoo", episodes=2)
     assert card == read_card("mine", tmp_path / "zoo")
     assert (card.commit, card.task, card.seed) == (COMMIT, "reacher", 1)
     assert (card.env_states, card.return_mean) == (60 * 8192, 795.5)
