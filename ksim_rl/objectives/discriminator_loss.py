@@ -1,6 +1,7 @@
 """This module has the loss of a discriminator of motions, and the reward that it gives."""
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -24,23 +25,24 @@ def discriminator_loss(
     It is mean((D(r) - 1)^2) + mean((D(p) + 1)^2) + w / 2 mean(|dD(r)/dr|^2), r of the reference and p of the policy:
     equation 8 of Peng et al., arXiv 2104.02180, w the `gradient_penalty`, whose gradient needs D to be differentiable
     twice. Logged, detached, are `loss`, `penalty` (without w / 2), `reference_score`, `policy_score` (means of D), and
-    `accuracy`, the share of transitions on their side of zero. The policy's transitions count where `mask_B` is True.
+    `accuracy`, the share of transitions on their side of zero. With `mask_B` there are as many r as p (C is B), and the
+    pairs where it is True count.
     """
     reference_CL = reference_CL.detach().requires_grad_()
     reference_C, policy_B = judge(reference_CL), judge(policy_BL)
     # Its gradient is a part of the loss, so it has to have one itself.
     (slope_CL,) = torch.autograd.grad(reference_C.sum(), reference_CL, create_graph=True)
-    penalty = slope_CL.square().sum(-1).mean()
-    mask_B = torch.ones_like(policy_B, dtype=torch.bool) if mask_B is None else mask_B
-    loss = (reference_C - 1.0).square().mean() + masked_mean((policy_B + 1.0).square(), mask_B)
+    mean: Judge = torch.mean if mask_B is None else partial(masked_mean, mask=mask_B)
+    penalty = mean(slope_CL.square().sum(-1))
+    loss = mean((reference_C - 1.0).square()) + mean((policy_B + 1.0).square())
     loss = loss + 0.5 * gradient_penalty * penalty
     with torch.no_grad():
-        accuracy = ((reference_C > 0.0).float().mean() + masked_mean((policy_B < 0.0).float(), mask_B)) / 2
+        accuracy = (mean((reference_C > 0.0).float()) + mean((policy_B < 0.0).float())) / 2
         logged = {
             "loss": loss.detach(),
             "penalty": penalty.detach(),
-            "reference_score": reference_C.mean(),
-            "policy_score": masked_mean(policy_B, mask_B),
+            "reference_score": mean(reference_C),
+            "policy_score": mean(policy_B),
             "accuracy": accuracy,
         }
     return loss, logged

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from typing import TypeVar
 
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 from torch import Tensor, nn
 
 from ksim_rl import ranks
@@ -125,13 +125,21 @@ def _fused(
 
 
 def descend(
-    loss: Float[Tensor, ""], optimizer: torch.optim.Optimizer, *, max_grad_norm: float | None
+    loss: Float[Tensor, ""],
+    optimizer: torch.optim.Optimizer,
+    *,
+    max_grad_norm: float | None,
+    mask: Bool[Tensor, "*rows"] | None = None,
 ) -> tuple[Float32[Tensor, ""], Float32[Tensor, ""]]:
     """Make one gradient step on the parameters of a fused optimizer, unless loss or gradient are not finite.
 
-    It can be captured in a CUDA graph. Returned are the norm before clipping, and 1 if the step was skipped, else 0.
+    It can be captured in a CUDA graph. The loss is a mean over the rows that `mask` marks, or over all: with several
+    ranks it becomes that over the rows of all of them. Returned are the norm before clipping, and 1 if the step was
+    skipped, else 0.
     """
-    return descend_together({"loss": loss}, {"loss": optimizer}, max_grad_norm=max_grad_norm)["loss"]
+    return descend_together({"loss": loss}, {"loss": optimizer}, max_grad_norm=max_grad_norm, mask=mask)[
+        "loss"
+    ]
 
 
 def descend_together(
@@ -139,12 +147,13 @@ def descend_together(
     optimizers: Mapping[str, torch.optim.Optimizer],
     *,
     max_grad_norm: float | None,
+    mask: Bool[Tensor, "*rows"] | None = None,
 ) -> dict[str, tuple[Float32[Tensor, ""], Float32[Tensor, ""]]]:
     """Do what `descend` says with each loss and the optimizer of its name, and go back through them at once.
 
     No loss may reach a parameter of another's optimizer.
     """
-    go_back(losses, optimizers)
+    go_back(losses, optimizers, mask=mask)
     return {name: step(optimizers[name], loss, max_grad_norm=max_grad_norm) for name, loss in losses.items()}
 
 
@@ -152,16 +161,22 @@ def go_back(
     losses: Mapping[str, Float[Tensor, ""]],
     optimizers: Mapping[str, torch.optim.Optimizer],
     *,
+    mask: Bool[Tensor, "*rows"] | None = None,
     beside: Iterable[Float[Tensor, ""]] = (),
 ) -> None:
-    """Compute the gradients of each loss, means over all ranks; losses and what is `beside` become means in place."""
+    """Compute the gradients of each loss, means over all ranks; losses and what is `beside` become means in place.
+
+    Each rank weighs as much as it has rows that `mask` marks.
+    """
     for name in losses:
         optimizers[name].zero_grad(set_to_none=True)
     torch.autograd.backward(list(losses.values()))
     if ranks.size() > 1:
         learnt = [parameter.grad for name in losses for parameter in _parameters(optimizers[name])]
         gradients = [gradient for gradient in learnt if gradient is not None]
-        ranks.mean_([*gradients, *(value.detach() for value in (*losses.values(), *beside))])
+        values = [value.detach() for value in (*losses.values(), *beside)]
+        weight = torch.ones_like(values[0]) if mask is None else mask.to(torch.float32).mean()
+        ranks.mean_([*gradients, *values], weight=weight)
 
 
 def step(

@@ -17,6 +17,7 @@ from ksim_rl.objectives.advantage_estimators import GAE, RolloutEstimator, TDLam
 from ksim_rl.objectives.algorithm_cfg import OnPolicyCfg, PPOCfg
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.gradient_step import StepGuard, adapt_learning_rate_, go_back, step
+from ksim_rl.objectives.masked import MASK_KEY
 from ksim_rl.objectives.symmetry import Loss, SymmetricAugmentation, mirror_loss
 from ksim_rl.transforms import MirrorMap
 
@@ -122,7 +123,8 @@ def ppo_step(
     total = reduce(add, [value for name, value in losses.items() if name.startswith("loss_")])
     learning_rate = optimizer.param_groups[0]["lr"]
     measured = {name: value.detach() for name, value in losses.items() if isinstance(value, Tensor)}
-    go_back({"loss": total}, {"loss": optimizer}, beside=measured.values())
+    mask = minibatch_B.get(MASK_KEY, None)
+    go_back({"loss": total}, {"loss": optimizer}, mask=mask, beside=measured.values())
     if cfg.schedule == "adaptive":
         adapt_learning_rate_(
             learning_rate,

@@ -16,27 +16,33 @@ from ksim_rl.ranks.group import size
 
 def sum_(tensors: Sequence[Num[Tensor, "*?shape"]]) -> None:
     """Replace each tensor by its sum over the ranks, in place: one collective for each dtype."""
-    _reduce_(tensors, 1)
+    _reduce_(tensors, None)
 
 
-def mean_(tensors: Sequence[Float[Tensor, "*?shape"]]) -> None:
-    """Replace each tensor by its mean over the ranks, in place: one collective for each dtype."""
-    _reduce_(tensors, size())
+def mean_(tensors: Sequence[Float[Tensor, "*?shape"]], *, weight: Float[Tensor, ""]) -> None:
+    """Replace each tensor by its mean over the ranks, in place, in which each rank has its `weight`, in [0, 1].
+
+    With the share of its rows that take part for weight, means over a rank's become means over those of all ranks; 0
+    where no rank has any. One collective for each dtype.
+    """
+    _reduce_(tensors, weight / size())
 
 
 @torch.no_grad()
-def _reduce_(tensors: Sequence[Tensor], parts: int) -> None:
+def _reduce_(tensors: Sequence[Tensor], share: Tensor | None) -> None:
     if size() == 1:
         return
     by_dtype: dict[torch.dtype, list[Tensor]] = {}
     for tensor in tensors:
         by_dtype.setdefault(tensor.dtype, []).append(tensor)
     for group in by_dtype.values():
-        flat = torch.cat([tensor.reshape(-1) for tensor in group])
-        if parts > 1:  # before they are added, so that sums of large gradients stay finite
-            flat.div_(parts)
+        flat = torch.cat([*(tensor.reshape(-1) for tensor in group), group[0].new_ones(1)])
+        if share is not None:  # before they are added, so that sums of large gradients stay finite
+            flat.mul_(share)
         dist.all_reduce(flat)
-        pieces = flat.split([tensor.numel() for tensor in group])
+        if share is not None:
+            flat.div_(flat[-1].clamp_min(torch.finfo(flat.dtype).tiny))
+        pieces = flat[:-1].split([tensor.numel() for tensor in group])
         torch._foreach_copy_(
             group, [piece.view_as(tensor) for piece, tensor in zip(pieces, group, strict=True)]
         )

@@ -54,7 +54,7 @@ def test_the_penalty_of_a_network_equals_the_written_out_slope_at_each_transitio
         torch.testing.assert_close(one, other)
 
 
-def test_masked_transitions_do_not_count():
+def test_masked_pairs_do_not_count():
     reference, policy = torch.randn(8, L), torch.randn(8, L)
     weight = torch.randn(L)
     mask = torch.tensor([True] * 5 + [False] * 3)
@@ -62,7 +62,7 @@ def test_masked_transitions_do_not_count():
     loss, logged = discriminator_loss(
         lambda x: x @ weight, reference, policy, gradient_penalty=1.0, mask_B=mask
     )
-    kept, _ = discriminator_loss(lambda x: x @ weight, reference, policy[:5], gradient_penalty=1.0)
+    kept, _ = discriminator_loss(lambda x: x @ weight, reference[:5], policy[:5], gradient_penalty=1.0)
     torch.testing.assert_close(loss, kept)
     assert logged["policy_score"].isfinite()
 

@@ -15,7 +15,7 @@ from ksim_rl import ranks
 from ksim_rl.algorithms.gradient_steps import RolloutUpdate, in_columns, load_optimizer_state, optimizer_state
 from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.algorithms.ppo.wiring import make_ppo_update
-from ksim_rl.data import ReplayCfg, ReplayRing
+from ksim_rl.data import MASK_KEY, ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.envs.signal_keys import STANDARD
 from ksim_rl.mdp.motion_observations import observe_motion
@@ -135,15 +135,16 @@ class AMPUpdate(RolloutUpdate):
             drawn_B = ranks.randint(len(self.reference_N2L), minibatch_B.batch_size, device=self.device)
             reference_B2L = self.reference_N2L[drawn_B]
             policy_B2L = _transitions(minibatch_B, *self._features)
+            mask_B = minibatch_B.get(MASK_KEY).squeeze(-1)
             loss, logged = discriminator_loss(
                 net.judge,
                 net.normalized(reference_B2L),
                 net.normalized(policy_B2L),
                 gradient_penalty=self.cfg.gradient_penalty,
-                mask_B=minibatch_B.get(("collector", "mask")).squeeze(-1),
+                mask_B=mask_B,
             )
             loss = loss + self.cfg.logit_decay * net.logit_weight_1L.square().sum()
-            _, skipped = descend(loss, self.optimizer, max_grad_norm=self.cfg.max_grad_norm)
+            _, skipped = descend(loss, self.optimizer, max_grad_norm=self.cfg.max_grad_norm, mask=mask_B)
             self.guard.count_(skipped)
             made.append(
                 logged | {"skipped": skipped, "skipped_in_a_row": self.guard.skipped_in_a_row.clone()}

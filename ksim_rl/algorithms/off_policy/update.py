@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 from ksim_rl.algorithms.gradient_steps import RolloutUpdate, in_columns, load_optimizer_state, optimizer_state
-from ksim_rl.data import ReplayCfg, ReplayRing
+from ksim_rl.data import MASK_KEY, ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
 from ksim_rl.envs.signal_keys import STANDARD, SignalKeys
@@ -157,8 +157,7 @@ class OffPolicyUpdate(RolloutUpdate):
         """Make one gradient step of the critics; return what it measured, and `skipped`, 0 or 1."""
         with self._precision():
             loss, logged = self._critic_loss(minibatch_B)
-        limit = self.cfg.max_grad_norm
-        norm, skipped = descend_together({"critic": loss}, self.optimizers, max_grad_norm=limit)["critic"]
+        norm, skipped = self._descend({"critic": loss}, minibatch_B)["critic"]
         if self.data.prioritized:
             self.replay.update_priority(minibatch_B.get("index"), minibatch_B.get("td_error"))
         return logged | {"loss_qvalue": loss, "critic_grad_norm": norm, "skipped": skipped}
@@ -170,11 +169,17 @@ class OffPolicyUpdate(RolloutUpdate):
             losses, logged = self._actor_losses(minibatch_B)
         learning = [name for name in ("actor", "alpha") if name in self.optimizers]
         losses_of = {name: losses[f"loss_{name}"] for name in learning}
-        steps = descend_together(losses_of, self.optimizers, max_grad_norm=self.cfg.max_grad_norm)
+        steps = self._descend(losses_of, minibatch_B)
         norm, skipped = steps["actor"]
         if "alpha" in steps:
             skipped = torch.maximum(skipped, steps["alpha"][1])
         return logged | {"loss_actor": losses["loss_actor"], "actor_grad_norm": norm, "skipped": skipped}
+
+    def _descend(
+        self, losses: dict[str, Tensor], minibatch_B: TensorDictBase
+    ) -> dict[str, tuple[Tensor, Tensor]]:
+        options: Any = {"max_grad_norm": self.cfg.max_grad_norm, "mask": minibatch_B.get(MASK_KEY)}
+        return descend_together(losses, self.optimizers, **options)
 
     def _precision(self) -> AbstractContextManager[Any]:
         # The cache of casted weights would outlive the steps that change them in a captured graph.

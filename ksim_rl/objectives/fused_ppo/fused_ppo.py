@@ -33,6 +33,7 @@ from ksim_rl.objectives.fused_ppo.layout import (
     parts,
     power_of_two,
 )
+from ksim_rl.objectives.fused_ppo.loss_kernels import MASK
 from ksim_rl.objectives.fused_ppo.mlp_kernels import minibatch_gradients, state_values, weight_gradients
 from ksim_rl.objectives.fused_ppo.step_kernels import SUMMARY, adam_step, sum_gradients
 from ksim_rl.objectives.gradient_step import StepGuard, adapt_learning_rate_
@@ -234,7 +235,7 @@ class FusedPPO:
                 if len(self.dataset.records) > self.dataset.size:
                     index_B = torch.cat([index_B, index_B + self.dataset.size])
                 self._multiply(index_B)
-                self._improve(step)
+                self._improve(step, index_B)
                 step += 1
         self.parameters.store()
         names = SUMMARY if self._mirrored else SUMMARY[:-1]
@@ -291,21 +292,22 @@ class FusedPPO:
         for at, following in reversed(pairs):
             run(at, following, forward=False)
 
-    def _improve(self, step: int) -> None:
+    def _improve(self, step: int, index_B: Tensor) -> None:
         """Add the parts up, and make the step of the optimizer."""
         summary, given = self._summary[step], self._arguments
         rate = self.optimizer.param_groups[0]["lr"]
         launch(sum_gradients, (len(given["squares"]) + 1,), given, learning_rate=rate, summary=summary)
         if ranks.size() > 1:
-            self._take_means(summary, rate)
+            weight = self.dataset.records[index_B, 3 * self.layout.out + MASK.value].mean()
+            self._take_means(summary, rate, weight)
         sizes = {"SIZE": self.layout.num_flat, "BLOCK": self.tuning.size}
         grid = (parts(self.layout.num_flat, self.tuning.size),)
         launch(adam_step, grid, given, summary=summary, steps=self.parameters.steps[step:], **sizes)
 
-    def _take_means(self, summary: Tensor, learning_rate: Tensor) -> None:
+    def _take_means(self, summary: Tensor, learning_rate: Tensor, weight: Tensor) -> None:
         """Take the means over all ranks of the gradients and of what the step measured, and adapt the learning rate."""
         cfg, gradients, squares = self.cfg, self._arguments["gradients"], self._arguments["squares"]
-        ranks.mean_([gradients, summary])
+        ranks.mean_([gradients, summary], weight=weight)
         squares.zero_()
         squares[0].copy_(gradients.square().sum())
         if cfg.schedule == "adaptive":
