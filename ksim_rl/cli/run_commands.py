@@ -11,6 +11,7 @@ from ksim_rl.cli.report import run_and_report, shown_working, verdict
 from ksim_rl.cli.runs import print_table
 from ksim_rl.config.plain_data import check_links
 from ksim_rl.envs.contract import part
+from ksim_rl.objectives import AMPCfg
 from ksim_rl.scene.robots import analyse
 from ksim_rl.scene.robots.analysis import TRIAL_S
 from ksim_rl.trainers import RunCfg, checkpoint
@@ -74,15 +75,14 @@ def _on_these_ranks(cfg: RunCfg, saved: checkpoint.Checkpoint) -> RunCfg:
     before, now = saved.state.get(checkpoint.RANKS, {"size": 1})["size"], ranks.size()
     if before == now:
         return cfg
-    size = cfg.data.num_env_states_per_minibatch
-    if "replay" in saved.state["update"] or cfg.num_envs * before % now or size * before % now:
-        raise ValueError(
-            f"the run was trained on {before} ranks with num_envs={cfg.num_envs} and minibatches of {size}, which "
-            f"{now} ranks cannot share equally, nor a replay: resume it on {before}"
-        )
-    shards = max(1, cfg.data.shards * before // now)
-    data = dataclasses.replace(cfg.data, num_env_states_per_minibatch=size * before // now, shards=shards)
-    return dataclasses.replace(cfg, num_envs=cfg.num_envs * before // now, data=data)
+    data, objective = cfg.data, cfg.objective
+    size, shards = ranks.share_of(data.num_env_states_per_minibatch, before), data.shards * before // now
+    data = dataclasses.replace(data, num_env_states_per_minibatch=size, shards=max(1, shards))
+    if isinstance(objective, AMPCfg):
+        size = ranks.share_of(objective.num_transitions_per_step, before)
+        objective = dataclasses.replace(objective, num_transitions_per_step=size)
+    num_envs = ranks.share_of(cfg.num_envs, before)
+    return dataclasses.replace(cfg, num_envs=num_envs, data=data, objective=objective)
 
 
 def evaluate(arguments: list[str]) -> int:

@@ -16,6 +16,8 @@ from torch import Tensor
 from ksim_rl.ranks.group import rank, size
 
 Tensors = dict[str, Shaped[Tensor, "*?leaf"]]
+# Below it, `ReplayRing` keeps rows in the order of places and, in each place, of envs.
+_RING = "/replay/ring/"
 # The parts of `RunningMoments`: of the observations that a rank has seen itself.
 _COUNT, _MEAN, _SQUARES = "count", "exact_mean", "exact_sum_of_squares"
 
@@ -68,8 +70,23 @@ def dealt(
     return {name: _dealt_one(name, parts, live.get(name)) for name in first}
 
 
+def share_of(number: int, ranks_before: int) -> int:
+    """Return how many each rank has of what `ranks_before` had `number` each; a ValueError where it is not whole."""
+    if number * ranks_before % size():
+        raise ValueError(
+            f"{ranks_before} ranks trained with {number} each, which {size()} cannot share equally: resume the run on "
+            f"{ranks_before}"
+        )
+    return number * ranks_before // size()
+
+
 def _dealt_one(name: str, parts: list[Tensors], live: Tensor | None) -> Tensor:
     tensors = [part[name] for part in parts]
+    update, found, leaf = name.partition(_RING)
+    if found and leaf.startswith(("available", "content/")):
+        num_envs = len(parts[0][f"{update}{_RING}head"])
+        rings_PE = torch.cat([rows.unflatten(0, (-1, num_envs)) for rows in tensors], 1)
+        return rings_PE.chunk(size(), 1)[rank()].flatten(0, 1)
     shape = tensors[0].shape
     if live is not None and live.shape != shape:
         dim = next(

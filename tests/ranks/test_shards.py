@@ -9,19 +9,23 @@ from ksim_rl import conf, ranks
 from ksim_rl.cli import run_commands
 from ksim_rl.device import state_tree
 from ksim_rl.trainers import build
-from tests.ranks.gloo import results
-from tests.ranks.test_agreement import NETWORKS, SMALL
+from tests.algorithms.imitation_problems import make_amp
+from tests.ranks.gloo import as_ranks_compute, results
+from tests.ranks.test_agreement import ALGORITHMS, SMALL
 
 
-def train(folder, num_envs, shards, iterations, resume):
+def train(name, folder, num_envs, shards, iterations, resume):
     """Train up to so many iterations, from the newest checkpoint if `resume`, and return all tensors of the end."""
-    sizes = [
-        f"num_envs={num_envs}",
-        f"data.num_env_states_per_minibatch={4 * num_envs}",
-        f"data.shards={shards}",
-    ]
-    overrides = [*SMALL, *NETWORKS, "data.num_minibatches=2", *sizes, f"trainer.num_iterations={iterations}"]
-    trainer = build(conf.compose(overrides))
+    if name == "amp":
+        trainer = make_amp(num_envs=num_envs, shards=shards, iterations=iterations)
+    else:
+        sizes = [
+            f"num_envs={num_envs}",
+            f"data.num_env_states_per_minibatch={4 * num_envs}",
+            f"data.shards={shards}",
+        ]
+        overrides = [*SMALL, *ALGORITHMS[name], *sizes, f"trainer.num_iterations={iterations}"]
+        trainer = build(conf.compose(overrides))
     trainer.folder = folder
     if resume:
         trainer.load(folder)
@@ -30,36 +34,74 @@ def train(folder, num_envs, shards, iterations, resume):
 
 
 @pytest.mark.full
-def test_two_ranks_go_on_bit_for_bit(tmp_path):
-    whole = results(train, tmp_path / "a", 4, 1, 3, False, size=2, folder=tmp_path / "whole")
-    results(train, tmp_path / "b", 4, 1, 2, False, size=2, folder=tmp_path / "first")
-    parts = results(train, tmp_path / "b", 4, 1, 3, True, size=2, folder=tmp_path / "second")
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_two_ranks_go_on_bit_for_bit(name, tmp_path):
+    whole = results(train, name, tmp_path / "a", 4, 1, 3, False, size=2, folder=tmp_path / "whole")
+    results(train, name, tmp_path / "b", 4, 1, 2, False, size=2, folder=tmp_path / "first")
+    parts = results(train, name, tmp_path / "b", 4, 1, 3, True, size=2, folder=tmp_path / "second")
     for expected, found in zip(whole, parts, strict=True):
         assert all(torch.equal(found[name], tensor) for name, tensor in expected.items())
 
 
-@pytest.mark.full
-def test_one_to_two_to_one_is_the_run_without_a_break(tmp_path):
-    whole = train(tmp_path / "whole", 8, 2, 3, False)
-    train(tmp_path / "run", 8, 2, 1, False)
-    results(train, tmp_path / "run", 4, 1, 2, True, size=2, folder=tmp_path / "two")
-    found = train(tmp_path / "run", 8, 2, 3, True)
+@pytest.mark.parametrize(
+    "name",
+    ["fast_td3", *(pytest.param(name, marks=pytest.mark.full) for name in ("ppo", "sac", "fast_sac", "amp"))],
+)
+def test_one_to_two_to_one_is_the_run_without_a_break(name, tmp_path, monkeypatch):
+    monkeypatch.setattr("tests.shapes.Shaped.fail", lambda *_: None)
+    # Sums over all that AMP has seen are too large for 1e-6 in float32.
+    with as_ranks_compute(torch.float64 if name == "amp" else torch.float32):
+        whole = train(name, tmp_path / "whole", 8, 2, 3, False)
+        train(name, tmp_path / "run", 8, 2, 1, False)
+        results(train, name, tmp_path / "run", 4, 1, 2, True, size=2, folder=tmp_path / "two")
+        found = train(name, tmp_path / "run", 8, 2, 3, True)
     worst = max(
         (found[name].double() - tensor.double()).abs().max().item()
         for name, tensor in whole.items()
         if name.startswith("/update/") and tensor.numel()
     )
-    print(f"1 to 2 to 1: largest difference {worst:.2g}")
+    print(f"{name}, 1 to 2 to 1: largest difference {worst:.2g}")
     assert worst <= 1e-6
 
 
-@pytest.mark.parametrize(("ranks_before", "update"), [(2, {"replay": {}}), (3, {})])
-def test_a_replay_and_envs_that_cannot_be_shared_out_are_refused(ranks_before, update, monkeypatch):
-    monkeypatch.setattr(ranks, "size", lambda: 2 if ranks_before == 3 else 1)
-    cfg = conf.compose([*SMALL, "num_envs=5", "data.num_env_states_per_minibatch=20"])
-    saved = SimpleNamespace(state={"ranks": {"size": ranks_before}, "update": update})
-    with pytest.raises(ValueError, match=f"trained on {ranks_before} ranks .* resume it on {ranks_before}"):
-        run_commands._on_these_ranks(cfg, saved)
+STYLE = ["task=walker_amp", "objective=amp", "objective.num_transitions_per_step=6"]
+
+
+def on_these_ranks(overrides, ranks_before):
+    cfg = conf.compose([*SMALL, "num_envs=4", "data.num_env_states_per_minibatch=24", *overrides])
+    return run_commands._on_these_ranks(cfg, SimpleNamespace(state={"ranks": {"size": ranks_before}}))
+
+
+def shared_out(overrides):
+    """Return what each of two ranks has of a run in one process."""
+    cfg = on_these_ranks(overrides, 1)
+    style = getattr(cfg.objective, "num_transitions_per_step", None)
+    return cfg.num_envs, cfg.data.num_env_states_per_minibatch, cfg.data.shards, style
+
+
+@pytest.mark.parametrize(
+    ("overrides", "style"), [(["data.shards=2"], None), (["objective=sac"], None), (STYLE, 3)]
+)
+def test_sizes_are_shared_out(overrides, style, tmp_path):
+    expected = (2, 12, 1, style)
+    assert results(shared_out, overrides, size=2, folder=tmp_path) == [expected] * 2
+    one = on_these_ranks(overrides, 3)
+    assert (one.num_envs, one.data.num_env_states_per_minibatch) == (12, 72)
+    assert one.data.shards == 3 * (1 + ("data.shards=2" in overrides))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["num_envs=5", "data.num_env_states_per_minibatch=20"],
+        [*STYLE, "objective.num_transitions_per_step=7"],
+    ],
+)
+def test_sizes_that_cannot_be_shared_out_are_refused(overrides, monkeypatch):
+    monkeypatch.setattr("ksim_rl.ranks.shards.size", lambda: 2)
+    monkeypatch.setattr(ranks, "size", lambda: 2)
+    with pytest.raises(ValueError, match="3 ranks trained with [57] each, .* resume the run on 3"):
+        on_these_ranks(overrides, 3)
 
 
 def merged(index):
