@@ -76,12 +76,12 @@ def _on_these_ranks(cfg: RunCfg, saved: checkpoint.Checkpoint) -> RunCfg:
     if before == now:
         return cfg
     data, objective = cfg.data, cfg.objective
-    size, shards = ranks.share_of(data.num_env_states_per_minibatch, before), data.shards * before // now
+    size, shards = ranks.share_of(data, "num_env_states_per_minibatch", before), data.shards * before // now
     data = dataclasses.replace(data, num_env_states_per_minibatch=size, shards=max(1, shards))
     if isinstance(objective, AMPCfg):
-        size = ranks.share_of(objective.num_transitions_per_step, before)
+        size = ranks.share_of(objective, "num_transitions_per_step", before)
         objective = dataclasses.replace(objective, num_transitions_per_step=size)
-    num_envs = ranks.share_of(cfg.num_envs, before)
+    num_envs = ranks.share_of(cfg, "num_envs", before)
     return dataclasses.replace(cfg, num_envs=num_envs, data=data, objective=objective)
 
 

@@ -18,6 +18,8 @@ from ksim_rl.ranks.group import rank, size
 Tensors = dict[str, Shaped[Tensor, "*?leaf"]]
 # Below it, `ReplayRing` keeps rows in the order of places and, in each place, of envs.
 _RING = "/replay/ring/"
+# What each rank counts of its own, and metrics add up.
+_COUNTERS = ("/non_finite_count", "/non_finite_env_states")
 # The parts of `RunningMoments`: of the observations that a rank has seen itself.
 _COUNT, _MEAN, _SQUARES = "count", "exact_mean", "exact_sum_of_squares"
 
@@ -70,11 +72,15 @@ def dealt(
     return {name: _dealt_one(name, parts, live.get(name)) for name in first}
 
 
-def share_of(number: int, ranks_before: int) -> int:
-    """Return how many each rank has of what `ranks_before` had `number` each; a ValueError where it is not whole."""
+def share_of(part: Any, field: str, ranks_before: int) -> int:
+    """Return what a config's `field`, which is per rank, is now for all ranks to have as many as `ranks_before` had.
+
+    A ValueError says where that is no whole number.
+    """
+    number = getattr(part, field)
     if number * ranks_before % size():
         raise ValueError(
-            f"{ranks_before} ranks trained with {number} each, which {size()} cannot share equally: resume the run on "
+            f"{field}={number} on each of {ranks_before} ranks cannot be shared equally by {size()}: resume the run on "
             f"{ranks_before}"
         )
     return number * ranks_before // size()
@@ -82,6 +88,9 @@ def share_of(number: int, ranks_before: int) -> int:
 
 def _dealt_one(name: str, parts: list[Tensors], live: Tensor | None) -> Tensor:
     tensors = [part[name] for part in parts]
+    if name.endswith(_COUNTERS):
+        total = torch.stack(tensors).sum(0)
+        return torch.zeros_like(total) if rank() else total
     update, found, leaf = name.partition(_RING)
     if found and leaf.startswith(("available", "content/")):
         num_envs = len(parts[0][f"{update}{_RING}head"])

@@ -100,7 +100,7 @@ def test_sizes_are_shared_out(overrides, style, tmp_path):
 def test_sizes_that_cannot_be_shared_out_are_refused(overrides, monkeypatch):
     monkeypatch.setattr("ksim_rl.ranks.shards.size", lambda: 2)
     monkeypatch.setattr(ranks, "size", lambda: 2)
-    with pytest.raises(ValueError, match="3 ranks trained with [57] each, .* resume the run on 3"):
+    with pytest.raises(ValueError, match="num_.*=[57] on each of 3 ranks .* by 2: resume the run on 3"):
         on_these_ranks(overrides, 3)
 
 
@@ -108,6 +108,7 @@ def merged(index):
     own = {
         "/env/level": torch.tensor([0.5]),
         "/env/state_E": torch.arange(2) + 2 * index,
+        "/update/non_finite_env_states": torch.tensor(3 + index),
         "/env/moments.0.count": torch.tensor(4 + index),
         "/env/moments.0.exact_mean": torch.tensor([1.0 + index], dtype=torch.float64),
         "/env/moments.0.exact_sum_of_squares": torch.tensor([2.0], dtype=torch.float64),
@@ -123,6 +124,7 @@ def test_checkpoints_are_gathered_and_dealt_out(tmp_path):
     live = own | {"/env/state_E": torch.zeros(4, dtype=torch.int64)}
     found = ranks.dealt(own, saved, live)
     assert found["/env/state_E"].tolist() == [0, 1, 2, 3]
+    assert found["/update/non_finite_env_states"] == 7
     # Four values of mean 1 and five of mean 2.
     assert found["/env/moments.0.count"] == 9
     torch.testing.assert_close(found["/env/moments.0.exact_mean"], torch.tensor([14.0 / 9.0]).double())
