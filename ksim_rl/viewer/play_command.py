@@ -25,7 +25,7 @@ from ksim_rl.trainers.video import FPS
 from ksim_rl.viewer.session import AGENTS, Conditions, Session, UntrainedAgent
 from ksim_rl.zoo import locate
 
-DEMO = "zoo:reacher"
+DEMO = "zoo:cartpole"
 VIDEO_SUFFIXES = (".mp4", ".gif")
 
 

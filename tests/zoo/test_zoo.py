@@ -37,6 +37,18 @@ def test_an_entry_is_small_and_says_where_it_comes_from(name):
     assert set(saved.state) == {"observation_columns", "update"}
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_the_page_has_the_figures_of_the_card(name):
+    page = (Path(__file__).parents[2] / "docs" / "zoo.md").read_text()
+    (row,) = [line for line in page.splitlines() if line.startswith(f"| `{name}` |")]
+    card = read_card(name)
+    _, _, task, trained, earned, compared, _ = (cell.strip() for cell in row.split("|"))
+    assert task == f"`{card.task}`" and trained.endswith(f", commit {card.commit[:7]}")
+    assert float(earned.split()[0]) == pytest.approx(card.return_mean, abs=0.5)
+    assert float(compared.split()[1]) == pytest.approx(card.sim2sim["return_ratio"], abs=5e-4)
+    assert compared.endswith(f", {card.sim2sim['episodes']:.0f} episodes")
+
+
 def test_one_is_copied_into_a_run_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     said = []
