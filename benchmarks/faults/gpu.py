@@ -163,7 +163,7 @@ ROWS = {
         limits={"algorithms": (EXACTLY, 3), "told": (EXACTLY, 3), "that_number_runs": (EXACTLY, 3)},
         measure=gpu_memory,
         device="cuda",
-        files=("ksim_rl/device/memory.py",),
+        files=("ksim_rl/device/memory.py", "ksim_rl/trainers/trial.py"),
     ),
     "gpu_nan_worlds": Row(
         fault="NaN and infinities in the physics of a third of the worlds, on a GPU",

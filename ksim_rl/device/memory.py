@@ -3,8 +3,8 @@
 import gc
 import re
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 
 import torch
 
@@ -13,44 +13,63 @@ from ksim_rl.device.upstream import ALLOCATION_REFUSALS
 _UNITS = {None: 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 
 
+class TooManyEnvsError(ValueError):
+    """Memory does not suffice for so many envs, of which one takes at least `per_env` bytes."""
+
+    def __init__(self, text: str, *, per_env: int) -> None:
+        super().__init__(text)
+        self.per_env = per_env
+
+
 @contextmanager
 def memory_for(
-    num_envs: int, device: torch.device, work: Callable[[int], object] | None = None
+    num_envs: int, device: torch.device, first_that_fits: Callable[[Iterable[int]], int | None] | None = None
 ) -> Iterator[None]:
-    """Turn an allocation that fails in this block into a ValueError: what one of the envs takes, and how many fit.
+    """Turn an allocation that fails in this block into a TooManyEnvsError: what an env takes, and how many may fit.
 
-    `work` does the same with another number of envs and returns what holds their memory: half as many are tried, and
-    so on, until it works and leaves a tenth of the memory free.
+    `first_that_fits` tries numbers of envs, half of `num_envs` and so on, after what the block built is given back.
     """
-    free, fewer = _free_bytes(device), num_envs
+    free = free_bytes(device)
     try:
         yield
     except (RuntimeError, ValueError) as error:
         asked = refused_bytes(error) or refused_bytes(error.__cause__)
         if asked is None:
             raise
-        taken = 0 if free is None else max(0, free - (_free_bytes(device) or 0))
+        taken = 0 if free is None else max(0, free - (free_bytes(device) or 0))
         per_env = max(1, (taken + asked) // num_envs)
-        fits = (
-            "" if free is None else f" of {free / 1e9:.1f} GB that were free: at most {free // per_env} fit"
-        )
-        traceback.clear_frames(error.__traceback__)  # they hold what was built
-        while work is not None and (fewer := fewer // 2):
-            gc.collect()
-            if torch.cuda.is_initialized():
-                # A memory pool gives back what it does not use when the host waits.
-                torch.cuda.synchronize(device)
-                torch.cuda.empty_cache()
-            with suppress(RuntimeError, ValueError):  # too many as well, or they do not divide the data
-                held = work(fewer), (_free_bytes(device) or 0) >= (free or 0) / 10
-                if held[1]:
-                    fits += f"; num_envs={fewer} was tried and fits"
-                    break
-            held = None
-        raise ValueError(
+        if isinstance(
+            error, TooManyEnvsError
+        ):  # which was raised nearer to it, before anything was given back
+            per_env = max(per_env, error.per_env)
+        most, fits = num_envs, ""
+        if free is not None:
+            most = free // per_env
+            fits = f" of {free / 1e9:.1f} GB that were free: at most {most} fit"
+        _give_back(error, device)
+        halves = [num_envs >> times for times in range(1, num_envs.bit_length())]
+        found = first_that_fits(half for half in halves if half <= most) if first_that_fits else None
+        if found is not None:
+            fits += f"; num_envs={found} was tried and fits"
+        raise TooManyEnvsError(
             f"num_envs={num_envs}: out of memory on {device}; one env takes at least {per_env:,} bytes{fits}. Lower "
-            "num_envs, or let other programs free what they hold"
+            "num_envs, or let other programs free what they hold",
+            per_env=per_env,
         ) from error
+
+
+def _give_back(error: BaseException, device: torch.device) -> None:
+    """Free what was built where `error` and its causes came from: their frames hold it."""
+    causes: list[BaseException | None] = [error]
+    for cause in causes:
+        if cause is not None:
+            traceback.clear_frames(cause.__traceback__)
+            causes += [each for each in (cause.__cause__, cause.__context__) if each not in causes]
+    gc.collect()
+    if device.type == "cuda" and torch.cuda.is_initialized():
+        # A memory pool gives back what it does not use when the host waits.
+        torch.cuda.synchronize(device)
+        torch.cuda.empty_cache()
 
 
 def refused_bytes(error: BaseException | None) -> int | None:
@@ -62,5 +81,6 @@ def refused_bytes(error: BaseException | None) -> int | None:
     return None
 
 
-def _free_bytes(device: torch.device) -> int | None:
+def free_bytes(device: torch.device) -> int | None:
+    """Return how much of a GPU's memory is free; None of a CPU."""
     return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else None

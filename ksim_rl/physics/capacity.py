@@ -7,11 +7,9 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-import warp as wp
 
-from ksim_rl.physics import upstream
 from ksim_rl.physics.load import caught_warnings
-from ksim_rl.physics.model_checks import model_bytes, warp_model_of
+from ksim_rl.physics.model_checks import model_bytes
 from ksim_rl.physics.sim_cfg import SimCfg
 
 # On what the probe saw: half as much again for rows and contacts; less for candidate pairs, which all worlds share.
@@ -186,13 +184,28 @@ def _lowest_points(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndarr
 
 
 class CandidatePairs:
-    """Counts the geom pairs whose bounding spheres touch: Warp keeps a place in the contact pool for each of them."""
+    """Counts the geom pairs whose bounding spheres touch: Warp keeps a place in the contact pool for each of them.
+
+    The pairs that may collide at all are those of MuJoCo's filters: contype and conaffinity, not the same rigid body,
+    not parent and child, not excluded.
+    """
 
     def __init__(self, mj_model: mujoco.MjModel) -> None:
         self.mj_model = mj_model
-        with wp.ScopedDevice("cpu"):
-            pairs, pair_ids = upstream.geom_pairs(warp_model_of(mj_model))
-        self.first, self.second = pairs[pair_ids[:, 0] > upstream.NO_CONTACT].T
+        first, second = np.triu_indices(mj_model.ngeom, k=1)
+        body_1, body_2 = mj_model.geom_bodyid[first], mj_model.geom_bodyid[second]
+        weld_1, weld_2 = mj_model.body_weldid[body_1], mj_model.body_weldid[body_2]
+        parent_1 = mj_model.body_weldid[mj_model.body_parentid[weld_1]]
+        parent_2 = mj_model.body_weldid[mj_model.body_parentid[weld_2]]
+        affine = (mj_model.geom_contype[first] & mj_model.geom_conaffinity[second]) | (
+            mj_model.geom_contype[second] & mj_model.geom_conaffinity[first]
+        )
+        keep = (affine != 0) & (weld_1 != weld_2)
+        if not mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
+            keep &= ~((weld_1 != 0) & (weld_2 != 0) & ((weld_1 == parent_2) | (weld_2 == parent_1)))
+        keep &= ~np.isin((body_1 << 16) + body_2, mj_model.exclude_signature)
+        self.first = np.concatenate([first[keep], mj_model.pair_geom1])
+        self.second = np.concatenate([second[keep], mj_model.pair_geom2])
         self.margin = np.maximum(mj_model.geom_margin[self.first], mj_model.geom_margin[self.second])
         is_plane = mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         self.plane_1, self.plane_2 = is_plane[self.first], is_plane[self.second]

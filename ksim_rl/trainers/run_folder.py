@@ -28,6 +28,7 @@ from ksim_rl.trainers.build import build, build_env
 from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_cfg import RunCfg
 from ksim_rl.trainers.trainer import Hook, Outcome, Trainer
+from ksim_rl.trainers.trial import first_that_fits
 from ksim_rl.transforms import observation_columns
 
 EVALUATION, CURVES, VIDEO = "evaluation.json", "curves.png", "video.mp4"
@@ -58,7 +59,7 @@ def run(
     """
     ranks.check_same({**cfg.to_tree(), "device": cfg.resolved_device().type}, what="config")
     # The graphs that the first iterations record take memory as well. Several ranks cannot try on their own.
-    few = None if ranks.size() > 1 else partial(_first_iterations, cfg, progress)
+    few = None if ranks.size() > 1 else partial(first_that_fits, cfg, note=progress.note)
     explained = memory_for(cfg.num_envs, cfg.resolved_device(), few)
     if ranks.rank():  # rank 0 writes for all
         with explained:
@@ -111,14 +112,6 @@ def _run_locked(
             record_video(cfg, trainer.update.actor, path, note=progress.note, status=progress.status)
     _close(trainer)
     return outcome
-
-
-def _first_iterations(cfg: RunCfg, progress: RunProgress, num_envs: int) -> Trainer:
-    progress.note(f"memory does not suffice: trying num_envs={num_envs}")
-    trainer = build(dataclasses.replace(cfg, num_envs=num_envs))
-    for _ in range(8):  # the first ones run eagerly or fill a replay, the next ones record graphs
-        trainer.iterate()
-    return trainer
 
 
 def _close(trainer: Trainer) -> None:

@@ -1,5 +1,6 @@
 """Where memory does not suffice, the message says what an env takes and how many fit."""
 
+import gc
 import weakref
 
 import mujoco_warp as mjw
@@ -8,9 +9,10 @@ import torch
 
 from ksim_rl import conf
 from ksim_rl.device import memory
-from ksim_rl.device.memory import memory_for, refused_bytes
-from ksim_rl.trainers import RunProgress, run_folder
+from ksim_rl.device.memory import TooManyEnvsError, memory_for, refused_bytes
+from ksim_rl.trainers import RunProgress, run_folder, trial
 from tests.cli.payloads import SMALL
+from tests.device.small_machine import hold_at_most
 from tests.physics.models import standing_quadrupeds
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda:0")
@@ -31,59 +33,57 @@ def test_refusals_are_told_from_other_errors():
 
 def test_the_number_that_fits_follows_from_what_was_taken(monkeypatch):
     free = iter((10_000_000_000, 4_000_000_000))
-    monkeypatch.setattr(memory, "_free_bytes", lambda device: next(free))
+    monkeypatch.setattr(memory, "free_bytes", lambda device: next(free))
     # 6 GB were taken when 10 GB more were asked for, for 1000 envs: 16 MB each, of which 10 GB hold 625.
     said = r"num_envs=1000: .* 16,000,000 bytes of 10\.0 GB .*: at most 625 fit"
     with pytest.raises(ValueError, match=said), memory_for(1000, CUDA):
         raise RuntimeError("Failed to allocate 10000000000 bytes on device 'cuda:0'")
 
 
-def test_half_as_many_are_tried_until_memory_is_left(monkeypatch):
-    def work(num_envs):
-        """Take a byte of 100 for each env; 40 are no number that divides the data."""
-        if num_envs == 40:
-            raise ValueError("40 envs do not divide the data")
-        if num_envs > 100:
-            raise torch.OutOfMemoryError(f"CUDA out of memory. Tried to allocate {num_envs}.00 KiB")
-        tried.append(num_envs)
-        return Held(num_envs)
+def test_what_was_built_is_given_back_before_fewer_are_tried():
+    """Also what is held by the error that another one was raised from, as of a graph that cannot be recorded."""
+    built = weakref.WeakSet()
 
-    class Held:
-        def __init__(self, num_envs):
-            free.append(100 - num_envs)
-
-        def __del__(self):
-            free.pop()
-
-    free, tried = [100], []
-    monkeypatch.setattr(memory, "_free_bytes", lambda device: free[-1])
-    failed = weakref.WeakSet()
-
-    def big():
+    def body():
         array = torch.zeros(3)
-        failed.add(array)
+        built.add(array)
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 1.00 KiB")
 
-    def looked(num_envs):
-        assert not failed  # what the block had built is gone before anything is tried
-        return work(num_envs)
+    def record():
+        try:
+            body()
+        except RuntimeError as error:
+            raise RuntimeError(f"the body cannot be captured: {error}") from error
 
-    # 160 do not fit, 80 do and leave 20 %; with 380, 190 do not fit, and 95 leave 5 %, so 47 it is.
-    for asked, fits in ((320, 80), (380, 47), (80, 20)):
-        said = rf"num_envs={asked}: .*; num_envs={fits} was tried and fits\."
-        with pytest.raises(ValueError, match=said), memory_for(asked, CUDA, looked):
-            big()
-    assert tried == [80, 95, 47, 20]
+    def first_that_fits(numbers):
+        assert not built
+        tried.extend(numbers)
+        return 80
+
+    tried = []
+    with (
+        pytest.raises(ValueError, match=r"num_envs=380: .*; num_envs=80 was tried and fits\."),
+        memory_for(380, CPU, first_that_fits),
+    ):
+        record()
+    assert tried == [190, 95, 47, 23, 11, 5, 2, 1]
 
 
-def test_where_nothing_fits_no_number_is_named(monkeypatch):
-    def work(num_envs):
-        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 1.00 GiB")
+def test_numbers_that_cannot_fit_are_not_tried(monkeypatch):
+    """The nearest to what failed knows best what an env takes: further out it may be given back already."""
 
-    monkeypatch.setattr(memory, "_free_bytes", lambda device: 2**20)
-    with pytest.raises(ValueError, match=r"num_envs=8: out of memory") as told, memory_for(8, CUDA, work):
-        work(8)
-    assert "was tried" not in str(told.value)
+    def first_that_fits(numbers):
+        tried.extend(numbers)
+
+    tried = []
+    monkeypatch.setattr(memory, "free_bytes", lambda device: 100)
+    with (
+        pytest.raises(TooManyEnvsError, match=r"at least 10 bytes .* at most 10 fit\. ") as told,
+        memory_for(50, CPU, first_that_fits),
+        memory_for(50, CPU),
+    ):
+        raise RuntimeError("Failed to allocate 500 bytes on device 'cuda:0'")
+    assert tried == [6, 3, 1] and "was tried" not in str(told.value)
 
 
 def test_other_errors_pass():
@@ -102,26 +102,39 @@ def test_a_world_that_does_not_fit_says_so(monkeypatch):
         standing_quadrupeds(4)
 
 
-def test_a_run_whose_envs_do_not_fit_names_a_number_that_it_trained(tmp_path, monkeypatch):
-    """A machine that holds four envs is asked for 8."""
-    build = run_folder.build
+@pytest.mark.parametrize(
+    ("room", "fits"),
+    # With 16 envs Warp's arrays take 69,095 bytes, with 8 of them 36,135; a tenth of the room has to be left.
+    [(80_000, 16), pytest.param(75_000, 8, marks=pytest.mark.full)],
+)
+def test_a_run_whose_envs_do_not_fit_names_a_number_that_trained_elsewhere(tmp_path, monkeypatch, room, fits):
+    smaller = f"from tests.device.small_machine import hold_at_most; hold_at_most({room}); "
+    monkeypatch.setattr(trial, "PROGRAM", smaller + trial.PROGRAM)
 
-    def build_where_four_fit(cfg, **options):
-        trainer = build(cfg, **options)
-        if cfg.num_envs > 4:
-            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 1.00 GiB")
-        built.append(cfg.num_envs)
-        return trainer
+    def note(line):
+        said.append(line)
+        assert sum(held.values()) < 1000, "what was built is given back before anything is tried"
 
-    built, said = [], []
-    monkeypatch.setattr(run_folder, "build", build_where_four_fit)
+    said = []
     progress = RunProgress(1, enabled=False)
-    monkeypatch.setattr(progress, "note", said.append)
-    cfg = conf.compose(
-        [*SMALL, "num_envs=8", "data.num_env_states_per_minibatch=16", "trainer.eval_episodes=0"]
-    )
+    monkeypatch.setattr(progress, "note", note)
+    cfg = conf.compose([*SMALL, "num_envs=32", "trainer.eval_episodes=0"])
+    gc.collect()
+    held = hold_at_most(room, monkeypatch.setattr)
     with pytest.raises(
-        ValueError, match=r"num_envs=8: out of memory .* bytes; num_envs=4 was tried and fits"
+        ValueError, match=rf"num_envs=32: out of memory .*; num_envs={fits} was tried and fits"
     ):
         run_folder.run(cfg, tmp_path / "run", progress=progress)
-    assert built == [4] and said[-1] == "memory does not suffice: trying num_envs=4"
+    assert said[-1] == f"memory does not suffice: trying num_envs={fits}"
+    if fits == 8:
+        assert "num_envs=16 does not train: 0.00 of 0.00 GB are left, fewer than a tenth" in said
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.full
+def test_a_config_that_another_process_cannot_build_is_tried_once(monkeypatch):
+    said = []
+    cfg = conf.compose([*SMALL, "num_envs=8"])
+    monkeypatch.setattr(type(cfg), "to_tree", lambda self: {"task_name": "?"})
+    assert trial.first_that_fits(cfg, (4, 2, 1), note=said.append) is None
+    assert len(said) == 2 and said[1].startswith("num_envs=4 does not train: ValueError: ")

@@ -1,0 +1,69 @@
+"""This module trains the first iterations of a run in processes of their own, to find a number of envs that fits.
+
+A process that ran out of GPU memory is no place to try again: torch, for one, never releases what a graph had taken
+that broke while it was recorded.
+"""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+
+from ksim_rl.config import plugins
+from ksim_rl.device.memory import free_bytes
+from ksim_rl.trainers.build import build
+from ksim_rl.trainers.run_cfg import PLUGINS, RunCfg
+
+PROGRAM = "import sys; from ksim_rl.trainers import trial; sys.exit(trial.main())"
+FITS, DOES_NOT = 0, 3  # exit codes
+ITERATIONS = 8  # the first ones run eagerly or fill a replay, the next ones record graphs
+SPARE = 0.1  # of the memory that was free
+
+
+def first_that_fits(cfg: RunCfg, numbers: Iterable[int], *, note: Callable[[str], None]) -> int | None:
+    """Return the first of some numbers of envs with which the run trains and leaves a tenth of the memory, or None.
+
+    Numbers that do not divide the data are passed over. `note` is told what is tried, and why it does not fit.
+    """
+    for num_envs in numbers:
+        try:
+            fewer = dataclasses.replace(cfg, num_envs=num_envs, device=str(cfg.resolved_device()))
+        except ValueError:
+            continue
+        note(f"memory does not suffice: trying num_envs={num_envs}")
+        ended = subprocess.run(
+            [sys.executable, "-c", PROGRAM],
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+            input=json.dumps(fewer.to_tree()),
+            capture_output=True,
+            text=True,
+        )
+        if ended.returncode == FITS:
+            return num_envs
+        note(f"num_envs={num_envs} does not train: {(ended.stderr.strip() or 'no reason').splitlines()[-1]}")
+        if ended.returncode > 0 and ended.returncode != DOES_NOT:
+            break  # the config cannot even be built there, and nobody knows whether memory suffices
+    return None
+
+
+def main() -> int:
+    """Train the config on stdin for a few iterations; return whether memory suffices, as an exit code."""
+    tree = json.load(sys.stdin)
+    plugins.load(tree.get(PLUGINS, ()))
+    cfg = RunCfg.from_tree(tree)
+    device = cfg.resolved_device()
+    free = free_bytes(device)
+    try:
+        trainer = build(cfg)
+        for _ in range(ITERATIONS):
+            trainer.iterate()
+    except (RuntimeError, ValueError) as error:  # where memory lacks, libraries have many words for it
+        print(" ".join(str(error).split()), file=sys.stderr)
+        return DOES_NOT
+    left = free_bytes(device)
+    if free and left is not None and left < SPARE * free:
+        print(f"{left / 1e9:.2f} of {free / 1e9:.2f} GB are left, fewer than a tenth", file=sys.stderr)
+        return DOES_NOT
+    return FITS
