@@ -169,7 +169,7 @@ def compare_runs(
     train("train", *overrides, f"trainer.num_iterations={num_iterations}", f"hydra.run.dir={straight}")
     train("train", *overrides, f"trainer.num_iterations={num_iterations // 2}", f"hydra.run.dir={halves}")
     run_command("resume", str(halves), "--num-iterations", str(num_iterations), "--device", "cpu")
-    one, other = (checkpoint.load(checkpoint.latest(run)) for run in (straight, halves))
+    one, other = (checkpoint.load_latest(run) for run in (straight, halves))
     if one.iteration != num_iterations or other.iteration != num_iterations:
         raise RuntimeError(f"the runs ended after {one.iteration} and {other.iteration} iterations")
     return compare(one.state, other.state)

@@ -100,7 +100,7 @@ def _unloadable(run: Path) -> bool:
     if not checkpoint.saved(run / "checkpoint"):
         return False
     try:
-        checkpoint.load(checkpoint.latest(run, note=lambda _: None))
+        checkpoint.load_latest(run, note=lambda _: None)
     except CheckpointError:
         return True
     return False

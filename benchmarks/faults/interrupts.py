@@ -118,7 +118,7 @@ def lock(folder: Path, *, races: int) -> Figures:
     figures = {
         "refused_with_2": refused.code == 2,
         "one_line_with_pid_host_time": len(lines) == 1 and all(word in lines[0] for word in words),
-        "readers_go_on": checkpoint.load(checkpoint.latest(run)).iteration == 1,
+        "readers_go_on": checkpoint.load_latest(run).iteration == 1,
     }
     holder.kill()
     after = children.start(second).wait()
@@ -163,7 +163,7 @@ def clock(folder: Path) -> Figures:
     ended = children.start(jump).wait()
     for age, path in enumerate(reversed(checkpoint.saved(jumping / "checkpoint"))):
         os.utime(path, (10**9 + age, 10**9 + age))
-    one, other = (checkpoint.load(checkpoint.latest(run)) for run in (steady, jumping))
+    one, other = (checkpoint.load_latest(run) for run in (steady, jumping))
     rows = [line.split(",") for line in (jumping / "metrics.csv").read_text().splitlines()]
     at = rows[0].index("seconds")
     seconds = [float(row[at]) for row in rows[1:]]

@@ -156,7 +156,7 @@ def same_seed(folder: Path, *, iterations: int) -> Figures:
             return 0
 
         children.start(work).wait()
-    one, other = (checkpoint.load(checkpoint.latest(run)).state for run in runs)
+    one, other = (checkpoint.load_latest(run).state for run in runs)
     return {"iterations": one["iteration"], "differ": same_bits(one, other)}
 
 
@@ -251,7 +251,7 @@ ROWS = {
             "named_stop": (EXACTLY, 1),
         },
         measure=non_finite_loss,
-        files=("ksim_rl/objectives/gradient_step.py",),
+        files=("ksim_rl/objectives/gradient_step.py", "ksim_rl/algorithms/gradient_steps.py"),
     ),
     "overflow": Row(
         fault="more contacts and constraint rows than there is room for",

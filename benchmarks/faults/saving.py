@@ -110,7 +110,7 @@ def _whole(path: Path) -> bool:
 
 def _newest(run: Path) -> Path | None:
     try:
-        return checkpoint.latest(run, note=lambda _: None)
+        return checkpoint.load_latest(run, note=lambda _: None).path
     except CheckpointError:
         return None
 
@@ -181,7 +181,7 @@ def latest(folder: Path) -> Figures:
             notes: list[str] = []
             expected = paths[-newest - 1]
             asked += 1
-            taken += checkpoint.latest(run, note=notes.append) == expected
+            taken += checkpoint.load_latest(run, note=notes.append).path == expected
             said += any(expected.name in note and paths[-1].name in note for note in notes)
     return {"damaged_folders": asked, "whole_one_taken": taken, "said": said}
 
@@ -202,12 +202,10 @@ def resume(folder: Path) -> Figures:
     shutil.copytree(halves, folder / "kept")
 
     def go_on() -> int:
-        return children.train(
-            halves, resume_from=checkpoint.load(checkpoint.latest(halves)), num_iterations=4
-        )
+        return children.train(halves, resume_from=checkpoint.load_latest(halves), num_iterations=4)
 
     children.start(go_on).wait()
-    one, other = (checkpoint.load(checkpoint.latest(run)) for run in (straight, halves))
+    one, other = (checkpoint.load_latest(run) for run in (straight, halves))
     assert one.iteration == other.iteration == 4
     tensors, values = state_tree.split(one.state)
     return {"compared": len(tensors) + len(values), "differ": same_bits(one.state, other.state)}

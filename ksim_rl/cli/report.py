@@ -32,7 +32,7 @@ def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None 
     """Train with progress on the terminal, say how it ended, and return the exit code."""
     folder = Path(ranks.run_folder(str(folder)))
     if ranks.restarted() and checkpoint.saved(folder / "checkpoint"):
-        resume_from = checkpoint.load(checkpoint.latest(folder))
+        resume_from = checkpoint.load_latest(folder)
     done = 0 if resume_from is None else resume_from.iteration
     progress = RunProgress(cfg.trainer.num_iterations, done=done)
     length = cfg.data.rollout_length(cfg.num_envs)

@@ -144,11 +144,6 @@ def saved(folder: Path) -> list[Path]:
     return sorted(found, key=lambda entry: _order(entry.name) or (0, 0))
 
 
-def latest(path: Path, *, note: Callable[[str], None] = warnings.warn) -> Path:
-    """Find the newest whole checkpoint, as `load_latest` does; a checkpoint is returned as it is, unread."""
-    return path if (path / MANIFEST).exists() else load_latest(path, note=note).path
-
-
 def load_latest(path: Path, *, note: Callable[[str], None] = warnings.warn) -> Checkpoint:
     """Read the newest whole checkpoint of a run folder or a checkpoint folder, or the one that `path` is.
 

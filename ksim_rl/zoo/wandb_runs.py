@@ -24,7 +24,7 @@ def upload(cfg: WandbCfg, run: Path, *, note: Callable[[str], None]) -> None:
         import wandb  # pyright: ignore[reportMissingImports]
 
         files = {name: run / name for name in ("config.yaml", "video.mp4") if (run / name).is_file()}
-        newest = checkpoint.latest(run, note=note)
+        newest = checkpoint.load_latest(run, note=note).path
         files |= {f"checkpoint/{newest.name}/{path.name}": path for path in newest.iterdir()}
         mode = "offline" if cfg.offline else None
         with tempfile.TemporaryDirectory() as temporary:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,18 +17,17 @@ from benchmarks.faults import __main__ as command
 from benchmarks.faults import children, machine, page
 from benchmarks.faults.row import Row
 from benchmarks.faults.rows import ROWS
+from ksim_rl.algorithms.gradient_steps import RolloutUpdate
 from ksim_rl.cli import errors
-from ksim_rl.config import plain_data
 from ksim_rl.envs.managers.action_manager import ActionManager
 from ksim_rl.envs.non_finite import NonFiniteTerms
-from ksim_rl.objectives.gradient_step import StepGuard
 from ksim_rl.physics import World, load
 from ksim_rl.runs import csv_table, run_lock
 from ksim_rl.scene.rendering import rendering
 from ksim_rl.trainers import checkpoint, progress, run_cfg, run_folder
 from ksim_rl.trainers import trainer as trainer_module
 from ksim_rl.trainers.interrupt import InterruptRequest
-from tests.cli.payloads import with_pickles
+from tests.cli.payloads import with_pickles, without_the_check_of_config
 from tests.cli.test_foreign_files import with_pickled_arrays
 
 RESULTS = report.RESULTS / "faults.json"
@@ -61,7 +61,10 @@ def sabotage(name):
 
 @sabotage("latest")
 def newest_in_any_case(patch):
-    patch.setattr(checkpoint, "latest", lambda run, note=None: checkpoint.saved(run / "checkpoint")[-1])
+    def newest(run, note=None):
+        return SimpleNamespace(path=checkpoint.saved(run / "checkpoint")[-1])
+
+    patch.setattr(checkpoint, "load_latest", newest)
 
 
 @sabotage("corruption")
@@ -143,7 +146,7 @@ def terms_are_not_watched(patch):
 
 @sabotage("non_finite_loss")
 def no_stop(patch):
-    patch.setattr(StepGuard, "check", lambda *_, **__: None)
+    patch.setattr(RolloutUpdate, "check", lambda *_: None)
 
 
 @sabotage("overflow")
@@ -169,10 +172,7 @@ def as_many_as_there_are(patch):
 
 @sabotage("payloads")
 def configs_are_not_checked(patch):
-    patch.setattr(run_cfg, "check_plain", lambda *_: None)
-    patch.setattr(run_cfg, "WRITTEN", ())
-    patch.setattr(plain_data, "check_events", lambda *_: None)
-    patch.setattr(plain_data, "check_plain", lambda *_: None)
+    without_the_check_of_config(patch)  # the short form always has the first of the families that it stops
 
 
 @sabotage("data_files")

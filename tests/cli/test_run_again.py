@@ -51,7 +51,7 @@ def test_a_run_folder_makes_the_same_run_again(first, tmp_path):
 def test_overrides_lie_over_a_run_that_is_made_again(first, tmp_path):
     changes = ("seed=4", "num_envs=8", "objective.gamma=0.9")
     assert run("--config-dir", str(first), *changes, f"hydra.run.dir={tmp_path}") == 0
-    config = checkpoint.load(checkpoint.latest(tmp_path)).config
+    config = checkpoint.load_latest(tmp_path).config
     assert (config["seed"], config["num_envs"]) == (4, 8)
     assert "seed" not in config["task"] and "num_envs" not in config["task"]["scene"]
     assert config["objective"]["gamma"] == 0.9
@@ -109,7 +109,7 @@ def test_a_new_run_starts_from_the_weights_of_another(first, tmp_path):
         *SMALL, *frozen, f"checkpoint={first}", "task=cartpole_swingup", "seed=9", f"hydra.run.dir={tmp_path}"
     )
     assert code == 0
-    began, ended = (checkpoint.load(checkpoint.latest(folder)) for folder in (first, tmp_path))
+    began, ended = (checkpoint.load_latest(folder) for folder in (first, tmp_path))
     assert ended.iteration == 2, "counted from its own start"
     assert ended.config["checkpoint"] == str(first)
     weights = {name for name, value in began.state["update"]["actor"].items() if value.dtype == torch.float32}
@@ -151,7 +151,7 @@ def test_a_run_names_its_teacher_so_that_it_is_found_from_anywhere(tmp_path, mon
 @pytest.mark.full
 def test_a_run_is_made_again_from_its_own_weights(first, tmp_path):
     code = run("--config-dir", str(first), f"checkpoint={first}", "seed=5", f"hydra.run.dir={tmp_path}")
-    config = checkpoint.load(checkpoint.latest(tmp_path)).config
+    config = checkpoint.load_latest(tmp_path).config
     assert code == 0 and (config["seed"], config["checkpoint"]) == (5, str(first))
 
 
@@ -161,7 +161,7 @@ def test_a_sweep_of_a_run_made_again(first, tmp_path):
     assert run("--multirun", "--config-dir", str(first), *axes, f"hydra.sweep.dir={tmp_path}") == 0
     found = sorted(
         (config["seed"], config["objective"]["clip_epsilon"])
-        for config in (checkpoint.load(checkpoint.latest(f)).config for f in tmp_path.iterdir() if f.is_dir())
+        for config in (checkpoint.load_latest(f).config for f in tmp_path.iterdir() if f.is_dir())
     )
     assert found == [(1, 0.1), (1, 0.2)]
 
@@ -177,7 +177,7 @@ def test_each_job_of_a_sweep_that_fails_says_so_and_the_others_run(first, tmp_pa
     ]
     assert all("its networks are others" in error for error in errors)
     (done,) = [folder for folder in (tmp_path / "sweep").iterdir() if folder.is_dir()]
-    assert checkpoint.load(checkpoint.latest(done)).iteration == 2
+    assert checkpoint.load_latest(done).iteration == 2
 
 
 @pytest.mark.full
@@ -186,5 +186,5 @@ def test_a_sweep_runs_in_the_processes_of_another_launcher(tmp_path, seeds):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     launcher = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
     assert run("--multirun", *launcher, *SMALL, f"seed={seeds}", f"hydra.sweep.dir={tmp_path}") == 0
-    saved = [checkpoint.load(checkpoint.latest(f)) for f in tmp_path.iterdir() if f.is_dir()]
+    saved = [checkpoint.load_latest(f) for f in tmp_path.iterdir() if f.is_dir()]
     assert sorted(entry.config["seed"] for entry in saved) == [1, 2]

@@ -64,7 +64,7 @@ def test_an_unsolved_run_exits_with_1_and_leaves_a_whole_run_folder(trained):
     assert imageio.imread(folder / "curves.png").shape[0] > 300
     figures = json.loads((folder / "evaluation.json").read_text())
     assert (figures["episodes"], figures["solved"]) == (4, False)
-    assert checkpoint.load(checkpoint.latest(folder)).iteration == 2
+    assert checkpoint.load_latest(folder).iteration == 2
 
 
 def test_eval_repeats_the_evaluation_of_the_run(trained, capsys):
@@ -99,7 +99,7 @@ def test_resume_continues_in_the_same_folder(trained):
     _, folder = trained
     assert run("resume", str(folder), "--num-iterations", "3") == 1
     assert [row["iteration"] for row in rows(folder)] == ["1", "2", "3"]
-    assert checkpoint.load(checkpoint.latest(folder)).iteration == 3
+    assert checkpoint.load_latest(folder).iteration == 3
 
 
 def test_fewer_iterations_than_are_done_are_refused(trained, capsys):
@@ -113,7 +113,7 @@ def test_a_sweep_runs_one_job_for_each_combination_and_ends_with_a_table(tmp_pat
     quick = ("trainer.num_iterations=1", "trainer.eval_episodes=0", "trainer.video=false")
     assert run("train", "--multirun", *SMALL, *quick, "seed=1,2", f"hydra.sweep.dir={tmp_path}") == 0
     seeds = {
-        folder.name: checkpoint.load(checkpoint.latest(folder)).config["seed"]
+        folder.name: checkpoint.load_latest(folder).config["seed"]
         for folder in tmp_path.iterdir()
         if folder.is_dir()
     }
@@ -149,7 +149,7 @@ def test_ctrl_c_saves_and_exits_with_130(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["ksim-rl", "train", *SMALL, *endless])
     assert run("train", *SMALL, *endless) == 130
     assert "SIGINT: everything is saved; continue with: ksim-rl resume" in capsys.readouterr().out
-    assert checkpoint.load(checkpoint.latest(tmp_path)).iteration >= 2
+    assert checkpoint.load_latest(tmp_path).iteration >= 2
     (session,) = record.read(tmp_path)
     assert (session.status, session.why) == ("interrupted", "SIGINT")
     assert session.command.endswith(f"hydra.run.dir={tmp_path}") and " train num_envs=16 " in session.command

@@ -59,19 +59,19 @@ def test_saving_the_same_iteration_again_keeps_both_until_one_is_old(tmp_path):
     first = checkpoint.save(tmp_path, STATE, iteration=5, config=CONFIG)
     second = checkpoint.save(tmp_path, STATE, iteration=5, config=CONFIG)
     assert first != second
-    assert checkpoint.latest(tmp_path) == second
+    assert checkpoint.load_latest(tmp_path).path == second
 
 
 @pytest.mark.parametrize("given", ["run folder", "checkpoint folder", "checkpoint"])
 def test_the_newest_is_found_from_each_level(tmp_path, saved, given):
     checkpoint.save(tmp_path / "checkpoint", STATE, iteration=3, config=CONFIG)
     path = {"run folder": tmp_path, "checkpoint folder": tmp_path / "checkpoint", "checkpoint": saved}[given]
-    assert checkpoint.latest(path) == saved
+    assert checkpoint.load_latest(path).path == saved
 
 
 def test_a_folder_without_a_checkpoint_says_what_was_expected(tmp_path):
     with pytest.raises(CheckpointError, match="no checkpoint here; expected a run folder"):
-        checkpoint.latest(tmp_path)
+        checkpoint.load_latest(tmp_path)
 
 
 def flip_bytes(saved, count, seed):
@@ -323,7 +323,7 @@ def kill_while_saving(folder, times):
             reported += more
         os.close(reading)
 
-        loaded = checkpoint.load(checkpoint.latest(folder))
+        loaded = checkpoint.load_latest(folder)
         assert loaded.iteration >= int(reported.split()[-1])
         for path in checkpoint.saved(folder):
             intact = checkpoint.load(path)
@@ -353,17 +353,17 @@ def test_a_newest_checkpoint_that_is_damaged_is_passed_over_and_said(tmp_path, d
     older = checkpoint.save(tmp_path, STATE, iteration=6, config=CONFIG)
     damage(checkpoint.save(tmp_path, STATE, iteration=7, config=CONFIG))
     notes = []
-    assert checkpoint.latest(tmp_path, note=notes.append) == older
+    assert checkpoint.load_latest(tmp_path, note=notes.append).path == older
     assert len(notes) == 1 and "00000007" in notes[0] and "00000006 is taken instead" in notes[0]
     with pytest.warns(UserWarning, match="passed over"):
-        checkpoint.latest(tmp_path)
+        checkpoint.load_latest(tmp_path)
     damage(older)
     with pytest.raises(CheckpointError, match="00000007"):
-        checkpoint.latest(tmp_path)
+        checkpoint.load_latest(tmp_path)
 
 
 def test_a_newest_checkpoint_of_an_unknown_format_is_not_passed_over(tmp_path):
     checkpoint.save(tmp_path, STATE, iteration=6, config=CONFIG)
     with_version(checkpoint.save(tmp_path, STATE, iteration=7, config=CONFIG), 99)
     with pytest.raises(CheckpointError, match="newer ksim_rl"):
-        checkpoint.latest(tmp_path)
+        checkpoint.load_latest(tmp_path)

@@ -29,7 +29,7 @@ def test_a_signal_ends_the_run_after_the_iteration_with_everything_saved(tmp_pat
     outcome = trainer.train()
     assert outcome.interrupted_by == number
     assert outcome.iteration == 3
-    assert checkpoint.load(checkpoint.latest(tmp_path)).iteration == 3
+    assert checkpoint.load_latest(tmp_path).iteration == 3
 
 
 def test_a_request_is_true_once_its_signal_came():

@@ -75,7 +75,7 @@ def test_evaluating_does_not_change_the_run():
 def test_a_checkpoint_of_version_1_resumes_bit_for_bit(tmp_path):
     straight = trained(iterations=4)
     trained(tmp_path, iterations=2)
-    manifest_path = checkpoint.latest(tmp_path) / checkpoint.MANIFEST
+    manifest_path = checkpoint.load_latest(tmp_path).path / checkpoint.MANIFEST
     manifest = json.loads(manifest_path.read_text())["manifest"]
     # What version 1 did not have; its config was sorted by name.
     for path in ("/hooks", "/update/recurrent_state"):
@@ -90,7 +90,7 @@ def test_a_checkpoint_of_version_1_resumes_bit_for_bit(tmp_path):
 
 def test_a_checkpoint_of_another_network_is_refused_with_both_shapes(tmp_path):
     make_trainer(tmp_path, iterations=1).train()
-    saved = checkpoint.load(checkpoint.latest(tmp_path))
+    saved = checkpoint.load_latest(tmp_path)
     name = next(name for name, tensor in saved.state["update"]["actor"].items() if tensor.shape == (16, 1))
     saved.state["update"]["actor"][name] = torch.zeros(32, 1)
     with pytest.raises(
@@ -101,7 +101,7 @@ def test_a_checkpoint_of_another_network_is_refused_with_both_shapes(tmp_path):
 
 def test_a_checkpoint_of_other_observations_is_refused(tmp_path):
     make_trainer(tmp_path, iterations=1).train()
-    saved = checkpoint.load(checkpoint.latest(tmp_path))
+    saved = checkpoint.load_latest(tmp_path)
     saved.state["observation_columns"] = {"actor": {"obs/height": [0, 1]}}
     with pytest.raises(ValueError, match="other observations: .*only the checkpoint has obs/height"):
         make_trainer().load_state_dict(saved.state)
@@ -109,7 +109,7 @@ def test_a_checkpoint_of_other_observations_is_refused(tmp_path):
 
 def test_a_checkpoint_of_another_transform_is_refused_and_its_networks_still_fit(tmp_path):
     trained(tmp_path, iterations=2)
-    saved = checkpoint.load(checkpoint.latest(tmp_path))
+    saved = checkpoint.load_latest(tmp_path)
     env = saved.state["env"]
     name = next(name for name in env if name.startswith("transform."))
     saved.state["env"] = {other: value for other, value in env.items() if other != name}
@@ -145,6 +145,6 @@ def test_a_resumed_run_in_real_physics_is_bit_identical(tmp_path):
 
     straight = run(4)
     run(2, folder=tmp_path)
-    columns = checkpoint.load(checkpoint.latest(tmp_path)).state["observation_columns"]["actor"]
+    columns = checkpoint.load_latest(tmp_path).state["observation_columns"]["actor"]
     assert [start for start, _ in columns.values()][1:] == [stop for _, stop in columns.values()][:-1]
     assert_same(straight, run(4, seed=5, load=tmp_path))

@@ -231,7 +231,7 @@ def test_a_run_is_sent_to_wandb_and_comes_back(wandb, zoo, tmp_path, monkeypatch
     said = []
     wandb_runs.upload(WandbCfg(project="robots"), run, note=said.append)
     assert said == [] and wandb.began["id"] == "abc123" and wandb.began["project"] == "robots"
-    newest = checkpoint.latest(run).name
+    newest = checkpoint.load_latest(run).path.name
     assert set(wandb.kept[0].files) == {
         "video.mp4",
         "policy.onnx",
