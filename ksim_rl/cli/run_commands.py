@@ -54,12 +54,7 @@ def resume(arguments: list[str]) -> int:
         check_links(folder, below=FOLDERS)
         check_run_tree(saved.config, saved.path, given=fields)
     tree = {**saved.config, "device": options.device}
-    if overrides:
-        conf.register()
-        conf.store_run(tree, saved.path)
-        (cfg,) = conf.check_command_line(overrides, name=conf.RUN_AGAIN, multirun=False, values=True)
-    else:
-        cfg = RunCfg.from_tree(tree)
+    cfg = conf.changed(tree, saved.path, overrides) if overrides else RunCfg.from_tree(tree)
     cfg = dataclasses.replace(_on_these_ranks(cfg, saved), device=str(cfg.resolved_device()))
     if cfg.trainer.num_iterations < saved.iteration:
         raise ValueError(

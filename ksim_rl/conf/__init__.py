@@ -1,7 +1,7 @@
 """This room composes the config of `ksim-rl train` with Hydra, from YAML, the dataclasses and what is registered."""
 
 from ksim_rl.conf import spelling
-from ksim_rl.conf.command_line import check_command_line, compose, fields_of, without_sweeps
+from ksim_rl.conf.command_line import changed, check_command_line, compose, fields_of, without_sweeps
 from ksim_rl.conf.registration import (
     MODULE,
     NAME,
@@ -10,5 +10,4 @@ from ksim_rl.conf.registration import (
     check_groups,
     register,
     register_run,
-    store_run,
 )

@@ -1,8 +1,9 @@
 """This module checks and composes a `ksim-rl train` command line as a whole, before anything is built or written."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -16,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ksim_rl.checks import unknown_name
 from ksim_rl.conf import spelling
-from ksim_rl.conf.registration import MODULE, NAME, RUN_AGAIN, register
+from ksim_rl.conf.registration import MODULE, NAME, RUN_AGAIN, register, store_run
 from ksim_rl.config.overrides import check_parsed
 from ksim_rl.trainers import RunCfg
 
@@ -30,6 +31,13 @@ def compose(overrides: Sequence[str] = ()) -> RunCfg:
     """Compose a run's config, as `ksim-rl train <overrides>` does; a ValueError lists the near names."""
     register()
     return check_command_line(overrides, name=NAME, multirun=False, values=True)[0]
+
+
+def changed(tree: Mapping[str, Any], path: Path, overrides: Sequence[str]) -> RunCfg:
+    """Return a run's config, the `tree` of its file at `path`, with overrides; a ValueError names a bad one."""
+    register()
+    store_run(tree, path)
+    return check_command_line(overrides, name=RUN_AGAIN, multirun=False, values=True)[0]
 
 
 def check_command_line(texts: Sequence[str], *, name: str, multirun: bool, values: bool) -> list[RunCfg]:

@@ -178,9 +178,7 @@ def _find(options: argparse.Namespace) -> Played:
     saved = checkpoint.load_latest(locate(first))
     if overrides:
         check_run_tree(saved.config, saved.path, given=conf.fields_of(overrides))
-        conf.register()
-        conf.store_run({**saved.config, "device": options.device}, saved.path)
-        (changed,) = conf.check_command_line(overrides, name=conf.RUN_AGAIN, multirun=False, values=True)
+        changed = conf.changed({**saved.config, "device": options.device}, saved.path, overrides)
         changed = dataclasses.replace(changed, device=options.device)
     policy = policy_of(saved, device=options.device, cfg=changed)
     if options.agent is not None:
