@@ -3,10 +3,11 @@
     python -m benchmarks.ranks
 
 trains `TASKS` on one GPU and on all (or `ranks=N`), as torchrun does it, with as many envs per rank, and prints whole
-iterations in ms and env states/s of both, their ratio, and the host's waits and copies in one iteration of rank 0; then
-the seconds until all ranks have ended after one was killed (`kill=no` leaves it out); and the seconds until Go1 follows
-its command on one GPU and on all, the median of `seeds` (1,2,3,4,5; none with `seeds=none`), without the first
-iteration. With `tasks=go1_velocity_flat:4096` others are chosen, and `device=cpu` tries it out.
+iterations in ms and env states/s of both, their ratio, and the host's waits and copies in one iteration of rank 0;
+then the seconds until all ranks have ended after one was killed (`kill=no` leaves it out); and the seconds until Go1
+follows its command on one GPU (one seed on each at a time) and on all, the median of `seeds` (1,2,3,4,5; none with
+`seeds=none`), without the first iteration. With `tasks=go1_velocity_flat:4096` others are chosen (none with
+`tasks=none`), and `device=cpu` tries it out.
 
 Figures go to benchmarks/results/ranks.json after each part, so that those of a part stay where a later one has no time
 left. All processes have the variables of `NCCL`, which leave NVLink multicast off and which the file records.
@@ -14,7 +15,6 @@ left. All processes have the variables of `NCCL`, which leave NVLink multicast o
 
 from __future__ import annotations
 
-import csv
 import gc
 import json
 import os
@@ -24,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -57,6 +58,7 @@ def worker(device: str, tasks: str) -> None:
     with ranks.joined("train"):
         for word in tasks.split(","):
             figures = measured(device, *word.split(":"))
+            # The next task's envs need the memory of this one's, which its circles of references would keep.
             gc.collect()
             if ranks.rank() == 0:
                 print(json.dumps(figures), flush=True)
@@ -87,14 +89,18 @@ def measured(device: str, task: str, num_envs: str) -> dict[str, float]:
     return figures
 
 
-def start(size: int, module: str, *arguments: str, folder: Path) -> subprocess.Popen[str]:
-    """Start a module on so many ranks of this machine."""
+def start(
+    size: int, module: str, *arguments: str, folder: Path, gpu: int | None = None
+) -> subprocess.Popen[str]:
+    """Start a module on so many ranks of this machine, or on one of its GPUs."""
     command = [sys.executable, "-m"]
     if size > 1:
         command += ["torch.distributed.run", "--rdzv-backend=c10d", "--rdzv-endpoint=localhost:0"]
         command += [f"--nproc-per-node={size}", "-m"]
     path = os.pathsep.join(filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", ""))))
     env = os.environ | NCCL | {"PYTHONPATH": path, "PYTHONUNBUFFERED": "1"}
+    if gpu is not None:
+        env["CUDA_VISIBLE_DEVICES"] = str(gpu)
     return subprocess.Popen(
         [*command, module, *arguments], cwd=folder, env=env, stdout=subprocess.PIPE, text=True
     )
@@ -103,40 +109,63 @@ def start(size: int, module: str, *arguments: str, folder: Path) -> subprocess.P
 def output(process: subprocess.Popen[str]) -> str:
     """Wait for a process, and return what it printed; SystemExit where it failed."""
     text, _ = process.communicate()
-    if process.returncode not in (0, 1):  # 1 is "not solved"
+    if process.returncode:
         raise SystemExit(f"{process.args} ended with exit code {process.returncode}")
     return text
 
 
-def seconds_to_track(size: int, seed: str, *, env_states: float, device: str) -> float:
+class Rows:
+    """Keeps what a run reports in memory, as a logger of it."""
+
+    def __init__(self) -> None:
+        self.rows: list[dict[str, float]] = []
+
+    def log_metrics(self, metrics: dict[str, float], step: int) -> None:
+        """Keep the metrics of an iteration."""
+        self.rows.append(dict(metrics))
+
+    def close(self) -> None:
+        """Have nothing to close."""
+
+
+def learner(device: str, env_states: str, seeds: str) -> None:
+    """Let this rank learn with each seed in turn, and print the seconds of each as JSON on rank 0."""
+    with ranks.joined("train"):
+        for seed in seeds.split(","):
+            seconds = seconds_to_track(seed, env_states=float(env_states), device=device)
+            gc.collect()
+            if ranks.rank() == 0:
+                print(json.dumps({"seed": int(seed), "seconds": seconds}), flush=True)
+
+
+def seconds_to_track(seed: str, *, env_states: float, device: str) -> float:
     """Train Go1 until it follows its command, and return the seconds without the first iteration; else infinity."""
-    with tempfile.TemporaryDirectory() as name:
-        levels = ", ".join(f"{metric}: {value}" for metric, value in LEVELS.items())
-        iterations = int(env_states / (4096 * 24 * size))
-        output(
-            start(
-                size,
-                "ksim_rl.cli.main",
-                "train",
-                "task=go1_velocity_flat",
-                f"device={device}",
-                "num_envs=4096",
-                f"seed={seed}",
-                f"trainer.num_iterations={iterations}",
-                f"trainer.stop_at={{{levels}}}",
-                "trainer.eval_episodes=0",
-                "trainer.video=false",
-                "trainer.checkpoint_interval=0",
-                "hydra.run.dir=run",
-                folder=Path(name),
-            )
-        )
-        with open(Path(name, "run", "metrics.csv"), newline="") as file:
-            rows = list(csv.DictReader(file))
-        last = rows[-1]
-        if any(not last.get(metric) or float(last[metric]) < value for metric, value in LEVELS.items()):
-            return float("inf")
-        return float(last["seconds"]) - float(rows[0]["seconds"])
+    iterations = max(2, int(env_states / (4096 * 24 * ranks.size())))
+    run = ["task=go1_velocity_flat", f"device={device}", "num_envs=4096", f"seed={seed}", "logger=none"]
+    run += [f"trainer.num_iterations={iterations}", "trainer.eval_episodes=0"]
+    levels = ", ".join(f"{metric}: {value}" for metric, value in LEVELS.items())
+    trainer = build(conf.compose([*run, f"trainer.stop_at={{{levels}}}"]))
+    kept = Rows()
+    trainer.loggers = [kept]
+    outcome = trainer.train()
+    return kept.rows[-1]["seconds"] - kept.rows[0]["seconds"] if outcome.target_met else float("inf")
+
+
+def seconds_of_seeds(
+    size: int, seeds: list[str], *, gpus: int, env_states: str, device: str
+) -> dict[int, float]:
+    """Return `seconds_to_track` of each seed on so many ranks; those of one rank run side by side, on all GPUs."""
+    here = Path(__file__).parents[1]
+    shares = [(seeds[gpu::gpus], gpu) for gpu in range(gpus)] if size == 1 and gpus else [(seeds, None)]
+    runs = [
+        start(size, "benchmarks.ranks", "learner", device, env_states, ",".join(share), folder=here, gpu=gpu)
+        for share, gpu in shares
+        if share
+    ]
+    lines = [line for run in runs for line in output(run).splitlines() if line.startswith("{")]
+    found = {one["seed"]: one["seconds"] for one in map(json.loads, lines)}
+    print(f"{size} of {device}: {found}", flush=True)
+    return found
 
 
 def seconds_to_end(size: int, task: str, num_envs: str, *, device: str) -> float:
@@ -156,30 +185,19 @@ def seconds_to_end(size: int, task: str, num_envs: str, *, device: str) -> float
         return time.monotonic() - began
 
 
-def main() -> None:
-    """Measure all tasks, then learning, then a kill, and write the figures."""
-    if sys.argv[1:2] == ["worker"]:
-        worker(*sys.argv[2:])
-        return
-    own = command_line.options(sys.argv[1:], OPTIONS)
-    device = torch.device(own["device"])
-    size = int(own["ranks"]) or (torch.cuda.device_count() if device.type == "cuda" else 2)
-    if size < 2:
-        raise ValueError(f"device={device} has {size} of it: ranks are measured on two or more")
-    label = f"{report.device_label(device)}x{size}"
-    saved = partial(report.write, "ranks", device=device, module="benchmarks.ranks", environment=NCCL)
+def compare(tasks: str, size: int, *, device: str, label: str, saved: Callable[..., Path]) -> None:
+    """Measure whole iterations of tasks on one rank and on `size`, print them side by side and save them."""
     table = Table("task", "envs", "1: ms", f"{size}: ms", "1: env states/s", f"{size}: env states/s", "ratio")
-    tasks, here = own["tasks"].split(","), Path(__file__).parents[1]
     by_size: list[list[dict[str, float]]] = []
     for count in (
         1,
         size,
     ):  # all tasks in the same processes, whose start takes longer than what they measure
-        began = time.monotonic()
-        text = output(start(count, "benchmarks.ranks", "worker", own["device"], own["tasks"], folder=here))
+        began, here = time.monotonic(), Path(__file__).parents[1]
+        text = output(start(count, "benchmarks.ranks", "worker", device, tasks, folder=here))
         by_size.append([json.loads(line) for line in text.splitlines() if line.startswith("{")])
-        print(f"{count} of {device.type}: {time.monotonic() - began:.0f} s", flush=True)
-    for word, one, all_ranks in zip(tasks, *by_size, strict=True):
+        print(f"{count} of {device}: {time.monotonic() - began:.0f} s", flush=True)
+    for word, one, all_ranks in zip(tasks.split(","), *by_size, strict=True):
         task, _, num_envs = word.partition(":")
         ratio = all_ranks["env_states_per_s"] / one["env_states_per_s"]
         prefix = f"{label}/{task}/{num_envs}"
@@ -192,20 +210,39 @@ def main() -> None:
         speeds = [f"{part['env_states_per_s']:,.0f}" for part in (one, all_ranks)]
         table.add_row(task, num_envs, *times, *speeds, f"{ratio:.3f}")
     Console().print(table)
+
+
+def main() -> None:
+    """Measure all tasks, then learning, then a kill, and write the figures."""
+    parts = {"worker": worker, "learner": learner}
+    if sys.argv[1:2] and sys.argv[1] in parts:
+        parts[sys.argv[1]](*sys.argv[2:])
+        return
+    own = command_line.options(sys.argv[1:], OPTIONS)
+    device = torch.device(own["device"])
+    size = int(own["ranks"]) or (torch.cuda.device_count() if device.type == "cuda" else 2)
+    if size < 2:
+        raise ValueError(f"device={device} has {size} of it: ranks are measured on two or more")
+    label = f"{report.device_label(device)}x{size}"
+    saved = partial(report.write, "ranks", device=device, module="benchmarks.ranks", environment=NCCL)
+    if own["tasks"] != "none":
+        compare(own["tasks"], size, device=own["device"], label=label, saved=saved)
     if own["kill"] == "yes":
-        killed = seconds_to_end(size, *tasks[-1].split(":"), device=own["device"])
+        killed = seconds_to_end(size, "go1_velocity_flat", "4096", device=own["device"])
         print(f"all ranks had ended {killed:.1f} s after one was killed", flush=True)
         saved(figures={f"{label}/killed/seconds_to_end": round(killed, 1)})
     if own["seeds"] != "none":
-        options = {"env_states": float(own["env_states"]), "device": own["device"]}
-        medians = [
-            statistics.median(seconds_to_track(count, seed, **options) for seed in own["seeds"].split(","))
-            for count in (1, size)
-        ]
-        print(f"seconds to track on one and on {size}: {medians[0]:.1f}, {medians[1]:.1f}")
-        prefix = f"{label}/seconds_to_track"
-        seconds = {f"{prefix}/{count}": value for count, value in zip((1, size), medians, strict=True)}
-        saved(figures={**seconds, f"{prefix}/ratio": round(medians[1] / medians[0], 3)})
+        gpus = size if device.type == "cuda" else 0
+        medians, prefix = {}, f"{label}/seconds_to_track"
+        for count in (size, 1):
+            seconds = seconds_of_seeds(
+                count, own["seeds"].split(","), gpus=gpus, env_states=own["env_states"], device=own["device"]
+            )
+            medians[count] = statistics.median(seconds.values())
+            each = {f"{prefix}/{count}/{seed}": value for seed, value in seconds.items()}
+            saved(figures={**each, f"{prefix}/{count}": medians[count]})
+        print(f"seconds to track on one and on {size}: {medians[1]:.1f}, {medians[size]:.1f}")
+        saved(figures={f"{prefix}/ratio": round(medians[size] / medians[1], 3)})
     print(f"written to {report.RESULTS / 'ranks.json'}")
 
 
