@@ -16,6 +16,7 @@ import torch
 
 # The variable is for benchmarks that run others and take their figures.
 RESULTS = Path(os.environ.get("BENCHMARK_RESULTS") or Path(__file__).parent / "results")
+WRITTEN = ("benchmarks/results", "docs")
 PACKAGES = ("ksim_rl", "torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
 
 
@@ -48,7 +49,10 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str:
-    """Return the commit that ran, with "-dirty" if files differ from it; outside a repository GIT_COMMIT names it."""
+    """Return the commit that ran, with "-dirty" if files differ from it; outside a repository GIT_COMMIT names it.
+
+    Results and pages do not count: a benchmark of several parts writes them between these.
+    """
 
     def git(*words: str) -> str:
         found = subprocess.run(
@@ -57,7 +61,8 @@ def commit() -> str:
         return found.stdout.strip()
 
     try:
-        return git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain") else "")
+        changed = git("status", "--porcelain", "--", *(f":(top,exclude){folder}" for folder in WRITTEN))
+        return git("rev-parse", "HEAD") + ("-dirty" if changed else "")
     except (OSError, subprocess.CalledProcessError):
         return os.environ.get("GIT_COMMIT", "unknown")
 

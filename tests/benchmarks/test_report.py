@@ -1,4 +1,5 @@
 import json
+import subprocess
 from pathlib import Path
 
 import torch
@@ -49,6 +50,22 @@ def test_a_report_says_what_ran_where_and_with_what(tmp_path: Path):
     assert "cores" in saved["device"]
     assert saved["versions"]["torch"] == torch.__version__.split("+")[0] or "torch" in saved["versions"]
     assert "not installed" not in (saved["versions"]["mujoco"], saved["versions"]["warp-lang"])
+
+
+def test_a_tree_is_dirty_by_its_code_and_not_by_what_benchmarks_write(tmp_path: Path, monkeypatch):
+    for name in ("benchmarks/report.py", "benchmarks/results/speed.json", "docs/speed.md", "package/code.py"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("")
+    who = ("-c", "user.name=a", "-c", "user.email=a@b")
+    for words in (("init", "-q"), ("add", "."), (*who, "commit", "-qm", "all")):
+        subprocess.run(["git", *words], cwd=tmp_path, check=True)
+    monkeypatch.setattr(report, "__file__", str(tmp_path / "benchmarks" / "report.py"))
+    clean = report.commit()
+    for name in ("benchmarks/results/speed.json", "benchmarks/results/new.json", "docs/speed.md"):
+        (tmp_path / name).write_text("1")
+    assert report.commit() == clean and len(clean) == 40
+    (tmp_path / "package" / "code.py").write_text("1")
+    assert report.commit() == f"{clean}-dirty"
 
 
 def test_figures_of_another_module_keep_their_own_run(tmp_path: Path):
