@@ -4,6 +4,7 @@ import pytest
 
 from ksim_rl import envs
 from ksim_rl.physics import World
+from ksim_rl.testing import check_physics
 from ksim_rl.testing.check_physics import SUBSTEPS, check_c_engine
 
 
@@ -40,4 +41,12 @@ def test_a_robot_in_contact_agrees_in_all_rows(env):
 def test_what_differs_is_named(env, monkeypatch, rows, by, message):
     monkeypatch.setattr(World, "step", wrong_in(list(rows), by))
     with pytest.raises(AssertionError, match=message):
+        check_c_engine(env, 20)
+
+
+def test_where_only_the_c_engine_stops_early_it_is_asked_to_solve_to_the_end(env, monkeypatch):
+    monkeypatch.setattr(env.base_env.world.mj_model.opt, "iterations", 1)  # not of the model that Warp has
+    check_c_engine(env, 20)
+    monkeypatch.setattr(check_physics, "SOLVED", 1)
+    with pytest.raises(AssertionError, match="differs from the C engine's"):
         check_c_engine(env, 20)
