@@ -34,19 +34,28 @@ _streams: dict[tuple[int, int], wp.Stream] = {}
 
 
 class QuickLaunch:
-    """One Warp kernel whose only argument is a struct of numbers and addresses, launched on torch's stream.
+    """One kernel in C++ whose only argument, `a`, is a struct of numbers and addresses, launched on torch's stream.
 
-    Addresses are `wp.uint64`, as wrapping a tensor takes longer than the launch; the kernel has no gradients.
+    Addresses are `wp.uint64`, as wrapping a tensor takes longer than the launch. The source runs for each pair of
+    `indices` within the launch's dim. The kernel has no gradients.
     """
 
-    def __init__(self, kernel: wp.Kernel, arguments: type) -> None:
+    def __init__(self, arguments: type, source: str, indices: tuple[str, str] = ("row", "lane")) -> None:
+        @wp.func_native(f"const int {indices[0]} = index_0, {indices[1]} = index_1;\n{source}")
+        def run(index_0: int, index_1: int, a: arguments): ...  # type: ignore[valid-type]
+
+        @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+        def kernel(a: arguments):  # type: ignore[valid-type]
+            index_0, index_1 = wp.tid()
+            run(index_0, index_1, a)
+
         self._kernel, self._arguments = kernel, arguments
-        self._recorded: dict[tuple[torch.device, tuple[int, ...]], tuple[wp.Launch, ctypes.Structure]] = {}
+        self._recorded: dict[tuple[torch.device, tuple[int, int]], tuple[wp.Launch, ctypes.Structure]] = {}
         self._packer = struct.Struct("")
         # The bytes are shared by all launches until the driver, or the kernel on the CPU, has read them.
         self._lock = threading.Lock()
 
-    def __call__(self, device: torch.device, dim: tuple[int, ...], *values: float) -> None:
+    def __call__(self, device: torch.device, dim: tuple[int, int], *values: float) -> None:
         """Launch with one value per field of the struct, in their order; do nothing for a dim of 0."""
         if 0 in dim:
             return
@@ -59,7 +68,7 @@ class QuickLaunch:
             self._packer.pack_into(packed, 0, *values)
             launch.launch(stream)
 
-    def _record(self, device: torch.device, dim: tuple[int, ...]) -> tuple[wp.Launch, ctypes.Structure]:
+    def _record(self, device: torch.device, dim: tuple[int, int]) -> tuple[wp.Launch, ctypes.Structure]:
         if len(self._recorded) >= MAX_RECORDED:
             self._recorded.clear()
         with warp_scope(device):

@@ -173,7 +173,8 @@ class _Fill:
 
 
 # On the CPU one thread fills all rows, in loops of vector instructions.
-@wp.func_native(
+_launch = QuickLaunch(
+    _Fill,
     DRAWS
     + r"""
     const long long seed = *(const long long*)a.seed;
@@ -200,18 +201,9 @@ class _Fill:
     if (a.kind == 0) run([=](long long at, unsigned b) { reals[at] = low + unit(b) * (high - low); });
     else if (a.kind == 1) run([=](long long at, unsigned b) { reals[at] = normal(b); });
     else run([=](long long at, unsigned b) { integers[at] = start + (long long)((b * span) >> 32); });
-"""
+""",
+    indices=("part", "chunk"),
 )
-def _fill_part(part: int, chunk: int, a: _Fill): ...
-
-
-@wp.kernel(enable_backward=False, grid_stride=False)
-def _fill(a: _Fill):
-    part, chunk = wp.tid()
-    _fill_part(part, chunk, a)
-
-
-_launch = QuickLaunch(_fill, _Fill)
 
 
 def _draw_now(

@@ -23,7 +23,7 @@ from ksim_rl.algorithms.off_policy import MANY_ENVS
 from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
-from ksim_rl.envs.term import CurriculumTerm, EventTerm, ObservationTerm, RewardTerm
+from ksim_rl.envs.term import EventTerm, ObservationTerm, RewardTerm
 from ksim_rl.modules import ActorCfg, QNetworkCfg
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.physics import SimCfg
@@ -40,7 +40,6 @@ from ksim_rl.scene.terrains import (
     PyramidSlope,
     PyramidStairs,
     RoughGround,
-    Terrain,
     TerrainGrid,
     TerrainPatch,
     Waves,
@@ -57,8 +56,6 @@ SELF = "self_collision"
 """The contact sensor of a robot against itself, for tasks that have one."""
 MOVING = {"command": COMMAND, "command_threshold": 0.05}
 """Rewards of the feet count only while the command asks to move."""
-
-TermCfgs = Mapping[str, ObservationTermCfg]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,10 +77,8 @@ def noisy(term: ObservationTerm, reach: float) -> ObservationTermCfg:
     return ObservationTermCfg(term=term, noise=UniformNoise(low=-reach, high=reach))
 
 
-def observations(
-    robot: LeggedRobot, *, actor: TermCfgs | None = None, critic: TermCfgs | None = None
-) -> dict[str, ObservationGroupCfg]:
-    """Return the groups: a noisy "actor" and a clean "critic" that also sees the feet; `actor`, `critic` add terms."""
+def observations(robot: LeggedRobot) -> dict[str, ObservationGroupCfg]:
+    """Return the groups: a noisy "actor" and a clean "critic" that also sees the feet."""
     lin_vel, ang_vel = mdp.SensorReading(sensor="imu_lin_vel"), mdp.SensorReading(sensor="imu_ang_vel")
     gravity, joint_vel = mdp.ProjectedGravity(), mdp.JointVel(joints=robot.joint_names)
     seen_by_both = {
@@ -111,8 +106,8 @@ def observations(
         "foot_contact_forces": ObservationTermCfg(term=mdp.FootContactForces(sensor=FEET)),
     }
     return {
-        "actor": ObservationGroupCfg(terms={**actor_terms, **(actor or {})}),
-        "critic": ObservationGroupCfg(terms={**critic_terms, **(critic or {})}),
+        "actor": ObservationGroupCfg(terms=actor_terms),
+        "critic": ObservationGroupCfg(terms=critic_terms),
     }
 
 
@@ -235,14 +230,12 @@ def velocity_cfg(
     viewer: ViewerCfg,
     observations: Mapping[str, ObservationGroupCfg],
     command: mdp.UniformVelocityCommand | None = None,
-    terrain: Terrain | None = None,
     sensors: Mapping[str, Sensor] | None = None,
-    curriculum: Mapping[str, CurriculumTerm] | None = None,
 ) -> ManagerBasedRlEnvCfg:
     """Return the config: 50 Hz control; an episode lasts 20 s, or until the root tilts by more than 70 degrees.
 
-    `feet` has one element per foot in the order of `robot.foot_sites`. By default the command is `velocity_command()`,
-    on a plane.
+    `feet` has one element per foot in the order of `robot.foot_sites`. By default the command is `velocity_command()`.
+    The ground is a plane; `on_rough_ground` changes that.
     """
     elements, num_feet = feet.geoms or feet.bodies or feet.subtrees, len(robot.foot_sites)
     if len(elements) != num_feet and all(re.fullmatch(r"[\w/-]+", element) for element in elements):
@@ -255,7 +248,7 @@ def velocity_cfg(
         sim=sim,
         scene=SceneCfg(
             robots={robot.name: robot},
-            terrain=PlaneTerrain() if terrain is None else terrain,
+            terrain=PlaneTerrain(),
             sensors={FEET: feet, **(sensors or {})},
             num_envs=4096,
             soft_joint_pos_limit_factor=robot.soft_joint_pos_limit_factor,
@@ -269,7 +262,6 @@ def velocity_cfg(
             "time_out": mdp.TimeOut(),
             "fell_over": mdp.BadOrientation(limit_angle=math.radians(70.0)),
         },
-        curriculum=curriculum or {},
         metrics={
             "linear_velocity_error": mdp.LinearVelocityError(command=COMMAND),
             "angular_velocity_error": mdp.AngularVelocityError(command=COMMAND),
@@ -277,6 +269,38 @@ def velocity_cfg(
         },
         episode_length_s=20.0,
         viewer=viewer,
+    )
+
+
+def flat_cfg(
+    robot: LeggedRobot,
+    pose: PoseStd,
+    *,
+    feet: ContactSensor,
+    viewer: ViewerCfg,
+    is_biped: bool = False,
+    torso: str | None = None,
+    foot_height: float = 0.1,
+    friction: Mapping[str, EventTerm] | None = None,
+    physics: SimCfg | None = None,
+    command: mdp.UniformVelocityCommand | None = None,
+) -> ManagerBasedRlEnvCfg:
+    """Return `velocity_cfg` with the parts of this module; bipeds are calmer, and keep their limbs apart."""
+    calm: dict[str, Any] = {"body_ang_vel": -0.05, "angular_momentum": -0.02} if is_biped else {}
+    earned = rewards(robot, pose=pose, torso=torso, foot_height=foot_height, **calm)
+    if is_biped:
+        earned["self_collisions"] = mdp.SelfCollision(weight=-1.0, sensor=SELF)
+    slip = {"foot_friction": foot_friction(robot, low=0.3, high=1.2)} if friction is None else friction
+    return velocity_cfg(
+        robot,
+        sim=physics or sim(),
+        feet=feet,
+        rewards=earned,
+        events={**events(robot, torso=torso), **slip},
+        viewer=viewer,
+        observations=observations(robot),
+        command=command,
+        sensors=self_contact(robot) if is_biped else {},
     )
 
 
@@ -309,25 +333,18 @@ class VelocityTask(Task):
 
 
 def _proposed_cfg(proposed: ModelRobot, analysis: RobotAnalysis) -> ManagerBasedRlEnvCfg:
-    """Return the config of a robot of any size; bipeds are slower and calmer, and keep their limbs apart."""
+    """Return the config of a robot of any size; bipeds are slower."""
     robot, height, biped = cast(LeggedRobot, proposed), proposed.init_pos[2], len(analysis.foot_bodies) == 2
     moving = analysis.by_joint(0.35, 0.15, 0.15) if biped else analysis.by_joint(0.6, 0.3, 0.15)
     pose = PoseStd(standing={".*": 0.05}, walking=moving, running=analysis.by_joint(0.6, 0.3, 0.4))
-    foot_height = round(min(0.1, 0.3 * height), 3)
-    calm: dict[str, Any] = {"body_ang_vel": -0.05, "angular_momentum": -0.02} if biped else {}
-    earned = rewards(robot, pose=pose, foot_height=foot_height, **calm)
     # A leg's natural speed grows with the root of its length: 1 m/s is much for a leg of 0.25 m.
     speed = round(min(1.0, 0.5 * math.sqrt(9.81 * height)), 2) if biped else 1.0
-    if biped:
-        earned["self_collisions"] = mdp.SelfCollision(weight=-1.0, sensor=SELF, threshold=10.0)
-    return velocity_cfg(
+    return flat_cfg(
         robot,
-        sim=sim(),
+        pose,
         feet=ContactSensor(bodies=analysis.foot_bodies),
-        observations=observations(robot),
-        rewards=earned,
-        events=events(robot) | {"foot_friction": foot_friction(robot, low=0.3, high=1.2)},
-        sensors=self_contact(robot) if biped else {},
+        is_biped=biped,
+        foot_height=round(min(0.1, 0.3 * height), 3),
         command=dataclasses.replace(velocity_command(), lin_vel_x=(-speed, speed), lin_vel_y=(-speed, speed)),
         viewer=ViewerCfg(body=robot.root_body, distance=max(1.0, 4.0 * height), elevation=-12.0),
     )

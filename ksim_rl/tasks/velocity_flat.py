@@ -7,12 +7,9 @@ humanoid are our own, with nothing to download; Go2's motors run PD control.
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 
-from ksim_rl import mdp
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
-from ksim_rl.physics import SimCfg
 from ksim_rl.scene.robots.booster_t1 import BoosterT1
-from ksim_rl.scene.robots.legged_robot import LeggedRobot
 from ksim_rl.scene.robots.own_robots import Humanoid, Quadruped
 from ksim_rl.scene.robots.unitree_g1 import UnitreeG1
 from ksim_rl.scene.robots.unitree_go import UnitreeGo1, UnitreeGo2
@@ -64,42 +61,35 @@ GO1_FRICTION = {
 
 def go1_velocity_flat() -> ManagerBasedRlEnvCfg:
     """Return the config of Unitree Go1."""
-    return velocity.velocity_cfg(
+    return velocity.flat_cfg(
         GO1_ROBOT,
-        sim=velocity.sim(cone="elliptic", impratio=10.0),
+        UNITREE_POSE,
+        physics=velocity.sim(cone="elliptic", impratio=10.0),
         feet=ContactSensor(geoms=GO1_ROBOT.foot_geoms),
-        observations=velocity.observations(GO1_ROBOT),
-        rewards=velocity.rewards(GO1_ROBOT, pose=UNITREE_POSE),
-        events=velocity.events(GO1_ROBOT) | GO1_FRICTION,
+        friction=GO1_FRICTION,
         viewer=dataclasses.replace(UNITREE_VIEW, body=GO1_ROBOT.root_body),
     )
 
 
 def go2_velocity_flat() -> ManagerBasedRlEnvCfg:
     """Return the config of Unitree Go2."""
-    return velocity.velocity_cfg(
+    return velocity.flat_cfg(
         GO2_ROBOT,
-        sim=velocity.sim(),
+        UNITREE_POSE,
         feet=ContactSensor(geoms=GO2_ROBOT.foot_geoms),
-        observations=velocity.observations(GO2_ROBOT),
-        rewards=velocity.rewards(GO2_ROBOT, pose=UNITREE_POSE),
-        events=velocity.events(GO2_ROBOT)
-        | {"foot_friction": velocity.foot_friction(GO2_ROBOT, low=0.3, high=1.5)},
+        friction={"foot_friction": velocity.foot_friction(GO2_ROBOT, low=0.3, high=1.5)},
         viewer=dataclasses.replace(UNITREE_VIEW, body=GO2_ROBOT.root_body),
     )
 
 
 def quadruped_velocity_flat() -> ManagerBasedRlEnvCfg:
     """Return the config of our own quadruped."""
-    robot = QUADRUPED_ROBOT
-    return velocity.velocity_cfg(
-        robot,
-        sim=velocity.sim(),
-        feet=ContactSensor(geoms=robot.foot_geoms),
-        observations=velocity.observations(robot),
-        rewards=velocity.rewards(robot, pose=_four_legs_pose(".*_(roll|hip)", ".*_knee"), foot_height=0.08),
-        events=velocity.events(robot) | {"foot_friction": velocity.foot_friction(robot, low=0.3, high=1.2)},
-        viewer=ViewerCfg(body=robot.root_body, distance=1.6, elevation=-15.0, azimuth=120.0),
+    return velocity.flat_cfg(
+        QUADRUPED_ROBOT,
+        _four_legs_pose(".*_(roll|hip)", ".*_knee"),
+        feet=ContactSensor(geoms=QUADRUPED_ROBOT.foot_geoms),
+        foot_height=0.08,
+        viewer=ViewerCfg(body=QUADRUPED_ROBOT.root_body, distance=1.6, elevation=-15.0, azimuth=120.0),
     )
 
 
@@ -169,51 +159,27 @@ HUMANOID_POSE = _pose(
 )
 
 
-def _two_legs_cfg(
-    robot: LeggedRobot,
-    pose: velocity.PoseStd,
-    *,
-    feet: ContactSensor,
-    viewer: ViewerCfg,
-    torso: str | None = None,
-    foot_height: float = 0.1,
-    sim: SimCfg | None = None,
-) -> ManagerBasedRlEnvCfg:
-    rewards = velocity.rewards(
-        robot, pose=pose, torso=torso, body_ang_vel=-0.05, angular_momentum=-0.02, foot_height=foot_height
-    )
-    friction = {"foot_friction": velocity.foot_friction(robot, low=0.3, high=1.2)}
-    return velocity.velocity_cfg(
-        robot,
-        sim=sim or velocity.sim(),
-        feet=feet,
-        observations=velocity.observations(robot),
-        sensors=velocity.self_contact(robot),
-        rewards=rewards | {"self_collisions": mdp.SelfCollision(weight=-1.0, sensor=velocity.SELF)},
-        events=velocity.events(robot, torso=torso) | friction,
-        viewer=viewer,
-    )
-
-
 def g1_velocity_flat() -> ManagerBasedRlEnvCfg:
     """Return the config of Unitree G1."""
     torso = G1_ROBOT.torso_body
-    return _two_legs_cfg(
+    return velocity.flat_cfg(
         G1_ROBOT,
         G1_POSE,
+        is_biped=True,
         feet=ContactSensor(subtrees=G1_ROBOT.foot_bodies),
         torso=torso,
         # A robot that lies on its arms needs 221 rows, more than the probe of the model finds.
-        sim=dataclasses.replace(velocity.sim(), njmax=256),
+        physics=dataclasses.replace(velocity.sim(), njmax=256),
         viewer=ViewerCfg(body=torso, distance=3.0, elevation=-10.0, azimuth=90.0),
     )
 
 
 def t1_velocity_flat() -> ManagerBasedRlEnvCfg:
     """Return the config of Booster T1."""
-    return _two_legs_cfg(
+    return velocity.flat_cfg(
         T1_ROBOT,
         T1_POSE,
+        is_biped=True,
         feet=ContactSensor(subtrees=T1_ROBOT.foot_bodies),
         viewer=ViewerCfg(body=T1_ROBOT.root_body, distance=3.0, elevation=-10.0, azimuth=90.0),
     )
@@ -221,9 +187,10 @@ def t1_velocity_flat() -> ManagerBasedRlEnvCfg:
 
 def humanoid_velocity_flat() -> ManagerBasedRlEnvCfg:
     """Return the config of our own humanoid."""
-    return _two_legs_cfg(
+    return velocity.flat_cfg(
         HUMANOID_ROBOT,
         HUMANOID_POSE,
+        is_biped=True,
         feet=ContactSensor(bodies=HUMANOID_ROBOT.foot_bodies),
         torso=HUMANOID_ROBOT.torso_body,
         foot_height=0.06,

@@ -46,7 +46,8 @@ class _Ring:
 
 # Rows of the ring are bytes, so that one kernel serves every dtype. The lanes of a row copy words of 16, 4 or 1 bytes,
 # a few at once, as the GPU waits for all of them together; on the CPU one lane copies whole parts.
-@wp.func_native(
+_quick = QuickLaunch(
+    _Ring,
     DRAWS
     + r"""
     struct alignas(16) Wide { unsigned word[4]; };
@@ -122,18 +123,8 @@ class _Ring:
             }
         }
     }
-"""
+""",
 )
-def _copy(row: int, lane: int, a: _Ring): ...
-
-
-@wp.kernel(enable_backward=False, grid_stride=False)
-def _push_and_read(a: _Ring):
-    row, lane = wp.tid()
-    _copy(row, lane, a)
-
-
-_quick = QuickLaunch(_push_and_read, _Ring)
 _LANES, _MANY_LANES = 32, 256
 """Threads that share a row on the GPU: a warp, or a block for large rows."""
 

@@ -20,7 +20,9 @@ class _Tally:
 
 
 # Parameters are what the CPU's compiler believes not to overlap, so that loops become vector instructions.
-@wp.func_native(r"""
+_quick_tally = QuickLaunch(
+    _Tally,
+    r"""
     const int begin = part * a.rows, end = begin + a.rows;
     auto begin_anew = [=](auto* __restrict__ kept, auto* __restrict__ out, const unsigned char* __restrict__ mask) {
         for (int row = begin; row < end; ++row) out[row] = kept[row] = mask[row] ? 0 : kept[row];
@@ -40,16 +42,9 @@ class _Tally:
         add(total, total_out, (const float*)a.reward);
         count(step, step_out);
     }
-""")
-def _tally_part(part: int, a: _Tally): ...
-
-
-@wp.kernel(enable_backward=False, grid_stride=False)
-def _tally_kernel(a: _Tally):
-    _tally_part(wp.tid(), a)
-
-
-_quick_tally = QuickLaunch(_tally_kernel, _Tally)
+""",
+    indices=("part", "lane"),
+)
 
 
 def tally(
@@ -74,7 +69,7 @@ def _tally_now(
     step_out_E, total_out_E = torch.empty_like(step_E), torch.empty_like(total_E)
     device, num_rows = step_E.device, step_E.numel()
     # One thread does all on the CPU, in vector instructions.
-    dim, rows = ((1,), num_rows) if device.type == "cpu" else ((num_rows,), 1)
+    dim, rows = ((1, 1), num_rows) if device.type == "cpu" else ((num_rows, 1), 1)
     read = address(mask_E), address(reward_E), total_E.data_ptr(), step_E.data_ptr()
     _quick_tally(device, dim, rows, *read, total_out_E.data_ptr(), step_out_E.data_ptr())
     return step_out_E, total_out_E

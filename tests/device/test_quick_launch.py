@@ -21,23 +21,18 @@ class Line:
     out: wp.uint64
 
 
-@wp.func_native("((double*)a.out)[i] = (double)a.slope * i + (double)a.offset + a.shift + a.scale;")
-def write_line(i: int, a: Line): ...
-
-
-@wp.kernel(enable_backward=False)
-def draw_line(a: Line):
-    write_line(wp.tid(), a)
-
-
 @pytest.fixture
 def launch() -> QuickLaunch:
-    return QuickLaunch(draw_line, Line)
+    return QuickLaunch(
+        Line,
+        "((double*)a.out)[i] = (double)a.slope * i + (double)a.offset + a.shift + a.scale;",
+        ("i", "lane"),
+    )
 
 
 def line(launch: QuickLaunch, size: int, slope: float, *numbers: int) -> list[float]:
     out_N = torch.full((size + 1,), -1.0, dtype=torch.float64)
-    launch(CPU, (size,), slope, *numbers, address(out_N))
+    launch(CPU, (size, 1), slope, *numbers, address(out_N))
     assert out_N[-1] == -1, "nothing is written beyond the launch's size"
     return out_N[:-1].tolist()
 

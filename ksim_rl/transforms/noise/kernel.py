@@ -138,17 +138,7 @@ _DEVICE = f"""
 """
 
 
-@wp.func_native(_DEVICE + DRAWS + _COLUMNS)
-def _columns(row: int, lane: int, a: _Noise): ...
-
-
-@wp.kernel(enable_backward=False, grid_stride=False)
-def _apply_noise(a: _Noise):
-    row, lane = wp.tid()
-    _columns(row, lane, a)
-
-
-_quick = QuickLaunch(_apply_noise, _Noise)
+_quick = QuickLaunch(_Noise, _DEVICE + DRAWS + _COLUMNS)
 
 
 class NoiseState(NamedTuple):
