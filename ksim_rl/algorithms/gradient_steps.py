@@ -55,7 +55,7 @@ class RolloutUpdate(ABC):
         networks: Mapping[str, nn.Module],
         *,
         max_skipped_steps: int,
-        device: torch.device | str = "cpu",
+        device: torch.device | str,
         logged: Mapping[str, str],
         signals: SignalKeys = STANDARD,
     ) -> None:
@@ -143,7 +143,7 @@ class DatasetUpdate(RolloutUpdate):
         loss: Any,
         networks: Mapping[str, TensorDictModuleBase],
         data: DatasetCfg,
-        seed: int = 0,
+        seed: int,
         **shared: Any,
     ) -> None:
         super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, **shared)

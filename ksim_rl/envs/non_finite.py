@@ -23,7 +23,9 @@ class _Table:
     count: wp.uint64
 
 
-_LOOK = """
+_quick = QuickLaunch(
+    _Table,
+    """
     if (fabsf(((const float*)a.table)[(long long)row * a.width + column]) <= 3.402823466e38f) return;
     const int term = ((const int*)a.term_of_column)[column];
     const long long place = *(const long long*)a.step * a.num_envs + row;
@@ -35,20 +37,9 @@ _LOOK = """
         long long* first = (long long*)a.first + term;
         *first = place < *first ? place : *first;
     #endif
-"""
-
-
-@wp.func_native(_LOOK)
-def _look(row: int, column: int, a: _Table): ...
-
-
-@wp.kernel(enable_backward=False)
-def _look_at(a: _Table):
-    row, column = wp.tid()
-    _look(row, column, a)
-
-
-_quick = QuickLaunch(_look_at, _Table)
+""",
+    indices=("row", "column"),
+)
 
 
 class NonFiniteTerms:
@@ -75,8 +66,10 @@ class NonFiniteTerms:
             return
         if table_EL.dtype != torch.float32 or not table_EL.is_contiguous():
             table_EL = table_EL.float().contiguous()
-        shape = table_EL.shape
-        _quick(self._device, shape, shape[1], self._num_envs, table_EL.data_ptr(), *self._addresses[key])
+        num_rows, width = table_EL.shape
+        _quick(
+            self._device, (num_rows, width), width, self._num_envs, table_EL.data_ptr(), *self._addresses[key]
+        )
 
     def start(self) -> None:
         """Count from here: what terms give while an env is constructed is of no state that anybody sees."""

@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -225,20 +225,31 @@ def steps_of(network: TensorDictModuleBase) -> AbstractContextManager[Any]:
 
 
 def discounted_sum(
-    term_ET: Float[Tensor, "*batch 1"],
-    discount_ET: Float[Tensor, "*batch 1"],
-    *,
-    time_dim: int,
-    last_E: Float[Tensor, "*batch_without_time 1"] | None = None,
+    term_ET: Float[Tensor, "*batch 1"], discount_ET: Float[Tensor, "*batch 1"], *, time_dim: int
 ) -> Float[Tensor, "*batch 1"]:
-    """Return x with x_t = term_t + discount_t x_{t+1}; x after the last step is `last_E`, or zero."""
+    """Return x with x_t = term_t + discount_t x_{t+1}; x after the last step is zero."""
     terms, discounts = (leaf.movedim(time_dim, 0).unbind(0) for leaf in (term_ET, discount_ET))
-    total = torch.zeros_like(terms[0]) if last_E is None else last_E
+    total = torch.zeros_like(terms[0])
     totals = []
     for term_t, discount_t in zip(reversed(terms), reversed(discounts), strict=True):
         total = torch.addcmul(term_t, discount_t, total)
         totals.append(total)
     return torch.stack(totals[::-1]).movedim(0, time_dim)
+
+
+def _discounted_errors(
+    signals: Signals, gamma: Tensor, lmbda: Tensor, weight: Tensor | float = 1.0
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what `_estimate` does, of the sums of weighted TD errors, discounted by gamma lambda in each episode."""
+    bootstrap_ET = signals.bootstrap(signals.value_ET_t_plus_1, gamma)
+    delta_ET = weight * (signals.reward_ET + bootstrap_ET - signals.value_ET_t)
+    finite_ET = delta_ET.isfinite()
+    adv_ET = discounted_sum(
+        torch.where(finite_ET, delta_ET, torch.zeros_like(delta_ET)),
+        torch.where(finite_ET & ~signals.done_ET, gamma * lmbda, 0.0),
+        time_dim=signals.time_dim,
+    )
+    return adv_ET, adv_ET + signals.value_ET_t, finite_ET
 
 
 class GAE(RolloutEstimator, value.GAE):
@@ -254,15 +265,7 @@ class GAE(RolloutEstimator, value.GAE):
         )
 
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-        bootstrap_ET = signals.bootstrap(signals.value_ET_t_plus_1, self.gamma)
-        delta_ET = signals.reward_ET + bootstrap_ET - signals.value_ET_t
-        finite_ET = delta_ET.isfinite()
-        adv_ET = discounted_sum(
-            torch.where(finite_ET, delta_ET, torch.zeros_like(delta_ET)),
-            (finite_ET & ~signals.done_ET) * (self.gamma * self.lmbda),
-            time_dim=signals.time_dim,
-        )
-        return adv_ET, adv_ET + signals.value_ET_t, finite_ET
+        return _discounted_errors(signals, self.gamma, self.lmbda)
 
 
 class TDLambda(RolloutEstimator, value.TDLambdaEstimator):
@@ -277,21 +280,11 @@ class TDLambda(RolloutEstimator, value.TDLambdaEstimator):
         super().__init__(lmbda=lmbda, vectorized=False, **options)
 
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-        bootstrap_ET = signals.bootstrap(signals.value_ET_t_plus_1, self.gamma)
-        finite_ET = (signals.reward_ET + bootstrap_ET - signals.value_ET_t).isfinite()
-        goes_on_ET = finite_ET & ~signals.done_ET
-        weight_ET = torch.where(signals.done_ET, torch.ones_like(bootstrap_ET), 1.0 - self.lmbda)
-        # Before a step that is not finite, the return is the value there.
-        cut_ET = signals.value_ET_t.nan_to_num(0.0, 0.0, 0.0)
-        last = -1 % signals.reward_ET.shape[signals.time_dim]
-        following_ET = torch.where(goes_on_ET, signals.value_ET_t_plus_1, 0.0)
-        target_ET = discounted_sum(
-            torch.where(finite_ET, signals.reward_ET + weight_ET * bootstrap_ET, cut_ET),
-            goes_on_ET * (self.gamma * self.lmbda),
-            time_dim=signals.time_dim,
-            last_E=following_ET.select(signals.time_dim, last),
-        )
-        return target_ET - signals.value_ET_t, target_ET, finite_ET
+        # G_{t+1} is V_{t+1} + A_{t+1}: TD errors with this mean of both values after a step sum up to G_t - V_t.
+        after_ET = signals.value_ET_t_plus_1
+        following_ET = _shifted(signals.value_ET_t.nan_to_num(0.0, 0.0, 0.0), after_ET, signals.time_dim)
+        mean_ET = torch.where(signals.done_ET, after_ET, after_ET + self.lmbda * (following_ET - after_ET))
+        return _discounted_errors(replace(signals, value_ET_t_plus_1=mean_ET), self.gamma, self.lmbda)
 
 
 class VTrace(RolloutEstimator, value.VTrace):
@@ -349,15 +342,7 @@ class VTrace(RolloutEstimator, value.VTrace):
         time_dim, value_ET_t_plus_1 = signals.time_dim, signals.value_ET_t_plus_1
         ratio_ET = self._ratio(tensordict, signals)
         rho_ET, c_ET = ratio_ET.clamp_max(self.rho_thresh), self.lmbda * ratio_ET.clamp_max(self.c_thresh)
-        bootstrap_ET = signals.bootstrap(value_ET_t_plus_1, self.gamma)
-        delta_ET = rho_ET * (signals.reward_ET + bootstrap_ET - signals.value_ET_t)
-        finite_ET = delta_ET.isfinite()
-        correction_ET = discounted_sum(
-            torch.where(finite_ET, delta_ET, torch.zeros_like(delta_ET)),
-            torch.where(finite_ET & ~signals.done_ET, self.gamma * c_ET, torch.zeros_like(c_ET)),
-            time_dim=time_dim,
-        )
-        target_ET = signals.value_ET_t + correction_ET
+        _, target_ET, finite_ET = _discounted_errors(signals, self.gamma, c_ET, rho_ET)
         # Past the end of an episode, of the rollout, or a step that is not finite there is the value only.
         known_ET = ~signals.done_ET & _shifted(finite_ET, torch.zeros_like(finite_ET), time_dim)
         target_ET_t_plus_1 = _shifted(target_ET, value_ET_t_plus_1, time_dim)

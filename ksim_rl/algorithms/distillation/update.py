@@ -15,7 +15,7 @@ from ksim_rl.algorithms.gradient_steps import DatasetUpdate, in_columns
 from ksim_rl.algorithms.ppo.wiring import make_ppo_policy
 from ksim_rl.data import DatasetCfg
 from ksim_rl.device import state_tree
-from ksim_rl.envs.signal_keys import signal_keys
+from ksim_rl.envs.signal_keys import STANDARD, SignalKeys, signal_keys
 from ksim_rl.modules import MixedPolicy, update_normalizers
 from ksim_rl.objectives import (
     DistillationCfg,
@@ -36,6 +36,7 @@ def make_distillation_update(
 ) -> "DistillationUpdate":
     """Build the distillation of a run; the teacher is in `resumed`, or else the policy of `objective.teacher`."""
     objective: Any = cfg.objective
+    data = part_of(cfg, "data", DatasetCfg)
     student = make_ppo_policy(cfg, env)
     if resumed is None:
         teacher = load_teacher(Path(objective.teacher), env, cfg=cfg)
@@ -45,7 +46,7 @@ def make_distillation_update(
         objective,
         actor=student,
         teacher=teacher,
-        data=part_of(cfg, "data", DatasetCfg),
+        data=data,
         seed=cfg.seed,
         device=cfg.resolved_device(),
         signals=signal_keys(env),
@@ -56,8 +57,7 @@ class DistillationUpdate(DatasetUpdate):
     """Lets a student learn, from one rollout at a time, what its teacher would do there; see `DatasetUpdate`.
 
     The student is any probabilistic module; a recurrent one learns on sequences. The teacher's actions must be those of
-    the student; its policy labels env states, and helps to collect where `teacher_share` says so. In `shared` are
-    `data` and the other arguments of `DatasetUpdate`.
+    the student; its policy labels env states, and helps to collect where `teacher_share` says so.
     """
 
     def __init__(
@@ -66,11 +66,23 @@ class DistillationUpdate(DatasetUpdate):
         *,
         actor: ProbabilisticTensorDictSequential,
         teacher: Teacher,
-        **shared: Any,
+        data: DatasetCfg,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        signals: SignalKeys = STANDARD,
     ) -> None:
         self.actor, self.teacher = actor, teacher
         loss = DistillationLoss(actor, teacher.policy, loss=cfg.loss)
-        super().__init__(cfg, loss=loss, networks={"actor": actor}, logged=LOGGED, **shared)
+        super().__init__(
+            cfg,
+            loss=loss,
+            networks={"actor": actor},
+            data=data,
+            seed=seed,
+            device=device,
+            signals=signals,
+            logged=LOGGED,
+        )
         self.teacher_share = torch.tensor(cfg.teacher_share, device=self.device)
         helps = cfg.teacher_share > 0.0
         self.behavior: TensorDictModuleBase = actor

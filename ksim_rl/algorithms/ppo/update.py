@@ -12,7 +12,9 @@ from torch import Tensor
 
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate, in_columns
 from ksim_rl.algorithms.ppo.fused import make_fused_ppo
+from ksim_rl.data import DatasetCfg
 from ksim_rl.device import state_tree
+from ksim_rl.envs.signal_keys import STANDARD, SignalKeys
 from ksim_rl.modules import CarriedState, update_normalizers
 from ksim_rl.objectives import (
     PPOCfg,
@@ -44,7 +46,7 @@ class PPOUpdate(DatasetUpdate):
 
     The actor is any probabilistic module, which writes actions, their log-probabilities and parameters of the
     distribution; the critic writes `state_value`. For `cfg.symmetry`, `mirror` has the mirror images of what they read
-    and of the action. In `shared` are `data` and the other arguments of `DatasetUpdate`.
+    and of the action.
     """
 
     def __init__(
@@ -53,9 +55,11 @@ class PPOUpdate(DatasetUpdate):
         *,
         actor: ProbabilisticTensorDictSequential,
         critic: TensorDictModule,
+        data: DatasetCfg,
+        seed: int = 0,
         device: torch.device | str = "cpu",
         mirror: Mapping[Any, MirrorMap] | None = None,
-        **shared: Any,
+        signals: SignalKeys = STANDARD,
     ) -> None:
         cfg = with_precision_of(cfg, device)
         self.actor = self.behavior = actor
@@ -63,7 +67,16 @@ class PPOUpdate(DatasetUpdate):
         self.advantage = make_advantage(cfg, actor, critic)
         loss = make_loss(cfg, actor, critic)
         networks = {"actor": actor, "critic": critic}
-        super().__init__(cfg, loss=loss, networks=networks, device=device, logged=LOGGED, **shared)
+        super().__init__(
+            cfg,
+            loss=loss,
+            networks=networks,
+            data=data,
+            seed=seed,
+            device=device,
+            signals=signals,
+            logged=LOGGED,
+        )
         losses = make_symmetric(cfg, loss, mirror, device=self.device)
         self._losses = in_precision(losses, cfg.precision, device=self.device)
         # The rollouts hold the recurrent states of the actor, and not those of the critic.
