@@ -62,9 +62,7 @@ def new(arguments: list[str]) -> int:
             "robot.py", words, "from importlib.resources import files\n" if is_file else ""
         ),
         f"{name}/tasks.py": _text("tasks.py", words),
-        f"tests/test_{name}.py": _text(
-            "test.py", words, "import dataclasses\n\nimport torch" if stands else ""
-        )
+        f"tests/test_{name}.py": _text("test.py", words, "import torch\n" if stands else "")
         + (_text("test_stands.py", words) if stands else ""),
     }
     for file, text in texts.items():
