@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ksim_rl.checks import unknown_name
 from ksim_rl.conf import spelling
-from ksim_rl.conf.registration import MODULE, NAME, RUN_AGAIN, register, store_run
+from ksim_rl.conf.registration import CHOSEN_BY_TASK, MODULE, NAME, RUN_AGAIN, register, store_run
 from ksim_rl.config.overrides import check_parsed
 from ksim_rl.trainers import RunCfg
 
@@ -134,7 +134,7 @@ def _check_names(overrides: Sequence[Override], loader: ConfigLoader, name: str)
     sources = tuple(element.path or "" for element in loader.get_search_path().get_path())
     # The primary config of a run that is made again is another one each time.
     tree = (_names.__wrapped__ if name == RUN_AGAIN else _names)(name, tuple(choices), sources)
-    check_parsed({**dict.fromkeys(groups), **tree}, fields)
+    check_parsed({**dict.fromkeys(group for group in groups if group not in CHOSEN_BY_TASK), **tree}, fields)
 
 
 @cache
@@ -143,6 +143,16 @@ def _names(name: str, choices: tuple[str, ...], sources: tuple[str, ...]) -> dic
     tree = OmegaConf.to_container(hydra.compose(name, overrides=list(choices)))
     assert isinstance(tree, dict)
     return {str(key): value for key, value in tree.items()}
+
+
+def _listed_groups() -> str:
+    loader = GlobalHydra.instance().config_loader()
+    names = [group for group in _groups(loader) if group not in CHOSEN_BY_TASK]
+    return "\n".join(f"{name}: {', '.join(loader.get_group_options(name))}" for name in names)
+
+
+# For `--help`, whose own list has the groups that nobody chooses from.
+OmegaConf.register_new_resolver("listed_groups", _listed_groups, replace=True)
 
 
 def _groups(loader: ConfigLoader) -> list[str]:

@@ -22,6 +22,7 @@ from ksim_rl.trainers.run_cfg import check_run_tree, without_env_size
 
 MODULE, NAME = "ksim_rl.conf", "train"
 RUN_AGAIN, RUN_CONFIG = "run_again", CONFIG
+CHOSEN_BY_TASK = TRAINING, OBJECTIVE_TRAINING = "task/training", "task/objective_training"
 WRITTEN_BY_LOGGERS = ("wandb", "mlflow")
 
 MOST_LETTERS = 120
@@ -52,10 +53,10 @@ def _register(_named: tuple[str, ...]) -> None:
     store = partial(upstream.store_config, package="_global_")
     choices.store_choices()
     for name in envs.names():
-        store("task/training", name, partial(choices.training_defaults, name))
+        store(TRAINING, name, partial(choices.training_defaults, name))
         for objective in algorithms.names():
             make = partial(choices.objective_defaults, name, objective)
-            store("task/objective_training", f"{name}_{objective}", make)
+            store(OBJECTIVE_TRAINING, f"{name}_{objective}", make)
     upstream.quicken()
 
 

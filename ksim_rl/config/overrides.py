@@ -70,5 +70,5 @@ def check_key(tree: Mapping[str, Any], key: str) -> None:
             above = ".".join(parts[:depth])
             names = level if isinstance(level, Mapping) else ()
             choices = [str(name) for name in names if name != "_target_"]
-            where = f"{above} has no field {part!r}" if above else f"no field {part!r}"
-            raise ValueError(f"unknown field {key!r}: {where}: {near(part, choices)}")
+            where = f"{above} has no field {part!r}: " if above else ""
+            raise ValueError(f"unknown field {key!r}: {where}{near(part, choices)}")
