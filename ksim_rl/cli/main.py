@@ -80,7 +80,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     sys.exit(code)
 
 
-def _dispatch(arguments: list[str]) -> int:
+def _dispatch(words: list[str]) -> int:
+    arguments, names = _without_plugins(words)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(USAGE)
         return 0 if arguments else REFUSED
@@ -95,7 +96,6 @@ def _dispatch(arguments: list[str]) -> int:
 
         raise unknown_name("command", command, COMMANDS)
     # Imported here, so that usage and mistyped commands answer at once.
-    rest, names = _without_plugins(rest)
     module, _, function = COMMANDS[command].partition(":")
     with gc_disabled():
         run = getattr(importlib.import_module(module), function)

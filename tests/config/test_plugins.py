@@ -137,6 +137,7 @@ def test_it_is_named_by_the_flag_or_by_the_users_settings(work, trained):
 
 def test_a_plug_in_that_does_not_exist_is_refused(refused):
     assert "plug-in 'mine_of_tset' cannot be loaded" in refused("envs", "--plugin", "mine_of_tset")
+    assert "plug-in 'mine_of_tset' cannot be loaded" in refused("--plugin", "mine_of_tset", "envs")
     assert "--plugin: expected the name" in refused("envs", "--plugin")
 
 

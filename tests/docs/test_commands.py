@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from ksim_rl import conf, envs
+from ksim_rl.cli.main import COMMANDS
 from tests.docs.guide import DOCS, REPOSITORY
 
 _PAGES = (*sorted(REPOSITORY.glob("*.md")), *sorted(DOCS.rglob("*.md")))
@@ -43,6 +44,13 @@ def test_the_fields_of_a_command_exist(command: str) -> None:
         pytest.skip("a task or a package that the reader writes")
     assert named <= set(envs.names())
     assert conf.compose(words).num_envs > 0
+
+
+def test_the_commands_exist() -> None:
+    named = set(re.findall(r"(?:^|[`$ ])ksim-rl ((?:--plugin \w+ )?[a-z_0-9]+)(?=[ `\n])", ALL, re.MULTILINE))
+    commands = {words.rpartition(" ")[2] for words in named}
+    assert len(commands) > 12
+    assert commands <= {*COMMANDS, "help"}
 
 
 def test_fields_in_the_text_exist() -> None:
