@@ -1,16 +1,14 @@
 """These Warp kernels recompute the constants that MuJoCo derives at `qpos0`, in the worlds of a mask only.
 
-The joint-space inertia is factored as M = L^T D L over the tree of dofs (Featherstone, "Rigid Body Dynamics
-Algorithms", 2008, section 6.5), and L is inverted row by row. Then J M^-1 J^T = sum_k (J L^-1)_k^2 / D_k for each
-Jacobian row, with no further solve. One matrix [nv, nv] per world holds D on its diagonal, L below and L^-1 above
-(transposed); entries of dofs that are not on one chain stay zero.
-
-Few worlds reset at a time, so that what counts is how long one takes: the lanes of a warp share its work.
+What follows from the joint-space inertia is computed in C++, see `constants_of_inertia.cpp`.
 """
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
+
+import functools
+from importlib.resources import files
 
 import mujoco
 import mujoco_warp as mjw
@@ -24,6 +22,7 @@ BALL = wp.constant(int(mujoco.mjtJoint.mjJNT_BALL))
 MINVAL = wp.constant(float(mujoco.mjMINVAL))
 KIN0 = wp.constant(int(mjw.SetConstGroup.KIN0))
 INERT0 = wp.constant(int(mjw.SetConstGroup.INERT0))
+_SOURCE = files("ksim_rl.physics").joinpath("constants_of_inertia.cpp").read_text()
 
 
 @struct_with(
@@ -48,6 +47,8 @@ class Constants:
     group_start: wp.array[int]
     group_size: wp.array[int]
     last_dof: wp.array[int]
+    tree_first: wp.array[int]
+    tree_end: wp.array[int]
     actuator_dof: wp.array[int]
     xpos: wp.array2d[wp.vec3]
     xquat: wp.array2d[wp.quat]
@@ -55,13 +56,7 @@ class Constants:
     axis: wp.array2d[wp.vec3]
     xipos: wp.array2d[wp.vec3]
     inertia: wp.array2d[wp.mat33]
-    factor: wp.array3d[float]
-
-
-@wp.func
-def _point_velocity(rotates: float, axis: wp.vec3, anchor: wp.vec3, point: wp.vec3) -> wp.vec3:
-    """Velocity of a point when its dof moves at unit speed."""
-    return rotates * wp.cross(axis, point - anchor) + (1.0 - rotates) * axis
+    scratch: wp.array2d[float]
 
 
 @wp.kernel(enable_backward=False)
@@ -134,38 +129,6 @@ def _add_up_body(world: int, body: int, c: Constants):
     c.inertia[world, body] = axes @ wp.diag(moments) @ wp.transpose(axes)
 
 
-@wp.func
-def _mass_matrix_row(world: int, dof: int, c: Constants):
-    """Row `dof` of M: what the momentum of its subtree, moved at unit speed, is along the dofs of its chain."""
-    frame = world % c.axis.shape[0]
-    first = c.dof_bodyid[dof]
-    point = c.xipos[world, first]
-    rotates = c.dof_rotates[dof]
-    turning = rotates * c.axis[frame, dof]
-    momentum = wp.vec3(0.0, 0.0, 0.0)
-    spin = wp.vec3(0.0, 0.0, 0.0)
-    for body in range(first, first + c.body_subtreenum[first]):
-        com = c.xipos[world, body]
-        velocity = _point_velocity(rotates, c.axis[frame, dof], c.anchor[frame, dof], com)
-        part = c.body_mass[world % c.body_mass.shape[0], body] * velocity
-        momentum += part
-        spin += c.inertia[world, body] @ turning + wp.cross(com - point, part)
-    armature = float(c.dof_armature[world % c.dof_armature.shape[0], dof])
-    for i in range(c.num_actuators):
-        if c.actuator_dof[i] == dof:
-            gear = c.actuator_gear[world % c.actuator_gear.shape[0], i][0]
-            armature += c.actuator_armature[world % c.actuator_armature.shape[0], i] * gear * gear
-    other = dof
-    while other >= 0:
-        along = c.dof_rotates[other]
-        velocity = _point_velocity(along, c.axis[frame, other], c.anchor[frame, other], point)
-        c.factor[world, dof, other] = (
-            wp.dot(momentum, velocity) + along * wp.dot(spin, c.axis[frame, other]) + armature
-        )
-        armature = 0.0
-        other = c.dof_parentid[other]
-
-
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
 __syncthreads();
@@ -173,115 +136,6 @@ __syncthreads();
 """)
 def _wait_for_all() -> None:
     """Let the lanes of a world see what all have written."""
-
-
-@wp.func
-def _ancestor(dof: int, steps: int, c: Constants) -> int:
-    """Return the dof that is so many steps closer to the root, -1 beyond it."""
-    found = int(dof)
-    for _ in range(steps):
-        if found >= 0:
-            found = c.dof_parentid[found]
-    return found
-
-
-@wp.func
-def _factorize(world: int, lane: int, lanes: int, c: Constants):
-    """M = L^T D L, in place, from the leaves to the root; each lane has some ancestors of a dof."""
-    for step in range(c.nv):
-        k = c.nv - 1 - step
-        inverse = 1.0 / c.factor[world, k, k]
-        i = _ancestor(k, lane + 1, c)
-        while i >= 0:
-            ratio = c.factor[world, k, i] * inverse
-            j = int(i)
-            while j >= 0:
-                c.factor[world, i, j] = c.factor[world, i, j] - ratio * c.factor[world, k, j]
-                j = c.dof_parentid[j]
-            i = _ancestor(i, lanes, c)
-        _wait_for_all()
-        i = _ancestor(k, lane + 1, c)
-        while i >= 0:
-            c.factor[world, k, i] = c.factor[world, k, i] * inverse
-            i = _ancestor(i, lanes, c)
-    _wait_for_all()
-
-
-@wp.func
-def _invert_row(world: int, dof: int, c: Constants):
-    """Row `dof` of X = L^-1, from X L = 1; X[dof, k] is kept at [k, dof]."""
-    k = c.dof_parentid[dof]
-    while k >= 0:
-        total = float(c.factor[world, dof, k])
-        j = c.dof_parentid[dof]
-        while j > k:
-            total += c.factor[world, j, dof] * c.factor[world, j, k]
-            j = c.dof_parentid[j]
-        c.factor[world, k, dof] = -total
-        k = c.dof_parentid[k]
-
-
-@wp.func
-def _dof_invweight(world: int, dof: int, c: Constants):
-    """Diagonal of M^-1, averaged over the translations and over the rotations of one joint."""
-    total = float(0.0)  # noqa: UP018
-    for member in range(c.group_start[dof], c.group_start[dof] + c.group_size[dof]):
-        total += 1.0 / c.factor[world, member, member]
-        k = c.dof_parentid[member]
-        while k >= 0:
-            total += c.factor[world, k, member] * c.factor[world, k, member] / c.factor[world, k, k]
-            k = c.dof_parentid[k]
-    c.dof_invweight0[world % c.dof_invweight0.shape[0], dof] = total / float(c.group_size[dof])
-
-
-@wp.func
-def _body_invweight(world: int, body: int, c: Constants):
-    """Mean diagonal of J M^-1 J^T at each centre of mass: translation, rotation."""
-    frame = world % c.axis.shape[0]
-    point = c.xipos[world, body]
-    moved = float(0.0)  # noqa: UP018
-    turned = float(0.0)  # noqa: UP018
-    k = c.last_dof[body]
-    while k >= 0:
-        linear = wp.vec3(0.0, 0.0, 0.0)
-        angular = wp.vec3(0.0, 0.0, 0.0)
-        i = c.last_dof[body]
-        while i >= k:
-            share = float(1.0)  # noqa: UP018
-            if i > k:
-                share = c.factor[world, k, i]
-            linear += share * _point_velocity(c.dof_rotates[i], c.axis[frame, i], c.anchor[frame, i], point)
-            angular += share * c.dof_rotates[i] * c.axis[frame, i]
-            i = c.dof_parentid[i]
-        moved += wp.dot(linear, linear) / c.factor[world, k, k]
-        turned += wp.dot(angular, angular) / c.factor[world, k, k]
-        k = c.dof_parentid[k]
-    # As in C: a body that only slides has 0 for rotation, where mujoco_warp.set_const takes the other figure.
-    c.body_invweight0[world % c.body_invweight0.shape[0], body] = wp.vec2(moved / 3.0, turned / 3.0)
-
-
-@wp.func
-def _actuator_acceleration(world: int, actuator: int, c: Constants):
-    """Norm of the acceleration from unit force: of column `actuator_dof` of M^-1, times the gear."""
-    dof = c.actuator_dof[actuator]
-    total = float(0.0)  # noqa: UP018
-    for other in range(c.nv):
-        entry = float(0.0)  # noqa: UP018
-        k = dof
-        while k >= 0:
-            left = float(1.0)  # noqa: UP018
-            right = float(0.0)  # noqa: UP018
-            if k < dof:
-                left = c.factor[world, k, dof]
-            if k == other:
-                right = 1.0
-            elif k < other:
-                right = c.factor[world, k, other]
-            entry += left * right / c.factor[world, k, k]
-            k = c.dof_parentid[k]
-        total += entry * entry
-    gear = c.actuator_gear[world % c.actuator_gear.shape[0], actuator][0]
-    c.actuator_acc0[world % c.actuator_acc0.shape[0], actuator] = wp.abs(gear) * wp.sqrt(total)
 
 
 @wp.func
@@ -334,32 +188,39 @@ def _light_reference(world: int, light: int, c: Constants):
     c.light_dir0[world % c.light_dir0.shape[0], light] = wp.normalize(direction)
 
 
-@wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-def constants_at_qpos0(c: Constants, groups: int, lanes: int):
-    """Recompute the constants of `groups` in the worlds of the mask; launch it over (worlds, lanes)."""
-    world, lane = wp.tid()
-    if not c.mask[world]:
-        return
-    for body in range(lane, c.nbody, lanes):
-        _add_up_body(world, body, c)
-    _wait_for_all()
-    if groups & KIN0:
-        for camera in range(lane, c.ncam, lanes):
-            _camera_reference(world, camera, c)
-        for light in range(lane, c.nlight, lanes):
-            _light_reference(world, light, c)
-    if groups & INERT0 == 0:
-        return
-    for dof in range(lane, c.nv, lanes):
-        _mass_matrix_row(world, dof, c)
-    _wait_for_all()
-    _factorize(world, lane, lanes, c)
-    for dof in range(lane, c.nv, lanes):
-        _invert_row(world, dof, c)
-    _wait_for_all()
-    for dof in range(lane, c.nv, lanes):
-        _dof_invweight(world, dof, c)
-    for body in range(lane, c.nbody, lanes):
-        _body_invweight(world, body, c)
-    for actuator in range(lane, c.actuator_dof.shape[0], lanes):
-        _actuator_acceleration(world, actuator, c)
+def floats_per_world(nv: int, nbody: int) -> int:
+    """Return the floats that the C++ works on, in the order in which it lays them out."""
+    return 2 * nv**2 + 11 * nv + 35 * nbody
+
+
+@functools.cache
+def constants_kernel(nv: int, nbody: int, lanes: int, on_chip: bool) -> wp.Kernel:
+    """Return the kernel that recomputes constants; launch it over (worlds, lanes), in blocks of as many lanes.
+
+    What it works on is on the chip (in shared memory), or else in the scratch memory of its `Constants`.
+    """
+    floats = floats_per_world(nv, nbody)
+    sizes = {"NV": nv, "NB": nbody, "LANES": lanes, "ON_CHIP": int(on_chip), "FLOATS": floats}
+    snippet = "".join(f"constexpr int {name} = {value};\n" for name, value in sizes.items()) + _SOURCE
+
+    @wp.func_native(snippet)
+    def constants_of_inertia(world: int, lane: int, c: Constants) -> None: ...
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"block_dim": lanes})
+    def constants_at_qpos0(c: Constants, groups: int):
+        world, lane = wp.tid()
+        if not c.mask[world]:
+            return
+        for body in range(lane, c.nbody, lanes):
+            _add_up_body(world, body, c)
+        _wait_for_all()
+        if groups & INERT0:
+            constants_of_inertia(world, lane, c)
+        if groups & KIN0:
+            # The last lanes have had the least to do.
+            for camera in range(lanes - 1 - lane, c.ncam, lanes):
+                _camera_reference(world, camera, c)
+            for light in range(lanes - 1 - lane, c.nlight, lanes):
+                _light_reference(world, light, c)
+
+    return constants_at_qpos0

@@ -19,13 +19,16 @@ from ksim_rl.physics.upstream import set_fixed_constants
 
 KINEMATIC = frozenset(("qpos0", "body_pos", "body_quat", "jnt_pos", "jnt_axis"))
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-LANES = 32
-"""Threads that share the work of one world on a GPU: a warp."""
+LANES = 128
+"""Threads that share the work of one world on a GPU: a block."""
+_MOST_FLOATS_ON_CHIP = 40 * 1024 // 4
+"""Of the shared memory that a block has without asking for more, 48 KiB, some is Warp's."""
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 class MaskedConstants:
-    """Launches for the worlds of a mask, on scratch memory of its own: 4 nv^2 + 60 nbody bytes per world.
+    """Launches for the worlds of a mask, on memory of its own: 48 nbody bytes per world, and on the CPU, or where the
+    chip has no room for it, 8 nv^2 + 44 nv + 140 nbody more.
 
     Build it once the model's arrays are in their final place, on the device of the model.
     """
@@ -35,13 +38,18 @@ class MaskedConstants:
     ) -> None:
         self._warp_model = warp_model
         self._moves, self._resizes = KINEMATIC & set(expanded), "geom_size" in expanded
-        self._lanes = LANES if mask.device.is_cuda else 1
         self._inert = not mj_model.ntendon and not mj_model.nflex and _drives_scalar_joints(mj_model)
         self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any()) or mj_model.ntendon > 0
         has_armature = "actuator_armature" in expanded or np.any(mj_model.actuator_armature)
         self._num_envs = num_envs = mask.shape[0]
         nbody, nv = mj_model.nbody, mj_model.nv
         starts, sizes = _joint_groups(mj_model)
+        tree_first = mj_model.tree_dofadr[mj_model.dof_treeid]
+        tree_end = tree_first + mj_model.tree_dofnum[mj_model.dof_treeid]
+        self._lanes = LANES if mask.device.is_cuda else 1
+        floats = kernels.floats_per_world(nv, nbody)
+        on_chip = mask.device.is_cuda and floats <= _MOST_FLOATS_ON_CHIP
+        self._kernel = kernels.constants_kernel(nv, nbody, self._lanes, on_chip)
         # Frames at qpos0 are shared unless a field that moves them differs between worlds.
         num_frames = num_envs if self._moves else 1
         own = {
@@ -52,6 +60,8 @@ class MaskedConstants:
             "group_start": wp.array(starts, dtype=int),
             "group_size": wp.array(sizes, dtype=int),
             "last_dof": wp.array(_last_dofs(mj_model), dtype=int),
+            "tree_first": wp.array(tree_first, dtype=int),
+            "tree_end": wp.array(tree_end, dtype=int),
             "actuator_dof": wp.array(_driven_dofs(mj_model), dtype=int),
             "xpos": wp.zeros((num_frames, nbody), dtype=wp.vec3),
             "xquat": wp.zeros((num_frames, nbody), dtype=wp.quat),
@@ -59,7 +69,7 @@ class MaskedConstants:
             "axis": wp.zeros((num_frames, nv), dtype=wp.vec3),
             "xipos": wp.zeros((num_envs, nbody), dtype=wp.vec3),
             "inertia": wp.zeros((num_envs, nbody), dtype=wp.mat33),
-            "factor": wp.zeros((num_envs, nv, nv), dtype=float),
+            "scratch": wp.zeros((1 if on_chip else num_envs, floats), dtype=float),
         }
         self._constants = filled(kernels.Constants, own, warp_model)
         wp.launch(kernels.frames, dim=num_frames, inputs=[self._constants])
@@ -82,9 +92,9 @@ class MaskedConstants:
         if self._moves:
             wp.launch(kernels.frames, dim=self._num_envs, inputs=[self._constants])
         wp.launch(
-            kernels.constants_at_qpos0,
+            self._kernel,
             dim=(self._num_envs, self._lanes),
-            inputs=[self._constants, groups, self._lanes],
+            inputs=[self._constants, groups],
             block_dim=self._lanes,
         )
 

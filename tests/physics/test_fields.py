@@ -254,6 +254,6 @@ def test_bodies_that_only_slide_or_only_turn_weigh_as_in_the_c_engine(tendon, ma
 def test_rows_are_recomputed_in_one_launch(monkeypatch):
     """At resets few rows need it, so that launches cost more than the work."""
     world, launched = every_joint(INERTIAL), []
-    monkeypatch.setattr(wp, "launch", lambda kernel, **_: launched.append(kernel.key))
+    monkeypatch.setattr(wp, "launch", lambda kernel, **_: launched.append(kernel.func.__name__))
     world._masked_constants.launch(const_groups(INERTIAL))
     assert launched == ["constants_at_qpos0"]
