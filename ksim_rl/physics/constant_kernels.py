@@ -47,8 +47,6 @@ class Constants:
     group_start: wp.array[int]
     group_size: wp.array[int]
     last_dof: wp.array[int]
-    tree_first: wp.array[int]
-    tree_end: wp.array[int]
     actuator_dof: wp.array[int]
     xpos: wp.array2d[wp.vec3]
     xquat: wp.array2d[wp.quat]
@@ -190,7 +188,7 @@ def _light_reference(world: int, light: int, c: Constants):
 
 def floats_per_world(nv: int, nbody: int) -> int:
     """Return the floats that the C++ works on, in the order in which it lays them out."""
-    return 2 * nv**2 + 11 * nv + 35 * nbody
+    return 2 * nv**2 + 9 * nv + 27 * nbody
 
 
 @functools.cache

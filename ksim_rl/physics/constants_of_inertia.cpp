@@ -12,7 +12,6 @@
 using vec3 = wp::vec3;
 using mat33 = wp::mat33;
 
-constexpr int PARTS = 4;  // lanes that share the sum of a body
 constexpr int WIDTH = NV > 0 ? NV : 1;
 constexpr int COLUMNS = LANES < 32 ? LANES : 32, ROWS = LANES / COLUMNS;
 
@@ -29,16 +28,13 @@ vec3* const anchors = axes + NV;
 float* const rotates = (float*)(anchors + NV);
 float* const reciprocals = rotates + NV;  // of D
 int* const parents = (int*)(reciprocals + NV);
-int* const tree_first = parents + NV;  // the dofs of a tree
-int* const tree_end = tree_first + NV;
-vec3* const points = (vec3*)(tree_end + NV);  // centres of mass
+vec3* const points = (vec3*)(parents + NV);  // centres of mass
 vec3* const moments = points + NB;  // mass of a subtree times its offset from the centre of mass of its first body
 mat33* const inertias = (mat33*)(moments + NB);
 mat33* const spreads = inertias + NB;  // inertia of a subtree about the centre of mass of its first body
 float* const masses = (float*)(spreads + NB);
 float* const totals = masses + NB;  // mass of a subtree
 int* const tips = (int*)(totals + NB);  // the last dof that moves a body
-float* const sums = (float*)(tips + NB);
 
 auto sync = [] {
 #if defined(__CUDA_ARCH__)
@@ -62,8 +58,6 @@ each(NV, [&](int dof) {
     anchors[dof] = row_of(c.anchor)[dof];
     rotates[dof] = c.dof_rotates.data[dof];
     parents[dof] = c.dof_parentid.data[dof];
-    tree_first[dof] = c.tree_first.data[dof];
-    tree_end[dof] = c.tree_end.data[dof];
 });
 each(NB, [&](int body) {
     points[body] = row_of(c.xipos)[body];
@@ -116,15 +110,16 @@ sync();
 
 // Step k changes the rows above row k, of which each lane has some columns, and reads row k alone beside them.
 for (int k = NV - 1; k >= 0; --k) {
-    const int first = tree_first[k], end = tree_end[k];
     const float* __restrict__ const pivot = factor + k * NV;
     const float reciprocal = 1.0f / pivot[k];
     if (lane == 0)
         reciprocals[k] = reciprocal;
-    for (int j = first + lane % COLUMNS; j < end; j += COLUMNS) {
+    for (int j = lane % COLUMNS; j < NV; j += COLUMNS) {
         const float scaled = (j == k ? 1.0f : pivot[j]) * reciprocal;
+        if (scaled == 0.0f)
+            continue;
 #pragma unroll 4
-        for (int i = first + lane / COLUMNS; i < k; i += ROWS)
+        for (int i = lane / COLUMNS; i < k; i += ROWS)
             factor[i * NV + j] = (j == k ? 0.0f : factor[i * NV + j]) - pivot[i] * scaled;
     }
     sync();
@@ -134,29 +129,26 @@ auto share_of = [=](int k, int dof) { return dof == k ? 1.0f : factor[k * NV + d
 each(NV * NV, [&](int place) {
     const int i = place / WIDTH, j = place % WIDTH, last = wp::min(i, j);
     float total = 0.0f;
-#pragma unroll 4
-    for (int k = tree_first[i]; k <= last; ++k)
+    for (int k = last; k >= 0; k = parents[k])
         total += share_of(k, i) * share_of(k, j) * reciprocals[k];
     inverse[place] = total;
 });
-each(NB * PARTS, [&](int item) {
-    const int body = item / PARTS, tip = tips[body];
+// Mean diagonal of J M^-1 J^T at each centre of mass: translation, rotation. As in C, a body that only slides has 0 for
+// rotation, where mujoco_warp.set_const takes the other figure.
+each(NB, [&](int body) {
     const vec3 point = points[body];
     float moved = 0.0f, turned = 0.0f;
-    int place = item % PARTS;
-    for (int k = tip; k >= 0; k = parents[k])
-        if (place++ % PARTS == 0) {
-            vec3 linear, angular;
-            for (int i = tip; i >= k; i = parents[i]) {
-                const float share = share_of(k, i);
-                linear = linear + share * velocity_of(i, point);
-                angular = angular + share * rotates[i] * axes[i];
-            }
-            moved += wp::dot(linear, linear) * reciprocals[k];
-            turned += wp::dot(angular, angular) * reciprocals[k];
+    for (int k = tips[body]; k >= 0; k = parents[k]) {
+        vec3 linear, angular;
+        for (int i = tips[body]; i >= k; i = parents[i]) {
+            const float share = share_of(k, i);
+            linear = linear + share * velocity_of(i, point);
+            angular = angular + share * rotates[i] * axes[i];
         }
-    sums[2 * item] = moved;
-    sums[2 * item + 1] = turned;
+        moved += wp::dot(linear, linear) * reciprocals[k];
+        turned += wp::dot(angular, angular) * reciprocals[k];
+    }
+    row_of(c.body_invweight0)[body] = wp::vec2(moved / 3.0f, turned / 3.0f);
 });
 sync();
 
@@ -167,16 +159,6 @@ each(NV, [&](int dof) {
     for (int member = first; member < first + size; ++member)
         total += inverse[member * NV + member];
     row_of(c.dof_invweight0)[dof] = total / (float)size;
-});
-// Mean diagonal of J M^-1 J^T at each centre of mass: translation, rotation. As in C, a body that only slides has 0 for
-// rotation, where mujoco_warp.set_const takes the other figure.
-each(NB, [&](int body) {
-    float moved = 0.0f, turned = 0.0f;
-    for (int item = body * PARTS; item < (body + 1) * PARTS; ++item) {
-        moved += sums[2 * item];
-        turned += sums[2 * item + 1];
-    }
-    row_of(c.body_invweight0)[body] = wp::vec2(moved / 3.0f, turned / 3.0f);
 });
 // Norm of the acceleration from unit force: of a column of M^-1, times the gear.
 each(c.actuator_dof.shape[0], [&](int actuator) {

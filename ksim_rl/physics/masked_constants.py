@@ -28,7 +28,7 @@ _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 class MaskedConstants:
     """Launches for the worlds of a mask, on memory of its own: 48 nbody bytes per world, and on the CPU, or where the
-    chip has no room for it, 8 nv^2 + 44 nv + 140 nbody more.
+    chip has no room for it, 8 nv^2 + 36 nv + 108 nbody more.
 
     Build it once the model's arrays are in their final place, on the device of the model.
     """
@@ -44,8 +44,6 @@ class MaskedConstants:
         self._num_envs = num_envs = mask.shape[0]
         nbody, nv = mj_model.nbody, mj_model.nv
         starts, sizes = _joint_groups(mj_model)
-        tree_first = mj_model.tree_dofadr[mj_model.dof_treeid]
-        tree_end = tree_first + mj_model.tree_dofnum[mj_model.dof_treeid]
         self._lanes = LANES if mask.device.is_cuda else 1
         floats = kernels.floats_per_world(nv, nbody)
         on_chip = mask.device.is_cuda and floats <= _MOST_FLOATS_ON_CHIP
@@ -60,8 +58,6 @@ class MaskedConstants:
             "group_start": wp.array(starts, dtype=int),
             "group_size": wp.array(sizes, dtype=int),
             "last_dof": wp.array(_last_dofs(mj_model), dtype=int),
-            "tree_first": wp.array(tree_first, dtype=int),
-            "tree_end": wp.array(tree_end, dtype=int),
             "actuator_dof": wp.array(_driven_dofs(mj_model), dtype=int),
             "xpos": wp.zeros((num_frames, nbody), dtype=wp.vec3),
             "xquat": wp.zeros((num_frames, nbody), dtype=wp.quat),

@@ -1,6 +1,6 @@
 """These events draw gravity, mass and inertia of bodies that can exist, sizes of geoms, and friction."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -34,13 +34,10 @@ class RandomizeBodyMass(RandomizeBodyField, field="body_mass", lowest=_LEAST_MAS
 
     per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_inertia")
 
-    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        super().__call__(view, mask_E)
+    def follower(self, view: EnvView) -> tuple[Tensor, Sequence[float]]:
         ids = self.ids(view)
-        masses, moments = _masses(view, ids), view.world.mj_model.body_inertia[list(ids)]
-        per_mass_N3 = array_constant(moments / masses[:, None], view.device)
-        inertia_EN3 = per_mass_N3 * view.field("body_mass")[:, index_constant(ids, view.device), None]
-        write_entries(view.field("body_inertia"), ids, range(3), mask_E, inertia_EN3)
+        per_mass_N3 = view.world.mj_model.body_inertia[list(ids)] / _masses(view, ids)[:, None]
+        return view.field("body_inertia"), per_mass_N3.ravel().tolist()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,10 +3,9 @@
 Each draw starts from the model's own values, so that neither the order of resets nor their number matters.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 import torch
@@ -17,7 +16,8 @@ from ksim_rl.checked import NonNegative, Positive, Range, Within, check_value
 from ksim_rl.checks import check_choice
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.constants import array_constant, constant, index_constant
+from ksim_rl.mdp.constants import constant, index_constant
+from ksim_rl.mdp.randomization.drawing import draw_entries
 from ksim_rl.scene.names import Patterns
 
 Pair = tuple[float, float]
@@ -54,20 +54,21 @@ class Randomize(EventTerm, mode="startup"):
 
     def draw(self, view: EnvView, count: int, pairs: Sequence[Pair]) -> Float[Tensor, "E N C"]:
         """Draw `count` rows per world, or one if shared, with one column per range."""
-        size = (1 if self.shared else count) * len(pairs)
-        first = [float(pair[0]) for pair in pairs]
-        second = [float(pair[1]) for pair in pairs]
-        if self.distribution == "gaussian":
-            mean_C, deviation_C = constant(first, view.device), constant(second, view.device)
-            drawn_ENC = view.normal(size).view(view.num_envs, -1, len(pairs)).clamp(-CUT, CUT)
-            return torch.addcmul(mean_C, drawn_ENC, deviation_C)
-        if self.distribution == "log_uniform":
-            first, second = [math.log(low) for low in first], [math.log(high) for high in second]
-        low_C = constant(first, view.device)
-        width_C = constant([high - low for low, high in zip(first, second, strict=True)], view.device)
-        drawn_ENC = view.uniform(size).view(view.num_envs, -1, len(pairs))
-        drawn_ENC = torch.addcmul(low_C, drawn_ENC, width_C)
-        return torch.exp(drawn_ENC) if self.distribution == "log_uniform" else drawn_ENC
+        own_NC = np.zeros((1 if self.shared else count, len(pairs)))
+        drawn_ENC = torch.empty(view.num_envs, *own_NC.shape, device=view.device)
+        self._draw_into(drawn_ENC, view, own_NC, range(len(own_NC)), dict(enumerate(pairs)))
+        return drawn_ENC
+
+    def _draw_into(
+        self, field_ENC: Tensor, view: EnvView, own_NC: np.ndarray, ids: Sequence[int], pairs: Mapping[int, Pair],
+        operation: Operation = "abs", mask_E: Tensor | None = None,
+        follower: tuple[Tensor | None, Sequence[float]] = (None, ()),
+    ) -> None:  # fmt: skip
+        low, high = zip(*pairs.values(), strict=True)
+        table = constant((*low, *high, *pairs, *ids, *own_NC.flat, *follower[1]), view.device)
+        kinds = get_args(Distribution).index(self.distribution), get_args(Operation).index(operation)
+        layout = *own_NC.shape, self.shared, *kinds, CUT
+        draw_entries(field_ENC, mask_E, view.next_keys(), table, layout, follower[0])
 
     def combine(
         self, nominal: Float[Tensor, "*own"], drawn: Float[Tensor, "*draws"]
@@ -160,11 +161,13 @@ class RandomizeModelField(RandomizeField):
         if not pairs:
             return
         self._check_reach(view, nominal, pairs)
-        columns = tuple(pairs)
-        own_NC = array_constant(nominal[:, list(columns)], view.device)
-        value_ENC = self.combine(own_NC, self.draw(view, len(ids), list(pairs.values())))
-        held_ENC = view.field(self.field).view(view.num_envs, -1, self.columns)
-        write_entries(held_ENC, ids, columns, mask_E, value_ENC)
+        field_ENC = view.field(self.field).view(view.num_envs, -1, self.columns)
+        own_NC, follower = nominal[:, list(pairs)], self.follower(view)
+        self._draw_into(field_ENC, view, own_NC, ids, pairs, self.operation, mask_E, follower)
+
+    def follower(self, view: EnvView) -> tuple[Tensor | None, Sequence[float]]:
+        """Return, if there is one, the field that grows in proportion to this one, and how much, [N * columns]."""
+        return None, ()
 
     def _check_reach(self, view: EnvView, nominal: np.ndarray, pairs: Mapping[int, Pair]) -> None:
         for column, pair in pairs.items():

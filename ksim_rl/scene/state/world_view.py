@@ -237,15 +237,19 @@ class WorldView:
         high: float | Float[Tensor, "*high"] = 1.0,
     ) -> Float[Tensor, "E L"]:
         """Draw float32 from [low, high); the numbers depend on seed, term, env and moment only."""
-        return random.uniform(self._simulation.next_keys(), n, low, high)
+        return random.uniform(self.next_keys(), n, low, high)
 
     def normal(self, n: int) -> Float[Tensor, "E L"]:
         """Draw float32 from the standard normal distribution."""
-        return random.normal(self._simulation.next_keys(), n)
+        return random.normal(self.next_keys(), n)
 
     def integers(self, n: int, low: int, high: int) -> Int64[Tensor, "E L"]:
         """Draw from {low, ..., high}, both included."""
-        return random.integers(self._simulation.next_keys(), n, low, high)
+        return random.integers(self.next_keys(), n, low, high)
+
+    def next_keys(self) -> random.RowKeys:
+        """Return the coordinates of the next draw of the calling term, for a kernel that draws its numbers itself."""
+        return self._simulation.next_keys()
 
     # -- writes --------------------------------------------------------------------------------------------------
 

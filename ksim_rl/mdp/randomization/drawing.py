@@ -1,0 +1,86 @@
+"""This module draws entries of a model field by one kernel, in the worlds of a mask.
+
+At each step a few worlds reset, so that what counts is how many kernels a draw takes. Its numbers are those of
+`ksim_rl.device.random` at the same coordinates.
+"""
+
+import warp as wp
+from jaxtyping import Bool, Float32
+from torch import Tensor
+
+from ksim_rl.device.quick_launch import QuickLaunch, address
+from ksim_rl.device.random import DRAWS, RowKeys
+
+
+@wp.struct
+class _Draw:
+    elements: int
+    columns: int
+    shared: int
+    kind: int
+    operation: int
+    cut: float
+    lanes: int
+    world_stride: int
+    element_stride: int
+    followers: int
+    counter_stride: int
+    first_row: int
+    stream: wp.uint32
+    seed: wp.uint64
+    counter: wp.uint64
+    mask: wp.uint64
+    table: wp.uint64
+    field: wp.uint64
+    follower: wp.uint64
+
+
+# A follower is a field that grows in proportion to the only column that is drawn; it has as many elements.
+_quick = QuickLaunch(
+    _Draw,
+    DRAWS
+    + r"""
+    if (a.mask && !((const unsigned char*)a.mask)[row]) return;
+    const int elements = a.elements, columns = a.columns, followers = a.followers;
+    const float* first = (const float*)a.table;
+    const float *second = first + columns, *places = second + columns, *ids = places + columns, *own = ids + elements;
+    const float* ratios = own + elements * columns;
+    const long long count = ((const long long*)a.counter)[row * a.counter_stride];
+    const RowKey key = key_of(*(const long long*)a.seed, a.stream, count, a.first_row + row);
+    for (int item = lane; item < elements * columns; item += a.lanes) {
+        const int element = item / columns, column = item - element * columns;
+        const unsigned bits = bits_of(key, (unsigned)(a.shared ? column : item));
+        const float sample = a.kind == 2 ? wp::clamp(normal(bits), -a.cut, a.cut) : unit(bits);
+        const bool is_log = a.kind == 1;
+        const float low = is_log ? wp::log(first[column]) : first[column];
+        const float high = is_log ? wp::log(second[column]) : second[column];
+        const float sum = low + (a.kind == 2 ? high : high - low) * sample, drawn = is_log ? wp::exp(sum) : sum;
+        const float value = a.operation == 0 ? drawn : a.operation == 1 ? own[item] + drawn : own[item] * drawn;
+        const int id = (int)ids[element];
+        ((float*)a.field)[(long long)row * a.world_stride + id * a.element_stride + (int)places[column]] = value;
+        float* follower = (float*)a.follower + ((long long)row * (a.world_stride / a.element_stride) + id) * followers;
+        for (int i = 0; i < followers; ++i) follower[i] = ratios[element * followers + i] * value;
+    }
+""",
+)
+
+
+def draw_entries(
+    field_ENC: Float32[Tensor, "E N C"],
+    mask_E: Bool[Tensor, " E"] | None,
+    keys: RowKeys,
+    table: Float32[Tensor, " numbers"],
+    layout: tuple[float, ...],
+    follower_ENF: Float32[Tensor, "E N F"] | None = None,
+) -> None:
+    """Draw entries as the layout, the first fields of `_Draw`, says, in the worlds of `mask_E` or in all.
+
+    The table has the low and the high ends (means, deviations) and places of the columns, the rows of the elements,
+    the model's own values, and how much the follower has of each.
+    """
+    device, lanes = field_ENC.device, 1 if field_ENC.device.type == "cpu" else 32
+    mask_E = None if mask_E is None else mask_E.contiguous()
+    followers = 0 if follower_ENF is None else follower_ENF.shape[-1]
+    where = lanes, *field_ENC.stride()[:2], followers, keys.counter.ndim, keys.first_row, keys.stream
+    tensors = keys.seed, keys.counter.contiguous(), mask_E, table, field_ENC, follower_ENF
+    _quick(device, (field_ENC.shape[0], lanes), *layout, *where, *map(address, tensors))
