@@ -197,11 +197,9 @@ def constants_kernel(nv: int, nbody: int, lanes: int, on_chip: bool) -> wp.Kerne
 
     What it works on is on the chip (in shared memory), or else in the scratch memory of its `Constants`.
     """
-    floats = floats_per_world(nv, nbody)
-    sizes = {"NV": nv, "NB": nbody, "LANES": lanes, "ON_CHIP": int(on_chip), "FLOATS": floats}
-    snippet = "".join(f"constexpr int {name} = {value};\n" for name, value in sizes.items()) + _SOURCE
+    sizes = f"NV = {nv}, NB = {nbody}, FLOATS = {floats_per_world(nv, nbody)}, LANES = {lanes}, ON_CHIP = {+on_chip}"
 
-    @wp.func_native(snippet)
+    @wp.func_native(f"constexpr int {sizes};\n{_SOURCE}")
     def constants_of_inertia(world: int, lane: int, c: Constants) -> None: ...
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"block_dim": lanes})

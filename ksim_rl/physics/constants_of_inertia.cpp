@@ -1,5 +1,4 @@
-// What follows from the joint-space inertia M at `qpos0` in one world: the inverse weights of degrees of freedom and of
-// bodies, and the accelerations of actuators.
+// What follows from the joint-space inertia M at `qpos0` in one world: inverse weights, and accelerations of actuators.
 //
 // This is the body of the function constants_of_inertia(world, lane, c), before which constant_kernels.py puts the
 // constants NV, NB, LANES, ON_CHIP and FLOATS. M = L^T D L is eliminated from the leaves to the root (Featherstone, "Rigid
@@ -15,13 +14,11 @@ using mat33 = wp::mat33;
 constexpr int WIDTH = NV > 0 ? NV : 1;
 constexpr int COLUMNS = LANES < 32 ? LANES : 32, ROWS = LANES / COLUMNS;
 
+float* factor = c.scratch.data + (size_t)world * FLOATS;
 #if defined(__CUDA_ARCH__)
 __shared__ float on_chip[ON_CHIP ? FLOATS : 1];
-float* const memory = ON_CHIP ? on_chip : c.scratch.data + (size_t)world * FLOATS;
-#else
-float* const memory = c.scratch.data + (size_t)world * FLOATS;
+factor = ON_CHIP ? on_chip : factor;
 #endif
-float* const factor = memory;
 float* const inverse = factor + NV * NV;  // of M
 vec3* const axes = (vec3*)(inverse + NV * NV);
 vec3* const anchors = axes + NV;
@@ -49,8 +46,7 @@ auto each = [&](int count, auto work) {
 auto row_of = [=](auto& array) { return array.data + (array.shape[0] > 1 ? (size_t)world * array.shape[1] : 0); };
 // Velocity of a point when its dof moves at unit speed.
 auto velocity_of = [=](int dof, const vec3& point) {
-    const float turns = rotates[dof];
-    return turns * wp::cross(axes[dof], point - anchors[dof]) + (1.0f - turns) * axes[dof];
+    return rotates[dof] * wp::cross(axes[dof], point - anchors[dof]) + (1.0f - rotates[dof]) * axes[dof];
 };
 
 each(NV, [&](int dof) {

@@ -19,10 +19,8 @@ from ksim_rl.physics.upstream import set_fixed_constants
 
 KINEMATIC = frozenset(("qpos0", "body_pos", "body_quat", "jnt_pos", "jnt_axis"))
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-LANES = 128
-"""Threads that share the work of one world on a GPU: a block."""
-_MOST_FLOATS_ON_CHIP = 40 * 1024 // 4
-"""Of the shared memory that a block has without asking for more, 48 KiB, some is Warp's."""
+LANES = 128  # threads that share the work of one world on a GPU: a block
+_MOST_FLOATS_ON_CHIP = 40 * 1024 // 4  # of the 48 KiB of shared memory that any block has, some is Warp's
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 

@@ -34,7 +34,7 @@ class RandomizeBodyMass(RandomizeBodyField, field="body_mass", lowest=_LEAST_MAS
 
     per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_inertia")
 
-    def follower(self, view: EnvView) -> tuple[Tensor, Sequence[float]]:
+    def _follower(self, view: EnvView) -> tuple[Tensor, Sequence[float]]:
         ids = self.ids(view)
         per_mass_N3 = view.world.mj_model.body_inertia[list(ids)] / _masses(view, ids)[:, None]
         return view.field("body_inertia"), per_mass_N3.ravel().tolist()

@@ -41,19 +41,17 @@ _quick = QuickLaunch(
     DRAWS
     + r"""
     if (a.mask && !((const unsigned char*)a.mask)[row]) return;
-    const int elements = a.elements, columns = a.columns, followers = a.followers;
-    const float* first = (const float*)a.table;
-    const float *second = first + columns, *places = second + columns, *ids = places + columns, *own = ids + elements;
-    const float* ratios = own + elements * columns;
+    const int elements = a.elements, columns = a.columns, followers = a.followers, is_log = a.kind == 1;
+    auto end_of = [=](float end) { return is_log ? wp::log(end) : end; };
+    const float *first = (const float*)a.table, *second = first + columns, *places = second + columns;
+    const float *ids = places + columns, *own = ids + elements, *ratios = own + elements * columns;
     const long long count = ((const long long*)a.counter)[row * a.counter_stride];
     const RowKey key = key_of(*(const long long*)a.seed, a.stream, count, a.first_row + row);
     for (int item = lane; item < elements * columns; item += a.lanes) {
         const int element = item / columns, column = item - element * columns;
         const unsigned bits = bits_of(key, (unsigned)(a.shared ? column : item));
         const float sample = a.kind == 2 ? wp::clamp(normal(bits), -a.cut, a.cut) : unit(bits);
-        const bool is_log = a.kind == 1;
-        const float low = is_log ? wp::log(first[column]) : first[column];
-        const float high = is_log ? wp::log(second[column]) : second[column];
+        const float low = end_of(first[column]), high = end_of(second[column]);
         const float sum = low + (a.kind == 2 ? high : high - low) * sample, drawn = is_log ? wp::exp(sum) : sum;
         const float value = a.operation == 0 ? drawn : a.operation == 1 ? own[item] + drawn : own[item] * drawn;
         const int id = (int)ids[element];
@@ -69,7 +67,7 @@ def draw_entries(
     field_ENC: Float32[Tensor, "E N C"],
     mask_E: Bool[Tensor, " E"] | None,
     keys: RowKeys,
-    table: Float32[Tensor, " numbers"],
+    table_L: Float32[Tensor, " L"],
     layout: tuple[float, ...],
     follower_ENF: Float32[Tensor, "E N F"] | None = None,
 ) -> None:
@@ -78,9 +76,9 @@ def draw_entries(
     The table has the low and the high ends (means, deviations) and places of the columns, the rows of the elements,
     the model's own values, and how much the follower has of each.
     """
-    device, lanes = field_ENC.device, 1 if field_ENC.device.type == "cpu" else 32
+    lanes = 32 if field_ENC.is_cuda else 1
     mask_E = None if mask_E is None else mask_E.contiguous()
     followers = 0 if follower_ENF is None else follower_ENF.shape[-1]
     where = lanes, *field_ENC.stride()[:2], followers, keys.counter.ndim, keys.first_row, keys.stream
-    tensors = keys.seed, keys.counter.contiguous(), mask_E, table, field_ENC, follower_ENF
-    _quick(device, (field_ENC.shape[0], lanes), *layout, *where, *map(address, tensors))
+    tensors = keys.seed, keys.counter.contiguous(), mask_E, table_L, field_ENC, follower_ENF
+    _quick(field_ENC.device, (field_ENC.shape[0], lanes), *layout, *where, *map(address, tensors))

@@ -65,10 +65,10 @@ class Randomize(EventTerm, mode="startup"):
         follower: tuple[Tensor | None, Sequence[float]] = (None, ()),
     ) -> None:  # fmt: skip
         low, high = zip(*pairs.values(), strict=True)
-        table = constant((*low, *high, *pairs, *ids, *own_NC.flat, *follower[1]), view.device)
+        table_L = constant((*low, *high, *pairs, *ids, *own_NC.flat, *follower[1]), view.device)
         kinds = get_args(Distribution).index(self.distribution), get_args(Operation).index(operation)
         layout = *own_NC.shape, self.shared, *kinds, CUT
-        draw_entries(field_ENC, mask_E, view.next_keys(), table, layout, follower[0])
+        draw_entries(field_ENC, mask_E, view.next_keys(), table_L, layout, follower[0])
 
     def combine(
         self, nominal: Float[Tensor, "*own"], drawn: Float[Tensor, "*draws"]
@@ -162,10 +162,10 @@ class RandomizeModelField(RandomizeField):
             return
         self._check_reach(view, nominal, pairs)
         field_ENC = view.field(self.field).view(view.num_envs, -1, self.columns)
-        own_NC, follower = nominal[:, list(pairs)], self.follower(view)
+        own_NC, follower = nominal[:, list(pairs)], self._follower(view)
         self._draw_into(field_ENC, view, own_NC, ids, pairs, self.operation, mask_E, follower)
 
-    def follower(self, view: EnvView) -> tuple[Tensor | None, Sequence[float]]:
+    def _follower(self, view: EnvView) -> tuple[Tensor | None, Sequence[float]]:
         """Return, if there is one, the field that grows in proportion to this one, and how much, [N * columns]."""
         return None, ()
 
