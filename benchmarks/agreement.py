@@ -232,7 +232,7 @@ def _needs_menagerie(name: str) -> bool:
 def main(arguments: list[str] | None = None) -> int:
     """Print the table, write the results, and return 1 if anything disagrees."""
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.agreement", description=__doc__.splitlines()[0]
+        prog="python -m benchmarks.agreement", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--worlds", type=int, default=64)

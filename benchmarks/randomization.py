@@ -29,7 +29,7 @@ from ksim_rl import envs, mdp
 from ksim_rl.device.capture import Captured
 from ksim_rl.envs import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import EventTerm
-from ksim_rl.mdp.randomization.randomize import Mode, Randomize
+from ksim_rl.mdp.randomization.randomize import Randomize
 from ksim_rl.physics import load_model
 from ksim_rl.scene.scene import build_spec
 from ksim_rl.trainers import RunCfg
@@ -96,7 +96,7 @@ def _bodies_and_step(task: ManagerBasedRlEnvCfg) -> tuple[tuple[str, ...], float
 def _inertial_events(bodies: tuple[str, ...], variant: str) -> dict[str, EventTerm]:
     if variant == "none":
         return {}
-    mode: Mode = "startup" if variant == "startup" else "reset"
+    mode = "startup" if variant == "startup" else "reset"
     mass = mdp.RandomizeBodyMass(bodies=bodies, ranges=(1.0, 1.0), mode=mode)
     com = mdp.RandomizeBodyCom(bodies=bodies, ranges=(0.0, 0.0), operation="add", mode=mode)
     return {"benchmark_mass": mass, "benchmark_com": com}

@@ -116,7 +116,8 @@ class Child:
 def start(work: Callable[[], int], *, hangs_s: float = HANGS_S) -> Child:
     """Fork, and let the child do `work` and exit with what it returns; its output goes to the parent."""
     warm()
-    sys.stdout.flush(), sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
     reading, writing = os.pipe()
     pid = os.fork()
     if pid:
@@ -125,7 +126,8 @@ def start(work: Callable[[], int], *, hangs_s: float = HANGS_S) -> Child:
     code = 99
     try:
         os.close(reading)
-        os.dup2(writing, 1), os.dup2(writing, 2)
+        for output in (1, 2):
+            os.dup2(writing, output)
         # Whatever a test runner put in their place belongs to the parent.
         sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
         # A shell lets what it starts in the background ignore SIGINT.
@@ -165,7 +167,7 @@ def train(
 
     more, run_folder.build = hooks, build_warm
     # Asking git and the machine, and drawing all panels, takes longer than all else that a child does.
-    record._code, record._versions, record._hardware = (lambda *_: {}), dict, dict
+    record._code, record.versions, record.hardware = (lambda *_: {}), dict, dict
     curves.PANELS = curves.PANELS[:1]
     try:
         with errors.sigterm_interrupts():

@@ -33,8 +33,11 @@ SAYS = ("warning: ", "ksim-rl: error: ", "no learning curves")
 def _operations(run: Path) -> list[str]:
     """Return what a run does to files, in order: kind and name."""
 
+    def say(kind: str, path: str) -> None:
+        os.write(1, f"@{kind} {Path(path).name}\n".encode())
+
     def work() -> int:
-        on_each(run, lambda kind, path: os.write(1, f"@{kind} {Path(path).name}\n".encode()) and None)
+        on_each(run, say)
         return children.train(run)
 
     text = children.start(work).wait().text

@@ -109,7 +109,7 @@ def non_finite_loss(folder: Path) -> Figures:
     trainer = build(conf.compose([*children.SMALLEST, "logger=none", "objective.max_skipped_steps=4"]))
     trainer.iterate()
     with torch.no_grad():
-        next(trainer.update.critic.parameters()).fill_(torch.nan)
+        next(trainer.update.networks["critic"].parameters()).fill_(torch.nan)
     before = [parameter.clone() for parameter in trainer.update.actor.parameters()]
     iterations = named = 0
     try:

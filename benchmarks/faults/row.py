@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-Figures = dict[str, float]
+Figures = Mapping[str, float]
 AT_MOST, AT_LEAST, EXACTLY = "at most", "at least", "exactly"
 _HOLDS: dict[str, Callable[[float, float], bool]] = {
     AT_MOST: lambda figure, limit: figure <= limit,
