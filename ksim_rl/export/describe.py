@@ -174,6 +174,8 @@ _add(mdp.FootHeight, lambda t, v: sites("site_height", t, v))
 _add(mdp.FootAirTime, lambda t, v: contact(t, "air_time"))
 _add(mdp.FootContact, lambda t, v: contact(t, "found"))
 _add(mdp.FootContactForces, _signed_log)
+_add(mdp.OffsetToBody, lambda t, v: _to_body(t, v))
+_add(mdp.OffsetToCommand, lambda t, v: _to_target(t, v))
 
 
 # -- rewards, terminations and metrics ---------------------------------------------------------------------------
@@ -235,8 +237,8 @@ def tilt(term: Any, view: EnvView) -> Node:
     return squared(some(quantity("projected_gravity", body=term.body or root(term, view)), 0, 1))
 
 
-def beyond(value: Node, low: Sequence[float] | float, high: Sequence[float] | float) -> Node:
-    """Return how far values are outside of ranges."""
+def beyond(value: Node, low: Sequence[float] | float, high: Sequence[float] | float | None) -> Node:
+    """Return how far values are outside of ranges; None is a range without an end."""
     return op("absolute", difference(value, op("clip", value, low=low, high=high)))
 
 
@@ -249,6 +251,25 @@ def table(term: Any, view: EnvView, field: str) -> list[float]:
 def foot_velocity(term: Any, view: EnvView) -> Node:
     """Return the horizontal velocities of feet."""
     return op("take", sites("site_lin_vel", term, view), indices=[0, 1], width=3)
+
+
+def _place(t: Any, v: EnvView) -> Node:
+    """Return where the body or site of a term is, in the world."""
+    if getattr(t, "site", None) is not None:
+        return quantity("site_pos", sites=[t.site])
+    return quantity("body_pos", bodies=[t.body])
+
+
+def _to_target(t: Any, v: EnvView) -> Node:
+    asked = some(command(t), 0, 1, 2)
+    if t.frame == "root":
+        turned = op("rotate", quantity("body_quat", bodies=[root(t, v)]), asked)
+        asked = op("add", quantity("body_pos", bodies=[root(t, v)]), turned)
+    return difference(asked, _place(t, v))
+
+
+def _to_body(t: Any, v: EnvView) -> Node:
+    return difference(quantity("body_pos", bodies=[t.body]), _place(t, v))
 
 
 def _pose(t: mdp.Pose, v: EnvView) -> Node:
@@ -344,6 +365,9 @@ _add(mdp.ActionAccelerationL2, lambda t, v: squared(changed(_action_rate())))
 _add(mdp.ActionJerkL2, lambda t, v: squared(changed(changed(_action_rate()))))
 _add(mdp.TrackLinearVelocity, _track_linear)
 _add(mdp.TrackAngularVelocity, _track_angular)
+_add(mdp.TrackPosition, lambda t, v: rated(t, squared(_to_target(t, v))))
+_add(mdp.NearBody, lambda t, v: rated(t, squared(_to_body(t, v))))
+_add(mdp.TargetReached, lambda t, v: op("less", op("norm", _to_target(t, v), width=3), t.tolerance))
 _add(mdp.Upright, lambda t, v: rated(t, tilt(t, v)))
 _add(mdp.TiltL2, tilt)
 _add(mdp.TrackRootHeight, lambda t, v: rated(t, squared(difference(command(t), root_height(t, v)))))

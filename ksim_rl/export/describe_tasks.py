@@ -4,16 +4,39 @@ import math
 from typing import Any
 
 from ksim_rl.envs.view import EnvView
-from ksim_rl.export.describe import Node, beyond, describe, difference, op, quantity, some
+from ksim_rl.export.describe import (
+    Node,
+    beyond,
+    describe,
+    difference,
+    joint_names,
+    op,
+    quantity,
+    root,
+    root_height,
+    some,
+)
 from ksim_rl.tasks import control_suite as control
+from ksim_rl.tasks import get_up, planar
 
 CART, HINGE = (quantity("joint_pos", joints=[name]) for name in ("slider", "hinge"))
 
 
-def tolerance(value: Node, low: float, high: float, margin: float) -> Node:
+def tolerance(value: Node, low: float, high: float | None, margin: float) -> Node:
     """Return `mdp.rewards.tracking.tolerance` of the shape "gaussian"."""
     outside = op("divide", beyond(value, low, high), margin)
     return op("exp", op("multiply", math.log(0.1), op("square", outside)))
+
+
+def linear(value: Node, low: float, margin: float, value_at_margin: float = 0.0) -> Node:
+    """Return `mdp.rewards.tracking.tolerance` of the shape "linear", from `low` on."""
+    outside = op("divide", beyond(value, low, None), margin)
+    return op("maximum", difference(1.0, op("multiply", 1.0 - value_at_margin, outside)), 0.0)
+
+
+def product(*of: Node) -> Node:
+    """Return the product of some numbers."""
+    return of[0] if len(of) == 1 else op("multiply", of[0], product(*of[1:]))
 
 
 def mean(one: Node, other: Node, weight: float = 1.0) -> Node:
@@ -33,7 +56,7 @@ def _reward(*_: Any) -> Node:
     speed = quantity("joint_vel", joints=["hinge"])
     small_velocity = mean(1.0, tolerance(speed, 0.0, 0.0, 5.0))
     upright, centered = mean(1.0, op("cos", HINGE)), mean(1.0, tolerance(CART, 0.0, 0.0, 2.0))
-    return op("multiply", op("multiply", upright, centered), op("multiply", small_control, small_velocity))
+    return product(upright, centered, small_control, small_velocity)
 
 
 @describe.register(control.PoleFallen)
@@ -57,3 +80,91 @@ def _to_target(term: Any, view: EnvView) -> Node:
 def _reached(term: Any, view: EnvView) -> Node:
     distance = op("norm", _to_target(term, view), width=2)
     return tolerance(distance, 0.0, control.TARGET_RADIUS, 0.1)
+
+
+@describe.register(control.PendulumAngle)
+def _angle(term: Any, view: EnvView) -> Node:
+    angle = quantity("joint_pos", joints=joint_names(view, ".*"))
+    return op("concat", op("cos", angle), op("sin", angle))
+
+
+@describe.register(control.PendulumReward)
+def _swung_up(term: Any, view: EnvView) -> Node:
+    names = joint_names(view, ".*")
+    up = linear(op("cos", quantity("joint_pos", joints=names)), control.UPRIGHT, 1.0 + control.UPRIGHT)
+    return product(up, mean(tolerance(quantity("joint_vel", joints=names), 0.0, 0.0, 5.0), 1.0, weight=4.0))
+
+
+# -- planar robots -----------------------------------------------------------------------------------------------
+
+HEIGHT = quantity("joint_pos", joints=["root_z"])
+FORWARD = some(quantity("sensor", sensor="com_velocity"), 0)
+
+
+def upright(body: str) -> Node:
+    """Return 1 where a body is upright, 0 where it is upside down."""
+    return mean(1.0, op("negative", some(quantity("projected_gravity", body=body), 2)))
+
+
+@describe.register(planar.ForwardSpeed)
+def _forward_speed(*_: Any) -> Node:
+    return FORWARD
+
+
+@describe.register(planar.CheetahReward)
+def _runs(*_: Any) -> Node:
+    return linear(FORWARD, planar.CHEETAH_SPEED, planar.CHEETAH_SPEED)
+
+
+@describe.register(planar.HopperReward)
+def _hops(term: planar.HopperReward, view: EnvView) -> Node:
+    above_foot = difference(HEIGHT, some(quantity("body_pos", bodies=["foot"]), 2))
+    tall = tolerance(above_foot, planar.HOPPER_HEIGHT, None, planar.HOPPER_HEIGHT / 2)
+    if term.speed:
+        return product(tall, upright(root(term, view)), linear(FORWARD, term.speed, term.speed))
+    action = op("clip", quantity("action"), low=-1.0, high=1.0)
+    small_effort = op("mean", difference(1.0, op("square", action)))
+    return product(tall, upright(root(term, view)), mean(1.0, small_effort, weight=4.0))
+
+
+@describe.register(planar.WalkerReward)
+def _walks(term: planar.WalkerReward, view: EnvView) -> Node:
+    tall = tolerance(HEIGHT, planar.WALKER_HEIGHT, None, planar.WALKER_HEIGHT / 2)
+    stands = mean(tall, upright(root(term, view)), weight=3.0)
+    if not term.speed:
+        return stands
+    return product(stands, mean(linear(FORWARD, term.speed, term.speed / 2, 0.5), 1.0, weight=5.0))
+
+
+@describe.register(planar.WalkAt)
+def _walks_at(term: planar.WalkAt, view: EnvView) -> Node:
+    return tolerance(FORWARD, term.speed - 0.1, term.speed + 0.1, term.speed)
+
+
+# -- getting up --------------------------------------------------------------------------------------------------
+
+
+@describe.register(get_up.Uprightness)
+def _uprightness(term: Any, view: EnvView) -> Node:
+    return upright(root(term, view))
+
+
+@describe.register(get_up.RisenHeight)
+def _risen(term: Any, view: EnvView) -> Node:
+    return op("clip", op("divide", root_height(term, view), term.standing_height), low=0.0, high=1.0)
+
+
+@describe.register(get_up.Standing)
+def _standing(term: get_up.Standing, view: EnvView) -> Node:
+    names = joint_names(view, ".*")
+    up = op("square", product(upright(root(term, view)), _risen(term, view)))
+    stray = op("mean", op("square", op("divide", quantity("joint_pos_rel", joints=names), term.pose_std)))
+    motion = op("mean", op("square", op("divide", quantity("joint_vel", joints=names), term.speed_std)))
+    return product(up, op("exp", op("negative", op("add", stray, motion))))
+
+
+@describe.register(get_up.Stands)
+def _stands(term: get_up.Stands, view: EnvView) -> Node:
+    is_high = op("greater", root_height(term, view), 0.85 * term.standing_height)
+    down = some(quantity("projected_gravity", body=root(term, view)), 2)
+    return product(is_high, op("less", down, -math.cos(0.35)))

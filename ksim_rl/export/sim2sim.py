@@ -93,10 +93,12 @@ def sim2sim(
             causes = find_causes(meta, read_arrays(folder / "trace.npz"), read_arrays(replay))
         except (KeyError, IndexError, TypeError) as error:
             raise ValueError(f"{folder}: trace.npz does not fit export.json: {error!r}") from error
-    # The same episodes on both sides, in pairs.
+    # The same episodes on both sides, in pairs, and returns of the same terms.
     pairs = np.arange(episodes) % len(ours["return"])
     own = {name: np.array(values)[pairs] for name, values in ours.items() if name.startswith(TABLE)}
     theirs = {name: np.array([one[name] for one in found]) for name in found[0] if name.startswith(TABLE)}
+    described = [own[name] for name in own if name.startswith("reward/") and name in theirs]
+    own["return"] = np.sum(described, axis=0) if described else np.zeros(episodes)
     return Report(
         task=str(meta["task"]),
         episodes=episodes,

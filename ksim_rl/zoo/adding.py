@@ -1,6 +1,7 @@
 """This module makes an entry of the zoo out of a run folder."""
 
 import json
+import math
 import re
 import shutil
 import tempfile
@@ -20,7 +21,8 @@ CURVE_POINTS, RETURN = 24, "episode/return"
 def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> Card:
     """Make an entry out of a run folder, with `episodes` compared with MuJoCo's C engine, and return its card.
 
-    Raises ValueError for a wrong name, a run of code that is not in one commit, and more than 200 kB.
+    Raises ValueError for a wrong name, a run of code that is not in one commit, rewards that cannot be compared, and
+    more than 200 kB.
     """
     if not NAME.fullmatch(name):
         raise ValueError(f"{name!r}: expected lower-case letters, digits and _")
@@ -34,6 +36,8 @@ def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> 
         entry, exported = Path(temporary) / name, Path(temporary) / "export"
         export(run, exported, episodes=episodes, note=print)
         report = sim2sim(exported, episodes=episodes, note=print)
+        if not math.isfinite(report.return_ratio):
+            raise ValueError(f"{run}: of its rewards none has a description; see docs/deploy.md")
         entry.mkdir()
         shutil.copyfile(exported / ONNX, entry / ONNX)
         actor = {"actor": saved.state["update"]["actor"]}

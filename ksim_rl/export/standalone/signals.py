@@ -33,6 +33,7 @@ FUNCTIONS |= {
     "concat": lambda *parts: np.concatenate(parts),
     "normalize": lambda a: a / max(float(np.linalg.norm(a)), 1e-12),
     "subtract_point": lambda a, b: (a.reshape(-1, 3) - b).ravel(),
+    "rotate": lambda quat, vector: rotated(quat, vector),
     "rotate_inverse": lambda quat, vector: rotated(quat * np.array([1.0, -1.0, -1.0, -1.0]), vector),
 }
 
