@@ -15,7 +15,9 @@ from ksim_rl.envs import (
     ViewerCfg,
 )
 from ksim_rl.scene.rendering import rendering
-from tests.envs.probe_env import DT, Launch, Position, Target, puck_cfg, push
+from ksim_rl.scene.scene import MjcfRobot, Placement, SceneCfg
+from ksim_rl.scene.terrains import PlaneTerrain
+from tests.envs.probe_env import DT, PUCK_XML, Launch, Position, Target, puck_cfg, push
 
 WIDTH, HEIGHT = 64, 48
 # From above, 0.1 m of radius in a picture that shows about 0.8 m of height.
@@ -94,6 +96,23 @@ def test_the_camera_follows_its_body(gl):
     place(env, 3.0)
     there = env.render()
     assert lit(here).any() and np.array_equal(lit(here), lit(there))
+    env.close()
+
+
+def test_its_shadow_follows_too(gl):
+    aside = dataclasses.replace(TOP, body="puck", elevation=-30.0, distance=2.0)
+    robots, placements = {"puck": MjcfRobot(source=PUCK_XML)}, {"puck": Placement(pos=(0.0, 0.0, 0.5))}
+    scene = SceneCfg(robots=robots, placements=placements, terrain=PlaneTerrain(), num_envs=3)
+    env = filmed(aside, scene=scene)
+
+    def shadow(picture):
+        return (picture[HEIGHT // 2 + 6 :].max(-1) < 25).sum()
+
+    place(env, 0.0)
+    here = env.render()
+    place(env, 4.0)
+    there = env.render()
+    assert shadow(here) > 5 and shadow(there) > 5
     env.close()
 
 

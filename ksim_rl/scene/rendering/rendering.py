@@ -88,6 +88,10 @@ class OffscreenRenderer:
         target = self._cfg.lookat if self._body is None else self._data.xpos[self._body]
         self._camera.lookat[:] = target
         renderer.update_scene(self._data, self._camera, visible_groups(self._mj_model))
+        for light in renderer.scene.lights[: renderer.scene.nlight]:
+            # It shines everywhere, but MuJoCo draws shadows near its place only.
+            if light.type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL:
+                light.pos[:2] = target[:2]
         draw(DebugVisualizer(self._mj_model, renderer.scene), first)
         columns = int(np.ceil(np.sqrt(last - first)))
         for index in range(1, last - first):
