@@ -207,14 +207,15 @@ def main() -> None:
     given = command_line.options(sys.argv[1:], {"runs": "healthy", "only": ""})
     table: dict[str, Any] = {"healthy": HEALTHY, "faults": FAULTS}[given["runs"]]
     for name in given["only"].split(",") if given["only"] else table:
-        found = table[name] if given["runs"] == "faults" else (table[name], (), None)
+        found: Any = table[name] if given["runs"] == "faults" else (table[name], (), None)
         kept = train(*found)
+        rows: dict[str, Any] = {given["runs"]: {name: kept}}
         report.write(
             "diagnosis",
             figures={f"cpu/{name}/reward": float(_last(kept["metrics"]["rollout/reward"]))},
             device=torch.device("cpu"),
             module="benchmarks.diagnosis",
-            **{given["runs"]: {name: kept}},
+            **rows,
         )
         print(name, {metric: _last(row) for metric, row in kept["metrics"].items()}, flush=True)
 

@@ -32,6 +32,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import command_line, report
+from ksim_rl.data import DatasetCfg
 from ksim_rl.runs.csv_table import read_table
 from ksim_rl.trainers import RunCfg, RunProgress, run
 
@@ -167,6 +168,7 @@ def draw(curves: dict[int, list[Curve]], picture: Path, *, title: str) -> None:
 
 
 def _title(cfg: RunCfg, num_seeds: int, figures: dict[str, float]) -> str:
+    assert isinstance(cfg.data, DatasetCfg)
     return (
         f"{cfg.task_name}, {num_seeds} seeds, {cfg.data.num_env_states} env states per update\n"
         f"largest difference of two means: {figures['difference_in_deviations']:.2f} standard deviations of seeds, "

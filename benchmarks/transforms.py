@@ -89,7 +89,7 @@ def _clock() -> Transform:
     left = UnaryTransform(
         in_keys=["step_count"], out_keys=["left"], fn=lambda n: ((HORIZON - n) / HORIZON).clamp_min(0.0)
     )
-    return Compose(StepCounter(), left)
+    return Compose([StepCounter(), left])
 
 
 def _frames(length: int) -> Transform:
@@ -98,21 +98,19 @@ def _frames(length: int) -> Transform:
 
 def _chain() -> Transform:
     return Compose(
-        ours.ObservationNoise("observation", noise=GaussianNoise(std=0.1)),
-        ours.ObservationDelay("observation", delay=DelayCfg(max_lag=MAX_LAG)),
-        ours.ObservationHistory("observation", "frames", length=HISTORY),
-        ours.ObservationGroups({"actor": ["frames", *NAMES]}),
+        [
+            ours.ObservationNoise("observation", noise=GaussianNoise(std=0.1)),
+            ours.ObservationDelay("observation", delay=DelayCfg(max_lag=MAX_LAG)),
+            ours.ObservationHistory("observation", "frames", length=HISTORY),
+            ours.ObservationGroups({"actor": ["frames", *NAMES]}),
+        ]
     )
 
 
 def _stock_chain() -> Transform:
     delay = CatFrames(MAX_LAG + 1, -1, in_keys=["observation"], out_keys=["late"], padding="same")
-    return Compose(
-        _noisy(torch.randn_like)(),
-        delay,
-        _frames(HISTORY),
-        CatTensors(["frames", *NAMES], "actor", del_keys=False, sort=False),
-    )
+    cat = CatTensors(["frames", *NAMES], "actor", del_keys=False, sort=False)
+    return Compose([_noisy(torch.randn_like)(), delay, _frames(HISTORY), cat])
 
 
 PAIRS = {
@@ -184,7 +182,7 @@ PAIRS = {
     "EpisodeTracker": Pair(
         ours=lambda: ours.EpisodeTracker(),
         nearest="RewardSum and StepCounter",
-        stock=lambda: Compose(RewardSum(), StepCounter()),
+        stock=lambda: Compose([RewardSum(), StepCounter()]),
     ),
     "chain": Pair(ours=_chain, nearest="the same of the parts above", stock=_stock_chain),
 }
@@ -324,7 +322,7 @@ def measure_go1(num_envs: int, device: torch.device) -> dict[str, float]:
         if name == "actor"
     }
     chain = compile_groups(groups)
-    bare, chained = (_Go1(cfg, transforms, device) for transforms in (Compose(), Compose(*chain)))
+    bare, chained = (_Go1(cfg, transforms, device) for transforms in (Compose([]), Compose(list(chain))))
     generator = torch.Generator(device).manual_seed(0)
     times: tuple[list[float], list[float]] = ([], [])
     settle = GO1_STEPS[device.type] // 2

@@ -21,6 +21,7 @@ from __future__ import annotations
 import copy
 import sys
 from collections.abc import Callable
+from typing import Any, Literal
 
 import torch
 from rich.console import Console
@@ -89,7 +90,7 @@ def compare(
     notes = {}
     torch.set_float32_matmul_precision("high")
 
-    def ours(**options: str) -> PPOUpdate:
+    def ours(**options: Any) -> PPOUpdate:
         update = _ours(networks, num_envs=num_envs, device=device, **options)
         _warm_up(lambda: update(rollout_ET), device)
         return update
@@ -157,6 +158,7 @@ class StockUpdate:
             total = losses["loss_objective"] + losses["loss_entropy"] + losses["loss_critic"]
             self.optimizer.zero_grad()
             total.backward()
+            assert CFG.max_grad_norm is not None
             nn.utils.clip_grad_norm_(self.loss.parameters(), CFG.max_grad_norm)
             self.optimizer.step()
 
@@ -225,7 +227,11 @@ def make_rollout(
 
 
 def _ours(
-    networks: Networks, *, num_envs: int, device: torch.device, precision: str = "float32"
+    networks: Networks,
+    *,
+    num_envs: int,
+    device: torch.device,
+    precision: Literal["float32", "bfloat16"] = "float32",
 ) -> PPOUpdate:
     actor, critic = copy.deepcopy(networks)
     cfg = PPOCfg(schedule="fixed", precision=precision)

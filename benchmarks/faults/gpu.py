@@ -7,6 +7,7 @@ import gc
 import re
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -15,6 +16,7 @@ from benchmarks.faults.numbers import count_non_finite
 from benchmarks.faults.row import AT_LEAST, AT_MOST, EXACTLY, Figures, Row
 from benchmarks.faults.saving import same_bits
 from ksim_rl import conf
+from ksim_rl.physics import World
 from ksim_rl.trainers import Hook, RunProgress, Trainer, run_folder
 from ksim_rl.trainers.build import build, build_env
 
@@ -97,13 +99,17 @@ def gpu_memory(folder: Path) -> Figures:
     return {"algorithms": len(ALGORITHMS), "told": told, "that_number_runs": ran}
 
 
+def _world(env: Any) -> World:
+    return env.base_env.world
+
+
 def gpu_nan_worlds(folder: Path, *, envs: int, device: str = "cuda") -> Figures:
     """Break the state of a third of the worlds of walking robots, beside two equal envs that are whole."""
     cfg = conf.compose(["task=go1_velocity_flat", f"device={device}", f"num_envs={envs}"])
     whole, twin, env = (build_env(cfg, num_envs=envs, seed=1) for _ in range(3))
     broken_E = torch.arange(envs, device=device) % 3 == 0
     roots = [each.reset() for each in (whole, twin, env)]
-    world = env.base_env.world
+    world = _world(env)
     world.qvel_EL[broken_E, 0] = torch.tensor([torch.nan, torch.inf, -torch.inf], device=device).repeat(envs)[
         : int(broken_E.sum())
     ]
@@ -115,7 +121,7 @@ def gpu_nan_worlds(folder: Path, *, envs: int, device: str = "cuda") -> Figures:
         if step == 0:
             ended = int(state_E["next", "terminated"][broken_E].sum())
         non_finite += count_non_finite(state_E)
-    qpos_EL, twin_EL, other_EL = (each.base_env.world.qpos_EL[~broken_E] for each in (whole, twin, env))
+    qpos_EL, twin_EL, other_EL = (_world(each).qpos_EL[~broken_E] for each in (whole, twin, env))
     # A contact that comes a step later in one world of a hundred says nothing.
     twins, others = (float((a - qpos_EL).abs().amax(1).quantile(0.9)) for a in (twin_EL, other_EL))
     return {

@@ -115,7 +115,7 @@ def lock(folder: Path, *, races: int) -> Figures:
     refused = children.start(second).wait()
     words = (str(holder.pid), known["host"], known["since"], "writes this run")
     lines = [line for line in refused.text.splitlines() if line.startswith("ksim-rl: error:")]
-    figures = {
+    figures: dict[str, float] = {
         "refused_with_2": refused.code == 2,
         "one_line_with_pid_host_time": len(lines) == 1 and all(word in lines[0] for word in words),
         "readers_go_on": checkpoint.load_latest(run).iteration == 1,

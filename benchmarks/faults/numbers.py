@@ -86,12 +86,12 @@ def nan_terms(folder: Path) -> Figures:
     for make in FAULTS.values():
         for value in (torch.nan, torch.inf, -torch.inf):
             env = puck_env(num_envs=4, limit=None, **make(env=2, step=3, value=value))
-            root_E = env.reset()
+            env_state_E: Any = {"next": env.reset()}
             for _ in range(2):
-                root_E = push(env, root_E)["next"]
+                env_state_E = push(env, env_state_E["next"])
             early += len(env.non_finite_terms())
             for _ in range(2):
-                root_E = push(env, root_E)["next"]
+                env_state_E = push(env, env_state_E["next"])
             lines = env.non_finite_terms()
             cases += 1
             named += len(lines) == 1 and "'odd'" in lines[0] and "env 2 at its step 3" in lines[0]
@@ -109,7 +109,8 @@ def non_finite_loss(folder: Path) -> Figures:
     trainer = build(conf.compose([*children.SMALLEST, "logger=none", "objective.max_skipped_steps=4"]))
     trainer.iterate()
     with torch.no_grad():
-        next(trainer.update.networks["critic"].parameters()).fill_(torch.nan)
+        update: Any = trainer.update
+        next(update.critic.parameters()).fill_(torch.nan)
     before = [parameter.clone() for parameter in trainer.update.actor.parameters()]
     iterations = named = 0
     try:
