@@ -11,14 +11,14 @@ from typing import Any
 
 import torch
 
+from benchmarks import determinism
 from benchmarks.faults.growth import memory
 from benchmarks.faults.numbers import count_non_finite
 from benchmarks.faults.row import AT_LEAST, AT_MOST, EXACTLY, Figures, Row
-from benchmarks.faults.saving import same_bits
 from ksim_rl import conf
 from ksim_rl.physics import World
 from ksim_rl.trainers import Hook, RunProgress, Trainer, run_folder
-from ksim_rl.trainers.build import build, build_env
+from ksim_rl.trainers.build import build_env
 
 GO1 = ("task=go1_velocity_flat", "device=cuda", "trainer.eval_episodes=0", "trainer.video=false")
 ALGORITHMS = {
@@ -135,16 +135,11 @@ def gpu_nan_worlds(folder: Path, *, envs: int, device: str = "cuda") -> Figures:
 
 
 def gpu_same_seed(folder: Path, *, iterations: int) -> Figures:
-    """Train twice from one seed, and compare every tensor."""
-    states = []
-    for _ in range(2):
-        trainer = build(conf.compose([*GO1, "num_envs=1024", "logger=none"]))
-        for _ in range(iterations):
-            trainer.iterate()
-        trainer.settle()
-        states.append(trainer.state_dict())
-        trainer.collector.env.close(raise_if_closed=False)
-    return {"iterations": iterations, "differ": same_bits(*states)}
+    """Train twice from one seed, and compare every tensor as `benchmarks.determinism` does."""
+    cfg = conf.compose([*GO1, "num_envs=1024", "logger=none"])
+    figures, _, lines = determinism.compare(cfg, runs=2, iterations=iterations)
+    print(*lines, sep="\n", flush=True)
+    return {"iterations": iterations, "differ": figures["tensors_that_differ"]}
 
 
 ROWS = {
