@@ -25,6 +25,9 @@ from mujoco_warp._src.math import rot_vec_quat as rot_vec_quat
 # What a step adds to the inertia matrix and to the bias forces for tendons.
 from mujoco_warp._src.smooth import tendon_armature as tendon_armature
 from mujoco_warp._src.smooth import tendon_bias as tendon_bias
+
+# The bits of `contact.type`.
+from mujoco_warp._src.types import ContactType as ContactType
 from torch import Tensor
 
 FIXED = int(mjw.SetConstGroup.FIXED)
