@@ -9,7 +9,9 @@ import numpy as np
 import warp as wp
 
 from ksim_rl.physics import kernels, upstream
+from ksim_rl.physics.contact_sensors import ContactReadings
 from ksim_rl.physics.newton import solver as newton
+from ksim_rl.physics.rows.contact_lists import ContactLists
 from ksim_rl.physics.smooth.stages import calls_back, smooth_dynamics
 
 # These read the contacts of the last substep's collision pass, which a reset empties.
@@ -52,6 +54,13 @@ class Substeps:
             self._warp_model_of_solver = dataclasses.replace(warp_model, opt=opt)
             self._solve = newton.solver(self._warp_model_of_solver, warp_data_E)
         self._dynamics = smooth_dynamics(warp_model, warp_data_E) if one_kernel_dynamics else None
+        self._contacts: ContactReadings | None = None
+        if self._warp_model_of_solver is not None and one_kernel_dynamics:
+            lists = ContactLists(warp_model, warp_data_E)
+            self._contacts = ContactReadings(mj_model, warp_model, warp_data_E, lists)
+            self._warp_model_of_solver = upstream.without_contact_sensors(
+                self._warp_model_of_solver, self._contacts.sensors
+            )
         self._refresh_warp_model = upstream.with_refreshable_sensors(
             warp_model, skip=has_history | np.isin(sensor_type, COLLISION_SENSORS), sensor_type=sensor_type
         )
@@ -76,7 +85,14 @@ class Substeps:
             sensors = sensors or self._always_senses
             opt = self._warp_model_of_solver.opt
             opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
-            newton.step(self._warp_model_of_solver, self.warp_data_E, self._solve, dynamics, sensors=sensors)
+            newton.step(
+                self._warp_model_of_solver,
+                self.warp_data_E,
+                self._solve,
+                dynamics,
+                sensors=sensors,
+                contacts=self._contacts,
+            )
         else:
             mjw.step(self.warp_model if sensors else self._silent_warp_model, self.warp_data_E)
 

@@ -5,6 +5,7 @@ Each part says why it is needed; all were checked with MuJoCo Warp 4.0.0 and War
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import mujoco
 import mujoco_warp as mjw
@@ -22,9 +23,13 @@ from mujoco_warp._src.math import mul_quat as mul_quat
 from mujoco_warp._src.math import quat_to_mat as quat_to_mat
 from mujoco_warp._src.math import rot_vec_quat as rot_vec_quat
 
+# How its contact sensors match the elements of a contact, and the force of that.
+from mujoco_warp._src.sensor import _check_match
+
 # What a step adds to the inertia matrix and to the bias forces for tendons.
 from mujoco_warp._src.smooth import tendon_armature as tendon_armature
 from mujoco_warp._src.smooth import tendon_bias as tendon_bias
+from mujoco_warp._src.support import contact_force_fn as contact_force_fn
 
 # The bits of `contact.type`.
 from mujoco_warp._src.types import ContactType as ContactType
@@ -33,6 +38,7 @@ from torch import Tensor
 FIXED = int(mjw.SetConstGroup.FIXED)
 # The two columns of `nxn_pairid` for a pair that never makes a contact, and for one that no sensor measures.
 NO_CONTACT, NO_SENSOR = -2, -1
+is_of = _check_match
 
 
 def per_world_fields() -> tuple[str, ...]:
@@ -97,6 +103,12 @@ def with_refreshable_sensors(
         nsensortaxel=0,
         nrangefinder=0 if skips_rays else warp_model.nrangefinder,
     )
+
+
+def without_contact_sensors(warp_model: mjw.Model, sensors: Sequence[int]) -> mjw.Model:
+    """Return a model on the same arrays that does not compute some contact sensors with forces."""
+    left = [sensor for sensor in warp_model.sensor_contact_acc_adr.numpy() if sensor not in sensors]
+    return dataclasses.replace(warp_model, sensor_contact_acc_adr=wp.array(left, dtype=int))
 
 
 def collide_boxes_exactly(warp_model: mjw.Model) -> None:

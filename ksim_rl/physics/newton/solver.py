@@ -6,6 +6,7 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
+from ksim_rl.physics.contact_sensors import ContactReadings
 from ksim_rl.physics.newton.kernel import (
     CUDA_LANES,
     Problem,
@@ -120,12 +121,13 @@ def step(
     dynamics: Callable[[bool], None] | None = None,
     *,
     sensors: bool,
+    contacts: ContactReadings | None = None,
 ) -> None:
     """Launch a physics step: that of MuJoCo Warp, with this solver.
 
     The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
     not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel,
-    with forces or without.
+    with forces or without; `contacts` reads contact sensors that the model leaves out.
     """
     m, d = warp_model, warp_data_E
     if dynamics is None:
@@ -148,9 +150,16 @@ def step(
         mjw.fwd_actuation(m, d)
         mjw.fwd_acceleration(m, d, factorize=True)
     solve()
-    if m.opt.run_rne_postconstraint or (sensors and m.sensor_rne_postconstraint):
+    runs_rne = m.opt.run_rne_postconstraint or (sensors and m.sensor_rne_postconstraint)
+    if contacts is not None and (runs_rne or sensors):
+        contacts.list()
+    if runs_rne and contacts is not None:
+        contacts.rne_postconstraint(m)
+    elif runs_rne:
         mjw.rne_postconstraint(m, d)
     if sensors:
+        if contacts is not None:
+            contacts.read_sensors()
         mjw.sensor_acc(m, d, skip_rne_postconstraint=True)
     if m.opt.integrator == mjw.IntegratorType.EULER:
         mjw.euler(m, d)

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ksim_rl.physics.contact_sensors import NET, STRONGEST
 from ksim_rl.scene.names import as_index, match_names
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.sensor import Sensor, SensorTracker, check_present, sensor_columns
@@ -23,9 +24,6 @@ _OBJECTS = {
     "subtree": mujoco.mjtObj.mjOBJ_XBODY,
 }
 _TABLES = {"geom": "geom", "body": "body", "subtree": "body"}
-# Bits of MuJoCo's contact sensor (mjtConDataField) and its reductions.
-_FOUND, _FORCE, _POSITION, _NORMAL, _TANGENT = 1 << 0, 1 << 1, 1 << 4, 1 << 5, 1 << 6
-_STRONGEST, _NET = 2, 3
 _RGBA = (1.0, 0.55, 0.1, 1.0)
 
 
@@ -94,18 +92,13 @@ class ContactSensor(Sensor):
             table = _TABLES[self.against_kind]
             check_present(name, table, self.against, parts[table])
             other = {"reftype": _OBJECTS[self.against_kind], "refname": self.against}
-        bits = _FOUND | _FORCE | _POSITION
-        reduction = _NET
-        if self.reduce == "strongest":
-            # A single contact's force is in the axes of that contact, which are needed to turn it.
-            bits, reduction = bits | _NORMAL | _TANGENT, _STRONGEST
         for element in elements:
             spec.add_sensor(
                 name=f"{name}_{element}",
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
                 objtype=_OBJECTS[self.kind],
                 objname=element,
-                intprm=[bits, reduction, 1],
+                intprm=[*(NET if self.reduce == "net" else STRONGEST)],
                 **other,
             )
 

@@ -1,0 +1,166 @@
+"""The kernel of contact sensors, against MuJoCo Warp's own and the C engine, on the same contacts and forces."""
+
+import itertools
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from ksim_rl.physics import SimCfg, World, prepare_spec
+from ksim_rl.physics.contact_sensors import NET, STRONGEST, read_by_us
+from tests.physics import row_models
+
+OBJECT = mujoco.mjtObj
+ELEMENTS = ((OBJECT.mjOBJ_GEOM, "box"), (OBJECT.mjOBJ_GEOM, "floor"), (OBJECT.mjOBJ_BODY, "hand"))
+TREES = ((OBJECT.mjOBJ_XBODY, "trunk"), (OBJECT.mjOBJ_XBODY, "arm"))
+OTHERS = (None, (OBJECT.mjOBJ_GEOM, "floor"), (OBJECT.mjOBJ_BODY, "world"), (OBJECT.mjOBJ_XBODY, "trunk"))
+# What only MJCF of users has.
+FOREIGN = (
+    (NET[0], 1, 1),
+    (*STRONGEST[:2], 3),
+    (STRONGEST[0], NET[1], 1),
+    (511, *STRONGEST[1:]),
+)
+ENVS = 4
+
+
+def model(cone: str) -> mujoco.MjModel:
+    spec = mujoco.MjSpec.from_string(row_models.XML)
+    spec.option.cone = getattr(mujoco.mjtCone, f"mjCONE_{cone.upper()}")
+    prepare_spec(spec, ())
+    for own, other, layout in itertools.product((*ELEMENTS, *TREES), OTHERS, (NET, STRONGEST, *FOREIGN)):
+        sensor = spec.add_sensor(
+            type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=own[0], objname=own[1], intprm=[*layout]
+        )
+        if other is not None:
+            sensor.reftype, sensor.refname = other
+    return spec.compile()
+
+
+def stepped(cone: str, *, one_kernel: bool = True) -> World:
+    """Return worlds after one step from states in which they touch, the last one in the air."""
+    sim = SimCfg(njmax=120, nconmax=40, one_kernel_dynamics=one_kernel)
+    world = World(model(cone), num_envs=ENVS, sim=sim)
+    place(world)
+    world.step()
+    return world
+
+
+def place(world: World) -> None:
+    rng = np.random.default_rng(0)
+    qpos = world.qpos_EL.numpy()
+    qpos[:, 2] -= 0.03
+    qpos += 0.05 * rng.standard_normal(qpos.shape).astype(np.float32)
+    qpos[-1, 2] += 3.0
+    world.qvel_EL.numpy()[:] = 0.5 * rng.standard_normal(world.qvel_EL.shape)
+
+
+def columns(mj_model: mujoco.MjModel, *, ours: bool) -> np.ndarray:
+    read = read_by_us(mj_model)
+    return np.concatenate(
+        [
+            np.arange(adr, adr + dim)
+            for sensor, (adr, dim) in enumerate(zip(mj_model.sensor_adr, mj_model.sensor_dim, strict=True))
+            if (sensor in read) == ours
+        ]
+    )
+
+
+@pytest.fixture(scope="module", params=["pyramidal", "elliptic"])
+def world(request: pytest.FixtureRequest) -> World:
+    return stepped(request.param)
+
+
+def test_values_are_those_of_mujoco_warp_which_reads_the_other_kinds(world: World):
+    ours, theirs = (columns(world.mj_model, ours=ours) for ours in (True, False))
+    assert len(read_by_us(world.mj_model)) == 40
+    read = world.sensordata_EL.numpy().copy()
+    assert (read[:-1, ours] != 0.0).mean() > 0.2 and (read[:-1, theirs] != 0.0).mean() > 0.2
+    with wp.ScopedDevice("cpu"):
+        world.warp_data_E.sensordata.zero_()
+        mjw.sensor_acc(world.warp_model, world.warp_data_E)
+    expected = world.sensordata_EL.numpy()
+    np.testing.assert_allclose(read[:, ours], expected[:, ours], rtol=2e-6, atol=2e-5)
+    np.testing.assert_array_equal(read[:, theirs], expected[:, theirs])
+    world.sensordata_EL.numpy()[:] = read
+
+
+def test_values_are_those_of_the_c_engine(world: World):
+    ours, start = columns(world.mj_model, ours=True), World(world.mj_model, num_envs=ENVS, sim=world.sim)
+    place(start)
+    for row in range(ENVS):
+        mj_data = mujoco.MjData(world.mj_model)
+        mj_data.qpos[:], mj_data.qvel[:] = start.qpos_EL[row].numpy(), start.qvel_EL[row].numpy()
+        mujoco.mj_forward(world.mj_model, mj_data)
+        scale = max(1.0, np.abs(mj_data.sensordata).max())
+        np.testing.assert_allclose(
+            world.sensordata_EL.numpy()[row, ours], mj_data.sensordata[ours], rtol=1e-3, atol=1e-4 * scale
+        )
+
+
+def test_bits_do_not_depend_on_places_in_the_pool(world: World):
+    contacts = world._substeps._contacts
+    assert contacts is not None
+    read = world.sensordata_EL.numpy().copy()
+    with wp.ScopedDevice("cpu"):
+        contacts.rne_postconstraint(world.warp_model)
+    forces = world.view("cfrc_ext").numpy().copy()
+    for seed in range(3):
+        row_models.permute_pool(world, seed)
+        world.sensordata_EL.zero_()
+        with wp.ScopedDevice("cpu"):
+            contacts.list()
+            contacts.read_sensors()
+            contacts.rne_postconstraint(world.warp_model)
+        np.testing.assert_array_equal(world.view("cfrc_ext").numpy(), forces)
+        ours = columns(world.mj_model, ours=True)
+        np.testing.assert_array_equal(world.sensordata_EL.numpy()[:, ours], read[:, ours])
+
+
+def test_of_equally_strong_contacts_the_first_in_the_order_of_the_c_engine_counts():
+    """A ball between two walls that press alike: MuJoCo Warp's choice would be that of its sort."""
+    spec = mujoco.MjSpec.from_string(
+        """<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody>
+        <geom name="left" type="box" size="0.1 1 1" pos="-0.19 0 0"/>
+        <geom name="right" type="box" size="0.1 1 1" pos="0.19 0 0"/>
+        <body name="ball"><freejoint/><geom name="ball" size="0.1"/></body></worldbody></mujoco>"""
+    )
+    for layout in (NET, STRONGEST):
+        spec.add_sensor(
+            type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=OBJECT.mjOBJ_GEOM, objname="ball", intprm=[*layout]
+        )
+    prepare_spec(spec, ())
+    world = World(spec.compile(), num_envs=2, sim=SimCfg(njmax=20, nconmax=8, one_kernel_dynamics=True))
+    mj_data = mujoco.MjData(world.mj_model)
+    mujoco.mj_forward(world.mj_model, mj_data)
+    world.step()
+    force, other = mj_data.efc_force.reshape(2, -1).sum(1)
+    assert force == pytest.approx(other, abs=1e-9) and force > 1.0
+    assert mj_data.sensordata[11] == pytest.approx(-0.095)  # the left wall's
+    for row in world.sensordata_EL.numpy():
+        np.testing.assert_allclose(row, mj_data.sensordata, rtol=1e-3, atol=2e-3)
+
+
+def test_forces_on_bodies_are_those_of_mujoco_warp(world: World):
+    contacts, found = world._substeps._contacts, {}
+    assert contacts is not None
+    world.xfrc_applied_EL[:, 1, :] = torch.arange(6.0)
+    with wp.ScopedDevice("cpu"):
+        for name, launch in (("ours", contacts.rne_postconstraint), ("theirs", theirs_of(world))):
+            launch(world.warp_model)
+            found[name] = {part: world.view(part).numpy().copy() for part in ("cfrc_ext", "cfrc_int", "cacc")}
+    for part, expected in found["theirs"].items():
+        scale = max(1.0, np.abs(expected).max())
+        np.testing.assert_allclose(found["ours"][part], expected, rtol=1e-5, atol=2e-6 * scale)
+    assert np.abs(found["ours"]["cfrc_ext"]).max() > 10.0
+
+
+def theirs_of(world: World):
+    return lambda warp_model: mjw.rne_postconstraint(warp_model, world.warp_data_E)
+
+
+def test_without_the_kernel_of_the_dynamics_mujoco_warp_reads_all():
+    assert stepped("elliptic", one_kernel=False)._substeps._contacts is None
