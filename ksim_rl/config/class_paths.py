@@ -33,6 +33,8 @@ MOVED = {
     ),
 }
 """Paths of 0.1 and where their classes are now, applied in turn; else a class is found by its package's exports."""
+GONE = {("SimCfg", "deterministic")}
+"""Fields that earlier versions wrote into configs, by their class, and that nothing needs any more."""
 
 
 def public_path(cls: type) -> str:

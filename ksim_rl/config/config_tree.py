@@ -176,7 +176,7 @@ def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> 
     fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
     given = {}
     for key, entry in tree.items():
-        if key == TARGET:
+        if key == TARGET or (cls.__name__, key) in class_paths.GONE:
             continue
         where = _join(path, key)
         if key not in fields:

@@ -26,15 +26,12 @@ class SimCfg(Checked):
         ccd_iterations: most iterations of convex collision detection.
         njmax: most constraint rows of one world; `None` probes the model.
         nconmax: contacts (and candidate pairs) per world. They share one pool of `num_envs * nconmax`; `None` probes.
-        deterministic: ask MuJoCo Warp for its reproducible contact order, constraint order and sums on a GPU, at a cost
-            (large for scenes with many contacts). With MuJoCo Warp 4.0 it narrows the differences between runs and does
-            not remove all of them (Go1 on an H200: 5e-7 in qpos after a step). On the CPU results are always the same.
         one_kernel_solver: solve the constraints of a substep in one kernel instead of some hundred. It is MuJoCo Warp's
             algorithm, so that results agree up to rounding (four substeps of 4096 worlds on an H200: Go1 2.4 ms instead
             of 8.2, G1 5.0 instead of 9.9). Models out of its range (solvers other than Newton, integrators "rk4" and
             "discrete", more than 64 degrees of freedom, more than 700 to 1700 constraint rows, flexes, sleeping,
-            energies, noslip, no warm start, a dense Jacobian) and `deterministic` take MuJoCo Warp's own;
-            `World.one_kernel_unavailable` says why.
+            energies, noslip, no warm start, a dense Jacobian) take MuJoCo Warp's own; `World.one_kernel_unavailable`
+            says why.
         one_kernel_dynamics: with the one-kernel solver, compute all that constraints have no part in (kinematics,
             inertias, bias, passive and actuator forces) in one kernel instead of some 35. Results agree up to rounding.
             Models out of its range (tendons, fluids, gravity compensation, muscles, delayed actuators, transmissions
@@ -61,7 +58,6 @@ class SimCfg(Checked):
     ccd_iterations: Count | None = None
     njmax: Count | None = None
     nconmax: Count | None = None
-    deterministic: bool = False
     one_kernel_solver: bool = True
     one_kernel_dynamics: bool | None = None
     require_graphs: bool = False

@@ -82,7 +82,6 @@ class World(views.DataViews):
             self.warp_model = warp_model_of(stored_model, dict.fromkeys(expanded, num_envs))
             follow_the_c_engine(self.warp_model)
             self.warp_model.opt.warn_overflow = 0
-            self.warp_model.opt.deterministic = self.sim.deterministic
             if self.sim.tolerance is not None:
                 self.warp_model.opt.tolerance.fill_(self.sim.tolerance)
             if self.device.type == "cuda":

@@ -51,6 +51,15 @@ def test_a_task_config_that_0_1_wrote_builds_the_same_task(name):
     assert from_tree(ManagerBasedRlEnvCfg, RUNS[name]) == envs.make_cfg(name)
 
 
+def test_fields_that_are_gone_are_ignored_and_only_where_they_were():
+    tree = RUNS[min(RUNS)]
+    assert from_tree(
+        ManagerBasedRlEnvCfg, {**tree, "sim": {**tree["sim"], "deterministic": True}}
+    ) == from_tree(ManagerBasedRlEnvCfg, tree)
+    with pytest.raises(ValueError, match="deterministic"):
+        from_tree(ManagerBasedRlEnvCfg, {**tree, "deterministic": True})
+
+
 def test_classes_that_the_command_line_could_not_load_are_noted():
     here, plugged = {"_target_": "__main__.Mine"}, {"_target_": "some_package.terms.Alive", "weight": 1.0}
     own = {"_target_": "ksim_rl.mdp.Alive", "inside": [{"_target_": "torchrl.envs.transforms.InitTracker"}]}

@@ -12,7 +12,7 @@ STEPS = 24
 
 def run(clip: str, *, captured: bool):
     """Roots after each step and the log in the end, on the CPU; `captured` replays a graph from the third step on."""
-    env = busy_env(clip, device="cuda", sim=SimCfg(deterministic=True))
+    env = busy_env(clip, device="cuda", sim=SimCfg())
     chosen = torch.sin(torch.arange(STEPS * NUM_ENVS, device="cuda", dtype=torch.float32)).view(STEPS, -1, 1)
     root_E, action = env.reset(), torch.zeros(NUM_ENVS, 1, device="cuda")
 

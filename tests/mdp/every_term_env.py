@@ -126,9 +126,7 @@ REWARDS: dict[str, RewardTerm] = {
 }
 
 
-def every_term_env(
-    num_envs: int = 3, device: str = "cpu", *, deterministic: bool = False
-) -> ManagerBasedRlEnv:
+def every_term_env(num_envs: int = 3, device: str = "cpu") -> ManagerBasedRlEnv:
     """Build the env: 50 Hz, episodes of 0.24 s, pushes, commands that change often."""
     group = ObservationGroupCfg(
         terms={name: ObservationTermCfg(term=term) for name, term in OBSERVATIONS.items()}
@@ -136,7 +134,7 @@ def every_term_env(
     often = {"resampling_time_range_s": (0.04, 0.1)}
     cfg = ManagerBasedRlEnvCfg(
         decimation=4,
-        sim=SimCfg(njmax=80, nconmax=40, deterministic=deterministic),
+        sim=SimCfg(njmax=80, nconmax=40),
         scene=SceneCfg(
             robots={"quadruped": MjcfRobot(source=QUADRUPED)},
             sensors={

@@ -246,7 +246,7 @@ def test_models_out_of_range_take_the_solver_of_mujoco_warp():
         SimCfg(one_kernel_solver="auto")  # pyright: ignore[reportArgumentType]
     world = World(model, num_envs=1, sim=sim)
     assert world.has_one_kernel_solver and world.one_kernel_unavailable is None
-    for setting in ({"deterministic": True}, {"one_kernel_solver": False}, {"integrator": "rk4"}):
+    for setting in ({"one_kernel_solver": False}, {"integrator": "rk4"}):
         world = World(model, num_envs=1, sim=dataclasses.replace(sim, **setting))
         reason = str(world.one_kernel_unavailable)
         assert not world.has_one_kernel_solver and next(iter(setting)) in reason, reason

@@ -41,7 +41,7 @@ def test_a_spec_takes_the_settings_too():
         ("iterations", 2.5, "whole number"),
         ("njmax", True, "whole number"),
         ("nconmax", -3, "nconmax=-3"),
-        ("deterministic", 1, "expected true or false"),
+        ("require_graphs", 1, "expected true or false"),
         ("nan_guard", "folder", "expected a NanGuardCfg"),
     ],
 )

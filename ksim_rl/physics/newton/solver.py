@@ -60,8 +60,6 @@ def one_kernel_unavailable(mj_model: mujoco.MjModel, sim: SimCfg, *, njmax: int)
     """Return why the worlds of this model take MuJoCo Warp's own solver, or None where one kernel solves them."""
     if not sim.one_kernel_solver:
         return "sim.one_kernel_solver is False"
-    if sim.deterministic:
-        return "sim.deterministic is True"
     return unsuited(mj_model, njmax=njmax)
 
 
