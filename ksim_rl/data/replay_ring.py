@@ -124,13 +124,15 @@ class PrioritySampler(SavedByStateDict, Sampler):
                 "extend by data with one batch dim"
             )
         score_N = self._scores(storage)
-        upto_N = score_N.cumsum(0)
+        # Whole numbers, whose sum has no order: a GPU adds floats up otherwise each time. One takes up to 2^62 / N.
+        unit = score_N.amax().clamp_min(1e-300) * (score_N.shape[0] / 2.0**62)
+        upto_N = (score_N / unit).to(torch.int64).cumsum(0)
         device = upto_N.device
         share_B = torch.arange(batch_size, dtype=torch.float64, device=device)
         share_B = (share_B + torch.rand(batch_size, dtype=torch.float64, device=device)) / batch_size
         # Rounding could lead past the last entry that has a score.
         last = (score_N > 0.0).to(torch.int64).mul_(torch.arange(score_N.shape[0], device=device)).amax()
-        index_B = torch.searchsorted(upto_N, share_B * upto_N[-1], right=True)
+        index_B = torch.searchsorted(upto_N, (share_B * upto_N[-1]).to(torch.int64), right=True)
         index_B = torch.minimum(index_B, last)
         lowest = torch.where(score_N > 0.0, score_N, torch.inf).amin()
         # Where nothing has a score, what is drawn is masked: a finite weight keeps the losses' means finite.

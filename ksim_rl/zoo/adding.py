@@ -64,9 +64,7 @@ def _of_run(saved: checkpoint.Checkpoint, *, name: str) -> Card:
         raise ValueError(f"{run}: made of {commit}: train in a clean clone of one commit, and add that run")
     _, rows = csv_table.read_table(run / listing.METRICS)
     earned = [(int(row[csv_table.STEP]), value) for row in rows for value in listing.numbers([row], RETURN)]
-    curve = tuple(
-        (step, float(f"{value:.4g}")) for step, value in earned[:: max(1, len(earned) // CURVE_POINTS)]
-    )
+    curve = tuple((step, float(f"{value:.4g}")) for step, value in earned[:: max(1, len(earned) // CURVE_POINTS)])
     return Card(
         name=name,
         task=str(saved.config["task_name"]),

@@ -1,0 +1,82 @@
+"""Equal runs on a GPU have equal bits, whatever the order in which its threads come."""
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+
+from ksim_rl import conf
+from ksim_rl.data import PrioritySampler
+from ksim_rl.physics import Captured
+from ksim_rl.trainers.build import build_env
+
+LOOKS = ("qpos", "qvel", "qacc", "qacc_warmstart", "sensordata", "cfrc_ext", "cacc", "xpos", "time")
+STEPS, LOOK_EVERY = 100, 10
+
+
+def walk(task: str, *, device: str, num_envs: int, steps: int = STEPS) -> list[dict[str, torch.Tensor]]:
+    """Return what the physics holds after each tenth captured control step with random actions, on the CPU."""
+    env: Any = build_env(
+        conf.compose([f"task={task}", f"device={device}", f"num_envs={num_envs}"]), num_envs=num_envs, seed=1
+    )
+    root_E, world = env.reset(), env.base_env.world
+    generator = torch.Generator(device).manual_seed(0)
+    action = torch.zeros_like(env.action_spec.rand())
+
+    def body() -> None:
+        _, after_E = env.step_and_maybe_reset(root_E.copy().set("action", action))
+        for key in list(root_E.keys(True, True)):
+            root_E.get(key).copy_(after_E.get(key))
+
+    step = Captured(body, device=device, warmup=2)
+    looks = []
+    for number in range(1, steps + 1):
+        action.copy_(2.0 * torch.rand(action.shape, device=device, generator=generator) - 1.0)
+        step()
+        if number % LOOK_EVERY == 0:
+            looks.append({name: world.last_substep(name).cpu().clone() for name in LOOKS})
+            looks[-1]["contacts"] = world.last_substep("nacon").cpu().clone()
+    assert step.ready == (device == "cuda")
+    env.close(raise_if_closed=False)
+    return looks
+
+
+def first_difference(one: list[dict[str, torch.Tensor]], other: list[dict[str, torch.Tensor]]) -> str | None:
+    """Return the step and the names of the arrays at which two runs differ first, with how many worlds do."""
+    for number, (mine, theirs) in enumerate(zip(one, other, strict=True), start=1):
+        differ = {name: _rows_that_differ(values, theirs[name]) for name, values in mine.items()}
+        if any(differ.values()):
+            return f"after step {number * LOOK_EVERY}, worlds that differ: {differ}"
+    return None
+
+
+def _rows_that_differ(one: torch.Tensor, other: torch.Tensor) -> int:
+    differ = one.view(torch.int32) != other.view(torch.int32)
+    return int(differ.reshape(differ.shape[0], -1).any(1).sum())
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("task", ["quadruped_velocity_flat", "humanoid_get_up"])
+def test_equal_worlds_stay_equal_bit_for_bit(task):
+    one, other = (walk(task, device="cuda", num_envs=512) for _ in range(2))
+    assert int(one[-1]["contacts"]) > 512
+    assert first_difference(one, other) is None
+
+
+@pytest.mark.gpu
+def test_prioritized_draws_from_equal_priorities_are_equal():
+    size, drawn = 2**22, []
+    for _ in range(2):
+        sampler = PrioritySampler(size, device="cuda")
+        buffer = ReplayBuffer(
+            storage=LazyTensorStorage(size, device="cuda"), sampler=sampler, batch_size=2**16
+        )
+        buffer.extend(TensorDict({"number": torch.arange(size, device="cuda")}, [size]))
+        generator = torch.Generator("cuda").manual_seed(0)
+        priority_N = torch.rand(size, device="cuda", generator=generator)
+        buffer.update_priority(torch.arange(size, device="cuda"), priority_N)
+        torch.manual_seed(1)
+        drawn.append(buffer.sample()["number"])
+    assert torch.equal(*drawn)
