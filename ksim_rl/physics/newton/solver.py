@@ -118,6 +118,7 @@ def step(
     warp_data_E: mjw.Data,
     solve: Callable[[], None],
     dynamics: Callable[[bool], None] | None = None,
+    make_rows: Callable[[], None] | None = None,
     *,
     sensors: bool,
 ) -> None:
@@ -125,7 +126,7 @@ def step(
 
     The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
     not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel,
-    with forces or without.
+    with forces or without, and `make_rows`, which needs it, the constraint rows as one.
     """
     m, d = warp_model, warp_data_E
     if dynamics is None:
@@ -137,7 +138,10 @@ def step(
             mjw.camlight(m, d)
         if m.opt.run_collision_detection:
             mjw.collision(m, d)
-        mjw.make_constraint(m, d)
+        if make_rows is None:
+            mjw.make_constraint(m, d)
+        else:
+            make_rows()
     if sensors:
         d.sensordata.zero_()
         mjw.sensor_pos(m, d)
