@@ -53,7 +53,8 @@ def _summary(cfg: ManagerBasedRlEnvCfg, driver: EnvDriver) -> str:
         f"{driver.step_dt:g} s per step = {cfg.decimation} x {driver.physics_dt:g} s, "
         f"episodes of {length if driver.max_episode_length else 'any length'}\n"
         f"constraints are solved by {_kernels(driver.world.one_kernel_unavailable, 'solver')}\n"
-        f"what precedes them is computed by {_kernels(driver.world.one_kernel_dynamics_unavailable, 'kernels')}"
+        f"what precedes them is computed by {_kernels(driver.world.one_kernel_dynamics_unavailable, 'kernels')}\n"
+        f"their rows are made by {_kernels(driver.world.one_kernel_rows_unavailable, 'kernels')}"
         + "".join(f"\n{line}" for line in driver.non_finite.lines())
     )
 

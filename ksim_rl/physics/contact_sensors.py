@@ -14,7 +14,7 @@ import mujoco_warp as mjw
 import warp as wp
 
 from ksim_rl.physics import upstream
-from ksim_rl.physics.rows.contact_lists import ContactLists, ordering
+from ksim_rl.physics.rows.contact_lists import ContactLists
 from ksim_rl.physics.structs import filled, struct_with
 
 # The `intprm` of the two kinds: bits of mjtConDataField, the reduction of several contacts, and the number of slots.
@@ -44,6 +44,7 @@ def read_by_us(mj_model: mujoco.MjModel) -> list[int]:
 
 
 @struct_with(
+    ("", ContactLists, "count ids"),
     ("", mjw.Option, "cone"),
     ("", mjw.Model, "body_parentid geom_bodyid sensor_objtype sensor_objid sensor_reftype sensor_refid"),
     ("", mjw.Model, "sensor_intprm sensor_adr"),
@@ -55,8 +56,6 @@ class Problem:
     """What the kernels read and write, the sensors that they read, and the lists of contacts."""
 
     sensors: wp.array[int]
-    count: wp.array[int]
-    ids: wp.array2d[int]
     forces: wp.array2d[wp.spatial_vector]
 
 
@@ -74,20 +73,18 @@ class ContactReadings:
         self.sensors = read_by_us(mj_model)
         own = {
             "sensors": wp.array(self.sensors, dtype=int, device=d.qpos.device),
-            "count": lists.count,
-            "ids": lists.ids,
             "forces": wp.empty_like(d.xfrc_applied),
         }
         contacts = {f"contact_{name}": array for name, array in vars(d.contact).items()}
-        self._problem = filled(Problem, own, contacts, {"efc_force": d.efc.force}, m.opt, m, d)
+        self._problem = filled(Problem, own, lists, contacts, {"efc_force": d.efc.force}, m.opt, m, d)
         # The same arrays, but the forces of contacts are among those that users apply, and it has no pool of contacts.
         self._without_pool = dataclasses.replace(d, xfrc_applied=own["forces"], naconmax=0)
-        self._lists, self._order = lists, ordering(lists)
+        self._lists = lists
 
     def list(self) -> None:
-        """List each world's contacts."""
+        """List each world's contacts, where no kernel of constraint rows has."""
         self._lists.append()
-        self._order()
+        self._lists.order()
 
     def read_sensors(self) -> None:
         """Write the sensors that contacts match; the others have to be zero before."""

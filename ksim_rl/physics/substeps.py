@@ -1,7 +1,7 @@
 """This module launches the substeps of a world, sensors on the last one only, and the refresh of derived quantities."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import mujoco_warp as mjw
@@ -11,6 +11,7 @@ import warp as wp
 from ksim_rl.physics import kernels, upstream
 from ksim_rl.physics.contact_sensors import ContactReadings
 from ksim_rl.physics.newton import solver as newton
+from ksim_rl.physics.rows.constraint_rows import constraint_rows
 from ksim_rl.physics.rows.contact_lists import ContactLists
 from ksim_rl.physics.smooth.stages import calls_back, smooth_dynamics
 
@@ -29,7 +30,8 @@ class Substeps:
 
     The variants share all arrays with `warp_model`. Build them once its arrays are in their final place. With
     `one_kernel_solver`, `newton` solves, which must suit the model, instead of MuJoCo Warp's own solver. Then, with
-    `one_kernel_dynamics`, which must suit it too, one kernel precedes the constraints.
+    `one_kernel_dynamics`, which must suit it too, one kernel precedes the constraints, and then, with
+    `one_kernel_rows`, one makes their rows, and `contact_lists` besides, from which contact sensors are read.
     """
 
     def __init__(
@@ -40,6 +42,7 @@ class Substeps:
         *,
         one_kernel_solver: bool = False,
         one_kernel_dynamics: bool = False,
+        one_kernel_rows: bool = False,
     ) -> None:
         self.warp_model, self.warp_data_E = warp_model, warp_data_E
         sensor_type = mj_model.sensor_type
@@ -54,10 +57,13 @@ class Substeps:
             self._warp_model_of_solver = dataclasses.replace(warp_model, opt=opt)
             self._solve = newton.solver(self._warp_model_of_solver, warp_data_E)
         self._dynamics = smooth_dynamics(warp_model, warp_data_E) if one_kernel_dynamics else None
+        self.contact_lists: ContactLists | None = None
+        self._make_rows: Callable[[], None] | None = None
         self._contacts: ContactReadings | None = None
-        if self._warp_model_of_solver is not None and one_kernel_dynamics:
-            lists = ContactLists(warp_model, warp_data_E)
-            self._contacts = ContactReadings(mj_model, warp_model, warp_data_E, lists)
+        if one_kernel_rows and self._warp_model_of_solver is not None:
+            self.contact_lists = ContactLists(warp_model, warp_data_E)
+            self._make_rows = constraint_rows(warp_model, warp_data_E, self.contact_lists)
+            self._contacts = ContactReadings(mj_model, warp_model, warp_data_E, self.contact_lists)
             self._warp_model_of_solver = upstream.without_contact_sensors(
                 self._warp_model_of_solver, self._contacts.sensors
             )
@@ -85,14 +91,8 @@ class Substeps:
             sensors = sensors or self._always_senses
             opt = self._warp_model_of_solver.opt
             opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
-            newton.step(
-                self._warp_model_of_solver,
-                self.warp_data_E,
-                self._solve,
-                dynamics,
-                sensors=sensors,
-                contacts=self._contacts,
-            )
+            launches = self._solve, dynamics, self._make_rows, self._contacts
+            newton.step(self._warp_model_of_solver, self.warp_data_E, *launches, sensors=sensors)
         else:
             mjw.step(self.warp_model if sensors else self._silent_warp_model, self.warp_data_E)
 

@@ -73,10 +73,11 @@ def test_the_first_line_says_how_many_and_how_long():
 
 
 def test_the_next_lines_say_what_kernels_compute_physics():
-    assert explained().splitlines()[1:3] == [
+    assert explained().splitlines()[1:4] == [
         "constraints are solved by one kernel",
         "what precedes them is computed by MuJoCo Warp's own kernels, "
         "because sim.one_kernel_dynamics is None, on the CPU",
+        "their rows are made by MuJoCo Warp's own kernels, because what precedes them is not one kernel",
     ]
     env = puck_env(limit=None, sim=SimCfg(solver="cg", one_kernel_dynamics=True))
     solver, kernels = env.explain().splitlines()[1:3]

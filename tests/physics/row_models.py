@@ -30,7 +30,7 @@ XML = """
         <geom name="capsule" type="capsule" size="0.04" fromto="0.1 0 -0.05 0.3 0 -0.06" mass="0.4" condim="3"/>
         <body name="hand" pos="0.35 0 -0.06">
           <joint name="wrist" axis="0 1 0" range="-0.2 0.3" limited="true" frictionloss="0.1" armature="0.01"/>
-          <geom name="ball" size="0.04" mass="0.2" solref="-500 -5"/>
+          <geom name="ball" size="0.04" mass="0.2" solref="-500 -5" gap="0.4"/>
         </body>
       </body>
       <body name="drawer" pos="-0.1 0 0.1">
@@ -38,7 +38,7 @@ XML = """
         <geom type="box" size="0.05 0.05 0.05" mass="0.3" contype="0" conaffinity="0"/>
       </body>
     </body>
-    <body name="post" pos="0 0.12 0.35">
+    <body name="post" pos="0 0.02 0.25">
       <joint name="pole" axis="0 0 1" pos="0 0 0" frictionloss="0.05"/>
       <joint name="lift" type="slide" axis="0 0 1"/>
       <geom name="lid" size="0.12" mass="0.5" condim="3"/>
@@ -67,13 +67,14 @@ def mj_model(cone: str) -> mujoco.MjModel:
 def touching(
     cone: str, *, njmax: int = 120, nconmax: int = 40, device: str = "cpu", num_envs: int = NUM_ENVS
 ) -> World:
-    """Return worlds in other states each, of which the last ones hang in the air, with what precedes the rows."""
+    """Return worlds in other states each, of which the last one hangs in the air, with what precedes the rows."""
     sim = SimCfg(njmax=njmax, nconmax=nconmax, one_kernel_dynamics=True)
     world = World(mj_model(cone), num_envs=num_envs, sim=sim, device=device, per_world_fields=PER_WORLD)
     generator = torch.Generator().manual_seed(0)
-    world.qpos_EL[:, 2] -= 0.03
-    for row, scale in ((world.qpos_EL, 0.05), (world.qvel_EL, 0.5)):
+    world.qpos_EL[:, 2] -= 0.02
+    for row, scale in ((world.qpos_EL, 0.03), (world.qpos_EL[:, 7:], 0.3), (world.qvel_EL, 0.5)):
         row.add_((scale * torch.randn(row.shape, generator=generator)).to(device))
+    world.qpos_EL[-1] = torch.from_numpy(mj_model(cone).qpos0)
     world.qpos_EL[-1, 2] += 3.0
     for name in PER_WORLD[:2]:
         field = world.field(name)

@@ -117,27 +117,34 @@ def step(
     warp_data_E: mjw.Data,
     solve: Callable[[], None],
     dynamics: Callable[[bool], None] | None = None,
+    make_rows: Callable[[], None] | None = None,
+    contacts: ContactReadings | None = None,
     *,
     sensors: bool,
-    contacts: ContactReadings | None = None,
 ) -> None:
     """Launch a physics step: that of MuJoCo Warp, with this solver.
 
     The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
     not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel,
-    with forces or without; `contacts` reads contact sensors that the model leaves out.
+    with forces or without, and `make_rows`, which needs it, the constraint rows as one, with the lists of contacts that
+    `contacts` reads.
     """
     m, d = warp_model, warp_data_E
     if dynamics is None:
         mjw.fwd_position(m, d, factorize=False)
         mjw.fwd_velocity(m, d)
+        if contacts is not None:
+            contacts.list()
     else:
         dynamics(True)
         if sensors:
             mjw.camlight(m, d)
         if m.opt.run_collision_detection:
             mjw.collision(m, d)
-        mjw.make_constraint(m, d)
+        if make_rows is None:
+            mjw.make_constraint(m, d)
+        else:
+            make_rows()
     if sensors:
         d.sensordata.zero_()
         mjw.sensor_pos(m, d)
@@ -149,8 +156,6 @@ def step(
         mjw.fwd_acceleration(m, d, factorize=True)
     solve()
     runs_rne = m.opt.run_rne_postconstraint or (sensors and m.sensor_rne_postconstraint)
-    if contacts is not None and (runs_rne or sensors):
-        contacts.list()
     if runs_rne and contacts is not None:
         contacts.rne_postconstraint(m)
     elif runs_rne:

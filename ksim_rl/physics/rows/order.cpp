@@ -5,8 +5,16 @@
 
 const int appended = problem.appended.data[world], contacts = wp::min(appended, ROOM);
 const int* const found = row_of(problem.found);
-const auto* const keys = row_of(problem.keys);
+unsigned long long* const keys = (unsigned long long*)row_of(problem.keys);
 int* const ids = row_of(problem.ids);
+
+each(contacts, [&](int item) {
+    const auto& geoms = problem.contact_geom.data[found[item]];
+    const int bodies[] = {problem.geom_bodyid.data[geoms[0]], problem.geom_bodyid.data[geoms[1]]};
+    auto pair_of = [](int a, int b) { return (unsigned)wp::min(a, b) << 16 | (unsigned)wp::max(a, b); };
+    keys[item] = (unsigned long long)pair_of(bodies[0], bodies[1]) << 32 | pair_of(geoms[0], geoms[1]);
+});
+sync();
 
 auto precedes = [&](int item, int other) {
     if (keys[item] != keys[other])
