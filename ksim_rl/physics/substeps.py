@@ -30,8 +30,8 @@ class Substeps:
 
     The variants share all arrays with `warp_model`. Build them once its arrays are in their final place. With
     `one_kernel_solver`, `newton` solves, which must suit the model, instead of MuJoCo Warp's own solver. Then, with
-    `one_kernel_dynamics`, which must suit it too, one kernel precedes the constraints, and then, with
-    `one_kernel_rows`, one makes their rows, and `contact_lists` besides, from which contact sensors are read.
+    `one_kernel_dynamics`, which must suit it too, one kernel precedes the constraints. Then, with `one_kernel_rows`,
+    one makes their rows, and `contact_lists` besides, from which contact sensors are read.
     """
 
     def __init__(

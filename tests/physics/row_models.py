@@ -17,7 +17,7 @@ XML = """
 <mujoco>
   <option timestep="0.004" integrator="implicitfast" impratio="3"/>
   <compiler angle="radian"/>
-  <default><geom condim="1" friction="0.8 0.02 0.01" solref="0.01 0.9"/></default>
+  <default><geom condim="1" friction="0.8 0.02 0.01" solref="0.006 0.9"/></default>
   <worldbody>
     <geom name="floor" type="plane" size="5 5 1"/>
     <geom name="wall" type="box" size="0.1 1 1" pos="-0.42 0 0" condim="3" solimp="0.8 0.9 0.01 0.3 3"/>
@@ -45,11 +45,11 @@ XML = """
     </body>
   </worldbody>
   <equality>
-    <joint joint1="rail" joint2="lift" polycoef="0.01 0.5 0.3 0 0"/>
+    <joint joint1="rail" joint2="lift" polycoef="0.01 0.5 0.3 0.7 -2"/>
     <joint joint1="pole" polycoef="0.1 0 0 0 0" solref="0.03 1"/>
     <joint joint1="wrist" joint2="pole" active="false"/>
   </equality>
-  <contact><pair geom1="lid" geom2="box" condim="3" solreffriction="0.02 1.2"/></contact>
+  <contact><pair geom1="lid" geom2="box" condim="3" solreffriction="0.03 1.2" friction="0.8 0.6 0.02 0.01 0.02"/></contact>
 </mujoco>
 """
 PER_WORLD = ("dof_frictionloss", "jnt_range", "geom_friction")
@@ -115,6 +115,6 @@ def permute_pool(world: World, seed: int) -> None:
     order = np.argsort(draws)
     for array in vars(d.contact).values():
         if isinstance(array, wp.array) and array.shape[0] == d.naconmax:
-            values = array.numpy()
+            values = array.numpy().copy()
             values[:count] = values[order]
             array.assign(values)

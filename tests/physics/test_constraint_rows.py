@@ -41,7 +41,7 @@ def made(world: World, row: int) -> dict[str, np.ndarray]:
     """Return what has been made of a world, with J in full."""
     efc, d = world.warp_data_E.efc, world.warp_data_E
     count = min(int(d.nefc.numpy()[row]), d.njmax)
-    found = {name: getattr(efc, name).numpy()[row][:count] for name in (*COLUMNS, "id")}
+    found = {name: getattr(efc, name).numpy()[row][:count].copy() for name in (*COLUMNS, "id")}
     found["J"] = np.zeros((count, d.qvel.shape[1]), np.float32)
     columns, values = efc.J_colind.numpy()[row].ravel(), efc.J.numpy()[row].ravel()
     for each, (begin, size) in enumerate(
@@ -53,7 +53,7 @@ def made(world: World, row: int) -> dict[str, np.ndarray]:
 
 def bits(world: World) -> list[np.ndarray]:
     """Return all that has been made, but for the contacts' places in the pool."""
-    found = [getattr(world.warp_data_E, name).numpy() for name in (*COUNTS, "overflow")]
+    found = [getattr(world.warp_data_E, name).numpy().copy() for name in (*COUNTS, "overflow")]
     for row in range(NUM_ENVS):
         found += [array for name, array in made(world, row).items() if name != "id"]
     return found
@@ -106,14 +106,14 @@ def test_rows_are_those_of_mujoco_warp(cone: str):
     world = world_of(cone)
     launch(world)
     ours = [made(world, row) for row in range(NUM_ENVS)]
-    counts = {name: getattr(world.warp_data_E, name).numpy() for name in COUNTS}
-    addresses = world.warp_data_E.contact.efc_address.numpy()
+    counts = {name: getattr(world.warp_data_E, name).numpy().copy() for name in COUNTS}
+    addresses = world.warp_data_E.contact.efc_address.numpy().copy()
     with wp.ScopedDevice("cpu"):
         mjw.make_constraint(world.warp_model, world.warp_data_E)
     for name in COUNTS:
         np.testing.assert_array_equal(counts[name], getattr(world.warp_data_E, name).numpy())
     # A contact of which one has rows has as many of the other.
-    theirs_addresses = world.warp_data_E.contact.efc_address.numpy()
+    theirs_addresses = world.warp_data_E.contact.efc_address.numpy().copy()
     count = int(world.warp_data_E.nacon.numpy()[0])
     np.testing.assert_array_equal(
         addresses[:count] == -1, np.where(theirs_addresses[:count] == 77, -1, theirs_addresses[:count]) == -1

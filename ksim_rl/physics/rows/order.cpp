@@ -1,4 +1,6 @@
-// Part 2: the contacts of this world, in the order of MuJoCo's C engine: by the pair of bodies, then by that of geoms.
+// Part 2: the contacts of this world, in the order of MuJoCo's C engine: by the pair of bodies, then by that of geoms,
+// of which each contact has that of the lower type first (engine_collision_driver.c; explicit pairs of geoms, which it
+// puts before the others of their bodies, stand among them here).
 //
 // One thread writes the contacts of a pair one after another, so that their places in the pool are in its order. Only
 // contacts of signed distance fields are each written by another thread: these are ordered by where they are.
@@ -10,9 +12,10 @@ int* const ids = row_of(problem.ids);
 
 each(contacts, [&](int item) {
     const auto& geoms = problem.contact_geom.data[found[item]];
-    const int bodies[] = {problem.geom_bodyid.data[geoms[0]], problem.geom_bodyid.data[geoms[1]]};
-    auto pair_of = [](int a, int b) { return (unsigned)wp::min(a, b) << 16 | (unsigned)wp::max(a, b); };
-    keys[item] = (unsigned long long)pair_of(bodies[0], bodies[1]) << 32 | pair_of(geoms[0], geoms[1]);
+    const int body = problem.geom_bodyid.data[geoms[0]], other = problem.geom_bodyid.data[geoms[1]];
+    auto pair_of = [](int a, int b) { return (unsigned)a << 16 | (unsigned)b; };
+    const unsigned bodies = pair_of(wp::min(body, other), wp::max(body, other));
+    keys[item] = (unsigned long long)bodies << 32 | pair_of(geoms[0], geoms[1]);
 });
 sync();
 
