@@ -10,7 +10,7 @@ import warp as wp
 
 from ksim_rl.physics import kernels, upstream
 from ksim_rl.physics.newton import solver as newton
-from ksim_rl.physics.smooth.stages import calls_back, smooth_dynamics
+from ksim_rl.physics.smooth.stages import calls_back, integration, smooth_dynamics
 
 # These read the contacts of the last substep's collision pass, which a reset empties.
 COLLISION_SENSORS = (
@@ -27,7 +27,8 @@ class Substeps:
 
     The variants share all arrays with `warp_model`. Build them once its arrays are in their final place. With
     `one_kernel_solver`, `newton` solves, which must suit the model, instead of MuJoCo Warp's own solver. Then, with
-    `one_kernel_dynamics`, which must suit it too, one kernel precedes the constraints.
+    `one_kernel_dynamics`, which must suit it too, one kernel precedes the constraints, and with
+    `one_kernel_integration` one integrates.
     """
 
     def __init__(
@@ -38,6 +39,7 @@ class Substeps:
         *,
         one_kernel_solver: bool = False,
         one_kernel_dynamics: bool = False,
+        one_kernel_integration: bool = False,
     ) -> None:
         self.warp_model, self.warp_data_E = warp_model, warp_data_E
         sensor_type = mj_model.sensor_type
@@ -52,6 +54,7 @@ class Substeps:
             self._warp_model_of_solver = dataclasses.replace(warp_model, opt=opt)
             self._solve = newton.solver(self._warp_model_of_solver, warp_data_E)
         self._dynamics = smooth_dynamics(warp_model, warp_data_E) if one_kernel_dynamics else None
+        self._integrate = integration(warp_model, warp_data_E) if one_kernel_integration else None
         self._refresh_warp_model = upstream.with_refreshable_sensors(
             warp_model, skip=has_history | np.isin(sensor_type, COLLISION_SENSORS), sensor_type=sensor_type
         )
@@ -76,7 +79,8 @@ class Substeps:
             sensors = sensors or self._always_senses
             opt = self._warp_model_of_solver.opt
             opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
-            newton.step(self._warp_model_of_solver, self.warp_data_E, self._solve, dynamics, sensors=sensors)
+            stages = self._solve, dynamics, self._integrate
+            newton.step(self._warp_model_of_solver, self.warp_data_E, *stages, sensors=sensors)
         else:
             mjw.step(self.warp_model if sensors else self._silent_warp_model, self.warp_data_E)
 

@@ -118,6 +118,7 @@ def step(
     warp_data_E: mjw.Data,
     solve: Callable[[], None],
     dynamics: Callable[[bool], None] | None = None,
+    integrate: Callable[[], None] | None = None,
     *,
     sensors: bool,
 ) -> None:
@@ -125,7 +126,7 @@ def step(
 
     The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
     not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel,
-    with forces or without.
+    with forces or without, and `integrate` what advances the state.
     """
     m, d = warp_model, warp_data_E
     if dynamics is None:
@@ -152,7 +153,9 @@ def step(
         mjw.rne_postconstraint(m, d)
     if sensors:
         mjw.sensor_acc(m, d, skip_rne_postconstraint=True)
-    if m.opt.integrator == mjw.IntegratorType.EULER:
+    if integrate is not None:
+        integrate()
+    elif m.opt.integrator == mjw.IntegratorType.EULER:
         mjw.euler(m, d)
     else:
         mjw.implicit(m, d)
