@@ -5,7 +5,7 @@
 
 if (SOLVES) {
 #pragma unroll 1
-    for (int i = 0; i < NUM_ELIMINATED; ++i) {
+    for (int i = 0; i < problem.eliminated.shape[0]; ++i) {
         const int dof = look_up(problem.eliminated, i), ancestors = num_ancestors(dof);
         const float* const row = system + row_start(dof);
         const float inverse = 1.0f / row[ancestors];
@@ -19,7 +19,7 @@ if (SOLVES) {
         sync();
     }
     // From the roots to the leaves; lanes whose chains share a degree of freedom find and write the same.
-    each(NUM_LEAVES, [&](int leaf) {
+    each(problem.leaves.shape[0], [&](int leaf) {
         const int last = look_up(problem.leaves, leaf), chain = row_start(last);
 #pragma unroll 1
         for (int place = 0; place <= num_ancestors(last); ++place) {

@@ -115,8 +115,6 @@ class Shape:
     clamps_ctrl: bool
     actuators_act: bool
     num_entries: int
-    num_eliminated: int
-    num_leaves: int
     num_free_bodies: int
     implicit_fast: bool
     solves: bool

@@ -141,8 +141,6 @@ def _shape(warp_model: mjw.Model) -> Shape:
         clamps_ctrl=not flags & bits.CLAMPCTRL,
         actuators_act=m.nactuator > 0 and not flags & bits.ACTUATION,
         num_entries=m.M_colind.size,
-        num_eliminated=len(_eliminated(m)),
-        num_leaves=len(_leaves(m)),
         num_free_bodies=_num_free_bodies(m),
         implicit_fast=fast and m.nactuator > 0 and not flags & bits.ACTUATION,
         solves=fast or not flags & (bits.EULERDAMP | bits.DAMPER),
