@@ -1,11 +1,11 @@
-"""This benchmark times the one kernel of the smooth dynamics beside the same stages of MuJoCo Warp.
+"""This benchmark times the kernels of smooth dynamics and of integration beside the same stages of MuJoCo Warp.
 
     python -m benchmarks.smooth_dynamics task=go1_velocity_flat num_envs=4096 device=cuda lanes=4,8,16,32
 
 takes states of the task under random actions, times those stages from there (kinematics to the sum of forces, in one
 graph) by MuJoCo Warp's kernels and by ours with each number of threads per world, checks that both agree and that the
-number of threads changes no bit, and times the substeps of one env step with either. Figures go to
-benchmarks/results/smooth_dynamics.json.
+number of threads changes no bit, does the same for the integration, and times the substeps of one env step with either.
+Figures go to benchmarks/results/smooth_dynamics.json.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ from benchmarks.stopwatch import milliseconds
 from ksim_rl import envs
 from ksim_rl.device.streams import checked_device
 from ksim_rl.physics import World
-from ksim_rl.physics.smooth.stages import smooth_dynamics
+from ksim_rl.physics.smooth.stages import integration, smooth_dynamics
 from ksim_rl.transforms.innermost import innermost
 
 RANDOM_STEPS = 20
 TIMES_IN_A_GRAPH = 20
 REPEATS = 20
+STATE = ("qpos", "qvel", "act", "time")
 COMPARED = ("M", "qfrc_bias", "qfrc_smooth", "geom_xpos", "cvel", "cdof_dot", "cinert", "site_xmat")
 LARGEST_ERROR = 1e-5
 
@@ -48,7 +49,7 @@ def main() -> None:
     env = envs.make(given["task"], num_envs=num_envs, device=device, seed=0)
     env.rollout(RANDOM_STEPS, break_when_any_done=False)
     world = innermost(env).world
-    figures = stages_ms(world, lanes) | substeps_ms(world, decimation)
+    figures = stages_ms(world, lanes) | integration_ms(world, lanes) | substeps_ms(world, decimation)
     table = Table(title=f"{given['task']}, {num_envs} envs, {report.device_name(device)}")
     for column in ("", "ms"):
         table.add_column(column, justify="left" if not column else "right")
@@ -86,8 +87,44 @@ def stages_ms(world: World, lanes: list[int]) -> dict[str, float]:
     for name, way in ways.items():
         found[name] = _stages_ms(world, name, way)
         results.append({field: world.last_substep(field).clone() for field in COMPARED})
-    for field in COMPARED:
+    check(results)
+    return found
+
+
+def integration_ms(world: World, lanes: list[int]) -> dict[str, float]:
+    """Return the time of an integration by MuJoCo Warp's kernels and by ours, ms; a RuntimeError where they differ."""
+    if world.one_kernel_integration_unavailable is not None:
+        return {}
+    m, d = world.warp_model, world.warp_data_E
+    theirs = mjw.euler if m.opt.integrator == mjw.IntegratorType.EULER else mjw.implicit
+    ways: dict[str, Callable[[], None]] = {"mujoco_warp_integration_ms": partial(theirs, m, d)}
+    for number in lanes:
+        ways[f"one_kernel_integration_{number}_lanes_ms"] = integration(m, d, lanes=number)
+    world.step(1)
+    before = {field: world.last_substep(field).clone() for field in STATE}
+    found, results = {}, []
+    for name, way in ways.items():
+        # Once, then as often as it takes to time it, which leads to no state that a world would reach.
+        for once in (True, False):
+            for field, rows in before.items():
+                world.last_substep(field).copy_(rows)
+            if once:
+                world.launch(f"{name} once", way)
+                results.append({field: world.last_substep(field).clone() for field in STATE})
+            else:
+                found[name] = _stages_ms(world, name, way)
+    for field, rows in before.items():
+        world.last_substep(field).copy_(rows)
+    check(results)
+    return found
+
+
+def check(results: list[dict[str, torch.Tensor]]) -> None:
+    """Raise a RuntimeError where later results differ among themselves, or from the first by more than rounding."""
+    for field in results[0]:
         expected, *ours = (result[field] for result in results)
+        if not expected.numel():
+            continue
         scale = 1.0 + expected.abs().max()
         if any(not torch.equal(other, ours[0]) for other in ours):
             raise RuntimeError(f"{field}: the number of lanes changes bits")
@@ -96,7 +133,6 @@ def stages_ms(world: World, lanes: list[int]) -> dict[str, float]:
             raise RuntimeError(
                 f"{field}: {error:.1e} of the largest from MuJoCo Warp's, at most {LARGEST_ERROR}"
             )
-    return found
 
 
 def _stages_ms(world: World, name: str, way: Callable[[], None]) -> float:

@@ -13,7 +13,7 @@ from ksim_rl.physics.contact_sensors import ContactReadings
 from ksim_rl.physics.newton import solver as newton
 from ksim_rl.physics.rows.constraint_rows import constraint_rows
 from ksim_rl.physics.rows.contact_lists import ContactLists
-from ksim_rl.physics.smooth.stages import calls_back, smooth_dynamics
+from ksim_rl.physics.smooth.stages import calls_back, integration, smooth_dynamics
 
 # These read the contacts of the last substep's collision pass, which a reset empties.
 COLLISION_SENSORS = (
@@ -31,7 +31,8 @@ class Substeps:
     The variants share all arrays with `warp_model`. Build them once its arrays are in their final place. With
     `one_kernel_solver`, `newton` solves, which must suit the model, instead of MuJoCo Warp's own solver. Then, with
     `one_kernel_dynamics`, which must suit it too, one kernel precedes the constraints. Then, with `one_kernel_rows`,
-    one makes their rows, and `contact_lists` besides, from which contact sensors are read.
+    one makes their rows, and `contact_lists` besides, from which contact sensors are read, and with
+    `one_kernel_integration` one integrates.
     """
 
     def __init__(
@@ -43,6 +44,7 @@ class Substeps:
         one_kernel_solver: bool = False,
         one_kernel_dynamics: bool = False,
         one_kernel_rows: bool = False,
+        one_kernel_integration: bool = False,
     ) -> None:
         self.warp_model, self.warp_data_E = warp_model, warp_data_E
         sensor_type = mj_model.sensor_type
@@ -67,6 +69,7 @@ class Substeps:
             self._warp_model_of_solver = upstream.without_contact_sensors(
                 self._warp_model_of_solver, self._contacts.sensors
             )
+        self._integrate = integration(warp_model, warp_data_E) if one_kernel_integration else None
         self._refresh_warp_model = upstream.with_refreshable_sensors(
             warp_model, skip=has_history | np.isin(sensor_type, COLLISION_SENSORS), sensor_type=sensor_type
         )
@@ -91,8 +94,8 @@ class Substeps:
             sensors = sensors or self._always_senses
             opt = self._warp_model_of_solver.opt
             opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
-            launches = self._solve, dynamics, self._make_rows, self._contacts
-            newton.step(self._warp_model_of_solver, self.warp_data_E, *launches, sensors=sensors)
+            stages = self._solve, dynamics, self._make_rows, self._contacts, self._integrate
+            newton.step(self._warp_model_of_solver, self.warp_data_E, *stages, sensors=sensors)
         else:
             mjw.step(self.warp_model if sensors else self._silent_warp_model, self.warp_data_E)
 

@@ -27,7 +27,10 @@ from ksim_rl.physics.newton.solver import one_kernel_unavailable, takes_conditio
 from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
 from ksim_rl.physics.rows.constraint_rows import one_kernel_rows_unavailable
 from ksim_rl.physics.sim_cfg import SimCfg
-from ksim_rl.physics.smooth.stages import one_kernel_dynamics_unavailable
+from ksim_rl.physics.smooth.stages import (
+    one_kernel_dynamics_unavailable,
+    one_kernel_integration_unavailable,
+)
 from ksim_rl.physics.substeps import Substeps
 
 
@@ -51,6 +54,8 @@ class World(views.DataViews):
         one_kernel_dynamics_unavailable: why MuJoCo Warp's own kernels compute what precedes the constraints; None where
             one kernel does (`SimCfg.one_kernel_dynamics`).
         one_kernel_rows_unavailable: the same of the constraint rows.
+        one_kernel_integration_unavailable: why MuJoCo Warp's own kernels advance the state; None where one kernel does,
+            which the same setting asks for.
     """
 
     def __init__(
@@ -107,11 +112,15 @@ class World(views.DataViews):
             self.one_kernel_rows_unavailable = one_kernel_rows_unavailable(
                 self.warp_model, dynamics_unavailable=self.one_kernel_dynamics_unavailable
             )
+            self.one_kernel_integration_unavailable = one_kernel_integration_unavailable(
+                self.warp_model, dynamics_unavailable=self.one_kernel_dynamics_unavailable
+            )
             self._substeps = Substeps(
                 *models,
                 one_kernel_solver=self.has_one_kernel_solver,
                 one_kernel_dynamics=self.one_kernel_dynamics_unavailable is None,
                 one_kernel_rows=self.one_kernel_rows_unavailable is None,
+                one_kernel_integration=self.one_kernel_integration_unavailable is None,
             )
             self._masked_constants = self._prepare_constants(expanded)
         self._reset_mask_E = wp.to_torch(self._reset_mask)

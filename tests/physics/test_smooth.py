@@ -51,12 +51,13 @@ MIXED = """
       </body>
     </body>
     <body pos="3 0 1">
-      <joint type="free" stiffness="2" damping="0.1"/><geom size="0.1" contype="0"/>
+      <joint type="free" stiffness="2" damping="0.1"/>
+      <geom type="box" size="0.1 0.3 0.05" pos="0.02 0.04 0" quat="0.9 0.2 0.1 0" contype="0"/>
     </body>
     <body pos="-1 0 1"><geom size="0.1" contype="0"/></body>
   </worldbody>
   <actuator>
-    <motor joint="twist" gear="2" ctrllimited="true" ctrlrange="-0.5 0.5"/>
+    <motor joint="twist" gear="2" ctrllimited="true" ctrlrange="-0.5 0.5" damping="0.2 0.1 0.05" armature="0.01"/>
     <position joint="twist" kp="5" kv="0.3" forcelimited="true" forcerange="-1 1"/>
     <velocity joint="bend" kv="2"/>
     <intvelocity joint="tail" kp="4" actrange="-0.2 0.2"/>
@@ -93,9 +94,10 @@ def mixed() -> mujoco.MjModel:
     return spec.compile()
 
 
-def moved(**kwargs) -> World:
+def moved(model: mujoco.MjModel | None = None, **kwargs) -> World:
     """Worlds in other states each, the first of which is pushed by nothing."""
-    world = World(mixed(), num_envs=NUM_ENVS, sim=SimCfg(one_kernel_dynamics=True), **kwargs)
+    kwargs.setdefault("sim", SimCfg(one_kernel_dynamics=True))
+    world = World(mixed() if model is None else model, num_envs=NUM_ENVS, **kwargs)
     generator = torch.Generator().manual_seed(0)
     for name in ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos"):
         row = world.view(name)

@@ -119,6 +119,7 @@ def step(
     dynamics: Callable[[bool], None] | None = None,
     make_rows: Callable[[], None] | None = None,
     contacts: ContactReadings | None = None,
+    integrate: Callable[[], None] | None = None,
     *,
     sensors: bool,
 ) -> None:
@@ -126,8 +127,8 @@ def step(
 
     The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
     not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel,
-    with forces or without, and `make_rows`, which needs it, the constraint rows as one, with the lists of contacts that
-    `contacts` reads.
+    with forces or without; `make_rows`, which needs it, the constraint rows as one, with the lists of contacts that
+    `contacts` reads; and `integrate` what advances the state.
     """
     m, d = warp_model, warp_data_E
     if dynamics is None:
@@ -164,7 +165,9 @@ def step(
         if contacts is not None:
             contacts.read_sensors()
         mjw.sensor_acc(m, d, skip_rne_postconstraint=True)
-    if m.opt.integrator == mjw.IntegratorType.EULER:
+    if integrate is not None:
+        integrate()
+    elif m.opt.integrator == mjw.IntegratorType.EULER:
         mjw.euler(m, d)
     else:
         mjw.implicit(m, d)

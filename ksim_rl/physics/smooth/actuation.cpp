@@ -1,17 +1,6 @@
-// Part 6: what actuators do (mj_transmission, mj_fwdActuation), and the sum of all forces but those of constraints
+// Part 7: what actuators do (mj_transmission, mj_fwdActuation), and the sum of all forces but those of constraints
 // (mj_fwdAcceleration). An actuator drives a hinge or a slide, and has a gain, a bias and an activation that are affine.
 
-auto next_activation = [&](int actuator, int address, float rate) {
-    const float timestep = of_world(problem.timestep);
-    const float own = row_of(problem.act)[address];
-    float found = own + rate * timestep;
-    if (look_up(problem.actuator_dyntype, actuator) == FILTER_EXACT) {
-        const float time_constant = wp::max(TINY, model_row(problem.actuator_dynprm)[actuator][0]);
-        found = own + rate * time_constant * (1.0f - wp::exp(-timestep / time_constant));
-    }
-    const wp::vec2 range = model_row(problem.actuator_actrange)[actuator];
-    return problem.actuator_actlimited.data[actuator] ? wp::clamp(found, range[0], range[1]) : found;
-};
 auto activation_rate = [&](int actuator, float ctrl, float act) {
     const int type = look_up(problem.actuator_dyntype, actuator);
     if (type == INTEGRATOR)
@@ -31,21 +20,14 @@ each(NUM_ACTUATORS, [&](int actuator) {
     row_of(problem.moment_rowadr)[actuator] = actuator;
     row_of(problem.moment_colind)[actuator] = dof;
     row_of(problem.actuator_moment)[actuator] = gear;
-    float input = 0.0f, found = 0.0f;
-    const int address = look_up(problem.actuator_ctrladr, actuator);
-    if (look_up(problem.actuator_ctrlnum, actuator) > 0) {
-        const wp::vec2 range = model_row(problem.actuator_ctrlrange)[address];
-        input = row_of(problem.ctrl)[address];
-        if (CLAMPS_CTRL && problem.actuator_ctrllimited.data[address])
-            input = wp::clamp(input, range[0], range[1]);
+    float rate = 0.0f, found = 0.0f;
+    const int address = activation_of(actuator);
+    if (address >= 0) {
+        if (ACTUATORS_ACT)
+            rate = activation_rate(actuator, ctrl_of(actuator), row_of(problem.act)[address]);
+        row_of(problem.act_dot)[address] = rate;
     }
-    const int last = look_up(problem.actuator_actadr, actuator) + look_up(problem.actuator_actnum, actuator) - 1;
-    if (HAS_ACTIVATION && look_up(problem.actuator_actadr, actuator) >= 0) {
-        const float rate = ACTUATORS_ACT ? activation_rate(actuator, input, row_of(problem.act)[last]) : 0.0f;
-        row_of(problem.act_dot)[last] = rate;
-        input = problem.actuator_actearly.data[actuator] ? next_activation(actuator, last, rate)
-                                                         : row_of(problem.act)[last];
-    }
+    const float input = input_of(actuator, rate);
     if (ACTUATORS_ACT) {
         auto affine = [&](const auto& factors) {
             return factors[0] + factors[1] * length + factors[2] * speed;

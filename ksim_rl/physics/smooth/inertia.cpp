@@ -1,4 +1,4 @@
-// Part 3: centres of mass, the axes of the degrees of freedom, and inertias, all at them (mj_comPos).
+// Part 4: centres of mass, the axes of the degrees of freedom, and inertias, all at them (mj_comPos).
 
 const float* const mass = model_row(problem.body_mass);
 struct Column {

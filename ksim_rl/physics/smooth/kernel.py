@@ -1,9 +1,9 @@
-"""This module makes the one kernel of a substep's smooth dynamics: all of it that constraints have no part in.
+"""This module makes the kernels of a substep before and after its constraints: smooth dynamics and integration.
 
-MuJoCo Warp launches some 35 kernels for it, each of which waits for its slowest world; here some lanes of a warp own a
-world from its positions to the sum of its forces, with its bodies on the chip. It is written in C++, as the solver's
-kernel is; the CPU compiles the same source, for one lane. Read its parts in their order: layout.cpp, kinematics.cpp,
-inertia.cpp, velocities.cpp, passive.cpp, actuation.cpp.
+MuJoCo Warp launches some 35 kernels for the first and some 10 for the second, each of which waits for its slowest
+world; here some lanes of a warp own a world, with its bodies or its inertia matrix on the chip. They are written in
+C++, as the solver's kernel is; the CPU compiles the same source, for one lane. Read their parts in the order in which
+SMOOTH and INTEGRATION name them.
 
 Source of the algorithms: https://mujoco.readthedocs.io/en/stable/computation/index.html
 """
@@ -22,8 +22,8 @@ import warp as wp
 from ksim_rl.physics.structs import struct_with
 
 CUDA_THREADS = 32
-_PARTS = ("layout", "kinematics", "inertia", "velocities", "passive", "actuation")
-_SOURCE = "".join(files("ksim_rl.physics.smooth").joinpath(f"{part}.cpp").read_text() for part in _PARTS)
+SMOOTH = ("world", "layout", "kinematics", "inertia", "velocities", "passive", "actuation")
+INTEGRATION = ("world", "derivative", "factorization", "free_bodies", "advance")
 _ENUMS = {
     "FREE": mujoco.mjtJoint.mjJNT_FREE,
     "BALL": mujoco.mjtJoint.mjJNT_BALL,
@@ -36,11 +36,14 @@ _ENUMS = {
     "FILTER_EXACT": mujoco.mjtDyn.mjDYN_FILTEREXACT,
     "AFFINE_GAIN": mujoco.mjtGain.mjGAIN_AFFINE,
     "AFFINE_BIAS": mujoco.mjtBias.mjBIAS_AFFINE,
+    "OUT_OF_ROWS": mjw.OverflowType.NEFC,
+    "OUT_OF_PAIRS": mjw.OverflowType.BROADPHASE,
+    "OUT_OF_CONTACTS": mjw.OverflowType.NARROWPHASE,
 }
 
 
 @struct_with(
-    ("", mjw.Model, "qpos0 qpos_spring M_hinit_i M_colind"),
+    ("", mjw.Model, "qpos0 qpos_spring M_hinit_i M_colind M_rownnz M_rowadr body_freeadr"),
     (
         "",
         mjw.Model,
@@ -76,21 +79,26 @@ _ENUMS = {
         "actuator_length actuator_velocity moment_rownnz moment_rowadr moment_colind actuator_moment act_dot "
         "actuator_force qfrc_actuator qfrc_smooth",
     ),
+    ("", mjw.Data, "crb qacc qacc_warmstart time overflow nefc ncollision nacon njmax naconmax"),
+    ("efc_", mjw.Constraint, "Ma"),
 )
 class Problem:
-    """What the kernel reads of a model and its worlds, and what it writes.
+    """What the kernels read of a model and its worlds, and what they write.
 
-    Besides, the geoms that move, and by `first_driver` the actuators that drive each degree of freedom.
+    Besides, the geoms that move, by `first_driver` the actuators that drive each degree of freedom, and of the degrees
+    of freedom those that are eliminated, in that order, and of these the leaves.
     """
 
     moving_geoms: wp.array[int]
     first_driver: wp.array[int]
     drivers: wp.array[int]
+    eliminated: wp.array[int]
+    leaves: wp.array[int]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Shape:
-    """What of a model is compiled into its kernel: its sizes, and what it has of MuJoCo's features."""
+    """What of a model is compiled into its kernels: its sizes, and what it has of MuJoCo's features."""
 
     parents: tuple[int, ...]
     num_joints: int
@@ -106,6 +114,10 @@ class Shape:
     dampers: bool
     clamps_ctrl: bool
     actuators_act: bool
+    num_entries: int
+    num_free_bodies: int
+    implicit_fast: bool
+    solves: bool
 
     @property
     def num_bodies(self) -> int:
@@ -122,34 +134,37 @@ class Shape:
         """Floats of the joints' frames, then of the bodies' velocities, then of momenta."""
         return 6 * max(self.num_bodies, self.num_joints, self.num_dofs)
 
-    def floats(self, lanes: int) -> int:
+    def floats(self, lanes: int, parts: tuple[str, ...] = SMOOTH) -> int:
         """Return how many floats the lanes of a world share."""
         needed = self.poses + self.joints + 9 * self.num_bodies + 6 * self.num_dofs
+        if parts == INTEGRATION:
+            needed = self.num_entries + 2 * self.num_dofs
         # Worlds of a warp begin in other banks: those of one lie side by side for its lanes.
         return needed + (lanes - needed) % 32
 
 
 @functools.cache
-def smooth_kernel(shape: Shape, lanes: int, threads: int) -> wp.Kernel:
-    """Return the kernel of a `Problem`; launch it over (worlds, lanes) in blocks of `threads`.
+def kernel_of(parts: tuple[str, ...], shape: Shape, lanes: int, threads: int) -> wp.Kernel:
+    """Return the kernel of a `Problem` that has these parts; launch it over (worlds, lanes) in blocks of `threads`.
 
-    Its other argument says whether it goes on after the velocities, to the inertia matrix and the forces.
+    The other argument of SMOOTH says whether it goes on after the velocities, to the inertia matrix and the forces.
     """
     constants = {field.name: getattr(shape, field.name) for field in dataclasses.fields(shape)[1:]}
     constants |= {"num_bodies": shape.num_bodies, "poses": shape.poses, "joints": shape.joints}
-    constants |= {"floats": shape.floats(lanes), "lanes": lanes, "threads": threads, **_ENUMS}
+    constants |= {"floats": shape.floats(lanes, parts), "lanes": lanes, "threads": threads, **_ENUMS}
     parents = ", ".join(map(str, shape.parents))
     snippet = "".join(f"constexpr int {name.upper()} = {int(value)};\n" for name, value in constants.items())
-    snippet += f"constexpr int PARENTS[] = {{{parents}}};\n{_SOURCE}"
+    snippet += f"constexpr int PARENTS[] = {{{parents}}};\n"
+    snippet += "".join(files("ksim_rl.physics.smooth").joinpath(f"{part}.cpp").read_text() for part in parts)
 
     @wp.func_native(snippet)
-    def smooth_dynamics(world: int, lane: int, forces_too: bool, problem: Problem) -> None: ...
+    def compute(world: int, lane: int, forces_too: bool, problem: Problem) -> None: ...
 
     @wp.kernel(
         module="unique", enable_backward=False, grid_stride=False, module_options={"block_dim": threads}
     )
     def kernel(problem: Problem, forces_too: bool):
         world, lane = wp.tid()
-        smooth_dynamics(world, lane, forces_too, problem)
+        compute(world, lane, forces_too, problem)
 
     return kernel

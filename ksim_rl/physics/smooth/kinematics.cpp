@@ -1,4 +1,4 @@
-// Part 2: kinematics (mj_kinematics). A chain from a root to a leaf is one lane's, whatever chains share: it passes the
+// Part 3: kinematics (mj_kinematics). A chain from a root to a leaf is one lane's, whatever chains share: it passes the
 // pose on from body to body in registers, and lanes that compute the same body find and write the same.
 
 const float* const qpos = row_of(problem.qpos);

@@ -1,4 +1,4 @@
-"""This module chooses which worlds have their smooth dynamics computed by one kernel, and launches it."""
+"""This module chooses which worlds have one kernel for smooth dynamics and one for integration, and launches them."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from ksim_rl.physics.sim_cfg import SimCfg
-from ksim_rl.physics.smooth.kernel import CUDA_THREADS, Problem, Shape, smooth_kernel
+from ksim_rl.physics.smooth.kernel import CUDA_THREADS, INTEGRATION, SMOOTH, Problem, Shape, kernel_of
 from ksim_rl.physics.structs import filled
 
 # The shared memory that a block has without asking for more, in floats.
@@ -40,7 +40,7 @@ def unsuited(warp_model: mjw.Model) -> str | None:
         "joints yield": bool(m.nplastic),
         "an actuator is delayed": m.nhistory > 0,
         "an actuator is not affine or drives no hinge or slide": not _has_affine_actuators(m),
-        "its bodies do not fit shared memory": _lanes(_shape(m)) is None,
+        "its bodies do not fit shared memory": _lanes(SMOOTH, _shape(m)) is None,
     }
     return next((reason for reason, holds in reasons.items() if holds), None)
 
@@ -62,6 +62,15 @@ def one_kernel_dynamics_unavailable(
     return unsuited(warp_model)
 
 
+def one_kernel_integration_unavailable(
+    warp_model: mjw.Model, *, dynamics_unavailable: str | None
+) -> str | None:
+    """Return why MuJoCo Warp's own kernels integrate, or None where one kernel does."""
+    if dynamics_unavailable is None and warp_model.opt.integrator == mjw.IntegratorType.IMPLICIT:
+        return "the integrator is mjINT_IMPLICIT"
+    return dynamics_unavailable
+
+
 def smooth_dynamics(
     warp_model: mjw.Model, warp_data_E: mjw.Data, *, lanes: int | None = None
 ) -> Callable[[bool], None]:
@@ -72,18 +81,39 @@ def smooth_dynamics(
     what positions and velocities alone decide. `lanes` is how many threads share a world on CUDA; None takes the
     fewest that fit.
     """
+    return _launcher(SMOOTH, warp_model, warp_data_E, lanes)
+
+
+def integration(
+    warp_model: mjw.Model, warp_data_E: mjw.Data, *, lanes: int | None = None
+) -> Callable[[], None]:
+    """Return what launches the integration of a model for which it is available: MuJoCo Warp's `euler` or `implicit`.
+
+    Each sum has one order, whatever the number of lanes. Where forces are disabled it follows the C engine: activations
+    without actuation keep still, and implicitfast has the derivatives of what is left; MuJoCo Warp forgets some.
+    """
+    launch = _launcher(INTEGRATION, warp_model, warp_data_E, lanes)
+    return lambda: launch(True)
+
+
+def _launcher(
+    parts: tuple[str, ...], warp_model: mjw.Model, warp_data_E: mjw.Data, lanes: int | None
+) -> Callable[[bool], None]:
     m, d = warp_model, warp_data_E
     shape, device = _shape(m), d.qpos.device
     threads = CUDA_THREADS if device.is_cuda else 1
-    lanes = (lanes or _lanes(shape) or CUDA_THREADS) if device.is_cuda else 1
+    lanes = (lanes or _lanes(parts, shape) or CUDA_THREADS) if device.is_cuda else 1
     driven = m.jnt_dofadr.numpy()[m.actuator_trnid.numpy()[:, 0]]
-    own = {
-        "moving_geoms": wp.array(_moving_geoms(m), dtype=int, device=device),
-        "first_driver": wp.array(np.searchsorted(np.sort(driven), range(m.nv + 1)), dtype=int, device=device),
-        "drivers": wp.array(np.argsort(driven, kind="stable"), dtype=int, device=device),
+    tables = {
+        "moving_geoms": _moving_geoms(m),
+        "first_driver": np.searchsorted(np.sort(driven), range(m.nv + 1)),
+        "drivers": np.argsort(driven, kind="stable"),
+        "eliminated": _eliminated(m),
+        "leaves": _leaves(m),
     }
-    problem = filled(Problem, own, m, m.opt, d)
-    kernel = smooth_kernel(shape, lanes, threads)
+    own = {name: wp.array(table, dtype=int, device=device) for name, table in tables.items()}
+    rows = {"efc_Ma": d.efc.Ma}
+    problem, kernel = filled(Problem, own, rows, m, m.opt, d), kernel_of(parts, shape, lanes, threads)
 
     def launch(forces_too: bool) -> None:
         wp.launch(kernel, dim=(d.nworld, lanes), inputs=[problem, forces_too], block_dim=threads)
@@ -94,6 +124,7 @@ def smooth_dynamics(
 def _shape(warp_model: mjw.Model) -> Shape:
     m = warp_model
     flags, bits = int(m.opt.disableflags), mjw.DisableBit
+    fast = m.opt.integrator == mjw.IntegratorType.IMPLICITFAST
     return Shape(
         parents=tuple(m.body_parentid.numpy().tolist()),
         num_joints=m.njnt,
@@ -109,7 +140,30 @@ def _shape(warp_model: mjw.Model) -> Shape:
         dampers=not flags & bits.DAMPER,
         clamps_ctrl=not flags & bits.CLAMPCTRL,
         actuators_act=m.nactuator > 0 and not flags & bits.ACTUATION,
+        num_entries=m.M_colind.size,
+        num_free_bodies=_num_free_bodies(m),
+        implicit_fast=fast and m.nactuator > 0 and not flags & bits.ACTUATION,
+        solves=fast or not flags & (bits.EULERDAMP | bits.DAMPER),
     )
+
+
+def _num_free_bodies(warp_model: mjw.Model) -> int:
+    """Return how many bodies have nothing but a free joint, and are solved for each on its own."""
+    return 0 if warp_model.opt.integrator == mjw.IntegratorType.EULER else warp_model.body_freeadr.size
+
+
+def _eliminated(warp_model: mjw.Model) -> np.ndarray:
+    """Return the degrees of freedom, from the last to the first, but for those of bodies solved for on their own."""
+    m = warp_model
+    alone = m.body_freeadr.numpy()[: _num_free_bodies(m)]
+    return np.flatnonzero(~np.isin(m.dof_bodyid.numpy(), alone))[::-1]
+
+
+def _leaves(warp_model: mjw.Model) -> np.ndarray:
+    """Return the eliminated degrees of freedom that are in no other's row of the inertia matrix."""
+    m = warp_model
+    row, column = m.M_hinit_i.numpy(), m.M_colind.numpy()
+    return np.setdiff1d(_eliminated(m), column[row != column])
 
 
 def _has_affine_actuators(warp_model: mjw.Model) -> bool:
@@ -119,9 +173,11 @@ def _has_affine_actuators(warp_model: mjw.Model) -> bool:
     return bool(np.isin(m.jnt_type.numpy()[m.actuator_trnid.numpy()[:, 0]], HINGES).all())
 
 
-def _lanes(shape: Shape) -> int | None:
+def _lanes(parts: tuple[str, ...], shape: Shape) -> int | None:
     """Return the fewest lanes for which the worlds of a warp fit shared memory together."""
-    fitting = (lanes for lanes in LANES if shape.floats(lanes) * (CUDA_THREADS // lanes) <= SHARED_FLOATS)
+    fitting = (
+        lanes for lanes in LANES if shape.floats(lanes, parts) * (CUDA_THREADS // lanes) <= SHARED_FLOATS
+    )
     return next(fitting, None)
 
 

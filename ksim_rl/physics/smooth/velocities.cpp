@@ -1,4 +1,4 @@
-// Part 4: velocities (mj_comVel), bias forces (mj_rne without accelerations) and the inertia matrix (mj_crb). A body
+// Part 5: velocities (mj_comVel), bias forces (mj_rne without accelerations) and the inertia matrix (mj_crb). A body
 // accelerates with the one before it and by the rates of the axes that its own velocity turns; gravity is an
 // acceleration of the world.
 
@@ -54,22 +54,13 @@ sum_subtrees(16, [&](int index) {
     return index < 10 ? Column {inertias + index, POSE} : Column {forces + index - 10, 6};
 });
 write(problem.cfrc_int, NUM_BODIES, forces, 6);
+if (NUM_FREE_BODIES > 0)
+    write(problem.crb, NUM_BODIES, inertias, POSE);  // the integration reads it
 
 each(NUM_DOFS, [&](int dof) {
     momentum(dof) = times_inertia(inertia(look_up(problem.dof_bodyid, dof)), motion(dof));
 });
 sync();
-// Calls body(actuator) for the actuators that add armature or damping to a joint: none, one, or (below -1) several.
-auto each_actuator_of = [&](int joint, auto body) {
-    const int only = look_up(problem.jnt_actuatorid, joint);
-    if (only >= 0)
-        body(only);
-    for (int actuator = 0; only < -1 && actuator < NUM_ACTUATORS; ++actuator) {
-        const int type = look_up(problem.actuator_trntype, actuator);
-        if ((type == JOINT || type == JOINT_IN_PARENT) && problem.actuator_trnid.data[actuator][0] == joint)
-            body(actuator);
-    }
-};
 #pragma unroll 4
 for (int entry = lane; entry < problem.M_hinit_i.shape[0]; entry += LANES) {
     const int row = look_up(problem.M_hinit_i, entry), column = look_up(problem.M_colind, entry);
