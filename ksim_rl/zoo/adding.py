@@ -64,7 +64,7 @@ def _of_run(saved: checkpoint.Checkpoint, *, name: str) -> Card:
         raise ValueError(f"{run}: made of {commit}: train in a clean clone of one commit, and add that run")
     _, rows = csv_table.read_table(run / listing.METRICS)
     earned = [(int(row[csv_table.STEP]), value) for row in rows for value in listing.numbers([row], RETURN)]
-    curve = tuple((step, float(f"{value:.4g}")) for step, value in earned[:: max(1, len(earned) // CURVE_POINTS)])
+    thinned = earned[:: max(1, len(earned) // CURVE_POINTS)]
     return Card(
         name=name,
         task=str(saved.config["task_name"]),
@@ -74,5 +74,5 @@ def _of_run(saved: checkpoint.Checkpoint, *, name: str) -> Card:
         iteration=saved.iteration,
         env_states=summary.env_states or 0,
         return_mean=summary.evaluation,
-        curve=curve,
+        curve=tuple((step, float(f"{value:.4g}")) for step, value in thinned),
     )

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ksim_rl.zoo import wandb_runs
-from ksim_rl.zoo.cards import CARD, CHECKPOINT, FOLDER, ONNX, read_card
+from ksim_rl.zoo.cards import CHECKPOINT, FOLDER, read_card
 
 
 def locate(text: str | Path, *, folder: Path = FOLDER, note: Callable[[str], None] = print) -> Path:
@@ -20,10 +20,7 @@ def locate(text: str | Path, *, folder: Path = FOLDER, note: Callable[[str], Non
         return wandb_runs.download(name, Path("runs/wandb"), note=note)
     card = read_card(name, folder)
     copy = Path("runs/zoo") / name
-    copy.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(copy / CHECKPOINT, ignore_errors=True)
-    shutil.copytree(folder / name / CHECKPOINT, copy / CHECKPOINT)
-    for file in (CARD, ONNX):
-        shutil.copyfile(folder / name / file, copy / file)
+    shutil.copytree(folder / name, copy, dirs_exist_ok=True)
     note(f"{text}: {card.task}, {card.env_states:,} env states; copied to {copy}")
     return copy
