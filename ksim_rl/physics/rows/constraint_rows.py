@@ -18,7 +18,7 @@ import warp as wp
 from ksim_rl.physics.rows.contact_lists import ContactLists, launch
 from ksim_rl.physics.structs import filled, struct_with
 
-PARTS = "layout order row joints contacts"
+PARTS = ("layout", "order", "row", "joints", "contacts")
 # The degrees of freedom that move a geom are bits of a number, and a body or geom of a pair is 16 bits of another.
 MOST_DOFS, MOST_GEOMS = 64, 1 << 16
 _ENUMS = {
@@ -97,7 +97,7 @@ def constraint_rows(
         "contacts": on[bits.CONTACT],
         "elliptic": m.opt.cone == mjw.ConeType.ELLIPTIC,
         "refsafe": not flags & bits.REFSAFE,
-        "lanes": lanes or lists.constants["lanes"],
+        "lanes": lanes if lanes and device.is_cuda else lists.constants["lanes"],
     }
 
     def make_rows() -> None:
