@@ -130,6 +130,16 @@ def test_whole_steps_are_those_of_the_c_engine_with_parameters_of_each_world():
         check_step(world, before, own, row)
 
 
+def test_mujoco_warps_implicit_finds_the_inertias_of_free_bodies():
+    world = spinning(sim=SimCfg(one_kernel_dynamics=True, integrator="implicit"))
+    assert world.one_kernel_dynamics_unavailable is None
+    assert "mjINT_IMPLICIT" in str(world.one_kernel_integration_unavailable)
+    before = values(world, INPUTS)
+    world.step(1)
+    for row in range(NUM_ENVS):
+        check_step(world, before, world.mj_model, row)
+
+
 def test_what_is_not_finite_stays_in_its_world():
     found = []
     for spoilt in (False, True):
@@ -143,11 +153,6 @@ def test_what_is_not_finite_stays_in_its_world():
         assert torch.equal(clean[[0, 2]], found[1][name][[0, 2]]), name
 
 
-def test_worlds_that_it_does_not_integrate_are_told_why():
-    with wp.ScopedDevice("cpu"):
-        model = copy.copy(mixed())
-        model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICIT
-        warp_model = mjw.put_model(model)
-    unavailable = stages.one_kernel_integration_unavailable
-    assert unavailable(warp_model, dynamics_unavailable="a reason") == "a reason"
-    assert "mjINT_IMPLICIT" in str(unavailable(warp_model, dynamics_unavailable=None))
+def test_worlds_whose_dynamics_have_no_kernel_of_their_own_are_told_why():
+    world = World(mixed(), num_envs=1, sim=SimCfg(one_kernel_dynamics=False))
+    assert "one_kernel_dynamics is False" in str(world.one_kernel_integration_unavailable)
