@@ -9,7 +9,7 @@ import pytest
 import torch
 import warp as wp
 
-from ksim_rl.physics import SimCfg, World
+from ksim_rl.physics import SimCfg, World, load_model
 from ksim_rl.physics.smooth import stages
 from tests.physics.test_smooth import NUM_ENVS, PER_WORLD, mixed, moved
 
@@ -69,7 +69,7 @@ def check_step(world: World, before: dict[str, torch.Tensor], mj_model: mujoco.M
     mujoco.mj_step(mj_model, mj_data)
     for name in STATE:
         ours, theirs = world.last_substep(name)[row].numpy(), np.asarray(getattr(mj_data, name))
-        scale = 1.0 + np.abs(theirs).max()
+        scale = 1.0 + np.abs(theirs).max(initial=0.0)
         np.testing.assert_allclose(ours / scale, theirs / scale, atol=1e-4, err_msg=name)
 
 
@@ -130,6 +130,31 @@ def test_whole_steps_are_those_of_the_c_engine_with_parameters_of_each_world():
         check_step(world, before, own, row)
 
 
+def test_the_derivative_of_a_gain_has_the_control_within_its_range():
+    model = load_model(
+        "<mujoco><option integrator='implicitfast'/><worldbody><body><joint name='j' armature='0.01'/>"
+        "<geom size='0.01' mass='0.001'/></body></worldbody><actuator><general joint='j' gaintype='affine' "
+        "gainprm='0 0 -2' ctrllimited='true' ctrlrange='-1 1'/></actuator></mujoco>"
+    )
+    world = World(model, num_envs=1, sim=SimCfg(njmax=8, nconmax=8))
+    world.qvel_EL[:], world.ctrl_EL[:] = 1.0, 5.0
+    with wp.ScopedDevice("cpu"):
+        mjw.forward(world.warp_model, world.warp_data_E)
+    before = values(world, INPUTS)
+    integrate(world)
+    check_step(world, before, model, 0)
+
+
+def test_mujoco_warps_implicit_finds_the_inertias_of_free_bodies():
+    world = spinning(sim=SimCfg(one_kernel_dynamics=True, integrator="implicit"))
+    assert world.one_kernel_dynamics_unavailable is None
+    assert "mjINT_IMPLICIT" in str(world.one_kernel_integration_unavailable)
+    before = values(world, INPUTS)
+    world.step(1)
+    for row in range(NUM_ENVS):
+        check_step(world, before, world.mj_model, row)
+
+
 def test_what_is_not_finite_stays_in_its_world():
     found = []
     for spoilt in (False, True):
@@ -143,11 +168,6 @@ def test_what_is_not_finite_stays_in_its_world():
         assert torch.equal(clean[[0, 2]], found[1][name][[0, 2]]), name
 
 
-def test_worlds_that_it_does_not_integrate_are_told_why():
-    with wp.ScopedDevice("cpu"):
-        model = copy.copy(mixed())
-        model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICIT
-        warp_model = mjw.put_model(model)
-    unavailable = stages.one_kernel_integration_unavailable
-    assert unavailable(warp_model, dynamics_unavailable="a reason") == "a reason"
-    assert "mjINT_IMPLICIT" in str(unavailable(warp_model, dynamics_unavailable=None))
+def test_worlds_whose_dynamics_have_no_kernel_of_their_own_are_told_why():
+    world = World(mixed(), num_envs=1, sim=SimCfg(one_kernel_dynamics=False))
+    assert "one_kernel_dynamics is False" in str(world.one_kernel_integration_unavailable)

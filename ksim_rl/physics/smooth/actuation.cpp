@@ -1,5 +1,6 @@
 // Part 7: what actuators do (mj_transmission, mj_fwdActuation), and the sum of all forces but those of constraints
-// (mj_fwdAcceleration). An actuator drives a hinge or a slide, and has a gain, a bias and an activation that are affine.
+// (mj_fwdAcceleration). An actuator drives a hinge or a slide, and has a gain, a bias and an activation that are
+// affine.
 
 auto activation_rate = [&](int actuator, float ctrl, float act) {
     const int type = look_up(problem.actuator_dyntype, actuator);

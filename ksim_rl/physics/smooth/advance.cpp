@@ -1,4 +1,5 @@
-// Part 5 of the integration: the state at the end of the substep (mj_advance), and which rows and contacts found no room.
+// Part 5 of the integration: the state at the end of the substep (mj_advance), and which rows and contacts found no
+// room.
 
 each(NUM_DOFS, [&](int dof) {
     row_of(problem.qvel)[dof] = right[dof] = row_of(problem.qvel)[dof] + timestep * qacc[dof];

@@ -2,10 +2,10 @@
 //
 //     (M - h dF/dv) qacc' = M qacc
 //
-// (computation chapter, "Numerical integration"), in which h is the timestep and F are those smooth forces that depend on
-// velocity: of dampers, and of actuators if the integrator is implicitfast. These act on the degree of freedom that they
-// are of, since actuators drive hinges and slides alone, so that dF/dv is diagonal. M qacc is the solver's: with a solver
-// that has converged it is the sum of all forces.
+// (computation chapter, "Numerical integration"), in which h is the timestep and F are those smooth forces that depend
+// on velocity: of dampers, and of actuators if the integrator is implicitfast. These act on the degree of freedom that
+// they are of, since actuators drive hinges and slides alone, so that dF/dv is diagonal. M qacc is the solver's: with a
+// solver that has converged it is the sum of all forces.
 //
 // The matrix has the entries of M: a row has a degree of freedom's ancestors, from the root on, and then itself.
 

@@ -1,7 +1,7 @@
-// Part 3 of the integration: its solution by L' D L = M - h dF/dv (computation chapter, "Inertia factorization"), whose L
-// has entries where M has some. Degrees of freedom are eliminated from the last to the first: each takes from the rows of
-// its ancestors, among which that of the n-th has the columns of the first n. A lane has some of the columns, so that an
-// entry is summed by one lane, in the order of elimination.
+// Part 3 of the integration: its solution by L' D L = M - h dF/dv (computation chapter, "Inertia factorization"), whose
+// L has entries where M has some. Degrees of freedom are eliminated from the last to the first: each takes from the
+// rows of its ancestors, among which that of the n-th has the columns of the first n. A lane has some of the columns,
+// so that an entry is summed by one lane, in the order of elimination.
 
 if (SOLVES) {
 #pragma unroll 1

@@ -1,6 +1,6 @@
-// Part 4 of the integration: with implicitfast a body that has nothing but a free joint is solved for with the derivative
-// of its gyroscopic forces too (mjd_freeMhat), which is not symmetric. With w its angular velocity and s the arm from
-// its frame to its centre of mass, both along the axes of the world, m its mass and I its inertia there,
+// Part 4 of the integration: with implicitfast a body that has nothing but a free joint is solved for with the
+// derivative of its gyroscopic forces too (mjd_freeMhat), which is not symmetric. With w its angular velocity and s the
+// arm from its frame to its centre of mass, both along the axes of the world, m its mass and I its inertia there,
 //
 //     d bias / d v = [0  -m K R; 0  R' (-m [s] K + [w] I - [I w]) R],   K = s w' - w's + [w x s].
 

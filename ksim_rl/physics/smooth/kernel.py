@@ -43,43 +43,31 @@ _ENUMS = {
 
 
 @struct_with(
-    ("", mjw.Model, "qpos0 qpos_spring M_hinit_i M_colind M_rownnz M_rowadr body_freeadr"),
     (
         "",
         mjw.Model,
+        "qpos0 qpos_spring M_hinit_i M_colind M_rownnz M_rowadr body_freeadr "
         "body_rootid body_mocapid body_jntnum body_jntadr body_dofadr body_subtreenum body_branches "
-        "body_branch_start body_pos body_quat body_ipos body_iquat body_mass body_subtreemass body_inertia",
-    ),
-    (
-        "",
-        mjw.Model,
+        "body_branch_start body_pos body_quat body_ipos body_iquat body_mass body_subtreemass body_inertia "
         "jnt_type jnt_qposadr jnt_dofadr jnt_bodyid jnt_pos jnt_axis jnt_actuatorid jnt_stiffness jnt_stiffnesspoly "
-        "jnt_actfrclimited jnt_actfrcrange dof_bodyid dof_jntid dof_armature dof_damping dof_dampingpoly",
-    ),
-    ("", mjw.Model, "geom_bodyid geom_pos geom_quat site_bodyid site_pos site_quat"),
-    (
-        "",
-        mjw.Model,
+        "jnt_actfrclimited jnt_actfrcrange dof_bodyid dof_jntid dof_armature dof_damping dof_dampingpoly "
+        "geom_bodyid geom_pos geom_quat site_bodyid site_pos site_quat "
         "actuator_trntype actuator_trnid actuator_gear actuator_armature actuator_damping actuator_dampingpoly "
         "actuator_dyntype actuator_gaintype actuator_biastype actuator_dynprm actuator_gainprm actuator_biasprm "
         "actuator_ctrladr actuator_ctrlnum actuator_ctrllimited actuator_ctrlrange actuator_actadr actuator_actnum "
         "actuator_actlimited actuator_actrange actuator_actearly actuator_forcelimited actuator_forcerange",
     ),
     ("", mjw.Option, "gravity timestep"),
-    ("", mjw.Data, "qpos qvel act ctrl mocap_pos mocap_quat qfrc_applied xfrc_applied"),
     (
         "",
         mjw.Data,
+        "qpos qvel act ctrl mocap_pos mocap_quat qfrc_applied xfrc_applied "
         "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat subtree_com cdof cinert "
-        "cvel cdof_dot cacc cfrc_int M qfrc_bias qfrc_spring qfrc_damper qfrc_passive",
-    ),
-    (
-        "",
-        mjw.Data,
+        "cvel cdof_dot cacc cfrc_int crb M qfrc_bias qfrc_spring qfrc_damper qfrc_passive "
         "actuator_length actuator_velocity moment_rownnz moment_rowadr moment_colind actuator_moment act_dot "
-        "actuator_force qfrc_actuator qfrc_smooth",
+        "actuator_force qfrc_actuator qfrc_smooth "
+        "qacc qacc_warmstart time overflow nefc ncollision nacon njmax naconmax",
     ),
-    ("", mjw.Data, "crb qacc qacc_warmstart time overflow nefc ncollision nacon njmax naconmax"),
     ("efc_", mjw.Constraint, "Ma"),
 )
 class Problem:

@@ -89,8 +89,9 @@ def integration(
 ) -> Callable[[], None]:
     """Return what launches the integration of a model for which it is available: MuJoCo Warp's `euler` or `implicit`.
 
-    Each sum has one order, whatever the number of lanes. Where forces are disabled it follows the C engine: activations
-    without actuation keep still, and implicitfast has the derivatives of what is left; MuJoCo Warp forgets some.
+    Each sum has one order, whatever the number of lanes. Where MuJoCo Warp differs from the C engine it follows C: with
+    forces disabled (activations without actuation keep still, and implicitfast has the derivatives of what is left),
+    and with controls out of range, whose derivative is that of the clamped ones.
     """
     launch = _launcher(INTEGRATION, warp_model, warp_data_E, lanes)
     return lambda: launch(True)

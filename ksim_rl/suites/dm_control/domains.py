@@ -53,7 +53,6 @@ _OWN_RANGES = {"start": DrawStart(own_ranges=True)}
 _FISH_JOINTS = (
     "tail1", "tail_twist", "tail2", "finright_roll", "finright_pitch", "finleft_roll", "finleft_pitch",
 )  # fmt: skip
-_LINKS = ("head", *map(str, range(5)))
 _ALL_BODIES = "(?!world$).+"
 _WALKER_POSE = BodyAxes(bodies=_ALL_BODIES, entries=("xx", "xz"))
 
