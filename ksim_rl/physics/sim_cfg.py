@@ -33,9 +33,11 @@ class SimCfg(Checked):
             energies, noslip, no warm start, a dense Jacobian) take MuJoCo Warp's own; `World.one_kernel_unavailable`
             says why.
         one_kernel_dynamics: with the one-kernel solver, compute all that constraints have no part in (kinematics,
-            inertias, bias, passive and actuator forces) in one kernel instead of some 35. Results agree up to rounding.
-            Models out of its range (tendons, fluids, gravity compensation, muscles, delayed actuators, transmissions
-            other than to hinges and slides) take MuJoCo Warp's own; `World.one_kernel_dynamics_unavailable` says why.
+            inertias, bias, passive and actuator forces) in one kernel instead of some 35, and make the constraint rows
+            in another instead of ten, in the C engine's order. Results agree up to rounding. Models out of its range
+            (tendons, fluids, gravity compensation, muscles, delayed actuators, transmissions other than to hinges and
+            slides; for rows, bodies that are tied) take MuJoCo Warp's own; `World.one_kernel_dynamics_unavailable` and
+            `one_kernel_rows_unavailable` say why.
             `None` does so on GPUs, where Go1 trains 1.21 times as fast (4096 envs, H200); on the CPU it gains a tenth
             of the physics, and compiles for 12 s.
         require_graphs: refuse to run where graphs are unavailable, instead of a warning and a slow run.

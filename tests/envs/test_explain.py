@@ -32,7 +32,7 @@ def tables(text):
     """Return the tables by title, each a list of rows without its heads."""
     found: dict[str, list[str]] = {}
     title = ""
-    for line in text.splitlines()[3:]:
+    for line in text.splitlines()[4:]:
         if line and not line.startswith(" "):
             title = line
             found[title] = []

@@ -49,7 +49,9 @@ XML = """
     <joint joint1="pole" polycoef="0.1 0 0 0 0" solref="0.03 1"/>
     <joint joint1="wrist" joint2="pole" active="false"/>
   </equality>
-  <contact><pair geom1="lid" geom2="box" condim="3" solreffriction="0.03 1.2" friction="0.8 0.6 0.02 0.01 0.02"/></contact>
+  <contact>
+    <pair geom1="lid" geom2="box" condim="3" solreffriction="0.03 1.2" friction="0.8 0.6 0.02 0.01 0.02"/>
+  </contact>
 </mujoco>
 """
 PER_WORLD = ("dof_frictionloss", "jnt_range", "geom_friction")

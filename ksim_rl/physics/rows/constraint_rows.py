@@ -15,10 +15,10 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from ksim_rl.physics.rows.contact_lists import LANES, ContactLists, launch
+from ksim_rl.physics.rows.contact_lists import ContactLists, launch
 from ksim_rl.physics.structs import filled, struct_with
 
-PARTS = ("layout", "order", "row", "joints", "contacts")
+PARTS = "layout order row joints contacts"
 # The degrees of freedom that move a geom are bits of a number, and a body or geom of a pair is 16 bits of another.
 MOST_DOFS, MOST_GEOMS = 64, 1 << 16
 _ENUMS = {
@@ -31,8 +31,12 @@ _ENUMS = {
 @struct_with(
     ("", ContactLists, "count ids appended found keys"),
     ("", mjw.Model, "qpos0 jnt_type jnt_qposadr jnt_dofadr jnt_solref jnt_solimp jnt_range jnt_margin"),
-    ("", mjw.Model, "dof_solref dof_solimp dof_frictionloss dof_invweight0 body_invweight0 geom_bodyid"),
-    ("", mjw.Model, "eq_obj1id eq_obj2id eq_solref eq_solimp eq_data eq_jnt_adr"),
+    ("", mjw.Model, "dof_solref dof_solimp dof_frictionloss dof_invweight0 dof_bodyid"),
+    (
+        "",
+        mjw.Model,
+        "body_invweight0 body_rootid geom_bodyid eq_obj1id eq_obj2id eq_solref eq_solimp eq_data eq_jnt_adr",
+    ),
     ("", mjw.Option, "timestep impratio_invsqrt"),
     ("", mjw.Data, "qpos qvel eq_active subtree_com cdof ne nf nl nefc overflow"),
     ("contact_", mjw.Contact, "dist pos frame includemargin friction solref solreffriction solimp dim geom"),
@@ -40,42 +44,34 @@ _ENUMS = {
     ("efc_", mjw.Constraint, "type id J_rownnz J_rowadr D aref frictionloss pos margin vel"),
 )
 class Problem:
-    """What the kernel reads of a model, its worlds and lists, and what it writes.
-
-    Besides, the joints with limits, the root of the tree of each degree of freedom, and the bits of those that move
-    each geom.
-    """
+    """What the kernel reads and writes, the joints with limits, and the bits of the dofs that move each geom."""
 
     limited: wp.array[int]
-    root_of_dof: wp.array[int]
     dofs_of_geom: wp.array[wp.uint64]
     efc_J_colind: wp.array2d[int]
     efc_J: wp.array2d[float]
 
 
 def one_kernel_rows_unavailable(warp_model: mjw.Model, *, dynamics_unavailable: str | None) -> str | None:
-    """Return why MuJoCo Warp's own kernels make a model's rows, or None where one kernel does.
-
-    Models for which there is a reason `dynamics_unavailable` against one kernel of what precedes them have none here.
-    """
+    """Return why MuJoCo Warp's own kernels make a model's rows, or None where one does, as of what precedes them."""
     m = warp_model
     reasons = {
         "what precedes them is not one kernel": dynamics_unavailable is not None,
         "equality constraints tie bodies": m.eq_connect_adr.size + m.eq_wld_adr.size > 0,
         "surfaces move": bool(m.flg_surfacevel),
-        f"there are more than {MOST_DOFS} degrees of freedom or {MOST_GEOMS} geoms": m.nv > MOST_DOFS
-        or m.ngeom > MOST_GEOMS,
+        f"there are more than {MOST_DOFS} degrees of freedom": m.nv > MOST_DOFS,
+        f"there are more than {MOST_GEOMS} geoms": m.ngeom > MOST_GEOMS,
     }
     return next((reason for reason, holds in reasons.items() if holds), None)
 
 
 def constraint_rows(
-    warp_model: mjw.Model, warp_data_E: mjw.Data, lists: ContactLists, *, lanes: int = LANES
+    warp_model: mjw.Model, warp_data_E: mjw.Data, lists: ContactLists, *, lanes: int | None = None
 ) -> Callable[[], None]:
     """Return what launches `mjw.make_constraint` for a model with sparse rows, with arrays in their final place.
 
     It also makes the contact lists. What only MuJoCo Warp's own solver reads (`jtdaj_*`, `Jqvel`, `dof_frictionadr`) is
-    not written. `lanes` is how many threads share a world on CUDA.
+    not written. `lanes` is how many threads share a world on CUDA; None takes the usual.
     """
     m, d, bits, flags = warp_model, warp_data_E, mjw.DisableBit, int(warp_model.opt.disableflags)
     limited = np.concatenate([m.jnt_limited_ball_adr.numpy(), m.jnt_limited_slide_hinge_adr.numpy()])
@@ -84,7 +80,6 @@ def constraint_rows(
     device = d.qpos.device
     own = {
         "limited": wp.array(np.sort(limited), dtype=int, device=device),
-        "root_of_dof": wp.array(m.body_rootid.numpy()[m.dof_bodyid.numpy()], dtype=int, device=device),
         "dofs_of_geom": wp.array(masks, dtype=wp.uint64, device=device),
         "efc_J_colind": d.efc.J_colind.reshape((d.nworld, -1)),
         "efc_J": d.efc.J.reshape((d.nworld, -1)),
@@ -93,23 +88,20 @@ def constraint_rows(
     contacts = {f"contact_{name}": array for name, array in vars(d.contact).items()}
     problem = filled(Problem, own, lists, rows, contacts, m, m.opt, d)
     on = {bit: not flags & (bits.CONSTRAINT | bit) for bit in bits}
+    sizes = {"num_dofs": m.nv, "njmax": d.njmax, "most_nonzeros": d.njmax_nnz}
     constants = {
-        **lists.constants,
-        **_ENUMS,
-        "num_dofs": m.nv,
-        "njmax": d.njmax,
-        "most_nonzeros": d.njmax_nnz,
-    } | {
+        **(lists.constants | _ENUMS | sizes),
         "equalities": m.eq_jnt_adr.size if on[bits.EQUALITY] else 0,
         "limited_joints": limited.size if on[bits.LIMIT] else 0,
         "frictionloss": on[bits.FRICTIONLOSS],
         "contacts": on[bits.CONTACT],
         "elliptic": m.opt.cone == mjw.ConeType.ELLIPTIC,
         "refsafe": not flags & bits.REFSAFE,
+        "lanes": lanes or lists.constants["lanes"],
     }
 
     def make_rows() -> None:
         lists.append()
-        launch(PARTS, constants, Problem, problem, d.nefc, lanes)
+        launch(PARTS, constants, Problem, problem, d.nefc)
 
     return make_rows

@@ -25,8 +25,8 @@ HAS_ROWS = wp.constant(int(upstream.ContactType.CONSTRAINT))
 class ContactLists:
     """Each world's contacts that may have constraint rows, in the order of MuJoCo's C engine.
 
-    Those in the gap of a margin, which have none, are among them. A world that has more contacts than `room`, by default
-    enough for `njmax` rows, leaves out those that happen to come last. Models with flexes have no lists.
+    Those in the gap of a margin, which have none, are among them. A world that has more contacts than `room`, by
+    default enough for `njmax` rows, leaves out those that happen to come last. Models with flexes have no lists.
 
     Attributes:
         count, ids: int32 [E], how many contacts a world has, and [E, room], their places in the pool.
@@ -46,7 +46,8 @@ class ContactLists:
         self.count, self.appended = (wp.zeros(d.nworld, dtype=int, device=device) for _ in range(2))
         self.ids, self.found = (wp.zeros((d.nworld, self.room), dtype=int, device=device) for _ in range(2))
         self.keys = wp.empty((d.nworld, self.room), dtype=wp.uint64, device=device)
-        self.constants = {"room": self.room, "sdf": bool(m.has_sdf_geom)}
+        lanes = LANES if device.is_cuda else 1
+        self.constants = {"room": self.room, "sdf": bool(m.has_sdf_geom), "lanes": lanes}
         contacts = {f"contact_{name}": array for name, array in vars(d.contact).items()}
         self._problem, self._naconmax = filled(Problem, self, contacts, m, d), d.naconmax
 
@@ -56,7 +57,7 @@ class ContactLists:
 
     def order(self) -> None:
         """Launch the second half, where no kernel of constraint rows does so on its way."""
-        launch(("layout", "order"), self.constants, Problem, self._problem, self.count)
+        launch("layout order", self.constants, Problem, self._problem, self.count)
 
 
 @struct_with(
@@ -80,27 +81,18 @@ def append_contacts(p: Problem):
             p.found[world, place] = contact
 
 
-def launch(
-    parts: tuple[str, ...],
-    constants: dict[str, int],
-    struct: Any,
-    problem: Any,
-    count: wp.array,
-    lanes: int = LANES,
-) -> None:
-    """Launch C++ parts of this folder over the worlds and lanes of a problem, compiled with constants."""
-    threads, lanes = (CUDA_THREADS, lanes) if count.device.is_cuda else (1, 1)
-    kernel = _kernel(parts, (*constants.items(), ("lanes", lanes)), struct, threads)
-    wp.launch(kernel, dim=(count.size, lanes), inputs=[problem], block_dim=threads, device=count.device)
+def launch(parts: str, constants: dict[str, int], struct: Any, problem: Any, count: wp.array) -> None:
+    """Launch C++ parts of this folder, compiled with constants, over the worlds and lanes of a problem."""
+    threads, dim = CUDA_THREADS if count.device.is_cuda else 1, (count.size, constants["lanes"])
+    kernel = _kernel(parts, tuple(constants.items()), struct, threads)
+    wp.launch(kernel, dim=dim, inputs=[problem], block_dim=threads, device=count.device)
 
 
 @functools.cache
-def _kernel(
-    parts: tuple[str, ...], constants: tuple[tuple[str, int], ...], struct: Any, threads: int
-) -> wp.Kernel:
+def _kernel(parts: str, constants: tuple[tuple[str, int], ...], struct: Any, threads: int) -> wp.Kernel:
     folder = files("ksim_rl.physics.rows")
     snippet = "".join(f"constexpr int {name.upper()} = {int(value)};\n" for name, value in constants)
-    snippet += "".join(folder.joinpath(f"{part}.cpp").read_text() for part in parts)
+    snippet += "".join(folder.joinpath(f"{part}.cpp").read_text() for part in parts.split())
 
     @wp.func_native(snippet)
     def body(world: int, lane: int, problem: struct) -> None: ...

@@ -49,7 +49,7 @@ auto write_jacobian = [&](int contact, int address, int rows) {
         const int dof = lowest_of(rest);
         const auto& motion = row_of(problem.cdof)[dof];
         const vec3 spin(motion[0], motion[1], motion[2]), glide(motion[3], motion[4], motion[5]);
-        const vec3 arm = position - row_of(problem.subtree_com)[problem.root_of_dof.data[dof]];
+        const vec3 arm = position - row_of(problem.subtree_com)[problem.body_rootid.data[problem.dof_bodyid.data[dof]]];
         const float sign = of_second >> dof & 1 ? 1.0f : -1.0f;
         const vec3 rotation = sign * spin, translation = sign * (glide + wp::cross(spin, arm));
         auto rate = [&](int axis) { return axis < 3 ? along(axis, translation) : along(axis - 3, rotation); };
