@@ -18,7 +18,7 @@ import warp as wp
 from ksim_rl.physics.rows.contact_lists import ContactLists, launch
 from ksim_rl.physics.structs import filled, struct_with
 
-PARTS = "layout order row joints contacts"
+PARTS = ("layout", "order", "row", "joints", "contacts")
 # The degrees of freedom that move a geom are bits of a number, and a body or geom of a pair is 16 bits of another.
 MOST_DOFS, MOST_GEOMS = 64, 1 << 16
 _ENUMS = {

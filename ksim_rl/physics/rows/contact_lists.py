@@ -57,7 +57,7 @@ class ContactLists:
 
     def order(self) -> None:
         """Launch the second half, where no kernel of constraint rows does so on its way."""
-        launch("layout order", self.constants, Problem, self._problem, self.count)
+        launch(("layout", "order"), self.constants, Problem, self._problem, self.count)
 
 
 @struct_with(
@@ -81,7 +81,9 @@ def append_contacts(p: Problem):
             p.found[world, place] = contact
 
 
-def launch(parts: str, constants: dict[str, int], struct: Any, problem: Any, count: wp.array) -> None:
+def launch(
+    parts: tuple[str, ...], constants: dict[str, int], struct: Any, problem: Any, count: wp.array
+) -> None:
     """Launch C++ parts of this folder, compiled with constants, over the worlds and lanes of a problem."""
     threads, dim = CUDA_THREADS if count.device.is_cuda else 1, (count.size, constants["lanes"])
     kernel = _kernel(parts, tuple(constants.items()), struct, threads)
@@ -89,10 +91,12 @@ def launch(parts: str, constants: dict[str, int], struct: Any, problem: Any, cou
 
 
 @functools.cache
-def _kernel(parts: str, constants: tuple[tuple[str, int], ...], struct: Any, threads: int) -> wp.Kernel:
+def _kernel(
+    parts: tuple[str, ...], constants: tuple[tuple[str, int], ...], struct: Any, threads: int
+) -> wp.Kernel:
     folder = files("ksim_rl.physics.rows")
     snippet = "".join(f"constexpr int {name.upper()} = {int(value)};\n" for name, value in constants)
-    snippet += "".join(folder.joinpath(f"{part}.cpp").read_text() for part in parts.split())
+    snippet += "".join(folder.joinpath(f"{part}.cpp").read_text() for part in parts)
 
     @wp.func_native(snippet)
     def body(world: int, lane: int, problem: struct) -> None: ...
