@@ -103,4 +103,4 @@ class ContactReadings:
         mjw.rne_postconstraint(warp_model, self._without_pool)
 
     def _launch(self, part: str) -> None:
-        launch(f"layout wrench {part}", self._constants, Problem, self._problem, self._lists.count)
+        launch(("layout", "wrench", part), self._constants, Problem, self._problem, self._lists.count)
