@@ -11,8 +11,8 @@ import warp as wp
 from ksim_rl.physics import SimCfg, World, prepare_spec
 
 NUM_ENVS = 4
-# All numbers of contact dimensions, several geoms on a body, a gap, limits of slides, hinges and balls, dry friction,
-# and joints that are tied.
+# All numbers of contact dimensions, several geoms on a body, a gap, a distance that is measured, which takes a place in
+# the pool, limits of slides, hinges and balls, dry friction, and joints that are tied.
 XML = """
 <mujoco>
   <option timestep="0.004" integrator="implicitfast" impratio="3"/>
@@ -52,6 +52,7 @@ XML = """
   <contact>
     <pair geom1="lid" geom2="box" condim="3" solreffriction="0.03 1.2" friction="0.8 0.6 0.02 0.01 0.02"/>
   </contact>
+  <sensor><distance geom1="wall" geom2="lid" cutoff="2"/></sensor>
 </mujoco>
 """
 PER_WORLD = ("dof_frictionloss", "jnt_range", "geom_friction")

@@ -10,7 +10,7 @@ import pytest
 import torch
 import warp as wp
 
-from ksim_rl.physics import SimCfg, World
+from ksim_rl.physics import SimCfg, World, upstream
 from ksim_rl.physics.rows import constraint_rows as rows
 from ksim_rl.physics.rows.contact_lists import ContactLists
 from tests.physics.row_models import NUM_ENVS, in_c, mj_model, permute_pool, touching
@@ -30,7 +30,10 @@ def launch(world: World, **changes) -> ContactLists:
     m = dataclasses.replace(world.warp_model, opt=dataclasses.replace(world.warp_model.opt, **changes))
     for name in (*COLUMNS, "J", "J_colind", "J_rowadr", "J_rownnz", "id"):
         getattr(world.warp_data_E.efc, name).fill_(77)
-    world.warp_data_E.contact.efc_address.fill_(77)
+    contact = world.warp_data_E.contact
+    may_have_rows = contact.type.numpy()[:, None] & int(upstream.ContactType.CONSTRAINT) != 0
+    # What only a sensor measures is left as the collision pass wrote it.
+    contact.efc_address.assign(np.where(may_have_rows, 77, np.full(contact.efc_address.shape, -1)))
     with wp.ScopedDevice("cpu"):
         lists = ContactLists(m, world.warp_data_E)
         rows.constraint_rows(m, world.warp_data_E, lists)()
@@ -188,6 +191,10 @@ def test_rows_beyond_njmax_are_counted_and_not_written():
     most = d.contact.efc_address.shape[1]
     np.testing.assert_array_equal(d.nefc.numpy()[:-1], 20 + most * beyond[:-1])
     assert d.nefc.numpy()[-1] == needed[-1]
+    world.step(1)
+    report = world.overflow_report()
+    assert report.worlds["NEFC"] == NUM_ENVS - 1 and report.nefc == max(needed)
+    assert f"set sim.njmax >= {max(needed)}" in report.messages[0]
 
 
 def test_a_full_jacobian_is_said_and_drops_the_last_rows():

@@ -97,7 +97,7 @@ def constraint_rows(
         "contacts": on[bits.CONTACT],
         "elliptic": m.opt.cone == mjw.ConeType.ELLIPTIC,
         "refsafe": not flags & bits.REFSAFE,
-        "lanes": lanes or lists.constants["lanes"],
+        "lanes": lanes if lanes and device.is_cuda else lists.constants["lanes"],
     }
 
     def make_rows() -> None:
