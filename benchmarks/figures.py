@@ -27,6 +27,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "agreement": STEP[:1],
     "collector": (*STEP, "ksim_rl/collectors"),
     "dm_control": (*STEP, *LEARN, "ksim_rl/suites"),
+    "determinism": (*STEP, *LEARN, *TASK),
     "diagnosis": ("ksim_rl/diagnosis", *LEARN),
     "humanoids": (*STEP, *LEARN, *TASK),
     "learning": (*STEP, *LEARN, *TASK),

@@ -23,13 +23,9 @@ from mujoco_warp._src.math import mul_quat as mul_quat
 from mujoco_warp._src.math import quat_to_mat as quat_to_mat
 from mujoco_warp._src.math import rot_vec_quat as rot_vec_quat
 
-# How its contact sensors match the elements of a contact, and the force of that.
-from mujoco_warp._src.sensor import _check_match
-
 # What a step adds to the inertia matrix and to the bias forces for tendons.
 from mujoco_warp._src.smooth import tendon_armature as tendon_armature
 from mujoco_warp._src.smooth import tendon_bias as tendon_bias
-from mujoco_warp._src.support import contact_force_fn as contact_force_fn
 
 # The bits of `contact.type`.
 from mujoco_warp._src.types import ContactType as ContactType
@@ -38,7 +34,6 @@ from torch import Tensor
 FIXED = int(mjw.SetConstGroup.FIXED)
 # The two columns of `nxn_pairid` for a pair that never makes a contact, and for one that no sensor measures.
 NO_CONTACT, NO_SENSOR = -2, -1
-is_of = _check_match
 
 
 def per_world_fields() -> tuple[str, ...]:

@@ -59,11 +59,15 @@ def place(world: World) -> None:
 
 
 def columns(mj_model: mujoco.MjModel, *, ours: bool) -> np.ndarray:
-    read = read_by_us(mj_model)
+    read, (contact,) = (
+        read_by_us(mj_model),
+        (mj_model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT).nonzero(),
+    )
+    spans = zip(mj_model.sensor_adr[contact], mj_model.sensor_dim[contact], strict=True)
     return np.concatenate(
         [
             np.arange(adr, adr + dim)
-            for sensor, (adr, dim) in enumerate(zip(mj_model.sensor_adr, mj_model.sensor_dim, strict=True))
+            for sensor, (adr, dim) in zip(contact, spans, strict=True)
             if (sensor in read) == ours
         ]
     )
