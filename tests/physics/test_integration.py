@@ -11,6 +11,7 @@ import warp as wp
 
 from ksim_rl.physics import SimCfg, World, load_model
 from ksim_rl.physics.smooth import stages
+from tests.physics.test_nan_guard import HEAVY, SLEDS
 from tests.physics.test_smooth import NUM_ENVS, PER_WORLD, mixed, moved
 
 STATE = ("qpos", "qvel", "act", "time")
@@ -166,6 +167,15 @@ def test_what_is_not_finite_stays_in_its_world():
     assert found[1]["qvel"][1].isnan().all()
     for name, clean in found[0].items():
         assert torch.equal(clean[[0, 2]], found[1][name][[0, 2]]), name
+
+
+def test_a_gear_whose_square_no_float_holds_is_no_derivative_where_velocity_adds_no_force():
+    world = World(load_model(SLEDS), num_envs=2, sim=SimCfg(one_kernel_dynamics=True))
+    world.ctrl_EL[:, HEAVY] = 1.0
+    world.step()
+    expected = torch.zeros(world.qvel_EL.shape)
+    expected[:, HEAVY] = world.timestep / 2.0  # 1 N on 2 kg
+    torch.testing.assert_close(world.qvel_EL, expected)
 
 
 def test_worlds_whose_dynamics_have_no_kernel_of_their_own_are_told_why():

@@ -40,7 +40,7 @@ auto drive_rate = [&](int dof) {
         if (look_up(problem.actuator_gaintype, actuator) == AFFINE_GAIN)
             rate += model_row(problem.actuator_gainprm)[actuator][2] * present_input(actuator);
         const float gear = model_row(problem.actuator_gear)[actuator][0];
-        sum += gear * gear * rate;
+        sum += gear * (gear * rate);  // a rate of 0 is none, however large the gear is
     }
     return sum;
 };

@@ -100,7 +100,7 @@ auto damping_of = [&](int joint, int dof) {
     each_actuator_of(joint, [&](int actuator) {
         const float gear = model_row(problem.actuator_gear)[actuator][0];
         found.linear += model_row(problem.actuator_damping)[actuator] * gear * gear;
-        found.more = found.more + model_row(problem.actuator_dampingpoly)[actuator] * (gear * gear);
+        found.more = found.more + model_row(problem.actuator_dampingpoly)[actuator] * gear * gear;
     });
     found.linear = model_row(problem.dof_damping)[dof] + found.linear;
     found.more = model_row(problem.dof_dampingpoly)[dof] + found.more;
