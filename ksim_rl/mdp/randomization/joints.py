@@ -115,14 +115,11 @@ class RandomizeDefaultJointPos(OfJoints, RandomizeNumber, operation="add"):
     """
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        joints, model = view.joints(self.joints).index, view.world.mj_model
-        pose = model.key_qpos[0] if model.nkey else model.qpos0
-        own = pose[model.jnt_qposadr[scalar_joint_ids(model)]]
-        ids = view.resolver.ids("joint", self.joints)
-        drawn_EN = self.draw(view, len(ids), [self.ranges])[..., 0]
-        value_EN = self.combine(array_constant(own[list(ids)], view.device), drawn_EN)
-        held_EN = view.default_joint_pos_EL[:, joints]
-        view.default_joint_pos_EL[:, joints] = torch.where(mask_E[:, None], value_EN, held_EN)
+        joints = view.joints(self.joints)
+        drawn_EN = self.draw(view, len(joints), [self.ranges])[..., 0]
+        value_EN = self.combine(view.default_qpos_L[joints.qpos], drawn_EN)
+        held_EN = joints.default_pos_EL
+        view.default_joint_pos_EL[:, joints.index] = torch.where(mask_E[:, None], value_EN, held_EN)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,10 +129,10 @@ class RandomizeEncoderBias(OfJoints, RandomizeNumber):
     operation: Literal["abs"] = "abs"
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        joints = view.joints(self.joints).index
-        held_EN = view.encoder_bias_EL[:, joints]
-        drawn_EN = self.draw(view, held_EN.shape[1], [self.ranges])[..., 0]
-        view.encoder_bias_EL[:, joints] = torch.where(mask_E[:, None], drawn_EN, held_EN)
+        joints = view.joints(self.joints)
+        drawn_EN = self.draw(view, len(joints), [self.ranges])[..., 0]
+        biased_EN = torch.where(mask_E[:, None], drawn_EN, joints.encoder_bias_EL)
+        view.encoder_bias_EL[:, joints.index] = biased_EN
 
 
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
