@@ -13,7 +13,6 @@ from ksim_rl.envs.view import EnvView
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.sensors import ContactState
-from ksim_rl.scene.state.entity import Entity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,20 +100,6 @@ class GaussianReward(RewardTerm):
     def rate(self, squared_error_E: Float[Tensor, " E"]) -> Float[Tensor, " E"]:
         """Return the reward of a squared error."""
         return torch.exp(squared_error_E / -(self.std**2))
-
-
-@dataclass(frozen=True, kw_only=True)
-class OfFreeRoot(OfEntity):
-    """A term that moves the root of a robot or object."""
-
-    def root_of(self, view: EnvView) -> Entity:
-        """Return the entity; a ValueError says if its root is fixed."""
-        entity = view.entity(self.entity)
-        if not entity.free_root:
-            raise ValueError(
-                f"{type(self).__name__} needs a robot whose first joint is free; the root of {entity.name!r} is fixed"
-            )
-        return entity
 
 
 @dataclass(frozen=True, kw_only=True)
