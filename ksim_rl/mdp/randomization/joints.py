@@ -20,7 +20,7 @@ from ksim_rl.mdp.randomization.randomize import (
     RandomizeNumber,
     write_entries,
 )
-from ksim_rl.scene.names import Patterns, scalar_joint_ids
+from ksim_rl.scene.names import Patterns, actuators_of_joint, scalar_joint_ids
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,9 +135,6 @@ class RandomizeEncoderBias(OfJoints, RandomizeNumber):
         view.encoder_bias_EL[:, joints.index] = biased_EN
 
 
-_JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-
-
 @dataclass(frozen=True, kw_only=True)
 class RandomizeActuator(OfJoints, Randomize, operation="scale"):
     """What the events of this file share; `joints` are those that are driven."""
@@ -231,7 +228,7 @@ class RandomizeEffortLimit(RandomizeActuator, RandomizeNumber):
         ranges: dict[str, dict[int, int]] = {"actuator_forcerange": {}, "jnt_actfrcrange": {}}
         for i in builtin:
             joint = model.joint(names[i]).id
-            limited = [a for a in _actuators(model, joint) if model.actuator_forcelimited[a]]
+            limited = [a for a in actuators_of_joint(model, joint) if model.actuator_forcelimited[a]]
             ranges["actuator_forcerange"] |= dict.fromkeys(limited, i)
             if model.jnt_actfrclimited[joint]:
                 ranges["jnt_actfrcrange"][joint] = i
@@ -253,11 +250,6 @@ class RandomizeEffortLimit(RandomizeActuator, RandomizeNumber):
             write_entries(view.field(field), rows, (0, 1), mask_E, size_EN2 * signs_2)
 
 
-def _actuators(mj_model: mujoco.MjModel, joint: int) -> list[int]:
-    on_joints = np.isin(mj_model.actuator_trntype, _JOINT_TRANSMISSIONS)
-    return [int(a) for a in np.flatnonzero(on_joints & (mj_model.actuator_trnid[:, 0] == joint))]
-
-
 def _servo(mj_model: mujoco.MjModel, joint: int, gain: str) -> tuple[int, bool]:
     """Return the servo that has this gain, and whether the number is also its `gainprm[0]`.
 
@@ -265,7 +257,7 @@ def _servo(mj_model: mujoco.MjModel, joint: int, gain: str) -> tuple[int, bool]:
     with the gain damping.
     """
     position, velocity = None, None
-    for actuator in _actuators(mj_model, joint):
+    for actuator in actuators_of_joint(mj_model, joint):
         if (
             mj_model.actuator_gaintype[actuator] != mujoco.mjtGain.mjGAIN_FIXED
             or mj_model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE
