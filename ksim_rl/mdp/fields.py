@@ -157,20 +157,16 @@ def contact_force(view: EnvView, sensor: str) -> Float[Tensor, "E N"]:
 
 def commanded_speed(view: EnvView, command: str) -> Float[Tensor, " E"]:
     """Return |c_xy| + |c_z| of the command (vx, vy, wz), m/s and rad/s added as numbers."""
-    key = f"speed of {command}"
-    speed_E = view.command_cache.get(key)
-    if speed_E is None:
+    cache, key = view.command_cache, f"speed of {command}"
+    if key not in cache:
         command_EK = view.command(command)
-        speed_E = torch.linalg.vector_norm(command_EK[:, :2], dim=-1) + command_EK[:, 2].abs()
-        view.command_cache[key] = speed_E
-    return speed_E
+        cache[key] = torch.linalg.vector_norm(command_EK[:, :2], dim=-1) + command_EK[:, 2].abs()
+    return cache[key]
 
 
 def is_commanded(view: EnvView, command: str, threshold: float) -> Float[Tensor, " E"]:
     """Return 1 where the commanded speed exceeds the threshold, else 0."""
-    key = f"speed of {command} > {threshold}"
-    moves_E = view.command_cache.get(key)
-    if moves_E is None:
-        moves_E = (commanded_speed(view, command) > threshold).to(torch.float32)
-        view.command_cache[key] = moves_E
-    return moves_E
+    cache, key = view.command_cache, f"speed of {command} > {threshold}"
+    if key not in cache:
+        cache[key] = (commanded_speed(view, command) > threshold).to(torch.float32)
+    return cache[key]

@@ -143,10 +143,8 @@ class RandomizeActuator(OfJoints, Randomize, operation="scale"):
         self, view: EnvView, mask_E: Tensor, name: str, pair: Pair, finite: bool = False
     ) -> tuple[Tensor, list[int]]:
         """Draw a number for each joint, and write it where an explicit actuator has it; return the other places too."""
-        joints, owners = (
-            view.resolver.ids("joint", self.joints),
-            view.actuator_params.joints(name, finite=finite),
-        )
+        joints = view.resolver.ids("joint", self.joints)
+        owners = view.actuator_params.joints(name, finite=finite)
         drawn_EN = self.draw(view, len(joints), [pair])[..., 0].expand(-1, len(joints))
         explicit = [i for i, joint in enumerate(joints) if joint in owners]
         if explicit:
