@@ -112,13 +112,9 @@ class JointEffortAction(JointAction):
         own_K2, limits_K2 = super().bounds(view), view.targets.limits("effort", self.joints)
         if limits_K2 is None or self.tanh:
             return own_K2
-        scale, offset = (
-            torch.as_tensor(per_joint(view, name, value, self.joints), device=view.device).expand(
-                len(limits_K2)
-            )
-            for name, value in (("scale", self.scale), ("offset", self.offset))
-        )
-        range_K2 = ((limits_K2 - offset[:, None]) / scale[:, None]).sort(dim=-1).values
+        scale = per_joint(view, "scale", self.scale, self.joints)
+        offset = per_joint(view, "offset", self.offset, self.joints)
+        range_K2 = ((limits_K2.T - offset) / scale).T.sort(dim=-1).values
         return range_K2 if own_K2 is None else range_K2.clamp(own_K2[:, :1], own_K2[:, 1:])
 
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:

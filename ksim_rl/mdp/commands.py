@@ -124,11 +124,9 @@ class JointPositionCommand(HeldCommand, drawn=("offset",)):
         return torch.clamp(default_EN + offset_EN, limits_N2[:, 0], limits_N2[:, 1])
 
     def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
-        qpos = view.world.qpos_EL[env_index].cpu().numpy().copy()
-        targets = self.held(view)[env_index].tolist()
-        for name, target in zip(view.joints(self.joints).names, targets, strict=True):
-            qpos[view.world.mj_model.joint(name).qposadr[0]] = target
-        visualizer.ghost(qpos, rgba=_WANTED)
+        qpos_L = view.world.qpos_EL[env_index].clone()
+        qpos_L[view.joints(self.joints).qpos] = self.held(view)[env_index]
+        visualizer.ghost(qpos_L.cpu().numpy(), rgba=_WANTED)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -222,16 +222,14 @@ class CommandRangesByStage(OfCommand, CurriculumTerm):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         held = _ranges_of(view, self.command, {field for ranges in self.stages.values() for field in ranges})
-        wanted = dict(held)
+        changes = ranks.any_of(mask_E)
         for step, ranges in sorted(self.stages.items()):
+            begins = changes & (view.step_count >= step)
             for field, pair in ranges.items():
-                pair_2 = constant(pair, view.device)
-                wanted[field] = torch.where(view.step_count >= step, pair_2, wanted[field])
-        for field, held_2 in held.items():
-            held_2.copy_(torch.where(ranks.any_of(mask_E), wanted[field], held_2))
+                held[field].copy_(torch.where(begins, constant(pair, view.device), held[field]))
         stage = (view.step_count >= constant(sorted(self.stages), view.device)).sum().to(torch.float32)
         held_stage = view.shared("stage", 0.0)
-        held_stage.copy_(torch.where(ranks.any_of(mask_E), stage, held_stage))
+        held_stage.copy_(torch.where(changes, stage, held_stage))
         return held_stage.clone()
 
 

@@ -14,7 +14,7 @@ from ksim_rl.checks import check_in_range, check_pair
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
-from ksim_rl.mdp.fields import OfFreeRoot, OfJoints, root_height
+from ksim_rl.mdp.fields import OfEntity, OfJoints, root_height
 from ksim_rl.scene import quaternion
 
 Axis = Literal["x", "y", "z", "roll", "pitch", "yaw"]
@@ -87,7 +87,7 @@ class ResetJointsByScale(JointReset):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ResetRootUniform(OfFreeRoot, EventTerm):
+class ResetRootUniform(OfEntity, EventTerm):
     """Put the free root body at its default pose, on a terrain at the env's origin, plus uniform offset and velocity.
 
     `pose_range` is by axis: x, y, z (m, world frame), roll, pitch, yaw (rad, in the default pose's frame), and
@@ -98,7 +98,7 @@ class ResetRootUniform(OfFreeRoot, EventTerm):
     velocity_range: Ranges = field(default_factory=dict)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        body = self.root_of(view)
+        body = view.entity(self.entity)
         offset_E6 = _draw(view, self.pose_range)
         velocity_E6 = _draw(view, self.velocity_range)
         turn_E4 = quaternion.from_euler_xyz(*offset_E6[:, 3:].unbind(-1))
@@ -111,13 +111,13 @@ class ResetRootUniform(OfFreeRoot, EventTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ResetHeading(OfFreeRoot, EventTerm):
+class ResetHeading(OfEntity, EventTerm):
     """Turn the free root body about the world's z axis to a drawn heading (rad), also after `ResetRootUniform`."""
 
     heading_range: Range = (-math.pi, math.pi)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        body = self.root_of(view)
+        body = view.entity(self.entity)
         turn_E = view.uniform(1, *self.heading_range)[:, 0] - body.heading_E
         nothing_E = torch.zeros_like(turn_E)
         turn_E4 = quaternion.from_euler_xyz(nothing_E, nothing_E, turn_E)
@@ -125,26 +125,26 @@ class ResetHeading(OfFreeRoot, EventTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ResetHeight(OfFreeRoot, EventTerm):
+class ResetHeight(OfEntity, EventTerm):
     """Put the free root body at a drawn height (m) above the ground right below it, also after `ResetRootUniform`."""
 
     height_range: Range
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        body = self.root_of(view)
+        body = view.entity(self.entity)
         rise_E1 = view.uniform(1, *self.height_range) - root_height(view, self.entity)[:, None]
         pos_E3 = torch.cat((body.root_pos_EL[:, :2], body.root_pos_EL[:, 2:] + rise_E1), dim=-1)
         body.write_root_pose(mask_E, pos_E3, body.root_quat_EL)
 
 
 @dataclass(frozen=True, kw_only=True)
-class PushByVelocity(OfFreeRoot, EventTerm, mode="interval"):
+class PushByVelocity(OfEntity, EventTerm, mode="interval"):
     """Kick the free root body: add a uniform draw to its velocity (m/s and rad/s, world frame), whatever its mass."""
 
     velocity_range: Ranges
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        body = self.root_of(view)
+        body = view.entity(self.entity)
         kick_E6 = _draw(view, self.velocity_range)
         lin_vel_E3 = body.root_lin_vel_w_EL + kick_E6[:, :3]
         body.write_root_velocity(mask_E, lin_vel_E3, body.root_ang_vel_w_EL + kick_E6[:, 3:])
@@ -181,13 +181,13 @@ class PushByForce(EventTerm, mode="interval"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Jump(OfFreeRoot, EventTerm, mode="interval"):
+class Jump(OfEntity, EventTerm, mode="interval"):
     """Throw the free root body up: add the velocity sqrt(2 g h) that carries it a drawn height h (m) in free flight."""
 
     height_range: NonNegativeRange
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        body = self.root_of(view)
+        body = view.entity(self.entity)
         height_E = view.uniform(1, *self.height_range)[:, 0]
         up_E = torch.sqrt(2.0 * torch.linalg.vector_norm(view.world.gravity_EL, dim=-1) * height_E)
         lin_vel_E3 = body.root_lin_vel_w_EL.clone()

@@ -13,7 +13,6 @@ from ksim_rl.envs.view import EnvView
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.sensors import ContactState
-from ksim_rl.scene.state.entity import Entity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,20 +103,6 @@ class GaussianReward(RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfFreeRoot(OfEntity):
-    """A term that moves the root of a robot or object."""
-
-    def root_of(self, view: EnvView) -> Entity:
-        """Return the entity; a ValueError says if its root is fixed."""
-        entity = view.entity(self.entity)
-        if not entity.free_root:
-            raise ValueError(
-                f"{type(self).__name__} needs a robot whose first joint is free; the root of {entity.name!r} is fixed"
-            )
-        return entity
-
-
-@dataclass(frozen=True, kw_only=True)
 class FramedObservation(InFrame, ObservationTerm):
     """An observation in a frame: positions are relative to its origin, velocities and forces given in its axes.
 
@@ -172,20 +157,16 @@ def contact_force(view: EnvView, sensor: str) -> Float[Tensor, "E N"]:
 
 def commanded_speed(view: EnvView, command: str) -> Float[Tensor, " E"]:
     """Return |c_xy| + |c_z| of the command (vx, vy, wz), m/s and rad/s added as numbers."""
-    key = f"speed of {command}"
-    speed_E = view.command_cache.get(key)
-    if speed_E is None:
+    cache, key = view.command_cache, f"speed of {command}"
+    if key not in cache:
         command_EK = view.command(command)
-        speed_E = torch.linalg.vector_norm(command_EK[:, :2], dim=-1) + command_EK[:, 2].abs()
-        view.command_cache[key] = speed_E
-    return speed_E
+        cache[key] = torch.linalg.vector_norm(command_EK[:, :2], dim=-1) + command_EK[:, 2].abs()
+    return cache[key]
 
 
 def is_commanded(view: EnvView, command: str, threshold: float) -> Float[Tensor, " E"]:
     """Return 1 where the commanded speed exceeds the threshold, else 0."""
-    key = f"speed of {command} > {threshold}"
-    moves_E = view.command_cache.get(key)
-    if moves_E is None:
-        moves_E = (commanded_speed(view, command) > threshold).to(torch.float32)
-        view.command_cache[key] = moves_E
-    return moves_E
+    cache, key = view.command_cache, f"speed of {command} > {threshold}"
+    if key not in cache:
+        cache[key] = (commanded_speed(view, command) > threshold).to(torch.float32)
+    return cache[key]

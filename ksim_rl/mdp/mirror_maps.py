@@ -1,7 +1,7 @@
 """The left-right mirror image of what a policy reads and does is found here from the env's own terms."""
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -101,6 +101,19 @@ _FIXED = {
 for _kind, _image in _FIXED.items():
     term_mirror.register(_kind, lambda term, env, image=_image: image)
 
+_RULES: Mapping[type, Callable[[Any, ManagerBasedRlEnv], MirrorMap]] = {
+    mdp.ImuReading: lambda term, env: _IMU[term.quantity],
+    mdp.Command: lambda term, env: term_mirror(env.cfg.commands[term.command], env),
+    **dict.fromkeys(
+        (mdp.JointVel, mdp.JointAcc, mdp.JointEffort, mdp.JointPos),
+        lambda term, env: _joints(env, term.joints),
+    ),
+    mdp.JointPosRel: lambda term, env: _relative_joints(env, term.joints),
+    mdp.LastAction: lambda term, env: _action(env),
+}
+for _kind, _rule in _RULES.items():
+    term_mirror.register(_kind, _rule)
+
 
 @term_mirror.register
 def _(term: mdp.SensorReading, env: ManagerBasedRlEnv) -> MirrorMap:
@@ -112,40 +125,12 @@ def _(term: mdp.SensorReading, env: ManagerBasedRlEnv) -> MirrorMap:
 
 
 @term_mirror.register
-def _(term: mdp.ImuReading, env: ManagerBasedRlEnv) -> MirrorMap:
-    return _IMU[term.quantity]
-
-
-@term_mirror.register
 def _(term: mdp.HeightScan, env: ManagerBasedRlEnv) -> MirrorMap:
     points_N3 = grid_points(term.size, term.resolution)
     # Rows along x, one after the other along y.
     rows = len(np.unique(points_N3[:, 1].round(6)))
     columns = np.arange(len(points_N3)).reshape(rows, -1)[::-1].ravel()
     return MirrorMap(source=tuple(map(int, columns)))
-
-
-@term_mirror.register
-def _(term: mdp.Command, env: ManagerBasedRlEnv) -> MirrorMap:
-    return term_mirror(env.cfg.commands[term.command], env)
-
-
-@term_mirror.register(mdp.JointVel)
-@term_mirror.register(mdp.JointAcc)
-@term_mirror.register(mdp.JointEffort)
-@term_mirror.register(mdp.JointPos)
-def _(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
-    return _joints(env, term.joints)
-
-
-@term_mirror.register
-def _(term: mdp.JointPosRel, env: ManagerBasedRlEnv) -> MirrorMap:
-    return _relative_joints(env, term.joints)
-
-
-@term_mirror.register
-def _(term: mdp.LastAction, env: ManagerBasedRlEnv) -> MirrorMap:
-    return _action(env)
 
 
 @term_mirror.register

@@ -13,6 +13,9 @@ from ksim_rl.checks import near
 
 Patterns = str | Sequence[str]
 Index = Int64[Tensor, " N"] | slice
+SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+TO_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+"""The transmissions of actuators that drive joints."""
 
 
 class NameResolver:
@@ -76,8 +79,13 @@ def as_patterns(patterns: Patterns) -> tuple[str, ...]:
 
 def scalar_joint_ids(mj_model: mujoco.MjModel) -> list[int]:
     """Return the ids of the joints with one degree of freedom: hinges and slides."""
-    scalar = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    return [int(i) for i in np.flatnonzero(np.isin(mj_model.jnt_type, scalar))]
+    return [int(i) for i in np.flatnonzero(np.isin(mj_model.jnt_type, SCALAR_JOINTS))]
+
+
+def actuators_of_joint(mj_model: mujoco.MjModel, joint: int) -> list[int]:
+    """Return the ids of the actuators that drive a joint."""
+    on_joints = np.isin(mj_model.actuator_trntype, TO_JOINTS)
+    return [int(a) for a in np.flatnonzero(on_joints & (mj_model.actuator_trnid[:, 0] == joint))]
 
 
 def as_index(ids: Sequence[int], device: torch.device) -> Index:

@@ -117,15 +117,10 @@ class RandomizePseudoInertia(Randomize):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         ids, model = view.resolver.ids("body", self.bodies), view.world.mj_model
         rows = list(ids)
-        mass_N1, com_N3, axes_N4, spread_N3 = (
-            array_constant(values, view.device)
-            for values in (
-                model.body_mass[rows][:, None],
-                model.body_ipos[rows],
-                model.body_iquat[rows],
-                second_moments(view, ids),
-            )
-        )
+        mass_N1 = array_constant(model.body_mass[rows][:, None], view.device)
+        com_N3 = array_constant(model.body_ipos[rows], view.device)
+        axes_N4 = array_constant(model.body_iquat[rows], view.device)
+        spread_N3 = array_constant(second_moments(view, ids), view.device)
         drawn = self.draw(
             view, len(ids), [self.alpha, *[self.stretch] * 3, *[self.shear] * 3, *[self.shift] * 3]
         )

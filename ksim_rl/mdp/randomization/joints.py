@@ -20,7 +20,7 @@ from ksim_rl.mdp.randomization.randomize import (
     RandomizeNumber,
     write_entries,
 )
-from ksim_rl.scene.names import Patterns, scalar_joint_ids
+from ksim_rl.scene.names import Patterns, actuators_of_joint, scalar_joint_ids
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,14 +115,11 @@ class RandomizeDefaultJointPos(OfJoints, RandomizeNumber, operation="add"):
     """
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        joints, model = view.joints(self.joints).index, view.world.mj_model
-        pose = model.key_qpos[0] if model.nkey else model.qpos0
-        own = pose[model.jnt_qposadr[scalar_joint_ids(model)]]
-        ids = view.resolver.ids("joint", self.joints)
-        drawn_EN = self.draw(view, len(ids), [self.ranges])[..., 0]
-        value_EN = self.combine(array_constant(own[list(ids)], view.device), drawn_EN)
-        held_EN = view.default_joint_pos_EL[:, joints]
-        view.default_joint_pos_EL[:, joints] = torch.where(mask_E[:, None], value_EN, held_EN)
+        joints = view.joints(self.joints)
+        drawn_EN = self.draw(view, len(joints), [self.ranges])[..., 0]
+        value_EN = self.combine(view.default_qpos_L[joints.qpos], drawn_EN)
+        held_EN = joints.default_pos_EL
+        view.default_joint_pos_EL[:, joints.index] = torch.where(mask_E[:, None], value_EN, held_EN)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,13 +129,10 @@ class RandomizeEncoderBias(OfJoints, RandomizeNumber):
     operation: Literal["abs"] = "abs"
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        joints = view.joints(self.joints).index
-        held_EN = view.encoder_bias_EL[:, joints]
-        drawn_EN = self.draw(view, held_EN.shape[1], [self.ranges])[..., 0]
-        view.encoder_bias_EL[:, joints] = torch.where(mask_E[:, None], drawn_EN, held_EN)
-
-
-_JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        joints = view.joints(self.joints)
+        drawn_EN = self.draw(view, len(joints), [self.ranges])[..., 0]
+        biased_EN = torch.where(mask_E[:, None], drawn_EN, joints.encoder_bias_EL)
+        view.encoder_bias_EL[:, joints.index] = biased_EN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,10 +143,8 @@ class RandomizeActuator(OfJoints, Randomize, operation="scale"):
         self, view: EnvView, mask_E: Tensor, name: str, pair: Pair, finite: bool = False
     ) -> tuple[Tensor, list[int]]:
         """Draw a number for each joint, and write it where an explicit actuator has it; return the other places too."""
-        joints, owners = (
-            view.resolver.ids("joint", self.joints),
-            view.actuator_params.joints(name, finite=finite),
-        )
+        joints = view.resolver.ids("joint", self.joints)
+        owners = view.actuator_params.joints(name, finite=finite)
         drawn_EN = self.draw(view, len(joints), [pair])[..., 0].expand(-1, len(joints))
         explicit = [i for i, joint in enumerate(joints) if joint in owners]
         if explicit:
@@ -234,7 +226,7 @@ class RandomizeEffortLimit(RandomizeActuator, RandomizeNumber):
         ranges: dict[str, dict[int, int]] = {"actuator_forcerange": {}, "jnt_actfrcrange": {}}
         for i in builtin:
             joint = model.joint(names[i]).id
-            limited = [a for a in _actuators(model, joint) if model.actuator_forcelimited[a]]
+            limited = [a for a in actuators_of_joint(model, joint) if model.actuator_forcelimited[a]]
             ranges["actuator_forcerange"] |= dict.fromkeys(limited, i)
             if model.jnt_actfrclimited[joint]:
                 ranges["jnt_actfrcrange"][joint] = i
@@ -256,11 +248,6 @@ class RandomizeEffortLimit(RandomizeActuator, RandomizeNumber):
             write_entries(view.field(field), rows, (0, 1), mask_E, size_EN2 * signs_2)
 
 
-def _actuators(mj_model: mujoco.MjModel, joint: int) -> list[int]:
-    on_joints = np.isin(mj_model.actuator_trntype, _JOINT_TRANSMISSIONS)
-    return [int(a) for a in np.flatnonzero(on_joints & (mj_model.actuator_trnid[:, 0] == joint))]
-
-
 def _servo(mj_model: mujoco.MjModel, joint: int, gain: str) -> tuple[int, bool]:
     """Return the servo that has this gain, and whether the number is also its `gainprm[0]`.
 
@@ -268,7 +255,7 @@ def _servo(mj_model: mujoco.MjModel, joint: int, gain: str) -> tuple[int, bool]:
     with the gain damping.
     """
     position, velocity = None, None
-    for actuator in _actuators(mj_model, joint):
+    for actuator in actuators_of_joint(mj_model, joint):
         if (
             mj_model.actuator_gaintype[actuator] != mujoco.mjtGain.mjGAIN_FIXED
             or mj_model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE

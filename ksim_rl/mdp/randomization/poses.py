@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant
+from ksim_rl.mdp.fields import OfSites
 from ksim_rl.mdp.randomization.randomize import (
     Pair,
     RandomizeField,
@@ -101,17 +102,13 @@ class RandomizeGeomQuat(RandomizeTurn, field="geom_quat"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeSitePos(RandomizePos, field="site_pos"):
+class RandomizeSitePos(OfSites, RandomizePos, field="site_pos"):
     """Position of sites in the frame of their body, m; columns x, y, z. Their sensors and forces move along."""
-
-    sites: Patterns
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeSiteQuat(RandomizeTurn, field="site_quat"):
+class RandomizeSiteQuat(OfSites, RandomizeTurn, field="site_quat"):
     """Orientation of sites in their body, rad by angle, about their own axes: an IMU that is mounted askew, say."""
-
-    sites: Patterns
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,8 +13,8 @@ from ksim_rl.checked import NonNegative, Positive
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.actions import per_joint
 from ksim_rl.mdp.commands import OfTarget, target_pose_w
-from ksim_rl.mdp.constants import constant, values_by_name
 from ksim_rl.mdp.fields import (
     GaussianReward,
     InFrame,
@@ -189,17 +189,13 @@ class Pose(OfCommand, OfJoints, RewardTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         speed_E1 = commanded_speed(view, self.command).unsqueeze(-1)
-        standing_L, walking_L, running_L = (
-            self._std(view, f"std_{gait}") for gait in ("standing", "walking", "running")
-        )
+        standing_L = per_joint(view, "std_standing", self.std_standing, self.joints)
+        walking_L = per_joint(view, "std_walking", self.std_walking, self.joints)
+        running_L = per_joint(view, "std_running", self.std_running, self.joints)
         moving_EL = torch.where(speed_E1 < self.running_threshold, walking_L, running_L)
         std_EL = torch.where(speed_E1 < self.walking_threshold, standing_L, moving_EL)
         error_EL = view.joints(self.joints).pos_rel_EL
         return torch.exp(-(error_EL / std_EL).square().mean(-1))
-
-    def _std(self, view: EnvView, field: str) -> Tensor:
-        names = view.joints(self.joints).names
-        return constant(values_by_name(field, getattr(self, field), names), view.device)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int64, Shaped
 from torch import Tensor
 
 from ksim_rl.checked import Checked, NonNegative, Positive
-from ksim_rl.scene.names import Patterns, as_index, scalar_joint_ids
+from ksim_rl.scene.names import Patterns, as_index
 from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKind
 from ksim_rl.scene.state.simulation import Simulation
 from ksim_rl.scene.state.world_view import WorldView
@@ -24,19 +24,15 @@ class Drive:
     """The N joints of one law, in the model's order."""
 
     def __init__(self, name: str, simulation: Simulation, view: WorldView, joint_ids: Sequence[int]) -> None:
-        model = view.world.mj_model
-        scalar = scalar_joint_ids(model)
         self.num_envs, self.num_joints, self.device = view.num_envs, len(joint_ids), view.device
         self._name, self._simulation, self._view = name, simulation, view
-        self._joints = as_index(joint_ids, view.device)
-        self._qpos = as_index([model.jnt_qposadr[scalar[i]] for i in joint_ids], view.device)
-        self._qvel = as_index([model.jnt_dofadr[scalar[i]] for i in joint_ids], view.device)
+        self._joints = view.joints().some(joint_ids)
         self._motors = as_index([view.targets.motor(i) for i in joint_ids], view.device)
         self._at_reset: list[Callable[[Bool[Tensor, " E"]], None]] = []
 
     def param(self, name: str) -> Float[Tensor, "E N"]:
         """Return the present values of a number of `Actuator.params`."""
-        return self._view.actuator_param(name)[:, self._joints]
+        return self._view.actuator_param(name)[:, self._joints.index]
 
     def buffer(
         self, name: str, *shape: int, dtype: torch.dtype = torch.float32, keep: bool = False
@@ -61,12 +57,12 @@ class Drive:
 
     def state(self) -> JointState:
         """Return where the joints are now, in the middle of an env step too."""
-        world = self._view.world
-        return JointState(world.qpos_EL[:, self._qpos], world.qvel_EL[:, self._qvel])
+        world, joints = self._view.world, self._joints
+        return JointState(world.qpos_EL[:, joints.qpos], world.qvel_EL[:, joints.qvel])
 
     def target(self) -> JointTarget:
         """Return what the joints are asked for."""
-        targets, joints = self._view.targets, self._joints
+        targets, joints = self._view.targets, self._joints.index
         return JointTarget(targets.pos_EL[:, joints], targets.vel_EL[:, joints], targets.effort_EL[:, joints])
 
     def write(self, control_EN: Float[Tensor, "E N"]) -> None:

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import mujoco
-from torch import Tensor
 
 from ksim_rl.checked import NonNegative, Positive, Range
 from ksim_rl.scene.actuators.actuator import Drive, JointActuator, Law
 from ksim_rl.scene.names import Patterns
-from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKind, control_kind
+from ksim_rl.scene.state.joint_targets import TargetKind, control_kind
 
 _NUM_PARAMETERS = 10
 
@@ -27,11 +26,7 @@ class BuiltinActuator(JointActuator):
 
     def law(self, drive: Drive) -> Law:
         (kind,) = self.takes
-
-        def control_EN(state: JointState, target: JointTarget) -> Tensor:
-            return getattr(target, f"{kind}_EN")
-
-        return control_EN
+        return lambda _, target: getattr(target, f"{kind}_EN")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,12 +7,9 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.scene.actuators.actuator import Actuator, Drive, Law
-from ksim_rl.scene.names import as_patterns, match_names
+from ksim_rl.scene.names import SCALAR_JOINTS, TO_JOINTS, as_patterns, match_names
 from ksim_rl.scene.state.simulation import Simulation
 from ksim_rl.scene.state.world_view import WorldView
-
-_OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-_SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def set_actuators(spec: mujoco.MjSpec, actuators: Sequence[Actuator]) -> None:
@@ -21,12 +18,12 @@ def set_actuators(spec: mujoco.MjSpec, actuators: Sequence[Actuator]) -> None:
     Actuators of the model that drive the same joints are replaced, and their sensors read the new ones; the model's
     other actuators stay, in front.
     """
-    joints = {joint.name: joint for joint in spec.joints if joint.type in _SCALAR}
+    joints = {joint.name: joint for joint in spec.joints if joint.type in SCALAR_JOINTS}
     driven = driven_joints(actuators, list(joints))
     new_names = {name for _, names in driven for name in names}
     replaced: dict[str, str] = {}
     for old in list(spec.actuators):
-        if old.trntype in _OF_JOINTS and old.target in new_names:
+        if old.trntype in TO_JOINTS and old.target in new_names:
             replaced[old.name] = old.target
             spec.delete(old)
     for sensor in spec.sensors:

@@ -18,7 +18,7 @@ from ksim_rl.physics import load_model, load_spec
 from ksim_rl.physics.capacity import probe
 from ksim_rl.physics.load import Source
 from ksim_rl.scene.actuators import PositionActuator
-from ksim_rl.scene.names import scalar_joint_ids
+from ksim_rl.scene.names import actuators_of_joint, scalar_joint_ids
 from ksim_rl.scene.rendering.rendering import choose_gl_platform
 from ksim_rl.scene.rendering.visualizer import visible_groups
 from ksim_rl.scene.robots.anatomy import Anatomy, dissect, posed, rounded
@@ -310,12 +310,7 @@ def _drive(mj_model: mujoco.MjModel, joint: int) -> tuple[str, tuple[float, floa
     kind, gains, limits = "none", (0.0, 0.0), []
     if mj_model.jnt_actfrclimited[joint]:
         limits.append(np.abs(mj_model.jnt_actfrcrange[joint]).max())
-    for a in range(mj_model.nu):
-        if (mj_model.actuator_trntype[a], mj_model.actuator_trnid[a, 0]) != (
-            mujoco.mjtTrn.mjTRN_JOINT,
-            joint,
-        ):
-            continue
+    for a in actuators_of_joint(mj_model, joint):
         gear, bias = abs(mj_model.actuator_gear[a, 0]), mj_model.actuator_biasprm[a]
         target = control_kind(mj_model.actuator_biastype[a], bias, mj_model.actuator_dyntype[a])
         kind = {"pos": "position", "vel": "velocity", "effort": "motor"}[target]

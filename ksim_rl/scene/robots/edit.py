@@ -9,7 +9,7 @@ import mujoco
 
 from ksim_rl.checks import unknown_name
 from ksim_rl.physics.load import caught_warnings
-from ksim_rl.scene.names import match_names
+from ksim_rl.scene.names import SCALAR_JOINTS, match_names
 from ksim_rl.scene.state.joint_targets import control_kind
 
 Vector = tuple[float, ...]
@@ -232,5 +232,4 @@ def set_keyframe(
 
 
 def _single_dof_joints(spec: mujoco.MjSpec) -> list[mujoco.MjsJoint]:
-    kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    return [joint for joint in spec.joints if joint.type in kinds]
+    return [joint for joint in spec.joints if joint.type in SCALAR_JOINTS]

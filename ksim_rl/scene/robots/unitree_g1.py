@@ -101,14 +101,11 @@ def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:
         ("wrist", "wrist_pitch", 0.035, (-0.01, 0, 0, 0.06, 0, 0)),
         ("hand", "wrist_yaw", 0.035, (0.07, 0, 0, 0.15, -0.02 * y, 0)),
     )
-    leg_geoms, arm_geoms = (
-        tuple(
-            capsule(f"{side}_{name}_collision", f"{side}_{link}_link", radius, ends, condim=1)
-            for name, link, radius, ends in limbs
-        )
-        for limbs in (legs, arms)
-    )
-    return (*leg_geoms, *_foot_geoms(side), *arm_geoms)
+    limbs = [
+        capsule(f"{side}_{name}_collision", f"{side}_{link}_link", radius, ends, condim=1)
+        for name, link, radius, ends in (*legs, *arms)
+    ]
+    return (*limbs[: len(legs)], *_foot_geoms(side), *limbs[len(legs) :])
 
 
 @dataclass(frozen=True, kw_only=True)

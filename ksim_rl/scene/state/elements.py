@@ -38,7 +38,10 @@ class JointTables(NamedTuple):
 
 
 class Joints(_Elements):
-    """The hinges (rad) and slides (m) that some patterns match: `view.joints("hip.*").pos_EL`."""
+    """The hinges (rad) and slides (m) that some patterns match: `view.joints("hip.*").pos_EL`.
+
+    `qpos` and `qvel` are their columns in MuJoCo's state.
+    """
 
     def __init__(
         self,
@@ -52,8 +55,8 @@ class Joints(_Elements):
         model, device = state.world.mj_model, state.world.device
         scalar = scalar_joint_ids(model)
         self._tables, self._every_joint = tables, every_joint or self
-        self._qpos = as_index([model.jnt_qposadr[scalar[i]] for i in ids], device)
-        self._qvel = as_index([model.jnt_dofadr[scalar[i]] for i in ids], device)
+        self.qpos = as_index([model.jnt_qposadr[scalar[i]] for i in ids], device)
+        self.qvel = as_index([model.jnt_dofadr[scalar[i]] for i in ids], device)
 
     def some(self, ids: Sequence[int]) -> "Joints":
         """Return those at some places among the model's hinges and slides; for all joints only."""
@@ -65,22 +68,22 @@ class Joints(_Elements):
     @quantity
     def pos_EL(self) -> Float[Tensor, "E L"]:
         """Positions, rad or m; position stage."""
-        return self._state.world.qpos_EL[:, self._qpos]
+        return self._state.world.qpos_EL[:, self.qpos]
 
     @quantity
     def vel_EL(self) -> Float[Tensor, "E L"]:
         """Velocities, rad/s or m/s; velocity stage."""
-        return self._state.world.qvel_EL[:, self._qvel]
+        return self._state.world.qvel_EL[:, self.qvel]
 
     @quantity
     def acc_EL(self) -> Float[Tensor, "E L"]:
         """Accelerations, rad/s^2 or m/s^2; acceleration stage."""
-        return self._state.world.qacc_EL[:, self._qvel]
+        return self._state.world.qacc_EL[:, self.qvel]
 
     @quantity
     def effort_EL(self) -> Float[Tensor, "E L"]:
         """What actuators exert, N m or N, behind the gears; acceleration stage."""
-        return self._state.world.qfrc_actuator_EL[:, self._qvel]
+        return self._state.world.qfrc_actuator_EL[:, self.qvel]
 
     @quantity
     def pos_rel_EL(self) -> Float[Tensor, "E L"]:
@@ -110,11 +113,11 @@ class Joints(_Elements):
 
     def write_pos(self, mask_E: Bool[Tensor, " E"], pos_EL: Float[Tensor, "E L"]) -> None:
         """Set the positions in the rows of `mask_E`."""
-        self._state.write(self._state.world.qpos_EL, self._qpos, mask_E, pos_EL)
+        self._state.write(self._state.world.qpos_EL, self.qpos, mask_E, pos_EL)
 
     def write_vel(self, mask_E: Bool[Tensor, " E"], vel_EL: Float[Tensor, "E L"]) -> None:
         """Set the velocities in the rows of `mask_E`."""
-        self._state.write(self._state.world.qvel_EL, self._qvel, mask_E, vel_EL)
+        self._state.write(self._state.world.qvel_EL, self.qvel, mask_E, vel_EL)
 
 
 class Bodies(_Elements):

@@ -132,4 +132,7 @@ class Entity:
 
     def _require_free_root(self, what: str) -> None:
         if not self.free_root:
-            raise ValueError(f"{what} of {self.name!r}: its root body {self.root.name!r} has no free joint")
+            raise ValueError(
+                f"{what} of {self.name!r}: its root body {self.root.name!r} has no free joint; this needs a robot or "
+                "object whose first joint is free"
+            )

@@ -60,18 +60,13 @@ class WorldView:
 
         model, joints = self.world.mj_model, scalar_joint_ids(self.world.mj_model)
         self.num_joints = len(joints)
-        self._sensor_slices = {
-            model.sensor(i).name: slice(
-                int(model.sensor_adr[i]), int(model.sensor_adr[i] + model.sensor_dim[i])
-            )
-            for i in range(model.nsensor)
-        }
+        places = zip(model.sensor_adr.tolist(), model.sensor_dim.tolist(), strict=True)
+        slices = (slice(first, first + size) for first, size in places)
+        self._sensor_slices = dict(zip(self.resolver.names("sensor"), slices, strict=True))
 
-        default_qpos = torch.tensor(
-            model.key_qpos[0] if model.nkey else model.qpos0, device=self.device, dtype=torch.float32
-        )
-        self.default_qpos_L = default_qpos
-        default_joint_pos_L = default_qpos[as_index([model.jnt_qposadr[j] for j in joints], self.device)]
+        pose = model.key_qpos[0] if model.nkey else model.qpos0
+        self.default_qpos_L = torch.tensor(pose, device=self.device, dtype=torch.float32)
+        default_joint_pos_L = self.default_qpos_L[as_index(model.jnt_qposadr[joints].tolist(), self.device)]
         self.default_joint_pos_EL = self.buffers.get(
             "default_joint_pos_EL", self.num_joints, keep=True, initial=default_joint_pos_L
         )
@@ -85,29 +80,22 @@ class WorldView:
         self.ctrl_limits_L2 = self._limited(ctrl_range.view(-1, 2), model.actuator_ctrllimited)
         self.soft_joint_pos_limits_L2 = self._soft_limits(joints, soft_joint_pos_limit_factor)
         self.encoder_bias_EL = self.buffers.get("encoder_bias_EL", self.num_joints, keep=True)
-        self._joint_tables = JointTables(
-            self.default_joint_pos_EL, self.soft_joint_pos_limits_L2, self.encoder_bias_EL
-        )
-        self._every_joint = Joints(
-            simulation, range(self.num_joints), self.resolver.names("joint"), self._joint_tables
-        )
-        several = len(entities) > 1
+        tables = JointTables(self.default_joint_pos_EL, self.soft_joint_pos_limits_L2, self.encoder_bias_EL)
+        self._every_joint = Joints(simulation, range(self.num_joints), self.resolver.names("joint"), tables)
         self.entities = {
             name: Entity(
                 simulation,
                 name=name,
-                prefix=f"{name}/" if several else "",
-                default_qpos_L=default_qpos,
+                prefix=f"{name}/" if len(entities) > 1 else "",
+                default_qpos_L=self.default_qpos_L,
                 every_joint=self._every_joint,
             )
             for name in entities or ("robot",)
         }
         self.robot = next(iter(self.entities.values()))
         self.free_root = self.robot.free_root
-        self.write_root_pose, self.write_root_velocity = (
-            self.robot.write_root_pose,
-            self.robot.write_root_velocity,
-        )
+        self.write_root_pose = self.robot.write_root_pose
+        self.write_root_velocity = self.robot.write_root_velocity
 
     # -- names ---------------------------------------------------------------------------------------------------
 
