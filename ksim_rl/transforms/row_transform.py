@@ -15,7 +15,7 @@ from torchrl.envs.transforms import Transform
 from ksim_rl import checks
 from ksim_rl.device import random
 from ksim_rl.transforms import upstream
-from ksim_rl.transforms.specs import Device, batch_dims_of, drop_leaf_spec, leaf_spec, set_leaf_spec, spell
+from ksim_rl.transforms.specs import Device, batch_dims_of, drop_leaf, leaf_spec, set_leaf_spec, spell
 
 Keys = Sequence[NestedKey] | NestedKey
 _NO_SEED = -(1 << 63)
@@ -92,7 +92,7 @@ class CheckedKeys(Transform):
         replaced = [new_spec(index, spec) for index, spec in enumerate(found)]
         for key, out_key in zip(in_keys, out_keys, strict=True):
             if is_inverse and key != out_key:
-                drop_leaf_spec(specs, key)
+                drop_leaf(specs, key)
         for out_key, spec in zip(out_keys, replaced, strict=True):
             set_leaf_spec(specs, out_key, spec)
         return found
