@@ -173,8 +173,9 @@ class RolloutCollector:
                     f"keys: no step produces {key!r}; it produces {sorted(map(spell, produced))}"
                 )
         kept_E = env_state_E.select(*(self._keys or produced))
-        self._storage_TE = kept_E.new_zeros(self.rollout_length, *kept_E.batch_size)
+        storage_TE: Any = kept_E.new_zeros(torch.Size([self.rollout_length, *kept_E.batch_size]))
+        self._storage_TE = storage_TE
         by_dtype: dict[torch.dtype, list[tuple[NestedKey, Tensor]]] = {}
-        for key, leaf_TE in self._storage_TE.items(True, True):
+        for key, leaf_TE in storage_TE.items(True, True):
             by_dtype.setdefault(leaf_TE.dtype, []).append((key, leaf_TE))
         self._leaves_by_dtype = list(by_dtype.values())
