@@ -228,16 +228,11 @@ def _has_whole_rows(value_E: Tensor) -> bool:
     return value_E.ndim == 1 or value_E.ndim == 2 and value_E.stride(1) == 1 or value_E.is_contiguous()
 
 
-def _empty(
-    ring_EM: Tensor,
-    age_E: Tensor,
-    value_E: Tensor,
-    lag_E: object,
-    mask_E: object,
-    num_frames: int,
-    *_: object,
-) -> Tensor:
-    return value_E.new_empty((ring_EM.shape[0], num_frames * ring_EM.shape[2:].numel()))
-
-
-_run = as_operator("ring", _launch, _empty, mutates=("ring_EM", "age_E", "lag_E", "draw_count_E"))
+_run = as_operator(
+    "ring",
+    _launch,
+    lambda ring_EM, _age_E, value_E, _lag_E, _mask_E, num_frames, *_: value_E.new_empty(
+        (ring_EM.shape[0], num_frames * ring_EM.shape[2:].numel())
+    ),
+    mutates=("ring_EM", "age_E", "lag_E", "draw_count_E"),
+)
