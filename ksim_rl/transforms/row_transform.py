@@ -1,5 +1,6 @@
 """This module holds the bases of transforms with state per env: buffers, draws of their own, a level to follow."""
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NoReturn, Self
@@ -169,10 +170,7 @@ class RowTransform(CheckedKeys, ABC):
         ]
         if not masks:
             return torch.ones(self.num_rows, dtype=torch.bool, device=tensordict_reset.device)
-        mask_E = masks[0]
-        for mask in masks[1:]:
-            mask_E = mask_E | mask
-        return mask_E
+        return functools.reduce(torch.logical_or, masks)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Refuse: without an env there are no steps and no resets to follow."""
