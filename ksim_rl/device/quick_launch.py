@@ -30,6 +30,12 @@ _CODES = {
 }
 
 
+def arguments_of(*fields: tuple[type, str]) -> Any:
+    """Return the struct of a `QuickLaunch` with these fields in order: types, each with names and blanks between."""
+    types = {name: kind for kind, names in fields for name in names.split()}
+    return wp.struct(type("Arguments", (), {"__annotations__": types}))
+
+
 class QuickLaunch:
     """One kernel in C++ whose only argument, `a`, is a struct of numbers and addresses, launched on torch's stream.
 

@@ -21,7 +21,7 @@ from jaxtyping import Float32, Int, Int64
 from torch import Tensor
 
 from ksim_rl import ranks
-from ksim_rl.device.quick_launch import QuickLaunch, as_operator
+from ksim_rl.device.quick_launch import QuickLaunch, arguments_of, as_operator
 
 DRAWS = r"""
     const unsigned golden = 0x9E3779B9u;
@@ -136,27 +136,17 @@ def integers(
     return low + ((_drawn(*keys, n, _INTEGER, 0.0, 1.0, 0, 1 << 32) * (high - low + 1)) >> 32)
 
 
-@wp.struct
-class _Fill:
-    rows: int
-    columns: int
-    n: int
-    kind: int
-    low: float
-    high: float
-    start: wp.int64
-    span: wp.int64
-    stream: wp.uint32
-    counter_stride: int
-    first_row: int
-    seed: wp.uint64
-    counter: wp.uint64
-    out: wp.uint64
-
-
+_ARGUMENTS = arguments_of(
+    (int, "rows columns n kind"),
+    (float, "low high"),
+    (wp.int64, "start span"),
+    (wp.uint32, "stream"),
+    (int, "counter_stride first_row"),
+    (wp.uint64, "seed counter out"),
+)
 # On the CPU one thread fills all rows, in loops of vector instructions.
 _launch = QuickLaunch(
-    _Fill,
+    _ARGUMENTS,
     DRAWS
     + r"""
     const long long seed = *(const long long*)a.seed;
