@@ -18,6 +18,7 @@ from ksim_rl.device.capture import Captured
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.envs.masked_reset import MaskedReset
+from ksim_rl.transforms.specs import spell
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,12 +87,10 @@ class RolloutCollector:
         if self._root is None:
             self.reset()
         self._run()
-        assert self._storage_TE is not None
         if isinstance(self.env, MaskedReset):
             # The env's own reference points into the graph's memory, which the next replay overwrites.
             self.env.last_root = self._root
-        rollout_ET = self._storage_TE.transpose(0, 1)
-        return dims.name(rollout_ET, dims.E, dims.T)
+        return self._stored_rollout()
 
     @torch.no_grad()
     def made_up_rollout(self) -> TensorDict:
@@ -104,6 +103,9 @@ class RolloutCollector:
             env_state_E = self.policy(self.env.fake_tensordict())
         for t in range(self.rollout_length):
             self._store(t, env_state_E)
+        return self._stored_rollout()
+
+    def _stored_rollout(self) -> TensorDict:
         assert self._storage_TE is not None
         return dims.name(self._storage_TE.transpose(0, 1), dims.E, dims.T)
 
@@ -127,7 +129,7 @@ class RolloutCollector:
         """Return the EnvState from which the next rollout starts, by flat key."""
         if self._root is None:
             return {}
-        return {_flat(key): self._root.get(key).clone() for key in self._root.keys(True, True)}
+        return self._root.clone().flatten_keys(".").to_dict()
 
     @torch.no_grad()
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -135,8 +137,8 @@ class RolloutCollector:
         if self._root is None:
             self.reset()
         assert self._root is not None
-        own = {_flat(key): self._root.get(key) for key in self._root.keys(True, True)}
-        copy_into(own, state, what="state of another collector (build the env with the same num_envs)")
+        what = "state of another collector (build the env with the same num_envs)"
+        copy_into(self._root.flatten_keys(".").to_dict(), state, what=what)
 
     def _rollout(self) -> None:
         assert self._root is not None
@@ -168,22 +170,12 @@ class RolloutCollector:
         for key in self._keys or []:
             if key not in produced:
                 raise ValueError(
-                    f"keys: no step produces {key!r}; it produces {sorted(map(_flat, produced))}"
+                    f"keys: no step produces {key!r}; it produces {sorted(map(spell, produced))}"
                 )
         kept_E = env_state_E.select(*(self._keys or produced))
-        self._storage_TE = TensorDict(
-            {
-                key: torch.zeros(self.rollout_length, *leaf.shape, dtype=leaf.dtype, device=leaf.device)
-                for key, leaf in kept_E.items(True, True)
-            },
-            batch_size=[self.rollout_length, *env_state_E.batch_size],
-            device=env_state_E.device,
-        )
+        storage_TE: Any = kept_E.new_zeros(torch.Size([self.rollout_length, *kept_E.batch_size]))
+        self._storage_TE = storage_TE
         by_dtype: dict[torch.dtype, list[tuple[NestedKey, Tensor]]] = {}
-        for key, leaf_TE in self._storage_TE.items(True, True):
+        for key, leaf_TE in storage_TE.items(True, True):
             by_dtype.setdefault(leaf_TE.dtype, []).append((key, leaf_TE))
         self._leaves_by_dtype = list(by_dtype.values())
-
-
-def _flat(key: NestedKey) -> str:
-    return key if isinstance(key, str) else ".".join(map(str, key))

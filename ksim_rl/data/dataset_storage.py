@@ -1,11 +1,11 @@
 """This module stores one dataset in place, and lets no non-finite number in."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Int64, Shaped
-from tensordict import TensorDict, TensorDictBase
+from jaxtyping import Int64
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data.replay_buffers import Writer
 from torchrl.data.replay_buffers.storages import TensorStorage
@@ -67,7 +67,7 @@ class DatasetStorage(TensorStorage):
         leaves: dict[Any, Tensor] = dict(data.items(include_nested=True, leaves_only=True))
         mask = leaves.pop(MASK_KEY, None)
         if not self.initialized:
-            self._allocate(leaves, data.batch_dims)
+            self._allocate(data.exclude(MASK_KEY))
         stored = self._stored_leaves(leaves, data.batch_dims)
         for key, leaf_D in stored.items():
             leaf_D.unflatten(0, data.batch_size).copy_(leaves[key])
@@ -95,11 +95,11 @@ class DatasetStorage(TensorStorage):
             self.non_finite_count = self.non_finite_count.to(self.device)
         self.non_finite_count.copy_(state_dict["non_finite_count"])
 
-    def _allocate(self, leaves: dict[Any, Tensor], batch_dims: int) -> None:
+    def _allocate(self, data: TensorDictBase) -> None:
         if self.device == "auto":
-            self.device = next(iter(leaves.values())).device
+            self.device = next(iter(data.values(True, True))).device
             self.non_finite_count = self.non_finite_count.to(self.device)
-        content = allocated(leaves, self.max_size, batch_dims=batch_dims, device=self.device)
+        content: Any = data.new_zeros(torch.Size([self.max_size]), device=self.device)
         content.set(MASK_KEY, torch.ones((self.max_size, 1), dtype=torch.bool, device=self.device))
         self._storage = dims.name(content, dims.D)
         self.initialized = True
@@ -119,21 +119,6 @@ class DatasetStorage(TensorStorage):
                     f"had {stored[key].dtype} {tuple(stored[key].shape[1:])}"
                 )
         return stored
-
-
-def allocated(
-    leaves: Mapping[Any, Shaped[Tensor, "*?shape"]],
-    num_rows: int,
-    *,
-    batch_dims: int,
-    device: torch.device | str,
-) -> TensorDict:
-    """Return zeros for so many rows of leaves, whose own dims come after `batch_dims`."""
-    rows = {
-        key: torch.zeros(num_rows, *leaf.shape[batch_dims:], dtype=leaf.dtype, device=device)
-        for key, leaf in leaves.items()
-    }
-    return TensorDict(rows, batch_size=[num_rows], device=device)
 
 
 class DatasetWriter(Stateless, Writer):

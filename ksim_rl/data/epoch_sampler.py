@@ -233,13 +233,10 @@ class SequenceSampler(EpochSampler):
         index: Any = rollout_S1 * steps + clamped_ST
         if storage.ndim > 1:
             index = (clamped_ST, rollout_S1.expand_as(clamped_ST))
-        return index, self._info(step_ST, offset_T)
-
-    def _info(self, step_ST: Tensor, offset_T: Tensor) -> dict[Any, Tensor]:
         if not self.burn_in:
-            return {}
+            return index, {}
         before_T = offset_T < 0
-        return {
+        return index, {
             MASK_KEY: (~before_T).expand_as(step_ST).unsqueeze(-1),
             BURN_IN_KEY: (before_T & (step_ST >= 0)).unsqueeze(-1),
         }

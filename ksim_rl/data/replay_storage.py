@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
 from ksim_rl import dims
-from ksim_rl.data.dataset_storage import MASK_KEY, DatasetWriter, allocated
+from ksim_rl.data.dataset_storage import MASK_KEY, DatasetWriter
 from ksim_rl.device.state_tree import copy_into
 
 REWARD: NestedKey = ("next", "reward")
@@ -181,7 +181,8 @@ class ReplayStorage(SavedByStateDict, Storage):
         if not content:
             self._empty()
         elif self.content is None:
-            self.content = allocated(content, self.max_size, batch_dims=1, device=self.device)
+            saved = TensorDict(content, batch_size=[self.max_size])
+            self.content = saved.new_zeros(saved.batch_size, device=self.device)
         own = self.state_dict()
         leaves = own.pop("content")
         if content:
@@ -200,10 +201,8 @@ class ReplayStorage(SavedByStateDict, Storage):
         missing = [key for key in needed if key not in produced]
         if missing:
             raise ValueError(f"the rollout lacks {missing}; it has {sorted(map(str, produced))}")
-        leaves = {
-            key: leaf for key, leaf in rollout_ET.items(True, True) if key[0] != "next" or key in _LEAVES
-        }
-        self.content = allocated(leaves, self.max_size, batch_dims=2, device=self.device)
+        kept_ET = rollout_ET.select(*(key for key in produced if key[0] != "next" or key in _LEAVES))
+        self.content = kept_ET.new_zeros(torch.Size([self.max_size]), device=self.device)
 
     def _head_index(self) -> Tensor:
         """Return the index of the newest observation of each env, [E]."""

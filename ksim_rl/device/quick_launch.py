@@ -16,7 +16,7 @@ from jaxtyping import Shaped
 from torch import Tensor
 
 from ksim_rl.device import upstream
-from ksim_rl.device.streams import CPU_LOCK, warp_scope, warp_stream
+from ksim_rl.device.streams import CPU_LOCK, current_warp_stream, warp_scope
 
 MAX_RECORDED = 64
 """Records that one kernel keeps, one per device and size; a batch size that never comes again must not pile up."""
@@ -30,7 +30,10 @@ _CODES = {
 }
 
 
-_streams: dict[tuple[int, int], wp.Stream] = {}
+def arguments_of(*fields: tuple[type, str]) -> Any:
+    """Return the struct of a `QuickLaunch` with these fields in order: types, each with names and blanks between."""
+    types = {name: kind for kind, names in fields for name in names.split()}
+    return wp.struct(type("Arguments", (), {"__annotations__": types}))
 
 
 class QuickLaunch:
@@ -62,7 +65,7 @@ class QuickLaunch:
         if device.type == "cpu":
             lock, stream = CPU_LOCK, None
         else:
-            lock, stream = self._lock, _current_stream(device)
+            lock, stream = self._lock, current_warp_stream(device)
         with lock:
             launch, packed = self._recorded.get((device, dim)) or self._record(device, dim)
             self._packer.pack_into(packed, 0, *values)
@@ -96,16 +99,6 @@ def as_operator(
         return (operator if torch.compiler.is_compiling() else launch)(*arguments)
 
     return run
-
-
-def _current_stream(device: torch.device) -> wp.Stream:
-    """Return Warp's wrapper of torch's current stream; the look-up by handle spares the making of a stream object."""
-    handle = upstream.current_stream_handle(device)
-    found = _streams.get((device.index, handle))
-    if found is None:
-        # The wrapper keeps the stream for ever, so no other one gets its handle.
-        found = _streams[device.index, handle] = warp_stream(torch.cuda.current_stream(device))
-    return found
 
 
 def address(tensor: Shaped[Tensor, "*shape"] | None) -> int:

@@ -21,7 +21,7 @@ from jaxtyping import Float32, Int, Int64
 from torch import Tensor
 
 from ksim_rl import ranks
-from ksim_rl.device.quick_launch import QuickLaunch, as_operator
+from ksim_rl.device.quick_launch import QuickLaunch, arguments_of, as_operator
 
 DRAWS = r"""
     const unsigned golden = 0x9E3779B9u;
@@ -42,7 +42,11 @@ DRAWS = r"""
         return mix(mix(key.first ^ ((index + 1u) * golden)) ^ key.second);
     };
     auto unit = [](unsigned b) { return (float)(b >> 8) * 5.9604644775390625e-08f; };
-    auto normal = [](unsigned b) {
+    auto horner = [](float x, float sum, auto... coefficients) {
+        ((sum = sum * x + coefficients), ...);
+        return sum;
+    };
+    auto normal = [=](unsigned b) {
         const float x = ((float)((int)(b >> 8) - 8388608) + 0.5f) * 1.1920928955078125e-07f;
         const float t = (1.0f - x) * (1.0f + x);
         unsigned word;
@@ -54,36 +58,14 @@ DRAWS = r"""
         const bool is_large = mantissa > 1.41421356f;
         exponent += is_large;
         const float f = (is_large ? 0.5f * mantissa : mantissa) - 1.0f;
-        float s = 7.0376836292e-2f;
-        s = s * f - 1.1514610310e-1f;
-        s = s * f + 1.1676998740e-1f;
-        s = s * f - 1.2420140846e-1f;
-        s = s * f + 1.4249322787e-1f;
-        s = s * f - 1.6668057665e-1f;
-        s = s * f + 2.0000714765e-1f;
-        s = s * f - 2.4999993993e-1f;
-        s = s * f + 3.3333331174e-1f;
+        const float s = horner(f, 7.0376836292e-2f, -1.1514610310e-1f, 1.1676998740e-1f, -1.2420140846e-1f,
+            1.4249322787e-1f, -1.6668057665e-1f, 2.0000714765e-1f, -2.4999993993e-1f, 3.3333331174e-1f);
         const float w = -(f + f * f * (s * f - 0.5f) + (float)exponent * 0.693147180559945f);
-        const float c = w - 2.5f;
-        float p = 2.81022636e-08f;
-        p = p * c + 3.43273939e-07f;
-        p = p * c - 3.5233877e-06f;
-        p = p * c - 4.39150654e-06f;
-        p = p * c + 2.1858087e-04f;
-        p = p * c - 1.25372503e-03f;
-        p = p * c - 4.17768164e-03f;
-        p = p * c + 2.46640727e-01f;
-        p = p * c + 1.50140941f;
+        const float p = horner(w - 2.5f, 2.81022636e-08f, 3.43273939e-07f, -3.5233877e-06f, -4.39150654e-06f,
+            2.1858087e-04f, -1.25372503e-03f, -4.17768164e-03f, 2.46640727e-01f, 1.50140941f);
         const float d = sqrtf(w < 5.0f ? 5.0f : w) - 3.0f;
-        float q = -2.00214257e-04f;
-        q = q * d + 1.00950558e-04f;
-        q = q * d + 1.34934322e-03f;
-        q = q * d - 3.67342844e-03f;
-        q = q * d + 5.73950773e-03f;
-        q = q * d - 7.6224613e-03f;
-        q = q * d + 9.43887047e-03f;
-        q = q * d + 1.00167406f;
-        q = q * d + 2.83297682f;
+        const float q = horner(d, -2.00214257e-04f, 1.00950558e-04f, 1.34934322e-03f, -3.67342844e-03f,
+            5.73950773e-03f, -7.6224613e-03f, 9.43887047e-03f, 1.00167406f, 2.83297682f);
         return 1.41421356237f * x * (w < 5.0f ? p : q);
     };
 """
@@ -154,27 +136,17 @@ def integers(
     return low + ((_drawn(*keys, n, _INTEGER, 0.0, 1.0, 0, 1 << 32) * (high - low + 1)) >> 32)
 
 
-@wp.struct
-class _Fill:
-    rows: int
-    columns: int
-    n: int
-    kind: int
-    low: float
-    high: float
-    start: wp.int64
-    span: wp.int64
-    stream: wp.uint32
-    counter_stride: int
-    first_row: int
-    seed: wp.uint64
-    counter: wp.uint64
-    out: wp.uint64
-
-
+_ARGUMENTS = arguments_of(
+    (int, "rows columns n kind"),
+    (float, "low high"),
+    (wp.int64, "start span"),
+    (wp.uint32, "stream"),
+    (int, "counter_stride first_row"),
+    (wp.uint64, "seed counter out"),
+)
 # On the CPU one thread fills all rows, in loops of vector instructions.
 _launch = QuickLaunch(
-    _Fill,
+    _ARGUMENTS,
     DRAWS
     + r"""
     const long long seed = *(const long long*)a.seed;

@@ -16,11 +16,11 @@ from functools import cache
 import torch
 import warp as wp
 
-from ksim_rl.device.upstream import ABSENT_DRIVER
+from ksim_rl.device.upstream import ABSENT_DRIVER, current_stream_handle
 
 CPU_LOCK = threading.RLock()
 
-_warp_streams: dict[tuple[int, int], tuple[torch.cuda.Stream, wp.Stream]] = {}
+_warp_streams: dict[tuple[int, int], wp.Stream] = {}
 
 
 @cache
@@ -78,12 +78,18 @@ def warp_device(device: torch.device) -> wp.Device:
 
 
 def warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
-    """Return the one Warp wrapper of a torch stream; both live for ever."""
+    """Return the one Warp wrapper of a torch stream, which it holds; both live for ever."""
     key = (stream.device_index, stream.cuda_stream)
     if key not in _warp_streams:
         start_warp()  # without a world there was no need for Warp so far, and its stream look-up does not start it
-        _warp_streams[key] = (stream, wp.stream_from_torch(stream))
-    return _warp_streams[key][1]
+        _warp_streams[key] = wp.stream_from_torch(stream)
+    return _warp_streams[key]
+
+
+def current_warp_stream(device: torch.device) -> wp.Stream:
+    """Return Warp's wrapper of torch's current stream; the look-up by handle spares the making of a stream object."""
+    known = _warp_streams.get((device.index, current_stream_handle(device)))
+    return known or warp_stream(torch.cuda.current_stream(device))
 
 
 @contextmanager

@@ -2,7 +2,8 @@
 
 import dataclasses
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -40,9 +41,63 @@ def explain(
     console = Console(
         file=output, force_jupyter=False, width=width, highlight=False, markup=False, color_system=None
     )
+    show = partial(_show, console)
     console.print(_summary(cfg, driver))
-    for table in _tables(cfg, driver, shapes, action_sizes, events, levels):
-        console.print(table)
+    for group, group_cfg in cfg.observations.items():
+        rows, widths = [], []
+        for name, term_cfg in group_cfg.terms.items():
+            shape = tuple(shapes[name][1:])
+            if len(shape) == 1:
+                shape = (shape[0] * group_cfg.num_frames(name),)
+            widths.append(shape)
+            chain = _parameters(term_cfg, without=("term",))
+            rows.append((name, str(shape), chain, _described(term_cfg.term)))
+        # An image stands alone in its group; vectors are concatenated.
+        whole = widths[0] if len(widths) == 1 else (sum(shape[0] for shape in widths),)
+        show(f"observations/{group} {whole}", ("term", "shape", "chain", "parameters"), rows)
+
+    rows = [(name, f"({action_sizes[name]},)", _described(term)) for name, term in cfg.actions.items()]
+    show(f"actions ({sum(action_sizes.values())},)", ("term", "shape", "parameters"), rows)
+
+    rows = [
+        (name, f"({driver.readings.commands[name].shape[-1]},)", _seconds(term.resampling_time_range_s, "at resets"),
+         _described(term, without=("resampling_time_range_s",)))
+        for name, term in cfg.commands.items()
+    ]  # fmt: skip
+    show("commands", ("term", "shape", "resampled every", "parameters"), rows)
+
+    weights = driver.readings.reward_weights
+    shown = {
+        name: f"{float(weights[name]):g}" if name in weights else "0: not computed" for name in cfg.rewards
+    }
+    rows = [(name, shown[name], _described(term, ("weight",))) for name, term in cfg.rewards.items()]
+    scaled = f"times {driver.step_dt:g} s" if cfg.scale_rewards_by_dt else "per step"
+    show(f"rewards ({scaled})", ("term", "weight", "parameters"), rows)
+
+    ends = "terminated" if cfg.is_finite_horizon else "truncated"
+    rows = [
+        (name, ends if term.time_out else "terminated", _described(term, ("time_out",)))
+        for name, term in cfg.terminations.items()
+    ]
+    rows.append(("non_finite", "terminated", "always: the physics or the action is not finite"))
+    show("terminations", ("term", "marks", "parameters"), rows)
+
+    rows = [
+        (name, term.mode, _seconds(term.interval_range_s, ""), _described(term, ("mode", "interval_range_s")))
+        for name, term in events.items()
+    ]
+    show("events", ("term", "mode", "every", "parameters"), rows)
+
+    rows = [(name, f"{levels[name]:g}", _described(term)) for name, term in cfg.curriculum.items()]
+    show("curriculum", ("term", "level", "parameters"), rows)
+
+    rows = [(name, term.reduce, _described(term, ("reduce",))) for name, term in cfg.metrics.items()]
+    show("metrics", ("term", "reduced by", "parameters"), rows)
+
+    of_groups = compile_groups(cfg.observations)
+    rows = [("(groups)", _keys(transform), type(transform).__name__) for transform in of_groups]
+    rows += [(name, _keys(each.build()), _call(each)) for name, each in cfg.transforms.items()]
+    show("transforms (actions pass them from last to first)", ("term", "keys", "parameters"), rows)
     return "\n".join(line.rstrip() for line in output.getvalue().splitlines()) + "\n"
 
 
@@ -63,71 +118,6 @@ def _kernels(unavailable: str | None, theirs: str) -> str:
     return "one kernel" if unavailable is None else f"MuJoCo Warp's own {theirs}, because {unavailable}"
 
 
-def _tables(
-    cfg: ManagerBasedRlEnvCfg,
-    driver: EnvDriver,
-    shapes: Mapping[str, torch.Size],
-    action_sizes: Mapping[str, int],
-    events: Mapping[str, EventTerm],
-    levels: Mapping[str, float],
-) -> Iterable[Table]:
-    for group, group_cfg in cfg.observations.items():
-        rows, widths = [], []
-        for name, term_cfg in group_cfg.terms.items():
-            shape = tuple(shapes[name][1:])
-            if len(shape) == 1:
-                shape = (shape[0] * group_cfg.num_frames(name),)
-            widths.append(shape)
-            chain = _parameters(term_cfg, without=("term",))
-            rows.append((name, str(shape), chain, _described(term_cfg.term)))
-        # An image stands alone in its group; vectors are concatenated.
-        whole = widths[0] if len(widths) == 1 else (sum(shape[0] for shape in widths),)
-        yield _table(f"observations/{group} {whole}", ("term", "shape", "chain", "parameters"), rows)
-
-    rows = [(name, f"({action_sizes[name]},)", _described(term)) for name, term in cfg.actions.items()]
-    yield _table(f"actions ({sum(action_sizes.values())},)", ("term", "shape", "parameters"), rows)
-
-    rows = [
-        (name, f"({driver.readings.commands[name].shape[-1]},)", _seconds(term.resampling_time_range_s, "at resets"),
-         _described(term, without=("resampling_time_range_s",)))
-        for name, term in cfg.commands.items()
-    ]  # fmt: skip
-    yield _table("commands", ("term", "shape", "resampled every", "parameters"), rows)
-
-    weights = driver.readings.reward_weights
-    shown = {
-        name: f"{float(weights[name]):g}" if name in weights else "0: not computed" for name in cfg.rewards
-    }
-    rows = [(name, shown[name], _described(term, ("weight",))) for name, term in cfg.rewards.items()]
-    scaled = f"times {driver.step_dt:g} s" if cfg.scale_rewards_by_dt else "per step"
-    yield _table(f"rewards ({scaled})", ("term", "weight", "parameters"), rows)
-
-    ends = "terminated" if cfg.is_finite_horizon else "truncated"
-    rows = [
-        (name, ends if term.time_out else "terminated", _described(term, ("time_out",)))
-        for name, term in cfg.terminations.items()
-    ]
-    rows.append(("non_finite", "terminated", "always: the physics or the action is not finite"))
-    yield _table("terminations", ("term", "marks", "parameters"), rows)
-
-    rows = [
-        (name, term.mode, _seconds(term.interval_range_s, ""), _described(term, ("mode", "interval_range_s")))
-        for name, term in events.items()
-    ]
-    yield _table("events", ("term", "mode", "every", "parameters"), rows)
-
-    rows = [(name, f"{levels[name]:g}", _described(term)) for name, term in cfg.curriculum.items()]
-    yield _table("curriculum", ("term", "level", "parameters"), rows)
-
-    rows = [(name, term.reduce, _described(term, ("reduce",))) for name, term in cfg.metrics.items()]
-    yield _table("metrics", ("term", "reduced by", "parameters"), rows)
-
-    of_groups = compile_groups(cfg.observations)
-    rows = [("(groups)", _keys(transform), type(transform).__name__) for transform in of_groups]
-    rows += [(name, _keys(each.build()), _call(each)) for name, each in cfg.transforms.items()]
-    yield _table("transforms (actions pass them from last to first)", ("term", "keys", "parameters"), rows)
-
-
 def _keys(transform: Transform) -> str:
     """Return what a transform reads and, where that is elsewhere, writes."""
     keys = [[*transform.in_keys, *transform.in_keys_inv], [*transform.out_keys, *transform.out_keys_inv]]
@@ -140,7 +130,7 @@ def _call(described: TransformCfg) -> str:
     return f"{described.transform.__name__}({', '.join(parts)})"
 
 
-def _table(title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:
+def _show(console: Console, title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
     table = Table(title=title, title_justify="left", title_style="", box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("index", justify="right", no_wrap=True)
     for column in columns:
@@ -149,7 +139,7 @@ def _table(title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]]) ->
         table.add_row(str(index), *row)
     if not rows:
         table.add_row("-", "none", *[""] * (len(columns) - 1))
-    return table
+    console.print(table)
 
 
 def _described(term: Any, without: tuple[str, ...] = ()) -> str:

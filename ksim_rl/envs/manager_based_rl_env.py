@@ -107,7 +107,11 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self.view = self.driver.view
         self.load_managers()
         self.driver.freeze()
-        self._make_specs()
+        readings = {"obs": self.observation_manager.read(), "command": self.command_manager.values}
+        size, bounds_L2 = self.action_manager.size, self.action_manager.bounds_L2
+        self.observation_spec, self.full_action_spec, self.full_reward_spec, self.full_done_spec = make_specs(
+            readings, size, bounds_L2, batch_size=self.batch_size, device=self.device
+        )
         self.seed(-1 if cfg.seed is None else cfg.seed)
 
     # -- what it is made of --------------------------------------------------------------------------------------
@@ -177,13 +181,6 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
     def episode_step_E(self) -> Int64[Tensor, " E"]:
         """Env steps since each episode's start, int64 [E]."""
         return self.view.episode_step_E
-
-    def _make_specs(self) -> None:
-        readings = {"obs": self.observation_manager.read(), "command": self.command_manager.values}
-        size, bounds_L2 = self.action_manager.size, self.action_manager.bounds_L2
-        self.observation_spec, self.full_action_spec, self.full_reward_spec, self.full_done_spec = make_specs(
-            readings, size, bounds_L2, batch_size=self.batch_size, device=self.device
-        )
 
     # -- step and reset ------------------------------------------------------------------------------------------
 

@@ -60,7 +60,6 @@ class MaskedReset(EnvBase):
 
     # A reference, so that it costs nothing per step. Inside a captured graph it points to the graph's static output.
     _last_root: TensorDictBase | None = None
-    _masks: bool | None = None
     seed = _Seed()
 
     @property
@@ -88,7 +87,7 @@ class MaskedReset(EnvBase):
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Reset the rows that are done, without asking the host whether there are any."""
-        if not self._masks_resets():
+        if not self._masks_resets:
             return super().maybe_reset(tensordict)
         # A copy: an env may clear its own done buffer in place while transforms still read the mask.
         mask_E1 = tensordict.get("done").clone()
@@ -125,7 +124,7 @@ class MaskedReset(EnvBase):
         mask_E1 = None if tensordict is None else self._checked_mask(tensordict)
         if tensordict is not None and mask_E1 is not None:
             self._complete_with_last_root(tensordict)
-        if not self._masks_resets():
+        if not self._masks_resets:
             root = self._labelled(super().reset(tensordict, **kwargs))
         else:
             root = self._masked_reset(tensordict, mask_E1, **kwargs)
@@ -139,13 +138,10 @@ class MaskedReset(EnvBase):
         rollout_ET.names = [*names, dims.T]
         return rollout_ET
 
+    @functools.cached_property
     def _masks_resets(self) -> bool:
         """Whether resets go through masks; decided from what never changes, so it costs a dict look-up."""
-        known = self._masks
-        if known is None:
-            known = upstream.can_reset_nothing(self)
-            object.__setattr__(self, "_masks", known)
-        return known
+        return upstream.can_reset_nothing(self)
 
     def _masked_reset(
         self,

@@ -101,7 +101,6 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
         self.base_env.load_state_dict(parts[_BASE], strict=strict, **kwargs)
         self.transform.load_state_dict(parts[_TRANSFORM], strict=strict, **kwargs)
         if parts[_ROOT]:
-            root = TensorDict({}, batch_size=self.batch_size, device=self.device)
-            for key, value in parts[_ROOT].items():
-                root.set(tuple(key.split("/")) if "/" in key else key, value.to(self.device).clone())
+            leaves = {key: value.clone() for key, value in parts[_ROOT].items()}
+            root = TensorDict(leaves, batch_size=self.batch_size, device=self.device).unflatten_keys("/")
             self.last_root = dims.name(root, *self.dim_names) if self.batch_size else root  # pyright: ignore

@@ -7,24 +7,17 @@ import warp as wp
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import QuickLaunch, address
+from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of
 
 _NEVER = 2**62
 
 
-@wp.struct
-class _Table:
-    width: int
-    num_envs: int
-    table: wp.uint64
-    term_of_column: wp.uint64
-    step: wp.uint64
-    first: wp.uint64
-    count: wp.uint64
-
-
+_ARGUMENTS = arguments_of(
+    (int, "width num_envs"),
+    (wp.uint64, "table term_of_column step first count"),
+)
 _quick = QuickLaunch(
-    _Table,
+    _ARGUMENTS,
     """
     if (fabsf(((const float*)a.table)[(long long)row * a.width + column]) <= 3.402823466e38f) return;
     const int term = ((const int*)a.term_of_column)[column];

@@ -39,11 +39,7 @@ NOT_NEGATIVE_FIELDS = (
     *("dof_damping", "dof_frictionloss", "dof_armature", "tendon_damping", "tendon_frictionloss"),
     *("geom_friction", "pair_friction", "actuator_damping"),
 )
-CALLBACKS = {
-    "dyn": mujoco.get_mjcb_act_dyn,
-    "gain": mujoco.get_mjcb_act_gain,
-    "bias": mujoco.get_mjcb_act_bias,
-}
+CALLBACKS = {field: getattr(mujoco, f"get_mjcb_act_{field}") for field in ("dyn", "gain", "bias")}
 
 
 def check_finite(mj_model: mujoco.MjModel, source: str) -> None:
@@ -80,10 +76,8 @@ def check_meant(mj_model: mujoco.MjModel, source: str) -> None:
             where = _element_of(mj_model, field, int(bad[0]), values.shape)
             raise ValueError(f"{source}: {field}={values.flat[bad[0]]:g} in {where}: expected at least 0")
     for field, callback in CALLBACKS.items():
-        kinds = getattr(mj_model, f"actuator_{field}type")
-        users = np.flatnonzero(
-            kinds == int(ENUM_FIELDS[f"actuator_{field}type"].__members__[f"mj{field.upper()}_USER"])
-        )
+        user = ENUM_FIELDS[f"actuator_{field}type"].__members__[f"mj{field.upper()}_USER"]
+        users = np.flatnonzero(getattr(mj_model, f"actuator_{field}type") == int(user))
         if users.size and callback() is None:
             raise ValueError(
                 f"{source}: {field}type='user' in {_element(mj_model, 'actuator', int(users[0]))}: it needs a "

@@ -65,13 +65,8 @@ class OverflowRecord:
 
     def __init__(self, warp_data_E: mjw.Data) -> None:
         self._warp_data_E = warp_data_E
-        num_envs = warp_data_E.nworld
-        self._sticky = wp.zeros(num_envs, dtype=int)
-        self._most_nefc = wp.zeros(num_envs, dtype=int)
-        self._most_pool = wp.zeros(2, dtype=int)
-        self.sticky_E = wp.to_torch(self._sticky)
-        self.most_nefc_E = wp.to_torch(self._most_nefc)
-        self.most_pool = wp.to_torch(self._most_pool)
+        self._kept = [wp.zeros(size, dtype=int) for size in (warp_data_E.nworld, warp_data_E.nworld, 2)]
+        self.sticky_E, self.most_nefc_E, self.most_pool = map(wp.to_torch, self._kept)
 
     def record(self) -> None:
         """Launch the update of bits and maxima; runs after each substep, so before any reset clears them."""
@@ -80,7 +75,7 @@ class OverflowRecord:
             kernels.record_overflow,
             dim=d.nworld,
             inputs=[d.overflow, d.nefc, d.nacon, d.ncollision],
-            outputs=[self._sticky, self._most_nefc, self._most_pool],
+            outputs=self._kept,
         )
 
     def clear(self) -> None:

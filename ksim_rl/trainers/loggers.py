@@ -4,8 +4,7 @@ import importlib.util
 import os
 import re
 import uuid
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -154,19 +153,14 @@ def make_loggers(
         loggers.append(CsvTable(run_folder / METRICS))
     if cfg.tensorboard:
         loggers.append(TensorboardLogger("tensorboard", log_dir=str(run_folder)))
-    if cfg.wandb is not None:
-        with _service("wandb", "log in, or set logger.wandb.offline=true"):
-            loggers.append(open_wandb(cfg.wandb, run_folder, config or {}))
-    if cfg.mlflow is not None:
-        with _service("mlflow", "see to the server, or set logger.mlflow.tracking_uri"):
-            loggers.append(open_mlflow(cfg.mlflow, run_folder, config or {}))
+    services: dict[str, tuple[Callable[..., MetricLogger], str]] = {
+        "wandb": (open_wandb, "log in, or set logger.wandb.offline=true"),
+        "mlflow": (open_mlflow, "see to the server, or set logger.mlflow.tracking_uri"),
+    }
+    for name, (begin, fix) in services.items():
+        if (service := getattr(cfg, name)) is not None:
+            try:
+                loggers.append(begin(service, run_folder, config or {}))
+            except Exception as error:  # each service has types of its own
+                raise RuntimeError(f"logger.{name} cannot begin a run ({fix}): {error}") from error
     return loggers
-
-
-@contextmanager
-def _service(name: str, fix: str) -> Iterator[None]:
-    """Turn what a service raises, which has types of its own, into an error that names the logger and the fix."""
-    try:
-        yield
-    except Exception as error:
-        raise RuntimeError(f"logger.{name} cannot begin a run ({fix}): {error}") from error

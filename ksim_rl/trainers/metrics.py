@@ -18,19 +18,19 @@ _OVERFLOW, _NAN = "overflow/", "nan/worlds"
 ADDED, MOST = ("sum/", _NAN, "update/non_finite_env_states", "replay/"), (_OVERFLOW,)
 
 
+@dataclass(frozen=True)
 class PendingMetrics:
     """Metrics whose copy to the host may still be under way."""
 
-    def __init__(
-        self, names: tuple[str, ...], values_M: Float64[Tensor, " M"], copied: "torch.cuda.Event | None"
-    ) -> None:
-        self._names, self._values_M, self._copied = names, values_M, copied
+    names: tuple[str, ...]
+    values_M: Float64[Tensor, " M"]
+    copied: torch.cuda.Event | None = None
 
     def read(self) -> dict[str, float]:
         """Wait for the copy, and return the metrics by name."""
-        if self._copied is not None:
-            self._copied.synchronize()
-        return dict(zip(self._names, self._values_M.tolist(), strict=True))
+        if self.copied is not None:
+            self.copied.synchronize()
+        return dict(zip(self.names, self.values_M.tolist(), strict=True))
 
 
 def start_copy(metrics: Mapping[str, Shaped[Tensor, ""]], *, device: torch.device) -> PendingMetrics:
@@ -41,11 +41,11 @@ def start_copy(metrics: Mapping[str, Shaped[Tensor, ""]], *, device: torch.devic
     """
     names = tuple(metrics)
     if not names:
-        return PendingMetrics(names, torch.zeros(0, dtype=torch.float64), None)
+        return PendingMetrics(names, torch.zeros(0, dtype=torch.float64))
     # float64 holds every count of env states exactly.
     values_M = torch.stack([value.detach().to(torch.float64).reshape(()) for value in metrics.values()])
     if device.type != "cuda":
-        return PendingMetrics(names, values_M, None)
+        return PendingMetrics(names, values_M)
     on_host_M = torch.empty(values_M.shape, dtype=values_M.dtype, pin_memory=True)
     on_host_M.copy_(values_M, non_blocking=True)
     copied = torch.cuda.Event()

@@ -61,35 +61,30 @@ def run(
     # The graphs that the first iterations record take memory as well. Several ranks cannot try on their own.
     few = None if ranks.size() > 1 else partial(first_that_fits, cfg, note=progress.note)
     explained = memory_for(cfg.num_envs, cfg.resolved_device(), few)
+    make = partial(build, cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
     if ranks.rank():  # rank 0 writes for all
         with explained:
-            trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
+            trainer = make()
         outcome = trainer.train(progress)
         _close(trainer)
         return outcome
     run_folder.mkdir(parents=True, exist_ok=True)
     try:
         with locked(run_folder, note=progress.note), threads_that_fail(progress.note), explained:
-            return _run_locked(cfg, run_folder, progress, hooks, resume_from)
+            return _run_locked(cfg, run_folder, progress, make)
     except BaseException:
         with suppress(OSError):
             run_folder.rmdir()  # only where nothing is in it yet
         raise
 
 
-def _run_locked(
-    cfg: RunCfg,
-    run_folder: Path,
-    progress: RunProgress,
-    hooks: Sequence[Hook],
-    resume_from: checkpoint.Checkpoint | None,
-) -> Outcome:
+def _run_locked(cfg: RunCfg, run_folder: Path, progress: RunProgress, make: Callable[[], Trainer]) -> Outcome:
     for note in loading_notes(cfg.to_tree()):
         progress.note(note)
     for folder in (run_folder, run_folder / "checkpoint"):
         checkpoint.remove_leftovers(folder)
     with progress.busy("building envs and networks"):
-        trainer = build(cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
+        trainer = make()
     write_whole(run_folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
     trainer.watch = watch(run_folder, holds=CONFIG, note=progress.note)
     with recorded(run_folder, note=progress.note) as ended:

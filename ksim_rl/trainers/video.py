@@ -1,7 +1,6 @@
 """A video of a policy consists of the pictures that its env renders while it acts."""
 
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +47,22 @@ def record(
         raise VideoUnavailableError(_failed[0])
     every = max(1, round(1.0 / (fps * step_dt)))
     shown = 1.0 / (every * step_dt)
-    acting = partial(_frames, env, policy, steps=steps, every=every, seed=seed, status=status)
+
+    def acting() -> Iterator[np.ndarray]:
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            env.set_seed(seed)
+            current_E = env.reset()
+            for step in range(steps):
+                if step % every == 0:
+                    frame = None if (pictures := part(env, Pictures)) is None else pictures.render()
+                    if frame is None:
+                        raise VideoUnavailableError(
+                            "the env has no render mode: build it with render_mode='rgb_array'"
+                        )
+                    status(f"drawing the video: {step / steps:.0%}")
+                    yield frame
+                _, current_E = env.step_and_maybe_reset(policy(current_E))
+
     frames = acting()
     try:
         first = next(frames)
@@ -77,27 +91,3 @@ def _write(path: Path, first: np.ndarray, rest: Iterator[np.ndarray], *, fps: fl
             for frame in rest:
                 writer.append_data(frame)
     return path
-
-
-def _frames(
-    env: EnvBase,
-    policy: TensorDictModuleBase,
-    *,
-    steps: int,
-    every: int,
-    seed: int,
-    status: Callable[[str], None],
-) -> Iterator[np.ndarray]:
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        env.set_seed(seed)
-        current_E = env.reset()
-        for step in range(steps):
-            if step % every == 0:
-                frame = None if (pictures := part(env, Pictures)) is None else pictures.render()
-                if frame is None:
-                    raise VideoUnavailableError(
-                        "the env has no render mode: build it with render_mode='rgb_array'"
-                    )
-                status(f"drawing the video: {step / steps:.0%}")
-                yield frame
-            _, current_E = env.step_and_maybe_reset(policy(current_E))

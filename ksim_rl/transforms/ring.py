@@ -14,40 +14,19 @@ from jaxtyping import Bool, Int32, Int64, Shaped
 from torch import Tensor
 
 from ksim_rl import ranks
-from ksim_rl.device.quick_launch import QuickLaunch, address, as_operator
+from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator
 from ksim_rl.device.random import DRAWS
 
-
-@wp.struct
-class _Ring:
-    width: int
-    lanes: int
-    num_bytes: int
-    value_stride: int
-    num_slots: int
-    num_frames: int
-    stride: int
-    num_parts: int
-    counts: int
-    first_row: int
-    stream: wp.uint32
-    lowest: int
-    span: int
-    seed: wp.uint64
-    draw_count: wp.uint64
-    age: wp.uint64
-    lag: wp.uint64
-    mask: wp.uint64
-    parts: wp.uint64
-    value: wp.uint64
-    ring: wp.uint64
-    out: wp.uint64
-
-
+_ARGUMENTS = arguments_of(
+    (int, "width lanes num_bytes value_stride num_slots num_frames stride num_parts counts first_row"),
+    (wp.uint32, "stream"),
+    (int, "lowest span"),
+    (wp.uint64, "seed draw_count age lag mask parts value ring out"),
+)
 # Rows of the ring are bytes, so that one kernel serves every dtype. The lanes of a row copy words of 16, 4 or 1 bytes,
 # a few at once, as the GPU waits for all of them together; on the CPU one lane copies whole parts.
 _quick = QuickLaunch(
-    _Ring,
+    _ARGUMENTS,
     DRAWS
     + r"""
     struct alignas(16) Wide { unsigned word[4]; };
@@ -228,16 +207,11 @@ def _has_whole_rows(value_E: Tensor) -> bool:
     return value_E.ndim == 1 or value_E.ndim == 2 and value_E.stride(1) == 1 or value_E.is_contiguous()
 
 
-def _empty(
-    ring_EM: Tensor,
-    age_E: Tensor,
-    value_E: Tensor,
-    lag_E: object,
-    mask_E: object,
-    num_frames: int,
-    *_: object,
-) -> Tensor:
-    return value_E.new_empty((ring_EM.shape[0], num_frames * ring_EM.shape[2:].numel()))
-
-
-_run = as_operator("ring", _launch, _empty, mutates=("ring_EM", "age_E", "lag_E", "draw_count_E"))
+_run = as_operator(
+    "ring",
+    _launch,
+    lambda ring_EM, _age_E, value_E, _lag_E, _mask_E, num_frames, *_: value_E.new_empty(
+        (ring_EM.shape[0], num_frames * ring_EM.shape[2:].numel())
+    ),
+    mutates=("ring_EM", "age_E", "lag_E", "draw_count_E"),
+)

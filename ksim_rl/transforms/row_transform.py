@@ -1,5 +1,6 @@
 """This module holds the bases of transforms with state per env: buffers, draws of their own, a level to follow."""
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NoReturn, Self
@@ -15,7 +16,7 @@ from torchrl.envs.transforms import Transform
 from ksim_rl import checks
 from ksim_rl.device import random
 from ksim_rl.transforms import upstream
-from ksim_rl.transforms.specs import Device, batch_dims_of, drop_leaf_spec, leaf_spec, set_leaf_spec, spell
+from ksim_rl.transforms.specs import Device, batch_dims_of, drop_leaf, leaf_spec, set_leaf_spec, spell
 
 Keys = Sequence[NestedKey] | NestedKey
 _NO_SEED = -(1 << 63)
@@ -92,7 +93,7 @@ class CheckedKeys(Transform):
         replaced = [new_spec(index, spec) for index, spec in enumerate(found)]
         for key, out_key in zip(in_keys, out_keys, strict=True):
             if is_inverse and key != out_key:
-                drop_leaf_spec(specs, key)
+                drop_leaf(specs, key)
         for out_key, spec in zip(out_keys, replaced, strict=True):
             set_leaf_spec(specs, out_key, spec)
         return found
@@ -169,10 +170,7 @@ class RowTransform(CheckedKeys, ABC):
         ]
         if not masks:
             return torch.ones(self.num_rows, dtype=torch.bool, device=tensordict_reset.device)
-        mask_E = masks[0]
-        for mask in masks[1:]:
-            mask_E = mask_E | mask
-        return mask_E
+        return functools.reduce(torch.logical_or, masks)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Refuse: without an env there are no steps and no resets to follow."""

@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Num
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
@@ -49,13 +49,13 @@ def set_leaf_spec(observation_spec: Composite, key: NestedKey, spec: TensorSpec)
     parent[path[-1]] = spec
 
 
-def drop_leaf_spec(observation_spec: Composite, key: NestedKey) -> None:
-    """Remove the spec of `key`, and nested specs that it leaves empty."""
-    del observation_spec[key]
+def drop_leaf(tree: Composite | TensorDictBase, key: NestedKey) -> None:
+    """Remove a leaf, and the nested nodes that it leaves empty."""
+    del tree[key]
     if isinstance(key, tuple) and len(key) > 1:
         above = key[:-1] if len(key) > 2 else key[0]
-        if not list(observation_spec[above].keys()):
-            drop_leaf_spec(observation_spec, above)
+        if not list(tree[above].keys(True, True)):  # pyright: ignore[reportAttributeAccessIssue]
+            drop_leaf(tree, above)
 
 
 def bounds(spec: TensorSpec) -> tuple[Num[Tensor, "*leaf"], Num[Tensor, "*leaf"]]:

@@ -5,23 +5,15 @@ import warp as wp
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import QuickLaunch, address, as_operator
+from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator
 
-
-@wp.struct
-class _Tally:
-    rows: int
-    mask: wp.uint64
-    reward: wp.uint64
-    total: wp.uint64
-    step: wp.uint64
-    total_out: wp.uint64
-    step_out: wp.uint64
-
-
+_ARGUMENTS = arguments_of(
+    (int, "rows"),
+    (wp.uint64, "mask reward total step total_out step_out"),
+)
 # Parameters are what the CPU's compiler believes not to overlap, so that loops become vector instructions.
 _quick_tally = QuickLaunch(
-    _Tally,
+    _ARGUMENTS,
     r"""
     const int begin = part * a.rows, end = begin + a.rows;
     auto begin_anew = [=](auto* __restrict__ kept, auto* __restrict__ out, const unsigned char* __restrict__ mask) {

@@ -72,14 +72,15 @@ class Replay:
 
 
 def replay(failure: Failure) -> Replay:
-    """Run each kept substep on the C engine."""
-    mj_model = _with_fields(failure)
+    """Run each kept substep on the C engine, which says what it finds instead of starting anew."""
+    mj_model = failure.mj_model
+    write_fields(mj_model, failure.fields)
+    mj_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    mj_model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     data = mujoco.MjData(mj_model)
     reached_qvel = [*failure.states["qvel"][1:], failure.reached["qvel"]]
     with np.errstate(all="ignore"), caught_warnings():
-        substeps = tuple(
-            _substep(mj_model, data, failure, k, reached) for k, reached in enumerate(reached_qvel)
-        )
+        substeps = tuple(_substep(data, failure, k, reached) for k, reached in enumerate(reached_qvel))
     before = _broken_dofs(mj_model, failure.states["qpos"][-1], failure.states["qvel"][-1])
     after = _broken_dofs(mj_model, failure.reached["qpos"], failure.reached["qvel"])
     finite = np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()
@@ -150,18 +151,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _with_fields(failure: Failure) -> mujoco.MjModel:
-    """Return the model of the one world, which says what it finds instead of starting anew."""
+def _substep(data: mujoco.MjData, failure: Failure, k: int, reached_qvel: np.ndarray) -> Substep:
     mj_model = failure.mj_model
-    write_fields(mj_model, failure.fields)
-    mj_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-    mj_model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
-    return mj_model
-
-
-def _substep(
-    mj_model: mujoco.MjModel, data: mujoco.MjData, failure: Failure, k: int, reached_qvel: np.ndarray
-) -> Substep:
     mujoco.mj_resetData(mj_model, data)
     for name, values in failure.states.items():
         if name == "time":

@@ -16,7 +16,7 @@ from ksim_rl.transforms.specs import (
     Device,
     bounded,
     bounds,
-    drop_leaf_spec,
+    drop_leaf,
     leaf_spec,
     set_leaf_spec,
     spell,
@@ -119,7 +119,7 @@ class ObservationGroups(CheckedKeys):
         for name, spec in vectors.items():
             set_leaf_spec(observation_spec, name, spec)
         for key in self.drop:
-            drop_leaf_spec(observation_spec, key)
+            drop_leaf(observation_spec, key)
         return observation_spec
 
     def _vector_spec(self, specs: list[TensorSpec], batch_size: torch.Size, device: Device) -> TensorSpec:
@@ -149,7 +149,7 @@ class ObservationGroups(CheckedKeys):
         for name, vector in zip(self.groups, vectors):  # noqa: B905 (strict takes time in every step)
             next_tensordict.set(name, vector)
         for key in self.drop:
-            _drop(next_tensordict, key)
+            drop_leaf(next_tensordict, key)
         return next_tensordict
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -162,15 +162,6 @@ class ObservationGroups(CheckedKeys):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)
-
-
-def _drop(tensordict: TensorDictBase, key: NestedKey) -> None:
-    """Remove a leaf, and nested tensordicts that it leaves empty."""
-    tensordict.del_(key)
-    if isinstance(key, tuple) and len(key) > 1:
-        above = key[:-1] if len(key) > 2 else key[0]
-        if tensordict.get(above).is_empty():
-            _drop(tensordict, above)
 
 
 def group_specs(env: EnvBase) -> dict[NestedKey, GroupSpec]:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from ksim_rl import ranks
-from ksim_rl.device.quick_launch import QuickLaunch, address, as_operator
+from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator
 from ksim_rl.device.random import DRAWS
 
 GAUSSIAN, MULTIPLY, BIAS_GAUSSIAN, BIAS_MULTIPLY, BY_LEVEL, HOLD = (1 << bit for bit in range(6))
@@ -28,27 +28,11 @@ NUM_PARAMETERS = 7
 _MODES = {"forward": 0, "step": 1, "reset": 2}
 
 
-@wp.struct
-class _Noise:
-    n: int
-    mode: int
-    features: int
-    first_row: int
-    stream: wp.uint32
-    seed: wp.uint64
-    counter: wp.uint64
-    enabled: wp.uint64
-    level: wp.uint64
-    mask: wp.uint64
-    table: wp.uint64
-    flags: wp.uint64
-    clean: wp.uint64
-    bias: wp.uint64
-    walk: wp.uint64
-    last: wp.uint64
-    out: wp.uint64
-
-
+_ARGUMENTS = arguments_of(
+    (int, "n mode features first_row"),
+    (wp.uint32, "stream"),
+    (wp.uint64, "seed counter enabled level mask table flags clean bias walk last out"),
+)
 _COLUMNS = r"""
     const int n = a.n, features = a.features, mode = a.mode;
     const float* clean = (const float*)a.clean + (long long)row * n;
@@ -138,7 +122,7 @@ _DEVICE = f"""
 """
 
 
-_quick = QuickLaunch(_Noise, _DEVICE + DRAWS + _COLUMNS)
+_quick = QuickLaunch(_ARGUMENTS, _DEVICE + DRAWS + _COLUMNS)
 
 
 class NoiseState(NamedTuple):

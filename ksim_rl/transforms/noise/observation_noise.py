@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
@@ -107,7 +107,8 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         if columns.has(HAS_BIAS):
             present = self._buffers["bias_EL"]
             if present is None or present.shape != shape:
-                self._buffers["bias_EL"] = columns.neutral_bias().expand(shape).clone()
+                neutral_L = (columns.flags_L & noise_kernel.BIAS_MULTIPLY != 0).to(torch.float32)
+                self._buffers["bias_EL"] = neutral_L.expand(shape).clone()
         for name, feature in (("walk_EL", HAS_WALK), ("last_EL", HAS_DROPOUT)):
             if columns.has(feature):
                 self._size_buffer(name, torch.float32, (columns.size,))
@@ -141,16 +142,6 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
             clean_EL = side_by_side(values, tensordict.numel() if moment == "forward" else self.num_rows)
         if clean_EL.dtype != torch.float32:
             clean_EL = clean_EL.float()
-        state, features = self._state()
-        stream = self._stream_ids[moment]
-        noisy_EL = add_noise(clean_EL, state, features, moment, stream=stream, counter=counter, mask_E=mask_E)
-        found = [noisy_EL] if len(values) == 1 else split(noisy_EL, values)
-        for out_key, noisy, value in zip(self.out_keys, found, values):  # noqa: B905 (takes time in every step)
-            tensordict.set(out_key, noisy if noisy.dtype == value.dtype else noisy.to(value.dtype))
-        return tensordict
-
-    def _state(self) -> tuple[NoiseState, int]:
-        """Return what the kernel reads and changes, and what any column has."""
         # Look-ups by attribute go through `nn.Module` and would take a fifth of the step.
         buffers: dict[str, Any] = self._buffers
         columns: Any = self._modules["noise_columns"]
@@ -158,7 +149,12 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         read = parameters["table_PL"], parameters["flags_L"], buffers["enabled"], buffers["level"]
         changed = buffers["bias_EL"], buffers["walk_EL"], buffers["last_EL"]
         state = NoiseState(*read, buffers["seed_value"], *changed)
-        return state, columns.features
+        where = {"stream": self._stream_ids[moment], "counter": counter, "mask_E": mask_E}
+        noisy_EL = add_noise(clean_EL, state, columns.features, moment, **where)
+        found = [noisy_EL] if len(values) == 1 else split(noisy_EL, values)
+        for out_key, noisy, value in zip(self.out_keys, found, values):  # noqa: B905 (takes time in every step)
+            tensordict.set(out_key, noisy if noisy.dtype == value.dtype else noisy.to(value.dtype))
+        return tensordict
 
 
 def _one_per_key(
@@ -201,17 +197,12 @@ class NoiseColumns(nn.Module):
             noise_kernel.HAS_DROPOUT: bool(table[noise_kernel.DROPOUT].any()),
         }
         self.features = sum(feature for feature, is_there in found.items() if is_there)
-        self.by_level = any(cfg.by_level for cfg in cfgs)
         self.register_buffer("table_PL", table.to(device), persistent=False)
         self.register_buffer("flags_L", flags.to(device), persistent=False)
 
     def has(self, feature: int) -> bool:
         """Whether any column has it."""
         return bool(self.features & feature)
-
-    def neutral_bias(self) -> Float32[Tensor, " L"]:
-        """Return the bias that changes nothing, [L]."""
-        return (self.flags_L & noise_kernel.BIAS_MULTIPLY != 0).to(torch.float32)
 
 
 def _parameters(cfg: NoiseCfg, key: NestedKey, size: int) -> list[list[float]]:
