@@ -4,16 +4,14 @@ MuJoCo Warp sums and chooses in the order in which its threads come, which on a 
 kernels are rows/wrench.cpp with rows/sensors.cpp, and with rows/bodies.cpp.
 """
 
-# pyright: reportInvalidTypeForm=false
-
 import dataclasses
 
 import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-from ksim_rl.physics.rows.contact_lists import ContactLists, launch
-from ksim_rl.physics.structs import filled, struct_with
+from ksim_rl.physics import native
+from ksim_rl.physics.rows.contact_lists import ContactLists
 
 # The `intprm` of the two kinds: bits of mjtConDataField, the reduction of several contacts, and the number of slots.
 _FOUND, _FORCE, _POSITION, _NORMAL, _TANGENT = 1 << 0, 1 << 1, 1 << 4, 1 << 5, 1 << 6
@@ -39,21 +37,6 @@ def read_by_us(mj_model: mujoco.MjModel) -> list[int]:
     ]
 
 
-@struct_with(
-    ("", ContactLists, "count ids"),
-    ("", mjw.Model, "body_parentid geom_bodyid sensor_objtype sensor_objid sensor_reftype sensor_refid"),
-    ("", mjw.Model, "sensor_intprm sensor_adr"),
-    ("contact_", mjw.Contact, "pos frame friction dim geom efc_address adhesion"),
-    ("efc_", mjw.Constraint, "force"),
-    ("", mjw.Data, "xipos xfrc_applied sensordata"),
-)
-class Problem:
-    """What the kernels read and write, the sensors that they read, and the lists of contacts."""
-
-    sensors: wp.array[int]
-    forces: wp.array2d[wp.spatial_vector]
-
-
 class ContactReadings:
     """What a substep reads of its contacts once their forces are known.
 
@@ -67,15 +50,14 @@ class ContactReadings:
         m, d = warp_model, warp_data_E
         self.sensors = read_by_us(mj_model)
         own = {
+            **vars(lists),
             "sensors": wp.array(self.sensors, dtype=int, device=d.qpos.device),
             "forces": wp.empty_like(d.xfrc_applied),
         }
-        contacts = {f"contact_{name}": array for name, array in vars(d.contact).items()}
-        self._problem = filled(Problem, own, lists, contacts, {"efc_force": d.efc.force}, m, d)
         # The same arrays, but the forces of contacts are among those that users apply, and it has no pool of contacts.
         self._without_pool = dataclasses.replace(d, xfrc_applied=own["forces"], naconmax=0)
         self._lists = lists
-        self._constants = {
+        constants = {
             **lists.constants,
             "njmax": d.njmax,
             "elliptic": m.opt.cone == mjw.ConeType.ELLIPTIC,
@@ -86,6 +68,11 @@ class ContactReadings:
             "geom": GEOM,
             "subtree": SUBTREE,
         }
+        sources = [native.source_of("rows", ("layout", "wrench", part)) for part in ("sensors", "bodies")]
+        self._read_sensors, self._sum_forces = (
+            native.launcher(source, constants, own, m, d, lanes=lists.lanes, threads=lists.threads)
+            for source in sources
+        )
 
     def list(self) -> None:
         """List each world's contacts, where no kernel of constraint rows has."""
@@ -95,12 +82,9 @@ class ContactReadings:
     def read_sensors(self) -> None:
         """Write the sensors that contacts match; the others have to be zero before."""
         if self.sensors:
-            self._launch("sensors")
+            self._read_sensors()
 
     def rne_postconstraint(self, warp_model: mjw.Model) -> None:
         """Do what MuJoCo Warp's function of that name does; only what equalities and tendons exert has no order."""
-        self._launch("bodies")
+        self._sum_forces()
         mjw.rne_postconstraint(warp_model, self._without_pool)
-
-    def _launch(self, part: str) -> None:
-        launch(("layout", "wrench", part), self._constants, Problem, self._problem, self._lists.count)

@@ -1,8 +1,10 @@
 """Kernels take many arrays of a model and its worlds as one Warp struct, whose fields this module makes and fills."""
 
-from collections.abc import Callable, Mapping
+from collections import ChainMap
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+import mujoco_warp as mjw
 import warp as wp
 
 
@@ -22,10 +24,21 @@ def struct_with(*parts: tuple[str, type, str]) -> Callable[[type], Any]:
     return decorate
 
 
-def filled(struct: Any, *owners: object) -> Any:
-    """Return a struct in which each field is that of its name in the first owner that has it."""
-    fields = [owner if isinstance(owner, Mapping) else vars(owner) for owner in owners]
+def values_of(names: Iterable[str], *owners: Any) -> dict[str, Any]:
+    """Return what the first owner has that has it, by name; worlds have `contact_...` and `efc_...`, too."""
+    fields: list[Any] = []
+    for owner in owners:
+        fields.append(owner if isinstance(owner, Mapping) else vars(owner))
+        if isinstance(owner, mjw.Data):
+            for prefix, part in (("contact_", owner.contact), ("efc_", owner.efc)):
+                fields.append({prefix + name: array for name, array in vars(part).items()})
+    owned = ChainMap(*fields)
+    return {name: owned[name] for name in names}
+
+
+def filled(struct: Any, *owners: Any) -> Any:
+    """Return a struct in which each field is that of its name in the first owner that has it; see `values_of`."""
     instance = struct()
-    for name in struct.vars:
-        setattr(instance, name, next(owned[name] for owned in fields if name in owned))
+    for name, value in values_of(struct.vars, *owners).items():
+        setattr(instance, name, value)
     return instance

@@ -390,8 +390,7 @@ def take_over_height_fields(warp_model: mjw.Model) -> Callable[[mjw.Model, mjw.D
     }
 
     def append(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
-        contacts = {f"contact_{name}": array for name, array in vars(warp_data_E.contact).items()}
-        collisions = filled(Collisions, own, contacts, warp_model, warp_data_E)
+        collisions = filled(Collisions, own, warp_model, warp_data_E)
         wp.launch(height_field_contacts, dim=(warp_data_E.nworld, int(taken.sum())), inputs=[collisions])
 
     return append

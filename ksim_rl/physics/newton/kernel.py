@@ -11,23 +11,21 @@ Source of the algorithm: https://mujoco.readthedocs.io/en/stable/computation/ind
 search and tests of convergence: mujoco_warp/_src/solver.py.
 """
 
-# Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
-# pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportInvalidTypeForm=false
+# pyright: reportInvalidTypeForm=false
 
 import enum
-import functools
-from importlib.resources import files
+from collections.abc import Callable, Mapping
 
 import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-from ksim_rl.physics.structs import struct_with
+from ksim_rl.physics import native
 
 CUDA_LANES = 32
 SORTING_THREADS = 1024
 _PARTS = ("layout", "constraints", "cost", "hessian", "line_search", "newton")
-_SOURCE = "".join(files("ksim_rl.physics.newton").joinpath(f"{part}.cpp").read_text() for part in _PARTS)
+_SOURCE = native.source_of("newton", _PARTS)
 
 
 class Invariant(enum.IntFlag):
@@ -45,25 +43,6 @@ class Invariant(enum.IntFlag):
     """The cost falls along the search direction, up to rounding."""
     COST_FALLS = enum.auto()
     """A line search never returns a point that costs more than its start."""
-
-
-@struct_with(
-    ("", mjw.Model, "M_hinit_i M_colind"),
-    ("", mjw.Option, "tolerance ls_tolerance impratio_invsqrt iterations"),
-    ("", mjw.Data, "ne nf nefc M qacc qacc_warmstart qfrc_smooth qfrc_constraint solver_niter overflow"),
-    ("contact_", mjw.Contact, "friction dim"),
-    ("efc_", mjw.Constraint, "type id J_rownnz J_rowadr D aref frictionloss Ma force state"),
-)
-class Problem:
-    """What the kernel reads of a model and its worlds, what it writes, room for the rows that find none on chip, the
-    order in which the worlds are taken up, and the broken `Invariant`s of a debug build.
-    """
-
-    efc_J_colind: wp.array2d[int]
-    efc_J: wp.array2d[float]
-    scratch: wp.array2d[float]
-    order: wp.array[int]
-    broken: wp.array[int]
 
 
 def row_stride(nv: int) -> int:
@@ -88,15 +67,23 @@ def _column(nv: int) -> int:
     return _padded(nv + 1 + (CUDA_LANES if nv >= CUDA_LANES else 0))
 
 
-@functools.cache
-def newton_kernel(
-    nv: int, njmax: int, elliptic: bool, ls_iterations: int, lanes: int, rows_on_chip: int, checked: bool
-) -> wp.Kernel:
-    """Return the kernel of a `Problem` with `nv` degrees of freedom; launch it over (worlds, lanes).
+def launcher(
+    warp_model: mjw.Model,
+    warp_data_E: mjw.Data,
+    own: Mapping[str, wp.array],
+    *,
+    elliptic: bool,
+    lanes: int,
+    rows_on_chip: int,
+    checked: bool,
+) -> Callable[[], None]:
+    """Return what launches the kernel.
 
     There are 32 lanes on CUDA and 1 on the CPU. Rows beyond those on the chip (in shared memory) are in the scratch. A
-    `checked` (debug) build writes each world's broken `Invariant`s.
+    `checked` (debug) build writes each world's broken `Invariant`s. Of `own` it takes `efc_J_colind` and `efc_J`, the
+    `scratch`, the `order` in which the worlds are taken up, and `broken`.
     """
+    nv, njmax = warp_model.nv, warp_data_E.njmax
     states, rows = mujoco.mjtConstraintState, mujoco.mjtConstraint
     constants = {
         "NV": nv,
@@ -105,9 +92,8 @@ def newton_kernel(
         "STRIDE": row_stride(nv),
         "COLUMN": _column(nv),
         "ROWS_ON_CHIP": rows_on_chip,
-        "LANES": lanes,
         "FLOATS": floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=rows_on_chip),
-        "MOST_TRIALS": ls_iterations,
+        "MOST_TRIALS": warp_model.opt.ls_iterations,
         "ELLIPTIC": elliptic,
         "ELLIPTIC_CONTACT": rows.mjCNSTR_CONTACT_ELLIPTIC,
         "SATISFIED": states.mjCNSTRSTATE_SATISFIED,
@@ -120,33 +106,18 @@ def newton_kernel(
         "CHECKED": checked,
         **{str(invariant.name): invariant for invariant in Invariant},
     }
-    snippet = (
-        "".join(f"constexpr int {name} = {int(value)};\n" for name, value in constants.items()) + _SOURCE
+    return native.launcher(
+        _SOURCE, constants, own, warp_model, warp_data_E, lanes=lanes, threads=lanes, fast_math=True
     )
-
-    @wp.func_native(snippet)
-    def solve_world(world: int, lane: int, problem: Problem) -> None: ...
-
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        grid_stride=False,
-        module_options={"block_dim": lanes, "fast_math": True},
-    )
-    def kernel(problem: Problem):
-        world, lane = wp.tid()
-        solve_world(problem.order[world], lane, problem)
-
-    return kernel
 
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
 constexpr int KEYS = 64;
 __shared__ int places[KEYS];  // how many worlds have a key, then where the next of them goes
-const int thread = threadIdx.x, threads = blockDim.x, worlds = problem.order.shape[0];
+const int thread = threadIdx.x, threads = blockDim.x, worlds = order.shape[0];
 auto key_of = [&](int world) {
-    const int time = 2 * problem.solver_niter.data[world] + problem.nefc.data[world] / 4;
+    const int time = 2 * iterations.data[world] + rows.data[world] / 4;
     return KEYS - 1 - wp::min(time, KEYS - 1);
 };
 for (int key = thread; key < KEYS; key += threads)
@@ -165,24 +136,25 @@ if (thread == 0) {
 }
 __syncthreads();
 for (int world = thread; world < worlds; world += threads)
-    problem.order.data[atomicAdd(places + key_of(world), 1)] = world;
+    order.data[atomicAdd(places + key_of(world), 1)] = world;
 #endif
 """)
-def sort_by_counting(problem: Problem) -> None:
+def sort_by_counting(order: wp.array[int], iterations: wp.array[int], rows: wp.array[int]) -> None:
     """Write the worlds in the order of their keys."""
 
 
 @wp.kernel(
     module="unique", enable_backward=False, grid_stride=False, module_options={"block_dim": SORTING_THREADS}
 )
-def sort_worlds(problem: Problem):
+def sort_worlds(order: wp.array[int], iterations: wp.array[int], rows: wp.array[int]):
     """Write the order of the worlds, by one block."""
-    sort_by_counting(problem)
+    sort_by_counting(order, iterations, rows)
 
 
-def put_longest_first(problem: Problem) -> None:
+def put_longest_first(order: wp.array[int], warp_data_E: mjw.Data) -> None:
     """Let a GPU take up those worlds first which will take longest, by their last iterations and their rows.
 
     A world that takes three times as long as most would otherwise start late and leave the GPU waiting for it alone.
     """
-    wp.launch(sort_worlds, dim=SORTING_THREADS, inputs=[problem], block_dim=SORTING_THREADS)
+    inputs = [order, warp_data_E.solver_niter, warp_data_E.nefc]
+    wp.launch(sort_worlds, dim=SORTING_THREADS, inputs=inputs, block_dim=SORTING_THREADS)

@@ -1,6 +1,6 @@
 // Part 1: where the numbers of a world lie, and how its lanes share the work.
 //
-// These parts are the body of the function solve_world(world, lane, problem), before which kernel.py puts the
+// These parts are the body of a function f(world, lane, problem), before which native.py and kernel.py put the
 // constants of the kernel: sizes, MuJoCo's enums and its own invariants. They follow MuJoCo's chapter on computation
 // (https://mujoco.readthedocs.io/en/stable/computation/index.html): constraint model, cost, gradient and Hessian,
 // line search, Newton's method. There, r = J qacc - aref is the residual of the constraint rows, s(r) their cost,
@@ -14,6 +14,8 @@
 // each it has the row of the Hessian from the block's first column on: on CUDA these rows lie in registers, and
 // with one lane, on the CPU, they are the upper triangle. J and M lie on the chip as whole rows, zeros included:
 // then sums over them have no index to look up, and the lanes read one address or adjacent ones.
+
+world = problem.order.data[world];
 
 #if defined(__CUDA_ARCH__)
 #define UNROLL _Pragma("unroll")

@@ -9,14 +9,12 @@ import warp as wp
 from ksim_rl.physics.contact_sensors import ContactReadings
 from ksim_rl.physics.newton.kernel import (
     CUDA_LANES,
-    Problem,
     floats_per_world,
-    newton_kernel,
+    launcher,
     put_longest_first,
     row_stride,
 )
 from ksim_rl.physics.sim_cfg import SimCfg
-from ksim_rl.physics.structs import filled
 
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
@@ -89,8 +87,6 @@ def solver(
     if rows_on_chip is None:
         room = FLOATS_PER_WORLD - floats_per_world(m.nv, d.njmax, elliptic=elliptic, rows_on_chip=0)
         rows_on_chip = min(-(-d.njmax // 2), max(0, room // row_stride(m.nv))) if on_cuda else d.njmax
-    ls_iterations, checked = int(m.opt.ls_iterations), broken is not None
-    kernel = newton_kernel(m.nv, d.njmax, elliptic, ls_iterations, lanes, rows_on_chip, checked)
     far_floats = (d.njmax - rows_on_chip) * row_stride(m.nv)
     device = d.qpos.device
     own = {
@@ -100,14 +96,14 @@ def solver(
         "order": wp.array(list(range(d.nworld)), dtype=int, device=device),
         "broken": wp.empty(0, dtype=int, device=device) if broken is None else broken,
     }
-    rows = {f"efc_{name}": array for name, array in vars(efc).items()}
-    contacts = {f"contact_{name}": array for name, array in vars(d.contact).items()}
-    problem = filled(Problem, own, rows, contacts, m, m.opt, d)
+    solve = launcher(
+        m, d, own, elliptic=elliptic, lanes=lanes, rows_on_chip=rows_on_chip, checked=broken is not None
+    )
 
     def launch() -> None:
         if on_cuda:
-            put_longest_first(problem)
-        wp.launch(kernel, dim=(d.nworld, lanes), inputs=[problem], block_dim=lanes)
+            put_longest_first(own["order"], d)
+        solve()
 
     return launch
 

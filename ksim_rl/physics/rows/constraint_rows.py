@@ -6,8 +6,6 @@ Read the parts in their order: layout.cpp, order.cpp, row.cpp, joints.cpp, conta
 model" in https://mujoco.readthedocs.io/en/stable/computation/index.html and mujoco_warp/_src/constraint.py.
 """
 
-# pyright: reportInvalidTypeForm=false
-
 from collections.abc import Callable
 
 import mujoco
@@ -15,8 +13,8 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from ksim_rl.physics.rows.contact_lists import ContactLists, launch
-from ksim_rl.physics.structs import filled, struct_with
+from ksim_rl.physics import native
+from ksim_rl.physics.rows.contact_lists import ContactLists
 
 PARTS = ("layout", "order", "row", "joints", "contacts")
 # The degrees of freedom that move a geom are bits of a number, and a body or geom of a pair is 16 bits of another.
@@ -26,30 +24,6 @@ _ENUMS = {
     "BALL": mujoco.mjtJoint.mjJNT_BALL,
     "OUT_OF_NONZEROS": mjw.OverflowType.NJMAX_NNZ,
 }
-
-
-@struct_with(
-    ("", ContactLists, "count ids appended found keys"),
-    ("", mjw.Model, "qpos0 jnt_type jnt_qposadr jnt_dofadr jnt_solref jnt_solimp jnt_range jnt_margin"),
-    ("", mjw.Model, "dof_solref dof_solimp dof_frictionloss dof_invweight0 dof_bodyid"),
-    (
-        "",
-        mjw.Model,
-        "body_invweight0 body_rootid geom_bodyid eq_obj1id eq_obj2id eq_solref eq_solimp eq_data eq_jnt_adr",
-    ),
-    ("", mjw.Option, "timestep impratio_invsqrt"),
-    ("", mjw.Data, "qpos qvel eq_active subtree_com cdof ne nf nl nefc overflow"),
-    ("contact_", mjw.Contact, "dist pos frame includemargin friction solref solreffriction solimp dim geom"),
-    ("contact_", mjw.Contact, "efc_address"),
-    ("efc_", mjw.Constraint, "type id J_rownnz J_rowadr D aref frictionloss pos margin vel"),
-)
-class Problem:
-    """What the kernel reads and writes, the joints with limits, and the bits of the dofs that move each geom."""
-
-    limited: wp.array[int]
-    dofs_of_geom: wp.array[wp.uint64]
-    efc_J_colind: wp.array2d[int]
-    efc_J: wp.array2d[float]
 
 
 def one_kernel_rows_unavailable(warp_model: mjw.Model, *, dynamics_unavailable: str | None) -> str | None:
@@ -79,14 +53,13 @@ def constraint_rows(
     masks = (moves * (np.uint64(1) << np.arange(m.nv, dtype=np.uint64))).sum(-1, dtype=np.uint64)
     device = d.qpos.device
     own = {
+        **vars(lists),
+        # The joints with limits, and the bits of the degrees of freedom that move each geom.
         "limited": wp.array(np.sort(limited), dtype=int, device=device),
         "dofs_of_geom": wp.array(masks, dtype=wp.uint64, device=device),
         "efc_J_colind": d.efc.J_colind.reshape((d.nworld, -1)),
         "efc_J": d.efc.J.reshape((d.nworld, -1)),
     }
-    rows = {f"efc_{name}": array for name, array in vars(d.efc).items()}
-    contacts = {f"contact_{name}": array for name, array in vars(d.contact).items()}
-    problem = filled(Problem, own, lists, rows, contacts, m, m.opt, d)
     on = {bit: not flags & (bits.CONSTRAINT | bit) for bit in bits}
     sizes = {"num_dofs": m.nv, "njmax": d.njmax, "most_nonzeros": d.njmax_nnz}
     constants = {
@@ -97,11 +70,13 @@ def constraint_rows(
         "contacts": on[bits.CONTACT],
         "elliptic": m.opt.cone == mjw.ConeType.ELLIPTIC,
         "refsafe": not flags & bits.REFSAFE,
-        "lanes": lanes if lanes and device.is_cuda else lists.constants["lanes"],
     }
+    lanes = lanes if lanes and device.is_cuda else lists.lanes
+    source = native.source_of("rows", PARTS)
+    launch = native.launcher(source, constants, own, m, d, lanes=lanes, threads=lists.threads)
 
     def make_rows() -> None:
         lists.append()
-        launch(PARTS, constants, Problem, problem, d.nefc)
+        launch()
 
     return make_rows

@@ -1,6 +1,6 @@
 // Part 1: how the lanes of a world share its work.
 //
-// These parts are the body of a function f(world, lane, problem), before which Python puts the constants of the kernel.
+// These parts are the body of a function f(world, lane, problem), before which native.py puts the constants.
 // The lanes of a world are some of the threads of a warp. Worlds of a warp have other numbers of contacts, so that
 // lanes wait for those of their own world only. Whatever the number of lanes, each place in memory is written by the
 // same formula, and sums are added in one order: the results have the same bits.

@@ -1,19 +1,44 @@
-"""This module chooses which worlds have one kernel for smooth dynamics and one for integration, and launches them."""
+"""This module launches the kernels of a substep before and after its constraints: smooth dynamics and integration.
 
-from collections.abc import Callable
+MuJoCo Warp launches some 35 kernels for the first and some 10 for the second, each of which waits for its slowest
+world; here some lanes of a warp own a world, with its bodies or its inertia matrix on the chip. They are written in
+C++, as the solver's kernel is; the CPU compiles the same source, for one lane. Read their parts in the order in which
+SMOOTH and INTEGRATION name them.
+
+Source of the algorithms: https://mujoco.readthedocs.io/en/stable/computation/index.html
+"""
+
+from collections.abc import Callable, Mapping
 
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
+from ksim_rl.physics import native
 from ksim_rl.physics.sim_cfg import SimCfg
-from ksim_rl.physics.smooth.kernel import CUDA_THREADS, INTEGRATION, SMOOTH, Problem, Shape, kernel_of
-from ksim_rl.physics.structs import filled
 
+SMOOTH = ("world", "layout", "kinematics", "inertia", "velocities", "passive", "actuation")
+INTEGRATION = ("world", "derivative", "factorization", "free_bodies", "advance")
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
-LANES = (8, 16, 32)
+LANES, CUDA_THREADS = (8, 16, 32), 32
+_ENUMS = {
+    "FREE": mujoco.mjtJoint.mjJNT_FREE,
+    "BALL": mujoco.mjtJoint.mjJNT_BALL,
+    "SLIDE": mujoco.mjtJoint.mjJNT_SLIDE,
+    "HINGE": mujoco.mjtJoint.mjJNT_HINGE,
+    "JOINT": mujoco.mjtTrn.mjTRN_JOINT,
+    "JOINT_IN_PARENT": mujoco.mjtTrn.mjTRN_JOINTINPARENT,
+    "INTEGRATOR": mujoco.mjtDyn.mjDYN_INTEGRATOR,
+    "FILTER": mujoco.mjtDyn.mjDYN_FILTER,
+    "FILTER_EXACT": mujoco.mjtDyn.mjDYN_FILTEREXACT,
+    "AFFINE_GAIN": mujoco.mjtGain.mjGAIN_AFFINE,
+    "AFFINE_BIAS": mujoco.mjtBias.mjBIAS_AFFINE,
+    "OUT_OF_ROWS": mjw.OverflowType.NEFC,
+    "OUT_OF_PAIRS": mjw.OverflowType.BROADPHASE,
+    "OUT_OF_CONTACTS": mjw.OverflowType.NARROWPHASE,
+}
 FORCE_CALLBACKS = ("passive", "control", "act_dyn", "act_gain", "act_bias")
 HINGES = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 AFFINE = {
@@ -40,7 +65,7 @@ def unsuited(warp_model: mjw.Model) -> str | None:
         "joints yield": bool(m.nplastic),
         "an actuator is delayed": m.nhistory > 0,
         "an actuator is not affine or drives no hinge or slide": not _has_affine_actuators(m),
-        "its bodies do not fit shared memory": _lanes(SMOOTH, _shape(m)) is None,
+        "its bodies do not fit shared memory": _lanes(SMOOTH, _sizes(m)) is None,
     }
     return next((reason for reason, holds in reasons.items() if holds), None)
 
@@ -81,7 +106,8 @@ def smooth_dynamics(
     what positions and velocities alone decide. `lanes` is how many threads share a world on CUDA; None takes the
     fewest that fit.
     """
-    return _launcher(SMOOTH, warp_model, warp_data_E, lanes)
+    launch = _launcher(SMOOTH, warp_model, warp_data_E, lanes)
+    return lambda forces_too: launch(forces_too=forces_too)
 
 
 def integration(
@@ -93,17 +119,16 @@ def integration(
     forces disabled (activations without actuation keep still, and implicitfast has the derivatives of what is left),
     and with controls out of range, whose derivative is that of the clamped ones.
     """
-    launch = _launcher(INTEGRATION, warp_model, warp_data_E, lanes)
-    return lambda: launch(True)
+    return _launcher(INTEGRATION, warp_model, warp_data_E, lanes)
 
 
 def _launcher(
     parts: tuple[str, ...], warp_model: mjw.Model, warp_data_E: mjw.Data, lanes: int | None
-) -> Callable[[bool], None]:
+) -> Callable[..., None]:
     m, d = warp_model, warp_data_E
-    shape, device = _shape(m), d.qpos.device
+    sizes, device = _sizes(m), d.qpos.device
     threads = CUDA_THREADS if device.is_cuda else 1
-    lanes = (lanes or _lanes(parts, shape) or CUDA_THREADS) if device.is_cuda else 1
+    lanes = (lanes or _lanes(parts, sizes) or CUDA_THREADS) if device.is_cuda else 1
     driven = m.jnt_dofadr.numpy()[m.actuator_trnid.numpy()[:, 0]]
     tables = {
         "moving_geoms": _moving_geoms(m),
@@ -112,40 +137,54 @@ def _launcher(
         "eliminated": _eliminated(m),
         "leaves": _leaves(m),
     }
-    own = {name: wp.array(table, dtype=int, device=device) for name, table in tables.items()}
-    rows = {"efc_Ma": d.efc.Ma}
-    problem, kernel = filled(Problem, own, rows, m, m.opt, d), kernel_of(parts, shape, lanes, threads)
+    # Whether it goes on after the velocities, to the inertia matrix and the forces.
+    own = {"forces_too": True}
+    own |= {name: wp.array(table, dtype=int, device=device) for name, table in tables.items()}
+    constants = {**_ENUMS, **sizes, "floats": _floats(parts, sizes, lanes)}
+    parents = ", ".join(map(str, m.body_parentid.numpy()))
+    source = f"constexpr int PARENTS[] = {{{parents}}};\n" + native.source_of("smooth", parts)
+    return native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads)
 
-    def launch(forces_too: bool) -> None:
-        wp.launch(kernel, dim=(d.nworld, lanes), inputs=[problem, forces_too], block_dim=threads)
 
-    return launch
-
-
-def _shape(warp_model: mjw.Model) -> Shape:
+def _sizes(warp_model: mjw.Model) -> dict[str, int]:
+    """Return what of a model is compiled into its kernels: its sizes, and what it has of MuJoCo's features."""
     m = warp_model
     flags, bits = int(m.opt.disableflags), mjw.DisableBit
     fast = m.opt.integrator == mjw.IntegratorType.IMPLICITFAST
-    return Shape(
-        parents=tuple(m.body_parentid.numpy().tolist()),
-        num_joints=m.njnt,
-        num_dofs=m.nv,
-        num_chains=m.nbranch,
-        num_moving_geoms=len(_moving_geoms(m)),
-        num_sites=m.nsite,
-        num_actuators=m.nactuator,
-        has_mocap=bool(m.nmocap),
-        has_activation=m.na > 0,
-        gravity=not flags & bits.GRAVITY,
-        springs=not flags & bits.SPRING,
-        dampers=not flags & bits.DAMPER,
-        clamps_ctrl=not flags & bits.CLAMPCTRL,
-        actuators_act=m.nactuator > 0 and not flags & bits.ACTUATION,
-        num_entries=m.M_colind.size,
-        num_free_bodies=_num_free_bodies(m),
-        implicit_fast=fast and m.nactuator > 0 and not flags & bits.ACTUATION,
-        solves=fast or not flags & (bits.EULERDAMP | bits.DAMPER),
-    )
+    actuators_act = m.nactuator > 0 and not flags & bits.ACTUATION
+    return {
+        "num_bodies": m.nbody,
+        "num_joints": m.njnt,
+        "num_dofs": m.nv,
+        "num_chains": m.nbranch,
+        "num_moving_geoms": len(_moving_geoms(m)),
+        "num_sites": m.nsite,
+        "num_actuators": m.nactuator,
+        "has_mocap": bool(m.nmocap),
+        "has_activation": m.na > 0,
+        "gravity": not flags & bits.GRAVITY,
+        "springs": not flags & bits.SPRING,
+        "dampers": not flags & bits.DAMPER,
+        "clamps_ctrl": not flags & bits.CLAMPCTRL,
+        "actuators_act": actuators_act,
+        "num_entries": m.M_colind.size,
+        "num_free_bodies": _num_free_bodies(m),
+        "implicit_fast": fast and actuators_act,
+        "solves": fast or not flags & (bits.EULERDAMP | bits.DAMPER),
+        # Floats of the poses, then of inertias, then of sums of forces.
+        "poses": max(10 * m.nbody, m.nactuator + m.nv),
+        # Floats of the joints' frames, then of the bodies' velocities, then of momenta.
+        "joints": 6 * max(m.nbody, m.njnt, m.nv),
+    }
+
+
+def _floats(parts: tuple[str, ...], sizes: Mapping[str, int], lanes: int) -> int:
+    """Return how many floats the lanes of a world share."""
+    needed = sizes["poses"] + sizes["joints"] + 9 * sizes["num_bodies"] + 6 * sizes["num_dofs"]
+    if parts == INTEGRATION:
+        needed = sizes["num_entries"] + 2 * sizes["num_dofs"]
+    # Worlds of a warp begin in other banks: those of one lie side by side for its lanes.
+    return needed + (lanes - needed) % 32
 
 
 def _num_free_bodies(warp_model: mjw.Model) -> int:
@@ -174,10 +213,11 @@ def _has_affine_actuators(warp_model: mjw.Model) -> bool:
     return bool(np.isin(m.jnt_type.numpy()[m.actuator_trnid.numpy()[:, 0]], HINGES).all())
 
 
-def _lanes(parts: tuple[str, ...], shape: Shape) -> int | None:
+def _lanes(parts: tuple[str, ...], sizes: Mapping[str, int]) -> int | None:
     """Return the fewest lanes for which the worlds of a warp fit shared memory together."""
+    worlds_of = {lanes: CUDA_THREADS // lanes for lanes in LANES}
     fitting = (
-        lanes for lanes in LANES if shape.floats(lanes, parts) * (CUDA_THREADS // lanes) <= SHARED_FLOATS
+        lanes for lanes, worlds in worlds_of.items() if _floats(parts, sizes, lanes) * worlds <= SHARED_FLOATS
     )
     return next(fitting, None)
 

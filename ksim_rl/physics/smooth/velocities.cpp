@@ -40,7 +40,7 @@ each(NUM_CHAINS, [&](int chain) {
 });
 sync();
 write(problem.cvel, NUM_BODIES, velocities, 6);
-if (!forces_too)
+if (!problem.forces_too)
     return;
 write(problem.cacc, NUM_BODIES, forces, 6);
 sync();

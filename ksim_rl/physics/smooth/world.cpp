@@ -1,7 +1,7 @@
 // Part 1 of both kernels: how the lanes of a world share its work, how they reach its numbers, and what they compute
 // with.
 //
-// The parts of a kernel are the body of one function of (world, lane, problem), before which kernel.py puts the
+// The parts of a kernel are the body of one function of (world, lane, problem), before which stages.py puts the
 // constants of the kernel: the sizes of the model and what it has of MuJoCo's features. They follow MuJoCo's chapter on
 // computation (https://mujoco.readthedocs.io/en/stable/computation/index.html) and engine_core_smooth.c, stage by
 // stage, and add in one order whatever the number of lanes.

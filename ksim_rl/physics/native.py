@@ -1,0 +1,91 @@
+"""This module makes kernels of our own C++, which take those arrays of a model and its worlds that the C++ names."""
+
+# Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
+# pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportInvalidTypeForm=false
+
+import functools
+import re
+from collections.abc import Callable, Mapping
+from importlib.resources import files
+from typing import Any
+
+import mujoco_warp as mjw
+import warp as wp
+
+from ksim_rl.physics.structs import filled, values_of
+
+_ARRAYS = {1: wp.array, 2: wp.array2d, 3: wp.array3d}
+
+
+def source_of(folder: str, parts: tuple[str, ...]) -> str:
+    """Return the C++ of a kernel, whose parts lie in a folder of this room."""
+    return "".join((files("ksim_rl.physics") / folder / f"{part}.cpp").read_text() for part in parts)
+
+
+def launcher(
+    source: str,
+    constants: Mapping[str, int],
+    own: Mapping[str, Any],
+    warp_model: mjw.Model,
+    warp_data_E: mjw.Data,
+    *,
+    lanes: int,
+    threads: int,
+    fast_math: bool = False,
+) -> Callable[..., None]:
+    """Return what launches C++ over (worlds, lanes) in blocks of `threads`, with arrays in their final place.
+
+    The C++ is the body of a function of `world`, `lane` and `problem`; before it stand the constants, by their names in
+    capitals, with LANES and THREADS. What it calls `problem.x` is x of `own`, or else of the model, its options or its
+    worlds; see `values_of`. A launch may change scalars of `own`, by name.
+    """
+    names = dict.fromkeys(re.findall(r"\bproblem\.(\w+)", source))
+    owners = own, warp_model, warp_model.opt, warp_data_E
+    types = {name: _type_of(value) for name, value in values_of(names, *owners).items()}
+    values = {name.upper(): int(value) for name, value in constants.items()}
+    values |= {"LANES": lanes, "THREADS": threads}
+    kernel, struct = _kernel(source, tuple(values.items()), tuple(types.items()), threads, fast_math)
+    problem, dim, device = filled(struct, *owners), (warp_data_E.nworld, lanes), warp_data_E.qpos.device
+
+    def launch(**changes: Any) -> None:
+        for name, value in changes.items():
+            setattr(problem, name, value)
+        wp.launch(kernel, dim=dim, inputs=[problem], block_dim=threads, device=device)
+
+    return launch
+
+
+def _type_of(value: Any) -> Any:
+    return _ARRAYS[value.ndim][value.dtype] if isinstance(value, wp.array) else type(value)
+
+
+@functools.cache
+def _kernel(
+    source: str,
+    constants: tuple[tuple[str, int], ...],
+    types: tuple[tuple[str, Any], ...],
+    threads: int,
+    fast_math: bool,
+) -> tuple[wp.Kernel, Any]:
+    """Return the kernel, and the struct that it takes."""
+
+    class Problem: ...
+
+    Problem.__annotations__ = dict(types)
+    struct = wp.struct(Problem)
+    named = "".join(f"constexpr int {name} = {value};\n" for name, value in constants)
+
+    @wp.func_native(named + source)
+    def body(world: int, lane: int, problem: struct) -> None: ...
+
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        module_options={"block_dim": threads, "fast_math": fast_math},
+    )
+    def kernel(problem: struct):
+        world, lane = wp.tid()
+        body(world, lane, problem)
+
+    return kernel, struct
