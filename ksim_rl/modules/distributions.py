@@ -220,15 +220,13 @@ class TruncatedGaussian(BoundedDistribution):
     @property
     def mean(self) -> Float[Tensor, "*batch L"]:
         """The mean."""
-        density_a, density_b = self._bound_densities()
-        return self.loc + self._sign * self.scale * (density_a - density_b)
+        return self.loc + self._sign * self.scale * self._moments()[0]
 
     @property
     def variance(self) -> Float[Tensor, "*batch L"]:
         """The variance."""
-        density_a, density_b = self._bound_densities()
-        second = 1.0 + self._a * density_a - self._b * density_b
-        return self.scale.square() * (second - (density_a - density_b).square())
+        first, second = self._moments()
+        return self.scale.square() * (second - first.square())
 
     def rsample(self, sample_shape: Any = ()) -> Float[Tensor, "*shape L"]:
         """Draw; the gradients are those of the value at a fixed probability (Figurnov et al., arXiv 1805.08498)."""
@@ -257,17 +255,16 @@ class TruncatedGaussian(BoundedDistribution):
 
     def entropy(self) -> Float[Tensor, "*batch"]:
         """Return the differential entropy in nats."""
-        density_a, density_b = self._bound_densities()
-        spread = 1.0 + self._a * density_a - self._b * density_b
-        return (self.scale.log() + _HALF_LOG_2_PI + self._log_mass + 0.5 * spread).sum(-1)
+        second = self._moments()[1]
+        return (self.scale.log() + _HALF_LOG_2_PI + self._log_mass + 0.5 * second).sum(-1)
 
-    def _bound_densities(self) -> tuple[Tensor, Tensor]:
-        """Return the density of the standardized variable at its two bounds."""
+    def _moments(self) -> tuple[Tensor, Tensor]:
+        """Return the mean and the mean square of the standardized variable, in the mirror image where it is taken."""
         log_densities = (
             -0.5 * bound.square() - _HALF_LOG_2_PI - self._log_mass for bound in (self._a, self._b)
         )
         density_a, density_b = (log_density.exp() for log_density in log_densities)
-        return density_a, density_b
+        return density_a - density_b, 1.0 + self._a * density_a - self._b * density_b
 
 
 def _inverse_log_ndtr(log_cdf: Tensor) -> Tensor:
@@ -285,11 +282,9 @@ def _inverse_log_ndtr(log_cdf: Tensor) -> Tensor:
 @register_kl(TruncatedGaussian, TruncatedGaussian)
 def _kl_truncated(p: TruncatedGaussian, q: TruncatedGaussian) -> Tensor:
     # The bounds have to be the same: what p can give and q cannot would make it infinite.
-    density_a, density_b = p._bound_densities()
-    first = p._sign * (density_a - density_b)
-    second = 1.0 + p._a * density_a - p._b * density_b
+    first, second = p._moments()
     gap, ratio = (p.loc - q.loc) / q.scale, p.scale / q.scale
-    error = gap.square() + 2.0 * gap * ratio * first + ratio.square() * second
+    error = gap.square() + 2.0 * gap * ratio * (p._sign * first) + ratio.square() * second
     return (q._log_mass - p._log_mass - ratio.log() + 0.5 * (error - second)).sum(-1)
 
 
