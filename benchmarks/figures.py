@@ -49,6 +49,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "unseen_robots": (*STEP, *LEARN, *TASK),
     "update": (*LEARN, "ksim_rl/device"),
     "velocity": (*STEP, *LEARN, *TASK),
+    "viewer": ("ksim_rl/viewer", *STEP, *LEARN),
 }
 # Commands of earlier commits that are gone, and what renews their figures now.
 RENEWED_BY = {"learning_time": "ksim-rl reproduce velocity --rows ppo/go1"}
