@@ -12,7 +12,7 @@ import warp as wp
 from ksim_rl.physics import SimCfg, World, load_model
 from ksim_rl.physics.smooth import stages
 from tests.physics.test_nan_guard import HEAVY, SLEDS
-from tests.physics.test_smooth import NUM_ENVS, PER_WORLD, mixed, moved
+from tests.physics.test_smooth import NUM_ENVS, PER_WORLD, draw_parameters, mixed, moved, with_parameters_of
 
 STATE = ("qpos", "qvel", "act", "time")
 WRITTEN = (*STATE, "qacc_warmstart")
@@ -115,20 +115,11 @@ def test_all_it_writes_is_as_in_mujoco_warp(integrator, disabled):
 def test_whole_steps_are_those_of_the_c_engine_with_parameters_of_each_world():
     world = spinning(per_world_fields=PER_WORLD)
     assert world.one_kernel_integration_unavailable is None
-    generator = torch.Generator().manual_seed(1)
-    for name in PER_WORLD:
-        field = world.field(name)
-        field.mul_(1.0 + 0.5 * torch.rand(field.shape, generator=generator))
-    world.set_const(PER_WORLD)
+    draw_parameters(world)
     before = values(world, INPUTS)
     world.step(1)
     for row in range(NUM_ENVS):
-        own = copy.copy(mixed())
-        for name in PER_WORLD:
-            rows = getattr(own, name)
-            rows[:] = world.field(name)[row].numpy().reshape(rows.shape)
-        mujoco.mj_setConst(own, mujoco.MjData(own))
-        check_step(world, before, own, row)
+        check_step(world, before, with_parameters_of(world, row), row)
 
 
 def test_the_derivative_of_a_gain_has_the_control_within_its_range():

@@ -127,6 +127,25 @@ def check_row(world: World, expected: mujoco.MjData, row: int) -> None:
         np.testing.assert_allclose(ours / scale, theirs / scale, atol=3e-6, err_msg=name)
 
 
+def draw_parameters(world: World) -> None:
+    """Give each world other parameters of its own."""
+    generator = torch.Generator().manual_seed(1)
+    for name in PER_WORLD:
+        field = world.field(name)
+        field.mul_(1.0 + 0.5 * torch.rand(field.shape, generator=generator))
+    world.set_const(PER_WORLD)
+
+
+def with_parameters_of(world: World, row: int) -> mujoco.MjModel:
+    """Return the model with the parameters of one world."""
+    own = copy.copy(mixed())
+    for name in PER_WORLD:
+        values = getattr(own, name)
+        values[:] = world.field(name)[row].numpy().reshape(values.shape)
+    mujoco.mj_setConst(own, mujoco.MjData(own))
+    return own
+
+
 def test_all_it_computes_is_as_in_the_c_engine():
     world = moved()
     assert world.one_kernel_dynamics_unavailable is None
@@ -155,18 +174,10 @@ def test_refresh_leaves_what_belongs_to_the_last_substep():
 
 def test_each_world_has_its_own_masses_dampers_and_springs():
     world = moved(per_world_fields=PER_WORLD)
-    generator = torch.Generator().manual_seed(1)
-    for name in PER_WORLD:
-        field = world.field(name)
-        field.mul_(1.0 + 0.5 * torch.rand(field.shape, generator=generator))
-    world.set_const(PER_WORLD)
+    draw_parameters(world)
     launch(world)
     for row in range(NUM_ENVS):
-        own = copy.copy(mixed())
-        for name in PER_WORLD:
-            values = getattr(own, name)
-            values[:] = world.field(name)[row].numpy().reshape(values.shape)
-        mujoco.mj_setConst(own, mujoco.MjData(own))
+        own = with_parameters_of(world, row)
         check_row(world, in_c(world, own, row), row)
 
 
