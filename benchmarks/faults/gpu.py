@@ -23,7 +23,7 @@ from ksim_rl.trainers.build import build_env
 GO1 = ("task=go1_velocity_flat", "device=cuda", "trainer.eval_episodes=0", "trainer.video=false")
 ALGORITHMS = {
     "ppo": ("collector.rollout_length=24",),
-    "sac": (),
+    "sac": ("data.capacity=256",),  # with the steps of a run's replay, hardly an env would fit
     "fast_sac": ("objective.compile=false",),  # which takes a minute each time
 }
 ROOM = 8 * 2**30
@@ -73,7 +73,7 @@ def gpu_soak(folder: Path, *, seconds: int) -> Figures:
 
 
 def gpu_memory(folder: Path) -> Figures:
-    """Ask for far more envs than fit, with three algorithms; then train with the number that the message names."""
+    """Ask for more envs than fit, with three algorithms; then train with the number that the message names."""
     told = ran = 0
     for name, own in ALGORITHMS.items():
         overrides = [*GO1, f"objective={name}", "logger=none", "trainer.num_iterations=10", *own]
@@ -81,7 +81,7 @@ def gpu_memory(folder: Path) -> Figures:
         taken = torch.empty(max(0, torch.cuda.mem_get_info()[0] - ROOM), dtype=torch.uint8, device="cuda")
         fits = None
         try:
-            cfg = conf.compose([*overrides, f"num_envs={2**18}"])
+            cfg = conf.compose([*overrides, f"num_envs={2**16}"])
             run_folder.run(cfg, folder / name, progress=RunProgress(1, enabled=False))
         except ValueError as error:
             fits = re.search(r"num_envs=([0-9]+) was tried and fits", str(error))
