@@ -64,21 +64,15 @@ class FlatAdamW(torch.optim.Optimizer):
         Returned are the norm of the gradient before clipping, and 1 if the step was skipped, else 0.
         """
         gradients = [torch.zeros_like(own) if own.grad is None else own.grad for own in self._learning]
-        tensors = self._flat, *self._moments, self._steps, self._target, self._joined(gradients)
-        return self._change_(*tensors, loss.detach(), self.param_groups[0]["lr"], self._cfg)
+        changed = self._flat, *self._moments, self._steps, self._target
+        given = self._joined(gradients), loss.detach(), self.param_groups[0]["lr"]
+        return self._change_(changed, *given, self._cfg)
 
 
 def _change_(
-    flat: Tensor,
-    mean: Tensor,
-    variance: Tensor,
-    steps: Tensor,
-    target: Tensor,
-    gradient: Tensor,
-    loss: Tensor,
-    rate: Tensor,
-    cfg: OffPolicyCfg,
+    changed: tuple[Tensor, ...], gradient: Tensor, loss: Tensor, rate: Tensor, cfg: OffPolicyCfg
 ) -> tuple[Tensor, Tensor]:
+    flat, mean, variance, steps, target = changed
     norm = torch.linalg.vector_norm(gradient)
     made = norm.isfinite() & loss.isfinite()
     if cfg.max_grad_norm is not None:

@@ -198,6 +198,8 @@ def test_a_compiled_step_of_flat_memory_is_the_adamw_of_torch():
     for one, other in zip(network.parameters(), twin.parameters(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
     before = [own.clone() for own in network.parameters()]
-    next(network.parameters()).grad.fill_(float("nan"))
+    gradient = next(network.parameters()).grad
+    assert gradient is not None
+    gradient.fill_(float("nan"))
     assert flat.step(torch.zeros((), device="cuda"))[1] == 1.0
     assert all(map(torch.equal, before, network.parameters()))

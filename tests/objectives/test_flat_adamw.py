@@ -1,6 +1,7 @@
 """AdamW on one piece of memory, beside torch's on many."""
 
 import copy
+import dataclasses
 
 import pytest
 import torch
@@ -73,10 +74,29 @@ def test_a_loaded_state_continues():
     assert all(torch.equal(a, b) for a, b in zip(network.parameters(), twin.parameters(), strict=True))
 
 
+def test_a_state_of_torchs_own_adamw_continues():
+    network, rate = _network(), torch.tensor(1e-2)
+    twin = copy.deepcopy(network)
+    options = {"betas": CFG.betas, "weight_decay": CFG.weight_decay}
+    reference = torch.optim.AdamW(network.parameters(), lr=rate, **options)
+    for step in range(3):
+        _descend(network, reference, seed=step)
+        reference.step()
+    flat = FlatAdamW(dataclasses.replace(CFG, max_grad_norm=None), twin.parameters(), learning_rate=0.5)
+    twin.load_state_dict(network.state_dict())
+    load_optimizer_state(flat, optimizer_state(reference), what="optimizer")
+    _descend(network, reference, seed=3)
+    reference.step()
+    flat.step(_descend(twin, flat, seed=3))
+    for one, other in zip(twin.parameters(), network.parameters(), strict=True):
+        torch.testing.assert_close(one, other)
+
+
 def test_a_parameter_that_does_not_learn_stays():
     network = _network()
     network[0].requires_grad_(False)
-    before = network[0].weight.clone()
+    weight = next(network.parameters())
+    before = weight.clone()
     flat = FlatAdamW(CFG, network.parameters(), learning_rate=1e-2)
     flat.step(_descend(network, flat, seed=0))
-    assert torch.equal(network[0].weight, before) and len(flat.state) == 4
+    assert torch.equal(weight, before) and len(flat.state) == 4
