@@ -37,19 +37,9 @@ def _of_columns(weights, width, LANES: tl.constexpr):
 
 @triton.jit
 def normalize_rows(
-    features,
-    bias,
-    gain,
-    offset,
-    out,
-    moments,
-    num_rows,
-    width,
-    ACTIVATION: tl.constexpr,
-    STEPS: tl.constexpr,
-    ROWS: tl.constexpr,
-    LANES: tl.constexpr,
-):
+    features, bias, gain, offset, out, moments, num_rows, width,
+    ACTIVATION: tl.constexpr, STEPS: tl.constexpr, ROWS: tl.constexpr, LANES: tl.constexpr,
+):  # fmt: skip
     """Write activation(gain * standardized(features + bias) + offset) of `STEPS * ROWS` rows.
 
     Program (i, n) is of network n. `moments` [N, num_rows, 2] get the mean and one over the standard deviation of each
@@ -77,22 +67,10 @@ def normalize_rows(
 
 @triton.jit
 def normalize_rows_back(
-    d_out,
-    features,
-    bias,
-    gain,
-    offset,
-    moments,
-    d_features,
-    partials,
-    num_rows,
-    width,
-    ACTIVATION: tl.constexpr,
-    WEIGHTS: tl.constexpr,
-    STEPS: tl.constexpr,
-    ROWS: tl.constexpr,
-    LANES: tl.constexpr,
-):
+    d_out, features, bias, gain, offset, moments, d_features, partials, num_rows, width,
+    ACTIVATION: tl.constexpr, WEIGHTS: tl.constexpr,
+    STEPS: tl.constexpr, ROWS: tl.constexpr, LANES: tl.constexpr,
+):  # fmt: skip
     """Write the gradient at the features of `STEPS * ROWS` rows, and with WEIGHTS the sums of those of the weights.
 
     `partials` [N, programs, 3, width] get the sums of bias, gain and offset.
