@@ -84,13 +84,7 @@ class EnsembleLinear(nn.Module):
     """
 
     def __init__(
-        self,
-        num_networks: int,
-        input_dim: int,
-        output_dim: int,
-        *,
-        gain: float,
-        device: Device = None,
+        self, num_networks: int, input_dim: int, output_dim: int, *, gain: float, device: Device = None
     ) -> None:
         super().__init__()
         self.gain = gain

@@ -24,12 +24,7 @@ from ksim_rl.objectives.gradient_step import (
     go_back,
     make_optimizer,
 )
-from ksim_rl.objectives.off_policy_loss import (
-    OffPolicyLoss,
-    SACLoss,
-    TD3Loss,
-    frozen,
-)
+from ksim_rl.objectives.off_policy_loss import OffPolicyLoss, SACLoss, TD3Loss, frozen
 from ksim_rl.objectives.policy_kl import distribution_keys, kl_divergence, observation_keys
 from ksim_rl.objectives.ppo_step import (
     in_precision,

@@ -42,10 +42,7 @@ class StepGuard(nn.Module):
 
 @torch.no_grad()
 def clip_and_guard(
-    parameters: Iterable[nn.Parameter],
-    max_grad_norm: float | None,
-    *,
-    loss: Float[Tensor, ""] | None = None,
+    parameters: Iterable[nn.Parameter], max_grad_norm: float | None, *, loss: Float[Tensor, ""] | None = None
 ) -> tuple[Float32[Tensor, ""], Float32[Tensor, ""]]:
     """Scale the gradients down to a total norm of at most `max_grad_norm`, in place, and tell if they are finite.
 
