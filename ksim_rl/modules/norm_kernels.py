@@ -50,7 +50,7 @@ def normalize_rows(
     first = tl.program_id(1).to(tl.int64) * num_rows
     inside = (tl.arange(0, LANES) < width)[None, :]
     for step in tl.range(0, STEPS, num_stages=3):  # pyright: ignore[reportGeneralTypeIssues]
-        row, at, keep = _tile(step, num_rows, width, STEPS, ROWS, LANES)
+        row, at, keep = _tile(step, num_rows, width, STEPS, ROWS, LANES)  # pyright: ignore[reportGeneralTypeIssues]
         value = tl.load(features + first * width + at, mask=keep, other=0.0).to(tl.float32) + biases
         mean = tl.sum(value, 1) / width
         error = tl.where(inside, value - mean[:, None], 0.0)
@@ -83,7 +83,7 @@ def normalize_rows_back(
     d_offset = tl.zeros((LANES,), dtype=tl.float32)
     # Loads run ahead of the sums.
     for step in tl.range(0, STEPS, num_stages=3):  # pyright: ignore[reportGeneralTypeIssues]
-        row, at, keep = _tile(step, num_rows, width, STEPS, ROWS, LANES)
+        row, at, keep = _tile(step, num_rows, width, STEPS, ROWS, LANES)  # pyright: ignore[reportGeneralTypeIssues]
         mean = tl.load(moments + 2 * (first + row), mask=row < num_rows, other=0.0)[:, None]
         scale = tl.load(moments + 2 * (first + row) + 1, mask=row < num_rows, other=0.0)[:, None]
         value = tl.load(features + first * width + at, mask=keep, other=0.0).to(tl.float32) + biases

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
+from ksim_rl.device.compiling import compiled
 from ksim_rl.objectives.algorithm_cfg import OffPolicyCfg
 
 # Parameters begin at multiples of so many elements, as kernels that load 16 bytes at once ask.
@@ -39,8 +40,7 @@ class FlatAdamW(torch.optim.Optimizer):
         self._steps = torch.zeros((), device=device)
         for own, mean, variance in zip(learning, *map(self._parts, self._moments), strict=True):
             self.state[own] = {"step": self._steps, "exp_avg": mean, "exp_avg_sq": variance}
-        compiles = cfg.compile and device.type == "cuda"
-        self._change_ = torch.compile(_change_, fullgraph=True, dynamic=False) if compiles else _change_
+        self._change_ = compiled(_change_, device=device, wanted=cfg.compile)
 
     def _parts(self, flat: Tensor) -> list[Tensor]:
         sizes = [own.numel() + gap.numel() for own, gap in zip(self._learning, self._gaps, strict=True)]

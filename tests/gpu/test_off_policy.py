@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.data import Unbounded
 
+from ksim_rl.device import state_tree
 from ksim_rl.modules.mlp import mlp
 from ksim_rl.objectives import FlatAdamW, SACCfg, TD3Cfg, frozen, project_distribution
 from tests.algorithms.off_policy_problem import make_update
@@ -103,6 +104,20 @@ def test_captured_updates_equal_eager_ones():
         torch.testing.assert_close(results[0]["loss/value"], results[1]["loss/value"], rtol=1e-3, atol=1e-4)
     for one, other in zip(captured.loss.parameters(), eager.loss.parameters(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3)
+
+
+def test_equal_updates_that_are_compiled_anew_have_equal_bits():
+    states = []
+    for _ in range(3):
+        torch.compiler.reset()
+        # As large as a kernel of many sums needs to be timed by the compiler, if it may.
+        update, rollout = _update("fast_sac_compiled", num_env_states_per_minibatch=32768), _rollout()
+        for _ in range(5):
+            rollout.copy_(_rollout())
+            update(rollout)
+        states.append(state_tree.split(update.state_dict())[0])
+    for other in states[1:]:
+        assert [name for name, leaf in other.items() if not torch.equal(leaf, states[0][name])] == []
 
 
 def test_bfloat16_learns_like_float32():

@@ -17,6 +17,7 @@ from ksim_rl.algorithms.gradient_steps import RolloutUpdate, in_columns, load_op
 from ksim_rl.data import MASK_KEY, ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
+from ksim_rl.device.compiling import compiled
 from ksim_rl.envs.signal_keys import STANDARD, SignalKeys
 from ksim_rl.modules import ExploringPolicy, update_normalizers
 from ksim_rl.objectives import (
@@ -82,13 +83,12 @@ class OffPolicyUpdate(RolloutUpdate):
         self.critic = loss.critic_network
         self.behavior, self.num_env_states = behavior, num_envs * data.num_steps
         self._observations: list[Any] = loss.observation_keys
-        compiles = cfg.compile and self.device.type == "cuda"
-        compiled = partial(torch.compile, fullgraph=True, dynamic=False) if compiles else (lambda work: work)
+        fast: Any = partial(compiled, device=self.device, wanted=cfg.compile)
         self._images = None
         if cfg.symmetry == "augment":
             self._images = SymmetricAugmentation.of(mirror, read=self._observations, device=self.device)
-        self._read, self._count_ = compiled(self._stored), compiled(self.guard.count_)
-        self._critic_loss, self._actor_losses = compiled(loss.critic_loss), compiled(loss.actor_losses)
+        self._read, self._count_ = fast(self._stored), fast(self.guard.count_)
+        self._critic_loss, self._actor_losses = fast(loss.critic_loss), fast(loss.actor_losses)
         self.replay = ReplayRing(
             data, num_envs=num_envs, observations=self._observations, gamma=cfg.gamma, device=self.device
         )
@@ -153,7 +153,7 @@ class OffPolicyUpdate(RolloutUpdate):
 
     def _stored(self, index_B: Int64[Tensor, " B"]) -> TensorDictBase:
         """Return env states of the replay for their indices, every second one in the mirror with a symmetry."""
-        env_states_B = self.replay.storage.get(index_B)
+        env_states_B: TensorDictBase = self.replay.storage.get(index_B)  # type: ignore[arg-type]
         if self._images is not None:
             self._images.reflect_every_second_(env_states_B)
         return env_states_B
