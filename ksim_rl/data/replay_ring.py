@@ -264,28 +264,24 @@ class ReplayRing(ReplayBuffer):
         return self._ring.available.sum()
 
     def minibatches(
-        self, count: int, *, change_: Callable[[TensorDictBase], None] | None = None
+        self, count: int, *, read: Callable[[Int64[Tensor, " B"]], TensorDictBase] | None = None
     ) -> Iterator[TensorDictBase]:
-        """Yield `count` minibatches `["B"]`, of env states that `change_` has changed in place.
+        """Yield `count` minibatches `["B"]`, of env states as `read` gives them for their indices: else as stored.
 
         With priorities they have "priority_weight" and "index", and each is drawn when it is asked for, by the
         priorities of that moment.
         """
+        read, size = read or self._ring.get, self.cfg.num_env_states_per_minibatch
         if not self.cfg.prioritized:
             # One gather for all minibatches: a fraction of the kernels.
-            data, _ = self._sample(count * self.cfg.num_env_states_per_minibatch)
-            if change_ is not None:
-                change_(data)
-            for minibatch_B in data.split(self.cfg.num_env_states_per_minibatch):
+            index, _ = self.sampler.sample(self._ring, count * size)
+            for minibatch_B in read(index).split(size):
                 yield dims.name(minibatch_B, dims.B)
             return
         for _ in range(count):
-            minibatch_B, info = self._sample(self.cfg.num_env_states_per_minibatch)
-            if change_ is not None:
-                change_(minibatch_B)
-            minibatch_B.set("priority_weight", info["priority_weight"][:, None])
-            minibatch_B.set("index", info["index"])
-            yield minibatch_B
+            index_B, info = self.sampler.sample(self._ring, size)
+            minibatch_B = read(index_B).set("index", index_B)
+            yield minibatch_B.set("priority_weight", info["priority_weight"][:, None])
 
     def state_dict(self) -> dict[str, Any]:
         """Return the ring, and the priorities where there are any; without `save_replay` nothing."""

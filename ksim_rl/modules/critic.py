@@ -91,12 +91,7 @@ class QNetwork(ObservingNetwork):
 
 
 def make_q_network(
-    cfg: QNetworkCfg,
-    *,
-    obs_dim: int,
-    action_dim: int,
-    in_key: NestedKey = "critic",
-    device: Device = None,
+    cfg: QNetworkCfg, *, obs_dim: int, action_dim: int, in_key: NestedKey = "critic", device: Device = None
 ) -> TensorDictModule:
     """Build the networks as a TensorDict module, which reads `in_key` [..., obs_dim] and "action" [..., action_dim].
 

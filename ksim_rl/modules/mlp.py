@@ -1,18 +1,21 @@
-"""This module builds the multi-layer perceptrons that actors and critics are made of."""
+"""This module builds the perceptrons of actors and critics, and runs their layers in half precision on CUDA."""
 
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd import Function
 from torch.nn import functional
 
 from ksim_rl.checked import Count, check_value
 from ksim_rl.checks import check_choice, check_in_range
 
 Device = torch.device | str | None
+SPLITS = 8  # see `_Product`
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "elu": nn.ELU,
     "gelu": nn.GELU,
@@ -53,7 +56,7 @@ def mlp(
     norm: Callable[..., nn.Module] = nn.LayerNorm
     if num_networks is not None:
         layer, norm = partial(EnsembleLinear, num_networks), partial(EnsembleLayerNorm, num_networks)
-    layers, width = nn.Sequential(), input_dim
+    layers, width = nn.Sequential() if num_networks is None and not layer_norm else Layers(), input_dim
     for hidden_dim in hidden_dims:
         layers.append(layer(width, hidden_dim, gain=hidden_gain, device=device))
         if layer_norm:
@@ -81,13 +84,7 @@ class EnsembleLinear(nn.Module):
     """
 
     def __init__(
-        self,
-        num_networks: int,
-        input_dim: int,
-        output_dim: int,
-        *,
-        gain: float,
-        device: Device = None,
+        self, num_networks: int, input_dim: int, output_dim: int, *, gain: float, device: Device = None
     ) -> None:
         super().__init__()
         self.gain = gain
@@ -104,13 +101,7 @@ class EnsembleLinear(nn.Module):
 
     def forward(self, features_NBL: Float[Tensor, "N B L"]) -> Float[Tensor, "N B M"]:
         """Return what each layer gives for its own input."""
-        if not torch.is_autocast_enabled(features_NBL.device.type):
-            return torch.baddbmm(self.bias, features_NBL, self.weight)
-        # Tensor cores are fast with rows of whole 16 bytes: 315 inputs take three times as long as 320.
-        in_dim, out_dim = self.weight.shape[1:]
-        weight = functional.pad(self.weight, (0, -out_dim % 8, 0, -in_dim % 8))
-        out_NBM = torch.bmm(functional.pad(features_NBL, (0, -in_dim % 8)), weight)[..., :out_dim]
-        return out_NBM + self.bias.to(out_NBM.dtype)
+        return torch.baddbmm(self.bias, features_NBL, self.weight)
 
 
 class EnsembleLayerNorm(nn.Module):
@@ -129,8 +120,95 @@ class EnsembleLayerNorm(nn.Module):
 
     def forward(self, features_NBL: Float[Tensor, "N B L"]) -> Float[Tensor, "N B L"]:
         """Normalize the last dim, and apply each network's own scale and offset."""
-        # Autocast would go on in float32 up to the next product, which moves twice the memory.
-        with torch.autocast(features_NBL.device.type, enabled=False):
-            normalized_NBL = functional.layer_norm(features_NBL, (self.dim,))
-            weight, bias = (parameter.to(features_NBL.dtype) for parameter in (self.weight, self.bias))
-            return torch.addcmul(bias, normalized_NBL, weight)
+        return torch.addcmul(self.bias, functional.layer_norm(features_NBL, (self.dim,)), self.weight)
+
+
+class Layers(nn.Sequential):
+    """Linear layers, norms and activations in a row, which take [..., input_dim], or those of ensembles in a row.
+
+    With autocast on CUDA products are in bfloat16, and a norm, the bias before it and the activation after it are one
+    kernel. An activation that the kernel does not have follows it.
+    """
+
+    def forward(self, features: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch M"]:
+        """Return what the last layer gives."""
+        if not rounds(features):
+            return super().forward(features)
+        # Not above: Triton comes with torch for CUDA only.
+        from ksim_rl.modules.norm_kernels import FUSED, Normalized
+
+        alone = not isinstance(self[0], EnsembleLinear)
+        out = features.reshape(1, -1, features.shape[-1]) if alone else features
+        parts: list[Any] = list(self)
+        linears = [part for part in parts if isinstance(part, nn.Linear | EnsembleLinear)]
+        weights = [layer.weight.mT[None] if alone else layer.weight for layer in linears]
+        rounded = _rounded(weights)
+        while parts:
+            layer = parts.pop(0)
+            if not isinstance(layer, nn.Linear | EnsembleLinear):
+                out = layer(out)
+                continue
+            out = _Product.apply(out, weights.pop(0), rounded.pop(0))
+            if not parts or not isinstance(parts[0], nn.LayerNorm | EnsembleLayerNorm):
+                out = out + layer.bias.to(out.dtype)
+                continue
+            norm = parts.pop(0)
+            kind = type(parts[0]) if parts else None
+            known = FUSED.index(kind) + 1 if kind in FUSED else 0
+            out = Normalized.apply(out, layer.bias, norm.weight, norm.bias, known)
+            del parts[: bool(known)]
+        return out.reshape(*features.shape[:-1], -1) if alone else out
+
+
+def rounds(features: Float[Tensor, "*batch L"]) -> bool:
+    """Whether products of these are to be in bfloat16, on a device with kernels for what follows."""
+    return features.is_cuda and torch.is_autocast_enabled("cuda")
+
+
+class _Product(Function):
+    """The products [N, B, M] of features [N, B, K] and weights [N, K, M], which are there `rounded` as well.
+
+    The gradient of the weights is a sum over env states in SPLITS parts: its outputs alone, which are few, would occupy
+    a part of the GPU.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, features_NBK: Tensor, weight_NKM: Tensor, rounded: Tensor) -> Tensor:
+        fan_in, fan_out = ctx.sizes = weight_NKM.shape[1:]
+        features = _padded(features_NBK, -fan_in % 8)
+        ctx.save_for_backward(features, rounded)
+        ctx.dtype = features_NBK.dtype
+        return torch.bmm(features, rounded)[..., :fan_out]
+
+    @staticmethod
+    def backward(ctx: Any, d_out: Tensor) -> tuple[Tensor | None, ...]:
+        features, rounded = ctx.saved_tensors
+        fan_in, fan_out = ctx.sizes
+        d_out = _padded(d_out, -fan_out % 8)
+        d_features = d_weight = None
+        if ctx.needs_input_grad[0]:
+            d_features = torch.bmm(d_out, rounded.mT)[..., :fan_in].to(ctx.dtype)
+        if ctx.needs_input_grad[1]:
+            networks, rows = features.shape[:2]
+            splits = math.gcd(SPLITS, rows)
+            parts = [part.reshape(networks * splits, rows // splits, -1) for part in (features, d_out)]
+            sums = torch.bmm(parts[0].mT, parts[1]).unflatten(0, (networks, splits))
+            d_weight = sums.sum(1, dtype=torch.float32)[:, :fan_in, :fan_out]
+        return d_features, d_weight, None
+
+
+@torch.no_grad()
+def _rounded(weights: list[Tensor]) -> list[Tensor]:
+    """Return weights in bfloat16, padded to whole 16 bytes in each dim, all by one kernel of compiled code.
+
+    Tensor cores are fast with such rows: 315 inputs take three times as long as 320.
+    """
+    padded = [functional.pad(own, (0, -own.shape[-1] % 8, 0, -own.shape[-2] % 8)) for own in weights]
+    flat = torch.cat([own.reshape(-1) for own in padded]).to(torch.bfloat16)
+    parts = zip(flat.split([own.numel() for own in padded]), padded, strict=True)
+    return [part.view_as(own) for part, own in parts]
+
+
+def _padded(features: Tensor, columns: int) -> Tensor:
+    features = features.to(torch.bfloat16)
+    return functional.pad(features, (0, columns)) if columns else features

@@ -46,12 +46,7 @@ class ObservationNormalizer(RunningMoments):
     """
 
     def __init__(
-        self,
-        dim: int,
-        *,
-        eps: float = 1e-4,
-        until: int | None = None,
-        device: Device = None,
+        self, dim: int, *, eps: float = 1e-4, until: int | None = None, device: Device = None
     ) -> None:
         check_in_range("eps", eps, low=0.0, low_open=True)
         super().__init__(dim, until=until, device=device)

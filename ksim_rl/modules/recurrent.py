@@ -80,12 +80,7 @@ class RecurrentNetwork(nn.Module):
     """
 
     def __init__(
-        self,
-        cfg: RecurrentCfg,
-        *,
-        obs_dim: int,
-        obs_normalization: bool = False,
-        device: Device = None,
+        self, cfg: RecurrentCfg, *, obs_dim: int, obs_normalization: bool = False, device: Device = None
     ) -> None:
         super().__init__()
         self.cfg = cfg

@@ -14,22 +14,17 @@ from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.discriminator_loss import discriminator_loss, style_reward
 from ksim_rl.objectives.distillation_loss import DistillationLoss, observation_keys_of
 from ksim_rl.objectives.distributional import cross_entropy, mean_of, project_distribution
+from ksim_rl.objectives.flat_adamw import FlatAdamW
 from ksim_rl.objectives.gradient_step import (
     NonFiniteStepsError,
     StepGuard,
     adapt_learning_rate_,
     clip_and_guard,
     descend,
-    descend_together,
-    make_adamw,
+    go_back,
     make_optimizer,
 )
-from ksim_rl.objectives.off_policy_loss import (
-    OffPolicyLoss,
-    SACLoss,
-    TD3Loss,
-    frozen,
-)
+from ksim_rl.objectives.off_policy_loss import OffPolicyLoss, SACLoss, TD3Loss, frozen
 from ksim_rl.objectives.policy_kl import distribution_keys, kl_divergence, observation_keys
 from ksim_rl.objectives.ppo_step import (
     in_precision,

@@ -1,14 +1,13 @@
 """This module makes gradient steps without host syncs, skips what is not finite, and adapts the learning rate."""
 
 from collections.abc import Iterable, Mapping
-from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor, nn
 
 from ksim_rl import ranks
-from ksim_rl.objectives.algorithm_cfg import GradientCfg, OnPolicyCfg
+from ksim_rl.objectives.algorithm_cfg import OnPolicyCfg
 
 
 class NonFiniteStepsError(RuntimeError):
@@ -43,10 +42,7 @@ class StepGuard(nn.Module):
 
 @torch.no_grad()
 def clip_and_guard(
-    parameters: Iterable[nn.Parameter],
-    max_grad_norm: float | None,
-    *,
-    loss: Float[Tensor, ""] | None = None,
+    parameters: Iterable[nn.Parameter], max_grad_norm: float | None, *, loss: Float[Tensor, ""] | None = None
 ) -> tuple[Float32[Tensor, ""], Float32[Tensor, ""]]:
     """Scale the gradients down to a total norm of at most `max_grad_norm`, in place, and tell if they are finite.
 
@@ -85,40 +81,19 @@ def adapt_learning_rate_(
     return lr.copy_(torch.where(too_far, slower, torch.where(too_near, faster, lr)))
 
 
-AnyAdam = TypeVar("AnyAdam", torch.optim.Adam, torch.optim.AdamW)
-
-
 def make_optimizer(cfg: OnPolicyCfg, *modules: nn.Module) -> torch.optim.Adam:
     """Build one fused Adam over the parameters of `modules`, each once, capturable on CUDA.
 
     `optimizer.param_groups[0]["lr"]` is a float32 tensor [] on the device that changes in place.
     """
-    parameters = dict.fromkeys(parameter for module in modules for parameter in module.parameters())
-    return _fused(torch.optim.Adam, cfg, parameters, cfg.learning_rate, cfg.weight_decay)
-
-
-def make_adamw(
-    cfg: GradientCfg, parameters: Iterable[nn.Parameter], *, learning_rate: float, weight_decay: float
-) -> torch.optim.AdamW:
-    """Build one fused AdamW (Loshchilov and Hutter, arXiv 1711.05101); else as `make_optimizer`."""
-    return _fused(torch.optim.AdamW, cfg, parameters, learning_rate, weight_decay)
-
-
-def _fused(
-    kind: type[AnyAdam],
-    cfg: GradientCfg,
-    parameters: Iterable[nn.Parameter],
-    rate: float,
-    weight_decay: float,
-) -> AnyAdam:
-    parameters = list(parameters)
+    parameters = list(dict.fromkeys(parameter for module in modules for parameter in module.parameters()))
     device = parameters[0].device
-    return kind(
+    return torch.optim.Adam(
         parameters,
-        lr=torch.tensor(rate, dtype=torch.float32, device=device),
+        lr=torch.tensor(cfg.learning_rate, dtype=torch.float32, device=device),
         betas=cfg.betas,
         eps=cfg.adam_eps,
-        weight_decay=weight_decay,
+        weight_decay=cfg.weight_decay,
         fused=True,
         capturable=device.type == "cuda",
     )
@@ -137,24 +112,8 @@ def descend(
     ranks it becomes that over the rows of all of them. Returned are the norm before clipping, and 1 if the step was
     skipped, else 0.
     """
-    return descend_together({"loss": loss}, {"loss": optimizer}, max_grad_norm=max_grad_norm, mask=mask)[
-        "loss"
-    ]
-
-
-def descend_together(
-    losses: Mapping[str, Float[Tensor, ""]],
-    optimizers: Mapping[str, torch.optim.Optimizer],
-    *,
-    max_grad_norm: float | None,
-    mask: Bool[Tensor, "*rows"] | None = None,
-) -> dict[str, tuple[Float32[Tensor, ""], Float32[Tensor, ""]]]:
-    """Do what `descend` says with each loss and the optimizer of its name, and go back through them at once.
-
-    No loss may reach a parameter of another's optimizer.
-    """
-    go_back(losses, optimizers, mask=mask)
-    return {name: step(optimizers[name], loss, max_grad_norm=max_grad_norm) for name, loss in losses.items()}
+    go_back({"loss": loss}, {"loss": optimizer}, mask=mask)
+    return step(optimizer, loss, max_grad_norm=max_grad_norm)
 
 
 def go_back(
@@ -166,7 +125,7 @@ def go_back(
 ) -> None:
     """Compute the gradients of each loss, means over all ranks; losses and what is `beside` become means in place.
 
-    Each rank weighs as much as it has rows that `mask` marks.
+    Each rank weighs as much as it has rows that `mask` marks. No loss may reach a parameter of another's optimizer.
     """
     for name in losses:
         optimizers[name].zero_grad(set_to_none=True)

@@ -100,7 +100,7 @@ class OffPolicyLoss(LossModule):
 
     @property
     def target_critic_network(self) -> TensorDictModule:
-        """The critics that targets are computed with; they change by `update_target_` only."""
+        """The critics that targets are computed with; they follow by `FlatAdamW` or `update_target_`."""
         return self._target_critic
 
     @property

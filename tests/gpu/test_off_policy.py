@@ -1,14 +1,18 @@
 """Off-policy updates as CUDA graphs. Skipped where there is no GPU."""
 
+import copy
 import dataclasses
 from contextlib import nullcontext
 
 import pytest
 import torch
 from tensordict import TensorDict
+from torch import nn
 from torchrl.data import Unbounded
 
-from ksim_rl.objectives import SACCfg, TD3Cfg, frozen, project_distribution
+from ksim_rl.device import state_tree
+from ksim_rl.modules.mlp import mlp
+from ksim_rl.objectives import FlatAdamW, SACCfg, TD3Cfg, frozen, project_distribution
 from tests.algorithms.off_policy_problem import make_update
 from tests.gpu.no_syncs import no_syncs
 
@@ -102,6 +106,20 @@ def test_captured_updates_equal_eager_ones():
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3)
 
 
+def test_equal_updates_that_are_compiled_anew_have_equal_bits():
+    states = []
+    for _ in range(3):
+        torch.compiler.reset()
+        # As large as a kernel of many sums needs to be timed by the compiler, if it may.
+        update, rollout = _update("fast_sac_compiled", num_env_states_per_minibatch=32768), _rollout()
+        for _ in range(5):
+            rollout.copy_(_rollout())
+            update(rollout)
+        states.append(state_tree.split(update.state_dict())[0])
+    for other in states[1:]:
+        assert [name for name, leaf in other.items() if not torch.equal(leaf, states[0][name])] == []
+
+
 def test_bfloat16_learns_like_float32():
     losses = {}
     for autocast in (False, True):
@@ -142,3 +160,61 @@ def test_projected_distributions_are_those_of_the_cpu_and_the_same_each_time():
     found = project_distribution(*moved)
     torch.testing.assert_close(found.cpu(), expected, rtol=1e-4, atol=1e-5)
     assert torch.equal(found, project_distribution(*moved))
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize(
+    ("num_networks", "hidden_dims"), [(None, (512, 256, 128)), (2, (768, 384, 192)), (3, (100, 36))]
+)
+def test_layers_in_half_precision_err_as_torch_does(num_networks, hidden_dims, compiled):
+    torch.manual_seed(0)
+    options = {"activation": "silu", "layer_norm": True, "num_networks": num_networks, "device": "cuda"}
+    layers = mlp(315, hidden_dims, 101, **options)
+    for parameter in layers.parameters():
+        parameter.data.add_(0.1 * torch.randn_like(parameter))
+    shape = (2048, 315) if num_networks is None else (num_networks, 2048, 315)
+    inputs = torch.randn(shape, device="cuda").requires_grad_()
+
+    def run(forward, *, autocast=True):
+        with torch.autocast("cuda", torch.bfloat16, enabled=autocast):
+            out = forward(inputs)
+        loss = out.float().log_softmax(-1)[..., 7].square().mean()
+        return out.detach(), *torch.autograd.grad(loss, [inputs, *layers.parameters()])
+
+    def as_torch(inputs):
+        return nn.Sequential.forward(layers, inputs)
+
+    exact, of_torch = run(layers, autocast=False), run(as_torch)
+    forward = torch.compile(layers, fullgraph=True, dynamic=False) if compiled else layers
+    ours = run(forward)
+    assert ours[0].dtype == torch.bfloat16
+    for one, plain, true in zip(ours, of_torch, exact, strict=True):
+        assert one.shape == true.shape
+        allowed = max(0.01, 1.3 * float((plain - true).norm() / true.norm()))
+        assert (one - true).norm() < allowed * true.norm()
+    assert all(map(torch.equal, ours, run(forward)))
+
+
+def test_a_compiled_step_of_flat_memory_is_the_adamw_of_torch():
+    torch.manual_seed(0)
+    network = mlp(315, (768, 384), 101, num_networks=2, layer_norm=True, device="cuda")
+    twin, target = copy.deepcopy(network), copy.deepcopy(network).requires_grad_(False)
+    cfg = SACCfg(betas=(0.9, 0.95), weight_decay=0.1, tau=0.2, max_grad_norm=0.5, compile=True)
+    flat = FlatAdamW(cfg, network.parameters(), learning_rate=1e-3, target=target.parameters())
+    reference = torch.optim.AdamW(twin.parameters(), lr=1e-3, betas=cfg.betas, weight_decay=0.1, fused=True)
+    for _ in range(5):
+        for one, other in zip(network.parameters(), twin.parameters(), strict=True):
+            one.grad = torch.randn_like(one)
+            other.grad = one.grad.clone()
+        norm, skipped = flat.step(torch.zeros((), device="cuda"))
+        torch.testing.assert_close(norm, nn.utils.clip_grad_norm_(twin.parameters(), 0.5))
+        reference.step()
+        assert not skipped
+    for one, other in zip(network.parameters(), twin.parameters(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
+    before = [own.clone() for own in network.parameters()]
+    gradient = next(network.parameters()).grad
+    assert gradient is not None
+    gradient.fill_(float("nan"))
+    assert flat.step(torch.zeros((), device="cuda"))[1] == 1.0
+    assert all(map(torch.equal, before, network.parameters()))

@@ -38,24 +38,6 @@ def test_an_ensemble_is_its_networks(layer_norm):
         torch.testing.assert_close(ensemble(inputs)[which], _alone(ensemble, which)(inputs[which]))
 
 
-def test_half_precision_stays_near_single():
-    torch.manual_seed(0)
-    ensemble = mlp(60, (256, 128), 51, num_networks=2, activation="silu", layer_norm=True)
-    inputs = 3.0 * torch.randn(2, 512, 60)
-
-    def outputs_and_gradients():
-        outputs = ensemble(inputs)
-        return outputs, *torch.autograd.grad(outputs.float().square().mean(), list(ensemble.parameters()))
-
-    expected = outputs_and_gradients()
-    with torch.autocast("cpu", torch.bfloat16):
-        assert ensemble[:2](inputs).dtype == torch.bfloat16, "the norm must not widen what the product gave"
-        rounded = outputs_and_gradients()
-    for half, single in zip(rounded, expected, strict=True):
-        # bfloat16 rounds each number by up to 0.4 %.
-        assert (half.float() - single).norm() < 0.03 * single.norm()
-
-
 def test_networks_start_different_orthogonal_and_with_zero_biases():
     first = mlp(6, (16,), 1, num_networks=2)[0]
     assert not torch.equal(first.weight[0], first.weight[1]) and not first.bias.any()

@@ -7,15 +7,20 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torch._dynamo.backends.common import aot_autograd
+from torch._functorch.aot_autograd import make_boxed_func
+from torch._inductor.decomposition import select_decomp_table
 from torchrl import objectives
 from torchrl.data import Unbounded
 
 from ksim_rl.data import MASK_KEY
 from ksim_rl.modules import QNetworkCfg, SquashedActorCfg, make_q_network, make_squashed_actor
-from ksim_rl.objectives import SACLoss, TD3Loss, frozen
+from ksim_rl.objectives import SACLoss, TD3Loss, frozen, off_policy_loss
 from ksim_rl.testing import count_syncs
 
 BATCH, OBS, ACTION = 64, 5, 3
+# What CUDA adds up by atomics, in the order in which threads come, and sums of floats whose blocks do.
+UNORDERED = ("scatter_add", "scatter_reduce", "index_add", "index_put", "embedding_dense_backward", "cumsum")
 
 
 class _OneOfN(nn.Module):
@@ -206,6 +211,28 @@ def test_keys_can_be_renamed():
     result = loss(renamed)
     assert (result == expected).all()
     assert "error" in renamed.keys() and ("next", "gain") in loss.in_keys
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_no_sum_of_a_compiled_step_is_without_an_order(layer_norm, monkeypatch):
+    # On CUDA a kernel projects, in one order.
+    monkeypatch.setattr(off_policy_loss, "project_distribution", lambda probs, *_: probs)
+    actor, critic = networks(11, layer_norm=layer_norm)
+    loss = SACLoss(actor, critic, target_entropy=-3.0, support_A=critic.module.support)
+    found = []
+
+    def note(graph, _):
+        found.extend(str(node.target) for node in graph.graph.nodes if node.op == "call_function")
+        return make_boxed_func(graph.forward)
+
+    backend = aot_autograd(fw_compiler=note, decompositions=select_decomp_table())
+    compiled = partial(torch.compile, backend=backend, fullgraph=True, dynamic=False)
+    compiled(loss.critic_loss)(minibatch())[0].backward()
+    with frozen(critic):
+        losses = compiled(loss.actor_losses)(minibatch())[0]
+    torch.autograd.backward(list(losses.values()))
+    assert sum("mm" in name for name in found) > 10
+    assert [name for name in found if any(kind in name for kind in UNORDERED)] == []
 
 
 @pytest.mark.parametrize("num_atoms", [pytest.param(1, marks=pytest.mark.full), 11])

@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Num
+from jaxtyping import Int64, Num
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
@@ -16,17 +17,18 @@ from ksim_rl.algorithms.gradient_steps import RolloutUpdate, in_columns, load_op
 from ksim_rl.data import MASK_KEY, ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
+from ksim_rl.device.compiling import compiled
 from ksim_rl.envs.signal_keys import STANDARD, SignalKeys
 from ksim_rl.modules import ExploringPolicy, update_normalizers
 from ksim_rl.objectives import (
+    FlatAdamW,
     OffPolicyCfg,
     OffPolicyLoss,
     SACCfg,
     SACLoss,
     SymmetricAugmentation,
-    descend_together,
     frozen,
-    make_adamw,
+    go_back,
 )
 from ksim_rl.transforms import MirrorMap
 
@@ -81,26 +83,23 @@ class OffPolicyUpdate(RolloutUpdate):
         self.critic = loss.critic_network
         self.behavior, self.num_env_states = behavior, num_envs * data.num_steps
         self._observations: list[Any] = loss.observation_keys
-        self._reflect_ = None
+        fast: Any = partial(compiled, device=self.device, wanted=cfg.compile)
+        self._images = None
         if cfg.symmetry == "augment":
-            images = SymmetricAugmentation.of(mirror, read=self._observations, device=self.device)
-            self._reflect_ = images.reflect_every_second_
-        compiles = cfg.compile and self.device.type == "cuda"
-        compiled = partial(torch.compile, fullgraph=True, dynamic=False) if compiles else (lambda loss: loss)
-        self._critic_loss, self._actor_losses = compiled(loss.critic_loss), compiled(loss.actor_losses)
+            self._images = SymmetricAugmentation.of(mirror, read=self._observations, device=self.device)
+        self._read, self._count_ = fast(self._stored), fast(self.guard.count_)
+        self._critic_loss, self._actor_losses = fast(loss.critic_loss), fast(loss.actor_losses)
         self.replay = ReplayRing(
             data, num_envs=num_envs, observations=self._observations, gamma=cfg.gamma, device=self.device
         )
-        rates = {"critic": cfg.critic_learning_rate, "actor": cfg.actor_learning_rate}
+        target, rate = loss.target_critic_network.parameters(), cfg.critic_learning_rate
         self.optimizers = {
-            name: make_adamw(
-                cfg, networks[name].parameters(), learning_rate=rate, weight_decay=cfg.weight_decay
-            )
-            for name, rate in rates.items()
+            "critic": FlatAdamW(cfg, self.critic.parameters(), learning_rate=rate, target=target),
+            "actor": FlatAdamW(cfg, self.actor.parameters(), learning_rate=cfg.actor_learning_rate),
         }
         if isinstance(cfg, SACCfg) and isinstance(loss, SACLoss) and loss.log_alpha.requires_grad:
-            rate = cfg.alpha_learning_rate
-            self.optimizers["alpha"] = make_adamw(cfg, [loss.log_alpha], learning_rate=rate, weight_decay=0.0)
+            free, rate = replace(cfg, weight_decay=0.0), cfg.alpha_learning_rate
+            self.optimizers["alpha"] = FlatAdamW(free, [loss.log_alpha], learning_rate=rate)
         self.steps_made = 0
         # Zero until learning starts.
         self._means.update({name: torch.zeros((), device=self.device) for name in logged.values()})
@@ -139,7 +138,7 @@ class OffPolicyUpdate(RolloutUpdate):
 
     def _update(self) -> None:
         self._store()
-        minibatches = self.replay.minibatches(self.data.num_minibatches, change_=self._reflect_)
+        minibatches = self.replay.minibatches(self.data.num_minibatches, read=self._read)
         of_critic, of_actor, in_a_row = [], [], []
         for step, minibatch_B in enumerate(minibatches, start=1):
             of_critic.append(self._improve_critic(minibatch_B))
@@ -147,14 +146,20 @@ class OffPolicyUpdate(RolloutUpdate):
             if step % self.cfg.policy_delay == 0:
                 of_actor.append(self._improve_actor(minibatch_B))
                 skipped = torch.maximum(skipped, of_actor[-1]["skipped"])
-            self.loss.update_target_(self.cfg.tau)
-            self.guard.count_(skipped)
+            self._count_(skipped)
             in_a_row.append(self.guard.skipped_in_a_row.clone())
         self._measure_(in_columns(of_critic) | {"skipped_in_a_row": torch.stack(in_a_row)})
         self._means.take_(in_columns(of_actor))
 
+    def _stored(self, index_B: Int64[Tensor, " B"]) -> TensorDictBase:
+        """Return env states of the replay for their indices, every second one in the mirror with a symmetry."""
+        env_states_B: TensorDictBase = self.replay.storage.get(index_B)  # type: ignore[arg-type]
+        if self._images is not None:
+            self._images.reflect_every_second_(env_states_B)
+        return env_states_B
+
     def _improve_critic(self, minibatch_B: TensorDictBase) -> dict[str, Tensor]:
-        """Make one gradient step of the critics; return what it measured, and `skipped`, 0 or 1."""
+        """Make one gradient step of critics and targets; return what it measured, and `skipped`, 0 or 1."""
         with self._precision():
             loss, logged = self._critic_loss(minibatch_B)
         norm, skipped = self._descend({"critic": loss}, minibatch_B)["critic"]
@@ -178,8 +183,8 @@ class OffPolicyUpdate(RolloutUpdate):
     def _descend(
         self, losses: dict[str, Tensor], minibatch_B: TensorDictBase
     ) -> dict[str, tuple[Tensor, Tensor]]:
-        options: Any = {"max_grad_norm": self.cfg.max_grad_norm, "mask": minibatch_B.get(MASK_KEY)}
-        return descend_together(losses, self.optimizers, **options)
+        go_back(losses, self.optimizers, mask=minibatch_B.get(MASK_KEY))
+        return {name: self.optimizers[name].step(loss) for name, loss in losses.items()}
 
     def _precision(self) -> AbstractContextManager[Any]:
         # The cache of casted weights would outlive the steps that change them in a captured graph.

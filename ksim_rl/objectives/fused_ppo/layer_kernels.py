@@ -38,29 +38,12 @@ def _linear(
 
 @triton.jit
 def layer(
-    inputs,
-    slopes,
-    weights,
-    biases,
-    block_partials,
-    num_rows,
-    width,
-    length,
-    read_at,
-    slope_at,
-    output_at,
-    FORWARD: tl.constexpr,
-    NUM_PADDED: tl.constexpr,
-    NUM_BIASES: tl.constexpr,
-    NUM_STATISTICS: tl.constexpr,
-    INPUTS: tl.constexpr,
-    GRADIENTS: tl.constexpr,
-    ACTIVATION: tl.constexpr,
-    BLOCK: tl.constexpr,
-    TILE: tl.constexpr,
-    DEPTH: tl.constexpr,
-    TILE_STAGES: tl.constexpr,
-):
+    inputs, slopes, weights, biases, block_partials,
+    num_rows, width, length, read_at, slope_at, output_at,
+    FORWARD: tl.constexpr, NUM_PADDED: tl.constexpr, NUM_BIASES: tl.constexpr, NUM_STATISTICS: tl.constexpr,
+    INPUTS: tl.constexpr, GRADIENTS: tl.constexpr, ACTIVATION: tl.constexpr,
+    BLOCK: tl.constexpr, TILE: tl.constexpr, DEPTH: tl.constexpr, TILE_STAGES: tl.constexpr,
+):  # fmt: skip
     """Compute TILE of `width` hidden units for BLOCK rows, FORWARD or back: program (i, j, n) is of network n.
 
     Forward, units are sums over `length` columns of `inputs` [2, num_rows, INPUTS] from `read_at` on, with the layer's
@@ -102,41 +85,14 @@ def layer(
 
 @triton.jit
 def output_gradients(
-    records,
-    order,
-    inputs,
-    slopes,
-    weights,
-    biases,
-    block_partials,
-    image_of,
-    num_rows,
-    fan_in,
-    input_at,
-    slope_at,
-    log_ratio_low,
-    log_ratio_high,
-    clip_value,
-    entropy_coeff,
-    critic_coeff,
-    symmetry_coeff,
-    NUM_PADDED: tl.constexpr,
-    NUM_BIASES: tl.constexpr,
-    NUM_STATISTICS: tl.constexpr,
-    RECORD: tl.constexpr,
-    INPUTS: tl.constexpr,
-    GRADIENTS: tl.constexpr,
-    ACTIONS: tl.constexpr,
-    OUT: tl.constexpr,
-    LOG_STD: tl.constexpr,
-    MIN_STD: tl.constexpr,
-    STATE_STD: tl.constexpr,
-    MIRROR: tl.constexpr,
-    CLIP_VALUE: tl.constexpr,
-    BLOCK: tl.constexpr,
-    DEPTH: tl.constexpr,
-    TILE_STAGES: tl.constexpr,
-):
+    records, order, inputs, slopes, weights, biases, block_partials, image_of,
+    num_rows, fan_in, input_at, slope_at,
+    log_ratio_low, log_ratio_high, clip_value, entropy_coeff, critic_coeff, symmetry_coeff,
+    NUM_PADDED: tl.constexpr, NUM_BIASES: tl.constexpr, NUM_STATISTICS: tl.constexpr,
+    RECORD: tl.constexpr, INPUTS: tl.constexpr, GRADIENTS: tl.constexpr, ACTIONS: tl.constexpr, OUT: tl.constexpr,
+    LOG_STD: tl.constexpr, MIN_STD: tl.constexpr, STATE_STD: tl.constexpr, MIRROR: tl.constexpr,
+    CLIP_VALUE: tl.constexpr, BLOCK: tl.constexpr, DEPTH: tl.constexpr, TILE_STAGES: tl.constexpr,
+):  # fmt: skip
     """Run BLOCK rows through the last layer and the loss: program (i, n) is of network n (0: actor, 1: critic).
 
     Gradients at the outputs go to `slopes` [2, num_rows, GRADIENTS] from `slope_at` on, their sums and the statistics

@@ -20,21 +20,10 @@ HALF_LOG_2_PI = tl.constexpr(0.9189385332046727)
 
 @triton.jit
 def policy_gradient(
-    loc,
-    raw_std,
-    record,
-    valid,
-    d_std_at,
-    statistics,
-    log_ratio_low,
-    log_ratio_high,
-    entropy_coeff,
-    ACTIONS: tl.constexpr,
-    OUT: tl.constexpr,
-    LOG_STD: tl.constexpr,
-    MIN_STD: tl.constexpr,
-    STATE_STD: tl.constexpr,
-):
+    loc, raw_std, record, valid, d_std_at, statistics, log_ratio_low, log_ratio_high, entropy_coeff,
+    ACTIONS: tl.constexpr, OUT: tl.constexpr,
+    LOG_STD: tl.constexpr, MIN_STD: tl.constexpr, STATE_STD: tl.constexpr,
+):  # fmt: skip
     """Return the gradient of the policy loss and the entropy loss at `loc` and at `raw_std`, both [rows, OUT].
 
     Writes the sum of the latter to `d_std_at` [OUT], and to `statistics` the sums of mask, policy loss, divergence and
@@ -104,15 +93,9 @@ def _store_moments(at, values, mask, count):
 
 @triton.jit
 def value_gradient(
-    out,
-    record,
-    valid,
-    statistics,
-    clip_value,
-    critic_coeff,
-    OUT: tl.constexpr,
-    CLIP_VALUE: tl.constexpr,
-):
+    out, record, valid, statistics, clip_value, critic_coeff,
+    OUT: tl.constexpr, CLIP_VALUE: tl.constexpr,
+):  # fmt: skip
     """Return the gradient of the value loss at `out` [rows, OUT], whose first column is the value.
 
     Writes to `statistics` the sums of mask and value loss (without `critic_coeff`), and of targets and errors their sum
@@ -144,19 +127,9 @@ def value_gradient(
 
 @triton.jit
 def estimate_advantages(
-    values,
-    next_values,
-    rewards,
-    done,
-    terminated,
-    advantages,
-    targets,
-    num_envs,
-    gamma,
-    decay,
-    STEPS: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    values, next_values, rewards, done, terminated, advantages, targets, num_envs, gamma, decay,
+    STEPS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Write advantages and value targets of BLOCK envs; all signals are time-major, [STEPS, num_envs].
 
     As `GAE`: a step whose delta is not finite gets a NaN advantage, and the recursion starts anew before it. `decay` is

@@ -42,21 +42,10 @@ def slope_of(value, ACTIVATION: tl.constexpr):
 
 @triton.jit
 def _outputs(
-    observed,
-    weights,
-    biases,
-    inputs,
-    input_rows,
-    keep,
-    H1: tl.constexpr,
-    H2: tl.constexpr,
-    H3: tl.constexpr,
-    OUT: tl.constexpr,
-    CHUNK: tl.constexpr,
-    STAGES: tl.constexpr,
-    ACTIVATION: tl.constexpr,
-    STORE: tl.constexpr,
-):
+    observed, weights, biases, inputs, input_rows, keep,
+    H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr, OUT: tl.constexpr,
+    CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr, STORE: tl.constexpr,
+):  # fmt: skip
     """Return the outputs [BLOCK, OUT] for `observed` [BLOCK, OBS]; STORE keeps the hidden layers in `inputs`."""
     BLOCK: tl.constexpr = observed.shape[0]
     OBS: tl.constexpr = observed.shape[1]
@@ -93,21 +82,10 @@ def _outputs(
 
 @triton.jit
 def state_values(
-    obs,
-    weights,
-    biases,
-    values,
-    num_rows,
-    OBS: tl.constexpr,
-    H1: tl.constexpr,
-    H2: tl.constexpr,
-    H3: tl.constexpr,
-    OUT: tl.constexpr,
-    BLOCK: tl.constexpr,
-    CHUNK: tl.constexpr,
-    STAGES: tl.constexpr,
-    ACTIVATION: tl.constexpr,
-):
+    obs, weights, biases, values, num_rows,
+    OBS: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr, OUT: tl.constexpr,
+    BLOCK: tl.constexpr, CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr,
+):  # fmt: skip
     """Write the first output of a network for each row of `obs` [D, OBS] to `values` [D]."""
     rows = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     valid = rows < num_rows
@@ -121,41 +99,14 @@ def state_values(
 
 @triton.jit
 def minibatch_gradients(
-    obs,
-    records,
-    order,
-    weights,
-    biases,
-    inputs,
-    slopes,
-    block_partials,
-    num_rows,
-    num_obs,
-    log_ratio_low,
-    log_ratio_high,
-    clip_value,
-    entropy_coeff,
-    critic_coeff,
-    NUM_PADDED: tl.constexpr,
-    NUM_BIASES: tl.constexpr,
-    NUM_STATISTICS: tl.constexpr,
-    RECORD: tl.constexpr,
-    INPUTS: tl.constexpr,
-    GRADIENTS: tl.constexpr,
-    OBS: tl.constexpr,
-    H1: tl.constexpr,
-    H2: tl.constexpr,
-    H3: tl.constexpr,
-    ACTIONS: tl.constexpr,
-    OUT: tl.constexpr,
-    LOG_STD: tl.constexpr,
-    MIN_STD: tl.constexpr,
-    CLIP_VALUE: tl.constexpr,
-    BLOCK: tl.constexpr,
-    CHUNK: tl.constexpr,
-    STAGES: tl.constexpr,
-    ACTIVATION: tl.constexpr,
-):
+    obs, records, order, weights, biases, inputs, slopes, block_partials, num_rows, num_obs,
+    log_ratio_low, log_ratio_high, clip_value, entropy_coeff, critic_coeff,
+    NUM_PADDED: tl.constexpr, NUM_BIASES: tl.constexpr, NUM_STATISTICS: tl.constexpr,
+    RECORD: tl.constexpr, INPUTS: tl.constexpr, GRADIENTS: tl.constexpr,
+    OBS: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr, ACTIONS: tl.constexpr,
+    OUT: tl.constexpr, LOG_STD: tl.constexpr, MIN_STD: tl.constexpr, CLIP_VALUE: tl.constexpr,
+    BLOCK: tl.constexpr, CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr,
+):  # fmt: skip
     """Run a block of a minibatch through one network, its loss, and back: all but the products for the weights.
 
     Program (i, n) takes BLOCK rows of the minibatch, the env states `order` [B], through network n (0: actor, 1:
@@ -240,19 +191,10 @@ def minibatch_gradients(
 
 @triton.jit
 def weight_gradients(
-    tiles,
-    inputs,
-    slopes,
-    weight_partials,
-    num_rows,
-    NUM_WEIGHTS: tl.constexpr,
-    INPUTS: tl.constexpr,
-    GRADIENTS: tl.constexpr,
-    ROWS: tl.constexpr,
-    TILE: tl.constexpr,
-    DEPTH: tl.constexpr,
-    TILE_STAGES: tl.constexpr,
-):
+    tiles, inputs, slopes, weight_partials, num_rows,
+    NUM_WEIGHTS: tl.constexpr, INPUTS: tl.constexpr, GRADIENTS: tl.constexpr,
+    ROWS: tl.constexpr, TILE: tl.constexpr, DEPTH: tl.constexpr, TILE_STAGES: tl.constexpr,
+):  # fmt: skip
     """Multiply gradients by layer inputs: program (i, s) computes tile i of `FusedLayout.weight_tiles` over split s.
 
     A split has ROWS rows of the minibatch. Of several splits each writes its own sum, [splits, 2, NUM_WEIGHTS], so that

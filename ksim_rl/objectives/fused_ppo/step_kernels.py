@@ -71,34 +71,14 @@ def _column(values, index: tl.constexpr, SIZE: tl.constexpr):
 
 @triton.jit
 def sum_gradients(
-    weight_partials,
-    block_partials,
-    gradients,
-    squares,
-    biases,
-    learning_rate,
-    summary,
-    entropy_coeff,
-    critic_coeff,
-    desired_kl,
-    learning_rate_min,
-    learning_rate_max,
-    SPLITS: tl.constexpr,
-    BLOCKS: tl.constexpr,
-    NUM_WEIGHTS: tl.constexpr,
-    NUM_BIASES: tl.constexpr,
-    NUM_STATISTICS: tl.constexpr,
-    ACTIONS: tl.constexpr,
-    OUT: tl.constexpr,
-    LOG_STD: tl.constexpr,
-    MIN_STD: tl.constexpr,
-    STATE_STD: tl.constexpr,
-    MIRROR: tl.constexpr,
-    ADAPTIVE: tl.constexpr,
-    SIZE: tl.constexpr,
-    COLUMNS: tl.constexpr,
-    ROWS: tl.constexpr,
-):
+    weight_partials, block_partials, gradients, squares, biases, learning_rate, summary,
+    entropy_coeff, critic_coeff, desired_kl, learning_rate_min, learning_rate_max,
+    SPLITS: tl.constexpr, BLOCKS: tl.constexpr,
+    NUM_WEIGHTS: tl.constexpr, NUM_BIASES: tl.constexpr, NUM_STATISTICS: tl.constexpr,
+    ACTIONS: tl.constexpr, OUT: tl.constexpr, LOG_STD: tl.constexpr, MIN_STD: tl.constexpr,
+    STATE_STD: tl.constexpr, MIRROR: tl.constexpr, ADAPTIVE: tl.constexpr,
+    SIZE: tl.constexpr, COLUMNS: tl.constexpr, ROWS: tl.constexpr,
+):  # fmt: skip
     """Add up what splits and blocks left, divide by the number of env states, and adapt the learning rate.
 
     The first programs take SIZE weights each, the next COLUMNS biases each, and leave mean gradients [2, NUM_WEIGHTS +
@@ -185,31 +165,12 @@ def sum_gradients(
 
 @triton.jit
 def adam_step(
-    parameters,
-    means,
-    variances,
-    places,
-    gradients,
-    weights,
-    exact_weights,
-    squares,
-    summary,
-    steps,
-    skipped,
-    skipped_in_a_row,
-    beta1,
-    beta2,
-    log_beta1,
-    log_beta2,
-    adam_eps,
-    weight_decay,
-    max_grad_norm,
-    SIZE: tl.constexpr,
-    NUM_SQUARES: tl.constexpr,
-    SQUARES: tl.constexpr,
-    CLIP: tl.constexpr,
+    parameters, means, variances, places, gradients, weights, exact_weights, squares, summary,
+    steps, skipped, skipped_in_a_row,
+    beta1, beta2, log_beta1, log_beta2, adam_eps, weight_decay, max_grad_norm,
+    SIZE: tl.constexpr, NUM_SQUARES: tl.constexpr, SQUARES: tl.constexpr, CLIP: tl.constexpr,
     BLOCK: tl.constexpr,
-):
+):  # fmt: skip
     """Make one step of Adam (Kingma and Ba, arXiv 1412.6980), as torch's, on the clipped gradient.
 
     If the norm of the gradient, from its NUM_SQUARES partial `squares`, or the loss is not finite, nothing changes but

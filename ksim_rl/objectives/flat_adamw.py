@@ -1,0 +1,92 @@
+"""This module makes the gradient step of a network as one piece of memory: a few kernels, whatever its layers are."""
+
+import math
+from collections.abc import Iterable
+
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor, nn
+
+from ksim_rl.device.compiling import compiled
+from ksim_rl.objectives.algorithm_cfg import OffPolicyCfg
+
+# Parameters begin at multiples of so many elements, as kernels that load 16 bytes at once ask.
+ALIGNMENT = 32
+
+
+class FlatAdamW(torch.optim.Optimizer):
+    """AdamW (Loshchilov and Hutter, arXiv 1711.05101) on parameters that lie end to end, as do their moments.
+
+    From then on the parameters, and those of a `target` that follows each step by the share `tau` of the config, are
+    parts of one tensor; they keep their names, and `state` has the parts of the moments. The learning rate, a tensor []
+    on the device, may change in place.
+    """
+
+    def __init__(
+        self,
+        cfg: OffPolicyCfg,
+        parameters: Iterable[nn.Parameter],
+        *,
+        learning_rate: float,
+        target: Iterable[nn.Parameter] = (),
+    ) -> None:
+        learning = [parameter for parameter in parameters if parameter.requires_grad]
+        device = learning[0].device
+        super().__init__(learning, {"lr": torch.tensor(learning_rate, device=device)})
+        self._cfg, self._learning = cfg, learning
+        self._gaps = [own.new_zeros(-own.numel() % ALIGNMENT) for own in learning]
+        self._flat, self._target = self._end_to_end(learning), self._end_to_end(list(target))
+        self._moments = torch.zeros_like(self._flat), torch.zeros_like(self._flat)
+        self._steps = torch.zeros((), device=device)
+        for own, mean, variance in zip(learning, *map(self._parts, self._moments), strict=True):
+            self.state[own] = {"step": self._steps, "exp_avg": mean, "exp_avg_sq": variance}
+        self._change_ = compiled(_change_, device=device, wanted=cfg.compile)
+
+    def _parts(self, flat: Tensor) -> list[Tensor]:
+        sizes = [own.numel() + gap.numel() for own, gap in zip(self._learning, self._gaps, strict=True)]
+        parts = zip(flat.split(sizes), self._learning, strict=True)
+        return [part[: own.numel()].view_as(own) for part, own in parts]
+
+    def _joined(self, tensors: list[Tensor]) -> Tensor:
+        pairs = zip(tensors, self._gaps, strict=True)
+        return torch.cat([part for own, gap in pairs for part in (own.reshape(-1), gap)])
+
+    def _end_to_end(self, parameters: list[nn.Parameter]) -> Tensor:
+        flat = self._joined([own.detach() for own in parameters]) if parameters else torch.empty(0)
+        for parameter, part in zip(parameters, self._parts(flat) if parameters else (), strict=True):
+            parameter.data = part
+        return flat
+
+    @torch.no_grad()
+    def step(self, loss: Float[Tensor, ""]) -> tuple[Float32[Tensor, ""], Float32[Tensor, ""]]:  # type: ignore[override]
+        """Make the step whose gradients are there, unless they or the loss are not finite, without a host sync.
+
+        Returned are the norm of the gradient before clipping, and 1 if the step was skipped, else 0.
+        """
+        gradients = [torch.zeros_like(own) if own.grad is None else own.grad for own in self._learning]
+        changed = self._flat, *self._moments, self._steps, self._target
+        given = self._joined(gradients), loss.detach(), self.param_groups[0]["lr"]
+        return self._change_(changed, *given, self._cfg)
+
+
+def _change_(
+    changed: tuple[Tensor, ...], gradient: Tensor, loss: Tensor, rate: Tensor, cfg: OffPolicyCfg
+) -> tuple[Tensor, Tensor]:
+    flat, mean, variance, steps, target = changed
+    norm = torch.linalg.vector_norm(gradient)
+    made = norm.isfinite() & loss.isfinite()
+    if cfg.max_grad_norm is not None:
+        gradient = gradient * (cfg.max_grad_norm / (norm + 1e-6)).clamp_max(1.0)
+    # 1 - beta^step loses most digits of float32 in the first steps; this does not.
+    unbias = [-torch.expm1((steps + 1.0) * (math.log(beta) if beta else -math.inf)) for beta in cfg.betas]
+    new_mean = mean.lerp(gradient, 1.0 - cfg.betas[0])
+    new_variance = variance.lerp(gradient.square(), 1.0 - cfg.betas[1])
+    change = new_mean / unbias[0] / ((new_variance / unbias[1]).sqrt() + cfg.adam_eps)
+    change = rate * (change + cfg.weight_decay * flat)
+    flat.copy_(torch.where(made, flat - change, flat))
+    mean.copy_(torch.where(made, new_mean, mean))
+    variance.copy_(torch.where(made, new_variance, variance))
+    steps.add_(made)
+    if target.numel():
+        target.lerp_(flat, cfg.tau)
+    return norm, 1.0 - made.to(torch.float32)
