@@ -103,6 +103,5 @@ def publish(every: Sequence[RunningMoments]) -> None:
     own_L = [(own.count.expand(own.dim), own.exact_mean, own.exact_sum_of_squares) for own in every]
     count_L, mean_L, squares_L = ranks.merged(*map(torch.cat, zip(*own_L, strict=True)))
     var_L = torch.where(count_L > 0, squares_L / count_L.clamp_min(1), 1.0)
-    for own, mean, var in zip(every, mean_L.split(dims), var_L.split(dims), strict=True):
-        own.mean.copy_(mean)
-        own.var.copy_(var)
+    torch._foreach_copy_([own.mean for own in every], mean_L.split(dims))
+    torch._foreach_copy_([own.var for own in every], var_L.split(dims))

@@ -151,7 +151,6 @@ class FusedPPO:
             mirror=mirror,
         )
 
-        # With room for the SHARE of a rank.
         self._summary = torch.zeros(num_steps, power_of_two(len(SUMMARY) + 1), device=device)
         self._arguments = self._all_arguments(rows, mirror)
 
@@ -208,7 +207,6 @@ class FusedPPO:
             "RECORD": dataset.records.shape[1],
             "NUM_STATISTICS": NUM_STATISTICS,
             "NUM_GRADIENTS": 2 * layout.num_padded,
-            "COLUMNS_OF_SUMMARY": self._summary.shape[1],
             "NUM_SQUARES": 2 * programs,
             "SQUARES": power_of_two(2 * programs),
             "BLOCKS": blocks,

@@ -22,7 +22,6 @@ SUMMARY = (
     "skipped_in_a_row",
     "loss_mirror",
 )
-KL = tl.constexpr(SUMMARY.index("kl"))
 LOSS = tl.constexpr(SUMMARY.index("loss"))
 LEARNING_RATE = tl.constexpr(SUMMARY.index("learning_rate"))
 GRAD_NORM = tl.constexpr(SUMMARY.index("grad_norm"))
@@ -119,8 +118,7 @@ def sum_gradients(
     """Add up what splits and blocks left, divide by the number of env states, and adapt the learning rate.
 
     The first programs take SIZE weights each, the next COLUMNS biases each, and leave mean gradients [2, NUM_WEIGHTS +
-    NUM_BIASES] and the sum of their squares; the last one takes the statistics of the loss. With several ranks all is
-    multiplied by this one's SHARE.
+    NUM_BIASES] and the sum of their squares; the last takes the loss's statistics. Ranks multiply all by their SHARE.
     """
     WEIGHT_PROGRAMS: tl.constexpr = (NUM_WEIGHTS + SIZE - 1) // SIZE
     BIAS_PROGRAMS: tl.constexpr = (NUM_BIASES + COLUMNS - 1) // COLUMNS
@@ -179,7 +177,7 @@ def sum_gradients(
             entropy = tl.sum(tl.where(output < ACTIONS, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0))
         alone: tl.constexpr = ADAPTIVE and RANKS == 1
         rate = _adapt(learning_rate, kl, desired_kl, learning_rate_min, learning_rate_max, alone)
-        share = counted / divisor
+        share = counted / divisor  # zero, as all means, where no env state takes part
         tl.store(summary + SHARE, share)
         tl.store(summary, objective * share)
         tl.store(summary + 1, critic * share)
@@ -192,7 +190,6 @@ def sum_gradients(
             mirror = _column(policy, 5, NUM_STATISTICS)
             tl.store(summary + LOSS_MIRROR, mirror * share)
             loss += mirror
-        # The mean over no env state is zero, that of the entropy too.
         tl.store(summary + LOSS, loss * share)
         tl.store(summary + LEARNING_RATE, rate)
 
@@ -207,27 +204,22 @@ def take_means(
     learning_rate_min,
     learning_rate_max,
     NUM_GRADIENTS: tl.constexpr,
-    COLUMNS_OF_SUMMARY: tl.constexpr,
     ADAPTIVE: tl.constexpr,
     SIZE: tl.constexpr,
 ):
-    """Divide what `sum_gradients` left, added up over the ranks, by the sum of the shares; adapt the learning rate.
-
-    Each program takes SIZE gradients, as far as there are any, and leaves the sum of their squares.
-    """
+    """Make means, and sums of squares, of what `sum_gradients` left, added up over ranks; adapt the learning rate."""
     sums = gradients + NUM_GRADIENTS
-    share = tl.load(sums + SHARE)
-    share = tl.where(share > 0.0, share, 1.0)  # all sums are zero where no row takes part
+    share = tl.maximum(tl.load(sums + SHARE), 1e-30)  # all sums are zero where no env state takes part
     at = tl.program_id(0) * SIZE + tl.arange(0, SIZE)
     mean = tl.load(gradients + at, mask=at < NUM_GRADIENTS, other=0.0) / share
     tl.store(gradients + at, mean, mask=at < NUM_GRADIENTS)
     tl.store(squares + tl.program_id(0), tl.sum(mean * mean))
     if tl.program_id(0) == 0:
-        column = tl.arange(0, COLUMNS_OF_SUMMARY)
-        means = tl.load(sums + column) / share
-        kl = tl.load(sums + KL) / share
+        kl = tl.load(sums + 3) / share
         rate = _adapt(learning_rate, kl, desired_kl, learning_rate_min, learning_rate_max, ADAPTIVE)
-        tl.store(summary + column, tl.where(column == LEARNING_RATE, rate, means))
+        column = tl.arange(0, SIZE)
+        means = tl.load(sums + column, mask=column < SHARE) / share
+        tl.store(summary + column, tl.where(column == LEARNING_RATE, rate, means), mask=column < SHARE)
 
 
 @triton.jit
