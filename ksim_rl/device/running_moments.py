@@ -1,5 +1,7 @@
 """This module keeps an exact running mean and variance, in one process or over all ranks."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -54,7 +56,7 @@ class RunningMoments(nn.Module):
         Rows with a non-finite element, and rows that `valid` ([...] or [..., 1]) marks False, are left out.
         """
         self.count_rows(values, valid)
-        self.publish()
+        publish([self])
 
     @torch.no_grad()
     def count_rows(
@@ -82,7 +84,7 @@ class RunningMoments(nn.Module):
         mean = weight_N @ exact_NL / added.clamp_min(1)
         sum_of_squares = weight_N @ exact_NL.sub_(mean).square_()
 
-        # What `_merge` does, in place.
+        # The union of both, as of those of ranks in `ranks.merged`, in place.
         before = self.count.to(torch.float64)
         total = before + added
         share = added / total.clamp_min(1)
@@ -91,29 +93,15 @@ class RunningMoments(nn.Module):
         self.exact_sum_of_squares.add_(sum_of_squares.addcmul_(delta.square_(), share * before))
         self.count.copy_(total)
 
-    @torch.no_grad()
-    def publish(self) -> None:
-        """Set `mean` and `var` from all that was counted; with several ranks all of them have to call it."""
-        moments = self.count, self.exact_mean, self.exact_sum_of_squares
-        if ranks.size() > 1:
-            own = torch.cat(
-                (self.count.to(torch.float64).reshape(1), self.exact_mean, self.exact_sum_of_squares)
-            )
-            split = [part.split((1, self.dim, self.dim)) for part in ranks.gather(own)]
-            moments = split[0][0][0], split[0][1], split[0][2]
-            for count, mean, sum_of_squares in split[1:]:
-                moments = _merge(moments, (count[0], mean, sum_of_squares))
-        count, mean, sum_of_squares = moments
-        self.mean.copy_(mean)
-        self.var.copy_(torch.where(count > 0, sum_of_squares / count.clamp_min(1), 1.0))
 
-
-Moments = tuple[Tensor, Tensor, Tensor]
-
-
-def _merge(one: Moments, other: Moments) -> Moments:
-    """Return count, mean and sum of squared deviations of the union of two sets."""
-    total = one[0] + other[0]
-    share = other[0].to(torch.float64) / total.clamp_min(1)
-    delta = other[1] - one[1]
-    return total, one[1] + delta * share, one[2] + (other[2] + delta.square() * share * one[0])
+@torch.no_grad()
+def publish(every: Sequence[RunningMoments]) -> None:
+    """Set `mean` and `var` of each from all that was counted; all ranks have to call it, for one collective."""
+    if not every:
+        return
+    dims = [own.dim for own in every]
+    own_L = [(own.count.expand(own.dim), own.exact_mean, own.exact_sum_of_squares) for own in every]
+    count_L, mean_L, squares_L = ranks.merged(*map(torch.cat, zip(*own_L, strict=True)))
+    var_L = torch.where(count_L > 0, squares_L / count_L.clamp_min(1), 1.0)
+    torch._foreach_copy_([own.mean for own in every], mean_L.split(dims))
+    torch._foreach_copy_([own.var for own in every], var_L.split(dims))

@@ -78,7 +78,7 @@ class SteppedLevel(LevelCurriculum):
         held_2 = view.shared("episodes_and_score_2", (0.0, 0.0))
         ended_E2 = torch.stack((torch.ones_like(ended_E, dtype=torch.float32), self.score(view)), dim=-1)
         added_2 = torch.where(ended_E[:, None], ended_E2, 0.0).sum(0)
-        ranks.sum_([added_2])
+        ranks.sum_(added_2)
         total_2 = held_2 + added_2
         is_enough = total_2[0] >= (self.min_episodes or view.num_envs * ranks.size())
         mean = total_2[1] / total_2[0].clamp(min=1.0)
@@ -247,9 +247,10 @@ class CommandRangesByLevel(OfCommand, CurriculumTerm):
             )
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
+        changes = ranks.any_of(mask_E)
         for field, held_2 in _ranges_of(view, self.command, self.start).items():
             start_2, end_2 = constant(self.start[field], view.device), constant(self.end[field], view.device)
-            held_2.copy_(torch.where(ranks.any_of(mask_E), by_level(start_2, end_2, view.level), held_2))
+            held_2.copy_(torch.where(changes, by_level(start_2, end_2, view.level), held_2))
         return view.level.clone()
 
 

@@ -13,7 +13,7 @@ from torchrl.data import Composite
 
 from ksim_rl.checked import Checked, Count, Filled, Name, NonNegative
 from ksim_rl.checks import check_choice, check_in_range
-from ksim_rl.device.running_moments import RunningMoments
+from ksim_rl.device.running_moments import RunningMoments, publish
 from ksim_rl.modules.mlp import ACTIVATIONS, Device, mlp
 
 ObservationKey = str | tuple[str, ...]
@@ -69,15 +69,16 @@ def update_normalizers(
     Networks are actors, critics, or any other modules, which are searched for owners of a `normalizer`. Env states,
     e.g. of a rollout `["E","T"]`, that are marked False in `valid` are left out.
     """
-    seen: set[int] = set()
+    seen: dict[int, ObservationNormalizer] = {}
     for network in networks:
         for module in network.modules():
             normalizer = getattr(getattr(module, "module", None), "normalizer", None)
             if not isinstance(module, TensorDictModule) or not isinstance(normalizer, ObservationNormalizer):
                 continue
             if id(normalizer) not in seen:
-                seen.add(id(normalizer))
-                normalizer.update(_observation(tensordict, module, normalizer.dim), valid)
+                seen[id(normalizer)] = normalizer
+                normalizer.count_rows(_observation(tensordict, module, normalizer.dim), valid)
+    publish([*seen.values()])
 
 
 def _observation(tensordict: TensorDictBase, module: TensorDictModule, dim: int) -> Tensor:

@@ -28,10 +28,8 @@ def standardized(
     values: Float[Tensor, "*batch"], mask: Bool[Tensor, "*batch"], *, lowest_std: float
 ) -> Float[Tensor, "*batch"]:
     """Shift and scale to mean 0 and standard deviation 1, or divide by `lowest_std`, over all that masks mark."""
-    zero, count = torch.zeros_like(values), mask.sum()
-    total = torch.where(mask, values, zero).sum()
-    ranks.sum_([total, count])
-    error = values - total / count.clamp_min(1)
-    squares = torch.where(mask, error, zero).square().sum()
-    ranks.sum_([squares])
-    return error / (squares / (count - 1).clamp_min(1)).sqrt().clamp_min(lowest_std)
+    count, own_mean = mask.sum(), masked_mean(values, mask)
+    own_squares = torch.where(mask, values - own_mean, 0.0).square().sum()
+    count, mean, squares = ranks.merged(count, own_mean, own_squares)
+    std = (squares / (count - 1).clamp_min(1)).sqrt().clamp_min(lowest_std)
+    return (values - mean.to(values.dtype)) / std.to(values.dtype)

@@ -14,38 +14,30 @@ from torch import Tensor
 from ksim_rl.ranks.group import size
 
 
-def sum_(tensors: Sequence[Num[Tensor, "*?shape"]]) -> None:
-    """Replace each tensor by its sum over the ranks, in place: one collective for each dtype."""
-    _reduce_(tensors, None)
+def sum_(tensor: Num[Tensor, "*shape"]) -> None:
+    """Replace a contiguous tensor by its sum over the ranks, in place."""
+    if size() > 1:
+        dist.all_reduce(tensor)
 
 
+@torch.no_grad()
 def mean_(tensors: Sequence[Float[Tensor, "*?shape"]], *, weight: Float[Tensor, ""]) -> None:
     """Replace each tensor by its mean over the ranks, in place, in which each rank has its `weight`, in [0, 1].
 
     With the share of its rows that take part for weight, means over a rank's become means over those of all ranks; 0
-    where no rank has any. One collective for each dtype.
+    where no rank has any. One collective for all of them, in the widest of their dtypes.
     """
-    _reduce_(tensors, weight / size())
-
-
-@torch.no_grad()
-def _reduce_(tensors: Sequence[Tensor], share: Tensor | None) -> None:
     if size() == 1:
         return
-    by_dtype: dict[torch.dtype, list[Tensor]] = {}
-    for tensor in tensors:
-        by_dtype.setdefault(tensor.dtype, []).append(tensor)
-    for group in by_dtype.values():
-        flat = torch.cat([*(tensor.reshape(-1) for tensor in group), group[0].new_ones(1)])
-        if share is not None:  # before they are added, so that sums of large gradients stay finite
-            flat.mul_(share)
-        dist.all_reduce(flat)
-        if share is not None:
-            flat.div_(flat[-1].clamp_min(torch.finfo(flat.dtype).tiny))
-        pieces = flat[:-1].split([tensor.numel() for tensor in group])
-        torch._foreach_copy_(
-            group, [piece.view_as(tensor) for piece, tensor in zip(pieces, group, strict=True)]
-        )
+    share = weight / size()
+    flat = torch.cat([*(tensor.reshape(-1) for tensor in tensors), share.reshape(1)])
+    means, total = flat[:-1], flat[-1]
+    means.mul_(share)  # before they are added, so that sums of large gradients stay finite
+    dist.all_reduce(flat)
+    means.div_(total.clamp_min(torch.finfo(flat.dtype).tiny))
+    pieces = means.split([tensor.numel() for tensor in tensors])
+    views = [piece.view_as(tensor) for piece, tensor in zip(pieces, tensors, strict=True)]
+    torch._foreach_copy_(list(tensors), views)
 
 
 def gather(tensor: Shaped[Tensor, "*shape"]) -> list[Shaped[Tensor, "*shape"]]:
@@ -57,12 +49,28 @@ def gather(tensor: Shaped[Tensor, "*shape"]) -> list[Shaped[Tensor, "*shape"]]:
     return parts
 
 
+def merged(
+    count: Num[Tensor, "*shape"], mean: Num[Tensor, "*shape"], squares: Num[Tensor, "*shape"]
+) -> tuple[Num[Tensor, "*shape"], Num[Tensor, "*shape"], Num[Tensor, "*shape"]]:
+    """Return count, mean and sum of squared deviations of what all ranks have, in float64, by one collective.
+
+    With one rank they are returned as they are.
+    """
+    if size() == 1:
+        return count, mean, squares
+    own_3 = torch.stack([column.to(torch.float64) for column in (count, mean, squares)])
+    count_R, mean_R, squares_R = torch.stack(gather(own_3), 1)
+    total = count_R.sum(0)
+    mean = (count_R * mean_R).sum(0) / total.clamp_min(1)
+    return total, mean, (squares_R + count_R * (mean_R - mean).square()).sum(0)
+
+
 def any_of(mask: Bool[Tensor, "*rows"]) -> Bool[Tensor, ""]:
     """Return whether any row of any rank is marked, on the device."""
     if size() == 1:
         return mask.any()
     count = mask.sum()
-    sum_([count])
+    sum_(count)
     return count > 0
 
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite, Unbounded
 
 from ksim_rl import checks, ranks
-from ksim_rl.device.running_moments import RunningMoments
+from ksim_rl.device.running_moments import RunningMoments, publish
 from ksim_rl.transforms import upstream
 from ksim_rl.transforms.row_transform import Keys, RowTransform
 from ksim_rl.transforms.specs import Device
@@ -24,7 +24,7 @@ class ObservationNormalization(RowTransform):
 
     `env.eval()` freezes the statistics and `env.train()` goes on, `enable_` does the same for one transform; both write
     a device flag, so a captured or compiled step follows. With `torch.distributed`, the ranks merge their statistics in
-    each step (one collective per key, none while frozen), so they have to step alike; states of resets join in the next
+    each step (one collective, none while frozen), so they have to step alike; states of resets join in the next
     step's.
 
     Prefer `obs_normalization` of actor and critic where they fit: those go into the checkpoint by themselves.
@@ -94,17 +94,17 @@ class ObservationNormalization(RowTransform):
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
         for values_EL, moments in self._flat(tensordict_reset, self.num_rows):
             moments.count_rows(values_EL, mask_E & self.updating)
-            # Ranks reset at different times, so they cannot merge here.
-            if ranks.size() == 1:
-                moments.publish()
+        # Ranks reset at different times, so they cannot merge here.
+        if ranks.size() == 1:
+            publish(self._each_moments())
         return self._normalize(tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._sized()
         for values_EL, moments in self._flat(next_tensordict, self.num_rows):
             moments.count_rows(values_EL, self.updating.expand(self.num_rows))
-            if self._collective or ranks.size() == 1:
-                moments.publish()
+        if self._collective or ranks.size() == 1:
+            publish(self._each_moments())
         return self._normalize(next_tensordict)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -2,7 +2,7 @@
 
 import torch
 
-from ksim_rl.device.running_moments import RunningMoments
+from ksim_rl.device.running_moments import RunningMoments, publish
 
 
 def test_merged_batches_equal_two_passes():
@@ -27,5 +27,5 @@ def test_counted_rows_show_once_they_are_published():
     moments = RunningMoments(1)
     moments.count_rows(torch.tensor([[1.0], [3.0]]))
     assert (moments.mean.item(), moments.var.item()) == (0.0, 1.0)
-    moments.publish()
+    publish([moments])
     assert (moments.mean.item(), moments.var.item()) == (2.0, 1.0)

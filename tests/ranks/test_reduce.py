@@ -35,12 +35,13 @@ def test_a_rank_counts_by_its_rows_that_take_part(num_taking_part, tmp_path):
 def reduced():
     mine = torch.tensor([1.0, 2.0]) * (1 + ranks.rank())
     summed, exact, counted = mine.clone(), mine.double(), torch.tensor(ranks.rank())
-    ranks.sum_([summed, counted])
+    ranks.sum_(summed)
+    ranks.sum_(counted)
     once = mine.clone()
     ranks.mean_([once, exact, once], weight=torch.tensor(0.25 + 0.5 * ranks.rank()))
     return summed.tolist(), counted.item(), once.tolist(), exact.tolist()
 
 
-def test_sums_and_means_of_each_dtype_and_of_what_is_listed_twice(tmp_path):
+def test_sums_and_means_of_several_dtypes_and_of_what_is_listed_twice(tmp_path):
     for found in results(reduced, size=2, folder=tmp_path):
         assert found == ([3.0, 6.0], 1, [1.75, 3.5], [1.75, 3.5])

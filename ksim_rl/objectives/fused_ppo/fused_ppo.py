@@ -33,10 +33,9 @@ from ksim_rl.objectives.fused_ppo.layout import (
     parts,
     power_of_two,
 )
-from ksim_rl.objectives.fused_ppo.loss_kernels import MASK
 from ksim_rl.objectives.fused_ppo.mlp_kernels import minibatch_gradients, state_values, weight_gradients
-from ksim_rl.objectives.fused_ppo.step_kernels import SUMMARY, adam_step, sum_gradients
-from ksim_rl.objectives.gradient_step import StepGuard, adapt_learning_rate_
+from ksim_rl.objectives.fused_ppo.step_kernels import SUMMARY, adam_step, sum_gradients, take_means
+from ksim_rl.objectives.gradient_step import StepGuard
 from ksim_rl.objectives.symmetry import SymmetricAugmentation
 
 # Sums that each block leaves beside its gradients.
@@ -152,7 +151,7 @@ class FusedPPO:
             mirror=mirror,
         )
 
-        self._summary = torch.zeros(num_steps, power_of_two(len(SUMMARY)), device=device)
+        self._summary = torch.zeros(num_steps, power_of_two(len(SUMMARY) + 1), device=device)
         self._arguments = self._all_arguments(rows, mirror)
 
     def _all_arguments(self, rows: int, mirror: SymmetricAugmentation | None) -> dict[str, Any]:
@@ -193,7 +192,8 @@ class FusedPPO:
             "slopes": zeros(2 * rows * layout.gradients + tuning.tile, dtype=dtype),
             "weight_partials": zeros(tuning.splits, 2, layout.num_weights),
             "block_partials": zeros(blocks, 2, layout.num_biases + NUM_STATISTICS),
-            "gradients": zeros(2, layout.num_padded),
+            # Of both networks; ranks add them up together with the summary behind them.
+            "gradients": zeros(2 * layout.num_padded + self._summary.shape[1]),
             "squares": zeros(2 * programs),
             "image_of": image_of,
             "skipped": self.guard.skipped,
@@ -206,12 +206,14 @@ class FusedPPO:
             "STATE_STD": self.networks.std_layer is not None,
             "RECORD": dataset.records.shape[1],
             "NUM_STATISTICS": NUM_STATISTICS,
+            "NUM_GRADIENTS": 2 * layout.num_padded,
             "NUM_SQUARES": 2 * programs,
             "SQUARES": power_of_two(2 * programs),
             "BLOCKS": blocks,
             "MIRROR": self._mirrored,
             "CLIP_VALUE": clip_value > 0.0,
-            "ADAPTIVE": cfg.schedule == "adaptive" and ranks.size() == 1,
+            "ADAPTIVE": cfg.schedule == "adaptive",
+            "RANKS": ranks.size(),
             "CLIP": cfg.max_grad_norm is not None,
         }
 
@@ -235,7 +237,7 @@ class FusedPPO:
                 if len(self.dataset.records) > self.dataset.size:
                     index_B = torch.cat([index_B, index_B + self.dataset.size])
                 self._multiply(index_B)
-                self._improve(step, index_B)
+                self._improve(step)
                 step += 1
         self.parameters.store()
         names = SUMMARY if self._mirrored else SUMMARY[:-1]
@@ -292,29 +294,19 @@ class FusedPPO:
         for at, following in reversed(pairs):
             run(at, following, forward=False)
 
-    def _improve(self, step: int, index_B: Tensor) -> None:
-        """Add the parts up, and make the step of the optimizer."""
+    def _improve(self, step: int) -> None:
+        """Add the parts up, over all ranks by one collective, and make the step of the optimizer."""
         summary, given = self._summary[step], self._arguments
         rate = self.optimizer.param_groups[0]["lr"]
-        launch(sum_gradients, (len(given["squares"]) + 1,), given, learning_rate=rate, summary=summary)
+        own = summary if ranks.size() == 1 else given["gradients"][given["NUM_GRADIENTS"] :]
+        programs = len(given["squares"])
+        launch(sum_gradients, (programs + 1,), given, learning_rate=rate, summary=own)
         if ranks.size() > 1:
-            weight = self.dataset.records[index_B, 3 * self.layout.out + MASK.value].mean()
-            self._take_means(summary, rate, weight)
+            ranks.sum_(given["gradients"])
+            launch(take_means, (programs,), given, learning_rate=rate, summary=summary)
         sizes = {"SIZE": self.layout.num_flat, "BLOCK": self.tuning.size}
         grid = (parts(self.layout.num_flat, self.tuning.size),)
         launch(adam_step, grid, given, summary=summary, steps=self.parameters.steps[step:], **sizes)
-
-    def _take_means(self, summary: Tensor, learning_rate: Tensor, weight: Tensor) -> None:
-        """Take the means over all ranks of the gradients and of what the step measured, and adapt the learning rate."""
-        cfg, gradients, squares = self.cfg, self._arguments["gradients"], self._arguments["squares"]
-        ranks.mean_([gradients, summary], weight=weight)
-        squares.zero_()
-        squares[0].copy_(gradients.square().sum())
-        if cfg.schedule == "adaptive":
-            bounds = {"lr_min": cfg.learning_rate_min, "lr_max": cfg.learning_rate_max}
-            kl = summary[SUMMARY.index("kl")]
-            adapt_learning_rate_(learning_rate, kl, desired_kl=cfg.desired_kl, **bounds)
-            summary[SUMMARY.index("learning_rate")].copy_(learning_rate)
 
     def _evaluate(self, obs_DL: Tensor, values_D: Tensor) -> None:
         if self.layout.chained:

@@ -26,6 +26,8 @@ LOSS = tl.constexpr(SUMMARY.index("loss"))
 LEARNING_RATE = tl.constexpr(SUMMARY.index("learning_rate"))
 GRAD_NORM = tl.constexpr(SUMMARY.index("grad_norm"))
 LOSS_MIRROR = tl.constexpr(SUMMARY.index("loss_mirror"))
+# Behind it stands which share of the rows of all ranks took part on this one.
+SHARE = tl.constexpr(len(SUMMARY))
 # As in TorchRL's explained variance: the resolution of float32.
 EPS = tl.constexpr(1.1920929e-07)
 
@@ -70,10 +72,22 @@ def _column(values, index: tl.constexpr, SIZE: tl.constexpr):
 
 
 @triton.jit
+def _adapt(learning_rate, kl, desired_kl, low, high, ADAPTIVE: tl.constexpr):
+    """Return the learning rate, after `adapt_learning_rate_` if it is ADAPTIVE."""
+    rate = tl.load(learning_rate)
+    if ADAPTIVE:  # comparisons with NaN are False
+        slower, faster = tl.maximum(rate / 1.5, low), tl.minimum(rate * 1.5, high)
+        too_near = (kl < 0.5 * desired_kl) & (kl > 0.0)
+        rate = tl.where(kl > 2.0 * desired_kl, slower, tl.where(too_near, faster, rate))
+        tl.store(learning_rate, rate)
+    return rate
+
+
+@triton.jit
 def sum_gradients(
-    weight_partials, block_partials, gradients, squares, biases, learning_rate, summary,
+    weight_partials, block_partials, gradients, squares, biases, learning_rate, summary, num_rows,
     entropy_coeff, critic_coeff, desired_kl, learning_rate_min, learning_rate_max,
-    SPLITS: tl.constexpr, BLOCKS: tl.constexpr,
+    RANKS: tl.constexpr, SPLITS: tl.constexpr, BLOCKS: tl.constexpr,
     NUM_WEIGHTS: tl.constexpr, NUM_BIASES: tl.constexpr, NUM_STATISTICS: tl.constexpr,
     ACTIONS: tl.constexpr, OUT: tl.constexpr, LOG_STD: tl.constexpr, MIN_STD: tl.constexpr,
     STATE_STD: tl.constexpr, MIRROR: tl.constexpr, ADAPTIVE: tl.constexpr,
@@ -82,7 +96,7 @@ def sum_gradients(
     """Add up what splits and blocks left, divide by the number of env states, and adapt the learning rate.
 
     The first programs take SIZE weights each, the next COLUMNS biases each, and leave mean gradients [2, NUM_WEIGHTS +
-    NUM_BIASES] and the sum of their squares; the last one takes the statistics of the loss.
+    NUM_BIASES] and the sum of their squares; the last takes the loss's statistics. Ranks multiply all by their SHARE.
     """
     WEIGHT_PROGRAMS: tl.constexpr = (NUM_WEIGHTS + SIZE - 1) // SIZE
     BIAS_PROGRAMS: tl.constexpr = (NUM_BIASES + COLUMNS - 1) // COLUMNS
@@ -93,7 +107,9 @@ def sum_gradients(
     # The first statistic of both networks is the number of env states that take part. It may be none.
     of_policy = statistic < (6 if STATE_STD or MIRROR else 4)
     sums = _block_sums(block_partials, NUM_BIASES + statistic, of_policy, WIDTH, BLOCKS, ROWS, NUM_STATISTICS)
-    count = tl.maximum(_column(sums, 0, NUM_STATISTICS), 1.0)
+    counted = _column(sums, 0, NUM_STATISTICS)
+    count = tl.maximum(counted, 1.0)
+    divisor = count if RANKS == 1 else num_rows * (1.0 * RANKS)
     if program < 2 * WEIGHT_PROGRAMS:
         network = program // WEIGHT_PROGRAMS
         at = (program % WEIGHT_PROGRAMS) * SIZE + tl.arange(0, SIZE)
@@ -102,16 +118,15 @@ def sum_gradients(
         for split in tl.static_range(SPLITS):
             place = (split * 2 + network) * NUM_WEIGHTS + at
             weight += tl.load(weight_partials + place, mask=kept, other=0.0)
-        weight = weight / count
+        weight = weight / divisor
         tl.store(gradients + (network * NUM_PADDED + at), weight, mask=kept)
         tl.store(squares + program, tl.sum(weight * weight))
     elif program < 2 * (WEIGHT_PROGRAMS + BIAS_PROGRAMS):
         network = (program - 2 * WEIGHT_PROGRAMS) // BIAS_PROGRAMS
         bias = ((program - 2 * WEIGHT_PROGRAMS) % BIAS_PROGRAMS) * COLUMNS + tl.arange(0, COLUMNS)
         inside = bias < NUM_BIASES
-        total = (
-            _block_sums(block_partials + network * WIDTH, bias, inside, WIDTH, BLOCKS, ROWS, COLUMNS) / count
-        )
+        total = _block_sums(block_partials + network * WIDTH, bias, inside, WIDTH, BLOCKS, ROWS, COLUMNS)
+        total = total / divisor
         tl.store(gradients + (network * NUM_PADDED + NUM_WEIGHTS + bias), total, mask=inside)
         tl.store(squares + program, tl.sum(total * total))
     else:
@@ -138,29 +153,43 @@ def sum_gradients(
             )
             std = tl.maximum(tl.exp(raw) if LOG_STD else raw, MIN_STD)
             entropy = tl.sum(tl.where(output < ACTIONS, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0))
-            # The mean over no env state is zero, as that of all losses.
-            entropy = tl.where(_column(sums, 0, NUM_STATISTICS) > 0.0, entropy, 0.0)
-        rate = tl.load(learning_rate)
-        if ADAPTIVE:
-            # As `adapt_learning_rate_`; comparisons with NaN are False.
-            slower = tl.maximum(rate / 1.5, learning_rate_min)
-            faster = tl.minimum(rate * 1.5, learning_rate_max)
-            too_near = (kl < 0.5 * desired_kl) & (kl > 0.0)
-            rate = tl.where(kl > 2.0 * desired_kl, slower, tl.where(too_near, faster, rate))
-            tl.store(learning_rate, rate)
-        tl.store(summary, objective)
-        tl.store(summary + 1, critic)
-        tl.store(summary + 2, entropy)
-        tl.store(summary + 3, kl)
-        tl.store(summary + 4, _column(policy, 3, NUM_STATISTICS))
-        tl.store(summary + 5, 1.0 - error_variance / (target_variance + EPS))
+        alone: tl.constexpr = ADAPTIVE and RANKS == 1
+        rate = _adapt(learning_rate, kl, desired_kl, learning_rate_min, learning_rate_max, alone)
+        share = counted / divisor  # zero, as all means, where no env state takes part
+        tl.store(summary + SHARE, share)
+        tl.store(summary, objective * share)
+        tl.store(summary + 1, critic * share)
+        tl.store(summary + 2, entropy * share)
+        tl.store(summary + 3, kl * share)
+        tl.store(summary + 4, _column(policy, 3, NUM_STATISTICS) * share)
+        tl.store(summary + 5, (1.0 - error_variance / (target_variance + EPS)) * share)
         loss = objective + critic - entropy_coeff * entropy
         if MIRROR:
             mirror = _column(policy, 5, NUM_STATISTICS)
-            tl.store(summary + LOSS_MIRROR, mirror)
+            tl.store(summary + LOSS_MIRROR, mirror * share)
             loss += mirror
-        tl.store(summary + LOSS, loss)
+        tl.store(summary + LOSS, loss * share)
         tl.store(summary + LEARNING_RATE, rate)
+
+
+@triton.jit
+def take_means(
+    gradients, squares, learning_rate, summary, desired_kl, learning_rate_min, learning_rate_max,
+    NUM_GRADIENTS: tl.constexpr, ADAPTIVE: tl.constexpr, SIZE: tl.constexpr,
+):  # fmt: skip
+    """Make means, and sums of squares, of what `sum_gradients` left, added up over ranks; adapt the learning rate."""
+    sums = gradients + NUM_GRADIENTS
+    share = tl.maximum(tl.load(sums + SHARE), 1e-30)  # all sums are zero where no env state takes part
+    at = tl.program_id(0) * SIZE + tl.arange(0, SIZE)
+    mean = tl.load(gradients + at, mask=at < NUM_GRADIENTS, other=0.0) / share
+    tl.store(gradients + at, mean, mask=at < NUM_GRADIENTS)
+    tl.store(squares + tl.program_id(0), tl.sum(mean * mean))
+    if tl.program_id(0) == 0:
+        kl = tl.load(sums + 3) / share
+        rate = _adapt(learning_rate, kl, desired_kl, learning_rate_min, learning_rate_max, ADAPTIVE)
+        column = tl.arange(0, SIZE)
+        means = tl.load(sums + column, mask=column < SHARE) / share
+        tl.store(summary + column, tl.where(column == LEARNING_RATE, rate, means), mask=column < SHARE)
 
 
 @triton.jit
