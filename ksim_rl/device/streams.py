@@ -9,7 +9,7 @@ import os
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 
@@ -103,3 +103,27 @@ def warp_scope(device: torch.device) -> Iterator[None]:
         stream = warp_stream(torch.cuda.current_stream(device))
         with wp.ScopedStream(stream, sync_enter=False, sync_exit=False):
             yield
+
+
+def stream_aside(device: torch.device) -> wp.Stream | None:
+    """Return a stream for `beside`, None on the CPU: one of torch's, which never wait for the default stream."""
+    return None if device.type == "cpu" else warp_stream(torch.cuda.Stream(device))
+
+
+@contextmanager
+def beside(launch: Callable[[], None], aside: wp.Stream | None) -> Iterator[None]:
+    """Let a GPU do what `launch` launches together with the Warp work of this block; without a stream, after it.
+
+    Both follow what precedes the block and precede what follows it, in a graph too. Neither may write what the other
+    reads or writes; `launch` allocates nothing, since memory is given back in the order of one stream.
+    """
+    if aside is None:
+        yield
+        launch()
+        return
+    stream = aside.device.stream
+    aside.wait_stream(stream)
+    with wp.ScopedStream(aside, sync_enter=False):
+        launch()
+    yield
+    stream.wait_stream(aside)

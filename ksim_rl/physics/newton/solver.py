@@ -1,11 +1,13 @@
 """This module chooses the constraint solver of a world, and launches the one that is a single kernel."""
 
 from collections.abc import Callable
+from functools import partial
 
 import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
+from ksim_rl.device.streams import beside
 from ksim_rl.physics.contact_sensors import ContactReadings
 from ksim_rl.physics.newton.kernel import (
     CUDA_LANES,
@@ -112,32 +114,36 @@ def step(
     warp_model: mjw.Model,
     warp_data_E: mjw.Data,
     solve: Callable[[], None],
-    dynamics: Callable[[bool], None] | None = None,
+    dynamics: Callable[..., None] | None = None,
     make_rows: Callable[[], None] | None = None,
     contacts: ContactReadings | None = None,
     integrate: Callable[[], None] | None = None,
     *,
     sensors: bool,
+    aside: wp.Stream | None = None,
 ) -> None:
     """Launch a physics step: that of MuJoCo Warp, with this solver.
 
     The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
-    not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel,
-    with forces or without; `make_rows`, which needs it, the constraint rows as one, with the lists of contacts that
-    `contacts` reads; and `integrate` what advances the state.
+    not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel; `make_rows`,
+    which needs it, the constraint rows as one, with the lists of contacts that `contacts` reads; and `integrate` what
+    advances the state. On a stream `aside`, dynamics go on beside the collision pass, which reads where geoms are.
     """
     m, d = warp_model, warp_data_E
+    if dynamics is None or m.callback.sensor:
+        aside = None
     if dynamics is None:
         mjw.fwd_position(m, d, factorize=False)
         mjw.fwd_velocity(m, d)
         if contacts is not None:
             contacts.list()
     else:
-        dynamics(True)
+        dynamics(goes_on=False)
+        with beside(partial(dynamics, places_geoms=False), aside):
+            if m.opt.run_collision_detection:
+                mjw.collision(m, d)
         if sensors:
             mjw.camlight(m, d)
-        if m.opt.run_collision_detection:
-            mjw.collision(m, d)
         if make_rows is None:
             mjw.make_constraint(m, d)
         else:
