@@ -1,7 +1,6 @@
 """This module chooses the constraint solver of a world, and launches the one that is a single kernel."""
 
 from collections.abc import Callable
-from functools import partial
 
 import mujoco
 import mujoco_warp as mjw
@@ -74,8 +73,10 @@ def solver(
     *,
     rows_on_chip: int | None = None,
     broken: wp.array | None = None,
-) -> Callable[[], None]:
+) -> Callable[..., None]:
     """Return what launches the solver: accelerations and forces from the constraint rows, which must be sparse.
+
+    On CUDA it first orders the worlds; with `solves=False` it does this alone, and with `orders=False` not.
 
     Args:
         warp_model, warp_data_E: a model that is not `unsuited`, and its worlds, with arrays in their final place.
@@ -102,10 +103,11 @@ def solver(
         m, d, own, elliptic=elliptic, lanes=lanes, rows_on_chip=rows_on_chip, checked=broken is not None
     )
 
-    def launch() -> None:
-        if on_cuda:
+    def launch(*, orders: bool = True, solves: bool = True) -> None:
+        if orders and on_cuda:
             put_longest_first(own["order"], d)
-        solve()
+        if solves:
+            solve()
 
     return launch
 
@@ -113,7 +115,7 @@ def solver(
 def step(
     warp_model: mjw.Model,
     warp_data_E: mjw.Data,
-    solve: Callable[[], None],
+    solve: Callable[..., None],
     dynamics: Callable[..., None] | None = None,
     make_rows: Callable[[], None] | None = None,
     contacts: ContactReadings | None = None,
@@ -127,7 +129,8 @@ def step(
     The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
     not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel; `make_rows`,
     which needs it, the constraint rows as one, with the lists of contacts that `contacts` reads; and `integrate` what
-    advances the state. On a stream `aside`, dynamics go on beside the collision pass, which reads where geoms are.
+    advances the state. On a stream `aside`, dynamics go on beside the collision pass, which reads where geoms are, and
+    the solver orders the worlds, by the last substep.
     """
     m, d = warp_model, warp_data_E
     if dynamics is None or m.callback.sensor:
@@ -138,8 +141,13 @@ def step(
         if contacts is not None:
             contacts.list()
     else:
+
+        def dynamics_and_order() -> None:
+            dynamics(places_geoms=False)
+            solve(solves=False)
+
         dynamics(goes_on=False)
-        with beside(partial(dynamics, places_geoms=False), aside):
+        with beside(dynamics_and_order, aside):
             if m.opt.run_collision_detection:
                 mjw.collision(m, d)
         if sensors:
@@ -157,7 +165,7 @@ def step(
             m.callback.control(m, d)
         mjw.fwd_actuation(m, d)
         mjw.fwd_acceleration(m, d, factorize=True)
-    solve()
+    solve(orders=dynamics is None)
     runs_rne = m.opt.run_rne_postconstraint or (sensors and m.sensor_rne_postconstraint)
     if runs_rne and contacts is not None:
         contacts.rne_postconstraint(m)
