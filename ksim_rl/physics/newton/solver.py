@@ -130,7 +130,7 @@ def step(
     not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel; `make_rows`,
     which needs it, the constraint rows as one, with the lists of contacts that `contacts` reads; and `integrate` what
     advances the state. On a stream `aside`, dynamics go on beside the collision pass, which reads where geoms are, and
-    the solver orders the worlds, by the last substep.
+    the solver orders the worlds, by the last substep. Then it solves beside the sensors of positions and velocities.
     """
     m, d = warp_model, warp_data_E
     if dynamics is None or m.callback.sensor:
@@ -150,22 +150,26 @@ def step(
         with beside(dynamics_and_order, aside):
             if m.opt.run_collision_detection:
                 mjw.collision(m, d)
-        if sensors:
-            mjw.camlight(m, d)
         if make_rows is None:
             mjw.make_constraint(m, d)
         else:
             make_rows()
-    if sensors:
-        d.sensordata.zero_()
-        mjw.sensor_pos(m, d)
-        mjw.sensor_vel(m, d)
-    if dynamics is None:
-        if m.callback.control and not m.opt.disableflags & mjw.DisableBit.ACTUATION:
-            m.callback.control(m, d)
-        mjw.fwd_actuation(m, d)
-        mjw.fwd_acceleration(m, d, factorize=True)
-    solve(orders=dynamics is None)
+
+    def act_and_solve() -> None:
+        if dynamics is None:
+            if m.callback.control and not m.opt.disableflags & mjw.DisableBit.ACTUATION:
+                m.callback.control(m, d)
+            mjw.fwd_actuation(m, d)
+            mjw.fwd_acceleration(m, d, factorize=True)
+        solve(orders=dynamics is None)
+
+    with beside(act_and_solve, aside if sensors else None):
+        if sensors:
+            if dynamics is not None:
+                mjw.camlight(m, d)
+            d.sensordata.zero_()
+            mjw.sensor_pos(m, d)
+            mjw.sensor_vel(m, d)
     runs_rne = m.opt.run_rne_postconstraint or (sensors and m.sensor_rne_postconstraint)
     if runs_rne and contacts is not None:
         contacts.rne_postconstraint(m)
