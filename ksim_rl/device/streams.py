@@ -105,25 +105,21 @@ def warp_scope(device: torch.device) -> Iterator[None]:
             yield
 
 
-def stream_aside(device: torch.device) -> wp.Stream | None:
-    """Return a stream for `beside`, None on the CPU: one of torch's, which never wait for the default stream."""
-    return None if device.type == "cpu" else warp_stream(torch.cuda.Stream(device))
-
-
 @contextmanager
-def beside(launch: Callable[[], None], aside: wp.Stream | None) -> Iterator[None]:
-    """Let a GPU do what `launch` launches together with the Warp work of this block; without a stream, after it.
+def beside(aside: wp.Stream | None, *launches: Callable[[], None]) -> Iterator[None]:
+    """Let a GPU do what `launches` launch together with the Warp work of this block; without a stream, after it.
 
     Both follow what precedes the block and precede what follows it, in a graph too. Neither may write what the other
-    reads or writes; `launch` allocates nothing, since memory is given back in the order of one stream.
+    reads or writes; `launches` allocate nothing, since memory is given back in the order of one stream.
     """
-    if aside is None:
+    if aside is not None:
+        aside.wait_stream(aside.device.stream)
+        with wp.ScopedStream(aside, sync_enter=False):
+            for launch in launches:
+                launch()
         yield
-        launch()
-        return
-    stream = aside.device.stream
-    aside.wait_stream(stream)
-    with wp.ScopedStream(aside, sync_enter=False):
-        launch()
-    yield
-    stream.wait_stream(aside)
+        aside.device.stream.wait_stream(aside)
+    else:
+        yield
+        for launch in launches:
+            launch()

@@ -95,10 +95,8 @@ class Substeps:
             sensors = sensors or self._always_senses
             opt = self._warp_model_of_solver.opt
             opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
-            stages = self._solve, dynamics, self._make_rows, self._contacts, self._integrate
-            newton.step(
-                self._warp_model_of_solver, self.warp_data_E, *stages, sensors=sensors, aside=self._aside
-            )
+            stages = self._solve, dynamics, self._make_rows, self._contacts, self._integrate, self._aside
+            newton.step(self._warp_model_of_solver, self.warp_data_E, *stages, sensors=sensors)
         else:
             mjw.step(self.warp_model if sensors else self._silent_warp_model, self.warp_data_E)
 

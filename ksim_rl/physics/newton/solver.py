@@ -1,6 +1,7 @@
 """This module chooses the constraint solver of a world, and launches the one that is a single kernel."""
 
 from collections.abc import Callable
+from functools import partial
 
 import mujoco
 import mujoco_warp as mjw
@@ -76,7 +77,7 @@ def solver(
 ) -> Callable[..., None]:
     """Return what launches the solver: accelerations and forces from the constraint rows, which must be sparse.
 
-    On CUDA it first orders the worlds; with `solves=False` it does this alone, and with `orders=False` not.
+    On CUDA it orders the worlds before: with `solves=False` it does that alone, with `orders=False` it does not.
 
     Args:
         warp_model, warp_data_E: a model that is not `unsuited`, and its worlds, with arrays in their final place.
@@ -120,9 +121,9 @@ def step(
     make_rows: Callable[[], None] | None = None,
     contacts: ContactReadings | None = None,
     integrate: Callable[[], None] | None = None,
+    aside: wp.Stream | None = None,
     *,
     sensors: bool,
-    aside: wp.Stream | None = None,
 ) -> None:
     """Launch a physics step: that of MuJoCo Warp, with this solver.
 
@@ -141,13 +142,8 @@ def step(
         if contacts is not None:
             contacts.list()
     else:
-
-        def dynamics_and_order() -> None:
-            dynamics(places_geoms=False)
-            solve(solves=False)
-
         dynamics(goes_on=False)
-        with beside(dynamics_and_order, aside):
+        with beside(aside, partial(dynamics, places_geoms=False), partial(solve, solves=False)):
             if m.opt.run_collision_detection:
                 mjw.collision(m, d)
         if make_rows is None:
@@ -163,7 +159,7 @@ def step(
             mjw.fwd_acceleration(m, d, factorize=True)
         solve(orders=dynamics is None)
 
-    with beside(act_and_solve, aside if sensors else None):
+    with beside(aside if sensors else None, act_and_solve):
         if sensors:
             if dynamics is not None:
                 mjw.camlight(m, d)
