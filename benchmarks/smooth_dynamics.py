@@ -82,7 +82,7 @@ def stages_ms(world: World, lanes: list[int]) -> dict[str, float]:
 
     ways: dict[str, Callable[[], None]] = {"mujoco_warp_stages_ms": theirs}
     for number in lanes:
-        ways[f"one_kernel_{number}_lanes_ms"] = partial(smooth_dynamics(m, d, lanes=number), True)
+        ways[f"one_kernel_{number}_lanes_ms"] = smooth_dynamics(m, d, lanes=number)
     found, results = {}, []
     for name, way in ways.items():
         found[name] = _stages_ms(world, name, way)

@@ -9,7 +9,7 @@ import os
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 
@@ -103,3 +103,23 @@ def warp_scope(device: torch.device) -> Iterator[None]:
         stream = warp_stream(torch.cuda.current_stream(device))
         with wp.ScopedStream(stream, sync_enter=False, sync_exit=False):
             yield
+
+
+@contextmanager
+def beside(aside: wp.Stream | None, *launches: Callable[[], None]) -> Iterator[None]:
+    """Let a GPU do what `launches` launch together with the Warp work of this block; without a stream, after it.
+
+    Both follow what precedes the block and precede what follows it, in a graph too. Neither may write what the other
+    reads or writes; `launches` allocate nothing, since memory is given back in the order of one stream.
+    """
+    if aside is not None:
+        aside.wait_stream(aside.device.stream)
+        with wp.ScopedStream(aside, sync_enter=False):
+            for launch in launches:
+                launch()
+        yield
+        aside.device.stream.wait_stream(aside)
+    else:
+        yield
+        for launch in launches:
+            launch()

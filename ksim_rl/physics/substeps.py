@@ -32,7 +32,7 @@ class Substeps:
     `one_kernel_solver`, `newton` solves, which must suit the model, instead of MuJoCo Warp's own solver. Then, with
     `one_kernel_dynamics`, which must suit it too, one kernel precedes the constraints. Then, with `one_kernel_rows`,
     one makes their rows, and `contact_lists` besides, from which contact sensors are read, and with
-    `one_kernel_integration` one integrates.
+    `one_kernel_integration` one integrates. What can run beside the rest of a substep does so on the stream `aside`.
     """
 
     def __init__(
@@ -45,8 +45,9 @@ class Substeps:
         one_kernel_dynamics: bool = False,
         one_kernel_rows: bool = False,
         one_kernel_integration: bool = False,
+        aside: wp.Stream | None = None,
     ) -> None:
-        self.warp_model, self.warp_data_E = warp_model, warp_data_E
+        self.warp_model, self.warp_data_E, self._aside = warp_model, warp_data_E, aside
         sensor_type = mj_model.sensor_type
         has_history = np.any(mj_model.sensor_history > 0, axis=-1)
         # A delayed sensor samples at every substep.
@@ -94,7 +95,7 @@ class Substeps:
             sensors = sensors or self._always_senses
             opt = self._warp_model_of_solver.opt
             opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
-            stages = self._solve, dynamics, self._make_rows, self._contacts, self._integrate
+            stages = self._solve, dynamics, self._make_rows, self._contacts, self._integrate, self._aside
             newton.step(self._warp_model_of_solver, self.warp_data_E, *stages, sensors=sensors)
         else:
             mjw.step(self.warp_model if sensors else self._silent_warp_model, self.warp_data_E)
@@ -112,7 +113,7 @@ class Substeps:
             mjw.tendon(m, d)
             mjw.com_vel(m, d)
         else:
-            self._dynamics(False)
+            self._dynamics(forces_too=False)
         mjw.camlight(m, d)
         needed = self.refreshed_on_demand
         if "M" in needed:

@@ -16,7 +16,7 @@ from ksim_rl.device.capture import WarpGraphs
 from ksim_rl.device.kernel_loading import loaded_together
 from ksim_rl.device.memory import memory_for
 from ksim_rl.device.state_tree import copy_into
-from ksim_rl.device.streams import checked_device, warp_scope
+from ksim_rl.device.streams import checked_device, warp_scope, warp_stream
 from ksim_rl.physics import capacity, kernels, upstream, views
 from ksim_rl.physics.contacts import follow_the_c_engine
 from ksim_rl.physics.fields import FIXED, GRAVITY, INERT0, const_groups, derived_fields, fields_to_expand
@@ -115,12 +115,15 @@ class World(views.DataViews):
             self.one_kernel_integration_unavailable = one_kernel_integration_unavailable(
                 self.warp_model, dynamics_unavailable=self.one_kernel_dynamics_unavailable
             )
+            # One of torch's, since Warp's own wait for the default stream, which no capture allows.
+            aside = None if self.device.type == "cpu" else warp_stream(torch.cuda.Stream(self.device))
             self._substeps = Substeps(
                 *models,
                 one_kernel_solver=self.has_one_kernel_solver,
                 one_kernel_dynamics=self.one_kernel_dynamics_unavailable is None,
                 one_kernel_rows=self.one_kernel_rows_unavailable is None,
                 one_kernel_integration=self.one_kernel_integration_unavailable is None,
+                aside=aside,
             )
             self._masked_constants = self._prepare_constants(expanded)
         self._reset_mask_E = wp.to_torch(self._reset_mask)

@@ -38,6 +38,28 @@ def test_captured_physics_and_torch_equal_eager_ones():
 
 
 @pytest.mark.gpu
+def test_what_runs_beside_the_rest_of_a_substep_changes_no_bit():
+    both, alone = (standing_quadrupeds(512, device="cuda") for _ in range(2))
+    assert both.one_kernel_rows_unavailable is None
+    alone._substeps._aside = None
+    graphs = []
+    for world in (both, alone):
+        world.qvel_EL[:, 6:].add_(torch.linspace(-2.0, 2.0, 512, device="cuda")[:, None])
+
+        def body(world=world) -> None:
+            world.step(4, sensors="every")
+            world.refresh()
+
+        graphs.append(Captured(body, device="cuda", require_graphs=True))
+    for _ in range(25):
+        for graph in graphs:
+            graph()
+        for name in ("qpos", "qvel", "qacc", "sensordata", "xpos", "geom_xpos", "cvel", "overflow"):
+            assert torch.equal(both.last_substep(name), alone.last_substep(name)), name
+    assert all(graph.ready for graph in graphs) and both.last_substep("nacon").item() > 512
+
+
+@pytest.mark.gpu
 def test_a_replay_does_not_sync_and_counts_as_one_call():
     world = standing_quadrupeds(16, device="cuda")
     count = torch.zeros((), dtype=torch.int64, device="cuda")

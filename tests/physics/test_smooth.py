@@ -108,7 +108,7 @@ def moved(model: mujoco.MjModel | None = None, **kwargs) -> World:
 
 def launch(world: World) -> None:
     with wp.ScopedDevice("cpu"):
-        stages.smooth_dynamics(world.warp_model, world.warp_data_E)(True)
+        stages.smooth_dynamics(world.warp_model, world.warp_data_E)()
 
 
 def in_c(world: World, mj_model: mujoco.MjModel, row: int) -> mujoco.MjData:
@@ -154,6 +154,25 @@ def test_all_it_computes_is_as_in_the_c_engine():
     launch(world)
     for row in range(NUM_ENVS):
         check_row(world, in_c(world, mixed(), row), row)
+
+
+def test_its_halves_beside_collisions_compute_what_the_whole_does():
+    whole, halves = moved(), moved()
+    for world in (whole, halves):
+        for name in (*WRITTEN, *GEOMS):
+            world.last_substep(name).fill_(7.0)
+    launch(whole)
+    with wp.ScopedDevice("cpu"):
+        dynamics = stages.smooth_dynamics(halves.warp_model, halves.warp_data_E)
+        dynamics(goes_on=False)
+        assert all((halves.last_substep(name) == 7.0).all() for name in WRITTEN)
+        for name in GEOMS:
+            assert torch.equal(halves.last_substep(name), whole.last_substep(name)), name
+            halves.last_substep(name).fill_(7.0)
+        dynamics(places_geoms=False)
+    assert all((halves.last_substep(name) == 7.0).all() for name in GEOMS)
+    for name in WRITTEN:
+        assert torch.equal(halves.last_substep(name), whole.last_substep(name)), name
 
 
 def test_refresh_leaves_what_belongs_to_the_last_substep():

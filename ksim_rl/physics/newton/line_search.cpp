@@ -138,7 +138,7 @@ auto search_line = [&](float slope, float half_curvature, float enough, float no
     for (int trial = -1; rows > 0; ++trial) {
         if (trial == MOST_TRIALS) {
             if (lane == 0)
-                problem.overflow.data[world] |= OUT_OF_LS_ITERATIONS;
+                wp::atomic_or(problem.overflow.data + world, OUT_OF_LS_ITERATIONS);
             break;
         }
         if (trial >= 0) {

@@ -62,7 +62,7 @@ UNROLL
         break;
     if (iteration == problem.iterations) {
         if (lane == 0)
-            problem.overflow.data[world] |= OUT_OF_ITERATIONS;
+            wp::atomic_or(problem.overflow.data + world, OUT_OF_ITERATIONS);
         break;
     }
     back_substitute();

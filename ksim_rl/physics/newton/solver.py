@@ -1,11 +1,13 @@
 """This module chooses the constraint solver of a world, and launches the one that is a single kernel."""
 
 from collections.abc import Callable
+from functools import partial
 
 import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
+from ksim_rl.device.streams import beside
 from ksim_rl.physics.contact_sensors import ContactReadings
 from ksim_rl.physics.newton.kernel import (
     CUDA_LANES,
@@ -72,8 +74,10 @@ def solver(
     *,
     rows_on_chip: int | None = None,
     broken: wp.array | None = None,
-) -> Callable[[], None]:
+) -> Callable[..., None]:
     """Return what launches the solver: accelerations and forces from the constraint rows, which must be sparse.
+
+    On CUDA it orders the worlds before: with `solves=False` it does that alone, with `orders=False` it does not.
 
     Args:
         warp_model, warp_data_E: a model that is not `unsuited`, and its worlds, with arrays in their final place.
@@ -100,10 +104,11 @@ def solver(
         m, d, own, elliptic=elliptic, lanes=lanes, rows_on_chip=rows_on_chip, checked=broken is not None
     )
 
-    def launch() -> None:
-        if on_cuda:
+    def launch(*, orders: bool = True, solves: bool = True) -> None:
+        if orders and on_cuda:
             put_longest_first(own["order"], d)
-        solve()
+        if solves:
+            solve()
 
     return launch
 
@@ -111,47 +116,56 @@ def solver(
 def step(
     warp_model: mjw.Model,
     warp_data_E: mjw.Data,
-    solve: Callable[[], None],
-    dynamics: Callable[[bool], None] | None = None,
+    solve: Callable[..., None],
+    dynamics: Callable[..., None] | None = None,
     make_rows: Callable[[], None] | None = None,
     contacts: ContactReadings | None = None,
     integrate: Callable[[], None] | None = None,
+    aside: wp.Stream | None = None,
     *,
     sensors: bool,
 ) -> None:
     """Launch a physics step: that of MuJoCo Warp, with this solver.
 
     The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
-    not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel,
-    with forces or without; `make_rows`, which needs it, the constraint rows as one, with the lists of contacts that
-    `contacts` reads; and `integrate` what advances the state.
+    not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel; `make_rows`,
+    which needs it, the constraint rows as one, with the lists of contacts that `contacts` reads; and `integrate` what
+    advances the state. On a stream `aside`, dynamics go on beside the collision pass, which reads where geoms are, and
+    the solver orders the worlds, by the last substep. Then it solves beside the sensors of positions and velocities.
     """
     m, d = warp_model, warp_data_E
+    if dynamics is None or m.callback.sensor:
+        aside = None
     if dynamics is None:
         mjw.fwd_position(m, d, factorize=False)
         mjw.fwd_velocity(m, d)
         if contacts is not None:
             contacts.list()
     else:
-        dynamics(True)
-        if sensors:
-            mjw.camlight(m, d)
-        if m.opt.run_collision_detection:
-            mjw.collision(m, d)
+        dynamics(goes_on=False)
+        with beside(aside, partial(dynamics, places_geoms=False), partial(solve, solves=False)):
+            if m.opt.run_collision_detection:
+                mjw.collision(m, d)
         if make_rows is None:
             mjw.make_constraint(m, d)
         else:
             make_rows()
-    if sensors:
-        d.sensordata.zero_()
-        mjw.sensor_pos(m, d)
-        mjw.sensor_vel(m, d)
-    if dynamics is None:
-        if m.callback.control and not m.opt.disableflags & mjw.DisableBit.ACTUATION:
-            m.callback.control(m, d)
-        mjw.fwd_actuation(m, d)
-        mjw.fwd_acceleration(m, d, factorize=True)
-    solve()
+
+    def act_and_solve() -> None:
+        if dynamics is None:
+            if m.callback.control and not m.opt.disableflags & mjw.DisableBit.ACTUATION:
+                m.callback.control(m, d)
+            mjw.fwd_actuation(m, d)
+            mjw.fwd_acceleration(m, d, factorize=True)
+        solve(orders=dynamics is None)
+
+    with beside(aside if sensors else None, act_and_solve):
+        if sensors:
+            if dynamics is not None:
+                mjw.camlight(m, d)
+            d.sensordata.zero_()
+            mjw.sensor_pos(m, d)
+            mjw.sensor_vel(m, d)
     runs_rne = m.opt.run_rne_postconstraint or (sensors and m.sensor_rne_postconstraint)
     if runs_rne and contacts is not None:
         contacts.rne_postconstraint(m)

@@ -61,6 +61,20 @@ each(NUM_CHAINS, [&](int chain) {
     }
 });
 sync();
+// Geoms of the world stay where make_data has put them.
+auto geom_of = [&](int item) { return look_up(problem.moving_geoms, item); };
+if (problem.places_geoms) {
+    compute_row(problem.geom_xpos, NUM_MOVING_GEOMS, geom_of, [&](int item) {
+        const int geom = geom_of(item), body = look_up(problem.geom_bodyid, geom);
+        return position(body) + rotate(model_row(problem.geom_pos)[geom], turn(body));
+    });
+    compute_row(problem.geom_xmat, NUM_MOVING_GEOMS, geom_of, [&](int item) {
+        const int geom = geom_of(item), body = look_up(problem.geom_bodyid, geom);
+        return matrix(product(turn(body), model_row(problem.geom_quat)[geom]));
+    });
+}
+if (!problem.goes_on)
+    return;
 each(NUM_BODIES, [&](int body) {
     center(body) = position(body) + rotate(model_row(problem.body_ipos)[body], turn(body));
 });
@@ -76,16 +90,6 @@ auto inertial_frame = [&](int body) {
 };
 compute_row(problem.xmat, NUM_BODIES, itself, [&](int body) { return matrix(turn(body)); });
 compute_row(problem.ximat, NUM_BODIES, itself, inertial_frame);
-// Geoms of the world stay where make_data has put them.
-auto geom_of = [&](int item) { return look_up(problem.moving_geoms, item); };
-compute_row(problem.geom_xpos, NUM_MOVING_GEOMS, geom_of, [&](int item) {
-    const int geom = geom_of(item), body = look_up(problem.geom_bodyid, geom);
-    return position(body) + rotate(model_row(problem.geom_pos)[geom], turn(body));
-});
-compute_row(problem.geom_xmat, NUM_MOVING_GEOMS, geom_of, [&](int item) {
-    const int geom = geom_of(item), body = look_up(problem.geom_bodyid, geom);
-    return matrix(product(turn(body), model_row(problem.geom_quat)[geom]));
-});
 compute_row(problem.site_xpos, NUM_SITES, itself, [&](int site) {
     const int body = look_up(problem.site_bodyid, site);
     return position(body) + rotate(model_row(problem.site_pos)[site], turn(body));

@@ -9,6 +9,7 @@ Source of the algorithms: https://mujoco.readthedocs.io/en/stable/computation/in
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import mujoco
 import mujoco_warp as mjw
@@ -23,6 +24,8 @@ INTEGRATION = ("world", "derivative", "factorization", "free_bodies", "advance")
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
 LANES, CUDA_THREADS = (8, 16, 32), 32
+# Whether it writes where geoms are, goes on after that, and after the velocities to the inertia matrix and the forces.
+WHOLE = {"places_geoms": True, "goes_on": True, "forces_too": True}
 _ENUMS = {
     "FREE": mujoco.mjtJoint.mjJNT_FREE,
     "BALL": mujoco.mjtJoint.mjJNT_BALL,
@@ -98,16 +101,17 @@ def one_kernel_integration_unavailable(
 
 def smooth_dynamics(
     warp_model: mjw.Model, warp_data_E: mjw.Data, *, lanes: int | None = None
-) -> Callable[[bool], None]:
+) -> Callable[..., None]:
     """Return what launches the smooth dynamics of a model that is not `unsuited`, with arrays in their final place.
 
-    Called with True, it computes all that MuJoCo Warp's `fwd_position`, `fwd_velocity`, `fwd_actuation` and
-    `fwd_acceleration` do, but for cameras, lights, contacts, constraint rows and `qacc_smooth`; with False, of these
-    what positions and velocities alone decide. `lanes` is how many threads share a world on CUDA; None takes the
+    It computes what MuJoCo Warp's `fwd_position`, `fwd_velocity`, `fwd_actuation` and `fwd_acceleration` do, but for
+    cameras, lights, contacts, constraint rows and `qacc_smooth`. With `forces_too=False` it computes of these what
+    positions and velocities alone decide; with `goes_on=False` only what collisions need, `geom_xpos` and `geom_xmat`;
+    and with `places_geoms=False` all but these two. `lanes` is how many threads share a world on CUDA; None takes the
     fewest that fit.
     """
     launch = _launcher(SMOOTH, warp_model, warp_data_E, lanes)
-    return lambda forces_too: launch(forces_too=forces_too)
+    return partial(launch, **WHOLE)
 
 
 def integration(
@@ -137,9 +141,7 @@ def _launcher(
         "eliminated": _eliminated(m),
         "leaves": _leaves(m),
     }
-    # Whether it goes on after the velocities, to the inertia matrix and the forces.
-    own = {"forces_too": True}
-    own |= {name: wp.array(table, dtype=int, device=device) for name, table in tables.items()}
+    own = WHOLE | {name: wp.array(table, dtype=int, device=device) for name, table in tables.items()}
     constants = {**_ENUMS, **sizes, "floats": _floats(parts, sizes, lanes)}
     parents = ", ".join(map(str, m.body_parentid.numpy()))
     source = f"constexpr int PARENTS[] = {{{parents}}};\n" + native.source_of("smooth", parts)
