@@ -27,13 +27,7 @@ class RslRlVecEnv(VecEnv):
     what the episodes that ended since then came to: per-term reward sums, metrics and shares of each termination.
     """
 
-    def __init__(
-        self,
-        env: EnvBase,
-        *,
-        keys: Keys = None,
-        log_interval: int = 24,
-    ) -> None:
+    def __init__(self, env: EnvBase, *, keys: Keys = None, log_interval: int = 24) -> None:
         base_env = part(env, ManagerBasedRlEnv)
         if base_env is None:
             raise ValueError(

@@ -33,13 +33,7 @@ class StableBaselines3VecEnv(VecEnv):
     `action_limit` bounds actions without bounds in the env's spec, since stable-baselines3 wants finite ones.
     """
 
-    def __init__(
-        self,
-        env: EnvBase,
-        *,
-        keys: Keys = None,
-        action_limit: float = 1.0,
-    ) -> None:
+    def __init__(self, env: EnvBase, *, keys: Keys = None, action_limit: float = 1.0) -> None:
         check_in_range("action_limit", action_limit, low=0.0, low_open=True)
         self.env, self._stepper = env, Stepper(env, keys)
         self.render_mode = self._stepper.render_mode

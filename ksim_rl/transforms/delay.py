@@ -12,13 +12,7 @@ from ksim_rl.checked import Checked, Share, WholeNumber
 from ksim_rl.device import random
 from ksim_rl.transforms import ring
 from ksim_rl.transforms.history import RingTransform
-from ksim_rl.transforms.row_transform import (
-    FollowsLevel,
-    KeyedTransform,
-    Keys,
-    RowTransform,
-    checked_action,
-)
+from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, Keys, RowTransform, checked_action
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,10 +7,7 @@ from torch import Tensor
 
 from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator
 
-_ARGUMENTS = arguments_of(
-    (int, "rows"),
-    (wp.uint64, "mask reward total step total_out step_out"),
-)
+_ARGUMENTS = arguments_of((int, "rows"), (wp.uint64, "mask reward total step total_out step_out"))
 # Parameters are what the CPU's compiler believes not to overlap, so that loops become vector instructions.
 _quick_tally = QuickLaunch(
     _ARGUMENTS,

@@ -24,11 +24,6 @@ class FastSACCfg(SACCfg):
 
 ACTOR = SquashedActorCfg(hidden_dims=(512, 256, 128), activation="silu", layer_norm=True, log_std_max=0.0)
 CRITIC = QNetworkCfg(
-    hidden_dims=(768, 384, 192),
-    activation="silu",
-    layer_norm=True,
-    num_atoms=101,
-    v_min=-20.0,
-    v_max=20.0,
+    hidden_dims=(768, 384, 192), activation="silu", layer_norm=True, num_atoms=101, v_min=-20.0, v_max=20.0
 )
 FAST_SAC = off_policy_algorithm("fast_sac", FastSACCfg, data=MANY_ENVS, actor=ACTOR, critic=CRITIC)

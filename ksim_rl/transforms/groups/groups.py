@@ -12,15 +12,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from ksim_rl import checks
 from ksim_rl.transforms.columns import side_by_side
 from ksim_rl.transforms.row_transform import CheckedKeys, as_keys
-from ksim_rl.transforms.specs import (
-    Device,
-    bounded,
-    bounds,
-    drop_leaf,
-    leaf_spec,
-    set_leaf_spec,
-    spell,
-)
+from ksim_rl.transforms.specs import Device, bounded, bounds, drop_leaf, leaf_spec, set_leaf_spec, spell
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,13 +14,7 @@ from ksim_rl.transforms.columns import side_by_side, split
 from ksim_rl.transforms.noise import kernel as noise_kernel
 from ksim_rl.transforms.noise.cfg import NoiseCfg, per_dim
 from ksim_rl.transforms.noise.kernel import HAS_BIAS, HAS_DROPOUT, HAS_WALK, NoiseState, add_noise
-from ksim_rl.transforms.row_transform import (
-    FollowsLevel,
-    KeyedTransform,
-    Keys,
-    RowTransform,
-    one_per_key,
-)
+from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, Keys, RowTransform, one_per_key
 from ksim_rl.transforms.specs import Device, add_bounds, bounded, bounds, multiply_bounds
 
 
