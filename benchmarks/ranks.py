@@ -6,7 +6,8 @@ trains `TASKS` on one GPU and on all (or `ranks=N`), as torchrun does it, with a
 iterations in ms and env states/s of both, their ratio, and the host's waits and copies in one iteration of rank 0;
 then the seconds until all ranks have ended after one was killed (`kill=no` leaves it out); and the seconds until Go1
 follows its command on one GPU (one seed on each at a time) and on all, the median of `seeds` (1,2,3,4,5; none with
-`seeds=none`), without the first iteration. With `tasks=go1_velocity_flat:4096` others are chosen (none with
+`seeds=none`), without the first iteration; there the env states per update are the same on all as on one, with shorter
+rollouts. With `tasks=go1_velocity_flat:4096` others are chosen (none with
 `tasks=none`), and `device=cpu` tries it out.
 
 Figures go to benchmarks/results/ranks.json after each part, so that those of a part stay where a later one has no time
@@ -50,6 +51,7 @@ OPTIONS = {
 LEVELS = load("velocity").rows["ppo/go1"].levels
 # Each switches off what would use NVLink multicast, which not every machine allows.
 NCCL = {"NCCL_NVLS_ENABLE": "0", "TORCH_SYMM_MEM_DISABLE_MULTICAST": "1", "NVSHMEM_DISABLE_NVLS": "1"}
+ROLLOUT_LENGTH = 24
 WARMUP, TIMED = {"cuda": 12, "cpu": 1}, {"cuda": 20, "cpu": 2}
 
 
@@ -140,8 +142,10 @@ def learner(device: str, env_states: str, seeds: str) -> None:
 
 def seconds_to_track(seed: str, *, env_states: float, device: str) -> float:
     """Train Go1 until it follows its command, and return the seconds without the first iteration; else infinity."""
-    iterations = max(2, int(env_states / (4096 * 24 * ranks.size())))
+    iterations = max(2, int(env_states / (4096 * ROLLOUT_LENGTH)))
+    # As many env states per update on any number of ranks: twice as many do not halve the updates that learning takes.
     run = ["task=go1_velocity_flat", f"device={device}", "num_envs=4096", f"seed={seed}", "logger=none"]
+    run += [f"collector.rollout_length={ROLLOUT_LENGTH // ranks.size()}"]
     run += [f"trainer.num_iterations={iterations}", "trainer.eval_episodes=0"]
     levels = ", ".join(f"{metric}: {value}" for metric, value in LEVELS.items())
     trainer = build(conf.compose([*run, f"trainer.stop_at={{{levels}}}"]))
