@@ -1,7 +1,9 @@
 """This module collects rollouts of fixed length from all envs, as one CUDA graph where there is CUDA."""
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -14,6 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ksim_rl import dims
 from ksim_rl.checked import Checked, Count
 from ksim_rl.checks import check_count
+from ksim_rl.collectors.compiled_step import CompiledStep
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.envs.contract import EpisodeClock, part
@@ -26,17 +29,20 @@ class CollectorCfg(Checked):
     """Options of `RolloutCollector` that a config may set.
 
     `require_graphs` fails where CUDA graphs are unavailable, instead of running slower with a warning.
+    `compile` compiles the env's step on CUDA, for fewer kernels; without, only its physics are.
     `stagger_episodes` spreads the time-outs of the envs over an episode's length at the first reset, where the env
     offers it. The first `warmup` rollouts on CUDA run eagerly. In the config of a run, `rollout_length` may be given
     instead of the dataset's size, which then follows from it and the number of envs.
     """
 
     require_graphs: bool = False
+    compile: bool = True
     stagger_episodes: bool = False
     warmup: Count = 2
     rollout_length: Count | None = None
 
 
+_exploring = partial(set_exploration_type, ExplorationType.RANDOM)
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
@@ -77,6 +83,7 @@ class RolloutCollector:
         self._storage_TE: TensorDict | None = None
         self._leaves_by_dtype: list[list[tuple[NestedKey, Tensor]]] = []
         device = env.device or torch.device("cpu")
+        self._compiles, self._compiled = cfg.compile and device.type == "cuda", None
         self._run = Captured(
             self._rollout, device=device, warmup=cfg.warmup, require_graphs=cfg.require_graphs
         )
@@ -84,13 +91,33 @@ class RolloutCollector:
     @torch.no_grad()
     def collect(self) -> TensorDict:
         """Run T steps and return the rollout, `["E","T"]`, whose memory the next call overwrites."""
-        if self._root is None:
-            self.reset()
+        self.warm_up()
         self._run()
         if isinstance(self.env, MaskedReset):
             # The env's own reference points into the graph's memory, which the next replay overwrites.
             self.env.last_root = self._root
         return self._stored_rollout()
+
+    @torch.no_grad()
+    def warm_up(self) -> None:
+        """Compile the env's step, if that has not been done and is wanted; env and draws are left as they were."""
+        if self._root is None:
+            self.reset()
+        if not self._compiles or self._compiled is not None:
+            return
+        assert self._root is not None
+        device = self._run.device
+        with torch.random.fork_rng([device] if device.type == "cuda" else []), _exploring():
+            tensordict = self.policy(self._root.copy())
+            try:
+                self._compiled = CompiledStep(self.env, self._root, tensordict)
+            except RuntimeError as error:
+                self._compiles = False
+                warnings.warn(
+                    f"THE ENV'S STEP IS NOT COMPILED, and slower: {error}", RuntimeWarning, stacklevel=2
+                )
+                return
+        self._allocate(self._compiled.env_state_E)
 
     @torch.no_grad()
     def made_up_rollout(self) -> TensorDict:
@@ -144,7 +171,13 @@ class RolloutCollector:
         assert self._root is not None
         root_keys = list(self._root.keys(True, True))
         root_E = self._root.copy()
-        with set_exploration_type(ExplorationType.RANDOM):
+        with _exploring():
+            if self._compiled is not None:
+                for t in range(self.rollout_length):
+                    env_state_E = self.policy(self._root.copy())
+                    self._store(t, env_state_E)  # before the step writes its root over this one
+                    self._store(t, self._compiled(env_state_E))
+                return
             for t in range(self.rollout_length):
                 env_state_E, root_E = self.env.step_and_maybe_reset(self.policy(root_E))
                 self._store(t, env_state_E)
@@ -156,7 +189,8 @@ class RolloutCollector:
         if self._storage_TE is None:
             self._allocate(env_state_E)
         for leaves in self._leaves_by_dtype:
-            pairs = [(leaf_TE[t], env_state_E.get(key)) for key, leaf_TE in leaves]
+            held = [(leaf_TE[t], env_state_E.get(key, None)) for key, leaf_TE in leaves]
+            pairs = [(kept, value) for kept, value in held if value is not None]
             # One kernel for all that lie in one piece; a column of something wider needs its own.
             whole = [pair for pair in pairs if pair[1].is_contiguous()]
             if whole:

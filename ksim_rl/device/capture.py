@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 import torch
 import warp as wp
 
+from ksim_rl.device import tape
 from ksim_rl.device.streams import checked_device, warp_device, warp_scope, warp_stream
 
 
@@ -193,6 +194,8 @@ class WarpGraphs:
 
     def run(self, key: Hashable, launches: Callable[[], None]) -> None:
         """Run `launches`, in order with torch's current stream. `key` names what it does."""
+        if tape.launched(lambda: self.run(key, launches)):
+            return
         with warp_scope(self.device):
             replays = _phase.warming_up and key in self._graphs
             if not self._available or (_wants_live_launches(self.device) and not replays):

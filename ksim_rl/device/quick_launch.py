@@ -15,7 +15,7 @@ import warp as wp
 from jaxtyping import Shaped
 from torch import Tensor
 
-from ksim_rl.device import upstream
+from ksim_rl.device import tape, upstream
 from ksim_rl.device.streams import CPU_LOCK, current_warp_stream, warp_scope
 
 MAX_RECORDED = 64
@@ -62,6 +62,7 @@ class QuickLaunch:
         """Launch with one value per field of the struct, in their order; do nothing for a dim of 0."""
         if 0 in dim:
             return
+        assert not tape.is_recording(), "a kernel that is no operator of torch cannot be recorded"
         if device.type == "cpu":
             lock, stream = CPU_LOCK, None
         else:
@@ -96,7 +97,8 @@ def as_operator(
     operator.register_fake(fake)
 
     def run(*arguments: object) -> Any:
-        return (operator if torch.compiler.is_compiling() else launch)(*arguments)
+        is_traced = torch.compiler.is_compiling() or tape.is_recording()
+        return (operator if is_traced else launch)(*arguments)
 
     return run
 

@@ -7,7 +7,7 @@ import warp as wp
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of
+from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator
 
 _NEVER = 2**62
 
@@ -35,6 +35,15 @@ _quick = QuickLaunch(
 )
 
 
+def _count_now(table_EL: Tensor, term_L: Tensor, step: Tensor, first_N: Tensor, count_N: Tensor) -> None:
+    num_rows, width = table_EL.shape
+    tensors = table_EL, term_L, step, first_N, count_N
+    _quick(table_EL.device, (num_rows, width), width, num_rows, *map(address, tensors))
+
+
+_count = as_operator("count_non_finite", _count_now, lambda *_: None, mutates=("first_N", "count_N"))
+
+
 class NonFiniteTerms:
     """Counts, on the device and without a sync, the numbers that are not finite by the term that gave them."""
 
@@ -59,18 +68,13 @@ class NonFiniteTerms:
             return
         if table_EL.dtype != torch.float32 or not table_EL.is_contiguous():
             table_EL = table_EL.float().contiguous()
-        num_rows, width = table_EL.shape
-        _quick(
-            self._device, (num_rows, width), width, self._num_envs, table_EL.data_ptr(), *self._addresses[key]
-        )
+        _count(table_EL, self._columns[key], self._step, self._first_N, self._count_N)
 
     def start(self) -> None:
         """Count from here: what terms give while an env is constructed is of no state that anybody sees."""
         self._is_learning = False
         self._count_N = self._count_N.new_zeros(len(self._names))
         self._first_N = torch.full_like(self._count_N, _NEVER)
-        rest = self._step, self._first_N, self._count_N
-        self._addresses = {key: tuple(map(address, (own, *rest))) for key, own in self._columns.items()}
 
     def num_terms(self) -> Float[Tensor, ""]:
         """Return how many terms have given such a number so far, on the device."""

@@ -69,10 +69,12 @@ def build(
         folder=run_folder / "checkpoint" if run_folder else None,
         config=cfg.to_tree(),
     )
-    if cfg.trainer.warm_up and isinstance(update, HasWarmUp):
+    if cfg.trainer.warm_up:
         # Before anything is loaded: a replay need not be kept apart meanwhile.
         began = time.monotonic()
-        update.warm_up(collector.made_up_rollout())
+        collector.warm_up()
+        if isinstance(update, HasWarmUp):
+            update.warm_up(collector.made_up_rollout())
         trainer.warm_up_s = time.monotonic() - began
     if resume_from is not None:
         trainer.load_state_dict(resume_from.state)

@@ -8,7 +8,7 @@ import warp as wp
 from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import QuickLaunch, address
+from ksim_rl.device.quick_launch import QuickLaunch, address, as_operator
 from ksim_rl.device.random import DRAWS, RowKeys
 
 
@@ -76,9 +76,29 @@ def draw_entries(
     The table has the low and the high ends (means, deviations) and places of the columns, the rows of the elements,
     the model's own values, and how much the follower has of each.
     """
+    *numbers, cut = layout
+    own = list(map(int, numbers)), cut, keys.stream, keys.first_row
+    _draw(field_ENC, mask_E, keys.seed, keys.counter, table_L, follower_ENF, *own)
+
+
+def _draw_now(
+    field_ENC: Tensor,
+    mask_E: Tensor | None,
+    seed: Tensor,
+    counter: Tensor,
+    table_L: Tensor,
+    follower_ENF: Tensor | None,
+    numbers: list[int],
+    cut: float,
+    stream: int,
+    first_row: int,
+) -> None:
     lanes = 32 if field_ENC.is_cuda else 1
     mask_E = None if mask_E is None else mask_E.contiguous()
     followers = 0 if follower_ENF is None else follower_ENF.shape[-1]
-    where = lanes, *field_ENC.stride()[:2], followers, keys.counter.ndim, keys.first_row, keys.stream
-    tensors = keys.seed, keys.counter.contiguous(), mask_E, table_L, field_ENC, follower_ENF
-    _quick(field_ENC.device, (field_ENC.shape[0], lanes), *layout, *where, *map(address, tensors))
+    where = lanes, *field_ENC.stride()[:2], followers, counter.ndim, first_row, stream
+    tensors = seed, counter.contiguous(), mask_E, table_L, field_ENC, follower_ENF
+    _quick(field_ENC.device, (field_ENC.shape[0], lanes), *numbers, cut, *where, *map(address, tensors))
+
+
+_draw = as_operator("draw_entries", _draw_now, lambda *_: None, mutates=("field_ENC", "follower_ENF"))
