@@ -269,8 +269,8 @@ def _attach(path: Path, meta: dict[str, Any]) -> None:
     import onnx  # an extra
 
     model = onnx.load(path, load_external_data=False)
-    for part in (*model.graph.node, *model.graph.value_info):
-        part.ClearField("metadata_props")  # what the exporter notes for itself, 20 kB
+    for written in (*model.graph.node, *model.graph.value_info):
+        written.ClearField("metadata_props")  # what the exporter notes for itself, 20 kB
     keys = (
         "run_path",
         "joint_names",
