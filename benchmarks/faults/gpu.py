@@ -21,10 +21,14 @@ from ksim_rl.trainers import Hook, RunProgress, Trainer, run_folder
 from ksim_rl.trainers.build import build_env
 
 GO1 = ("task=go1_velocity_flat", "device=cuda", "trainer.eval_episodes=0", "trainer.video=false")
+# Envs that are asked for, and settings. Half of them (with PPO and SAC) or an eighth leave a good tenth of the memory,
+# so that one number is tried: each takes a process, which spends most of its time before it trains.
 ALGORITHMS = {
-    "ppo": ("collector.rollout_length=24",),
-    "sac": ("data.capacity=256",),  # with the steps of a run's replay, hardly an env would fit
-    "fast_sac": ("objective.compile=false",),  # which takes a minute each time
+    "ppo": (49152, "collector.rollout_length=24"),
+    "sac": (40960, "data.capacity=256"),  # with the steps of a run's replay, hardly an env would fit
+    # Its own replay of 1024 steps is nine tenths of what an env takes. The batches of 48 gradient steps would take
+    # gigabytes beside it, however few the envs are, and compiling takes a minute each time.
+    "fast_sac": (61440, "objective.compile=false", "data.num_minibatches=4"),
 }
 ROOM = 8 * 2**30
 # What "flat" allows while a run of minutes goes on, in bytes.
@@ -75,24 +79,25 @@ def gpu_soak(folder: Path, *, seconds: int) -> Figures:
 def gpu_memory(folder: Path) -> Figures:
     """Ask for more envs than fit, with three algorithms; then train with the number that the message names."""
     told = ran = 0
-    for name, own in ALGORITHMS.items():
+    for name, (asked, *own) in ALGORITHMS.items():
         overrides = [*GO1, f"objective={name}", "logger=none", "trainer.num_iterations=10", *own]
         # A GPU of 8 GB, so that what fits is soon trained.
         taken = torch.empty(max(0, torch.cuda.mem_get_info()[0] - ROOM), dtype=torch.uint8, device="cuda")
-        fits = None
+        fits, began = None, time.monotonic()
         try:
-            cfg = conf.compose([*overrides, f"num_envs={2**16}"])
+            cfg = conf.compose([*overrides, f"num_envs={asked}"])
             run_folder.run(cfg, folder / name, progress=RunProgress(1, enabled=False))
         except ValueError as error:
             fits = re.search(r"num_envs=([0-9]+) was tried and fits", str(error))
             told += "one env takes at least" in str(error) and "\n" not in str(error) and fits is not None
-            print(f"{name}: {error}", flush=True)
+            print(f"{name}, after {time.monotonic() - began:.0f} s: {error}", flush=True)
         gc.collect()
         torch.cuda.empty_cache()
         if fits is not None:
             cfg = conf.compose([*overrides, f"num_envs={fits[1]}"])
             run_folder.run(cfg, folder / f"{name}_fits", progress=RunProgress(1, enabled=False))
             ran += 1
+            print(f"{name}: num_envs={fits[1]} has run after {time.monotonic() - began:.0f} s", flush=True)
         del taken
         gc.collect()
         torch.cuda.empty_cache()

@@ -202,6 +202,9 @@ class ReplayStorage(SavedByStateDict, Storage):
         if missing:
             raise ValueError(f"the rollout lacks {missing}; it has {sorted(map(str, produced))}")
         kept_ET = rollout_ET.select(*(key for key in produced if key[0] != "next" or key in _LEAVES))
+        # Asked for as a whole first: a refusal then names what all of it takes, and not its first leaf.
+        row = sum(leaf[0, 0].nbytes for leaf in kept_ET.values(True, True))
+        torch.empty(self.max_size * row, dtype=torch.uint8, device=self.device)
         self.content = kept_ET.new_zeros(torch.Size([self.max_size]), device=self.device)
 
     def _head_index(self) -> Tensor:

@@ -149,6 +149,7 @@ class Captured:
     def _record(self, stream: torch.cuda.Stream) -> tuple[torch.cuda.CUDAGraph, wp.Graph]:
         warp_side = warp_stream(stream)
         torch.cuda.synchronize(self.device)
+        torch.cuda.empty_cache()  # what the eager calls took: a graph has a pool of its own, and would take it again
         graph = torch.cuda.CUDAGraph()
         with (
             no_collection(),

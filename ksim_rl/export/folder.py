@@ -269,6 +269,8 @@ def _attach(path: Path, meta: dict[str, Any]) -> None:
     import onnx  # an extra
 
     model = onnx.load(path, load_external_data=False)
+    for written in (*model.graph.node, *model.graph.value_info):
+        written.ClearField("metadata_props")  # what the exporter notes for itself, 20 kB
     keys = (
         "run_path",
         "joint_names",

@@ -183,13 +183,14 @@ class DistillationCfg(OnPolicyCfg, checkpoint_fields=("teacher",)):
     learns how actions scatter; "mse" is that of the actions that both take deterministically, without noise while the
     student collects, for teachers without a distribution or with another kind of it. `teacher_share` is the chance that
     the teacher acts instead of the student, in each env state of the first rollout; it decays from rollout to rollout
-    by a factor.
+    by a factor. With 0 a student that sees its own last action may drive it up without end before it has learned
+    anything, and a normalizer never forgets such numbers.
     """
 
     teacher: Annotated[str, Filled("name a run folder or a checkpoint, objective.teacher=RUN")] = ""
     loss: DistillationKind = "kl"
     num_epochs: Count = 2
-    teacher_share: Share = 0.0
+    teacher_share: Share = 1.0
     teacher_share_decay: Share = 0.95
 
 

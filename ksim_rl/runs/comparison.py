@@ -14,7 +14,7 @@ from ksim_rl.runs.listing import CONFIG, HEADS, METRICS, line, numbers, summariz
 from ksim_rl.runs.record import printable
 
 RETURN = ("evaluation/return_mean", "episode/return")
-# Title, the metrics of which the first that a run has is drawn, and over what.
+# Title, the metrics of which the first that all runs have a curve of is drawn, and over what.
 PANELS = (
     ("Return", RETURN, STEP),
     ("Return", RETURN, "seconds"),
@@ -61,12 +61,22 @@ def draw(folders: Sequence[Path], picture: Path) -> None:
     drawn = False
     for index, (title, metrics, over) in enumerate(PANELS):
         axes = figure.add_subplot(2, 2, index + 1)
+        # Returns of evaluations and of training are not the same, and one evaluation is no curve.
+        curved = (m for m in metrics if all(len(numbers(rows, m)) > 1 for rows in tables))
+        metric = next(curved, metrics[-1])
         for name, rows in zip(names(folders), tables, strict=True):
-            metric, values = _first([row for row in rows if numbers([row], over)], metrics)
             points = [row for row in rows if numbers([row], over) and numbers([row], metric)]
-            label = f"{printable(name)}: {metric}" if len(metrics) > 1 else printable(name)
-            axes.plot(numbers(points, over), values, label=label, linewidth=1.6)
+            axes.plot(numbers(points, over), numbers(points, metric), label=printable(name), linewidth=1.6)
             drawn |= bool(points)
+        if title == PANELS[-1][0]:
+            # Where iterations overlap, one that waited for a graph to be recorded makes the next one look short.
+            usual = [
+                sorted(speeds)[int(0.97 * (len(speeds) - 1))]
+                for rows in tables
+                if (speeds := numbers(rows, metric))
+            ]
+            axes.set_ylim(0.0, 1.2 * max(usual, default=1.0))
+        title += f": {metric}" if len(metrics) > 1 else ""
         curves.dress(axes, title, over="time (s)" if over == "seconds" else "env states")
         axes.legend(fontsize=8, frameon=False)
     if not drawn:

@@ -12,11 +12,17 @@ import sys
 from collections.abc import Callable, Iterable
 
 from ksim_rl.config import plugins
+from ksim_rl.data import ReplayCfg
 from ksim_rl.device.memory import free_bytes
 from ksim_rl.trainers.build import build
 from ksim_rl.trainers.run_cfg import PLUGINS, RunCfg
 
-PROGRAM = "import sys; from ksim_rl.trainers import trial; sys.exit(trial.main())"
+# One that hangs says where after ten minutes. Nothing is torn down at the end: the driver takes the memory back, and
+# behind a capture that broke the libraries' own way out may hang.
+PROGRAM = (
+    "import faulthandler, os; faulthandler.dump_traceback_later(600, exit=True); "
+    "from ksim_rl.trainers import trial; os._exit(trial.main())"
+)
 FITS, DOES_NOT = 0, 3  # exit codes
 ITERATIONS = 8  # the first ones run eagerly or fill a replay, the next ones record graphs
 SPARE = 0.1  # of the memory that was free
@@ -42,7 +48,9 @@ def first_that_fits(cfg: RunCfg, numbers: Iterable[int], *, note: Callable[[str]
         )
         if ended.returncode == FITS:
             return num_envs
-        note(f"num_envs={num_envs} does not train: {(ended.stderr.strip() or 'no reason').splitlines()[-1]}")
+        # Behind the exit without a teardown, helpers of Python still write to stderr.
+        said = ended.stdout if ended.returncode == DOES_NOT else ended.stderr
+        note(f"num_envs={num_envs} does not train: {(said.strip() or 'no reason').splitlines()[-1]}")
         if ended.returncode > 0 and ended.returncode != DOES_NOT:
             break  # the config cannot even be built there, and nobody knows whether memory suffices
     return None
@@ -53,6 +61,10 @@ def main() -> int:
     tree = json.load(sys.stdin)
     plugins.load(tree.get(PLUGINS, ()))
     cfg = RunCfg.from_tree(tree)
+    if isinstance(cfg.data, ReplayCfg):
+        # Three rollouts record the graph that only stores, the next three the one that learns.
+        soon = min(cfg.data.learning_starts, 3 * cfg.data.num_steps + 1)
+        cfg = dataclasses.replace(cfg, data=dataclasses.replace(cfg.data, learning_starts=soon))
     device = cfg.resolved_device()
     free = free_bytes(device)
     try:
@@ -60,10 +72,10 @@ def main() -> int:
         for _ in range(ITERATIONS):
             trainer.iterate()
     except (RuntimeError, ValueError) as error:  # where memory lacks, libraries have many words for it
-        print(" ".join(str(error).split()), file=sys.stderr)
+        print(" ".join(str(error).split()), flush=True)
         return DOES_NOT
     left = free_bytes(device)
     if free and left is not None and left < SPARE * free:
-        print(f"{left / 1e9:.2f} of {free / 1e9:.2f} GB are left, fewer than a tenth", file=sys.stderr)
+        print(f"{left / 1e9:.2f} of {free / 1e9:.2f} GB are left, fewer than a tenth", flush=True)
         return DOES_NOT
     return FITS

@@ -100,6 +100,16 @@ class DriftEnv(StateEnv):
         return {"actor": (nearest_E1 == INDEX).float(), "privileged": self.x_EL.clone()}
 
 
+class EchoEnv(DriftEnv):
+    """A point goes where the action says, and the student sees it twenty times as large: its own last action."""
+
+    def move(self, x_EL, action_EL):
+        return action_EL.clone()
+
+    def observe(self):
+        return {"actor": 20.0 * self.x_EL.expand(-1, len(BINS)), "privileged": self.x_EL.clone()}
+
+
 class PlaneEnv(StateEnv):
     """A point in the plane moves by its action, at most 1 along each axis; episodes begin on the unit circle."""
 
@@ -137,17 +147,26 @@ def linear_teacher(gain=-GAIN, *, key="privileged"):
     return Teacher(policy=actor.requires_grad_(False).eval())
 
 
-def make_distillation(folder=None, *, seed=0, iterations=6, teacher=None, num_envs=64, shards=1, cfg=None):
+def make_distillation(
+    folder=None,
+    *,
+    seed=0,
+    iterations=6,
+    teacher=None,
+    num_envs=64,
+    shards=1,
+    cfg=None,
+    student=None,
+    env=None,
+):
     torch.manual_seed(seed)
-    env = DriftEnv(num_envs)
+    env = (env or DriftEnv)(num_envs)
     env.set_seed(seed)
-    student = make_actor(
-        ActorCfg(hidden_dims=(), obs_normalization=False, init_std=0.5), obs_dim=len(BINS), action_dim=1
-    )
+    actor = student or ActorCfg(hidden_dims=(), obs_normalization=False, init_std=0.5)
     data = DatasetCfg(num_env_states_per_minibatch=2 * num_envs, num_minibatches=4, shards=shards)
     update = DistillationUpdate(
         DistillationCfg(**{"teacher": "toy", "learning_rate": 0.05, "num_epochs": 4, **(cfg or {})}),
-        actor=student,
+        actor=make_actor(actor, obs_dim=len(BINS), action_dim=1),
         teacher=teacher or linear_teacher(),
         data=data,
         seed=seed,

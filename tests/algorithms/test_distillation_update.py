@@ -22,11 +22,12 @@ from ksim_rl.trainers import (
 from tests.algorithms.imitation_problems import (
     GAIN,
     DriftEnv,
+    EchoEnv,
     linear_teacher,
     make_distillation,
 )
 
-BINNED = {"loss": "kl", "learning_rate": 0.05}
+BINNED = {"loss": "kl", "learning_rate": 0.05, "teacher_share": 0.0}
 
 
 def played(actor, steps=12):
@@ -81,6 +82,21 @@ def test_dagger_stays_on_the_road_that_behavior_cloning_drifts_off():
     assert off["visited"].max() < 0.15
     assert off["mixed"].max() < 0.15
     assert mixed.metrics["update/teacher_share"] == pytest.approx(0.8 * 0.7**12, rel=1e-5)
+
+
+def test_a_student_that_sees_its_own_last_action_does_not_drive_it_up_before_it_knows_anything():
+    student = ActorCfg(hidden_dims=(32,), output_gain=1.0)
+    trainer = make_distillation(
+        iterations=30,
+        cfg={"loss": "mse", "learning_rate": 1e-2},
+        student=student,
+        env=EchoEnv,
+        teacher=linear_teacher(-0.9),
+    )
+    trainer.train()
+    # The teacher's actions are of order 0.1; a normalizer that has seen 1e6 shows the student nothing.
+    assert trainer.update.actor[0].module.normalizer.var.max() < 100.0
+    assert trainer.metrics["update/action_error"] < 0.02
 
 
 @pytest.mark.parametrize("cfg", [BINNED, {"loss": "mse", "teacher_share": 0.5}], ids=["kl", "mse"])

@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from ksim_rl.data import MASK_KEY, ReplayCfg, ReplayRing, ReplayStorage
+from ksim_rl.device.memory import refused_bytes
 from ksim_rl.testing import count_syncs
 
 NUM_ENVS, CAPACITY, GAMMA = 3, 20, 0.9
@@ -78,6 +79,19 @@ def _storage(n_step=1, capacity=CAPACITY):
     return ReplayStorage(
         num_envs=NUM_ENVS, capacity=capacity, observations=["actor", "critic"], n_step=n_step, gamma=GAMMA
     )
+
+
+def test_a_refusal_names_what_the_whole_replay_takes():
+    """Else too many envs seem to fit: of Go1's 535 bytes per env state, the first leaf has 192."""
+    storage = _storage(capacity=2**20)
+    rollout = _History().rollout(1)
+    # Observations of 2^25 numbers without memory of their own: no machine has addresses for a ring of them.
+    for name in ("actor", "critic"):
+        for key in (name, ("next", name)):
+            rollout[key] = torch.zeros(1).expand(NUM_ENVS, 1, 2**25)
+    with pytest.raises(RuntimeError) as refused:
+        storage.write(rollout)
+    assert refused_bytes(refused.value) == storage.max_size * (2 * 2**25 * 4 + 4 + 4 + 1 + 1)
 
 
 @pytest.mark.parametrize("n_step", [1, 3])

@@ -1,6 +1,9 @@
 """Where memory does not suffice, the message says what an env takes and how many fit."""
 
 import gc
+import io
+import json
+import sys
 import weakref
 
 import mujoco_warp as mjw
@@ -8,6 +11,7 @@ import pytest
 import torch
 
 from ksim_rl import conf
+from ksim_rl.algorithms.off_policy.update import OffPolicyUpdate
 from ksim_rl.device import memory
 from ksim_rl.device.memory import TooManyEnvsError, memory_for, refused_bytes
 from ksim_rl.trainers import RunProgress, run_folder, trial
@@ -129,6 +133,18 @@ def test_a_run_whose_envs_do_not_fit_names_a_number_that_trained_elsewhere(tmp_p
     if fits == 8:
         assert "num_envs=16 does not train: 0.00 of 0.00 GB are left, fewer than a tenth" in said
     assert not (tmp_path / "run").exists()
+
+
+def test_a_trial_learns_thrice_however_late_the_run_does(monkeypatch):
+    """A third update records the graph: without it, what the learning takes was not tried."""
+    made = []
+    for name in ("_store", "_update"):
+        monkeypatch.setattr(OffPolicyUpdate, name, lambda self, name=name: made.append(name))
+    cfg = conf.compose(["objective=sac", "num_envs=4", "device=cpu", "trainer.eval_episodes=0"])
+    assert cfg.data.learning_starts == 100
+    monkeypatch.setattr(sys, "stdin", io.StringIO(json.dumps(cfg.to_tree())))
+    assert trial.main() == trial.FITS
+    assert made == ["_store"] * 3 + ["_update"] * 5
 
 
 @pytest.mark.full
