@@ -8,7 +8,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.device.tape import Compiler, Tape, by_inductor, recorded
+from ksim_rl.device.tape import Tape, recorded
 
 SHARE, TOLERANCE = 0.99, 1e-3
 
@@ -22,41 +22,36 @@ class CompiledStep:
     numbers of a leaf may differ by more than 0.1 %, as where rounding decides between two branches.
     """
 
-    def __init__(
-        self,
-        env: EnvBase,
-        root_E: TensorDictBase,
-        tensordict: TensorDictBase,
-        *,
-        compiler: Compiler = by_inductor,
-    ) -> None:
+    def __init__(self, env: EnvBase, root_E: TensorDictBase, tensordict: TensorDictBase) -> None:
         root_keys = list(root_E.keys(True, True))
         self._changing = [key for key in tensordict.keys(True, True) if key not in root_keys]
-        given = [tensordict.get(key) for key in self._changing]
+        self._given = [tensordict.get(key) for key in self._changing]
         before, root_before_E = env.state_dict(), root_E.clone()
         with recorded() as recorder:
             self.env_state_E, next_root_E = env.step_and_maybe_reset(tensordict.copy())
             for key in root_keys:
                 root_E.get(key).copy_(next_root_E.get(key))
-        self._next_keys = [key for key in self.env_state_E.keys(True, True) if key[0] == "next"]
-        returned = [self.env_state_E.get(key) for key in self._next_keys]
-        self._tape = Tape(recorder, given=given, returned=returned, compiler=compiler)
+        self._next_E = self.env_state_E.select("next")
+        returned = list(self._next_E.values(True, True))
+        self._tape = Tape(recorder, num_rows=env.batch_size[0], returned=returned)
         expected = _state(env, root_E, returned)
         env.load_state_dict(before)
         root_E.update_(root_before_E)
-        next_E = self(tensordict)
-        found = _state(env, root_E, [next_E.get(key) for key in self._next_keys])
+        self(tensordict)
+        found = _state(env, root_E, returned)
         env.load_state_dict(before)
         root_E.update_(root_before_E)
         _compare(found, expected)
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Make a step, and reset the rows that are done: return the EnvState's `next`, and write the next root."""
-        leaves = self._tape(*[tensordict.get(key) for key in self._changing])
-        next_E: Any = self.env_state_E.select("next")
-        for key, leaf in zip(self._next_keys, leaves, strict=True):
-            next_E.set(key, leaf)
-        return next_E
+        """Make a step, and reset the rows that are done: return the EnvState's `next`, and write the next root.
+
+        The leaves lie in the same memory each time.
+        """
+        new = [tensordict.get(key) for key in self._changing]
+        torch._foreach_copy_(self._given, new)
+        self._tape()
+        return self._next_E
 
 
 def _state(env: EnvBase, root_E: TensorDictBase, leaves: Sequence[Tensor]) -> dict[str, Tensor]:

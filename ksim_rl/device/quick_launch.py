@@ -43,7 +43,9 @@ class QuickLaunch:
     `indices` within the launch's dim. The kernel has no gradients.
     """
 
-    def __init__(self, arguments: type, source: str, indices: tuple[str, str] = ("row", "lane")) -> None:
+    def __init__(
+        self, arguments: type, source: str, indices: tuple[str, str] = ("row", "lane"), *, block_dim: int = 256
+    ) -> None:
         @wp.func_native(f"const int {indices[0]} = index_0, {indices[1]} = index_1;\n{source}")
         def run(index_0: int, index_1: int, a: arguments): ...  # type: ignore[valid-type]
 
@@ -52,7 +54,7 @@ class QuickLaunch:
             index_0, index_1 = wp.tid()
             run(index_0, index_1, a)
 
-        self._kernel, self._arguments = kernel, arguments
+        self._kernel, self._arguments, self._block_dim = kernel, arguments, block_dim
         self._recorded: dict[tuple[torch.device, tuple[int, int]], tuple[wp.Launch, ctypes.Structure]] = {}
         self._packer = struct.Struct("")
         # The bytes are shared by all launches until the driver, or the kernel on the CPU, has read them.
@@ -77,7 +79,12 @@ class QuickLaunch:
             self._recorded.clear()
         with warp_scope(device):
             launch = wp.launch(
-                self._kernel, dim, inputs=[self._arguments()], device=str(device), record_cmd=True
+                self._kernel,
+                dim,
+                inputs=[self._arguments()],
+                device=str(device),
+                record_cmd=True,
+                block_dim=self._block_dim,
             )
         packed = upstream.recorded_arguments(launch)
         self._packer = struct.Struct("@" + "".join(_CODES[field[1]] for field in packed._fields_))

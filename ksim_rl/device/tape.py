@@ -1,37 +1,34 @@
-"""This module compiles what torch computes between launches of Warp: code of any shape, once it has run.
+"""This module makes few kernels of what torch computes for the rows of a batch: code of any shape, once it has run.
 
 A run of a function is written down operation by operation, as torch dispatches them, with the launches of Warp in
-between. Each stretch without a launch becomes one compiled function, in which hundreds of small kernels are few; a
-replay calls these and issues the launches anew. Python is not run again, as in a replay of a CUDA graph, and what is
+between. Operations that keep to their row, one after the other, become one kernel with a thread per row, in C++ of
+`row_code`; what lives in one kernel only is in that thread's own memory. Other operations are run by torch as they
+were. A replay uses the memory of the recording and runs no Python of the function, as a CUDA graph does, and what is
 fit for that is fit for this.
 """
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from torch import Tensor, fx
-from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
-from torch.utils._pytree import tree_flatten, tree_map_only
+import warp as wp
+from jaxtyping import Shaped
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
-Compiler = Callable[[fx.GraphModule, list[Tensor]], Callable[..., Sequence[Tensor]]]
-
-
-def by_inductor(graph: fx.GraphModule, inputs: list[Tensor]) -> Callable[..., Sequence[Tensor]]:
-    """Compile a stretch by Inductor; random numbers stay those of torch's generators, and equal runs have equal bits."""
-    from torch import _inductor
-
-    return _inductor.compile(graph, inputs, options={"deterministic": True, "fallback_random": True})
-
-
-_HOST_READS = frozenset({"_local_scalar_dense", "item", "nonzero", "masked_select", "equal", "_unique2"})
+MOST_SHARED = 256
+"""Numbers without rows that each thread may work out for itself."""
+MOST_OPERATIONS = 200
+_HOST_READS = frozenset({"_local_scalar_dense", "equal", "item", "masked_select", "nonzero"})
+_COUNTS = frozenset({"count_non_finite"})  # all rows write to the same numbers, in an order that does not matter
 
 
 class _Recording(threading.local):
-    tape: "_Recorder | None" = None
+    recorder: "Recorder | None" = None
 
 
 _recording = _Recording()
@@ -39,98 +36,102 @@ _recording = _Recording()
 
 def is_recording() -> bool:
     """Whether this thread writes down what torch computes: then every kernel has to be an operator of torch."""
-    return _recording.tape is not None
+    return _recording.recorder is not None
 
 
 def launched(launch: Callable[[], None]) -> bool:
-    """Let a launch of Warp be part of the recording, and say so; without one, do nothing."""
-    recorder = _recording.tape
+    """Make a launch of Warp part of the recording, and say so; without a recording, do nothing."""
+    recorder = _recording.recorder
     if recorder is None:
         return False
-    with paused():
+    with recorder.paused():
         launch()
     recorder.entries.append(launch)
     return True
 
 
-@contextmanager
-def paused() -> Iterator[None]:
-    """Record nothing in this block."""
-    recorder, _recording.tape = _recording.tape, None
-    try:
-        with _disable_current_modes():
-            yield
-    finally:
-        _recording.tape = recorder
-
-
 @dataclass(frozen=True, eq=False)
-class _Operation:
-    """One call of an operator, with the tensors that it read, wrote and made."""
+class Operation:
+    """One call of an operator, the tensors that it made, and those that it wrote."""
 
     function: Any
     args: tuple[Any, ...]
     kwargs: dict[str, Any]
-    made: list[Tensor]  # in place of a tensor that was written, None stands in `results`
+    made: list[Tensor]
     written: list[Tensor]
-    result: Any
 
-    def tensors(self) -> Iterator[Tensor]:
-        return (leaf for leaf in tree_flatten((self.args, self.kwargs))[0] if isinstance(leaf, Tensor))
+    @property
+    def name(self) -> str:
+        """What the operator is called, whatever its arguments are."""
+        return self.function.overloadpacket.__name__
+
+    def read(self) -> list[Tensor]:
+        """Return the tensors among the arguments."""
+        return _tensors((self.args, self.kwargs))
+
+    def __call__(self) -> None:
+        """Do it once more, in the same memory."""
+        result = self.function(*self.args, **self.kwargs)
+        if self.made:
+            again = [new for new in _tensors(result) if all(new is not old for old in self.written)]
+            for old, new in zip(self.made, again, strict=True):
+                old.copy_(new)
 
 
-class _Recorder(TorchDispatchMode):
-    """Writes down operations as they are dispatched; the tensors stay alive, so that addresses are not used again."""
+def _tensors(tree: Any) -> list[Tensor]:
+    return [leaf for leaf in tree_leaves(tree) if isinstance(leaf, Tensor)]
+
+
+class Recorder(TorchDispatchMode):
+    """Writes down operations as they are dispatched; tensors stay alive, so that no memory is used twice."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.entries: list[_Operation | Callable[[], None]] = []
+        self.entries: list[Operation | Callable[[], None]] = []
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Write nothing down in this block."""
+        _recording.recorder = None
+        try:
+            with torch.utils._python_dispatch._disable_current_modes():
+                yield
+        finally:
+            _recording.recorder = self
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
         if func.overloadpacket.__name__ in _HOST_READS:
             raise RuntimeError(f"{func} reads the device on the host")
-        recorder, _recording.tape = _recording.tape, None
+        _recording.recorder = None
         try:
             result = func(*args, **kwargs)
         finally:
-            _recording.tape = recorder
-        read = {id(leaf) for leaf in tree_flatten((args, kwargs))[0] if isinstance(leaf, Tensor)}
-        made = [x for x in tree_flatten(result)[0] if isinstance(x, Tensor) and id(x) not in read]
+            _recording.recorder = self
+        read = {id(tensor) for tensor in _tensors((args, kwargs))}
+        made = [tensor for tensor in _tensors(result) if id(tensor) not in read]
         written = list(_written(func, args, kwargs))
         if made or written:
-            self.entries.append(_Operation(func, args, kwargs, made, written, result))
+            self.entries.append(Operation(func, args, kwargs, made, written))
         return result
 
 
 def _written(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Iterator[Tensor]:
     for place, argument in enumerate(func._schema.arguments):
-        if argument.alias_info is None or not argument.alias_info.is_write:
-            continue
-        given = args[place] if place < len(args) else kwargs.get(argument.name)
-        yield from (leaf for leaf in tree_flatten(given)[0] if isinstance(leaf, Tensor))
+        if argument.alias_info is not None and argument.alias_info.is_write:
+            yield from _tensors(args[place] if place < len(args) else kwargs.get(argument.name))
 
 
 @contextmanager
-def recorded() -> Iterator[_Recorder]:
-    assert _recording.tape is None, "recordings do not nest"
-    recorder = _Recorder()
-    _recording.tape = recorder
+def recorded() -> Iterator[Recorder]:
+    """Write down what torch computes in this block, and what Warp launches."""
+    assert _recording.recorder is None, "recordings do not nest"
+    recorder = _recording.recorder = Recorder()
     try:
         with recorder:
             yield recorder
     finally:
-        _recording.tape = None
-
-
-# -- where tensors lie -------------------------------------------------------------------------------------------
-
-
-def _extent(tensor: Tensor) -> tuple[int, int]:
-    """Return the first address of a tensor's numbers and the one after the last."""
-    last = sum((size - 1) * stride for size, stride in zip(tensor.shape, tensor.stride(), strict=True))
-    first = tensor.data_ptr()
-    return first, first + (last + 1) * tensor.element_size() if tensor.numel() else first
+        _recording.recorder = None
 
 
 def _place(tensor: Tensor) -> int:
@@ -138,203 +139,194 @@ def _place(tensor: Tensor) -> int:
 
 
 @dataclass(eq=False)
-class _Stretch:
-    """Operations between two launches: what they take from outside, and what later ones need of them."""
+class _Kernel:
+    """Operations that run as one, and how each piece of memory is used: the distance of its rows, 0 without rows."""
 
-    operations: list[_Operation] = field(default_factory=list)
-    inputs: list[Tensor] = field(default_factory=list)  # as they were when recorded
-    outputs: list[Tensor] = field(default_factory=list)
-    run: Callable[..., Sequence[Tensor]] | None = None
-    graph: fx.GraphModule | None = None
+    operations: list[Operation] = field(default_factory=list)
+    rows: list[int] = field(default_factory=list)
+    distances: dict[int, set[int]] = field(default_factory=dict)
+    written: set[int] = field(default_factory=set)
+    made: set[int] = field(default_factory=set)
+    counted: set[int] = field(default_factory=set)
+    launch: Callable[[], None] | None = None
+
+    def fits(self, distances: dict[int, set[int]], written: set[int], counted: set[int]) -> bool:
+        """Whether an operation may follow in the same kernel: no row may see what another one writes."""
+        if len(self.operations) >= MOST_OPERATIONS:
+            return False
+        for place, own in distances.items():
+            is_written = place in self.written or place in written
+            if is_written and len(own | self.distances.get(place, set())) > 1:
+                return False
+        return self.counted.isdisjoint(distances.keys() - counted) and counted.isdisjoint(
+            self.distances.keys() - self.counted
+        )
 
 
 class Tape:
-    """A recorded function as compiled functions and launches: `tape(*inputs)` returns what it returned.
+    """A recorded function of the rows of a batch as kernels and launches.
 
-    `given` are the tensors that differ from call to call, in number and layout as recorded, and `returned` what the
-    function gave. All others have to stay where they are.
+    Call it to run them: it reads and writes the memory of the recording, what was returned included. `num_rows` is E,
+    and `returned` what is used afterwards.
     """
 
-    def __init__(
-        self, recorder: _Recorder, *, given: Sequence[Tensor], returned: Sequence[Tensor], compiler: Compiler
-    ) -> None:
-        self._parts: list[_Stretch | Callable[[], None]] = []
+    def __init__(self, recorder: Recorder, *, num_rows: int, returned: Sequence[Shaped[Tensor, "*shape"]]) -> None:
+        self._num_rows = num_rows
+        self._roots: dict[int, Tensor] = {}  # the first tensor of each piece of memory that the recording made
         for entry in recorder.entries:
-            if isinstance(entry, _Operation):
-                if not self._parts or not isinstance(self._parts[-1], _Stretch):
-                    self._parts.append(_Stretch())
-                self._parts[-1].operations.append(entry)
-            else:
-                self._parts.append(entry)
-        self._given, self._returned = list(given), list(returned)
-        # The first tensor of each piece of memory that was made while recording; others are views of it.
-        self._roots: dict[int, Tensor] = {}
-        self._made_in: dict[int, _Stretch] = {}
-        for stretch in self.stretches:
-            for operation in stretch.operations:
-                before = {_place(tensor) for tensor in operation.tensors()}
-                for tensor in operation.made:
-                    if _place(tensor) not in before and _place(tensor) not in self._roots:
-                        self._roots[_place(tensor)] = tensor
-                        self._made_in[_place(tensor)] = stretch
-        self._find_outputs()
-        for stretch in self.stretches:
-            self._build(stretch, compiler)
-        for stretch in self.stretches:
-            stretch.operations.clear()
+            if isinstance(entry, Operation):
+                before = {_place(tensor) for tensor in entry.read()}
+                for tensor in entry.made:
+                    if tensor.numel() and _place(tensor) not in before:
+                        self._roots.setdefault(_place(tensor), tensor)
+        self.parts: list[_Kernel | Callable[[], None]] = []
+        self._device = next(iter(returned)).device
+        for entry in recorder.entries:
+            if not isinstance(entry, Operation):
+                self.parts.append(entry)
+            elif any(tensor.device != self._device for tensor in entry.made):
+                continue  # a number that the host gave
+            elif entry.written or any(self._roots.get(_place(tensor)) is tensor for tensor in entry.made):
+                self._add(entry)
+        self._own = self._find_own(returned)
+        self._kept = [tensor for place, tensor in self._roots.items() if place not in self._own]
+        for part in self.parts:
+            if isinstance(part, _Kernel):
+                part.launch = self._compiled(part)
+                part.operations.clear()
 
     @property
-    def stretches(self) -> list[_Stretch]:
-        """What is compiled, in order."""
-        return [part for part in self._parts if isinstance(part, _Stretch)]
+    def num_kernels(self) -> int:
+        """How many of the parts are kernels of rows."""
+        return sum(isinstance(part, _Kernel) for part in self.parts)
 
-    def _find_outputs(self) -> None:
-        for stretch in self.stretches:
-            for operation in stretch.operations:
-                for tensor in operation.tensors():
-                    self._need(tensor, stretch)
-        for tensor in self._returned:
-            self._need(tensor, None)
+    def __call__(self) -> None:
+        """Run all parts in order."""
+        for part in self.parts:
+            launch = part.launch if isinstance(part, _Kernel) else part
+            assert launch is not None
+            launch()
 
-    def _need(self, tensor: Tensor, by: _Stretch | None) -> None:
-        maker = self._made_in.get(_place(tensor)) if tensor.numel() else None
-        if maker is not None and maker is not by:
-            root = self._roots[_place(tensor)]
-            if all(root is not known for known in maker.outputs):
-                maker.outputs.append(root)
+    def _add(self, operation: Operation) -> None:
+        """Put an operation into the kernel that comes last, or into a new one, or leave it to torch."""
+        rows = self._rows_of(operation)
+        try:
+            distances = self._distances(operation, rows)
+        except row_code.NotARowError:
+            self.parts.append(operation)
+            return
+        written = {_place(tensor) for tensor in (*operation.written, *operation.made)}
+        counted = written if operation.name in _COUNTS else set()
+        last = self.parts[-1] if self.parts else None
+        kernel = last if isinstance(last, _Kernel) and last.fits(distances, written - counted, counted) else _Kernel()
+        lone = {_place(tensor) for tensor in operation.written if 0 in distances[_place(tensor)]} - counted
+        if lone - kernel.made:
+            self.parts.append(operation)  # all rows would write numbers that were there before
+            return
+        if kernel is not last:
+            self.parts.append(kernel)
+        kernel.made |= {_place(tensor) for tensor in operation.made}
+        kernel.operations.append(operation)
+        kernel.rows.append(rows)
+        for place, own in distances.items():
+            kernel.distances.setdefault(place, set()).update(own)
+        kernel.written |= written - counted
+        kernel.counted |= counted
 
-    def _build(self, stretch: _Stretch, compiler: Compiler) -> None:
-        graph = fx.Graph()
-        nodes: dict[int, fx.Node] = {}
-        made = {id(tensor) for operation in stretch.operations for tensor in operation.made}
-        own = {place for place, maker in self._made_in.items() if maker is stretch}
+    def _rows_of(self, operation: Operation) -> int:
+        if operation.name in _COUNTS:
+            return self._num_rows
+        first = (*operation.made, *operation.written)[0]
+        return self._num_rows if first.ndim and first.shape[0] == self._num_rows else 0
+
+    def _distances(self, operation: Operation, rows: int) -> dict[int, set[int]]:
+        """Return how an operation uses memory; a NotARowError where it does not keep to its row."""
+        cells = row_code.Cells(rows=rows, address=lambda _: ("", True), device=self._device)
+        outs = [*operation.made, *operation.written]
+        if len(outs) > 1 and operation.name not in _COUNTS:
+            raise row_code.NotARowError("several results")
+        row_code.lines(operation.function, operation.args, operation.kwargs, outs, cells)
+        distances: dict[int, set[int]] = {}
+        for tensor, distance in cells.seen:
+            root = self._roots.get(_place(tensor))
+            if root is not None and root.dtype != tensor.dtype:
+                raise row_code.NotARowError("memory of two types")
+            if distance == 0 and tensor.numel() > MOST_SHARED and not rows:
+                raise row_code.NotARowError("many numbers without rows")
+            distances.setdefault(_place(tensor), set()).add(distance)
+        if rows and operation.name not in _COUNTS and any(0 in distances[_place(tensor)] for tensor in outs):
+            raise row_code.NotARowError("all rows write the same numbers")
+        return distances
+
+    def _find_own(self, returned: Sequence[Tensor]) -> dict[int, _Kernel]:
+        """Return the memory that one kernel alone uses, which need not exist outside of it."""
+        users: dict[int, set[int]] = {}
+        for number, part in enumerate(self.parts):
+            operations = part.operations if isinstance(part, _Kernel) else [part]
+            for operation in operations:
+                if isinstance(operation, Operation):
+                    for tensor in (*operation.read(), *operation.made):
+                        users.setdefault(_place(tensor), set()).add(number)
+        outside = {_place(tensor) for tensor in returned}
+        own: dict[int, _Kernel] = {}
+        for place, root in self._roots.items():
+            numbers = users.get(place, set())
+            kernel = self.parts[min(numbers)] if len(numbers) == 1 else None
+            if isinstance(kernel, _Kernel) and place not in outside and self._is_simple(root, kernel, place):
+                own[place] = kernel
+        return own
+
+    def _is_simple(self, root: Tensor, kernel: _Kernel, place: int) -> bool:
+        distances = kernel.distances.get(place, {0})
+        width = root.untyped_storage().nbytes() // root.element_size()
+        if distances == {0}:
+            return width <= MOST_SHARED
+        return distances == {width // self._num_rows} and width % self._num_rows == 0
+
+    def _compiled(self, kernel: _Kernel) -> Callable[[], None]:
+        names: dict[int, str] = {}
         outside: dict[int, Tensor] = {}
-        written: list[tuple[int, int]] = []
-        for operation in stretch.operations:
-            for tensor in operation.tensors():
-                if id(tensor) not in made:
-                    outside.setdefault(id(tensor), tensor)
-            written += [_extent(tensor) for tensor in operation.written if _place(tensor) not in own]
-        for group in _overlapping(outside.values()):
-            first, end = min(_extent(t)[0] for t in group), max(_extent(t)[1] for t in group)
-            is_written = any(low < end and first < high for low, high in written)
-            if len(group) == 1 or not is_written:
-                for tensor in group:
-                    nodes[id(tensor)] = _take(graph, stretch, tensor)
-            else:
-                base = _base(group)
-                taken = _take(graph, stretch, base)
-                for tensor in group:
-                    nodes[id(tensor)] = _view_of(graph, taken, base, tensor)
-        for operation in stretch.operations:
-            _write(graph, nodes, operation)
-        graph.output(tuple(nodes[id(tensor)] for tensor in stretch.outputs))
-        stretch.graph = fx.GraphModule(torch.nn.Module(), graph)
-        stretch.run = compiler(stretch.graph, [tensor.detach() for tensor in stretch.inputs])
+        arrays: list[str] = []
+        ends: list[str] = []
 
-    def __call__(self, *given: Tensor) -> list[Tensor]:
-        """Replay with these tensors in the place of those that were given."""
-        known: dict[int, Tensor] = {id(old): new for old, new in zip(self._given, given, strict=True)}
-        for part in self._parts:
-            if not isinstance(part, _Stretch):
-                part()
-                continue
-            assert part.run is not None
-            results = part.run(*[self._now(tensor, known) for tensor in part.inputs])
-            for old, new in zip(part.outputs, results, strict=True):
-                assert new.stride() == old.stride(), (old.stride(), new.stride())
-                known[id(old)] = new
-        return [self._now(tensor, known) for tensor in self._returned]
+        def address(tensor: Tensor) -> tuple[str, bool]:
+            place, root = _place(tensor), self._roots.get(_place(tensor))
+            shared = root is not None and kernel.distances.get(place) == {0} and place in kernel.written
+            is_own = self._own.get(place) is kernel
+            if place not in names:
+                names[place] = f"m{len(names)}"
+                ctype = row_code.CTYPES[tensor.dtype]
+                if is_own or shared:
+                    assert root is not None
+                    width = root.untyped_storage().nbytes() // root.element_size()
+                    width //= 1 if shared or kernel.distances.get(place) == {0} else self._num_rows
+                    arrays.append(f"{ctype} {names[place]}[{width}];")
+                    if not is_own:
+                        # All rows work it out, and one hands it on.
+                        outside[place] = tensor
+                        copy = f"(({ctype}*)a.{names[place]})[i] = {names[place]}[i];"
+                        ends.append(f"if (row == 0) for (int i = 0; i < {width}; ++i) {copy}")
+                else:
+                    outside[place] = tensor
+                    arrays.append(f"{ctype}* {names[place]} = ({ctype}*)a.{names[place]};")
+            return names[place], not (is_own or shared)
 
-    def _now(self, tensor: Tensor, known: dict[int, Tensor]) -> Tensor:
-        """Return what stands in a replay for a tensor of the recording."""
-        if id(tensor) in known:
-            return known[id(tensor)]
-        root = self._roots.get(_place(tensor)) if tensor.numel() else None
-        if root is None:
-            return tensor
-        offset = tensor.storage_offset() - root.storage_offset()
-        now = known[id(root)]
-        return now.as_strided(tensor.shape, tensor.stride(), now.storage_offset() + offset)
+        body: list[str] = []
+        for operation, rows in zip(kernel.operations, kernel.rows, strict=True):
+            cells = row_code.Cells(rows=rows, address=address, device=self._device)
+            outs = [*operation.made, *operation.written]
+            body += row_code.lines(operation.function, operation.args, operation.kwargs, outs, cells)
+        draws = [random.DRAWS] if any("key_of" in line for line in body) else []
+        source = "\n".join([*draws, row_code.PRELUDE, *arrays, *body, *ends])
+        fields = " ".join(names[place] for place in outside)
+        launch = quick_launch.QuickLaunch(
+            quick_launch.arguments_of((wp.uint64, fields)), source, indices=("row", "lane"), block_dim=32
+        )
+        addresses = tuple(outside)
+        self._kept += outside.values()
+        dim = (self._num_rows, 1)
+        return lambda: launch(self._device, dim, *addresses)
 
 
-def _take(graph: fx.Graph, stretch: _Stretch, tensor: Tensor) -> fx.Node:
-    stretch.inputs.append(tensor)
-    return graph.placeholder(f"input_{len(stretch.inputs)}")
-
-
-def _overlapping(tensors: Iterable[Tensor]) -> list[list[Tensor]]:
-    """Return the tensors in groups that share memory."""
-    groups: list[list[Tensor]] = []
-    end = -1
-    for tensor in sorted(tensors, key=lambda one: (_extent(one)[0], -_extent(one)[1])):
-        first, last = _extent(tensor)
-        if groups and first < end:
-            groups[-1].append(tensor)
-        else:
-            groups.append([tensor])
-        end = max(end, last)
-    return groups
-
-
-def _base(group: list[Tensor]) -> Tensor:
-    """Return a tensor that holds all the numbers of a group in order, in the same memory."""
-    first, end = _extent(group[0])[0], max(_extent(tensor)[1] for tensor in group)
-    size = group[0].element_size()
-    if len({tensor.dtype for tensor in group}) > 1:
-        raise RuntimeError("memory that changes is read as two dtypes")
-    for tensor in group:
-        storage = tensor.untyped_storage()
-        if storage.data_ptr() <= first and end <= storage.data_ptr() + storage.nbytes():
-            whole = tensor.is_contiguous() and _extent(tensor) == (first, end)
-            if whole:
-                return tensor
-            offset, length = (first - storage.data_ptr()) // size, (end - first) // size
-            return torch.empty(0, dtype=tensor.dtype, device=tensor.device).set_(
-                storage, offset, (length,), (1,)
-            )
-    raise RuntimeError("memory that changes is shared by arrays that lie side by side")
-
-
-def _view_of(graph: fx.Graph, node: fx.Node, base: Tensor, tensor: Tensor) -> fx.Node:
-    """Return `tensor` as a view of a base of the same memory."""
-    if tensor is base:
-        return node
-    offset = (tensor.data_ptr() - base.data_ptr()) // base.element_size()
-    aten = torch.ops.aten
-    # A column, or columns: what the compiler understands better than strides.
-    if base.ndim == 2 and offset < base.shape[1]:
-        if tensor.ndim == 1 and tensor.shape[0] == base.shape[0] and tensor.stride(0) == base.stride(0):
-            return graph.call_function(aten.select.int, (node, 1, offset))
-        if tensor.ndim == 2 and tensor.shape[0] == base.shape[0] and tensor.stride() == base.stride():
-            return graph.call_function(aten.slice.Tensor, (node, 1, offset, offset + tensor.shape[1]))
-    if base.ndim == 1 and tensor.ndim == 0:
-        return graph.call_function(aten.select.int, (node, 0, offset))
-    shape = list(tensor.shape), list(tensor.stride()), base.storage_offset() + offset
-    return graph.call_function(aten.as_strided.default, (node, *shape))
-
-
-def _write(graph: fx.Graph, nodes: dict[int, fx.Node], operation: _Operation) -> None:
-    args, kwargs = tree_map_only(Tensor, lambda leaf: nodes[id(leaf)], (operation.args, operation.kwargs))
-    if operation.function is torch.ops.aten.copy_.default:
-        # The compiler takes a bare copy for the source itself, and reads that after it was written in its turn.
-        is_bool = operation.args[1].dtype == torch.bool
-        negated = torch.ops.aten.logical_not.default if is_bool else torch.ops.aten.neg.default
-        twice = graph.call_function(negated, (graph.call_function(negated, (args[1],)),))
-        args = (args[0], twice, *args[2:])
-    node = graph.call_function(operation.function, args, kwargs)
-
-    def name(value: Any, node: fx.Node) -> None:
-        if isinstance(value, Tensor):
-            nodes.setdefault(id(value), node)
-        elif isinstance(value, (tuple, list)):
-            for place, part in enumerate(value):
-                if isinstance(part, Tensor) and id(part) in nodes:
-                    continue
-                name(part, graph.call_function(_item, (node, place)))
-
-    name(operation.result, node)
-
-
-def _item(values: Sequence[Any], place: int) -> Any:
-    return values[place]
+# At the end, since these ask whether something is being recorded.
+from ksim_rl.device import quick_launch, random, row_code  # noqa: E402

@@ -1,0 +1,458 @@
+"""This module writes operations of torch as C++ for one row of a batch; `tape` makes kernels of it.
+
+Each function returns lines that read and write elements through `Cells`, which knows where a tensor lies: in the
+memory of the device, or in an array of the row's own. The operations are those of torch, with its rules for types and
+for numbers that are not finite.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+CTYPES = {
+    torch.float32: "float",
+    torch.float64: "double",
+    torch.int64: "long long",
+    torch.int32: "int",
+    torch.uint8: "unsigned char",
+    torch.bool: "bool",
+}
+"""What an element is in C++."""
+
+# Operands are a, b, c in the order of the schema, in the type that torch computes in.
+_POINTWISE = {
+    "abs": "a > 0 ? a : 0 - a",
+    "add": "a + b * alpha",
+    "addcdiv": "a + value * b / c",
+    "addcmul": "a + value * b * c",
+    "atan2": "atan2(a, b)",
+    "clamp": "low(high(a, b), c)",
+    "clamp_max": "low(a, b)",
+    "clamp_min": "high(a, b)",
+    "clone": "a",
+    "copy": "b",
+    "cos": "cos(a)",
+    "div": "a / b",
+    "exp": "exp(a)",
+    "expm1": "expm1(a)",
+    "fill": "b",
+    "floor": "floor(a)",
+    "lerp": "c < 0.5f ? a + c * (b - a) : b - (b - a) * (1 - c)",
+    "log": "log(a)",
+    "log1p": "log1p(a)",
+    "masked_fill": "m ? b : a",
+    "maximum": "high(a, b)",
+    "minimum": "low(a, b)",
+    "mul": "a * b",
+    "neg": "-a",
+    "reciprocal": "1 / a",
+    "relu": "high(a, 0)",
+    "remainder": "modulo(a, b)",
+    "round": "rint(a)",
+    "rsqrt": "1 / sqrt(a)",
+    "rsub": "b - a * alpha",
+    "sigmoid": "1 / (1 + exp(-a))",
+    "sign": "(a > 0) - (a < 0)",
+    "sin": "sin(a)",
+    "sqrt": "sqrt(a)",
+    "square": "a * a",
+    "sub": "a - b * alpha",
+    "tan": "tan(a)",
+    "tanh": "tanh(a)",
+    "where": "m ? a : b",
+    "zero": "0",
+    "_to_copy": "a",
+    "_unsafe_view": "a",
+    "bitwise_and": "a & b",
+    "bitwise_not": "~a",
+    "bitwise_or": "a | b",
+    "bitwise_xor": "a ^ b",
+}
+# The result is a bool, computed in the operands' own type.
+_TESTS = {
+    "eq": "a == b",
+    "ge": "a >= b",
+    "gt": "a > b",
+    "isfinite": "a - a == 0",
+    "isinf": "a == a && a - a != 0",
+    "isnan": "a != a",
+    "le": "a <= b",
+    "logical_and": "(a != 0) & (b != 0)",
+    "logical_not": "a == 0",
+    "logical_or": "(a != 0) | (b != 0)",
+    "logical_xor": "(a != 0) != (b != 0)",
+    "lt": "a < b",
+    "ne": "a != b",
+}
+_FILLS = {"empty": 0, "empty_like": 0, "new_empty": 0, "new_zeros": 0, "ones": 1, "ones_like": 1, "zeros": 0}
+_FILLS |= {"zeros_like": 0, "new_ones": 1}
+# What a sum starts from, what each element `e` does to it, and what comes of it over `count` of them.
+_REDUCTIONS = {
+    "all": ("1", "s = s && e != 0", "s"),
+    "amax": ("-INFINITY", "s = high(s, e)", "s"),
+    "amin": ("INFINITY", "s = low(s, e)", "s"),
+    "any": ("0", "s = s || e != 0", "s"),
+    "linalg_vector_norm": ("0", "s += e * e", "sqrt(s)"),
+    "mean": ("0", "s += e", "s / count"),
+    "prod": ("1", "s *= e", "s"),
+    "sum": ("0", "s += e", "s"),
+}
+PRELUDE = r"""
+    auto high = [](auto x, auto y) { return x > y || x != x ? x : (decltype(x))y; };
+    auto low = [](auto x, auto y) { return x < y || x != x ? x : (decltype(x))y; };
+    auto count_up = [](long long* count) {
+    #if defined(__CUDA_ARCH__)
+        atomicAdd((unsigned long long*)count, 1ull);
+    #else
+        *count += 1;
+    #endif
+    };
+    auto least = [](long long* kept, long long value) {
+    #if defined(__CUDA_ARCH__)
+        atomicMin((unsigned long long*)kept, (unsigned long long)value);
+    #else
+        *kept = value < *kept ? value : *kept;
+    #endif
+    };
+    auto modulo = [](auto x, auto y) {
+        auto rest = (decltype(x))(x - (decltype(x))(long long)(x / y) * y);
+        if constexpr ((decltype(x))0.5 != 0) rest = (decltype(x))fmod(x, y);
+        return rest != 0 && (rest < 0) != (y < 0) ? (decltype(x))(rest + y) : rest;
+    };
+"""
+
+
+class NotARowError(Exception):
+    """An operation mixes rows, or is not known here: torch runs it."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Where tensors lie, for the operation at hand: `rows` are E, and 0 where it has no rows.
+
+    `address` returns the name of an array, and whether it has all rows. `seen` collects which tensors were used, with
+    the distance of their rows; 0 where all rows use the same elements.
+    """
+
+    rows: int
+    address: Callable[[Tensor], tuple[str, bool]]
+    device: torch.device
+    seen: list[tuple[Tensor, int]] = field(default_factory=list)
+
+    @property
+    def uniform(self) -> "Cells":
+        """The same for tensors that have no rows."""
+        return replace(self, rows=0)
+
+    def at(self, tensor: Tensor, place: Sequence[str]) -> str:
+        """Return the element of a tensor at a place, which has the trailing dims of an operation, rows aside."""
+        if tensor.dtype not in CTYPES:
+            raise NotARowError(f"numbers of type {tensor.dtype}")
+        if tensor.device != self.device:
+            return literal(tensor.item(), CTYPES[tensor.dtype])
+        indices = ([""] if self.rows else []) + list(place)
+        indices = indices[len(indices) - tensor.ndim :] if tensor.ndim else []
+        name, has_all_rows = self.address(tensor)
+        terms = [str(tensor.storage_offset())] if tensor.storage_offset() else []
+        distance = 0
+        for index, size, stride in zip(indices, tensor.shape, tensor.stride(), strict=True):
+            if size == 1 or stride == 0:
+                continue
+            if index:
+                terms.append(f"{index} * {stride}" if stride != 1 else index)
+            else:
+                distance = stride
+                terms += [f"row * {stride}LL"] if has_all_rows else []
+        self.seen.append((tensor, distance))
+        return f"{name}[{' + '.join(terms) or '0'}]"
+
+
+def _loops(shape: Sequence[int], body: Sequence[str]) -> list[str]:
+    names = [f"i{k}" for k in range(len(shape))]
+    heads = [
+        f"for (int {name} = 0; {name} < {size}; ++{name})" for name, size in zip(names, shape, strict=True)
+    ]
+    return [" ".join([*heads, "{", *body, "}"])]
+
+
+def _names(count: int, start: int = 0) -> list[str]:
+    return [f"i{k}" for k in range(start, start + count)]
+
+
+def literal(value: float, ctype: str) -> str:
+    """Return a number of Python in C++."""
+    if ctype in ("float", "double"):
+        value = float(value)
+        if math.isnan(value):
+            return "NAN"
+        if math.isinf(value):
+            return "INFINITY" if value > 0 else "(-INFINITY)"
+        return f"({ctype}){value!r}"
+    return f"({ctype}){int(value)}LL"
+
+
+def lines(function: Any, args: Sequence[Any], kwargs: dict[str, Any], results: Sequence[Tensor], cells: Cells) -> list[str]:
+    """Return the C++ of an operation, which writes `results`; a NotARowError where there is none."""
+    name = function.overloadpacket.__name__
+    is_in_place = name.endswith("_") and not name.startswith("_")
+    name = name.removesuffix("_") if is_in_place else name
+    if name in _FILLS or name in ("full", "full_like", "new_full", "scalar_tensor"):
+        value = _FILLS.get(name, args[0] if name == "scalar_tensor" else args[-1] if name not in _FILLS else 0)
+        return _fill(results[0], value, cells)
+    if name in _REDUCTIONS:
+        return _reduce(function, name, args, kwargs, results[0], cells)
+    if name in ("cat", "stack"):
+        return _join(name, args, kwargs, results[0], cells)
+    for known in (_POINTWISE, _TESTS):
+        if name in known:
+            return _pointwise(name, known[name], args, kwargs, results[0], cells)
+    special = _SPECIAL.get(name)
+    if special is None:
+        raise NotARowError(str(function))
+    return special(args, kwargs, results[0], cells)
+
+
+def _inner(tensor: Tensor, cells: Cells) -> list[int]:
+    """Return the shape of a result without its rows."""
+    return list(tensor.shape[1:]) if cells.rows else list(tensor.shape)
+
+
+def _fill(out: Tensor, value: Any, cells: Cells) -> list[str]:
+    if isinstance(value, Tensor):
+        raise NotARowError("fill by a tensor")
+    shape = _inner(out, cells)
+    number = literal(value, CTYPES[out.dtype])
+    return _loops(shape, [f"{cells.at(out, _names(len(shape)))} = {number};"])
+
+
+def _pointwise(
+    name: str, expression: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells
+) -> list[str]:
+    if kwargs.get("rounding_mode") is not None:
+        raise NotARowError("division that rounds")
+    operands = list(args)
+    if name == "_to_copy":
+        operands = operands[:1]
+    masks = [operands.pop({"where": 0, "masked_fill": 1}[name])] if name in ("where", "masked_fill") else []
+    if name == "clamp":
+        operands += [kwargs.get("min"), kwargs.get("max")][len(operands) - 1 :]
+        expression = {(True, True): "a", (False, True): "high(a, b)", (True, False): "low(a, c)"}.get(
+            (operands[1] is None, operands[2] is None), expression
+        )
+    shape = _inner(out, cells)
+    place = _names(len(shape))
+    tensors = [x for x in operands if isinstance(x, Tensor)]
+    computed = out.dtype
+    if name in _TESTS:
+        computed = tensors[0].dtype
+        for operand in operands[1:]:
+            other = operand.dtype if isinstance(operand, Tensor) else type(operand)
+            if isinstance(operand, Tensor):
+                computed = torch.promote_types(computed, operand.dtype) if operand.ndim or not computed.is_floating_point else computed
+            elif other is float and not computed.is_floating_point:
+                computed = torch.get_default_dtype()
+    ctype = CTYPES[computed]
+    if name == "bitwise_not" and computed == torch.bool:
+        expression = "!a"
+    body = []
+    for letter, operand in zip("abc", operands, strict=False):
+        if operand is None:
+            continue
+        value = cells.at(operand, place) if isinstance(operand, Tensor) else literal(operand, ctype)
+        if not isinstance(operand, (Tensor, int, float, bool)):
+            raise NotARowError(f"an operand {operand!r}")
+        body.append(f"const {ctype} {letter} = ({ctype}){value};")
+    if masks:
+        body.append(f"const bool m = {cells.at(masks[0], place)};")
+    for option in ("alpha", "value"):
+        if option in expression:
+            body.append(f"const {ctype} {option} = {literal(kwargs.get(option, 1), ctype)};")
+    body.append(f"{cells.at(out, place)} = ({CTYPES[out.dtype]})({expression});")
+    return _loops(shape, body)
+
+
+def _pow(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+    base, exponent = args[:2]
+    if isinstance(base, Tensor) and isinstance(exponent, (int, float)):
+        expression = {2: "a * a", 1: "a", 0.5: "sqrt(a)", 3: "a * a * a", -1: "1 / a"}.get(exponent, "pow(a, b)")
+    else:
+        expression = "pow(a, b)"
+    return _pointwise("", expression, args, kwargs, out, cells)
+
+
+def _dims(function: Any, args: Sequence[Any], kwargs: dict[str, Any], ndim: int) -> tuple[list[int], bool]:
+    given = dict(zip([a.name for a in function._schema.arguments], args, strict=False)) | kwargs
+    if given.get("dtype") is not None and given["dtype"] != args[0].dtype and args[0].is_floating_point():
+        raise NotARowError("a sum of another type")
+    dims = given.get("dim")
+    if given.get("ord", 2) != 2:
+        raise NotARowError("another norm")
+    dims = range(ndim) if dims is None or dims == [] else [dims] if isinstance(dims, int) else dims
+    return sorted(dim % ndim for dim in dims), bool(given.get("keepdim", False))
+
+
+def _reduce(
+    function: Any, name: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells
+) -> list[str]:
+    source = args[0]
+    if source.ndim == 0:
+        raise NotARowError("a reduction of a number")
+    dims, keeps = _dims(function, args, kwargs, source.ndim)
+    if cells.rows and 0 in dims or name in ("amax", "amin") and not out.is_floating_point():
+        raise NotARowError("a reduction over rows, or of whole numbers")
+    start, step, end = _REDUCTIONS[name]
+    first = bool(cells.rows)
+    names = dict(zip(range(first, source.ndim), _names(source.ndim - first), strict=True))
+    kept = [k for k in names if k not in dims]
+    place = ["0" if k in dims else names[k] for k in names] if keeps else [names[k] for k in kept]
+    ctype = "bool" if name in ("any", "all") else CTYPES[out.dtype]
+    element = "bool" if name in ("any", "all") else ctype
+    count = math.prod(source.shape[k] for k in dims)
+    inner = f"const {element} e = ({element}){cells.at(source, list(names.values()))}; {step};"
+    heads = " ".join(f"for (int {names[k]} = 0; {names[k]} < {source.shape[k]}; ++{names[k]})" for k in dims)
+    body = f"{ctype} s = {start}; {heads} {{ {inner} }} {cells.at(out, place)} = {end.replace('count', literal(count, ctype))};"
+    outer = " ".join(f"for (int {names[k]} = 0; {names[k]} < {source.shape[k]}; ++{names[k]})" for k in kept)
+    return [f"{outer} {{ {body} }}"]
+
+
+def _join(name: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+    tensors = [t for t in args[0] if t.numel() or t.ndim > 1]
+    dim = (args[1] if len(args) > 1 else kwargs.get("dim", 0)) % out.ndim
+    first = int(bool(cells.rows))
+    if dim < first:
+        raise NotARowError("rows are joined")
+    written, offset = [], 0
+    for number, tensor in enumerate(tensors):
+        shape = list(tensor.shape[first:])
+        names = _names(len(shape))
+        place = list(names)
+        if name == "stack":
+            place.insert(dim - first, str(number))
+        else:
+            place[dim - first] = f"({place[dim - first]} + {offset})"
+            offset += tensor.shape[dim]
+        written += _loops(shape, [f"{cells.at(out, place)} = ({CTYPES[out.dtype]}){cells.at(tensor, names)};"])
+    return written
+
+
+def _one_index(indices: Sequence[Any]) -> int:
+    """Return the dim that is indexed; only one may be, by numbers."""
+    places = [k for k, index in enumerate(indices) if index is not None]
+    if len(places) != 1 or indices[places[0]].dtype != torch.int64:
+        raise NotARowError("several indices, or a mask")
+    return places[0]
+
+
+def _picked(index: Tensor, names: Sequence[str], size: int, cells: Cells) -> str:
+    cell = cells.uniform.at(index, names)
+    return f"({cell} < 0 ? {cell} + {size} : {cell})"
+
+
+def _index(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+    source, indices = args[:2]
+    dim = _one_index(indices)
+    index, first = indices[dim], int(bool(cells.rows))
+    if dim < first:
+        raise NotARowError("rows are picked")
+    shape = _inner(out, cells)
+    names, at = _names(len(shape)), dim - first
+    picked = _picked(index, names[at : at + index.ndim], source.shape[dim], cells)
+    place = [*names[:at], picked, *names[at + index.ndim :]]
+    return _loops(shape, [f"{cells.at(out, names)} = {cells.at(source, place)};"])
+
+
+def _index_select(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+    source, dim, index = args
+    return _index((source, [*[None] * (dim % source.ndim), index]), kwargs, out, cells)
+
+
+def _index_put(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+    target, indices, values = args[:3]
+    if len(args) > 3 and args[3]:
+        raise NotARowError("index_put that adds")
+    dim = _one_index(indices)
+    index, first = indices[dim], int(bool(cells.rows))
+    if dim < first or target is not out:
+        raise NotARowError("rows are written")
+    at = dim - first
+    shape = [*out.shape[first:dim], *index.shape, *out.shape[dim + 1 :]]
+    names = _names(len(shape))
+    picked = _picked(index, names[at : at + index.ndim], out.shape[dim], cells)
+    place = [*names[:at], picked, *names[at + index.ndim :]]
+    return _loops(shape, [f"{cells.at(out, place)} = {cells.at(values, names)};"])
+
+
+def _gather(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+    source, dim, index = args[:3]
+    dim, first = dim % source.ndim, int(bool(cells.rows))
+    if dim < first:
+        raise NotARowError("rows are gathered")
+    names = _names(out.ndim - first)
+    place = [*names]
+    place[dim - first] = f"(int){cells.at(index, names)}"
+    return _loops(_inner(out, cells), [f"{cells.at(out, names)} = {cells.at(source, place)};"])
+
+
+def _cross(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+    dim = kwargs.get("dim", args[2] if len(args) > 2 else -1) % out.ndim - int(bool(cells.rows))
+    if dim < 0:
+        raise NotARowError("a cross product of rows")
+    shape = _inner(out, cells)
+    names = _names(len(shape))
+
+    def at(tensor: Tensor, k: int) -> str:
+        return cells.at(tensor, [*names[:dim], str(k), *names[dim + 1 :]])
+
+    ctype = CTYPES[out.dtype]
+    body = [f"const {ctype} {letter}{k} = {at(args[n], k)};" for n, letter in enumerate("xy") for k in range(3)]
+    pairs = ((1, 2), (2, 0), (0, 1))
+    body += [f"{at(out, k)} = x{i} * y{j} - x{j} * y{i};" for k, (i, j) in enumerate(pairs)]
+    shape[dim] = 1
+    return _loops(shape, body)
+
+
+def _bmm(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+    if not cells.rows:
+        raise NotARowError("matrices without rows")
+    left, right = args
+    term = f"s += {cells.at(left, ['i0', 'k'])} * {cells.at(right, ['k', 'i1'])};"
+    body = f"{CTYPES[out.dtype]} s = 0; for (int k = 0; k < {left.shape[2]}; ++k) {term} {cells.at(out, ['i0', 'i1'])} = s;"
+    return _loops(out.shape[1:], [body])
+
+
+def _draw(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+    seed, stream, counter, _, first_row, n, kind, low, high, start, span = args
+    plain = cells.uniform
+    count = cells.at(counter, []) if counter.ndim else plain.at(counter, [])
+    low_, width = literal(low, "float"), f"({literal(high, 'float')} - {literal(low, 'float')})"
+    value = (f"{low_} + unit(b) * {width}", "normal(b)", f"{start}LL + (long long)((b * {span}ull) >> 32)")[kind]
+    body = f"const unsigned b = bits_of(key, (unsigned)i0); {cells.at(out, ['i0'])} = {value};"
+    key = f"const RowKey key = key_of({plain.at(seed, [])}, {stream}u, {count}, {first_row} + row);"
+    return ["{ " + key, *_loops([n], [body]), "}"]
+
+
+def _count_non_finite(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+    table, term, step, first, count = args
+    plain = cells.uniform
+    at = f"{plain.at(term, ['i0'])}"
+    body = [f"if (fabsf({cells.at(table, ['i0'])}) <= 3.402823466e38f) continue;", f"const int term = {at};"]
+    body += [f"const long long place = {plain.at(step, [])} * {table.shape[0]} + row;"]
+    body += [f"count_up(&{plain.at(count, ['term'])}); least(&{plain.at(first, ['term'])}, place);"]
+    return _loops(table.shape[1:], body)
+
+
+_SPECIAL: dict[str, Callable[[Sequence[Any], dict[str, Any], Tensor, Cells], list[str]]] = {
+    "bmm": _bmm,
+    "count_non_finite": _count_non_finite,
+    "draw": _draw,
+    "gather": _gather,
+    "index": _index,
+    "index_put": _index_put,
+    "index_select": _index_select,
+    "linalg_cross": _cross,
+    "pow": _pow,
+}
