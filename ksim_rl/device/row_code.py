@@ -38,12 +38,12 @@ _POINTWISE = {
     "cos": "cos(a)",
     "div": "a / b",
     "exp": "exp(a)",
-    "expm1": "expm1(a)",
+    "expm1": "exp_less_1(a)",
     "fill": "b",
     "floor": "floor(a)",
     "lerp": "c < 0.5f ? a + c * (b - a) : b - (b - a) * (1 - c)",
     "log": "log(a)",
-    "log1p": "log1p(a)",
+    "log1p": "log_1_plus(a)",
     "masked_fill": "m ? b : a",
     "maximum": "high(a, b)",
     "minimum": "low(a, b)",
@@ -117,6 +117,12 @@ PRELUDE = r"""
     #else
         *kept = value < *kept ? value : *kept;
     #endif
+    };
+    // Exact to rounding, by W. Kahan; not every compiler's library has them.
+    auto log_1_plus = [](auto x) { const auto u = 1 + x; return u == 1 ? x : log(u) * x / (u - 1); };
+    auto exp_less_1 = [](auto x) {
+        const auto u = exp(x);
+        return u == 1 ? x : u - 1 == -1 ? (decltype(x))-1 : (decltype(x))((u - 1) * x / log(u));
     };
     auto modulo = [](auto x, auto y) {
         auto rest = (decltype(x))(x - (decltype(x))(long long)(x / y) * y);
