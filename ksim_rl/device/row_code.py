@@ -140,12 +140,12 @@ class NotARowError(Exception):
 class Cells:
     """Where tensors lie, for the operation at hand: `rows` are E, and 0 where it has no rows.
 
-    `address` returns the name of an array, and whether it has all rows. `seen` collects which tensors were used, with
+    `address` returns the name of an array, the place in it, and whether it has all rows. `seen` collects which tensors were used, with
     the distance of their rows; 0 where all rows use the same elements.
     """
 
     rows: int
-    address: Callable[[Tensor], tuple[str, bool]]
+    address: Callable[[Tensor], tuple[str, int, bool]]
     device: torch.device
     seen: list[tuple[Tensor, int]] = field(default_factory=list)
 
@@ -162,8 +162,8 @@ class Cells:
             return literal(tensor.item(), CTYPES[tensor.dtype])
         indices = ([""] if self.rows else []) + list(place)
         indices = indices[len(indices) - tensor.ndim :] if tensor.ndim else []
-        name, has_all_rows = self.address(tensor)
-        terms = [str(tensor.storage_offset())] if tensor.storage_offset() else []
+        name, offset, has_all_rows = self.address(tensor)
+        terms = [str(offset)] if offset else []
         distance = 0
         for index, size, stride in zip(indices, tensor.shape, tensor.stride(), strict=True):
             if size == 1 or stride == 0:

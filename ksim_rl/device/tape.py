@@ -134,8 +134,25 @@ def recorded() -> Iterator[Recorder]:
         _recording.recorder = None
 
 
-def _place(tensor: Tensor) -> int:
+def _storage(tensor: Tensor) -> int:
     return tensor.untyped_storage().data_ptr()
+
+
+def _extent(tensor: Tensor) -> tuple[int, int]:
+    """Return the address of a tensor's first number, and the one behind the last."""
+    last = sum((size - 1) * stride for size, stride in zip(tensor.shape, tensor.stride(), strict=True))
+    return tensor.data_ptr(), tensor.data_ptr() + (last + 1) * tensor.element_size()
+
+
+def _starts(tensors: Sequence[Tensor]) -> dict[tuple[int, int], int]:
+    """Return where the memory begins that each extent is part of: extents that overlap are one piece."""
+    starts: dict[tuple[int, int], int] = {}
+    start, end = 0, 0
+    for first, last in sorted({_extent(tensor) for tensor in tensors}):
+        start = first if first >= end else start
+        end = max(end, last)
+        starts[first, last] = start
+    return starts
 
 
 @dataclass(eq=False)
@@ -175,10 +192,13 @@ class Tape:
         self._roots: dict[int, Tensor] = {}  # the first tensor of each piece of memory that the recording made
         for entry in recorder.entries:
             if isinstance(entry, Operation):
-                before = {_place(tensor) for tensor in entry.read()}
+                before = {_storage(tensor) for tensor in entry.read()}
                 for tensor in entry.made:
-                    if tensor.numel() and _place(tensor) not in before:
-                        self._roots.setdefault(_place(tensor), tensor)
+                    if tensor.numel() and _storage(tensor) not in before:
+                        self._roots.setdefault(_storage(tensor), tensor)
+        operations = [entry for entry in recorder.entries if isinstance(entry, Operation)]
+        used = [tensor for one in operations for tensor in (*one.read(), *one.made) if tensor.numel()]
+        self._starts = _starts([tensor for tensor in used if _storage(tensor) not in self._roots])
         self.parts: list[_Kernel | Callable[[], None]] = []
         self._device = next(iter(returned)).device
         for entry in recorder.entries:
@@ -186,7 +206,7 @@ class Tape:
                 self.parts.append(entry)
             elif any(tensor.device != self._device for tensor in entry.made):
                 continue  # a number that the host gave
-            elif entry.written or any(self._roots.get(_place(tensor)) is tensor for tensor in entry.made):
+            elif entry.written or any(self._roots.get(self._place(tensor)) is tensor for tensor in entry.made):
                 self._add(entry)
         self._own = self._find_own(returned)
         self._kept = [tensor for place, tensor in self._roots.items() if place not in self._own]
@@ -207,6 +227,11 @@ class Tape:
             assert launch is not None
             launch()
 
+    def _place(self, tensor: Tensor) -> int:
+        """Return where the piece of memory begins that a tensor is part of: one storage may hold many."""
+        storage = _storage(tensor)
+        return storage if storage in self._roots or not tensor.numel() else self._starts[_extent(tensor)]
+
     def _add(self, operation: Operation) -> None:
         """Put an operation into the kernel that comes last, or into a new one, or leave it to torch."""
         rows = self._rows_of(operation)
@@ -215,17 +240,17 @@ class Tape:
         except row_code.NotARowError:
             self.parts.append(operation)
             return
-        written = {_place(tensor) for tensor in (*operation.written, *operation.made)}
+        written = {self._place(tensor) for tensor in (*operation.written, *operation.made)}
         counted = written if operation.name in _COUNTS else set()
         last = self.parts[-1] if self.parts else None
         kernel = last if isinstance(last, _Kernel) and last.fits(distances, written - counted, counted) else _Kernel()
-        lone = {_place(tensor) for tensor in operation.written if 0 in distances[_place(tensor)]} - counted
+        lone = {self._place(tensor) for tensor in operation.written if 0 in distances[self._place(tensor)]} - counted
         if lone - kernel.made:
             self.parts.append(operation)  # all rows would write numbers that were there before
             return
         if kernel is not last:
             self.parts.append(kernel)
-        kernel.made |= {_place(tensor) for tensor in operation.made}
+        kernel.made |= {self._place(tensor) for tensor in operation.made}
         kernel.operations.append(operation)
         kernel.rows.append(rows)
         for place, own in distances.items():
@@ -241,20 +266,20 @@ class Tape:
 
     def _distances(self, operation: Operation, rows: int) -> dict[int, set[int]]:
         """Return how an operation uses memory; a NotARowError where it does not keep to its row."""
-        cells = row_code.Cells(rows=rows, address=lambda _: ("", True), device=self._device)
+        cells = row_code.Cells(rows=rows, address=lambda _: ("", 0, True), device=self._device)
         outs = [*operation.made, *operation.written]
         if len(outs) > 1 and operation.name not in _COUNTS:
             raise row_code.NotARowError("several results")
         row_code.lines(operation.function, operation.args, operation.kwargs, outs, cells)
         distances: dict[int, set[int]] = {}
         for tensor, distance in cells.seen:
-            root = self._roots.get(_place(tensor))
+            root = self._roots.get(self._place(tensor))
             if root is not None and root.dtype != tensor.dtype:
                 raise row_code.NotARowError("memory of two types")
             if distance == 0 and tensor.numel() > MOST_SHARED and not rows:
                 raise row_code.NotARowError("many numbers without rows")
-            distances.setdefault(_place(tensor), set()).add(distance)
-        if rows and operation.name not in _COUNTS and any(0 in distances[_place(tensor)] for tensor in outs):
+            distances.setdefault(self._place(tensor), set()).add(distance)
+        if rows and operation.name not in _COUNTS and any(0 in distances[self._place(tensor)] for tensor in outs):
             raise row_code.NotARowError("all rows write the same numbers")
         return distances
 
@@ -266,8 +291,8 @@ class Tape:
             for operation in operations:
                 if isinstance(operation, Operation):
                     for tensor in (*operation.read(), *operation.made):
-                        users.setdefault(_place(tensor), set()).add(number)
-        outside = {_place(tensor) for tensor in returned}
+                        users.setdefault(self._place(tensor), set()).add(number)
+        outside = {self._place(tensor) for tensor in returned}
         own: dict[int, _Kernel] = {}
         for place, root in self._roots.items():
             numbers = users.get(place, set())
@@ -289,8 +314,8 @@ class Tape:
         arrays: list[str] = []
         ends: list[str] = []
 
-        def address(tensor: Tensor) -> tuple[str, bool]:
-            place, root = _place(tensor), self._roots.get(_place(tensor))
+        def address(tensor: Tensor) -> tuple[str, int, bool]:
+            place, root = self._place(tensor), self._roots.get(_storage(tensor))
             shared = root is not None and kernel.distances.get(place) == {0} and place in kernel.written
             is_own = self._own.get(place) is kernel
             if place not in names:
@@ -309,7 +334,8 @@ class Tape:
                 else:
                     outside[place] = tensor
                     arrays.append(f"{ctype}* {names[place]} = ({ctype}*)a.{names[place]};")
-            return names[place], not (is_own or shared)
+            offset = (tensor.data_ptr() - place) // tensor.element_size()
+            return names[place], offset, not (is_own or shared)
 
         body: list[str] = []
         for operation, rows in zip(kernel.operations, kernel.rows, strict=True):

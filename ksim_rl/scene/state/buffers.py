@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from ksim_rl.checks import unknown_name
+from ksim_rl.device import tape
 
 # Numbers per env that an arena has room for; a wider buffer has one of its own.
 ARENA_WIDTH = 128
@@ -21,6 +22,7 @@ class Arena:
         self._num_envs = num_envs
         self._row_N = torch.zeros(0, dtype=torch.int32, device=device)
         self._used = 0
+        self._taken: list[Tensor] = []
 
     def has_room(self, width: int, dtype: torch.dtype) -> bool:
         """Whether a buffer of this width and dtype fits."""
@@ -33,10 +35,15 @@ class Arena:
         rows = torch.arange(self._num_envs, dtype=torch.int32, device=self.values.device)
         # Which env each number belongs to.
         self._row_N = torch.cat((self._row_N, rows.repeat_interleave(width)))
-        return self.values[start : self._used].view(self._num_envs, *shape)
+        self._taken.append(self.values[start : self._used].view(self._num_envs, *shape))
+        return self._taken[-1]
 
     def clear(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Zero the rows of `mask_E` in all buffers."""
+        if tape.is_recording():
+            for taken in self._taken:  # each in the kernel that works on its rows
+                taken.masked_fill_(mask_E.view(-1, *[1] * (taken.ndim - 1)), 0)
+            return
         self.values[: self._used].masked_fill_(mask_E.index_select(0, self._row_N), 0)
 
 
