@@ -1,14 +1,14 @@
 """This module compiles the step of an env, resets included, whatever terms and transforms it is made of."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.device.tape import Tape, recorded
+from ksim_rl.device.recording import recorded
+from ksim_rl.device.tape import Tape
 
 SHARE, TOLERANCE = 0.99, 1e-3
 

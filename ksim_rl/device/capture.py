@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 import torch
 import warp as wp
 
-from ksim_rl.device import tape
+from ksim_rl.device import recording
 from ksim_rl.device.streams import checked_device, warp_device, warp_scope, warp_stream
 
 
@@ -195,7 +195,7 @@ class WarpGraphs:
 
     def run(self, key: Hashable, launches: Callable[[], None]) -> None:
         """Run `launches`, in order with torch's current stream. `key` names what it does."""
-        if tape.launched(lambda: self.run(key, launches)):
+        if recording.launched(lambda: self.run(key, launches)):
             return
         with warp_scope(self.device):
             replays = _phase.warming_up and key in self._graphs

@@ -12,7 +12,7 @@ import os
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -106,6 +106,12 @@ def loaded_together(device: torch.device) -> Iterator[None]:
 
     with upstream.launches_diverted(note):
         yield
-    workers = min(os.cpu_count() or 1, MOST_WORKERS)
     for block_dim, found in modules.items():
-        wp.force_load(warp_device(device), modules=list(found), block_dim=block_dim, max_workers=workers)
+        load(found, device, block_dim)
+
+
+def load(modules: Iterable[wp.Module], device: torch.device, block_dim: int | None) -> None:
+    """Compile and load modules, side by side, for launches of this block size; of any on the CPU."""
+    workers = min(os.cpu_count() or 1, MOST_WORKERS)
+    size = None if device.type == "cpu" else block_dim
+    wp.force_load(warp_device(device), modules=list(modules), block_dim=size, max_workers=workers)

@@ -15,7 +15,7 @@ import warp as wp
 from jaxtyping import Shaped
 from torch import Tensor
 
-from ksim_rl.device import tape, upstream
+from ksim_rl.device import recording, upstream
 from ksim_rl.device.streams import CPU_LOCK, current_warp_stream, warp_scope
 
 MAX_RECORDED = 64
@@ -44,7 +44,12 @@ class QuickLaunch:
     """
 
     def __init__(
-        self, arguments: type, source: str, indices: tuple[str, str] = ("row", "lane"), *, block_dim: int = 256
+        self,
+        arguments: type,
+        source: str,
+        indices: tuple[str, str] = ("row", "lane"),
+        *,
+        block_dim: int = 256,
     ) -> None:
         @wp.func_native(f"const int {indices[0]} = index_0, {indices[1]} = index_1;\n{source}")
         def run(index_0: int, index_1: int, a: arguments): ...  # type: ignore[valid-type]
@@ -60,11 +65,16 @@ class QuickLaunch:
         # The bytes are shared by all launches until the driver, or the kernel on the CPU, has read them.
         self._lock = threading.Lock()
 
+    @property
+    def module(self) -> wp.Module:
+        """What is compiled."""
+        return self._kernel.module
+
     def __call__(self, device: torch.device, dim: tuple[int, int], *values: float) -> None:
         """Launch with one value per field of the struct, in their order; do nothing for a dim of 0."""
         if 0 in dim:
             return
-        assert not tape.is_recording(), "a kernel that is no operator of torch cannot be recorded"
+        assert not recording.is_recording(), "a kernel that is no operator of torch cannot be recorded"
         if device.type == "cpu":
             lock, stream = CPU_LOCK, None
         else:
@@ -104,7 +114,7 @@ def as_operator(
     operator.register_fake(fake)
 
     def run(*arguments: object) -> Any:
-        is_traced = torch.compiler.is_compiling() or tape.is_recording()
+        is_traced = torch.compiler.is_compiling() or recording.is_recording()
         return (operator if is_traced else launch)(*arguments)
 
     return run

@@ -13,6 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ksim_rl.device.recording import Operation
+
 CTYPES = {
     torch.float32: "float",
     torch.float64: "double",
@@ -29,6 +31,9 @@ _POINTWISE = {
     "add": "a + b * alpha",
     "addcdiv": "a + value * b / c",
     "addcmul": "a + value * b * c",
+    "acos": "acos(a)",
+    "asin": "asin(a)",
+    "atan": "atan(a)",
     "atan2": "atan2(a, b)",
     "clamp": "low(high(a, b), c)",
     "clamp_max": "low(a, b)",
@@ -41,6 +46,7 @@ _POINTWISE = {
     "expm1": "exp_less_1(a)",
     "fill": "b",
     "floor": "floor(a)",
+    "nan_to_num": "a != a ? nan : a > most ? above : a < -most ? below : a",
     "lerp": "c < 0.5f ? a + c * (b - a) : b - (b - a) * (1 - c)",
     "log": "log(a)",
     "log1p": "log_1_plus(a)",
@@ -158,6 +164,8 @@ class Cells:
         """Return the element of a tensor at a place, which has the trailing dims of an operation, rows aside."""
         if tensor.dtype not in CTYPES:
             raise NotARowError(f"numbers of type {tensor.dtype}")
+        if not tensor.numel():
+            return "nothing"
         if tensor.device != self.device:
             return literal(tensor.item(), CTYPES[tensor.dtype])
         indices = ([""] if self.rows else []) + list(place)
@@ -178,6 +186,8 @@ class Cells:
 
 
 def _loops(shape: Sequence[int], body: Sequence[str]) -> list[str]:
+    if 0 in shape:
+        return []
     names = [f"i{k}" for k in range(len(shape))]
     heads = [
         f"for (int {name} = 0; {name} < {size}; ++{name})" for name, size in zip(names, shape, strict=True)
@@ -201,25 +211,28 @@ def literal(value: float, ctype: str) -> str:
     return f"({ctype}){int(value)}LL"
 
 
-def lines(function: Any, args: Sequence[Any], kwargs: dict[str, Any], results: Sequence[Tensor], cells: Cells) -> list[str]:
-    """Return the C++ of an operation, which writes `results`; a NotARowError where there is none."""
-    name = function.overloadpacket.__name__
-    is_in_place = name.endswith("_") and not name.startswith("_")
-    name = name.removesuffix("_") if is_in_place else name
-    if name in _FILLS or name in ("full", "full_like", "new_full", "scalar_tensor"):
-        value = _FILLS.get(name, args[0] if name == "scalar_tensor" else args[-1] if name not in _FILLS else 0)
-        return _fill(results[0], value, cells)
+def lines(operation: Operation, cells: Cells) -> list[str]:
+    """Return the C++ of an operation; a NotARowError where there is none."""
+    args, kwargs, outs = operation.args, operation.kwargs, [*operation.made, *operation.written]
+    name = operation.name
+    if name.endswith("_") and not name.startswith("_"):
+        name = name.removesuffix("_")
+    if name in _SPECIAL:
+        return _SPECIAL[name](args, kwargs, outs[0], cells)
+    if len(outs) > 1:
+        raise NotARowError("several results")
+    if name in _FILLS:
+        return _fill(outs[0], _FILLS[name], cells)
+    if name in ("full", "full_like", "new_full", "scalar_tensor"):
+        return _fill(outs[0], args[0 if name == "scalar_tensor" else -1], cells)
     if name in _REDUCTIONS:
-        return _reduce(function, name, args, kwargs, results[0], cells)
+        return _reduce(operation.function, name, args, kwargs, outs[0], cells)
     if name in ("cat", "stack"):
-        return _join(name, args, kwargs, results[0], cells)
-    for known in (_POINTWISE, _TESTS):
-        if name in known:
-            return _pointwise(name, known[name], args, kwargs, results[0], cells)
-    special = _SPECIAL.get(name)
-    if special is None:
-        raise NotARowError(str(function))
-    return special(args, kwargs, results[0], cells)
+        return _join(name, args, kwargs, outs[0], cells)
+    expression = _POINTWISE.get(name) or _TESTS.get(name)
+    if expression is None:
+        raise NotARowError(str(operation.function))
+    return _pointwise(name, expression, args, kwargs, outs[0], cells)
 
 
 def _inner(tensor: Tensor, cells: Cells) -> list[int]:
@@ -241,7 +254,7 @@ def _pointwise(
     if kwargs.get("rounding_mode") is not None:
         raise NotARowError("division that rounds")
     operands = list(args)
-    if name == "_to_copy":
+    if name in ("_to_copy", "clone", "nan_to_num", "_unsafe_view", "round"):
         operands = operands[:1]
     masks = [operands.pop({"where": 0, "masked_fill": 1}[name])] if name in ("where", "masked_fill") else []
     if name == "clamp":
@@ -258,7 +271,11 @@ def _pointwise(
         for operand in operands[1:]:
             other = operand.dtype if isinstance(operand, Tensor) else type(operand)
             if isinstance(operand, Tensor):
-                computed = torch.promote_types(computed, operand.dtype) if operand.ndim or not computed.is_floating_point else computed
+                computed = (
+                    torch.promote_types(computed, operand.dtype)
+                    if operand.ndim or not computed.is_floating_point
+                    else computed
+                )
             elif other is float and not computed.is_floating_point:
                 computed = torch.get_default_dtype()
     ctype = CTYPES[computed]
@@ -274,6 +291,15 @@ def _pointwise(
         body.append(f"const {ctype} {letter} = ({ctype}){value};")
     if masks:
         body.append(f"const bool m = {cells.at(masks[0], place)};")
+    if name == "nan_to_num":
+        given = dict(zip(("nan", "posinf", "neginf"), args[1:], strict=False)) | kwargs
+        most = torch.finfo(computed).max
+        numbers = {"nan": given.get("nan"), "above": given.get("posinf"), "below": given.get("neginf")}
+        usual = {"nan": 0.0, "above": most, "below": -most}
+        chosen = {key: usual[key] if value is None else value for key, value in numbers.items()} | {
+            "most": most
+        }
+        body += [f"const {ctype} {key} = {literal(value, ctype)};" for key, value in chosen.items()]
     for option in ("alpha", "value"):
         if option in expression:
             body.append(f"const {ctype} {option} = {literal(kwargs.get(option, 1), ctype)};")
@@ -284,7 +310,9 @@ def _pointwise(
 def _pow(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
     base, exponent = args[:2]
     if isinstance(base, Tensor) and isinstance(exponent, (int, float)):
-        expression = {2: "a * a", 1: "a", 0.5: "sqrt(a)", 3: "a * a * a", -1: "1 / a"}.get(exponent, "pow(a, b)")
+        expression = {2: "a * a", 1: "a", 0.5: "sqrt(a)", 3: "a * a * a", -1: "1 / a"}.get(
+            exponent, "pow(a, b)"
+        )
     else:
         expression = "pow(a, b)"
     return _pointwise("", expression, args, kwargs, out, cells)
@@ -341,7 +369,9 @@ def _join(name: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, c
         else:
             place[dim - first] = f"({place[dim - first]} + {offset})"
             offset += tensor.shape[dim]
-        written += _loops(shape, [f"{cells.at(out, place)} = ({CTYPES[out.dtype]}){cells.at(tensor, names)};"])
+        written += _loops(
+            shape, [f"{cells.at(out, place)} = ({CTYPES[out.dtype]}){cells.at(tensor, names)};"]
+        )
     return written
 
 
@@ -354,7 +384,7 @@ def _one_index(indices: Sequence[Any]) -> int:
 
 
 def _picked(index: Tensor, names: Sequence[str], size: int, cells: Cells) -> str:
-    cell = cells.uniform.at(index, names)
+    cell = cells.at(index, names)
     return f"({cell} < 0 ? {cell} + {size} : {cell})"
 
 
@@ -362,11 +392,13 @@ def _index(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cell
     source, indices = args[:2]
     dim = _one_index(indices)
     index, first = indices[dim], int(bool(cells.rows))
-    if dim < first:
-        raise NotARowError("rows are picked")
     shape = _inner(out, cells)
     names, at = _names(len(shape)), dim - first
-    picked = _picked(index, names[at : at + index.ndim], source.shape[dim], cells)
+    if dim < first:  # each row picks from a table that all have
+        picked = _picked(index, names[: index.ndim - 1], source.shape[0], cells)
+        place = [picked, *names[index.ndim - 1 :]]
+        return _loops(shape, [f"{cells.at(out, names)} = {cells.uniform.at(source, place)};"])
+    picked = _picked(index, names[at : at + index.ndim], source.shape[dim], cells.uniform)
     place = [*names[:at], picked, *names[at + index.ndim :]]
     return _loops(shape, [f"{cells.at(out, names)} = {cells.at(source, place)};"])
 
@@ -387,7 +419,7 @@ def _index_put(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: 
     at = dim - first
     shape = [*out.shape[first:dim], *index.shape, *out.shape[dim + 1 :]]
     names = _names(len(shape))
-    picked = _picked(index, names[at : at + index.ndim], out.shape[dim], cells)
+    picked = _picked(index, names[at : at + index.ndim], out.shape[dim], cells.uniform)
     place = [*names[:at], picked, *names[at + index.ndim :]]
     return _loops(shape, [f"{cells.at(out, place)} = {cells.at(values, names)};"])
 
@@ -414,7 +446,9 @@ def _cross(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cell
         return cells.at(tensor, [*names[:dim], str(k), *names[dim + 1 :]])
 
     ctype = CTYPES[out.dtype]
-    body = [f"const {ctype} {letter}{k} = {at(args[n], k)};" for n, letter in enumerate("xy") for k in range(3)]
+    body = [
+        f"const {ctype} {letter}{k} = {at(args[n], k)};" for n, letter in enumerate("xy") for k in range(3)
+    ]
     pairs = ((1, 2), (2, 0), (0, 1))
     body += [f"{at(out, k)} = x{i} * y{j} - x{j} * y{i};" for k, (i, j) in enumerate(pairs)]
     shape[dim] = 1
@@ -435,7 +469,9 @@ def _draw(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells
     plain = cells.uniform
     count = cells.at(counter, []) if counter.ndim else plain.at(counter, [])
     low_, width = literal(low, "float"), f"({literal(high, 'float')} - {literal(low, 'float')})"
-    value = (f"{low_} + unit(b) * {width}", "normal(b)", f"{start}LL + (long long)((b * {span}ull) >> 32)")[kind]
+    value = (f"{low_} + unit(b) * {width}", "normal(b)", f"{start}LL + (long long)((b * {span}ull) >> 32)")[
+        kind
+    ]
     body = f"const unsigned b = bits_of(key, (unsigned)i0); {cells.at(out, ['i0'])} = {value};"
     key = f"const RowKey key = key_of({plain.at(seed, [])}, {stream}u, {count}, {first_row} + row);"
     return ["{ " + key, *_loops([n], [body]), "}"]

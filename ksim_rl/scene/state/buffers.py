@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from ksim_rl.checks import unknown_name
-from ksim_rl.device import tape
+from ksim_rl.device import recording
 
 # Numbers per env that an arena has room for; a wider buffer has one of its own.
 ARENA_WIDTH = 128
@@ -40,7 +40,7 @@ class Arena:
 
     def clear(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Zero the rows of `mask_E` in all buffers."""
-        if tape.is_recording():
+        if recording.is_recording():
             for taken in self._taken:  # each in the kernel that works on its rows
                 taken.masked_fill_(mask_E.view(-1, *[1] * (taken.ndim - 1)), 0)
             return

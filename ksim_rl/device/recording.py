@@ -1,0 +1,121 @@
+"""This module writes down what torch computes and Warp launches, operation by operation, so that it can be compiled."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+_HOST_READS = frozenset({"_local_scalar_dense", "equal", "item", "masked_select", "nonzero"})
+
+
+class _Recording(threading.local):
+    recorder: "Recorder | None" = None
+
+
+_recording = _Recording()
+
+
+def is_recording() -> bool:
+    """Whether this thread writes down what torch computes: then every kernel has to be an operator of torch."""
+    return _recording.recorder is not None
+
+
+def launched(launch: Callable[[], None]) -> bool:
+    """Make a launch of Warp part of the recording, and say so; without a recording, do nothing."""
+    recorder = _recording.recorder
+    if recorder is None:
+        return False
+    with recorder.paused():
+        launch()
+    recorder.entries.append(launch)
+    return True
+
+
+@dataclass(frozen=True, eq=False)
+class Operation:
+    """One call of an operator, the tensors that it made, and those that it wrote."""
+
+    function: Any
+    args: tuple[Any, ...]
+    kwargs: dict[str, Any]
+    made: list[Tensor]
+    written: list[Tensor]
+
+    @property
+    def name(self) -> str:
+        """What the operator is called, whatever its arguments are."""
+        return self.function.overloadpacket.__name__
+
+    def read(self) -> list[Tensor]:
+        """Return the tensors among the arguments."""
+        return _tensors((self.args, self.kwargs))
+
+    def __call__(self) -> None:
+        """Do it once more, in the same memory."""
+        result = self.function(*self.args, **self.kwargs)
+        if self.made:
+            again = [new for new in _tensors(result) if all(new is not old for old in self.written)]
+            for old, new in zip(self.made, again, strict=True):
+                old.copy_(new)
+
+
+def _tensors(tree: Any) -> list[Tensor]:
+    return [leaf for leaf in tree_leaves(tree) if isinstance(leaf, Tensor)]
+
+
+class Recorder(TorchDispatchMode):
+    """Writes down operations as they are dispatched; tensors stay alive, so that no memory is used twice."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.entries: list[Operation | Callable[[], None]] = []
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Write nothing down in this block."""
+        _recording.recorder = None
+        try:
+            with torch.utils._python_dispatch._disable_current_modes():
+                yield
+        finally:
+            _recording.recorder = self
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if func.overloadpacket.__name__ in _HOST_READS:
+            raise RuntimeError(f"{func} reads the device on the host")
+        _recording.recorder = None
+        try:
+            result = func(*args, **kwargs)
+        finally:
+            _recording.recorder = self
+        read = {id(tensor) for tensor in _tensors((args, kwargs))}
+        made = [tensor for tensor in _tensors(result) if id(tensor) not in read]
+        written = list(_written(func, args, kwargs))
+        if made or written:
+            self.entries.append(Operation(func, args, kwargs, made, written))
+        return result
+
+
+def _written(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Iterator[Tensor]:
+    for place, argument in enumerate(func._schema.arguments):
+        if argument.alias_info is not None and argument.alias_info.is_write:
+            yield from _tensors(args[place] if place < len(args) else kwargs.get(argument.name))
+
+
+@contextmanager
+def recorded() -> Iterator[Recorder]:
+    """Write down what torch computes in this block, and what Warp launches."""
+    assert _recording.recorder is None, "recordings do not nest"
+    recorder = _recording.recorder = Recorder()
+    try:
+        with recorder:
+            yield recorder
+    finally:
+        _recording.recorder = None
