@@ -23,6 +23,7 @@ PACKAGE = "ksim_rl"
 PACKAGE_LINES = 38_000
 ROOMS_AROUND = {
     "cli": 900,
+    "compiled": 950,
     "diagnosis": 800,
     "export": 2_760,
     "ranks": 900,

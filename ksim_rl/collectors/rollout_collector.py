@@ -16,7 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ksim_rl import dims
 from ksim_rl.checked import Checked, Count
 from ksim_rl.checks import check_count
-from ksim_rl.collectors.compiled_step import CompiledStep
+from ksim_rl.compiled.compiled_step import CompiledStep
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.envs.contract import EpisodeClock, part
@@ -29,14 +29,15 @@ class CollectorCfg(Checked):
     """Options of `RolloutCollector` that a config may set.
 
     `require_graphs` fails where CUDA graphs are unavailable, instead of running slower with a warning.
-    `compile` compiles the env's step on CUDA, for fewer kernels; without, only its physics are.
+    `compile` makes few kernels of what terms and transforms compute, which is checked once against the env's own step:
+    rollouts take less time, and are those of the env to rounding.
     `stagger_episodes` spreads the time-outs of the envs over an episode's length at the first reset, where the env
     offers it. The first `warmup` rollouts on CUDA run eagerly. In the config of a run, `rollout_length` may be given
     instead of the dataset's size, which then follows from it and the number of envs.
     """
 
     require_graphs: bool = False
-    compile: bool = True
+    compile: bool = False
     stagger_episodes: bool = False
     warmup: Count = 2
     rollout_length: Count | None = None
@@ -83,7 +84,7 @@ class RolloutCollector:
         self._storage_TE: TensorDict | None = None
         self._leaves_by_dtype: list[list[tuple[NestedKey, Tensor]]] = []
         device = env.device or torch.device("cpu")
-        self._compiles, self._compiled = cfg.compile and device.type == "cuda", None
+        self._compiles, self._compiled = cfg.compile, None
         self._run = Captured(
             self._rollout, device=device, warmup=cfg.warmup, require_graphs=cfg.require_graphs
         )

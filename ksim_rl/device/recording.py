@@ -6,9 +6,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-import torch
+from jaxtyping import Shaped
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_leaves
 
 _HOST_READS = frozenset({"_local_scalar_dense", "equal", "item", "masked_select", "nonzero"})
@@ -52,7 +52,7 @@ class Operation:
         """What the operator is called, whatever its arguments are."""
         return self.function.overloadpacket.__name__
 
-    def read(self) -> list[Tensor]:
+    def read(self) -> list[Shaped[Tensor, "*?shape"]]:
         """Return the tensors among the arguments."""
         return _tensors((self.args, self.kwargs))
 
@@ -81,7 +81,7 @@ class Recorder(TorchDispatchMode):
         """Write nothing down in this block."""
         _recording.recorder = None
         try:
-            with torch.utils._python_dispatch._disable_current_modes():
+            with _disable_current_modes():
                 yield
         finally:
             _recording.recorder = self

@@ -7,8 +7,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from ksim_rl.compiled.tape import Tape
 from ksim_rl.device.recording import recorded
-from ksim_rl.device.tape import Tape
 
 SHARE, TOLERANCE = 0.99, 1e-3
 
@@ -25,10 +25,16 @@ class CompiledStep:
     def __init__(self, env: EnvBase, root_E: TensorDictBase, tensordict: TensorDictBase) -> None:
         root_keys = list(root_E.keys(True, True))
         self._changing = [key for key in tensordict.keys(True, True) if key not in root_keys]
-        self._given = [tensordict.get(key) for key in self._changing]
+        # Dense and in memory of their own, as later ones are copied here.
+        self._given = [
+            tensordict.get(key).clone(memory_format=torch.contiguous_format) for key in self._changing
+        ]
+        tensordict = tensordict.copy()
+        for key, leaf in zip(self._changing, self._given, strict=True):
+            tensordict.set(key, leaf)
         before, root_before_E = env.state_dict(), root_E.clone()
         with recorded() as recorder:
-            self.env_state_E, next_root_E = env.step_and_maybe_reset(tensordict.copy())
+            self.env_state_E, next_root_E = env.step_and_maybe_reset(tensordict)
             for key in root_keys:
                 root_E.get(key).copy_(next_root_E.get(key))
         self._next_E = self.env_state_E.select("next")

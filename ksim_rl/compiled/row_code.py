@@ -7,23 +7,13 @@ for numbers that are not finite.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from ksim_rl.compiled.cells import CTYPES, Cells, NotARowError, literal, loops, names_of
 from ksim_rl.device.recording import Operation
-
-CTYPES = {
-    torch.float32: "float",
-    torch.float64: "double",
-    torch.int64: "long long",
-    torch.int32: "int",
-    torch.uint8: "unsigned char",
-    torch.bool: "bool",
-}
-"""What an element is in C++."""
 
 # Operands are a, b, c in the order of the schema, in the type that torch computes in.
 _POINTWISE = {
@@ -125,10 +115,13 @@ PRELUDE = r"""
     #endif
     };
     // Exact to rounding, by W. Kahan; not every compiler's library has them.
-    auto log_1_plus = [](auto x) { const auto u = 1 + x; return u == 1 ? x : log(u) * x / (u - 1); };
+    auto log_1_plus = [](auto x) {
+        const auto u = 1 + x;
+        return u == 1 ? x : u - 1 == u ? log(u) : log(u) * x / (u - 1);
+    };
     auto exp_less_1 = [](auto x) {
         const auto u = exp(x);
-        return u == 1 ? x : u - 1 == -1 ? (decltype(x))-1 : (decltype(x))((u - 1) * x / log(u));
+        return u == 1 ? x : u - 1 == u ? u : u - 1 == -1 ? (decltype(x))-1 : (decltype(x))((u - 1) * x / log(u));
     };
     auto modulo = [](auto x, auto y) {
         auto rest = (decltype(x))(x - (decltype(x))(long long)(x / y) * y);
@@ -136,79 +129,6 @@ PRELUDE = r"""
         return rest != 0 && (rest < 0) != (y < 0) ? (decltype(x))(rest + y) : rest;
     };
 """
-
-
-class NotARowError(Exception):
-    """An operation mixes rows, or is not known here: torch runs it."""
-
-
-@dataclass(frozen=True)
-class Cells:
-    """Where tensors lie, for the operation at hand: `rows` are E, and 0 where it has no rows.
-
-    `address` returns the name of an array, the place in it, and whether it has all rows. `seen` collects which tensors were used, with
-    the distance of their rows; 0 where all rows use the same elements.
-    """
-
-    rows: int
-    address: Callable[[Tensor], tuple[str, int, bool]]
-    device: torch.device
-    seen: list[tuple[Tensor, int]] = field(default_factory=list)
-
-    @property
-    def uniform(self) -> "Cells":
-        """The same for tensors that have no rows."""
-        return replace(self, rows=0)
-
-    def at(self, tensor: Tensor, place: Sequence[str]) -> str:
-        """Return the element of a tensor at a place, which has the trailing dims of an operation, rows aside."""
-        if tensor.dtype not in CTYPES:
-            raise NotARowError(f"numbers of type {tensor.dtype}")
-        if not tensor.numel():
-            return "nothing"
-        if tensor.device != self.device:
-            return literal(tensor.item(), CTYPES[tensor.dtype])
-        indices = ([""] if self.rows else []) + list(place)
-        indices = indices[len(indices) - tensor.ndim :] if tensor.ndim else []
-        name, offset, has_all_rows = self.address(tensor)
-        terms = [str(offset)] if offset else []
-        distance = 0
-        for index, size, stride in zip(indices, tensor.shape, tensor.stride(), strict=True):
-            if size == 1 or stride == 0:
-                continue
-            if index:
-                terms.append(f"{index} * {stride}" if stride != 1 else index)
-            else:
-                distance = stride
-                terms += [f"row * {stride}LL"] if has_all_rows else []
-        self.seen.append((tensor, distance))
-        return f"{name}[{' + '.join(terms) or '0'}]"
-
-
-def _loops(shape: Sequence[int], body: Sequence[str]) -> list[str]:
-    if 0 in shape:
-        return []
-    names = [f"i{k}" for k in range(len(shape))]
-    heads = [
-        f"for (int {name} = 0; {name} < {size}; ++{name})" for name, size in zip(names, shape, strict=True)
-    ]
-    return [" ".join([*heads, "{", *body, "}"])]
-
-
-def _names(count: int, start: int = 0) -> list[str]:
-    return [f"i{k}" for k in range(start, start + count)]
-
-
-def literal(value: float, ctype: str) -> str:
-    """Return a number of Python in C++."""
-    if ctype in ("float", "double"):
-        value = float(value)
-        if math.isnan(value):
-            return "NAN"
-        if math.isinf(value):
-            return "INFINITY" if value > 0 else "(-INFINITY)"
-        return f"({ctype}){value!r}"
-    return f"({ctype}){int(value)}LL"
 
 
 def lines(operation: Operation, cells: Cells) -> list[str]:
@@ -245,7 +165,7 @@ def _fill(out: Tensor, value: Any, cells: Cells) -> list[str]:
         raise NotARowError("fill by a tensor")
     shape = _inner(out, cells)
     number = literal(value, CTYPES[out.dtype])
-    return _loops(shape, [f"{cells.at(out, _names(len(shape)))} = {number};"])
+    return loops(shape, [f"{cells.at(out, names_of(len(shape)))} = {number};"])
 
 
 def _pointwise(
@@ -263,7 +183,7 @@ def _pointwise(
             (operands[1] is None, operands[2] is None), expression
         )
     shape = _inner(out, cells)
-    place = _names(len(shape))
+    place = names_of(len(shape))
     tensors = [x for x in operands if isinstance(x, Tensor)]
     computed = out.dtype
     if name in _TESTS:
@@ -271,11 +191,7 @@ def _pointwise(
         for operand in operands[1:]:
             other = operand.dtype if isinstance(operand, Tensor) else type(operand)
             if isinstance(operand, Tensor):
-                computed = (
-                    torch.promote_types(computed, operand.dtype)
-                    if operand.ndim or not computed.is_floating_point
-                    else computed
-                )
+                computed = torch.result_type(tensors[0], operand)
             elif other is float and not computed.is_floating_point:
                 computed = torch.get_default_dtype()
     ctype = CTYPES[computed]
@@ -304,7 +220,7 @@ def _pointwise(
         if option in expression:
             body.append(f"const {ctype} {option} = {literal(kwargs.get(option, 1), ctype)};")
     body.append(f"{cells.at(out, place)} = ({CTYPES[out.dtype]})({expression});")
-    return _loops(shape, body)
+    return loops(shape, body)
 
 
 def _pow(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
@@ -340,17 +256,19 @@ def _reduce(
         raise NotARowError("a reduction over rows, or of whole numbers")
     start, step, end = _REDUCTIONS[name]
     first = bool(cells.rows)
-    names = dict(zip(range(first, source.ndim), _names(source.ndim - first), strict=True))
+    names = dict(zip(range(first, source.ndim), names_of(source.ndim - first), strict=True))
     kept = [k for k in names if k not in dims]
     place = ["0" if k in dims else names[k] for k in names] if keeps else [names[k] for k in kept]
     ctype = "bool" if name in ("any", "all") else CTYPES[out.dtype]
     element = "bool" if name in ("any", "all") else ctype
     count = math.prod(source.shape[k] for k in dims)
     inner = f"const {element} e = ({element}){cells.at(source, list(names.values()))}; {step};"
-    heads = " ".join(f"for (int {names[k]} = 0; {names[k]} < {source.shape[k]}; ++{names[k]})" for k in dims)
-    body = f"{ctype} s = {start}; {heads} {{ {inner} }} {cells.at(out, place)} = {end.replace('count', literal(count, ctype))};"
-    outer = " ".join(f"for (int {names[k]} = 0; {names[k]} < {source.shape[k]}; ++{names[k]})" for k in kept)
-    return [f"{outer} {{ {body} }}"]
+    over, each = (
+        " ".join(f"for (int {names[k]} = 0; {names[k]} < {source.shape[k]}; ++{names[k]})" for k in chosen)
+        for chosen in (dims, kept)
+    )
+    end = end.replace("count", literal(count, ctype))
+    return [f"{each} {{ {ctype} s = {start}; {over} {{ {inner} }} {cells.at(out, place)} = {end}; }}"]
 
 
 def _join(name: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
@@ -362,16 +280,14 @@ def _join(name: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, c
     written, offset = [], 0
     for number, tensor in enumerate(tensors):
         shape = list(tensor.shape[first:])
-        names = _names(len(shape))
+        names = names_of(len(shape))
         place = list(names)
         if name == "stack":
             place.insert(dim - first, str(number))
         else:
             place[dim - first] = f"({place[dim - first]} + {offset})"
             offset += tensor.shape[dim]
-        written += _loops(
-            shape, [f"{cells.at(out, place)} = ({CTYPES[out.dtype]}){cells.at(tensor, names)};"]
-        )
+        written += loops(shape, [f"{cells.at(out, place)} = ({CTYPES[out.dtype]}){cells.at(tensor, names)};"])
     return written
 
 
@@ -393,14 +309,14 @@ def _index(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cell
     dim = _one_index(indices)
     index, first = indices[dim], int(bool(cells.rows))
     shape = _inner(out, cells)
-    names, at = _names(len(shape)), dim - first
+    names, at = names_of(len(shape)), dim - first
     if dim < first:  # each row picks from a table that all have
         picked = _picked(index, names[: index.ndim - 1], source.shape[0], cells)
         place = [picked, *names[index.ndim - 1 :]]
-        return _loops(shape, [f"{cells.at(out, names)} = {cells.uniform.at(source, place)};"])
+        return loops(shape, [f"{cells.at(out, names)} = {cells.uniform.at(source, place)};"])
     picked = _picked(index, names[at : at + index.ndim], source.shape[dim], cells.uniform)
     place = [*names[:at], picked, *names[at + index.ndim :]]
-    return _loops(shape, [f"{cells.at(out, names)} = {cells.at(source, place)};"])
+    return loops(shape, [f"{cells.at(out, names)} = {cells.at(source, place)};"])
 
 
 def _index_select(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
@@ -418,10 +334,10 @@ def _index_put(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: 
         raise NotARowError("rows are written")
     at = dim - first
     shape = [*out.shape[first:dim], *index.shape, *out.shape[dim + 1 :]]
-    names = _names(len(shape))
+    names = names_of(len(shape))
     picked = _picked(index, names[at : at + index.ndim], out.shape[dim], cells.uniform)
     place = [*names[:at], picked, *names[at + index.ndim :]]
-    return _loops(shape, [f"{cells.at(out, place)} = {cells.at(values, names)};"])
+    return loops(shape, [f"{cells.at(out, place)} = {cells.at(values, names)};"])
 
 
 def _gather(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
@@ -429,10 +345,10 @@ def _gather(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cel
     dim, first = dim % source.ndim, int(bool(cells.rows))
     if dim < first:
         raise NotARowError("rows are gathered")
-    names = _names(out.ndim - first)
+    names = names_of(out.ndim - first)
     place = [*names]
     place[dim - first] = f"(int){cells.at(index, names)}"
-    return _loops(_inner(out, cells), [f"{cells.at(out, names)} = {cells.at(source, place)};"])
+    return loops(_inner(out, cells), [f"{cells.at(out, names)} = {cells.at(source, place)};"])
 
 
 def _cross(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
@@ -440,7 +356,7 @@ def _cross(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cell
     if dim < 0:
         raise NotARowError("a cross product of rows")
     shape = _inner(out, cells)
-    names = _names(len(shape))
+    names = names_of(len(shape))
 
     def at(tensor: Tensor, k: int) -> str:
         return cells.at(tensor, [*names[:dim], str(k), *names[dim + 1 :]])
@@ -452,7 +368,7 @@ def _cross(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cell
     pairs = ((1, 2), (2, 0), (0, 1))
     body += [f"{at(out, k)} = x{i} * y{j} - x{j} * y{i};" for k, (i, j) in enumerate(pairs)]
     shape[dim] = 1
-    return _loops(shape, body)
+    return loops(shape, body)
 
 
 def _bmm(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
@@ -460,8 +376,8 @@ def _bmm(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells)
         raise NotARowError("matrices without rows")
     left, right = args
     term = f"s += {cells.at(left, ['i0', 'k'])} * {cells.at(right, ['k', 'i1'])};"
-    body = f"{CTYPES[out.dtype]} s = 0; for (int k = 0; k < {left.shape[2]}; ++k) {term} {cells.at(out, ['i0', 'i1'])} = s;"
-    return _loops(out.shape[1:], [body])
+    body = f"{CTYPES[out.dtype]} s = 0; for (int k = 0; k < {left.shape[2]}; ++k) {term}"
+    return loops(out.shape[1:], [body, f"{cells.at(out, ['i0', 'i1'])} = s;"])
 
 
 def _draw(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
@@ -474,7 +390,7 @@ def _draw(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells
     ]
     body = f"const unsigned b = bits_of(key, (unsigned)i0); {cells.at(out, ['i0'])} = {value};"
     key = f"const RowKey key = key_of({plain.at(seed, [])}, {stream}u, {count}, {first_row} + row);"
-    return ["{ " + key, *_loops([n], [body]), "}"]
+    return ["{ " + key, *loops([n], [body]), "}"]
 
 
 def _count_non_finite(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
@@ -484,7 +400,7 @@ def _count_non_finite(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, 
     body = [f"if (fabsf({cells.at(table, ['i0'])}) <= 3.402823466e38f) continue;", f"const int term = {at};"]
     body += [f"const long long place = {plain.at(step, [])} * {table.shape[0]} + row;"]
     body += [f"count_up(&{plain.at(count, ['term'])}); least(&{plain.at(first, ['term'])}, place);"]
-    return _loops(table.shape[1:], body)
+    return loops(table.shape[1:], body)
 
 
 _SPECIAL: dict[str, Callable[[Sequence[Any], dict[str, Any], Tensor, Cells], list[str]]] = {

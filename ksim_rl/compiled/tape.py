@@ -14,7 +14,9 @@ import warp as wp
 from jaxtyping import Shaped
 from torch import Tensor
 
-from ksim_rl.device import kernel_loading, random, row_code
+from ksim_rl.compiled import row_code
+from ksim_rl.compiled.cells import CTYPES, Cells, NotARowError
+from ksim_rl.device import kernel_loading, random
 from ksim_rl.device.quick_launch import QuickLaunch, arguments_of
 from ksim_rl.device.recording import Operation, Recorder
 
@@ -118,7 +120,7 @@ class Tape:
     """
 
     def __init__(
-        self, recorder: Recorder, *, num_rows: int, returned: Sequence[Shaped[Tensor, "*shape"]]
+        self, recorder: Recorder, *, num_rows: int, returned: Sequence[Shaped[Tensor, "*?shape"]]
     ) -> None:
         self._num_rows, self._device = num_rows, returned[0].device
         self._memory = _Memory.of([entry for entry in recorder.entries if isinstance(entry, Operation)])
@@ -130,8 +132,8 @@ class Tape:
                 self._add(entry)
         self._own = self._find_own(returned)
         self._kept = [tensor for place, tensor in self._memory.made.items() if place not in self._own]
-        launches = [self._compiled(part) for part in self.parts if isinstance(part, Kernel)]
-        kernel_loading.load([launch.module for launch in launches], self._device, BLOCK)
+        modules = [self._compiled(part) for part in self.parts if isinstance(part, Kernel)]
+        kernel_loading.load([module for module in modules if module], self._device, BLOCK)
 
     def __call__(self) -> None:
         """Run all parts in order."""
@@ -151,7 +153,7 @@ class Tape:
         last = self.parts[-1] if self.parts else None
         try:
             use = self._use(operation, rows)
-        except row_code.NotARowError:
+        except NotARowError:
             self.parts.append(operation)
             return
         fits = isinstance(last, Kernel) and len(last.operations) < MOST_OPERATIONS and last.use.allows(use)
@@ -167,21 +169,21 @@ class Tape:
 
     def _use(self, operation: Operation, rows: int) -> _Use:
         """Return how an operation uses memory; a NotARowError where it does not keep to its row."""
-        cells = row_code.Cells(rows=rows, address=lambda _: ("", 0, True), device=self._device)
+        cells = Cells(rows=rows, address=lambda _: ("", 0, True), device=self._device)
         row_code.lines(operation, cells)
         use, counts = _Use(), operation.name in _COUNTS
         for tensor, distance in cells.seen:
             root = self._memory.made.get(_storage(tensor))
             if root is not None and root.dtype != tensor.dtype:
-                raise row_code.NotARowError("memory of two types")
+                raise NotARowError("memory of two types")
             if not rows and tensor.numel() > MOST_SHARED:
-                raise row_code.NotARowError("many numbers without rows")
+                raise NotARowError("many numbers without rows")
             use.distances.setdefault(self._memory.place(tensor), set()).add(distance)
         use.made = {self._memory.place(tensor) for tensor in operation.made}
         outs = use.made | {self._memory.place(tensor) for tensor in operation.written}
         use.counted, use.written = (outs, set()) if counts else (set(), outs)
         if rows and any(0 in use.distances[place] for place in use.written):
-            raise row_code.NotARowError("all rows write the same numbers")
+            raise NotARowError("all rows write the same numbers")
         return use
 
     def _find_own(self, returned: Sequence[Tensor]) -> dict[int, Kernel]:
@@ -210,14 +212,15 @@ class Tape:
         width, rest = divmod(width, self._num_rows)
         return width if distances == {width} and not rest else 0
 
-    def _compiled(self, kernel: Kernel) -> QuickLaunch:
+    def _compiled(self, kernel: Kernel) -> wp.Module | None:
+        """Give a kernel its launch, and return what is to be compiled; None where nobody sees what it computes."""
         names: dict[int, str] = {}
         given: list[int] = []
         begin: list[str] = []
         end: list[str] = []
 
         def address(tensor: Tensor) -> tuple[str, int, bool]:
-            place, ctype = self._memory.place(tensor), row_code.CTYPES[tensor.dtype]
+            place, ctype = self._memory.place(tensor), CTYPES[tensor.dtype]
             is_own = self._own.get(place) is kernel
             is_shared = place in kernel.use.made and kernel.use.distances[place] == {0}
             if place not in names:
@@ -236,7 +239,9 @@ class Tape:
 
         body: list[str] = []
         for operation, rows in kernel.operations:
-            body += row_code.lines(operation, row_code.Cells(rows=rows, address=address, device=self._device))
+            body += row_code.lines(operation, Cells(rows=rows, address=address, device=self._device))
+        if not given:
+            return None
         source = "\n".join([random.DRAWS, row_code.PRELUDE, *begin, *body, *end])
         fields = " ".join(names[place] for place in given)
         launch = QuickLaunch(arguments_of((wp.uint64, fields)), source, block_dim=BLOCK)
@@ -246,4 +251,4 @@ class Tape:
             tensor for one, _ in kernel.operations for tensor in one.read() if _storage(tensor) in given
         ]
         kernel.operations.clear()
-        return launch
+        return launch.module

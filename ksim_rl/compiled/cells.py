@@ -1,0 +1,89 @@
+"""This module names the elements of tensors in C++ that runs once per row of a batch."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Shaped
+from torch import Tensor
+
+CTYPES = {
+    torch.float32: "float",
+    torch.float64: "double",
+    torch.int64: "long long",
+    torch.int32: "int",
+    torch.uint8: "unsigned char",
+    torch.bool: "bool",
+}
+"""What an element is in C++."""
+
+
+class NotARowError(Exception):
+    """An operation mixes rows, or is not known here: torch runs it."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Where tensors lie, for the operation at hand: `rows` are E, and 0 where it has no rows.
+
+    `address` returns the name of an array, the place in it, and whether it has all rows. `seen` collects which tensors
+    were used, with the distance of their rows; 0 where all rows use the same elements.
+    """
+
+    rows: int
+    address: Callable[[Tensor], tuple[str, int, bool]]
+    device: torch.device
+    seen: list[tuple[Tensor, int]] = field(default_factory=list)
+
+    @property
+    def uniform(self) -> "Cells":
+        """The same for tensors that have no rows."""
+        return replace(self, rows=0)
+
+    def at(self, tensor: Shaped[Tensor, "*shape"], place: Sequence[str]) -> str:
+        """Return the element of a tensor at a place, which has the trailing dims of an operation, rows aside."""
+        if tensor.dtype not in CTYPES:
+            raise NotARowError(f"numbers of type {tensor.dtype}")
+        if not tensor.numel():
+            return "nothing"
+        if tensor.device != self.device:
+            return literal(tensor.item(), CTYPES[tensor.dtype])
+        indices = ([""] if self.rows else []) + list(place)
+        indices = indices[len(indices) - tensor.ndim :] if tensor.ndim else []
+        name, offset, has_all_rows = self.address(tensor)
+        terms = [str(offset)] if offset else []
+        distance = 0
+        for index, size, stride in zip(indices, tensor.shape, tensor.stride(), strict=True):
+            if size == 1 or stride == 0:
+                continue
+            if index:
+                terms.append(f"{index} * {stride}" if stride != 1 else index)
+            else:
+                distance = stride
+                terms += [f"row * {stride}LL"] if has_all_rows else []
+        self.seen.append((tensor, distance))
+        return f"{name}[{' + '.join(terms) or '0'}]"
+
+
+def loops(shape: Sequence[int], body: Sequence[str]) -> list[str]:
+    """Return a loop over the indices of a shape, rows aside; nothing for no numbers."""
+    heads = [f"for (int i{k} = 0; i{k} < {size}; ++i{k})" for k, size in enumerate(shape)]
+    return [] if 0 in shape else [" ".join([*heads, "{", *body, "}"])]
+
+
+def names_of(count: int) -> list[str]:
+    """Return the names of so many indices."""
+    return [f"i{k}" for k in range(count)]
+
+
+def literal(value: float, ctype: str) -> str:
+    """Return a number of Python in C++."""
+    if ctype in ("float", "double"):
+        value = float(value)
+        if math.isnan(value):
+            return "NAN"
+        if math.isinf(value):
+            return "INFINITY" if value > 0 else "(-INFINITY)"
+        return f"({ctype}){value!r}"
+    return f"({ctype}){int(value)}LL"

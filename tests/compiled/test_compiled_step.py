@@ -1,0 +1,102 @@
+"""A compiled step does what the env does, to rounding, whatever it is made of; one that does not is not used."""
+
+import pytest
+import torch
+
+from ksim_rl import envs
+from ksim_rl.collectors import CollectorCfg, RolloutCollector
+from ksim_rl.compiled import compiled_step
+from ksim_rl.compiled.compiled_step import CompiledStep
+
+QUICK = ("cartpole_swingup", "pendulum_swingup")
+TASKS = (
+    "arm_push", "cheetah_run", "reacher", "walker_track", "walker_amp", "quadruped_velocity_delayed",
+    "quadruped_get_up", "humanoid_velocity_flat", "humanoid_get_up", "playground_finger_spin", "dm_control_fish_swim",
+)  # fmt: skip
+MENAGERIE = ("go1_velocity_flat", "g1_velocity_flat", "go2_velocity_flat", "go1_velocity_rough")
+ROWS, STEPS = 33, 12
+
+
+def policy(env):
+    size = env.full_action_spec["action"].shape[-1]
+    return lambda td: td.set("action", torch.randn(*td.batch_size, size))
+
+
+def rollouts(task, *, compile, count=2, **overrides):
+    env = envs.make(task, num_envs=ROWS, seed=3, device="cpu", **overrides)
+    torch.manual_seed(0)
+    collector = RolloutCollector(env, policy(env), rollout_length=STEPS, cfg=CollectorCfg(compile=compile))
+    return [collector.collect().clone() for _ in range(count)], env.state_dict()
+
+
+def check(task, **overrides):
+    (expected, state), (found, own_state) = (
+        rollouts(task, compile=compile, **overrides) for compile in (False, True)
+    )
+    for own, true in zip(found, expected, strict=True):
+        for key in true.keys(True, True):
+            torch.testing.assert_close(
+                own[key], true[key], rtol=1e-3, atol=2e-3, msg=lambda text, key=key: f"{key}: {text}"
+            )
+    assert own_state.keys() == state.keys()
+    return expected
+
+
+@pytest.mark.parametrize("task", QUICK)
+def test_rollouts_are_those_of_the_env_resets_included(task):
+    expected = check(task, overrides=["task.episode_length_s=0.3"])
+    assert torch.cat([rollout["next", "done"] for rollout in expected]).any()
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("task", [*TASKS, *MENAGERIE])
+def test_rollouts_of_every_kind_of_task_are_those_of_the_env(task):
+    try:
+        check(task)
+    except (FileNotFoundError, ImportError) as error:
+        pytest.skip(str(error))
+
+
+def made(task="cartpole_swingup"):
+    env = envs.make(task, num_envs=ROWS, seed=3, device="cpu")
+    root_E = env.reset().clone()
+    return env, root_E, policy(env)(root_E.copy())
+
+
+def test_making_one_leaves_env_and_root_as_they_were():
+    env, root_E, tensordict = made()
+    before, root_before_E = env.state_dict(), root_E.clone()
+    CompiledStep(env, root_E, tensordict)
+    for name, value in env.state_dict().items():
+        assert not isinstance(value, torch.Tensor) or torch.equal(value, before[name]), name
+    assert (root_E == root_before_E).all()
+
+
+def test_it_is_few_kernels():
+    env, root_E, tensordict = made()
+    step = CompiledStep(env, root_E, tensordict)
+    assert len(step._tape.parts) < 20
+
+
+def test_a_step_that_gives_something_else_is_not_used(monkeypatch):
+    env, root_E, tensordict = made()
+    monkeypatch.setattr(compiled_step.Tape, "__call__", lambda tape: None)
+    with pytest.raises(RuntimeError, match="another .* than the env in"):
+        CompiledStep(env, root_E, tensordict)
+    collector = RolloutCollector(env, policy(env), rollout_length=2, cfg=CollectorCfg(compile=True))
+    with pytest.warns(RuntimeWarning, match="NOT COMPILED"):
+        collector.collect()
+    collector.collect()
+
+
+def test_a_term_that_reads_the_device_on_the_host_is_named():
+    env, root_E, tensordict = made()
+    step = env.step_and_maybe_reset
+
+    def reading(td):
+        td["action"].sum().item()
+        return step(td)
+
+    env.__dict__["step_and_maybe_reset"] = reading
+    with pytest.raises(RuntimeError, match="on the host"):
+        CompiledStep(env, root_E, tensordict)
