@@ -44,7 +44,7 @@ def check(task, **overrides):
 
 @pytest.mark.parametrize("task", QUICK)
 def test_rollouts_are_those_of_the_env_resets_included(task):
-    expected = check(task, overrides=["task.episode_length_s=0.3"])
+    expected = check(task, overrides=["task.episode_length_s=0.1"])
     assert torch.cat([rollout["next", "done"] for rollout in expected]).any()
 
 
