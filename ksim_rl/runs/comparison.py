@@ -42,7 +42,10 @@ def figures(folders: Sequence[Path]) -> list[list[str]]:
     configs = [dict(_flat(_config(folder))) for folder in folders]
     lines = [line(summarize(folder), name=name) for folder, name in zip(folders, names(folders), strict=True)]
     rows = [[head, *cells] for head, *cells in zip(HEADS, *lines, strict=True)]
-    returns = [_first(_rows(folder), RETURN)[1] for folder in folders]
+    returns = [
+        next(filter(None, (numbers(read_table(folder / METRICS)[1], metric) for metric in RETURN)), [])
+        for folder in folders
+    ]
     rows.append(["best return", *(written(max(values, default=None), ".4g") for values in returns)])
     fields = dict.fromkeys(name for config in configs for name in config)
     differing = [name for name in fields if len({config.get(name, "-") for config in configs}) > 1]
@@ -55,7 +58,7 @@ def figures(folders: Sequence[Path]) -> list[list[str]]:
 
 def draw(folders: Sequence[Path], picture: Path) -> None:
     """Draw the curves of runs over each other, into a PNG; a ValueError where none has any."""
-    tables = [_rows(folder) for folder in folders]
+    tables = [read_table(folder / METRICS)[1] for folder in folders]
     figure = Figure(figsize=(11, 7.5), layout="constrained")
     FigureCanvasAgg(figure)
     drawn = False
@@ -70,28 +73,14 @@ def draw(folders: Sequence[Path], picture: Path) -> None:
             drawn |= bool(points)
         if title == PANELS[-1][0]:
             # Where iterations overlap, one that waited for a graph to be recorded makes the next one look short.
-            usual = [
-                sorted(speeds)[int(0.97 * (len(speeds) - 1))]
-                for rows in tables
-                if (speeds := numbers(rows, metric))
-            ]
-            axes.set_ylim(0.0, 1.2 * max(usual, default=1.0))
+            speeds = sorted(speed for rows in tables for speed in numbers(rows, metric)) or [1.0]
+            axes.set_ylim(0.0, 1.2 * speeds[int(0.97 * (len(speeds) - 1))])
         title += f": {metric}" if len(metrics) > 1 else ""
         curves.dress(axes, title, over="time (s)" if over == "seconds" else "env states")
         axes.legend(fontsize=8, frameon=False)
     if not drawn:
         raise ValueError(f"{', '.join(map(str, folders))}: no {METRICS} with rows to draw")
     figure.savefig(picture, dpi=110)
-
-
-def _rows(folder: Path) -> list[dict[str, str]]:
-    return read_table(folder / METRICS)[1] if (folder / METRICS).exists() else []
-
-
-def _first(rows: Sequence[dict[str, str]], metrics: Sequence[str]) -> tuple[str, list[float]]:
-    """Return the first of some metrics that rows have, with its values."""
-    found = {metric: numbers(rows, metric) for metric in metrics}
-    return next(((metric, values) for metric, values in found.items() if values), (metrics[-1], []))
 
 
 def _config(folder: Path) -> Mapping[str, Any]:

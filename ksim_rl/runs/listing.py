@@ -79,7 +79,7 @@ def summarize(folder: Path) -> Summary:
         began = sessions[0].began if sessions else "?"
         text = read_bytes(folder / CONFIG, limit=MOST_YAML_BYTES).decode(errors="replace")
         task = found[1] if (found := _TASK.search(text)) else "?"
-        rows = read_table(folder / METRICS)[1] if (folder / METRICS).exists() else []
+        rows = read_table(folder / METRICS)[1]
     except (ValueError, csv.Error) as error:
         faults.append(record.printable(str(error)))
     speeds = numbers(rows[-LATEST:], "throughput/env_states_per_s")
