@@ -124,18 +124,12 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
         reach = (self.level * (delay.max_lag - delay.min_lag)).round().long()
         return random.integers(keys, 1, delay.min_lag, delay.min_lag + reach)[:, 0]
 
-    def _through(self, index: int, value: Tensor, mask_E: Tensor | None) -> Tensor:
+    def _lags(self, index: int) -> ring.Lags | None:
+        if index > 0 or not self._draws_in_ring:
+            return None
         buffers: dict[str, Any] = self._buffers
-        ring_EM, age_E, lag_E = buffers[f"ring_{index}"], buffers["age_E"], buffers["lag_E"]
-        value_E = value if value.ndim == ring_EM.ndim - 1 else value.reshape(-1, *ring_EM.shape[2:])
-        if mask_E is None:
-            counts = index == self._num_rings - 1
-            return ring.push(ring_EM, age_E, value_E, lag_E=lag_E, counts=counts)
-        lags = None
-        if index == 0 and self._draws_in_ring:
-            state = lag_E, buffers["seed_value"], buffers["reset_count_E"], self._stream_ids["reset/lag"]
-            lags = ring.Lags(*state, self.delay.min_lag, self.delay.max_lag)
-        return ring.begin(ring_EM, age_E, value_E, mask_E, lags=lags)
+        state = buffers["lag_E"], buffers["seed_value"], buffers["reset_count_E"]
+        return ring.Lags(*state, self._stream_ids["reset/lag"], self.delay.min_lag, self.delay.max_lag)
 
 
 class ObservationDelay(LaggedTransform):
