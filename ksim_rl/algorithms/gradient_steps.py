@@ -55,8 +55,8 @@ class RolloutUpdate(ABC):
         networks: Mapping[str, nn.Module],
         *,
         max_skipped_steps: int,
-        device: torch.device | str,
         logged: Mapping[str, str],
+        device: torch.device | str = "cpu",
         signals: SignalKeys = STANDARD,
     ) -> None:
         self.device, self.networks, self.signals = torch.device(device), networks, signals
@@ -143,7 +143,7 @@ class DatasetUpdate(RolloutUpdate):
         loss: Any,
         networks: Mapping[str, TensorDictModuleBase],
         data: DatasetCfg,
-        seed: int,
+        seed: int = 0,
         **shared: Any,
     ) -> None:
         super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, **shared)
