@@ -86,7 +86,7 @@ class OffPolicyUpdate(RolloutUpdate):
         fast: Any = partial(compiled, device=self.device, wanted=cfg.compile)
         self._images = None
         if cfg.symmetry == "augment":
-            self._images = SymmetricAugmentation.of(mirror, read=self._observations, device=self.device)
+            self._images = SymmetricAugmentation(mirror, read=self._observations, device=self.device)
         self._read, self._count_ = fast(self._stored), fast(self.guard.count_)
         self._critic_loss, self._actor_losses = fast(loss.critic_loss), fast(loss.actor_losses)
         self.replay = ReplayRing(
