@@ -28,7 +28,6 @@ from ksim_rl.trainers.metrics import (
     read_episode_sums,
     read_physics,
     start_copy,
-    without_counts,
 )
 from ksim_rl.trainers.progress import RunClock, RunProgress
 from ksim_rl.trainers.run_cfg import TrainerCfg
@@ -309,9 +308,8 @@ class Trainer:
             self.progress.note(f"NaN guard: {text}")
         self._warn(physics.lost, read, iteration)
         self.update.check(read)
-        self.metrics = episode_means(
-            without_counts(read), max_episode_length_s=0.0 if clock is None else clock.max_episode_length_s
-        )
+        longest_s = 0.0 if clock is None else clock.max_episode_length_s
+        self.metrics = episode_means(read, max_episode_length_s=longest_s)
         self.metrics |= physics.metrics | {
             "iteration": iteration,
             "seconds": self.clock.total,
