@@ -119,10 +119,8 @@ class OffPolicyUpdate(RolloutUpdate):
         self.behavior.random.fill_(not learns)
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
-        """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
-        return {
-            **self._means,
-            **self._skipped(),
+        """Return what the last update measured; see `RolloutUpdate`."""
+        return super().metrics() | {
             "replay/env_states": self.replay.num_stored,
             "update/non_finite_env_states": self.replay.non_finite_count,
         }
