@@ -49,7 +49,7 @@ class DistillationLoss(nn.Module):
             if not isinstance(teacher, ProbabilisticTensorDictSequential):
                 raise ValueError("loss='kl': the teacher's policy has no distribution; use loss='mse'")
             self.label_keys += distribution_keys(teacher)
-        self._has_choices = any(_is_logits(key) for key in distribution_keys(actor_network))
+        self._has_choices = any(path_of(key)[-1] == "logits" for key in distribution_keys(actor_network))
         if loss == "mse" and self._has_choices:
             raise ValueError("loss='mse': the actions are choices, which have no distance; use loss='kl'")
 
@@ -108,10 +108,6 @@ class DistillationLoss(nn.Module):
 def _action_of(dist: Distribution) -> Tensor:
     """Return the action that a distribution stands for when nothing is explored."""
     return dist.deterministic_sample if hasattr(dist, "deterministic_sample") else dist.mean  # type: ignore[attr-defined]
-
-
-def _is_logits(key: NestedKey) -> bool:
-    return key == "logits" or key[-1] == "logits"
 
 
 def _action_error(dist: Distribution, labels: TensorDictBase) -> Tensor:
