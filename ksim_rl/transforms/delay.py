@@ -10,7 +10,6 @@ from torchrl.data import Composite
 
 from ksim_rl.checked import Checked, Share, WholeNumber
 from ksim_rl.device import random
-from ksim_rl.transforms import ring
 from ksim_rl.transforms.history import RingTransform
 from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, Keys, RowTransform, checked_action
 
@@ -124,12 +123,11 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
         reach = (self.level * (delay.max_lag - delay.min_lag)).round().long()
         return random.integers(keys, 1, delay.min_lag, delay.min_lag + reach)[:, 0]
 
-    def _lags(self, index: int) -> ring.Lags | None:
+    def _draws(self, index: int) -> tuple[Any, ...]:
         if index > 0 or not self._draws_in_ring:
-            return None
-        buffers: dict[str, Any] = self._buffers
-        state = buffers["lag_E"], buffers["seed_value"], buffers["reset_count_E"]
-        return ring.Lags(*state, self._stream_ids["reset/lag"], self.delay.min_lag, self.delay.max_lag)
+            return ()
+        state = self._buffers["seed_value"], self._buffers["reset_count_E"], self._stream_ids["reset/lag"]
+        return *state, self.delay.min_lag, self.delay.max_lag
 
 
 class ObservationDelay(LaggedTransform):

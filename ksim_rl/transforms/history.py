@@ -80,14 +80,14 @@ class RingTransform(RowTransform):
         buffers: dict[str, Any] = self._buffers
         ring_EM, age_E = buffers[f"ring_{index}"], buffers["age_E"]
         value_E = value if value.ndim == ring_EM.ndim - 1 else value.reshape(-1, *ring_EM.shape[2:])
-        layout: dict[str, Any] = {"num_frames": self.num_frames, "parts_C": buffers["part_bytes"]}
-        if mask_E is not None:
-            return ring.begin(ring_EM, age_E, value_E, mask_E, lags=self._lags(index), **layout)
-        layout |= {"stride": self.stride, "counts": index == self._num_rings - 1}
-        return ring.push(ring_EM, age_E, value_E, lag_E=buffers.get("lag_E"), **layout)
+        begins = mask_E is not None
+        counts, draws = begins or index == self._num_rings - 1, self._draws(index) if begins else ()
+        layout = self.num_frames, self.stride, buffers["part_bytes"], counts
+        return ring.turn(ring_EM, age_E, value_E, buffers.get("lag_E"), mask_E, *layout, *draws)
 
-    def _lags(self, index: int) -> ring.Lags | None:
-        """Return the lags that rows draw as they begin in this ring, if they do."""
+    def _draws(self, index: int) -> tuple[Any, ...]:
+        """Return the last arguments of `ring.turn` for rows that begin, which draw their lags in this ring or not."""
+        return ()
 
     def _shaped(self, index: int, found_EL: Tensor, value: Tensor, batch_size: torch.Size) -> Tensor:
         """Return what comes out in the shape that the env emits."""
