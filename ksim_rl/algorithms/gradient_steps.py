@@ -55,8 +55,8 @@ class RolloutUpdate(ABC):
         networks: Mapping[str, nn.Module],
         *,
         max_skipped_steps: int,
-        device: torch.device | str,
         logged: Mapping[str, str],
+        device: torch.device | str = "cpu",
         signals: SignalKeys = STANDARD,
     ) -> None:
         self.device, self.networks, self.signals = torch.device(device), networks, signals
@@ -101,9 +101,10 @@ class RolloutUpdate(ABC):
         assert self._rollout_ET is not None
         return self.signals.renamed(self._rollout_ET)
 
-    def _skipped(self) -> dict[str, Tensor]:
-        """Return the metrics of the gradient steps that were not made."""
-        return {"update/skipped_steps": self.guard.skipped, "update/skipped_in_a_row": self._longest_skip}
+    def metrics(self) -> dict[str, Num[Tensor, ""]]:
+        """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
+        skipped = {"update/skipped_steps": self.guard.skipped, "update/skipped_in_a_row": self._longest_skip}
+        return {**self._means, **skipped}
 
     @abstractmethod
     def _update(self) -> None:
@@ -143,7 +144,7 @@ class DatasetUpdate(RolloutUpdate):
         loss: Any,
         networks: Mapping[str, TensorDictModuleBase],
         data: DatasetCfg,
-        seed: int,
+        seed: int = 0,
         **shared: Any,
     ) -> None:
         super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, **shared)
@@ -153,22 +154,15 @@ class DatasetUpdate(RolloutUpdate):
         self._recurrent = recurrent_modules(*networks.values())
         sampler = None
         if self._recurrent:
-            sampler = SequenceSampler(
-                sequence_length=data.sequence_length,
-                burn_in=data.burn_in,
-                seed=seed,
-                shards=data.shards,
-                num_minibatches=data.num_minibatches,
-            )
+            sizes = ("sequence_length", "burn_in", "shards", "num_minibatches")
+            sampler = SequenceSampler(seed=seed, **{name: getattr(data, name) for name in sizes})
         self.dataset = DatasetBuffer(
             data, keys=loss.dataset_keys, seed=seed, sampler=sampler, device=self.device
         )
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
-        """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
-        return {
-            **self._means,
-            **self._skipped(),
+        """Return what the last update measured; see `RolloutUpdate`."""
+        return super().metrics() | {
             "update/learning_rate": self.optimizer.param_groups[0]["lr"],
             "update/non_finite_env_states": self.dataset.non_finite_count,
         }

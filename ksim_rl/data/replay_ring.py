@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from jaxtyping import Int64, Shaped
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.data.replay_buffers import Sampler
@@ -219,31 +218,17 @@ class ReplayCfg(Checked):
 class ReplayRing(ReplayBuffer):
     """Holds the last env states of each env and yields minibatches of B of them, with what follows n steps later.
 
-    Its TorchRL parts are `ReplayStorage`, `ReplaySampler` or `PrioritySampler`, and `ReplayWriter`. `extend` takes
-    rollouts `["E","T"]`. None of its methods makes a host sync, so all can be captured in a CUDA graph.
+    Its TorchRL parts are `ReplayStorage`, whose other arguments are `of_storage`, `ReplaySampler` or `PrioritySampler`,
+    and `ReplayWriter`. `extend` takes rollouts `["E","T"]`. None of its methods makes a host sync, so all can be
+    captured in a CUDA graph.
     """
 
-    def __init__(
-        self,
-        cfg: ReplayCfg,
-        *,
-        num_envs: int,
-        observations: list[NestedKey],
-        gamma: float = 0.99,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        self._ring = ReplayStorage(
-            num_envs=num_envs,
-            capacity=cfg.capacity,
-            observations=observations,
-            n_step=cfg.n_step,
-            gamma=gamma,
-            device=device,
-        )
+    def __init__(self, cfg: ReplayCfg, **of_storage: Any) -> None:
+        self._ring = ReplayStorage(capacity=cfg.capacity, n_step=cfg.n_step, **of_storage)
         sampler: Any = ReplaySampler(shards=cfg.shards, minibatch=cfg.num_env_states_per_minibatch)
         if cfg.prioritized:
             exponents = {"alpha": cfg.priority_alpha, "beta": cfg.priority_beta}
-            sampler = PrioritySampler(self._ring.max_size, device=device, **exponents)
+            sampler = PrioritySampler(self._ring.max_size, device=self._ring.device, **exponents)
         super().__init__(
             storage=self._ring,
             sampler=sampler,

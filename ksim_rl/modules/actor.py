@@ -28,6 +28,7 @@ from ksim_rl.modules.distributions import (
 )
 from ksim_rl.modules.mlp import Device, linear, mlp
 from ksim_rl.modules.network import ObservingNetwork, OnPolicyNetworkCfg
+from ksim_rl.transforms.specs import path_of
 
 MIN_STD = 1e-3
 
@@ -192,7 +193,7 @@ class MixedHead(nn.Module):
     def parameter_keys(self) -> list[NestedKey]:
         """Where the parameters go: `("params", *action key, name)`."""
         return [
-            (PARAMETERS, *_path(key), name)
+            (PARAMETERS, *path_of(key), name)
             for key, head in zip(self.action_keys, self.heads, strict=True)
             for name in head.parameter_names  # type: ignore[union-attr]
         ]
@@ -205,13 +206,9 @@ class MixedHead(nn.Module):
         """Return the distribution of all actions; `params` is what stands under "params"."""
         parts: dict[Any, Any] = {}
         for key, head in zip(self.action_keys, self.heads, strict=True):
-            parameters = {name: params.get((*_path(key), name)) for name in head.parameter_names}  # type: ignore[union-attr]
+            parameters = {name: params.get((*path_of(key), name)) for name in head.parameter_names}  # type: ignore[union-attr]
             parts[key] = head.distribution(**parameters)  # type: ignore[operator]
         return CompositeDistribution.from_distributions(params, parts)
-
-
-def _path(key: NestedKey) -> tuple[Any, ...]:
-    return (key,) if isinstance(key, str) else tuple(key)
 
 
 def action_range(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -61,13 +61,10 @@ class ObservationNormalizer(RunningMoments):
         return f"dim={self.dim}, eps={self.eps}, until={self.until}"
 
 
-def update_normalizers(
-    tensordict: TensorDictBase, *networks: nn.Module, valid: Bool[Tensor, "*batch"] | None = None
-) -> None:
+def update_normalizers(tensordict: TensorDictBase, *networks: nn.Module) -> None:
     """Update each normalizer inside `networks` once, with the observations that its network reads.
 
-    Networks are actors, critics, or any other modules, which are searched for owners of a `normalizer`. Env states,
-    e.g. of a rollout `["E","T"]`, that are marked False in `valid` are left out.
+    Networks are actors, critics, or any other modules, which are searched for owners of a `normalizer`.
     """
     seen: dict[int, ObservationNormalizer] = {}
     for network in networks:
@@ -77,7 +74,7 @@ def update_normalizers(
                 continue
             if id(normalizer) not in seen:
                 seen[id(normalizer)] = normalizer
-                normalizer.count_rows(_observation(tensordict, module, normalizer.dim), valid)
+                normalizer.count_rows(_observation(tensordict, module, normalizer.dim))
     publish([*seen.values()])
 
 

@@ -146,16 +146,15 @@ class RolloutEstimator(ValueEstimatorBase):
             else:
                 tensordict.set(keys.value, self._state_values(tensordict, params, time_dim))
             following.set(keys.value, self._state_values(following, next_params, time_dim))
-        read: list[Any] = [tensordict.get(keys.value, None)]
-        read += [following.get(key, None) for key in (keys.value, keys.reward, keys.done)]
-        read.append(following.get(keys.terminated, read[-1]))
+        signals = (keys.value, keys.reward, keys.done, keys.terminated)
+        places = [keys.value, *(("next", key) for key in signals)]
+        read: list[Any] = [tensordict.get(place, None) for place in places]
+        read[-1] = read[-2] if read[-1] is None else read[-1]
         shapes = [None if signal is None else tuple(signal.shape) for signal in read]
         if None in shapes or len(set(shapes)) != 1:
+            got = ", ".join(f"{place!r} {shape}" for place, shape in zip(places, shapes, strict=True))
             raise ValueError(
-                f"{type(self).__name__} needs these signals, all in one shape [*batch, 1]; got "
-                f"{keys.value!r} {shapes[0]}, ('next', {keys.value!r}) {shapes[1]}, "
-                f"('next', {keys.reward!r}) {shapes[2]}, ('next', {keys.done!r}) {shapes[3]}, "
-                f"('next', {keys.terminated!r}) {shapes[4]}"
+                f"{type(self).__name__} needs these signals, all in one shape [*batch, 1]; got {got}"
             )
         names = ("value_ET_t", "value_ET_t_plus_1", "reward_ET", "done_ET", "terminated_ET")
         return Signals(**dict(zip(names, read, strict=True)), time_dim=time_dim)

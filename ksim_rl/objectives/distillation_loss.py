@@ -16,6 +16,7 @@ from ksim_rl.checked import check_value
 from ksim_rl.objectives.algorithm_cfg import DistillationKind
 from ksim_rl.objectives.masked import mask_of, masked_mean
 from ksim_rl.objectives.policy_kl import distribution_keys, observation_keys, policy_kl, stored_distribution
+from ksim_rl.transforms.specs import path_of
 
 TEACHER = "teacher"
 """Under this key a dataset holds what the teacher would do: its action and, for "kl", its distribution."""
@@ -48,7 +49,7 @@ class DistillationLoss(nn.Module):
             if not isinstance(teacher, ProbabilisticTensorDictSequential):
                 raise ValueError("loss='kl': the teacher's policy has no distribution; use loss='mse'")
             self.label_keys += distribution_keys(teacher)
-        self._has_choices = any(_is_logits(key) for key in distribution_keys(actor_network))
+        self._has_choices = any(path_of(key)[-1] == "logits" for key in distribution_keys(actor_network))
         if loss == "mse" and self._has_choices:
             raise ValueError("loss='mse': the actions are choices, which have no distance; use loss='kl'")
 
@@ -56,14 +57,14 @@ class DistillationLoss(nn.Module):
     def dataset_keys(self) -> list[NestedKey]:
         """The leaves that a dataset needs for this loss, labels included."""
         actor = self.actor_network
-        labels = [(TEACHER, *((key,) if isinstance(key, str) else key)) for key in self.label_keys]
+        labels = [(TEACHER, *path_of(key)) for key in self.label_keys]
         return list(dict.fromkeys([*observation_keys(actor), *distribution_keys(actor), *labels]))
 
     @torch.no_grad()
     def label(self, rollout_ET: TensorDictBase) -> TensorDictBase:
         """Return a rollout `["E","T"]` with what the teacher would do in each env state, under "teacher"."""
         (teacher,) = self._teacher
-        seen_ET = rollout_ET.select(*observation_keys_of(teacher))
+        seen_ET = rollout_ET.select(*observation_keys(teacher))
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             judged_ET = teacher(seen_ET)
         return rollout_ET.copy().set(TEACHER, judged_ET.select(*self.label_keys))
@@ -104,20 +105,9 @@ class DistillationLoss(nn.Module):
         return TensorDict({"loss_distillation": mean, "kl": kl.detach()})
 
 
-def observation_keys_of(policy: Any) -> list[NestedKey]:
-    """Return what any policy reads of an env state, one without a distribution included."""
-    if isinstance(policy, ProbabilisticTensorDictSequential):
-        return observation_keys(policy)
-    return list(policy.in_keys)
-
-
 def _action_of(dist: Distribution) -> Tensor:
     """Return the action that a distribution stands for when nothing is explored."""
     return dist.deterministic_sample if hasattr(dist, "deterministic_sample") else dist.mean  # type: ignore[attr-defined]
-
-
-def _is_logits(key: NestedKey) -> bool:
-    return key == "logits" or key[-1] == "logits"
 
 
 def _action_error(dist: Distribution, labels: TensorDictBase) -> Tensor:

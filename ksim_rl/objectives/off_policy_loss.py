@@ -132,8 +132,8 @@ class OffPolicyLoss(LossModule):
         self.update_target_(1.0)
 
     @abstractmethod
-    def critic_loss(self, tensordict: TensorDictBase) -> tuple[Scalar, dict[str, Scalar]]:
-        """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
+    def _next_action(self, following: TensorDictBase) -> tuple[Tensor, Tensor | None]:
+        """Return the actions of targets for what the actor observes, and what is added to their values, [B] or None."""
 
     @abstractmethod
     def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
@@ -173,13 +173,12 @@ class OffPolicyLoss(LossModule):
         values_BN = predicted if self.support_A is None else mean_of(predicted.softmax(-1), self.support_A)
         return values_BN.amin(-1) if self.value_reduction == "min" else values_BN.mean(-1)
 
-    def _critic_loss(
-        self, tensordict: TensorDictBase, next_action: Tensor, next_bonus_B: Tensor | None = None
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss of the critics, for the actions that follow and what is added to their values."""
+    def critic_loss(self, tensordict: TensorDictBase) -> tuple[Scalar, dict[str, Scalar]]:
+        """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
         keys = self.tensor_keys
         following = tensordict.get("next")
         with torch.no_grad():
+            next_action, next_bonus_B = self._next_action(following.select(*self.actor_network.in_keys))
             reward_B1 = following.get(keys.reward)
             going_B1 = 1.0 - following.get(keys.terminated).to(reward_B1.dtype)
             steps_B1 = tensordict.get(keys.steps_to_next_obs, None)
@@ -264,13 +263,9 @@ class SACLoss(OffPolicyLoss):
         """The temperature, without gradients."""
         return self.log_alpha.detach().exp()
 
-    def critic_loss(self, tensordict: TensorDictBase) -> tuple[Scalar, dict[str, Scalar]]:
-        """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
-        with torch.no_grad():
-            following = tensordict.get("next").select(*self.actor_network.in_keys)
-            next_action, log_prob_B = rsample_and_log_prob(self.actor_network.get_dist(following))
-            bonus_B = -self.alpha * log_prob_B
-        return self._critic_loss(tensordict, next_action, bonus_B)
+    def _next_action(self, following: TensorDictBase) -> tuple[Tensor, Tensor | None]:
+        next_action, log_prob_B = rsample_and_log_prob(self.actor_network.get_dist(following))
+        return next_action, -self.alpha * log_prob_B
 
     def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
         """Return the losses of actor and temperature, each with gradients for it alone, and what is logged."""
@@ -310,17 +305,13 @@ class TD3Loss(OffPolicyLoss):
         self.low_L, self.high_L = low_L, high_L
         self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
 
-    def critic_loss(self, tensordict: TensorDictBase) -> tuple[Scalar, dict[str, Scalar]]:
-        """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
-        with torch.no_grad():
-            following = tensordict.get("next").select(*self.actor_network.in_keys)
-            action = self.actor_network(following).get(self.tensor_keys.action)
-            noise = (ranks.randn(action.shape, device=action.device) * self.target_noise).clamp(
-                -self.target_noise_clip, self.target_noise_clip
-            )
-            action = action + noise * (self.high_L - self.low_L) / 2
-            next_action = torch.maximum(torch.minimum(action, self.high_L), self.low_L)
-        return self._critic_loss(tensordict, next_action)
+    def _next_action(self, following: TensorDictBase) -> tuple[Tensor, Tensor | None]:
+        action = self.actor_network(following).get(self.tensor_keys.action)
+        noise = (ranks.randn(action.shape, device=action.device) * self.target_noise).clamp(
+            -self.target_noise_clip, self.target_noise_clip
+        )
+        action = action + noise * (self.high_L - self.low_L) / 2
+        return torch.maximum(torch.minimum(action, self.high_L), self.low_L), None
 
     def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
         """Return the loss of the actor, which has gradients for it alone, and an empty dict."""

@@ -13,6 +13,8 @@ from torch import Tensor, distributions
 from torch.distributions import Distribution, TransformedDistribution
 from torchrl.modules.distributions.utils import has_analytic_kl
 
+from ksim_rl.transforms.specs import path_of
+
 
 def kl_divergence(
     loc_old: Float[Tensor, "*batch L"],
@@ -42,8 +44,8 @@ def gaussian_parameters(
 
 def distribution_keys(actor: Any) -> list[NestedKey]:
     """Return the leaves from which a `ProbabilisticTensorDictSequential` builds its distribution, e.g. `loc`."""
-    roots = {_path(key) for key in actor.dist_params_keys}
-    written = {_path(key): key for key in actor.out_keys}
+    roots = {path_of(key) for key in actor.dist_params_keys}
+    written = {path_of(key): key for key in actor.out_keys}
     parents = {path[:depth] for path in written for depth in range(1, len(path))}
     return [
         key
@@ -53,8 +55,9 @@ def distribution_keys(actor: Any) -> list[NestedKey]:
 
 
 def observation_keys(actor: Any) -> list[NestedKey]:
-    """Return what an actor reads of an EnvState: its `in_keys` without the parameters that it writes itself."""
-    return [key for key in actor.in_keys if key not in actor.dist_params_keys]
+    """Return what any policy reads of an EnvState: its `in_keys` without the parameters that it writes itself."""
+    written = getattr(actor, "dist_params_keys", ())
+    return [key for key in actor.in_keys if key not in written]
 
 
 def stored_distribution(actor: Any, tensordict: TensorDictBase) -> Distribution | None:
@@ -88,7 +91,3 @@ def estimated_kl(log_ratio: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     It is r - 1 - log r with r = new / old, from log r (Schulman, "Approximating KL divergence", 2020).
     """
     return torch.expm1(log_ratio) - log_ratio
-
-
-def _path(key: NestedKey) -> tuple[Any, ...]:
-    return (key,) if isinstance(key, str) else tuple(key)

@@ -93,7 +93,7 @@ def make_symmetric(
         return loss
     actor: Any = loss.actor_network
     read = [*actor.in_keys, *loss.critic_network.in_keys]
-    mirror = SymmetricAugmentation.of(maps, read=read, symmetry=cfg.symmetry, device=device)
+    mirror = SymmetricAugmentation(maps, read=read, symmetry=cfg.symmetry, device=device)
     if cfg.symmetry == "augment":
         return lambda minibatch_B: loss(mirror(minibatch_B))
 

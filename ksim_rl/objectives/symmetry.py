@@ -23,37 +23,26 @@ class SymmetricAugmentation:
     The image of an env state has the mirrored observations, action and distribution of the policy that collected it;
     advantage, value target, state value and log-probability are those of the env state, as they are the same in the
     mirror: there another policy collected, which is the image of the one that did. `maps` has, by key, all observations
-    that the networks read, and "action". Makes no host sync.
+    that the networks `read`, and "action"; a ValueError names those that it lacks. Makes no host sync.
     """
 
     def __init__(
-        self, maps: Mapping[NestedKey, MirrorMap], *, device: torch.device | str | None = None
+        self,
+        maps: Mapping[NestedKey, MirrorMap] | None,
+        *,
+        read: Iterable[NestedKey] = (),
+        symmetry: str = "augment",
+        device: torch.device | str | None = None,
     ) -> None:
-        if "action" not in maps:
-            raise ValueError(f"maps has the keys {list(maps)}: expected 'action' among them")
+        maps = maps or {}
+        missing = [key for key in dict.fromkeys([*read, "action"]) if key not in maps]
+        if missing:
+            raise ValueError(f"symmetry={symmetry!r} needs the mirror image of {missing}: add it to the maps")
         device = torch.device("cpu" if device is None else device)
         self._images = {key: mirror.tensors(device) for key, mirror in maps.items()}
         source_L, signs_L = self._images["action"]
         self._images["loc"] = (source_L, signs_L)
         self._images["scale"] = (source_L, torch.ones_like(signs_L))
-
-    @classmethod
-    def of(
-        cls,
-        maps: Mapping[NestedKey, MirrorMap] | None,
-        *,
-        read: Iterable[NestedKey],
-        symmetry: str = "augment",
-        device: torch.device | str | None = None,
-    ) -> "SymmetricAugmentation":
-        """Return the one for networks that read these keys.
-
-        Raises ValueError where `maps` lacks the mirror image of "action" or of what the networks read.
-        """
-        missing = [key for key in dict.fromkeys([*read, "action"]) if key not in (maps or {})]
-        if missing:
-            raise ValueError(f"symmetry={symmetry!r} needs the mirror image of {missing}: add it to the maps")
-        return cls(maps or {}, device=device)
 
     def image_of(self, key: NestedKey, leaf_BL: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch L"]:
         """Return the mirror image of vectors of a kind that has a map."""

@@ -11,7 +11,6 @@ from torchrl.envs import EnvBase
 
 from ksim_rl import dims
 from ksim_rl.device import random
-from ksim_rl.testing.check_specs import SPECS
 
 
 class CounterEnv(EnvBase):
@@ -36,32 +35,30 @@ class CounterEnv(EnvBase):
         batch = torch.Size([len(lengths)] if lengths else [])
         super().__init__(device=torch.device(device), batch_size=batch)
         self.num_rows = max(1, len(lengths))
-        self.register_buffer("length_E", torch.tensor(list(lengths) or [3], device=device))
-        self.register_buffer("count_E", torch.zeros(self.num_rows, dtype=torch.int64, device=device))
-        self.register_buffer("episode_E", torch.zeros(self.num_rows, dtype=torch.int64, device=device))
-        self.register_buffer("seed_value", torch.zeros((), dtype=torch.int64, device=device))
-        self.register_buffer("row_E", torch.arange(self.num_rows, device=device))
-        self.register_buffer("offset_L", torch.tensor([0.0, 100.0, 200.0], device=device))
-        shape_1 = torch.Size([*batch, 1])
-        scalar = Unbounded(shape_1, device=self.device)
-        self.observation_spec = Composite(
-            {name: scalar.clone() for name in ("count", "episode", "row")},
-            drawn=Bounded(0.0, 1.0, shape_1, device=self.device),
-            obs=Composite(
-                vector=Unbounded(torch.Size([*batch, 3]), device=self.device), shape=batch, device=self.device
-            ),
-            shape=batch,
-            device=self.device,
-        )
-        action = Bounded(-1.0, 1.0, torch.Size([*batch, action_size]), device=self.device)
-        self.full_action_spec = Composite(action=action, shape=batch, device=self.device)
-        self.full_reward_spec = Composite(reward=scalar.clone(), shape=batch, device=self.device)
-        done = Binary(1, dtype=torch.bool, shape=shape_1, device=self.device)
-        self.full_done_spec = Composite(
-            done=done, terminated=done.clone(), truncated=done.clone(), shape=batch, device=self.device
-        )
-        for which in SPECS:
-            getattr(self, which).names = [dims.E] * len(batch)
+        length_E = torch.tensor(list(lengths) or [3])
+        counters = {name: torch.zeros_like(length_E) for name in ("count_E", "episode_E")}
+        counters |= {
+            "length_E": length_E,
+            "seed_value": torch.tensor(0),
+            "row_E": torch.arange(self.num_rows),
+        }
+        for name, held in {**counters, "offset_L": torch.tensor([0.0, 100.0, 200.0])}.items():
+            self.register_buffer(name, held.to(device))
+        scalar, flag = Unbounded(1), Binary(1, dtype=torch.bool)
+        specs = {
+            "observation": {
+                **{name: scalar.clone() for name in ("count", "episode", "row")},
+                "drawn": Bounded(0.0, 1.0, (1,)),
+                "obs": Composite(vector=Unbounded(3)),
+            },
+            "action": {"action": Bounded(-1.0, 1.0, (action_size,))},
+            "reward": {"reward": scalar},
+            "done": {name: flag.clone() for name in ("done", "terminated", "truncated")},
+        }
+        for which, leaves in specs.items():
+            spec = Composite(leaves).expand(batch).to(self.device)
+            spec.names = [dims.E] * len(batch)
+            setattr(self, f"full_{which}_spec", spec)
 
     def _observe(self) -> dict[str, Any]:
         keys = random.row_keys(self.seed_value, 1, self.episode_E, self.num_rows)

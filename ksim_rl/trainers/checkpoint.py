@@ -217,21 +217,19 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     version = manifest.get("format_version") if isinstance(manifest, dict) else None
     if reason := checkpoint_formats.refusal(version):
         raise UnknownFormatError(f"{path}: {reason}")
-    well_formed = (
-        isinstance(manifest.get("iteration"), int)
-        and isinstance(manifest.get("config"), dict)
-        and isinstance(manifest.get("values"), dict)
-        and isinstance(manifest.get("files"), dict)
-        and set(manifest["files"]) == {TENSORS}
-        and isinstance(manifest["files"][TENSORS], dict)
-        and isinstance(manifest["files"][TENSORS].get("bytes"), int)
-        and isinstance(manifest["files"][TENSORS].get("sha256"), str)
-    )
-    if not well_formed:
+    files = manifest.get("files")
+    of_tensors = files.get(TENSORS) if isinstance(files, dict) and len(files) == 1 else None
+    if not (
+        _has(manifest, iteration=int, config=dict, values=dict) and _has(of_tensors, bytes=int, sha256=str)
+    ):
         raise CheckpointError(
             f"{path / MANIFEST}: not a checkpoint manifest: a field is missing or of another type"
         )
     return manifest
+
+
+def _has(tree: Any, **kinds: type) -> bool:
+    return isinstance(tree, dict) and all(isinstance(tree.get(name), kind) for name, kind in kinds.items())
 
 
 def _read_regular_file(path: Path, *, limit: int) -> bytes:

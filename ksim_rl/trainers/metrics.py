@@ -73,11 +73,13 @@ def read_episode_sums(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Num
 def episode_means(sums: Mapping[str, float], *, max_episode_length_s: float) -> dict[str, float]:
     """Turn sums over episodes into means per episode; without a finished episode those are left out.
 
+    What else is measured stays, but for the counts of `read_physics`.
+
     `episode/return`, `episode/length` (env steps) and `metric/<name>` are means. `termination/<name>` is a share of
     episodes. `reward/<term>` is the weighted sum over an episode, per second of the longest possible episode (or as it
     is where episodes have no limit), so that a term of weight w that is always 1 reads w.
     """
-    metrics = {name: value for name, value in sums.items() if not name.startswith("sum/")}
+    metrics = {name: value for name, value in sums.items() if not name.startswith(("sum/", _OVERFLOW, _NAN))}
     episodes = sums.get("sum/episodes")
     if episodes is None:
         return metrics
@@ -128,8 +130,3 @@ def explain_physics(env: EnvBase, counts: Mapping[str, float]) -> PhysicsReport:
         lost=tuple(overflow.messages),
         saved=tuple(world.nan_report().messages) if counts[_NAN] else (),
     )
-
-
-def without_counts(metrics: Mapping[str, float]) -> dict[str, float]:
-    """Leave out what only `explain_physics` reads."""
-    return {name: value for name, value in metrics.items() if not name.startswith((_OVERFLOW, _NAN))}

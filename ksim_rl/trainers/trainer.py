@@ -28,7 +28,6 @@ from ksim_rl.trainers.metrics import (
     read_episode_sums,
     read_physics,
     start_copy,
-    without_counts,
 )
 from ksim_rl.trainers.progress import RunClock, RunProgress
 from ksim_rl.trainers.run_cfg import TrainerCfg
@@ -309,9 +308,8 @@ class Trainer:
             self.progress.note(f"NaN guard: {text}")
         self._warn(physics.lost, read, iteration)
         self.update.check(read)
-        self.metrics = episode_means(
-            without_counts(read), max_episode_length_s=0.0 if clock is None else clock.max_episode_length_s
-        )
+        longest_s = 0.0 if clock is None else clock.max_episode_length_s
+        self.metrics = episode_means(read, max_episode_length_s=longest_s)
         self.metrics |= physics.metrics | {
             "iteration": iteration,
             "seconds": self.clock.total,
@@ -338,14 +336,16 @@ class Trainer:
         try:
             call(*arguments)
         except Exception as error:
-            name = type(logger).__name__
-            if name not in self._warned:
-                self._warned.add(name)
-                reason = " ".join(f"{type(error).__name__}: {error}".split())
-                self.progress.note(
-                    f"warning: the logger {name} failed at iteration {self.iteration}: {reason}; the run goes on "
-                    "(said once)"
-                )
+            name, reason = type(logger).__name__, " ".join(f"{type(error).__name__}: {error}".split())
+            self._warn_once(
+                name,
+                f"the logger {name} failed at iteration {self.iteration}: {reason}; the run goes on (said once)",
+            )
+
+    def _warn_once(self, kind: str, text: str) -> None:
+        if kind not in self._warned:
+            self._warned.add(kind)
+            self.progress.note(f"warning: {text}")
 
     def _look_at_target(self) -> None:
         targets = self.cfg.stop_at or {}
@@ -353,11 +353,9 @@ class Trainer:
         self._target_met |= bool(targets) and all(reached)
         for name in targets:
             known = name in self.metrics or name.startswith("evaluation/")
-            if not known and "episode/return" in self.metrics and name not in self._warned:
-                self._warned.add(name)
-                self.progress.note(
-                    f"warning: stop_at names {name!r}, which no metric is called: {near(name, self.metrics)}"
-                )
+            if not known and "episode/return" in self.metrics:
+                hint = near(name, self.metrics)
+                self._warn_once(name, f"stop_at names {name!r}, which no metric is called: {hint}")
 
     def _warn(self, losses: Sequence[str], metrics: Mapping[str, float], iteration: int) -> None:
         """Say what went wrong in this iteration, each kind once; the counts stay in the metrics."""
@@ -367,9 +365,7 @@ class Trainer:
             terms = part(self.collector.env, EpisodeSums)
             texts |= {line.split(":")[0]: line for line in (terms.non_finite_terms() if terms else ())}
         for kind, text in texts.items():
-            if kind not in self._warned:
-                self._warned.add(kind)
-                self.progress.note(f"warning: {text} (iteration {iteration}; said once)")
+            self._warn_once(kind, f"{text} (iteration {iteration}; said once)")
 
     def save(self) -> Path:
         """Write a checkpoint of everything that the next iteration depends on, of all ranks; see `checkpoint.save`."""

@@ -10,7 +10,6 @@ from torchrl.data import Composite
 
 from ksim_rl.checked import Checked, Share, WholeNumber
 from ksim_rl.device import random
-from ksim_rl.transforms import ring
 from ksim_rl.transforms.history import RingTransform
 from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, Keys, RowTransform, checked_action
 
@@ -124,18 +123,11 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
         reach = (self.level * (delay.max_lag - delay.min_lag)).round().long()
         return random.integers(keys, 1, delay.min_lag, delay.min_lag + reach)[:, 0]
 
-    def _through(self, index: int, value: Tensor, mask_E: Tensor | None) -> Tensor:
-        buffers: dict[str, Any] = self._buffers
-        ring_EM, age_E, lag_E = buffers[f"ring_{index}"], buffers["age_E"], buffers["lag_E"]
-        value_E = value if value.ndim == ring_EM.ndim - 1 else value.reshape(-1, *ring_EM.shape[2:])
-        if mask_E is None:
-            counts = index == self._num_rings - 1
-            return ring.push(ring_EM, age_E, value_E, lag_E=lag_E, counts=counts)
-        lags = None
-        if index == 0 and self._draws_in_ring:
-            state = lag_E, buffers["seed_value"], buffers["reset_count_E"], self._stream_ids["reset/lag"]
-            lags = ring.Lags(*state, self.delay.min_lag, self.delay.max_lag)
-        return ring.begin(ring_EM, age_E, value_E, mask_E, lags=lags)
+    def _draws(self, index: int) -> tuple[Any, ...]:
+        if index > 0 or not self._draws_in_ring:
+            return ()
+        state = self._buffers["seed_value"], self._buffers["reset_count_E"], self._stream_ids["reset/lag"]
+        return *state, self.delay.min_lag, self.delay.max_lag
 
 
 class ObservationDelay(LaggedTransform):

@@ -1,6 +1,5 @@
 """This module holds the base of transforms that remember the last values of signals, and histories of observations."""
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +23,8 @@ class RingTransform(RowTransform):
     """Values that a ring holds per env."""
     num_frames = 1
     """Values that come out of it at each step."""
+    stride = 0
+    """Env steps from one of these to the next."""
     _is_joined = False
     _num_rings = 0
 
@@ -31,6 +32,8 @@ class RingTransform(RowTransform):
 
     def _register_rings(self) -> None:
         self._register_rows("age_E", *self._per_key("ring"))
+        # What all frames of an observation take in memory, where several are in one ring.
+        self.register_buffer("part_bytes", None, persistent=False)
 
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
         return self._pass(tensordict_reset, mask_E)
@@ -72,9 +75,19 @@ class RingTransform(RowTransform):
             tensordict.set(out_key, self._shaped(index, found[index], values[index], tensordict.batch_size))
         return tensordict
 
-    @abstractmethod
     def _through(self, index: int, value: Tensor, mask_E: Tensor | None) -> Tensor:
         """Write this step's value [E, ...] and return what is due, [E, N * L]; masked rows begin with it."""
+        buffers: dict[str, Any] = self._buffers
+        ring_EM, age_E = buffers[f"ring_{index}"], buffers["age_E"]
+        value_E = value if value.ndim == ring_EM.ndim - 1 else value.reshape(-1, *ring_EM.shape[2:])
+        begins = mask_E is not None
+        counts, draws = begins or index == self._num_rings - 1, self._draws(index) if begins else ()
+        layout = self.num_frames, self.stride, buffers["part_bytes"], counts
+        return ring.turn(ring_EM, age_E, value_E, buffers.get("lag_E"), mask_E, *layout, *draws)
+
+    def _draws(self, index: int) -> tuple[Any, ...]:
+        """Return the last arguments of `ring.turn` for rows that begin, which draw their lags in this ring or not."""
+        return ()
 
     def _shaped(self, index: int, found_EL: Tensor, value: Tensor, batch_size: torch.Size) -> Tensor:
         """Return what comes out in the shape that the env emits."""
@@ -108,8 +121,6 @@ class ObservationHistory(RingTransform):
         self.num_frames = self.length = length
         self.stride, self.flat = stride, flat
         self.num_slots = (length - 1) * stride + 1
-        # What all frames of an observation take in memory, where several are in one ring.
-        self.register_buffer("part_bytes", None, persistent=False)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         leaves = self._replace_leaves(
@@ -128,15 +139,6 @@ class ObservationHistory(RingTransform):
             return Unbounded(shape, dtype=spec.dtype, device=spec.device)
         low, high = (end.reshape(shape) for end in bounds(stacked))
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
-
-    def _through(self, index: int, value: Tensor, mask_E: Tensor | None) -> Tensor:
-        buffers: dict[str, Any] = self._buffers
-        ring_EM, age_E, parts = buffers[f"ring_{index}"], buffers["age_E"], buffers["part_bytes"]
-        value_E = value if value.ndim == ring_EM.ndim - 1 else value.reshape(-1, *ring_EM.shape[2:])
-        if mask_E is not None:
-            return ring.begin(ring_EM, age_E, value_E, mask_E, num_frames=self.num_frames, parts_C=parts)
-        layout = {"num_frames": self.num_frames, "stride": self.stride, "parts_C": parts}
-        return ring.push(ring_EM, age_E, value_E, counts=index == self._num_rings - 1, **layout)
 
     def _shaped(self, index: int, found_EL: Tensor, value: Tensor, batch_size: torch.Size) -> Tensor:
         outer, inner = len(batch_size), self.batch_dims[index]

@@ -6,11 +6,9 @@ which the kernel counts on the device, so that a captured step goes on correctly
 """
 
 import math
-from typing import NamedTuple
 
 import torch
 import warp as wp
-from jaxtyping import Bool, Int32, Int64, Shaped
 from torch import Tensor
 
 from ksim_rl import ranks
@@ -108,78 +106,33 @@ _LANES, _MANY_LANES = 32, 256
 """Threads that share a row on the GPU: a warp, or a block for large rows."""
 
 
-class Lags(NamedTuple):
-    """Lags that rows draw as they begin: those of `ksim_rl.device.random.integers` at the counts that they reach.
-
-    All tensors are int64; `lag_E` and `count_E`, the resets of each row, are changed in place.
-    """
-
-    lag_E: Tensor | None
-    seed: Tensor | None
-    count_E: Tensor | None
-    stream: int
-    lowest: int
-    highest: int
-
-
-_NO_LAGS = Lags(None, None, None, 0, 0, 0)
-
-
-def push(
-    ring_EM: Shaped[Tensor, " E M *leaf"],
-    age_E: Int64[Tensor, " E"],
-    value_E: Shaped[Tensor, " E *leaf"],
-    *,
-    lag_E: Int64[Tensor, " E"] | None = None,
-    num_frames: int = 1,
-    stride: int = 0,
-    parts_C: Int32[Tensor, " C"] | None = None,
-    counts: bool = True,
-) -> Shaped[Tensor, "E L"]:
-    """Go on by one step: write its values, and return those of some steps ago, N frames of L elements per env.
-
-    The ring has M slots per env. `lag_E` is that of the newest frame, which is the last, below M; one that reaches back
-    beyond the reset gives the value of that. The age, the steps since each env's reset, is changed in place; of several
-    rings with one age only the last one `counts` it on. `parts_C` are sizes in bytes of what a value consists of: all
-    frames of the first part are returned, then all of the second one, and so on.
-    """
-    return _run(ring_EM, age_E, value_E, lag_E, None, num_frames, stride, parts_C, counts, *_NO_LAGS[1:])
-
-
-def begin(
-    ring_EM: Shaped[Tensor, " E M *leaf"],
-    age_E: Int64[Tensor, " E"],
-    value_E: Shaped[Tensor, " E *leaf"],
-    mask_E: Bool[Tensor, " E"],
-    *,
-    num_frames: int = 1,
-    parts_C: Int32[Tensor, " C"] | None = None,
-    lags: Lags | None = None,
-) -> Shaped[Tensor, "E L"]:
-    """Let the masked rows begin with these values, and return each row's value `num_frames` times; see `push`.
-
-    With `lags`, these rows also draw new ones.
-    """
-    drawn = _NO_LAGS if lags is None else lags
-    return _run(ring_EM, age_E, value_E, drawn[0], mask_E, num_frames, 0, parts_C, True, *drawn[1:])
-
-
 def _launch(
     ring_EM: Tensor,
     age_E: Tensor,
     value_E: Tensor,
-    lag_E: Tensor | None,
-    mask_E: Tensor | None,
-    num_frames: int,
-    stride: int,
-    parts: Tensor | None,
-    counts: bool,
-    seed: Tensor | None,
-    draw_count_E: Tensor | None,
-    stream: int,
-    lowest: int,
-    highest: int,
+    lag_E: Tensor | None = None,
+    mask_E: Tensor | None = None,
+    num_frames: int = 1,
+    stride: int = 0,
+    parts: Tensor | None = None,
+    counts: bool = True,
+    seed: Tensor | None = None,
+    draw_count_E: Tensor | None = None,
+    stream: int = 0,
+    lowest: int = 0,
+    highest: int = 0,
 ) -> Tensor:
+    """Go on by one step: write its values, and return those of some steps ago, N frames of L elements per env.
+
+    The ring has M slots per env. `lag_E` (int64, 0 for None) is that of the newest frame, which is the last, below M;
+    one that reaches back beyond the reset gives the value of that. The age, the steps since each env's reset, is
+    changed in place; of several rings with one age only the last one `counts` it on. `parts` are sizes in bytes (int32)
+    of what a value consists of: all frames of the first part are returned, then all of the second one, and so on.
+
+    With a mask no step is made: its rows begin with these values, and each row's value is returned N times. With a
+    `draw_count_E`, the resets of each row, these rows also draw new lags: those of `ksim_rl.device.random.integers` at
+    the counts that they reach. Lags and counts are changed in place.
+    """
     if not _has_whole_rows(value_E):
         value_E = value_E.contiguous()
     num_rows, num_slots, *leaf = ring_EM.shape
@@ -207,7 +160,7 @@ def _has_whole_rows(value_E: Tensor) -> bool:
     return value_E.ndim == 1 or value_E.ndim == 2 and value_E.stride(1) == 1 or value_E.is_contiguous()
 
 
-_run = as_operator(
+turn = as_operator(
     "ring",
     _launch,
     lambda ring_EM, _age_E, value_E, _lag_E, _mask_E, num_frames, *_: value_E.new_empty(

@@ -19,6 +19,11 @@ def spell(key: NestedKey) -> str:
     return key if isinstance(key, str) else "/".join(map(str, key))
 
 
+def path_of(key: NestedKey) -> tuple[Any, ...]:
+    """Return the names that lead to a leaf."""
+    return (key,) if isinstance(key, str) else tuple(key)
+
+
 def leaf_spec(observation_spec: Composite, key: NestedKey, owner: str) -> TensorSpec:
     """Return the spec of `key`; the KeyError of a missing one lists the near names."""
     leaves = {spell(leaf): leaf for leaf in observation_spec.keys(True, True)}
@@ -35,7 +40,7 @@ def batch_dims_of(specs: Composite, key: NestedKey) -> int:
 
 def set_leaf_spec(observation_spec: Composite, key: NestedKey, spec: TensorSpec) -> None:
     """Set the spec of `key`, with the nested specs above it, if its shape begins with the batch size of these."""
-    path = key if isinstance(key, tuple) else (key,)
+    path = path_of(key)
     parent = observation_spec
     for name in path[:-1]:
         if name not in parent:

@@ -2,7 +2,6 @@
 
 import torch
 import warp as wp
-from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator
@@ -36,23 +35,14 @@ _quick_tally = QuickLaunch(
 )
 
 
-def tally(
-    step_E: Int64[Tensor, " E"],
-    total_E: Float32[Tensor, " E *leaf"],
-    reward_E: Float32[Tensor, "*rows"] | None,
-    mask_E: Bool[Tensor, " E"] | None,
-) -> tuple[Int64[Tensor, " E"], Float32[Tensor, " E *leaf"]]:
-    """Count one env step and add its reward, or, given the rows that reset, let those begin at 0.
-
-    `step_E` and `total_E` are changed in place, one number per env; copies of both are returned. `reward_E` is None
-    for a reset, and `mask_E` for a step.
-    """
-    return _run_tally(step_E, total_E, reward_E, mask_E)
-
-
-def _tally_now(
+def _tally(
     step_E: Tensor, total_E: Tensor, reward_E: Tensor | None, mask_E: Tensor | None
 ) -> tuple[Tensor, Tensor]:
+    """Count one env step and add its reward, or, given the rows that reset, let those begin at 0.
+
+    `step_E` (int64) and `total_E` (float32) are changed in place, one number per env; copies of both are returned.
+    `reward_E`, float32, is None for a reset, and `mask_E`, bool [E], for a step.
+    """
     if reward_E is not None:
         reward_E = reward_E.contiguous()
     step_out_E, total_out_E = torch.empty_like(step_E), torch.empty_like(total_E)
@@ -64,9 +54,9 @@ def _tally_now(
     return step_out_E, total_out_E
 
 
-_run_tally = as_operator(
+tally = as_operator(
     "tally",
-    _tally_now,
+    _tally,
     lambda step_E, total_E, *_: (torch.empty_like(step_E), torch.empty_like(total_E)),
     mutates=("step_E", "total_E"),
 )

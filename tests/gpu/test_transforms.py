@@ -66,6 +66,16 @@ def test_steps_and_resets_do_not_synchronize_and_replay_as_they_ran(kind):
             check(step)
 
 
+def begin(ring_EM, age_E, value_E, mask_E, *, num_frames=1, parts=None, lag_E=None, draws=()):
+    """Let the masked rows begin."""
+    return ring.turn(ring_EM, age_E, value_E, lag_E, mask_E, num_frames, 0, parts, True, *draws)
+
+
+def push(ring_EM, age_E, value_E, *, num_frames, stride, parts=None):
+    """Make a step."""
+    return ring.turn(ring_EM, age_E, value_E, None, None, num_frames, stride, parts, True)
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.float16, torch.float32, torch.int64])
 @pytest.mark.parametrize("shape", [(), (3,), (48,), (2, 5)])
@@ -77,20 +87,20 @@ def test_rings_of_any_dtype_and_width_give_back_what_was_pushed(dtype, shape):
     age_E = torch.zeros(rows, dtype=torch.int64, device="cuda")
     everyone_E, nobody_E = (torch.full((rows,), flag, device="cuda") for flag in (True, False))
     shaped = (rows, length, *shape)
-    begun_EN = ring.begin(ring_EM, age_E, pushed_TE[0], everyone_E, num_frames=length).view(shaped)
+    begun_EN = begin(ring_EM, age_E, pushed_TE[0], everyone_E, num_frames=length).view(shaped)
     assert all(torch.equal(begun_EN[:, frame], pushed_TE[0]) for frame in range(length))
     age_E.fill_(2**34)
     ring_EM.copy_(pushed_TE[0].unsqueeze(1))
     for step in range(1, 9):
-        found_EN = ring.push(ring_EM, age_E, pushed_TE[step], num_frames=length, stride=1).view(shaped)
+        found_EN = push(ring_EM, age_E, pushed_TE[step], num_frames=length, stride=1).view(shaped)
         for frame in range(length):
             assert torch.equal(found_EN[:, frame], pushed_TE[max(step - length + 1 + frame, 0)]), (
                 step,
                 frame,
             )
-    unmoved = ring.begin(ring_EM, age_E, pushed_TE[0], nobody_E).view(pushed_TE[0].shape)
+    unmoved = begin(ring_EM, age_E, pushed_TE[0], nobody_E).view(pushed_TE[0].shape)
     assert torch.equal(unmoved, pushed_TE[0])
-    again_EN = ring.push(ring_EM, age_E, pushed_TE[8], num_frames=length, stride=1).view(shaped)
+    again_EN = push(ring_EM, age_E, pushed_TE[8], num_frames=length, stride=1).view(shaped)
     assert torch.equal(again_EN[:, 0], pushed_TE[6]), "a reset of nobody changes no ring"
     assert bool((age_E == 2**34 + 9).all())
 
@@ -104,12 +114,10 @@ def test_rings_of_several_parts_give_all_frames_of_one_part_after_another(sizes)
     age_E = torch.zeros(rows, dtype=torch.int64, device="cuda")
     parts = torch.tensor([4 * size for size in sizes], dtype=torch.int32, device="cuda")
     mask_E = torch.arange(rows, device="cuda") % 3 == 0
-    ring.begin(ring_EM, age_E, pushed_TEL[0], torch.ones_like(mask_E), num_frames=length, parts_C=parts)
+    begin(ring_EM, age_E, pushed_TEL[0], torch.ones_like(mask_E), num_frames=length, parts=parts)
     first_E = torch.zeros_like(age_E)
     for step in range(1, 12):
-        found_EL = ring.push(
-            ring_EM, age_E, pushed_TEL[step], num_frames=length, stride=stride, parts_C=parts
-        )
+        found_EL = push(ring_EM, age_E, pushed_TEL[step], num_frames=length, stride=stride, parts=parts)
         start = 0
         for part_EL in pushed_TEL.split(sizes, dim=2):
             for frame in range(length):
@@ -121,7 +129,7 @@ def test_rings_of_several_parts_give_all_frames_of_one_part_after_another(sizes)
                 assert torch.equal(found_EL[:, start:stop], expected_EL), (step, frame)
                 start = stop
         if step == 6:
-            ring.begin(ring_EM, age_E, pushed_TEL[6], mask_E, num_frames=length, parts_C=parts)
+            begin(ring_EM, age_E, pushed_TEL[6], mask_E, num_frames=length, parts=parts)
             first_E = torch.where(mask_E, 6, first_E)
 
 
@@ -132,8 +140,8 @@ def test_rows_that_begin_draw_their_lags():
     lag_E, count_E = torch.full_like(age_E, 9), torch.arange(rows, device="cuda")
     mask_E = torch.arange(rows, device="cuda") % 2 == 0
     seed = torch.tensor(5, device="cuda")
-    lags = ring.Lags(lag_E, seed, count_E, 77, 1, 3)
-    ring.begin(ring_EM, age_E, torch.ones(rows, 3, device="cuda"), mask_E, lags=lags)
+    draws = seed, count_E, 77, 1, 3
+    begin(ring_EM, age_E, torch.ones(rows, 3, device="cuda"), mask_E, lag_E=lag_E, draws=draws)
     assert torch.equal(count_E, torch.arange(rows, device="cuda") + mask_E)
     drawn_E = random.integers(random.row_keys(seed, 77, count_E, rows), 1, 1, 3)[:, 0]
     assert torch.equal(lag_E, torch.where(mask_E, drawn_E, 9))

@@ -227,7 +227,7 @@ def test_refusals():
     ):
         with pytest.raises(ValueError, match=rf"symmetry='augment'.*\[{missing}\]"):
             make_symmetric(PPOCfg(symmetry="augment"), loss, maps)
-    with pytest.raises(ValueError, match="'action' among them"):
+    with pytest.raises(ValueError, match="mirror image of .*'action'"):
         SymmetricAugmentation({"actor": MAPS["actor"]})
 
 
@@ -255,4 +255,4 @@ def test_every_second_transition_is_reflected_with_what_follows_it():
 @pytest.mark.parametrize("maps", [None, {"action": FLIP["action"]}])
 def test_networks_whose_mirror_image_is_missing_are_refused(maps):
     with pytest.raises(ValueError, match="mirror image of .*'actor'"):
-        SymmetricAugmentation.of(maps, read=["actor"])
+        SymmetricAugmentation(maps, read=["actor"])

@@ -15,14 +15,13 @@ from ksim_rl.algorithms.gradient_steps import DatasetUpdate, in_columns
 from ksim_rl.algorithms.ppo.wiring import make_ppo_policy
 from ksim_rl.data import DatasetCfg
 from ksim_rl.device import state_tree
-from ksim_rl.envs.signal_keys import STANDARD, SignalKeys, signal_keys
+from ksim_rl.envs.signal_keys import signal_keys
 from ksim_rl.modules import MixedPolicy, update_normalizers
 from ksim_rl.objectives import (
     DistillationCfg,
     DistillationLoss,
     distribution_keys,
     observation_keys,
-    observation_keys_of,
 )
 from ksim_rl.trainers.algorithm import part_of
 from ksim_rl.trainers.run_cfg import RunCfg
@@ -57,7 +56,8 @@ class DistillationUpdate(DatasetUpdate):
     """Lets a student learn, from one rollout at a time, what its teacher would do there; see `DatasetUpdate`.
 
     The student is any probabilistic module; a recurrent one learns on sequences. The teacher's actions must be those of
-    the student; its policy labels env states, and helps to collect where `teacher_share` says so.
+    the student; its policy labels env states, and helps to collect where `teacher_share` says so. The `shared` are the
+    other arguments of `DatasetUpdate`.
     """
 
     def __init__(
@@ -66,23 +66,11 @@ class DistillationUpdate(DatasetUpdate):
         *,
         actor: ProbabilisticTensorDictSequential,
         teacher: Teacher,
-        data: DatasetCfg,
-        seed: int = 0,
-        device: torch.device | str = "cpu",
-        signals: SignalKeys = STANDARD,
+        **shared: Any,
     ) -> None:
         self.actor, self.teacher = actor, teacher
         loss = DistillationLoss(actor, teacher.policy, loss=cfg.loss)
-        super().__init__(
-            cfg,
-            loss=loss,
-            networks={"actor": actor},
-            data=data,
-            seed=seed,
-            device=device,
-            signals=signals,
-            logged=LOGGED,
-        )
+        super().__init__(cfg, loss=loss, networks={"actor": actor}, logged=LOGGED, **shared)
         self.teacher_share = torch.tensor(cfg.teacher_share, device=self.device)
         helps = cfg.teacher_share > 0.0
         self.behavior: TensorDictModuleBase = actor
@@ -116,7 +104,7 @@ class DistillationUpdate(DatasetUpdate):
 
     @property
     def _teacher_keys(self) -> list[Any]:
-        return observation_keys_of(self.teacher.policy)
+        return observation_keys(self.teacher.policy)
 
     def _update(self) -> None:
         labelled_ET = self.loss.label(self.rollout_ET)

@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 from ksim_rl.algorithms.off_policy import MANY_ENVS
-from ksim_rl.algorithms.off_policy.wiring import off_policy_algorithm
+from ksim_rl.algorithms.off_policy.wiring import OFF_POLICY
 from ksim_rl.modules import QNetworkCfg, SquashedActorCfg
 from ksim_rl.objectives import SACCfg
+from ksim_rl.trainers.run_cfg import ModulesCfg
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,4 +27,5 @@ ACTOR = SquashedActorCfg(hidden_dims=(512, 256, 128), activation="silu", layer_n
 CRITIC = QNetworkCfg(
     hidden_dims=(768, 384, 192), activation="silu", layer_norm=True, num_atoms=101, v_min=-20.0, v_max=20.0
 )
-FAST_SAC = off_policy_algorithm("fast_sac", FastSACCfg, data=MANY_ENVS, actor=ACTOR, critic=CRITIC)
+MODULES = ModulesCfg(actor=ACTOR, critic=CRITIC)
+FAST_SAC = OFF_POLICY(name="fast_sac", cfg=FastSACCfg, data=MANY_ENVS, modules=MODULES)

@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 from ksim_rl.algorithms.off_policy import MANY_ENVS
-from ksim_rl.algorithms.off_policy.wiring import off_policy_algorithm
+from ksim_rl.algorithms.off_policy.wiring import OFF_POLICY
 from ksim_rl.modules import DeterministicActorCfg, QNetworkCfg
 from ksim_rl.objectives import TD3Cfg
+from ksim_rl.trainers.run_cfg import ModulesCfg
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,4 +23,5 @@ class FastTD3Cfg(TD3Cfg):
 
 ACTOR = DeterministicActorCfg()
 CRITIC = QNetworkCfg(hidden_dims=(1024, 512, 256), num_atoms=101)
-FAST_TD3 = off_policy_algorithm("fast_td3", FastTD3Cfg, data=MANY_ENVS, actor=ACTOR, critic=CRITIC)
+MODULES = ModulesCfg(actor=ACTOR, critic=CRITIC)
+FAST_TD3 = OFF_POLICY(name="fast_td3", cfg=FastTD3Cfg, data=MANY_ENVS, modules=MODULES)

@@ -18,7 +18,6 @@ from ksim_rl.data import MASK_KEY, ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.compiling import compiled
-from ksim_rl.envs.signal_keys import STANDARD, SignalKeys
 from ksim_rl.modules import ExploringPolicy, update_normalizers
 from ksim_rl.objectives import (
     FlatAdamW,
@@ -50,7 +49,8 @@ class OffPolicyUpdate(RolloutUpdate):
     Until each env has made `learning_starts` steps, rollouts have random actions and there are no gradient steps. From
     then on an update is `num_minibatches` gradient steps of the critics, each followed by one of the target networks,
     and by one of the actor (and the temperature) every `policy_delay`, which divides that number. For `cfg.symmetry`,
-    `mirror` has the mirror images of what the networks read and of the action. See `RolloutUpdate`.
+    `mirror` has the mirror images of what the networks read and of the action. The `shared` are the other arguments of
+    `RolloutUpdate`.
     """
 
     def __init__(
@@ -61,9 +61,8 @@ class OffPolicyUpdate(RolloutUpdate):
         behavior: ExploringPolicy,
         data: ReplayCfg,
         num_envs: int,
-        device: torch.device | str = "cpu",
         mirror: Mapping[NestedKey, MirrorMap] | None = None,
-        signals: SignalKeys = STANDARD,
+        **shared: Any,
     ) -> None:
         if data.num_minibatches % cfg.policy_delay:
             raise ValueError(
@@ -76,8 +75,7 @@ class OffPolicyUpdate(RolloutUpdate):
             "target_critic": loss.target_critic_network,
         }
         logged = LOGGED | (OF_TEMPERATURE if isinstance(loss, SACLoss) else {})
-        shared: Any = {"device": device, "signals": signals, "logged": logged}
-        super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, **shared)
+        super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, logged=logged, **shared)
         self.cfg, self.loss, self.data = cfg, loss, data
         self.actor: TensorDictModuleBase = loss.actor_network
         self.critic = loss.critic_network
@@ -86,7 +84,7 @@ class OffPolicyUpdate(RolloutUpdate):
         fast: Any = partial(compiled, device=self.device, wanted=cfg.compile)
         self._images = None
         if cfg.symmetry == "augment":
-            self._images = SymmetricAugmentation.of(mirror, read=self._observations, device=self.device)
+            self._images = SymmetricAugmentation(mirror, read=self._observations, device=self.device)
         self._read, self._count_ = fast(self._stored), fast(self.guard.count_)
         self._critic_loss, self._actor_losses = fast(loss.critic_loss), fast(loss.actor_losses)
         self.replay = ReplayRing(
@@ -121,10 +119,8 @@ class OffPolicyUpdate(RolloutUpdate):
         self.behavior.random.fill_(not learns)
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
-        """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
-        return {
-            **self._means,
-            **self._skipped(),
+        """Return what the last update measured; see `RolloutUpdate`."""
+        return super().metrics() | {
             "replay/env_states": self.replay.num_stored,
             "update/non_finite_env_states": self.replay.non_finite_count,
         }

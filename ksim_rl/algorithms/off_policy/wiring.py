@@ -1,6 +1,7 @@
 """This module builds SAC, TD3 and their fast variants for a run: networks, loss, exploration and update."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
@@ -20,29 +21,9 @@ from ksim_rl.modules import (
     make_squashed_actor,
 )
 from ksim_rl.modules.bounded_actors import BoundedActor
-from ksim_rl.objectives import OffPolicyCfg, OffPolicyLoss, SACCfg, SACLoss, TD3Loss
+from ksim_rl.objectives import OffPolicyLoss, SACCfg, SACLoss, TD3Loss
 from ksim_rl.trainers.algorithm import Algorithm, part_of
-from ksim_rl.trainers.run_cfg import ModulesCfg, RunCfg
-
-
-def off_policy_algorithm(
-    name: str,
-    cfg: type[OffPolicyCfg],
-    *,
-    data: ReplayCfg,
-    actor: DeterministicActorCfg | SquashedActorCfg,
-    critic: QNetworkCfg,
-) -> Algorithm:
-    """Return an algorithm with these settings and, beside them, the data and networks that suit it."""
-    return Algorithm(
-        name=name,
-        cfg=cfg,
-        update=make_off_policy_update,
-        policy=make_off_policy_policy,
-        data=data,
-        on_ranks=True,
-        modules=ModulesCfg(actor=actor, critic=critic),
-    )
+from ksim_rl.trainers.run_cfg import RunCfg
 
 
 def make_off_policy_update(
@@ -60,11 +41,8 @@ def make_off_policy_update(
     )
     bounded = next(module for module in actor.modules() if isinstance(module, BoundedActor))
     bounds: dict[str, Any] = {"low_L": bounded.low, "high_L": bounded.high}
-    learned: dict[str, Any] = {
-        "support_A": critic.module.support,
-        "gamma": objective.gamma,
-        "value_reduction": objective.value_reduction,
-    }
+    learned: dict[str, Any] = {"support_A": critic.module.support}
+    learned |= {name: getattr(objective, name) for name in ("gamma", "value_reduction")}
     noise = {}
     loss: OffPolicyLoss
     if isinstance(objective, SACCfg):
@@ -97,13 +75,15 @@ def make_off_policy_update(
 def make_off_policy_policy(cfg: RunCfg, env: EnvBase) -> TensorDictModuleBase:
     """Build the policy of a run: with SAC's settings one that draws its actions, with TD3's one that does not."""
     spec: Any = env.observation_spec
-    kind: Any
-    kind, make = DeterministicActorCfg, make_deterministic_actor
-    if isinstance(cfg.objective, SACCfg):
-        kind, make = SquashedActorCfg, make_squashed_actor
+    draws = isinstance(cfg.objective, SACCfg)
+    make: Any = make_squashed_actor if draws else make_deterministic_actor
     return make(
-        part_of(cfg, "modules.actor", kind),
+        part_of(cfg, "modules.actor", SquashedActorCfg if draws else DeterministicActorCfg),
         obs_dim=spec["actor"].shape[-1],
         action_spec=env.action_spec,
         device=cfg.resolved_device(),
     )
+
+
+OFF_POLICY = partial(Algorithm, update=make_off_policy_update, policy=make_off_policy_policy, on_ranks=True)
+"""Makes an algorithm of these from its name and settings, and the data and networks that suit it."""

@@ -46,7 +46,7 @@ def make_fused_ppo(update: DatasetUpdate, mirror: Mapping[Any, MirrorMap] | None
         networks,
         mirror=None
         if cfg.symmetry == "none"
-        else SymmetricAugmentation.of(mirror, read=read, device=update.device),
+        else SymmetricAugmentation(mirror, read=read, device=update.device),
         observe_actor=observer(actor[0]),
         observe_critic=observer(critic),
         optimizer=update.optimizer,

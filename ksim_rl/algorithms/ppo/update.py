@@ -12,9 +12,7 @@ from torch import Tensor
 
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate, in_columns
 from ksim_rl.algorithms.ppo.fused import make_fused_ppo
-from ksim_rl.data import DatasetCfg
 from ksim_rl.device import state_tree
-from ksim_rl.envs.signal_keys import STANDARD, SignalKeys
 from ksim_rl.modules import CarriedState, update_normalizers
 from ksim_rl.objectives import (
     PPOCfg,
@@ -46,7 +44,7 @@ class PPOUpdate(DatasetUpdate):
 
     The actor is any probabilistic module, which writes actions, their log-probabilities and parameters of the
     distribution; the critic writes `state_value`. For `cfg.symmetry`, `mirror` has the mirror images of what they read
-    and of the action.
+    and of the action. The `shared` are the other arguments of `DatasetUpdate`.
     """
 
     def __init__(
@@ -55,11 +53,9 @@ class PPOUpdate(DatasetUpdate):
         *,
         actor: ProbabilisticTensorDictSequential,
         critic: TensorDictModule,
-        data: DatasetCfg,
-        seed: int = 0,
         device: torch.device | str = "cpu",
         mirror: Mapping[Any, MirrorMap] | None = None,
-        signals: SignalKeys = STANDARD,
+        **shared: Any,
     ) -> None:
         cfg = with_precision_of(cfg, device)
         self.actor = self.behavior = actor
@@ -67,16 +63,7 @@ class PPOUpdate(DatasetUpdate):
         self.advantage = make_advantage(cfg, actor, critic)
         loss = make_loss(cfg, actor, critic)
         networks = {"actor": actor, "critic": critic}
-        super().__init__(
-            cfg,
-            loss=loss,
-            networks=networks,
-            data=data,
-            seed=seed,
-            device=device,
-            signals=signals,
-            logged=LOGGED,
-        )
+        super().__init__(cfg, loss=loss, networks=networks, device=device, logged=LOGGED, **shared)
         losses = make_symmetric(cfg, loss, mirror, device=self.device)
         self._losses = in_precision(losses, cfg.precision, device=self.device)
         # The rollouts hold the recurrent states of the actor, and not those of the critic.

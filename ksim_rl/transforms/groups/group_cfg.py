@@ -174,16 +174,13 @@ def _chain(group: str, cfg: ObservationGroupCfg, terms: Mapping[str, Observation
     noisy = {name: term.noise for name, term in terms.items() if term.noise is not None}
     if noisy:
         transforms.append(ObservationNoise(*advance(list(noisy)), noise=list(noisy.values())))
-    clipped = [name for name, term in terms.items() if term.clip is not None]
-    if clipped:
-        in_keys, out_keys = advance(clipped)
-        clips = {key: terms[name].clip for key, name in zip(in_keys, clipped, strict=True)}
-        transforms.append(ObservationClip(in_keys, out_keys, clip=clips))  # pyright: ignore[reportArgumentType]
-    scaled = [name for name, term in terms.items() if term.scale != 1.0]
-    if scaled:
-        in_keys, out_keys = advance(scaled)
-        scales = {key: terms[name].scale for key, name in zip(in_keys, scaled, strict=True)}
-        transforms.append(ObservationScale(in_keys, out_keys, scale=scales))
+    makers: dict[str, tuple[Any, Any]] = {"clip": (ObservationClip, None), "scale": (ObservationScale, 1.0)}
+    for field, (make, neutral) in makers.items():
+        given = {name: value for name, term in terms.items() if (value := getattr(term, field)) != neutral}
+        if given:
+            in_keys, out_keys = advance(list(given))
+            by_key = dict(zip(in_keys, given.values(), strict=True))
+            transforms.append(make(in_keys, out_keys, **{field: by_key}))
     for name, term in terms.items():
         if term.delay is not None and cfg.terms[name].delay is not None:
             # One transform per term: each sensor has a lag of its own.

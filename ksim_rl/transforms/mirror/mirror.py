@@ -13,7 +13,7 @@ from torchrl.data import Composite, TensorSpec
 from ksim_rl import checks
 from ksim_rl.device import random
 from ksim_rl.transforms.row_transform import KeyedTransform, Keys
-from ksim_rl.transforms.specs import Device, bounded, bounds
+from ksim_rl.transforms.specs import Device, bounded, bounds, path_of
 
 Bounds = tuple[Tensor, Tensor]
 
@@ -211,7 +211,7 @@ def mirrored(tensordict: TensorDictBase, maps: Mapping[NestedKey, MirrorMap]) ->
     """
     reflected = tensordict.clone(recurse=False)
     for key, mirror in maps.items():
-        path = key if isinstance(key, tuple) else (key,)
+        path = path_of(key)
         places = [place for place in (path, ("next", *path)) if tensordict.get(place, None) is not None]
         if not places:
             raise KeyError(f"maps: the batch has no {key!r}")

@@ -3,11 +3,8 @@
 Each column's draws are those of `ksim_rl.device.random` at (seed, stream, counter, row, column).
 """
 
-from typing import NamedTuple
-
 import torch
 import warp as wp
-from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from ksim_rl import ranks
@@ -125,45 +122,6 @@ _DEVICE = f"""
 _quick = QuickLaunch(_ARGUMENTS, _DEVICE + DRAWS + _COLUMNS)
 
 
-class NoiseState(NamedTuple):
-    """What the noise of a transform depends on, beside the readings.
-
-    `table_PL` has the rows `OFFSET`, `SPREAD`, ..., float32; `flags_L` tells the kind of noise of each column, int32.
-    `enabled` is bool [], `seed` int64 []; `level`, float32 [], is the strength of the columns with `BY_LEVEL`. The last
-    three are what lasts from step to step, float32; None where no column has it.
-    """
-
-    table_PL: Tensor
-    flags_L: Tensor
-    enabled: Tensor
-    level: Tensor
-    seed: Tensor
-    bias_EL: Tensor | None = None
-    walk_EL: Tensor | None = None
-    last_EL: Tensor | None = None
-
-
-def add_noise(
-    clean_EL: Float32[Tensor, "*leaf"],
-    state: NoiseState,
-    features: int,
-    moment: str,
-    *,
-    stream: int,
-    counter: Int64[Tensor, "*rows"],
-    mask_E: Bool[Tensor, " E"] | None = None,
-) -> Float32[Tensor, "*leaf"]:
-    """Return the noisy readings of E * L clean ones in any shape, drawn at the counts that the counter reaches.
-
-    A "step" adds 1 to the counter of each row [E], and changes what lasts in `state`. A "reset" begins the episodes of
-    the masked rows, counts them, and returns the others' clean readings. In a "forward", readings are samples, which
-    belong to no episode: the counter [] stays, and there is no bias, drift or dropout.
-    """
-    if moment == "forward":
-        features &= HAS_GAUSSIAN | HAS_RESOLUTION
-    return _run(clean_EL, *state, features, _MODES[moment], mask_E, stream, counter)
-
-
 def _launch(
     clean_EL: Tensor,
     table_PL: Tensor,
@@ -175,11 +133,23 @@ def _launch(
     walk_EL: Tensor | None,
     last_EL: Tensor | None,
     features: int,
-    moment: int,
+    moment: str,
     mask_E: Tensor | None,
     stream: int,
     counter: Tensor,
 ) -> Tensor:
+    """Return the noisy readings of E * L clean ones in any shape, drawn at the counts that the counter reaches.
+
+    A "step" adds 1 to the counter of each row [E], and changes what lasts from step to step: `bias_EL`, `walk_EL` and
+    `last_EL`, float32, None where no column has it. A "reset" begins the episodes of the masked rows, counts them, and
+    returns the others' clean readings. In a "forward", readings are samples, which belong to no episode: the counter []
+    stays, and there is no bias, drift or dropout.
+
+    `table_PL` has the rows `OFFSET`, `SPREAD`, ..., float32; `flags_L` tells the kind of noise of each column, int32.
+    `enabled` is bool [], `seed` int64 []; `level`, float32 [], is the strength of the columns with `BY_LEVEL`.
+    """
+    if moment == "forward":
+        features &= HAS_GAUSSIAN | HAS_RESOLUTION
     clean_EL = clean_EL.contiguous()
     out_EL = torch.empty_like(clean_EL)
     num_columns = flags_L.numel()
@@ -188,12 +158,12 @@ def _launch(
     state = seed, counter, enabled, level, mask_E, table_PL, flags_L
     tensors = *state, clean_EL, bias_EL, walk_EL, last_EL, out_EL
     dim = (num_rows, 1 if device.type == "cpu" else _LANES)
-    layout = num_columns, moment, features, ranks.first_row(num_rows), stream
+    layout = num_columns, _MODES[moment], features, ranks.first_row(num_rows), stream
     _quick(device, dim, *layout, *map(address, tensors))
     return out_EL
 
 
-_run = as_operator(
+add_noise = as_operator(
     "noise",
     _launch,
     lambda clean_EL, *_others: clean_EL.new_empty(clean_EL.shape),

@@ -13,7 +13,7 @@ from ksim_rl.transforms import upstream
 from ksim_rl.transforms.columns import side_by_side, split
 from ksim_rl.transforms.noise import kernel as noise_kernel
 from ksim_rl.transforms.noise.cfg import NoiseCfg, per_dim
-from ksim_rl.transforms.noise.kernel import HAS_BIAS, HAS_DROPOUT, HAS_WALK, NoiseState, add_noise
+from ksim_rl.transforms.noise.kernel import HAS_BIAS, HAS_DROPOUT, HAS_WALK, add_noise
 from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, Keys, RowTransform, one_per_key
 from ksim_rl.transforms.specs import Device, add_bounds, bounded, bounds, multiply_bounds
 
@@ -142,9 +142,9 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         parameters: dict[str, Any] = columns._buffers
         read = parameters["table_PL"], parameters["flags_L"], buffers["enabled"], buffers["level"]
         changed = buffers["bias_EL"], buffers["walk_EL"], buffers["last_EL"]
-        state = NoiseState(*read, buffers["seed_value"], *changed)
-        where = {"stream": self._stream_ids[moment], "counter": counter, "mask_E": mask_E}
-        noisy_EL = add_noise(clean_EL, state, columns.features, moment, **where)
+        state = *read, buffers["seed_value"], *changed
+        drawn = mask_E, self._stream_ids[moment], counter
+        noisy_EL = add_noise(clean_EL, *state, columns.features, moment, *drawn)
         found = [noisy_EL] if len(values) == 1 else split(noisy_EL, values)
         for out_key, noisy, value in zip(self.out_keys, found, values):  # noqa: B905 (takes time in every step)
             tensordict.set(out_key, noisy if noisy.dtype == value.dtype else noisy.to(value.dtype))
