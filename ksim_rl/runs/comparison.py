@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from ksim_rl.config.plain_data import read_yaml
 from ksim_rl.runs import curves
-from ksim_rl.runs.csv_table import STEP, read_table
-from ksim_rl.runs.listing import CONFIG, HEADS, METRICS, line, numbers, summarize, written
+from ksim_rl.runs.csv_table import STEP
+from ksim_rl.runs.listing import CONFIG, HEADS, METRICS, line, metric_rows, numbers, summarize, written
 from ksim_rl.runs.record import printable
 
 RETURN = ("evaluation/return_mean", "episode/return")
@@ -43,7 +43,7 @@ def figures(folders: Sequence[Path]) -> list[list[str]]:
     lines = [line(summarize(folder), name=name) for folder, name in zip(folders, names(folders), strict=True)]
     rows = [[head, *cells] for head, *cells in zip(HEADS, *lines, strict=True)]
     returns = [
-        next(filter(None, (numbers(read_table(folder / METRICS)[1], metric) for metric in RETURN)), [])
+        next(filter(None, (numbers(metric_rows(folder), metric) for metric in RETURN)), [])
         for folder in folders
     ]
     rows.append(["best return", *(written(max(values, default=None), ".4g") for values in returns)])
@@ -58,7 +58,7 @@ def figures(folders: Sequence[Path]) -> list[list[str]]:
 
 def draw(folders: Sequence[Path], picture: Path) -> None:
     """Draw the curves of runs over each other, into a PNG; a ValueError where none has any."""
-    tables = [read_table(folder / METRICS)[1] for folder in folders]
+    tables = [metric_rows(folder) for folder in folders]
     figure = Figure(figsize=(11, 7.5), layout="constrained")
     FigureCanvasAgg(figure)
     drawn = False

@@ -79,7 +79,7 @@ def summarize(folder: Path) -> Summary:
         began = sessions[0].began if sessions else "?"
         text = read_bytes(folder / CONFIG, limit=MOST_YAML_BYTES).decode(errors="replace")
         task = found[1] if (found := _TASK.search(text)) else "?"
-        rows = read_table(folder / METRICS)[1]
+        rows = metric_rows(folder)
     except (ValueError, csv.Error) as error:
         faults.append(record.printable(str(error)))
     speeds = numbers(rows[-LATEST:], "throughput/env_states_per_s")
@@ -97,6 +97,11 @@ def summarize(folder: Path) -> Summary:
         episodes=last(rows, "episode/return"),
         speed=median(speeds) if speeds else None,
     )
+
+
+def metric_rows(folder: Path) -> list[dict[str, str]]:
+    """Return the rows of a run's metrics; none where it has not written any."""
+    return read_table(folder / METRICS)[1] if (folder / METRICS).exists() else []
 
 
 def numbers(rows: Sequence[dict[str, str]], name: str) -> list[float]:
