@@ -49,8 +49,7 @@ def figures(folders: Sequence[Path]) -> list[list[str]]:
     rows.append(["best return", *(written(max(values, default=None), ".4g") for values in returns)])
     fields = dict.fromkeys(name for config in configs for name in config)
     differing = [name for name in fields if len({config.get(name, "-") for config in configs}) > 1]
-    for name in differing[:MOST_FIELDS]:
-        rows.append([name, *(config.get(name, "-") for config in configs)])
+    rows += [[name, *(config.get(name, "-") for config in configs)] for name in differing[:MOST_FIELDS]]
     if len(differing) > MOST_FIELDS:
         rows.append([f"... and {len(differing) - MOST_FIELDS} more fields", *("" for _ in folders)])
     return rows
@@ -59,9 +58,9 @@ def figures(folders: Sequence[Path]) -> list[list[str]]:
 def draw(folders: Sequence[Path], picture: Path) -> None:
     """Draw the curves of runs over each other, into a PNG; a ValueError where none has any."""
     tables = [metric_rows(folder) for folder in folders]
-    figure = Figure(figsize=(11, 7.5), layout="constrained")
-    FigureCanvasAgg(figure)
-    drawn = False
+    if not any(tables):
+        raise ValueError(f"{', '.join(map(str, folders))}: no {METRICS} with rows to draw")
+    FigureCanvasAgg(figure := Figure(figsize=(11, 7.5), layout="constrained"))
     for index, (title, metrics, over) in enumerate(PANELS):
         axes = figure.add_subplot(2, 2, index + 1)
         # Returns of evaluations and of training are not the same, and one evaluation is no curve.
@@ -70,7 +69,6 @@ def draw(folders: Sequence[Path], picture: Path) -> None:
         for name, rows in zip(names(folders), tables, strict=True):
             points = [row for row in rows if numbers([row], over) and numbers([row], metric)]
             axes.plot(numbers(points, over), numbers(points, metric), label=printable(name), linewidth=1.6)
-            drawn |= bool(points)
         if title == PANELS[-1][0]:
             # Where iterations overlap, one that waited for a graph to be recorded makes the next one look short.
             speeds = sorted(speed for rows in tables for speed in numbers(rows, metric)) or [1.0]
@@ -78,8 +76,6 @@ def draw(folders: Sequence[Path], picture: Path) -> None:
         title += f": {metric}" if len(metrics) > 1 else ""
         curves.dress(axes, title, over="time (s)" if over == "seconds" else "env states")
         axes.legend(fontsize=8, frameon=False)
-    if not drawn:
-        raise ValueError(f"{', '.join(map(str, folders))}: no {METRICS} with rows to draw")
     figure.savefig(picture, dpi=110)
 
 
