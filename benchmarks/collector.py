@@ -4,7 +4,8 @@
 
 takes the overrides of `ksim-rl train`; `num_envs` may be a list. Both sides step the same kind of env with the same
 policy for `steps` (default 32) steps per rollout, in turn; each figure is the median over the rounds of the ratio of
-their times, so that whatever else the machine does weighs on both. The stock side steps its env with eager physics
+their times, so that whatever else the machine does weighs on both. `compiled_over_captured` is what
+`collector.compile=true` makes of it. The stock side steps its env with eager physics
 (`captured_over_stock`), and once more with each control step's physics as one graph
 (`captured_over_stock_with_graphs`). Figures go to benchmarks/results/collector.json as
 `<device>/cartpole/<num_envs>/...`.
@@ -25,7 +26,7 @@ from torchrl.collectors import Collector
 
 from benchmarks import command_line, report
 from benchmarks.stopwatch import milliseconds
-from ksim_rl.collectors import RolloutCollector
+from ksim_rl.collectors import CollectorCfg, RolloutCollector
 from ksim_rl.device.capture import live_launches
 from ksim_rl.trainers import RunCfg
 from ksim_rl.trainers.algorithm import make_update
@@ -40,9 +41,12 @@ def measure(cfg: RunCfg, *, steps: int = STEPS, rounds: int = ROUNDS) -> dict[st
     """Return env states/s of each side, medians over the rounds, and the ratios."""
     device = cfg.resolved_device()
     torch.manual_seed(cfg.seed)
-    envs = [build_env(cfg, num_envs=cfg.num_envs, seed=cfg.seed) for _ in range(2)]
+    envs = [build_env(cfg, num_envs=cfg.num_envs, seed=cfg.seed) for _ in range(3)]
     actor = make_update(cfg, envs[0]).behavior
-    ours = RolloutCollector(envs[0], actor, rollout_length=steps)
+    ours, compiled = (
+        RolloutCollector(env, actor, rollout_length=steps, cfg=CollectorCfg(compile=compile))
+        for env, compile in zip(envs[::2], (False, True), strict=True)
+    )
     stock = iter(
         Collector(
             envs[1],
@@ -56,6 +60,7 @@ def measure(cfg: RunCfg, *, steps: int = STEPS, rounds: int = ROUNDS) -> dict[st
     )
     sides: dict[str, Callable[[], object]] = {
         "captured": ours.collect,
+        "compiled": compiled.collect,
         "stock": lambda: _next(stock, eager=True),
         "stock_with_graphs": lambda: _next(stock, eager=False),
     }
@@ -71,6 +76,8 @@ def measure(cfg: RunCfg, *, steps: int = STEPS, rounds: int = ROUNDS) -> dict[st
     for name in ("stock", "stock_with_graphs"):
         ratios = [other / own for other, own in zip(times[name], times["captured"], strict=True)]
         figures[f"captured_over_{name}"] = statistics.median(ratios)
+    ratios = [other / own for other, own in zip(times["captured"], times["compiled"], strict=True)]
+    figures["compiled_over_captured"] = statistics.median(ratios)
     for env in envs:
         env.close(raise_if_closed=False)
     return figures
@@ -90,7 +97,9 @@ def main() -> None:
     if not any(word.startswith("task=") for word in words):
         words.append("task=cartpole_balance")
     table = Table(title="captured rollout beside TorchRL's Collector")
-    for column in ("envs", "captured", "stock", "stock, graphs", "ratio", "ratio, graphs"):
+    sides = ("compiled", "captured", "stock", "stock_with_graphs")
+    ratios = ("compiled_over_captured", "captured_over_stock", "captured_over_stock_with_graphs")
+    for column in ("envs", *sides, *ratios):
         table.add_column(column, justify="right")
     figures: dict[str, float] = {}
     device = torch.device("cpu")
@@ -104,11 +113,8 @@ def main() -> None:
         robot = cfg.task_name.split("_")[0]
         prefix = f"{report.device_label(device)}/{robot}/{num_envs}"
         figures |= {f"{prefix}/{name}": round(value, 3) for name, value in found.items()}
-        speeds = [
-            f"{found[f'{side}_env_states_per_s']:,.0f}" for side in ("captured", "stock", "stock_with_graphs")
-        ]
-        ratios = [f"{found[f'captured_over_{side}']:.2f}" for side in ("stock", "stock_with_graphs")]
-        table.add_row(str(num_envs), *speeds, *ratios)
+        speeds = [f"{found[f'{side}_env_states_per_s']:,.0f}" for side in sides]
+        table.add_row(str(num_envs), *speeds, *(f"{found[ratio]:.2f}" for ratio in ratios))
     Console().print(table)
     path = report.write("collector", figures=figures, device=device, module="benchmarks.collector")
     print(f"written to {path}")
