@@ -21,8 +21,8 @@ CURVE_POINTS, RETURN = 24, "episode/return"
 def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> Card:
     """Make an entry out of a run folder, with `episodes` compared with MuJoCo's C engine, and return its card.
 
-    Raises ValueError for a wrong name, a run of code that is not in one commit, rewards that cannot be compared, and
-    more than 200 kB.
+    Matrices are rounded to float16, and what is compared is the rounded policy. Raises ValueError for a wrong name, a
+    run of code that is not in one commit, rewards that cannot be compared, and more than 200 kB.
     """
     if not NAME.fullmatch(name):
         raise ValueError(f"{name!r}: expected lower-case letters, digits and _")
@@ -34,22 +34,25 @@ def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> 
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder) as temporary:
         entry, exported = Path(temporary) / name, Path(temporary) / "export"
-        export(run, exported, episodes=episodes, note=print)
+        actor = dict(saved.state["update"]["actor"])
+        actor |= {key: x.half() for key, x in actor.items() if x.is_floating_point() and x.ndim > 1}
+        state = {"observation_columns": saved.state["observation_columns"], "update": {"actor": actor}}
+        entry.mkdir()
+        checkpoint.save(entry / CHECKPOINT, state, iteration=saved.iteration, config=saved.config)
+        made = {"commit": card.commit, "versions": dict(record.read(run)[-1].versions)}
+        export(entry, exported, episodes=episodes, note=print, trained_with=made)
         report = sim2sim(exported, episodes=episodes, note=print)
         if not math.isfinite(report.return_ratio):
             raise ValueError(f"{run}: of its rewards none has a description; see docs/deploy.md")
-        entry.mkdir()
         shutil.copyfile(exported / ONNX, entry / ONNX)
-        actor = {"actor": saved.state["update"]["actor"]}
-        state = {"observation_columns": saved.state["observation_columns"], "update": actor}
-        checkpoint.save(entry / CHECKPOINT, state, iteration=saved.iteration, config=saved.config)
         ratio = {"return_ratio": report.return_ratio, "standard_error": report.standard_error}
         card = replace(card, sim2sim={**ratio, "episodes": float(episodes)}, files=hashes(entry))
         (entry / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n")
         size = sum(path.stat().st_size for path in entry.rglob("*") if path.is_file())
         if size > MOST_BYTES:
-            fix = "train smaller networks, modules.actor.hidden_dims=[64,64]"
-            raise ValueError(f"{run}: {size:,} bytes, above the {MOST_BYTES:,} of an entry: {fix}")
+            raise ValueError(
+                f"{run}: {size:,} bytes, above the {MOST_BYTES:,} of an entry: train smaller networks"
+            )
         entry.rename(folder / name)
     return read_card(name, folder)
 
