@@ -9,7 +9,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from ksim_rl.export import export, sim2sim
-from ksim_rl.runs import csv_table, listing, record
+from ksim_rl.runs import listing, record
+from ksim_rl.runs.csv_table import STEP
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.run_cfg import check_run_tree
 from ksim_rl.zoo.cards import CARD, CHECKPOINT, FOLDER, MOST_BYTES, ONNX, Card, hashes, read_card
@@ -48,10 +49,9 @@ def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> 
         ratio = {"return_ratio": report.return_ratio, "standard_error": report.standard_error}
         card = replace(card, sim2sim={**ratio, "episodes": float(episodes)}, files=hashes(entry))
         (entry / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n")
-        size = sum(path.stat().st_size for path in entry.rglob("*") if path.is_file())
-        if size > MOST_BYTES:
+        if (size := sum(path.stat().st_size for path in entry.rglob("*") if path.is_file())) > MOST_BYTES:
             raise ValueError(
-                f"{run}: {size:,} bytes, above the {MOST_BYTES:,} of an entry: train smaller networks"
+                f"{run}: {size:,} bytes, above the {MOST_BYTES:,} of an entry: train a smaller actor"
             )
         entry.rename(folder / name)
     return read_card(name, folder)
@@ -65,9 +65,9 @@ def _of_run(saved: checkpoint.Checkpoint, *, name: str) -> Card:
     commit = " and ".join(sorted(made))
     if not re.fullmatch("[0-9a-f]{40}", commit):
         raise ValueError(f"{run}: made of {commit}: train in a clean clone of one commit, and add that run")
-    _, rows = csv_table.read_table(run / listing.METRICS)
-    earned = [(int(row[csv_table.STEP]), value) for row in rows for value in listing.numbers([row], RETURN)]
-    thinned = earned[:: max(1, len(earned) // CURVE_POINTS)]
+    rows = listing.metric_rows(run)
+    earned = [(int(row[STEP]), value) for row in rows for value in listing.numbers([row], RETURN)]
+    earned = earned[:: max(1, len(earned) // CURVE_POINTS)]
     return Card(
         name=name,
         task=str(saved.config["task_name"]),
@@ -77,5 +77,5 @@ def _of_run(saved: checkpoint.Checkpoint, *, name: str) -> Card:
         iteration=saved.iteration,
         env_states=summary.env_states or 0,
         return_mean=summary.evaluation,
-        curve=tuple((step, float(f"{value:.4g}")) for step, value in thinned),
+        curve=tuple((step, float(f"{value:.4g}")) for step, value in earned),
     )
