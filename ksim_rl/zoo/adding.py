@@ -50,9 +50,7 @@ def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> 
         card = replace(card, sim2sim={**ratio, "episodes": float(episodes)}, files=hashes(entry))
         (entry / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n")
         if (size := sum(path.stat().st_size for path in entry.rglob("*") if path.is_file())) > MOST_BYTES:
-            raise ValueError(
-                f"{run}: {size:,} bytes, above the {MOST_BYTES:,} of an entry: train a smaller actor"
-            )
+            raise ValueError(f"{run}: {size:,} bytes, above {MOST_BYTES:,}: train a smaller actor")
         entry.rename(folder / name)
     return read_card(name, folder)
 
