@@ -116,6 +116,7 @@ class Child:
 def start(work: Callable[[], int], *, hangs_s: float = HANGS_S) -> Child:
     """Fork, and let the child do `work` and exit with what it returns; its output goes to the parent."""
     warm()
+    torch.set_num_threads(1)  # again: who ran in between may have set more, and a fork would wait for them
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     reading, writing = os.pipe()

@@ -48,10 +48,10 @@ class CounterEnv(EnvBase):
         specs = {
             "observation": {
                 **{name: scalar.clone() for name in ("count", "episode", "row")},
-                "drawn": Bounded(0.0, 1.0, (1,)),
+                "drawn": Bounded(0.0, 1.0, torch.Size([1])),
                 "obs": Composite(vector=Unbounded(3)),
             },
-            "action": {"action": Bounded(-1.0, 1.0, (action_size,))},
+            "action": {"action": Bounded(-1.0, 1.0, torch.Size([action_size]))},
             "reward": {"reward": scalar},
             "done": {name: flag.clone() for name in ("done", "terminated", "truncated")},
         }
