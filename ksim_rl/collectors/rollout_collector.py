@@ -18,6 +18,7 @@ from ksim_rl.checked import Checked, Count
 from ksim_rl.checks import check_count
 from ksim_rl.compiled.compiled_step import CompiledStep
 from ksim_rl.device.capture import Captured
+from ksim_rl.device.copying import copy_rows
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.envs.contract import EpisodeClock, SimulatedWorld, part
 from ksim_rl.envs.masked_reset import MaskedReset
@@ -82,7 +83,7 @@ class RolloutCollector:
         self._keys = None if keys is None else list(keys)
         self._root: TensorDict | None = None
         self._storage_TE: TensorDict | None = None
-        self._leaves_by_dtype: list[list[tuple[NestedKey, Tensor]]] = []
+        self._leaves: list[tuple[NestedKey, Tensor]] = []
         device = env.device or torch.device("cpu")
         simulates = part(env, SimulatedWorld) is not None
         self._compiles = simulates if cfg.compile is None else cfg.compile
@@ -191,16 +192,9 @@ class RolloutCollector:
     def _store(self, t: int, env_state_E: TensorDictBase) -> None:
         if self._storage_TE is None:
             self._allocate(env_state_E)
-        for leaves in self._leaves_by_dtype:
-            held = [(leaf_TE[t], env_state_E.get(key, None)) for key, leaf_TE in leaves]
-            pairs = [(kept, value) for kept, value in held if value is not None]
-            # One kernel for all that lie in one piece; a column of something wider needs its own.
-            whole = [pair for pair in pairs if pair[1].is_contiguous()]
-            if whole:
-                torch._foreach_copy_([kept for kept, _ in whole], [value for _, value in whole])
-            for kept, value in pairs:
-                if not value.is_contiguous():
-                    kept.copy_(value)
+        held = [(leaf_TE[t], env_state_E.get(key, None)) for key, leaf_TE in self._leaves]
+        pairs = [(kept, value) for kept, value in held if value is not None]
+        copy_rows([kept for kept, _ in pairs], [value for _, value in pairs])
 
     def _allocate(self, env_state_E: TensorDictBase) -> None:
         produced = list(env_state_E.keys(True, True))
@@ -212,7 +206,4 @@ class RolloutCollector:
         kept_E = env_state_E.select(*(self._keys or produced))
         storage_TE: Any = kept_E.new_zeros(torch.Size([self.rollout_length, *kept_E.batch_size]))
         self._storage_TE = storage_TE
-        by_dtype: dict[torch.dtype, list[tuple[NestedKey, Tensor]]] = {}
-        for key, leaf_TE in storage_TE.items(True, True):
-            by_dtype.setdefault(leaf_TE.dtype, []).append((key, leaf_TE))
-        self._leaves_by_dtype = list(by_dtype.values())
+        self._leaves = list(storage_TE.items(True, True))

@@ -6,6 +6,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl.compiled.tape import Tape
+from ksim_rl.device.copying import copy_rows
 from ksim_rl.device.recording import recorded
 
 SHARE, TOLERANCE = 0.99, 1e-3
@@ -58,8 +59,7 @@ class CompiledStep:
 
         The leaves lie in the same memory each time.
         """
-        new = [tensordict.get(key) for key in self._changing]
-        torch._foreach_copy_(self._given, new)
+        copy_rows(self._given, [tensordict.get(key) for key in self._changing])
         self._tape()
         return self._next_E
 
