@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from ksim_rl.physics import kernels, upstream
+from ksim_rl.physics.collision.collisions import broad_phase_unavailable, collisions
 from ksim_rl.physics.contact_sensors import ContactReadings
 from ksim_rl.physics.newton import solver as newton
 from ksim_rl.physics.rows.constraint_rows import constraint_rows
@@ -76,6 +77,7 @@ class Substeps:
         self.contact_lists: ContactLists | None = None
         self._make_rows: Callable[[], None] | None = None
         self._contacts: ContactReadings | None = None
+        self._collide: Callable[[], None] | None = None
         if one_kernel_rows and one_kernel_solver:
             self.contact_lists = ContactLists(warp_model, warp_data_E)
             self._make_rows = constraint_rows(warp_model, warp_data_E, self.contact_lists)
@@ -83,6 +85,8 @@ class Substeps:
             self._alter(
                 sensor_contact_acc_adr=upstream.contact_sensors_but(warp_model, self._contacts.sensors)
             )
+            if broad_phase_unavailable(warp_model, warp_data_E) is None:
+                self._collide = collisions(warp_model, warp_data_E)
         self._integrate = integration(warp_model, warp_data_E) if one_kernel_integration else None
         self._needs_transmission = bool(np.isin(sensor_type, TRANSMISSION_SENSORS).any())
         self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any())
@@ -114,7 +118,15 @@ class Substeps:
             mjw.step(m, self.warp_data_E)
             return
         m.opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
-        stages = self._solve, dynamics, self._make_rows, self._contacts, self._integrate, self._aside
+        stages = (
+            self._solve,
+            dynamics,
+            self._make_rows,
+            self._contacts,
+            self._integrate,
+            self._aside,
+            self._collide,
+        )
         newton.step(m, self.warp_data_E, *stages, sensors=sensors != "none" or self._always_senses)
 
     def refresh(self, *, masked: bool = False) -> None:
