@@ -21,7 +21,7 @@ from mujoco_warp._src.collision_core import contact_params as contact_params
 # What lies between its broad phase and its narrow one, and the second.
 from mujoco_warp._src.collision_core import create_collision_context as create_collision_context
 from mujoco_warp._src.collision_core import write_contact as write_contact
-from mujoco_warp._src.collision_driver import _narrowphase as narrowphase
+from mujoco_warp._src.collision_driver import _narrowphase as narrowphase  # noqa: F401
 from mujoco_warp._src.math import make_frame as make_frame
 from mujoco_warp._src.math import mul_quat as mul_quat
 from mujoco_warp._src.math import quat_to_mat as quat_to_mat
