@@ -229,16 +229,14 @@ class FusedPPO:
         num_envs, length = rollout_ET.batch_size
         self.parameters.load()
         left_out = self.dataset.read(rollout_ET, evaluate=self._evaluate)
-        step = 0
-        for order_D in orders:
-            # From env by env to step by step.
-            index_D = (order_D % length) * num_envs + order_D.div(length, rounding_mode="floor")
-            for index_B in index_D.to(torch.int32).split(self.batch):
-                if len(self.dataset.records) > self.dataset.size:
-                    index_B = torch.cat([index_B, index_B + self.dataset.size])
-                self._multiply(index_B)
-                self._improve(step)
-                step += 1
+        order_N = torch.cat([*orders]).to(torch.int32)
+        # From env by env to step by step.
+        index_N = (order_N % length) * num_envs + order_N.div(length, rounding_mode="floor")
+        for step, index_B in enumerate(index_N.split(self.batch)):
+            if len(self.dataset.records) > self.dataset.size:
+                index_B = torch.cat([index_B, index_B + self.dataset.size])
+            self._multiply(index_B)
+            self._improve(step)
         self.parameters.store()
         names = SUMMARY if self._mirrored else SUMMARY[:-1]
         return dict(zip(names, self._summary.unbind(1), strict=False)), left_out
