@@ -9,7 +9,7 @@ moved the gradient of each parameter by 0.2 to 0.6 percent of its norm, where to
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ksim_rl import ranks
+from ksim_rl.device.streams import beside, warp_scope, warp_stream
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
 from ksim_rl.objectives.fused_ppo.dataset import FusedDataset, Observe
 from ksim_rl.objectives.fused_ppo.layer_kernels import layer, output_gradients
@@ -137,6 +138,7 @@ class FusedPPO:
         rows = self.batch if mirror is None else 2 * self.batch
         num_steps = cfg.num_epochs * num_minibatches
         device, dtype = networks.parameters[0].device, getattr(torch, cfg.precision)
+        self._side = warp_stream(torch.cuda.Stream(device)) if device.type == "cuda" else None
         self.parameters = FusedParameters(
             networks, layout, optimizer=optimizer, dtype=dtype, num_steps=num_steps
         )
@@ -218,26 +220,37 @@ class FusedPPO:
         }
 
     def __call__(
-        self, rollout_ET: TensorDictBase, orders: Sequence[Int64[Tensor, " D"]]
+        self,
+        rollout_ET: TensorDictBase,
+        orders: Iterable[Int64[Tensor, " D"]],
+        *meanwhile: Callable[[], None],
     ) -> tuple[dict[str, Float[Tensor, " steps"]], Int64[Tensor, ""]]:
         """Make all gradient steps of an update.
 
         `rollout_ET`, `["E","T"]`, may be time-major in memory, as that of a collector. `orders` has for each epoch the
-        env states in the order of the minibatches, counted env by env. Returned are what each gradient step measured,
-        by the names of `SUMMARY`, and how many env states took no part because an element was not finite.
+        env states in the order of the minibatches, counted env by env; a GPU draws them while it reads the rollout, and
+        does what is to be done `meanwhile` beside the steps, which do not. Returned are what each gradient step
+        measured, by the names of `SUMMARY`, and how many env states took no part as an element was not finite.
         """
         num_envs, length = rollout_ET.batch_size
-        self.parameters.load()
-        left_out = self.dataset.read(rollout_ET, evaluate=self._evaluate)
-        order_N = torch.cat([*orders]).to(torch.int32)
-        # From env by env to step by step.
-        index_N = (order_N % length) * num_envs + order_N.div(length, rounding_mode="floor")
-        for step, index_B in enumerate(index_N.split(self.batch)):
-            if len(self.dataset.records) > self.dataset.size:
-                index_B = torch.cat([index_B, index_B + self.dataset.size])
-            self._multiply(index_B)
-            self._improve(step)
-        self.parameters.store()
+        places: list[Tensor] = []
+
+        def place() -> None:
+            order_N = torch.cat([*orders]).to(torch.int32)
+            # From env by env to step by step.
+            places.append((order_N % length) * num_envs + order_N.div(length, rounding_mode="floor"))
+
+        with warp_scope(self._summary.device):
+            with beside(self._side, place):
+                self.parameters.load()
+                left_out = self.dataset.read(rollout_ET, evaluate=self._evaluate)
+            with beside(self._side, *meanwhile):
+                for step, index_B in enumerate(places[0].split(self.batch)):
+                    if len(self.dataset.records) > self.dataset.size:
+                        index_B = torch.cat([index_B, index_B + self.dataset.size])
+                    self._multiply(index_B)
+                    self._improve(step)
+                self.parameters.store()
         names = SUMMARY if self._mirrored else SUMMARY[:-1]
         return dict(zip(names, self._summary.unbind(1), strict=False)), left_out
 
