@@ -162,7 +162,7 @@ class FusedPPO:
         dataset, parameters = self.dataset, self.parameters
         zeros = partial(torch.zeros, device=dataset.records.device)
         blocks, dtype = parts(rows, tuning.block), dataset.obs.dtype
-        programs = parts(layout.num_weights, tuning.size) + parts(layout.num_biases, tuning.columns)
+        programs = 2 * parts(layout.num_padded, tuning.size) + 1
         # Where the image of each action comes from, counted from 1, times its sign; see `output_gradients`.
         image_of = torch.arange(1, layout.out + 1, device=dataset.records.device, dtype=torch.int32)
         if mirror is not None:
@@ -192,11 +192,11 @@ class FusedPPO:
             # Tiles at the edge read past the last row.
             "inputs": zeros(2 * rows * layout.inputs + tuning.tile, dtype=dtype),
             "slopes": zeros(2 * rows * layout.gradients + tuning.tile, dtype=dtype),
-            "weight_partials": zeros(tuning.splits, 2, layout.num_weights),
-            "block_partials": zeros(blocks, 2, layout.num_biases + NUM_STATISTICS),
+            "weight_partials": zeros(tuning.splits, 2, layout.num_padded),
+            "block_partials": zeros(blocks, 2, layout.out + NUM_STATISTICS),
             # Of both networks; ranks add them up together with the summary behind them.
             "gradients": zeros(2 * layout.num_padded + self._summary.shape[1]),
-            "squares": zeros(2 * programs),
+            "squares": zeros(programs),
             "image_of": image_of,
             "skipped": self.guard.skipped,
             "skipped_in_a_row": self.guard.skipped_in_a_row,
@@ -209,8 +209,8 @@ class FusedPPO:
             "RECORD": dataset.records.shape[1],
             "NUM_STATISTICS": NUM_STATISTICS,
             "NUM_GRADIENTS": 2 * layout.num_padded,
-            "NUM_SQUARES": 2 * programs,
-            "SQUARES": power_of_two(2 * programs),
+            "NUM_SQUARES": programs,
+            "SQUARES": power_of_two(programs),
             "BLOCKS": blocks,
             "MIRROR": self._mirrored,
             "CLIP_VALUE": clip_value > 0.0,
@@ -311,7 +311,7 @@ class FusedPPO:
         rate = self.optimizer.param_groups[0]["lr"]
         own = summary if ranks.size() == 1 else given["gradients"][given["NUM_GRADIENTS"] :]
         programs = len(given["squares"])
-        launch(sum_gradients, (programs + 1,), given, learning_rate=rate, summary=own)
+        launch(sum_gradients, (programs,), given, learning_rate=rate, summary=own)
         if ranks.size() > 1:
             ranks.sum_(given["gradients"])
             launch(take_means, (programs,), given, learning_rate=rate, summary=summary)
