@@ -34,14 +34,8 @@ EPS = tl.constexpr(1.1920929e-07)
 
 @triton.jit
 def _block_sums(
-    partials,
-    column,
-    inside,
-    WIDTH: tl.constexpr,
-    BLOCKS: tl.constexpr,
-    ROWS: tl.constexpr,
-    COLUMNS: tl.constexpr,
-):
+    partials, column, inside, WIDTH: tl.constexpr, BLOCKS: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr
+):  # fmt: skip
     sums = tl.zeros((ROWS, COLUMNS), dtype=tl.float32)
     for first in range(0, BLOCKS, ROWS):
         block = (first + tl.arange(0, ROWS))[:, None]
