@@ -57,10 +57,13 @@ def _outputs(
     column2 = tl.arange(0, H2)
     output = tl.arange(0, OUT)
     acc = tl.zeros((BLOCK, H2), dtype=tl.float32)
+    # Biases are loaded a chunk ahead: those of the same chunk each thread would copy to shared memory, like weights.
+    bias = tl.load(biases + column)
     for first in tl.range(0, H1, CHUNK, num_stages=STAGES):
         weight1 = tl.load(weights + ((first + column)[None, :] * OBS + obs_column[:, None]))
         weight2 = tl.load(weights + (SECOND_AT + column2[None, :] * H1 + (first + column)[:, None]))
-        hidden = tl.dot(observed, weight1) + tl.load(biases + first + column)[None, :]
+        hidden = tl.dot(observed, weight1) + bias[None, :]
+        bias = tl.load(biases + (first + CHUNK) % H1 + column)
         hidden = activate(hidden, ACTIVATION).to(observed.dtype)
         if STORE:
             tl.store(inputs + (input_rows + (OBS + first + column[None, :])), hidden, mask=keep)
@@ -69,10 +72,12 @@ def _outputs(
     if STORE:
         tl.store(inputs + (input_rows + (OBS + H1 + column2[None, :])), second, mask=keep)
     out = tl.zeros((BLOCK, OUT), dtype=tl.float32)
+    bias = tl.load(biases + H1 + H2 + column)
     for first in tl.range(0, H3, CHUNK, num_stages=STAGES):
         weight3 = tl.load(weights + (THIRD_AT + (first + column)[None, :] * H2 + column2[:, None]))
         weight4 = tl.load(weights + (OUT_AT + output[None, :] * H3 + (first + column)[:, None]))
-        hidden = tl.dot(second, weight3) + tl.load(biases + H1 + H2 + first + column)[None, :]
+        hidden = tl.dot(second, weight3) + bias[None, :]
+        bias = tl.load(biases + H1 + H2 + (first + CHUNK) % H3 + column)
         hidden = activate(hidden, ACTIVATION).to(observed.dtype)
         if STORE:
             tl.store(inputs + (input_rows + (OBS + H1 + H2 + first + column[None, :])), hidden, mask=keep)
