@@ -220,17 +220,14 @@ class FusedPPO:
         }
 
     def __call__(
-        self,
-        rollout_ET: TensorDictBase,
-        orders: Iterable[Int64[Tensor, " D"]],
-        *meanwhile: Callable[[], None],
+        self, rollout_ET: TensorDictBase, orders: Iterable[Int64[Tensor, " D"]], *aside: Callable[[], None]
     ) -> tuple[dict[str, Float[Tensor, " steps"]], Int64[Tensor, ""]]:
         """Make all gradient steps of an update.
 
         `rollout_ET`, `["E","T"]`, may be time-major in memory, as that of a collector. `orders` has for each epoch the
         env states in the order of the minibatches, counted env by env; a GPU draws them while it reads the rollout, and
-        does what is to be done `meanwhile` beside the steps, which do not. Returned are what each gradient step
-        measured, by the names of `SUMMARY`, and how many env states took no part as an element was not finite.
+        does what is `aside` beside the steps, which do not. Returned are what each gradient step measured, by the names
+        of `SUMMARY`, and how many env states took no part because an element was not finite.
         """
         num_envs, length = rollout_ET.batch_size
         places: list[Tensor] = []
@@ -244,7 +241,7 @@ class FusedPPO:
             with beside(self._side, place):
                 self.parameters.load()
                 left_out = self.dataset.read(rollout_ET, evaluate=self._evaluate)
-            with beside(self._side, *meanwhile):
+            with beside(self._side, *aside):
                 for step, index_B in enumerate(places[0].split(self.batch)):
                     if len(self.dataset.records) > self.dataset.size:
                         index_B = torch.cat([index_B, index_B + self.dataset.size])
