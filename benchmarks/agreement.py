@@ -148,7 +148,7 @@ def run_warp(
         (world.ctrl_EL, states.ctrl_EL),
     ):
         view.copy_(torch.from_numpy(values))
-    world.step(substeps)
+    world.step(substeps, sensors="every")
     overflow = world.overflow_report()
     if not overflow.ok:
         raise RuntimeError("; ".join(overflow.messages))

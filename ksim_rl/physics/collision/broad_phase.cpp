@@ -35,34 +35,69 @@ auto boxes_are_apart = [&](int a, int b, float margin) {
     }
     return false;
 };
-auto may_touch = [&](int item) {
-    const int a = pairs[item][0], b = pairs[item][1], pair = pair_ids[item][0];
-    if (pair_ids[item][1] >= 0)
-        return true;  // a sensor measures how far they are apart
-    const float margin = pair >= 0 ? model_row(problem.pair_margin)[pair] + model_row(problem.pair_gap)[pair]
-                                   : model_row(problem.geom_margin)[a] + model_row(problem.geom_gap)[a]
-                                         + model_row(problem.geom_margin)[b] + model_row(problem.geom_gap)[b];
+auto margin_of = [&](int a, int b, int pair) {
+    if (!HAS_MARGINS)
+        return 0.0f;
+    return pair >= 0 ? model_row(problem.pair_margin)[pair] + model_row(problem.pair_gap)[pair]
+                     : model_row(problem.geom_margin)[a] + model_row(problem.geom_gap)[a]
+                           + model_row(problem.geom_margin)[b] + model_row(problem.geom_gap)[b];
+};
+auto are_near = [&](int item) {
+    const int a = pairs[item][0], b = pairs[item][1];
+    const float margin = margin_of(a, b, HAS_MARGINS ? pair_ids[item][0] : -1), bound = bounds[a], bound_b = bounds[b];
+    if (MEASURES && pair_ids[item][1] >= 0)
+        return true;  // a sensor reads how far they are apart
     const wp::vec3 between = positions[b] - positions[a];
-    if (bounds[a] == 0.0f)
-        return wp::dot(between, axis(turns[a], 2)) <= bounds[b] + margin;
-    if (bounds[b] == 0.0f)
-        return -wp::dot(between, axis(turns[b], 2)) <= bounds[a] + margin;
-    const float most = bounds[a] + bounds[b] + margin;
-    return wp::dot(between, between) <= most * most && !boxes_are_apart(a, b, margin);
+    if (bound == 0.0f)
+        return wp::dot(between, axis(turns[a], 2)) <= bound_b + margin;
+    if (bound_b == 0.0f)
+        return -wp::dot(between, axis(turns[b], 2)) <= bound + margin;
+    const float most = bound + bound_b + margin;
+    return wp::dot(between, between) <= most * most;
+};
+auto may_touch = [&](int item) {
+    const int a = pairs[item][0], b = pairs[item][1];
+    if (bounds[a] == 0.0f || bounds[b] == 0.0f || (MEASURES && pair_ids[item][1] >= 0))
+        return true;
+    return !boxes_are_apart(a, b, margin_of(a, b, HAS_MARGINS ? pair_ids[item][0] : -1));
 };
 
-constexpr int BITS = 32;
-for (int first = 0; first < num_pairs; first += BITS * LANES) {
-    unsigned passing = 0;
-    int count = 0;
-    for (int bit = 0; bit < BITS; ++bit) {
-        const int item = first + bit * LANES + lane;
-        const bool passes = item < num_pairs && may_touch(item);
-        passing |= (unsigned)passes << bit;
-        count += passes;
+// Few pairs are near each other: they are listed first, so that no lane waits for the boxes of another's.
+constexpr int BITS = 32, CHUNK = BITS * LANES;
+#if defined(__CUDA_ARCH__)
+__shared__ unsigned short listed[THREADS / LANES][CHUNK];
+unsigned short* const near = listed[threadIdx.x / LANES];
+#else
+unsigned short near[CHUNK];
+#endif
+// The bits of the items of this lane that pass, the first item of which is `lane`.
+auto passing = [&](int count, auto test) {
+    unsigned bits = 0;
+    for (int bit = 0; bit * LANES < count; ++bit) {
+        const int item = bit * LANES + lane;
+        bits |= (unsigned)(item < count && test(item)) << bit;
     }
-    const int before = sum_before(count), total = of_lane(before + count, LANES - 1);
-    int place = 0;
+    return bits;
+};
+auto number_of = [](unsigned bits) {
+    int number = 0;
+    for (; bits != 0; bits &= bits - 1)
+        ++number;
+    return number;
+};
+auto each_of = [&](unsigned bits, auto body) {
+    for (int bit = 0; bit < BITS; ++bit)
+        if (bits >> bit & 1u)
+            body(bit * LANES + lane);
+};
+for (int first = 0; first < num_pairs; first += CHUNK) {
+    const unsigned bits = passing(wp::min(CHUNK, num_pairs - first), [&](int item) { return are_near(first + item); });
+    int place = sum_before(number_of(bits));
+    const int count = of_lane(place + number_of(bits), LANES - 1);
+    each_of(bits, [&](int item) { near[place++] = item; });
+    sync();
+    const unsigned touching = passing(count, [&](int item) { return may_touch(first + near[item]); });
+    const int own = number_of(touching), before = sum_before(own), total = of_lane(before + own, LANES - 1);
     if (lane == 0 && total > 0) {
 #if defined(__CUDA_ARCH__)
         place = atomicAdd(problem.ncollision.data, total);
@@ -72,16 +107,15 @@ for (int first = 0; first < num_pairs; first += BITS * LANES) {
 #endif
     }
     place = of_lane(place, 0) + before;
-    for (int bit = 0; bit < BITS; ++bit) {
-        if ((passing >> bit & 1u) == 0)
-            continue;
+    each_of(touching, [&](int item) {
         if (place < problem.naconmax) {
-            const int item = first + bit * LANES + lane, a = pairs[item][0], b = pairs[item][1];
+            const int pair = first + near[item], a = pairs[pair][0], b = pairs[pair][1];
             const bool swaps = problem.geom_type.data[a] > problem.geom_type.data[b];
             problem.collision_pair.data[place] = swaps ? wp::vec2i(b, a) : wp::vec2i(a, b);
-            problem.collision_pairid.data[place] = pair_ids[item];
+            problem.collision_pairid.data[place] = pair_ids[pair];
             problem.collision_worldid.data[place] = world;
         }
         ++place;
-    }
+    });
+    sync();
 }

@@ -45,7 +45,13 @@ def collisions(
     on_gpu = d.qpos.device.is_cuda
     source = native.source_of("rows", ("layout",)) + native.source_of("collision", ("broad_phase",))
     lanes, threads = (lanes or LANES, CUDA_THREADS) if on_gpu else (1, 1)
-    find_pairs = native.launcher(source, {}, own, m, d, lanes=lanes, threads=threads)
+    margins = m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap
+    constants = {
+        # Those of each world's own may be drawn at any time.
+        "has_margins": any(field.shape[0] > 1 or bool(field.numpy().any()) for field in margins),
+        "measures": bool((m.nxn_pairid_filtered.numpy()[:, 1] > upstream.NO_SENSOR).any()),
+    }
+    find_pairs = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads)
 
     def launch() -> None:
         d.ncollision.zero_()
