@@ -28,7 +28,7 @@ ROOMS_AROUND = {
     "export": 2_760,
     "ranks": 900,
     "runs": 800,
-    "suites": 1_500,
+    "suites": 1_750,
     "tables": 600,
     "viewer": 1_400,
     "zoo": 300,
