@@ -15,11 +15,13 @@ TASKS = ("panda_pick_cube", "leap_cube_reorient")
 SMALL = "num_envs=8 data.num_env_states_per_minibatch=32 data.num_minibatches=2 trainer.num_iterations=2 device=cpu"
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _models():
+@pytest.fixture(scope="module")
+def models():
+    """Skip where the package of models is absent."""
     truth.panda()
 
 
+@pytest.mark.usefixtures("models")
 @pytest.mark.parametrize("name", TASKS)
 def test_its_env_passes_the_checks(name):
     env = envs.make(name, num_envs=3, seed=0)
@@ -28,6 +30,7 @@ def test_its_env_passes_the_checks(name):
     env.close()
 
 
+@pytest.mark.usefixtures("models")
 @pytest.mark.parametrize("name", TASKS)
 def test_a_masked_reset_at_every_step_is_the_eager_one(name):
     rollouts = []
@@ -52,6 +55,7 @@ def test_a_masked_reset_at_every_step_is_the_eager_one(name):
     assert torch.equal(*rollouts)
 
 
+@pytest.mark.usefixtures("models")
 @pytest.mark.parametrize("name", TASKS)
 def test_two_iterations_train(name, tmp_path):
     cfg = conf.compose([f"task={name}", *SMALL.split(), "trainer.eval_episodes=0", "trainer.video=false"])
