@@ -29,7 +29,7 @@ ROOMS_AROUND = {
     "export": 2_760,
     "ranks": 900,
     "runs": 800,
-    "suites": 1_500,
+    "suites": 1_750,
     "tables": 600,
     "testing": 740,
     "viewer": 1_400,
