@@ -18,7 +18,7 @@ from pathlib import Path
 from tests import signatures
 
 PACKAGE = "ksim_rl"
-# Lines of the rooms that train; the rooms around them, the command line and the ways to other libraries among them, have
+# Lines of the rooms that train; the rooms around them, the command line and ways to other libraries among them, have
 # ceilings of their own, so that neither pays for the other.
 PACKAGE_LINES = 37_000
 ROOMS_AROUND = {
