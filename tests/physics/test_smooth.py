@@ -32,7 +32,7 @@ MIXED = """
       <freejoint name="root"/>
       <geom type="box" size="0.2 0.1 0.05" mass="3" pos="0.02 0 0.01" quat="0.9 0 0.1 0" contype="0"/>
       <site name="top" pos="0 0 0.1" quat="0.9 0.1 0.2 0"/>
-      <body pos="0.2 0.1 0" quat="0.9 0 0.3 0">
+      <body pos="0.2 0.1 0" quat="0.9 0 0.3 0" gravcomp="0.6">
         <joint name="wrist" type="ball" pos="0.01 0.02 0" stiffness="3" damping="0.3"/>
         <geom type="capsule" size="0.03" fromto="0 0 0 0.2 0 0" mass="0.7" contype="0"/>
         <body pos="0.2 0 0">
@@ -45,8 +45,8 @@ MIXED = """
           <body pos="0 0.2 0"><geom size="0.05" mass="0.2" contype="0"/></body>
         </body>
       </body>
-      <body pos="-0.2 0 0">
-        <joint name="tail" axis="0 1 0" pos="0.02 0 0"/>
+      <body pos="-0.2 0 0" gravcomp="1.2">
+        <joint name="tail" axis="0 1 0" pos="0.02 0 0" actuatorgravcomp="true"/>
         <geom type="capsule" size="0.02" fromto="0 0 0 -0.3 0 0" mass="0.5" contype="0"/>
       </body>
     </body>
@@ -81,7 +81,18 @@ PER_WORLD = (
 )
 WRITTEN = (
     *("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "site_xpos", "site_xmat", "subtree_com"),
-    *("cdof", "cinert", "cvel", "cdof_dot", "M", "qfrc_bias", "qfrc_spring", "qfrc_damper", "qfrc_passive"),
+    *(
+        "cdof",
+        "cinert",
+        "cvel",
+        "cdof_dot",
+        "M",
+        "qfrc_bias",
+        "qfrc_spring",
+        "qfrc_damper",
+        "qfrc_passive",
+        "qfrc_gravcomp",
+    ),
     *("actuator_length", "actuator_velocity", "act_dot", "actuator_force", "qfrc_actuator", "qfrc_smooth"),
 )
 GEOMS = ("geom_xpos", "geom_xmat")
@@ -256,7 +267,6 @@ def test_steps_and_their_sensors_are_those_of_mujoco_warps_kernels():
 BODY = '<body><joint name="a"/><geom name="g" size="0.1"/>{inside}</body>'
 OUT_OF_RANGE = {
     "tendons": f"<worldbody>{BODY}</worldbody><tendon><fixed><joint joint='a' coef='1'/></fixed></tendon>",
-    "gravity": "<worldbody><body gravcomp='1'><joint/><geom size='0.1'/></body></worldbody>",
     "fluid": f"<option density='1'/><worldbody>{BODY}</worldbody>",
     "delayed": f"<worldbody>{BODY}</worldbody><actuator><motor joint='a' nsample='2' delay='0.01'/></actuator>",
     "affine": f"<worldbody>{BODY}</worldbody><actuator><muscle joint='a' lengthrange='0 1'/></actuator>",

@@ -64,6 +64,20 @@ each(NUM_DOFS, [&](int dof) {
         const int actuator = look_up(problem.drivers, i);
         driven += model_row(problem.actuator_gear)[actuator][0] * actuator_forces[actuator];
     }
+    if (LIFTS) {
+        // Weights that are compensated (mj_gravcomp), by what is passive or by actuators.
+        const vec3 spin = rotation_of(motion(dof)), origin = com(look_up(problem.body_rootid, body));
+        float lifted = 0.0f;
+#pragma unroll 1
+        for (int of = body; of < body + look_up(problem.body_subtreenum, body); ++of) {
+            const vec3 moved = translation_of(motion(dof)) + wp::cross(spin, row_of(problem.xipos)[of] - origin);
+            lifted -= wp::dot(moved, of_world(problem.gravity)) * mass[of] * model_row(problem.body_gravcomp)[of];
+        }
+        row_of(problem.qfrc_gravcomp)[dof] = lifted;
+        const bool is_driven = problem.jnt_actgravcomp.data[joint];
+        driven += is_driven && ACTUATORS_ACT ? lifted : 0.0f;
+        row_of(problem.qfrc_passive)[dof] = passive[dof] += is_driven ? 0.0f : lifted;
+    }
     if (ACTUATORS_ACT && problem.jnt_actfrclimited.data[joint]) {
         const wp::vec2 range = model_row(problem.jnt_actfrcrange)[joint];
         driven = wp::clamp(driven, range[0], range[1]);

@@ -63,7 +63,6 @@ def unsuited(warp_model: mjw.Model) -> str | None:
         "there are flexes": m.nflex > 0,
         "there are tendons": m.ntendon > 0,
         "there are no degrees of freedom": m.nv == 0,
-        "bodies compensate gravity": len(m.body_gravcomp) > 1 or bool(m.body_gravcomp.numpy().any()),
         "there is a fluid": m.has_fluid,
         "contacts adhere": bool(m.flg_adhesion),
         "joints yield": bool(m.nplastic),
@@ -172,6 +171,10 @@ def _sizes(warp_model: mjw.Model) -> dict[str, int]:
         "has_mocap": bool(m.nmocap),
         "has_activation": m.na > 0,
         "gravity": not flags & bits.GRAVITY,
+        # MuJoCo Warp leaves it out with the springs and dampers.
+        "lifts": not flags & bits.GRAVITY
+        and not (flags & bits.SPRING and flags & bits.DAMPER)
+        and (len(m.body_gravcomp) > 1 or bool(m.body_gravcomp.numpy().any())),
         "springs": not flags & bits.SPRING,
         "dampers": not flags & bits.DAMPER,
         "clamps_ctrl": not flags & bits.CLAMPCTRL,
