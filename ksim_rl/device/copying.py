@@ -34,7 +34,8 @@ def copy_rows(
             pair = own.data_ptr(), new.data_ptr()
             unit = 1 if any(number % 4 for number in (*sizes, *pair)) else 4
             addresses += pair
-            layouts.append((unit, *(number // unit for number in sizes)))
+            width, stride, stride_of_new = (number // unit for number in sizes)
+            layouts.append((unit, width, stride, stride_of_new))
     if layouts:
         _launcher(tuple(layouts))(to[0].device, (to[0].shape[0], LANES), *addresses)
 
