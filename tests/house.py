@@ -23,13 +23,15 @@ PACKAGE = "ksim_rl"
 PACKAGE_LINES = 38_000
 ROOMS_AROUND = {
     "cli": 900,
+    "clips": 900,
     "compiled": 950,
     "diagnosis": 800,
     "export": 2_760,
     "ranks": 900,
     "runs": 800,
     "suites": 1_500,
-    "tables": 600,
+    "tables": 640,
+    "tracking": 500,
     "viewer": 1_400,
     "zoo": 300,
 }
