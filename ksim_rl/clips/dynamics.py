@@ -33,9 +33,7 @@ class Demand:
     torque_FM: Float[Array, "F M"]
 
 
-def velocities(
-    mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: float
-) -> Float[Array, "F M"]:
+def velocities(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: float) -> Float[Array, "F M"]:
     """Return qvel by central differences, one-sided at the ends; angular velocities come from quaternions."""
     last, qvel_FM = len(qpos_FL) - 1, np.zeros((len(qpos_FL), mj_model.nv))
     for frame in range(len(qpos_FL)):
@@ -88,11 +86,13 @@ def demand(
             torque.append(_joint_torques(model, data, feet, planted, force_3, zmp_2, spin))
     finally:
         model.opt.disableflags = flags
-    return Demand(zmp_F2=np.array(zmp), com_F3=np.array(com), force_F3=np.array(force), torque_FM=np.array(torque))
+    return Demand(
+        zmp_F2=np.array(zmp), com_F3=np.array(com), force_F3=np.array(force), torque_FM=np.array(torque)
+    )
 
 
 def _ground_wrench(data: mujoco.MjData) -> tuple[Array, Array, float]:
-    """Return the force on the root, the point of the ground (z = 0) about which its moment is vertical, and that one."""
+    """Return the ground's force, the point at z = 0 about which its moment is vertical, and that moment."""
     force_3, moment_3 = data.qfrc_inverse[:3].copy(), np.empty(3)
     mujoco.mju_rotVecQuat(moment_3, data.qfrc_inverse[3:6], data.qpos[3:7])
     about_origin_3 = moment_3 + np.cross(data.qpos[:3], force_3)
@@ -102,7 +102,7 @@ def _ground_wrench(data: mujoco.MjData) -> tuple[Array, Array, float]:
 
 
 def _joint_torques(
-    model: mujoco.MjModel,
+    mj_model: mujoco.MjModel,
     data: mujoco.MjData,
     feet: Sequence[str],
     planted_N: Array,
@@ -121,10 +121,10 @@ def _joint_torques(
         shares = np.array([1.0 - second, second])
     beside_2 = zmp_2 - shares @ places_N3[:, :2]
     torque_M = data.qfrc_inverse.copy()
-    jacobian_3M, turn_3M = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+    jacobian_3M, turn_3M = np.zeros((3, mj_model.nv)), np.zeros((3, mj_model.nv))
     for foot, place_3, share in zip(standing, places_N3, shares, strict=True):
         point_3 = np.append(place_3[:2] + beside_2, 0.0)
-        mujoco.mj_jac(model, data, jacobian_3M, turn_3M, point_3, int(model.site(foot).bodyid[0]))
+        mujoco.mj_jac(mj_model, data, jacobian_3M, turn_3M, point_3, int(mj_model.site(foot).bodyid[0]))
         torque_M -= share * (jacobian_3M.T @ force_3 + turn_3M[2] * spin)
     return torque_M[6:]
 

@@ -37,9 +37,9 @@ class PoseGoal:
 
 @dataclass(frozen=True, kw_only=True)
 class ComGoal:
-    """Where the robot's centre of mass should be, m; only the first `len(pos)` of x, y and z count."""
+    """Where the robot's centre of mass should be, m; only the first `len(pos_N)` of x, y and z count."""
 
-    pos: Float[Array, " N"]
+    pos_N: Float[Array, " N"]
     weight: float = 1.0
 
 
@@ -130,8 +130,8 @@ class InverseKinematics:
         move_3M, turn_3M = np.zeros((3, model.nv)), np.zeros((3, model.nv))
         if isinstance(goal, ComGoal):
             mujoco.mj_jacSubtreeCom(model, data, move_3M, 0)
-            count = len(goal.pos)
-            error = goal.pos - data.subtree_com[0][:count]
+            count = len(goal.pos_N)
+            error = goal.pos_N - data.subtree_com[0][:count]
             return goal.weight * move_3M[:count], goal.weight * error
         number, is_site = self._points[goal.name]
         if is_site:

@@ -89,7 +89,7 @@ class StartInMotion(ResetToMotion):
 
 @dataclass(frozen=True, kw_only=True)
 class FailedParts(OfMotion, CurriculumTerm):
-    """Lets episodes begin more often in the parts of a motion where they are ended by a failure; `StartInMotion` reads it.
+    """Lets episodes begin more often in the parts of a motion where failures end them; `StartInMotion` reads it.
 
     Reports the share of starts in the part that has most.
 

@@ -1,9 +1,10 @@
-"""This module has the tasks in which Unitree G1 follows the motions of `ksim_rl.clips.g1` with its whole body.
+"""This module has the tasks in which Unitree G1 follows the motions of `ksim_rl.tracking.g1_motions` with its whole body.
 
 Observations, noise, rewards, limits, pushes and randomization are those of mjlab's tracking task for G1
-(src/mjlab/tasks/tracking at its commit 0eda4e7), so that both can be compared on the same work. Three things differ:
-an episode ends (as a truncation) with the motion, where mjlab's goes on at another place of it; self-contact counts in
-each physics substep, with a quarter of the weight; and half of the starts are spread evenly.
+(src/mjlab/tasks/tracking at its commit 0eda4e7), so that both can be compared on the same work. Four things differ:
+actions move the servos' targets about the motion, where mjlab's move them about the default pose; an episode ends (as a
+truncation) with the motion, where mjlab's goes on at another place of it; self-contact counts in each physics substep,
+with a quarter of the weight; and half of the starts are spread evenly.
 """
 
 import dataclasses
@@ -42,8 +43,14 @@ ENDS = tuple(f"{side}_{link}_link" for side in SIDES for link in ("ankle_roll", 
 """Feet and hands."""
 HEIGHT_LIMIT, UPRIGHT_LIMIT = 0.25, 0.8
 """m, of the anchor and of feet and hands; and the difference of the vertical parts of the anchors' z axes."""
-KICK = {"x": (-0.5, 0.5), "y": (-0.5, 0.5), "z": (-0.2, 0.2), "roll": (-0.52, 0.52), "pitch": (-0.52, 0.52)}
-KICK |= {"yaw": (-0.78, 0.78)}
+KICK: mdp.Ranges = {
+    "x": (-0.5, 0.5),
+    "y": (-0.5, 0.5),
+    "z": (-0.2, 0.2),
+    "roll": (-0.52, 0.52),
+    "pitch": (-0.52, 0.52),
+    "yaw": (-0.78, 0.78),
+}
 """m/s and rad/s, of pushes and of the errors that episodes begin with."""
 PART_S = 1.0
 ENV_STATES_PER_ITERATION = 24 * 4096
@@ -53,13 +60,12 @@ ITERATIONS = 4_400
 
 def observations(file: str) -> dict[str, ObservationGroupCfg]:
     """Return the groups: a noisy "actor", and a clean "critic" that also sees where the bodies are."""
-    of_motion, of_anchor = {"file": file}, {"file": file, "anchor": ANCHOR}
     joints = ROBOT.joint_names
-    reference = {"reference": ObservationTermCfg(term=mdp.MotionJoints(joints=joints, **of_motion))}
+    reference = {"reference": ObservationTermCfg(term=mdp.MotionJoints(file=file, joints=joints))}
     last = {"actions": ObservationTermCfg(term=mdp.LastAction())}
     reaches = {
-        "anchor_pos": (terms.MotionAnchorPos(**of_anchor), 0.25),
-        "anchor_axes": (terms.MotionAnchorAxes(**of_anchor), 0.05),
+        "anchor_pos": (terms.MotionAnchorPos(file=file, anchor=ANCHOR), 0.25),
+        "anchor_axes": (terms.MotionAnchorAxes(file=file, anchor=ANCHOR), 0.05),
         "base_lin_vel": (mdp.SensorReading(sensor="imu_lin_vel"), 0.5),
         "base_ang_vel": (mdp.SensorReading(sensor="imu_ang_vel"), 0.2),
         "joint_pos": (mdp.JointPosRel(joints=joints), 0.01),
@@ -124,7 +130,6 @@ def events(file: str) -> dict[str, EventTerm]:
 
 def track_cfg(file: str) -> ManagerBasedRlEnvCfg:
     """Return the config of following a motion of G1, a file or one that comes with the package; 50 Hz control."""
-    bodies, anchor = {"file": file, "bodies": BODIES}, {"file": file, "anchor": ANCHOR}
     return ManagerBasedRlEnvCfg(
         decimation=4,
         # A robot that lies on its arms needs 221 rows, more than the probe of the model finds.
@@ -137,19 +142,23 @@ def track_cfg(file: str) -> ManagerBasedRlEnvCfg:
             soft_joint_pos_limit_factor=ROBOT.soft_joint_pos_limit_factor,
         ),
         observations=observations(file),
-        actions={"joint_pos": mdp.JointPositionAction(joints=ROBOT.joint_names, scale=ROBOT.action_scale)},
+        actions={
+            "joint_pos": terms.JointPositionAroundMotion(
+                file=file, joints=ROBOT.joint_names, scale=ROBOT.action_scale
+            )
+        },
         rewards=rewards(file),
         events=events(file),
         terminations={
             "finished": mdp.MotionFinished(file=file),
             "anchor_height": terms.OffHeight(file=file, bodies=ANCHOR, distance=HEIGHT_LIMIT),
-            "anchor_upright": terms.OffUpright(limit=UPRIGHT_LIMIT, **anchor),
+            "anchor_upright": terms.OffUpright(file=file, anchor=ANCHOR, limit=UPRIGHT_LIMIT),
             "ends_height": terms.OffHeight(file=file, bodies=ENDS, distance=HEIGHT_LIMIT),
         },
         curriculum={"failed_parts": FailedParts(file=file, part_s=PART_S)},
         metrics={
-            "body_pos_error": terms.BodyPosError(anchor=ANCHOR, **bodies),
-            "body_drift": terms.BodyDrift(**bodies),
+            "body_pos_error": terms.BodyPosError(file=file, anchor=ANCHOR, bodies=BODIES),
+            "body_drift": terms.BodyDrift(file=file, bodies=BODIES),
         },
         episode_length_s=10.0,
         viewer=ViewerCfg(body=ANCHOR, distance=3.0, elevation=-10.0, azimuth=90.0),
@@ -157,13 +166,13 @@ def track_cfg(file: str) -> ManagerBasedRlEnvCfg:
 
 
 def training() -> TrainingCfg:
-    """Return the training settings: mjlab's, with an output layer of ordinary scale, as our velocity tasks have it."""
+    """Return the training settings: mjlab's, but that the first policy keeps to the motion, with half the noise."""
     return TrainingCfg(
         num_envs=4096,
         seed=42,
         objective=PPOCfg(entropy_coeff=0.005, precision="auto"),
         data=DatasetCfg(num_env_states_per_minibatch=ENV_STATES_PER_ITERATION // 4, num_minibatches=4),
-        modules=ModulesCfg(actor=ActorCfg(output_gain=1.0)),
+        modules=ModulesCfg(actor=ActorCfg(init_std=0.5)),
         trainer=TrainerCfg(num_iterations=ITERATIONS),
     )
 
@@ -174,6 +183,7 @@ def _task(clip: str, what: str) -> Task:
         description=f"Unitree G1 follows {what} with its whole body",
         cfg=partial(track_cfg, f"g1_{clip}"),
         training=training(),
+        other_trainings=(velocity.fast_sac_training(symmetry="none"),),
     )
 
 

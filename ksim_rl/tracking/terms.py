@@ -1,7 +1,7 @@
 """These terms observe, rate and end episodes in which a robot follows a motion with its whole body.
 
-Kernels and limits are those of mjlab's tracking task (its src/mjlab/tasks/tracking, commit 0eda4e7), which has them from
-BeyondMimic (Liao et al., 2025): errors are means over bodies, and of their squares.
+Kernels and limits are those of mjlab's tracking task (its src/mjlab/tasks/tracking, commit 0eda4e7), which has them
+from BeyondMimic (Liao et al., 2025): errors are means over bodies, and of their squares.
 """
 
 from dataclasses import dataclass
@@ -14,11 +14,12 @@ from torch import Tensor
 from ksim_rl.checked import Positive
 from ksim_rl.envs.term import MetricTerm, ObservationTerm, TerminationTerm
 from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.actions import JointAction
 from ksim_rl.mdp.fields import GaussianReward
-from ksim_rl.mdp.motion_tracking import OfMotionBodies
+from ksim_rl.mdp.motion_tracking import OfMotion, OfMotionBodies
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
-from ksim_rl.scene.state.motion_clock import motion_bodies
+from ksim_rl.scene.state.motion_clock import motion_bodies, motion_time
 from ksim_rl.tracking.reference import OfAlignedBodies, OfAnchor, motion_velocities
 
 
@@ -75,6 +76,23 @@ class BodiesFromAnchor(ObservationTerm):
             away_EN3 = bodies.pos_EN3 - anchor.pos_EL[:, None]
             return quaternion.rotate_inverse(turn_EN4, away_EN3).flatten(start_dim=1)
         return first_axes(quaternion.multiply(quaternion.conjugate(turn_EN4), bodies.quat_EN4))
+
+
+# -- actions ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointPositionAroundMotion(OfMotion, JointAction):
+    """Positions (rad or m): the shaped action, relative to where the motion has the joints at the end of the env step.
+
+    What `RandomizeDefaultJointPos` adds to the default pose is added here too: it stands for joints that read wrongly.
+    """
+
+    def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
+        joints, time_E = view.joints(self.joints), motion_time(view, self.file) + view.step_dt
+        pos_EK, _ = view.motion(self.file).sample_joints(time_E, joints.index)
+        wrong_EK = joints.default_pos_EL - view.default_qpos_L[joints.qpos]
+        view.write_joint_pos_target(self.joints, pos_EK + wrong_EK + self.shaped(view, action_EK))
 
 
 # -- rewards ---------------------------------------------------------------------------------------------------------

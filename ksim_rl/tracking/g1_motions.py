@@ -1,4 +1,4 @@
-"""This module has the motions of Unitree G1 that come with the package, as keyframes: a walk, a squat, a turn, kicks."""
+"""This module has the motions of Unitree G1 that come with the package, as keyframes: walk, squat, turn, kick."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import mujoco
 
-from ksim_rl.clips.keyframes import Choreography, Figure, FootMove, Keys
 from ksim_rl.scene.robots.unitree_g1 import JOINTS, UnitreeG1
+from ksim_rl.tracking.keyframes import Choreography, Figure, FootMove, Keys
 
 ROBOT = UnitreeG1()
 STAND = 0.76
@@ -56,7 +56,12 @@ def _arms_out(begin_s: float, end_s: float, by: float) -> dict[str, Keys]:
     keys: dict[str, Keys] = {}
     for side, sign in (("left", 1.0), ("right", -1.0)):
         out = sign * by
-        keys[f"{side}_shoulder_roll_joint"] = ((begin_s, 0.0), (begin_s + 0.6, out), (end_s - 0.6, out), (end_s, 0.0))
+        keys[f"{side}_shoulder_roll_joint"] = (
+            (begin_s, 0.0),
+            (begin_s + 0.6, out),
+            (end_s - 0.6, out),
+            (end_s, 0.0),
+        )
     return keys
 
 
@@ -173,7 +178,8 @@ def kick() -> Choreography:
         for side, sign in (("left", 1.0), ("right", -1.0)):
             toward = sign if foot == 1 else -sign
             arms[side] += sorted(
-                [(begin_s + time, 0.7 * toward) for time in back] + [(begin_s + time, -0.7 * toward) for time in out]
+                [(begin_s + time, 0.7 * toward) for time in back]
+                + [(begin_s + time, -0.7 * toward) for time in out]
             )
             arms[side].append((begin_s + alone_s, 0.0))
         begin_s += alone_s + 1.0

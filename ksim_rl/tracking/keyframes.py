@@ -115,7 +115,9 @@ def foot_paths(
                     paths_FN5[:, foot, column],
                     eased(((move.begin_s, start), (move.end_s, end)), time_F),
                 )
-            up_F, ahead_F, pitch_F = (_on_the_way(keys, move, time_F) for keys in (move.lift, move.forward, move.pitch))
+            up_F, ahead_F, pitch_F = (
+                _on_the_way(keys, move, time_F) for keys in (move.lift, move.forward, move.pitch)
+            )
             heading_F = paths_FN5[:, foot, 3]
             paths_FN5[:, foot, 0] += ahead_F * np.cos(heading_F)
             paths_FN5[:, foot, 1] += ahead_F * np.sin(heading_F)
@@ -157,9 +159,7 @@ def zmp_plan(
     return np.stack(columns, axis=-1)
 
 
-def pendulum(
-    zmp_F2: Float[Array, "F 2"], height_F: Float[Array, " F"], fps: float
-) -> Float[Array, "F 2"]:
+def pendulum(zmp_F2: Float[Array, "F 2"], height_F: Float[Array, " F"], fps: float) -> Float[Array, "F 2"]:
     """Return the centre of mass that moves as a pendulum over a zero-moment point; it rests at both ends.
 
     It solves x - z x'' / (g + z'') = p with x'' as the second difference of x.
@@ -232,7 +232,7 @@ def _solved(
 ) -> Array:
     qpos_L, found = posture_FL[0].copy(), []
     for frame, posture_L in enumerate(posture_FL):
-        goals: list[PoseGoal | ComGoal] = [ComGoal(pos=com_F2[frame])]
+        goals: list[PoseGoal | ComGoal] = [ComGoal(pos_N=com_F2[frame])]
         for foot, (x, y, z, heading, pitch) in zip(figure.feet, paths_FN5[frame], strict=True):
             place_3 = np.array((x, y, z + figure.sole_z))
             goals.append(PoseGoal(name=foot, pos_3=place_3, quat_4=turned(heading, pitch), weight=3.0))
