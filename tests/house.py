@@ -31,7 +31,7 @@ ROOMS_AROUND = {
     "runs": 800,
     "suites": 1_500,
     "tables": 640,
-    "tracking": 1_300,
+    "tracking": 1_400,
     "viewer": 1_400,
     "zoo": 300,
 }

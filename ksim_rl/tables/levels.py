@@ -35,7 +35,7 @@ def thinned(points: Sequence[T], count: int) -> list[T]:
 
 
 def value_of(row: Row, results: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return what the seeds of a row come to: a mean return, a median of seconds (None is infinite), or a lowest share."""
+    """Return what the seeds come to: a mean return, a median of seconds (None is infinite), or a lowest share."""
     if row.measure == "return":
         return statistics.fmean(result["evaluation"]["return_mean"] for result in results)
     if row.measure == "success":

@@ -20,7 +20,7 @@ PROTOCOL = (
 
 
 def figures_of(table: Table, rows: Mapping[str, Results]) -> dict[str, float]:
-    """Return flat figures: `<table>/<row>`, of seconds `<table>/<row>/seconds` and `/falls`, of trials `/success`; means.
+    """Return flat figures: `<table>/<row>`, with `/seconds` and `/falls`, or `/success` for these measures; means.
 
     What is infinite has no figure, and neither has a mean over a group that lacks a row.
     """

@@ -61,7 +61,7 @@ class Row(Checked):
 
     @property
     def goal(self) -> float | None:
-        """What the measure should reach: a return or share at least, or seconds at most; None where nothing is asked."""
+        """What the measure should reach: a return or share at least, seconds at most; None where nothing is asked."""
         if self.measure == "success":
             return self.at_least
         return self.within_s if self.measure == "seconds" else self.published.get(self.against)

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ksim_rl.checked import Checked, Positive
-from ksim_rl.clips.dynamics import GRAVITY, Demand, demand
 from ksim_rl.clips.inverse_kinematics import ComGoal, InverseKinematics, PoseGoal
+from ksim_rl.tracking.dynamics import GRAVITY, Demand, demand
 
 Array = np.ndarray
 Keys = Sequence[tuple[float, float]]
