@@ -50,12 +50,15 @@ class SolverCfg(Checked):
     Attributes:
         damping: of steps where goals cannot be reached or say little, in units of the weights.
         max_step: rad or m by which one coordinate moves in a step.
+        reach: m; points that are further from where they should be pull as if they were so near, so that what cannot be
+            reached does not throw the robot about.
         tolerance: rad or m; a step below it ends the search.
     """
 
     iterations: Count = 60
     damping: NonNegative = 1e-4
     max_step: Positive = 0.3
+    reach: Positive = 0.3
     tolerance: Positive = 1e-8
 
 
@@ -142,7 +145,9 @@ class InverseKinematics:
             mujoco.mj_jacBody(model, data, move_3M, turn_3M, number)
             pos_3, quat_4 = data.xpos[number], data.xquat[number]
         weight_3 = np.broadcast_to(goal.weight, 3)
-        rows, errors = weight_3[:, None] * move_3M, weight_3 * (goal.pos_3 - pos_3)
+        away_3 = np.where(weight_3 > 0.0, goal.pos_3 - pos_3, 0.0)
+        away_3 = away_3 * min(1.0, self.cfg.reach / max(float(np.linalg.norm(away_3)), 1e-12))
+        rows, errors = weight_3[:, None] * move_3M, weight_3 * away_3
         if goal.quat_4 is None:
             return rows, errors
         turn_3 = goal.turn_weight * _turn_between(quat_4, goal.quat_4)

@@ -44,7 +44,7 @@ def between(count: int, fps: float, wanted_fps: float) -> tuple[Array, Float[Arr
 
 
 def slerp(
-    first: Float[Array, "*batch 4"], second: Float[Array, "*batch 4"], share: Float[Array, "*batch 1"]
+    first: Float[Array, "*batch 4"], second: Float[Array, "*batch 4"], share: Float[Array, "*share 1"]
 ) -> Float[Array, "*batch 4"]:
     """Return unit quaternions on the shorter arc between two, at an even speed."""
     cosine = (first * second).sum(-1, keepdims=True)

@@ -1,15 +1,21 @@
 """This module has the motions of Unitree G1 that come with the package, as keyframes: walk, squat, turn, kick."""
 
 import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ksim_rl.clips.motion_file import write_motion
 
 from ksim_rl.scene.robots.unitree_g1 import JOINTS, UnitreeG1
-from ksim_rl.tracking.keyframes import Choreography, Figure, FootMove, Keys
+from ksim_rl.tracking.keyframes import Choreography, Figure, FootMove, Keys, perform
 
-ROBOT = UnitreeG1()
+ROBOT, FPS = UnitreeG1(), 50.0
 STAND = 0.76
 """m: the root's height in the default pose."""
 _WIDTH = 0.1185
@@ -212,3 +218,16 @@ CLIPS: Mapping[str, Clip] = {
     "g1_kick": Clip(description="two kicks with each leg", plan=kick, shift_s=0.6),
 }
 """The motions by the name of their file."""
+
+
+def made(name: str) -> Float[np.ndarray, "F L"]:
+    """Return the qpos of a motion of `CLIPS`, 50 frames per second, made from its keyframes; it takes some seconds."""
+    clip = CLIPS[name]
+    qpos_FL, _, _ = perform(model(), FIGURE, clip.plan(), fps=FPS, shift_s=clip.shift_s)
+    return qpos_FL
+
+
+if __name__ == "__main__":
+    # Writes the files anew: python -m ksim_rl.tracking.g1_motions FOLDER
+    for name in CLIPS:
+        write_motion(Path(sys.argv[1]) / f"{name}.npz", model(), made(name), FPS)

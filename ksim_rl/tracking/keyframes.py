@@ -137,8 +137,8 @@ def zmp_plan(
 ) -> Float[Array, "F 2"]:
     """Return where the ground's pressure should have its centre: on the foot that stands alone, else between them.
 
-    It rests midway between the feet, and moves in `shift_frames` before a foot leaves the ground, or as long as both
-    feet stand, if that is shorter.
+    It rests midway between the feet, and moves in `shift_frames` before a foot leaves the ground and after one comes
+    down; it moves all the while that both feet stand, if that is shorter than both.
     """
     alone_F = planted_FN.sum(1) == 1
     middle_F2 = paths_FN5[:, :, :2].mean(1)
