@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ksim_rl.clips.motion_file import write_motion
-
 from ksim_rl.scene.robots.unitree_g1 import JOINTS, UnitreeG1
 from ksim_rl.tracking.keyframes import Choreography, Figure, FootMove, Keys, perform
 
