@@ -1,4 +1,4 @@
-"""What docs/motions.md says: its table of motions, its limits, and its pairs, which make a person's walk the robot's."""
+"""What docs/motions.md says: its table of motions, and its pairs, which make a person's movement the robot's."""
 
 import re
 from pathlib import Path
