@@ -2,12 +2,12 @@
 
     python -m benchmarks.profile task=go1_velocity_flat num_envs=4096 device=cuda
 
-takes the overrides of `ksim-rl train`. On CUDA one iteration runs without graphs, so that each kernel can be laid to
-the room in which the host launched it: physics, policy, terms, transforms, resets, the storage of the rollout, GAE and
-update. The times are those of the kernels alone, since the graphs have no pauses for launches; what the measured
-iteration (with graphs) takes beyond their sum is the `gaps`. On the CPU the rooms are timed on the wall clock. Figures
-go to benchmarks/results/profile.json: `<room>_ms`, `<room>_share` and, on CUDA, `<room>_kernels`. `label=before` keeps
-them under another name beside the present ones.
+takes the overrides of `ksim-rl train`; steps are not compiled, as a kernel would belong to many rooms. On CUDA one
+iteration runs without graphs, so that each kernel can be laid to the room in which the host launched it: physics,
+policy, terms, transforms, resets, the storage of the rollout, GAE and update. The times are those of the kernels alone,
+since the graphs have no pauses for launches; what the measured iteration (with graphs) takes beyond their sum is the
+`gaps`. On the CPU the rooms are timed on the wall clock. Figures go to benchmarks/results/profile.json: `<room>_ms`,
+`<room>_share` and, on CUDA, `<room>_kernels`. `label=before` keeps them under another name beside the present ones.
 """
 
 from __future__ import annotations
@@ -167,7 +167,8 @@ def main() -> None:
     """Measure, print the table and write the figures."""
     own, overrides = command_line.split(sys.argv[1:], {"label": ""})
     labels = [own["label"]] if own["label"] else []
-    cfg = command_line.compose([*overrides, "logger=none", "trainer.eval_episodes=0"])
+    fixed = "logger=none", "trainer.eval_episodes=0", "collector.compile=false"
+    cfg = command_line.compose([*overrides, *fixed])
     device = cfg.resolved_device()
     figures = measure(cfg)
     table = Table(

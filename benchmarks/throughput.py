@@ -6,8 +6,9 @@ takes the overrides of `ksim-rl train`, trains some iterations, and prints one t
 `mjw.step` calls of MuJoCo Warp as it is, as one graph, sensors in each, from states and controls recorded in this run),
 this project's own substeps from the same states, the env step, the rollout, the update and the whole iteration, each in
 env states/s and relative to raw physics. Below it: what the guards against overflow and non-finite states take of an
-iteration, and on CUDA the device memory per world and the waits and copies of the host in one iteration. Figures go to
-benchmarks/results/throughput.json. How long the first iteration takes: `benchmarks.first_iteration`.
+iteration, and on CUDA the kernels of a control step, the policy's included, the device memory per world, and the waits
+and copies of the host in one iteration. Figures go to benchmarks/results/throughput.json. How long the first iteration
+takes: `benchmarks.first_iteration`.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import command_line, report
-from benchmarks.host_traffic import host_traffic
+from benchmarks.host_traffic import cuda_events, host_traffic
 from benchmarks.raw_physics import own_physics_ms, physics_ms, record_steps
 from benchmarks.stopwatch import milliseconds
 from ksim_rl.device.capture import Captured
@@ -71,7 +72,13 @@ def measure(cfg: RunCfg) -> dict[str, float]:
     steps = record_steps(collector)
     env_step_ms = _env_step_ms(trainer, device, schedule.repeats)
     guards_ms = _guards_ms(trainer, cfg.task.decimation, device, schedule.repeats)
-    traffic = host_traffic(trainer.iterate) if device.type == "cuda" else {}
+    traffic: dict[str, float] = {}
+    if device.type == "cuda":
+        kernels = sum(event.get("cat") == "kernel" for event in cuda_events(collector.collect))
+        traffic = {
+            "kernels_per_control_step": kernels / collector.rollout_length,
+            **host_traffic(trainer.iterate),
+        }
     repeats = max(1, schedule.repeats // 3)
     own_ms = own_physics_ms(_world(trainer), cfg.task.decimation, steps, repeats=repeats)
     raw_ms = physics_ms(_world(trainer), cfg.task.decimation, steps, repeats=repeats)
@@ -193,12 +200,12 @@ def _world(trainer: Trainer) -> World:
 @torch.no_grad()
 def _env_step_ms(trainer: Trainer, device: torch.device, repeats: int) -> float:
     """Time one env step, with transforms and masked reset and without the policy, as one graph."""
-    env = trainer.collector.env
+    env, compiled_step = trainer.collector.env, trainer.collector.compiled_step
     root_E = env.reset()
-    action_EL = trainer.collector.policy(root_E.copy())["action"].clone()
+    answered_E = trainer.collector.policy(root_E.copy()).clone()
 
     def step() -> None:
-        env.step_and_maybe_reset(root_E.copy().set("action", action_EL))
+        (compiled_step or env.step_and_maybe_reset)(answered_E.copy())
 
     captured = Captured(step, device=device, warmup=2)
     for _ in range(4):
@@ -234,7 +241,8 @@ def main() -> None:
     device = cfg.resolved_device()
     figures = measure(cfg)
     Console().print(_table(cfg, figures, device))
-    for name in ("guards_share", *(name for name in figures if "per_world" in name or "host" in name)):
+    beside = ("per_world", "host", "kernels")
+    for name in ("guards_share", *(name for name in figures if any(word in name for word in beside))):
         print(f"{name} {figures[name]:.4g}")
     prefix = f"{report.device_label(device)}/{cfg.task_name}/{cfg.num_envs}"
     path = report.write(

@@ -18,10 +18,11 @@ from pathlib import Path
 from tests import signatures
 
 PACKAGE = "ksim_rl"
-# Lines of the rooms that train; the rooms around them, the command line among them, have ceilings of their own, so that
-# neither pays for the other.
-PACKAGE_LINES = 38_000
+# Lines of the rooms that train; the rooms around them, the command line and the ways to other libraries among them, have
+# ceilings of their own, so that neither pays for the other.
+PACKAGE_LINES = 37_000
 ROOMS_AROUND = {
+    "adapters": 620,
     "cli": 900,
     "clips": 900,
     "compiled": 950,
@@ -31,6 +32,7 @@ ROOMS_AROUND = {
     "runs": 800,
     "suites": 1_500,
     "tables": 640,
+    "testing": 740,
     "tracking": 1_400,
     "viewer": 1_400,
     "zoo": 300,

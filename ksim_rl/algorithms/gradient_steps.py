@@ -33,12 +33,13 @@ class StepMeans(dict[str, Tensor]):
     def take_(self, steps: Mapping[str, Num[Tensor, " steps"]]) -> None:
         """Take the means of `steps`, each [steps], over those that were made."""
         made = steps["skipped"] == 0.0
-        count = made.sum().clamp_min(1)
-        for name, logged in self._names.items():
-            if name in steps:
-                # A skipped step is counted; its numbers would spoil the means.
-                total = torch.where(made, steps[name], 0.0).sum()
-                self.setdefault(logged, torch.zeros_like(total)).copy_(total / count)
+        logged = {name: own for name, own in self._names.items() if name in steps}
+        # A skipped step is counted; its numbers would spoil the means.
+        totals = torch.where(made, torch.stack([steps[name] for name in logged]), 0.0).sum(1)
+        means = (totals / made.sum().clamp_min(1)).unbind()
+        for own in (own for own in logged.values() if own not in self):
+            self[own] = torch.zeros_like(means[0])
+        torch._foreach_copy_([self[own] for own in logged.values()], means)
 
 
 class RolloutUpdate(ABC):

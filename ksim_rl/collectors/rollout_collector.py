@@ -18,8 +18,9 @@ from ksim_rl.checked import Checked, Count
 from ksim_rl.checks import check_count
 from ksim_rl.compiled.compiled_step import CompiledStep
 from ksim_rl.device.capture import Captured
+from ksim_rl.device.copying import copy_rows
 from ksim_rl.device.state_tree import copy_into
-from ksim_rl.envs.contract import EpisodeClock, part
+from ksim_rl.envs.contract import EpisodeClock, SimulatedWorld, part
 from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.transforms.specs import spell
 
@@ -29,15 +30,15 @@ class CollectorCfg(Checked):
     """Options of `RolloutCollector` that a config may set.
 
     `require_graphs` fails where CUDA graphs are unavailable, instead of running slower with a warning.
-    `compile` makes few kernels of what terms and transforms compute, which is checked once against the env's own step:
-    rollouts take less time, and are those of the env to rounding.
+    `compile` makes few kernels of what terms and transforms compute, which is checked once against the env's own steps:
+    rollouts take less time, and are those of the env to rounding. None does so for envs with a `SimulatedWorld`.
     `stagger_episodes` spreads the time-outs of the envs over an episode's length at the first reset, where the env
     offers it. The first `warmup` rollouts on CUDA run eagerly. In the config of a run, `rollout_length` may be given
     instead of the dataset's size, which then follows from it and the number of envs.
     """
 
     require_graphs: bool = False
-    compile: bool = False
+    compile: bool | None = None
     stagger_episodes: bool = False
     warmup: Count = 2
     rollout_length: Count | None = None
@@ -82,9 +83,11 @@ class RolloutCollector:
         self._keys = None if keys is None else list(keys)
         self._root: TensorDict | None = None
         self._storage_TE: TensorDict | None = None
-        self._leaves_by_dtype: list[list[tuple[NestedKey, Tensor]]] = []
+        self._leaves: list[tuple[NestedKey, Tensor]] = []
         device = env.device or torch.device("cpu")
-        self._compiles, self._compiled = cfg.compile, None
+        simulates = part(env, SimulatedWorld) is not None
+        self._compiles = simulates if cfg.compile is None else cfg.compile
+        self.compiled_step: CompiledStep | None = None
         self._run = Captured(
             self._rollout, device=device, warmup=cfg.warmup, require_graphs=cfg.require_graphs
         )
@@ -104,21 +107,21 @@ class RolloutCollector:
         """Compile the env's step, if that has not been done and is wanted; env and draws are left as they were."""
         if self._root is None:
             self.reset()
-        if not self._compiles or self._compiled is not None:
+        if not self._compiles or self.compiled_step is not None:
             return
         assert self._root is not None
         device = self._run.device
         with torch.random.fork_rng([device] if device.type == "cuda" else []), _exploring():
             tensordict = self.policy(self._root.copy())
             try:
-                self._compiled = CompiledStep(self.env, self._root, tensordict)
+                self.compiled_step = CompiledStep(self.env, self._root, tensordict)
             except RuntimeError as error:
                 self._compiles = False
                 warnings.warn(
                     f"THE ENV'S STEP IS NOT COMPILED, and slower: {error}", RuntimeWarning, stacklevel=2
                 )
                 return
-        self._allocate(self._compiled.env_state_E)
+        self._allocate(self.compiled_step.env_state_E)
 
     @torch.no_grad()
     def made_up_rollout(self) -> TensorDict:
@@ -173,11 +176,11 @@ class RolloutCollector:
         root_keys = list(self._root.keys(True, True))
         root_E = self._root.copy()
         with _exploring():
-            if self._compiled is not None:
+            if self.compiled_step is not None:
                 for t in range(self.rollout_length):
                     env_state_E = self.policy(self._root.copy())
                     self._store(t, env_state_E)  # before the step writes its root over this one
-                    self._store(t, self._compiled(env_state_E))
+                    self._store(t, self.compiled_step(env_state_E))
                 return
             for t in range(self.rollout_length):
                 env_state_E, root_E = self.env.step_and_maybe_reset(self.policy(root_E))
@@ -189,16 +192,9 @@ class RolloutCollector:
     def _store(self, t: int, env_state_E: TensorDictBase) -> None:
         if self._storage_TE is None:
             self._allocate(env_state_E)
-        for leaves in self._leaves_by_dtype:
-            held = [(leaf_TE[t], env_state_E.get(key, None)) for key, leaf_TE in leaves]
-            pairs = [(kept, value) for kept, value in held if value is not None]
-            # One kernel for all that lie in one piece; a column of something wider needs its own.
-            whole = [pair for pair in pairs if pair[1].is_contiguous()]
-            if whole:
-                torch._foreach_copy_([kept for kept, _ in whole], [value for _, value in whole])
-            for kept, value in pairs:
-                if not value.is_contiguous():
-                    kept.copy_(value)
+        held = [(leaf_TE[t], env_state_E.get(key, None)) for key, leaf_TE in self._leaves]
+        pairs = [(kept, value) for kept, value in held if value is not None]
+        copy_rows([kept for kept, _ in pairs], [value for _, value in pairs])
 
     def _allocate(self, env_state_E: TensorDictBase) -> None:
         produced = list(env_state_E.keys(True, True))
@@ -210,7 +206,4 @@ class RolloutCollector:
         kept_E = env_state_E.select(*(self._keys or produced))
         storage_TE: Any = kept_E.new_zeros(torch.Size([self.rollout_length, *kept_E.batch_size]))
         self._storage_TE = storage_TE
-        by_dtype: dict[torch.dtype, list[tuple[NestedKey, Tensor]]] = {}
-        for key, leaf_TE in storage_TE.items(True, True):
-            by_dtype.setdefault(leaf_TE.dtype, []).append((key, leaf_TE))
-        self._leaves_by_dtype = list(by_dtype.values())
+        self._leaves = list(storage_TE.items(True, True))

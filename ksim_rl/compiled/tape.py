@@ -216,6 +216,7 @@ class Tape:
         """Give a kernel its launch, and return what is to be compiled; None where nobody sees what it computes."""
         names: dict[int, str] = {}
         given: list[int] = []
+        pointed: dict[str, str] = {}
         begin: list[str] = []
         end: list[str] = []
 
@@ -228,7 +229,7 @@ class Tape:
                 if is_own or is_shared:
                     begin.append(f"{ctype} {name}[{self._own_width(kernel, place)}];")
                 else:
-                    begin.append(f"{ctype}* {name} = ({ctype}*)a.{name};")
+                    pointed[name] = ctype
                 if not is_own:
                     given.append(place)
                 if is_shared and not is_own:  # each row works it out, and one hands it on
@@ -242,7 +243,11 @@ class Tape:
             body += row_code.lines(operation, Cells(rows=rows, address=address, device=self._device))
         if not given:
             return None
-        source = "\n".join([random.DRAWS, row_code.PRELUDE, *begin, *body, *end])
+        # No two of them overlap, so that numbers may be read ahead of what is written.
+        pointers = ", ".join(f"{ctype}* __restrict__ {name}" for name, ctype in pointed.items())
+        calls = ", ".join(f"({ctype}*)a.{name}" for name, ctype in pointed.items())
+        body = [f"auto run = [&]({pointers}) {{", *begin, *body, *end, "};", f"run({calls});"]
+        source = "\n".join([random.DRAWS, row_code.PRELUDE, *body])
         fields = " ".join(names[place] for place in given)
         launch = QuickLaunch(arguments_of((wp.uint64, fields)), source, block_dim=BLOCK)
         kernel.launch = partial(launch, self._device, (self._num_rows, 1), *given)

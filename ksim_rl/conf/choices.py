@@ -71,7 +71,7 @@ def store_choices() -> None:
 
 
 def _name_of(group: str, algorithm: Algorithm) -> str:
-    cfg = {"data": algorithm.data, "modules": algorithm.modules}[group]
+    cfg = getattr(algorithm, group)
     return next((name for name, choice in CHOICES[group].items() if choice == cfg), algorithm.name)
 
 

@@ -107,14 +107,14 @@ def warp_scope(device: torch.device) -> Iterator[None]:
 
 @contextmanager
 def beside(aside: wp.Stream | None, *launches: Callable[[], None]) -> Iterator[None]:
-    """Let a GPU do what `launches` launch together with the Warp work of this block; without a stream, after it.
+    """Let a GPU do what `launches` launch together with the work of this block; without a stream, after it.
 
     Both follow what precedes the block and precede what follows it, in a graph too. Neither may write what the other
-    reads or writes; `launches` allocate nothing, since memory is given back in the order of one stream.
+    reads or writes, or free what the other allocates: memory is given back in the order of one stream.
     """
     if aside is not None:
         aside.wait_stream(aside.device.stream)
-        with wp.ScopedStream(aside, sync_enter=False):
+        with wp.ScopedStream(aside, sync_enter=False), torch.cuda.stream(wp.stream_to_torch(aside)):
             for launch in launches:
                 launch()
         yield

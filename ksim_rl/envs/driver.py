@@ -33,7 +33,8 @@ class EnvDriver(Simulation):
             tracker = self.readings.sensors[name] = sensor.track(name, self.view)
             if tracker.every_substep:
                 self.after_substep.append(tracker.update_substep)
-                self.substep_sensors = "every"
+                only = tracker.contacts_only and self.substep_sensors != "every"
+                self.substep_sensors = "contacts" if only else "every"
 
     def freeze(self) -> None:
         """End construction: no new buffers, and all that lives on is known to `detached`."""

@@ -239,7 +239,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         driver.changed()
         self.event_manager.reset(mask_E)
         self.command_manager.resample(mask_E)
-        self.world.refresh()
+        self.world.refresh(mask_E)
         driver.refreshed()
         self.command_manager.refresh(mask_E)
         no_E1 = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)

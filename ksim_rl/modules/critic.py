@@ -14,7 +14,6 @@ from ksim_rl.checked import Count, NonNegative
 from ksim_rl.modules.mlp import Device, mlp
 from ksim_rl.modules.network import (
     LayeredNetwork,
-    ObservationKeys,
     ObservationNormalizer,
     ObservingNetwork,
     OffPolicyNetworkCfg,
@@ -23,10 +22,9 @@ from ksim_rl.modules.network import (
 
 
 @dataclass(frozen=True, kw_only=True)
-class CriticCfg(OnPolicyNetworkCfg):
+class CriticCfg(OnPolicyNetworkCfg, in_keys=("critic",)):
     """The value network; `output_gain` scales the last layer's weights."""
 
-    in_keys: ObservationKeys = ("critic",)
     output_gain: NonNegative = 1.0
 
 

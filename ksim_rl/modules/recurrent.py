@@ -27,7 +27,7 @@ from ksim_rl.modules.actor import ActorCfg, make_actor
 from ksim_rl.modules.critic import CriticCfg, make_critic
 from ksim_rl.modules.mlp import Device
 from ksim_rl.modules.network import ObservationKey, ObservationNormalizer, side_by_side
-from ksim_rl.modules.recurrent_cells import gru_layer, lstm_layer
+from ksim_rl.modules.recurrent_cells import GRU, LSTM
 
 
 class RecurrentStatePrimer(TensorDictPrimer):
@@ -123,8 +123,8 @@ class RecurrentNetwork(nn.Module):
         with torch.autocast(gates_TBG.device.type, enabled=False):
             gates_TBG = gates_TBG.to(weight_hh.dtype)
             if lstm:
-                return lstm_layer(gates_TBG, weight_hh, state_BH, reset_TB1)
-            return gru_layer(gates_TBG, weight_hh, bias_hh, state_BH, reset_TB1)
+                return LSTM.apply(gates_TBG, weight_hh, *state_BH, reset_TB1)
+            return (GRU.apply(gates_TBG, weight_hh, bias_hh, *state_BH, reset_TB1),)
 
 
 class RecurrentModule(TensorDictModule):

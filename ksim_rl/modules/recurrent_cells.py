@@ -17,45 +17,23 @@ from torch.autograd.function import once_differentiable
 from ksim_rl.modules import upstream
 
 
-def lstm_layer(
-    gates_TBG: Float[Tensor, "T B G"],
-    weight_hh_GH: Float[Tensor, "G H"],
-    state_BH: tuple[Float[Tensor, "B H"], ...],
-    reset_TB1: Bool[Tensor, "T B 1"] | None,
-) -> tuple[Float[Tensor, "T B H"], ...]:
-    """Run one LSTM layer (Hochreiter & Schmidhuber 1997, with forget gates; the formulas of `torch.nn.LSTM`).
+class LSTM(Function):
+    """One LSTM layer (Hochreiter & Schmidhuber 1997, with forget gates; the formulas of `torch.nn.LSTM`).
 
     `gates_TBG` is W_ih x + b_ih + b_hh of each step, G = 4 H: input, forget, cell, output. The state, h and c, is
-    zeroed before the steps that `reset_TB1` marks; returned is that after each step.
+    zeroed before the steps that `reset_TB1` marks.
     """
-    return _LSTM.apply(gates_TBG, weight_hh_GH, *state_BH, reset_TB1)  # type: ignore[no-any-return]
 
-
-def gru_layer(
-    gates_TBG: Float[Tensor, "T B G"],
-    weight_hh_GH: Float[Tensor, "G H"],
-    bias_hh_G: Float[Tensor, " G"],
-    state_BH: tuple[Float[Tensor, "B H"], ...],
-    reset_TB1: Bool[Tensor, "T B 1"] | None,
-) -> tuple[Float[Tensor, "T B H"], ...]:
-    """Run one GRU layer (Cho et al., arXiv 1406.1078, in the variant of `torch.nn.GRU`).
-
-    `gates_TBG` is W_ih x + b_ih of each step, G = 3 H: reset, update, new. The state, a tuple of h, is zeroed before
-    the steps that `reset_TB1` marks; returned is that after each step.
-    """
-    return (_GRU.apply(gates_TBG, weight_hh_GH, bias_hh_G, *state_BH, reset_TB1),)
-
-
-class _LSTM(Function):
     @staticmethod
     def forward(  # type: ignore[override]
         ctx: Any,
-        gates_TBG: Tensor,
-        weight_hh_GH: Tensor,
-        h_BH: Tensor,
-        c_BH: Tensor,
-        reset_TB1: Tensor | None,
-    ) -> tuple[Tensor, Tensor]:
+        gates_TBG: Float[Tensor, "T B G"],
+        weight_hh_GH: Float[Tensor, "G H"],
+        h_BH: Float[Tensor, "B H"],
+        c_BH: Float[Tensor, "B H"],
+        reset_TB1: Bool[Tensor, "T B 1"] | None,
+    ) -> tuple[Float[Tensor, "T B H"], ...]:
+        """Return h and c after each step."""
         h0_BH, c0_BH = h_BH, c_BH
         steps: list[tuple[Tensor, Tensor, Tensor]] = []
         for t, gates_BG in enumerate(gates_TBG.unbind(0)):
@@ -69,8 +47,10 @@ class _LSTM(Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        grad_h_TBH, grad_c_TBH = grads
+    def backward(
+        ctx: Any, grad_h_TBH: Float[Tensor, "T B H"] | None, grad_c_TBH: Float[Tensor, "T B H"] | None
+    ) -> tuple[Any, ...]:
+        """Return the gradients."""
         weight_hh_GH, h0_BH, c0_BH, h_TBH, c_TBH, activations_TBG, reset_TB1 = ctx.saved_tensors
         c_before_TBH = _before(c0_BH, c_TBH, reset_TB1)
         dh_BH, dc_BH = torch.zeros_like(h0_BH), torch.zeros_like(c0_BH)
@@ -87,16 +67,23 @@ class _LSTM(Function):
         return dgates_TBG, _outer(dgates_TBG, h_before_TBH), dh_BH, dc_BH, None
 
 
-class _GRU(Function):
+class GRU(Function):
+    """One GRU layer (Cho et al., arXiv 1406.1078, in the variant of `torch.nn.GRU`).
+
+    `gates_TBG` is W_ih x + b_ih of each step, G = 3 H: reset, update, new. The state h is zeroed before the steps that
+    `reset_TB1` marks.
+    """
+
     @staticmethod
     def forward(  # type: ignore[override]
         ctx: Any,
-        gates_TBG: Tensor,
-        weight_hh_GH: Tensor,
-        bias_hh_G: Tensor,
-        h_BH: Tensor,
-        reset_TB1: Tensor | None,
-    ) -> Tensor:
+        gates_TBG: Float[Tensor, "T B G"],
+        weight_hh_GH: Float[Tensor, "G H"],
+        bias_hh_G: Float[Tensor, " G"],
+        h_BH: Float[Tensor, "B H"],
+        reset_TB1: Bool[Tensor, "T B 1"] | None,
+    ) -> Float[Tensor, "T B H"]:
+        """Return h after each step."""
         h0_BH = h_BH
         steps: list[tuple[Tensor, Tensor]] = []
         for t, gates_BG in enumerate(gates_TBG.unbind(0)):
@@ -109,8 +96,8 @@ class _GRU(Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        (grad_h_TBH,) = grads
+    def backward(ctx: Any, grad_h_TBH: Float[Tensor, "T B H"]) -> tuple[Any, ...]:
+        """Return the gradients."""
         weight_hh_GH, h0_BH, h_TBH, workspace_TBG, reset_TB1 = ctx.saved_tensors
         dh_BH = torch.zeros_like(h0_BH)
         dinput: list[Tensor] = []

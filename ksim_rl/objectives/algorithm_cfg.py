@@ -58,7 +58,7 @@ class GradientCfg(AlgorithmCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnPolicyCfg(GradientCfg, learns_on_sequences=True):
+class OnPolicyCfg(GradientCfg, learns_on_sequences=True, max_grad_norm=1.0):
     """What the algorithms share that pass over each rollout `num_epochs` times, with one Adam.
 
     The "adaptive" schedule changes the learning rate before each gradient step, within its bounds, so that the
@@ -71,7 +71,6 @@ class OnPolicyCfg(GradientCfg, learns_on_sequences=True):
     desired_kl: Positive = 0.01
     learning_rate_min: Positive = 1e-5
     learning_rate_max: Positive = 1e-2
-    max_grad_norm: Positive | None = 1.0
 
     def _check_fields(self) -> None:
         low, high = self.learning_rate_min, self.learning_rate_max
@@ -86,7 +85,7 @@ class OnPolicyCfg(GradientCfg, learns_on_sequences=True):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PPOCfg(OnPolicyCfg):
+class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
     """Proximal policy optimization (Schulman et al., arXiv 1707.06347); the defaults suit legged locomotion.
 
     Attributes:
@@ -103,8 +102,6 @@ class PPOCfg(OnPolicyCfg):
             never does. They differ by the order of sums. The metric `update/fused` says which it is.
     """
 
-    num_epochs: Count = 5
-    schedule: Schedule = "adaptive"
     advantage: Literal["gae", "td_lambda", "vtrace"] = "gae"
     gamma: Share = 0.99
     lmbda: Share = 0.95
@@ -175,7 +172,7 @@ class AMPCfg(PPOCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistillationCfg(OnPolicyCfg, checkpoint_fields=("teacher",)):
+class DistillationCfg(OnPolicyCfg, num_epochs=2, checkpoint_fields=("teacher",)):
     """A student learns to act as a teacher (a run folder or a checkpoint) does, in the states that the student visits.
 
     That is DAgger (Ross et al., arXiv 1011.0686) without its aggregate of all data: the newest rollout of thousands of
@@ -189,7 +186,6 @@ class DistillationCfg(OnPolicyCfg, checkpoint_fields=("teacher",)):
 
     teacher: Annotated[str, Filled("name a run folder or a checkpoint, objective.teacher=RUN")] = ""
     loss: DistillationKind = "kl"
-    num_epochs: Count = 2
     teacher_share: Share = 1.0
     teacher_share_decay: Share = 0.95
 
@@ -232,7 +228,7 @@ class SACCfg(OffPolicyCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TD3Cfg(OffPolicyCfg):
+class TD3Cfg(OffPolicyCfg, policy_delay=2):
     """Twin delayed deterministic policy gradients (Fujimoto et al., arXiv 1802.09477).
 
     Targets take the present policy, not a slow copy of it, as FastTD3 does (Seo et al., arXiv 2505.22642). Each env has
@@ -240,7 +236,6 @@ class TD3Cfg(OffPolicyCfg):
     actions of targets is `target_noise`, clipped. All are in units of half the range of an action.
     """
 
-    policy_delay: Count = 2
     exploration_noise_min: NonNegative = 0.1
     exploration_noise_max: float = 0.1
     target_noise: NonNegative = 0.2

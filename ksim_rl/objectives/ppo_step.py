@@ -24,11 +24,8 @@ from ksim_rl.transforms import MirrorMap
 
 def with_precision_of(cfg: PPOCfg, device: torch.device | str) -> PPOCfg:
     """Return `cfg` with the precision that "auto" stands for on a device: "bfloat16" on CUDA, else "float32"."""
-    if cfg.precision != "auto":
-        return cfg
-    return dataclasses.replace(
-        cfg, precision="bfloat16" if torch.device(device).type == "cuda" else "float32"
-    )
+    resolved = "bfloat16" if torch.device(device).type == "cuda" else "float32"
+    return dataclasses.replace(cfg, precision=resolved) if cfg.precision == "auto" else cfg
 
 
 def in_precision(loss: Loss, precision: str, *, device: torch.device | str) -> Loss:

@@ -39,18 +39,6 @@ def align_steep_capsules(
 
 
 @wp.kernel(enable_backward=False)
-def zero_rows(mask: wp.array[bool], places: wp.array[wp.uint64], widths: wp.array[int]):
-    """Zero the rows of the worlds that `mask` names in arrays [E, width]; the launch is as wide as the widest."""
-    world, i = wp.tid()
-    if not mask[world]:
-        return
-    for k in range(places.shape[0]):
-        if i < widths[k]:
-            rows = wp.array(ptr=places[k], shape=(mask.shape[0], widths[k]), dtype=float)
-            rows[world, i] = 0.0
-
-
-@wp.kernel(enable_backward=False)
 def record_overflow(
     overflow: wp.array[int],
     nefc: wp.array[int],

@@ -76,6 +76,7 @@ class BatchCamera:
     ) -> None:
         self._world, self._camera = world, camera
         model, fields = world.mj_model, world.per_world_fields()
+        world.view("cam_xpos")  # so that refreshes place cameras and lights
         with warp_scope(world.device):
             self._context = mjw.create_render_context(
                 model,

@@ -1,7 +1,8 @@
-"""This module launches the substeps of a world, sensors on the last one only, and the refresh of derived quantities."""
+"""This module launches the substeps of a world with the sensors that are wanted, and the refresh of what derives."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any, Literal, get_args
 
 import mujoco
 import mujoco_warp as mjw
@@ -9,11 +10,13 @@ import numpy as np
 import warp as wp
 
 from ksim_rl.physics import kernels, upstream
+from ksim_rl.physics.collision.collisions import broad_phase_unavailable, collisions
 from ksim_rl.physics.contact_sensors import ContactReadings
 from ksim_rl.physics.newton import solver as newton
 from ksim_rl.physics.rows.constraint_rows import constraint_rows
 from ksim_rl.physics.rows.contact_lists import ContactLists
 from ksim_rl.physics.smooth.stages import calls_back, integration, smooth_dynamics
+from ksim_rl.physics.views import CAMERAS_AND_LIGHTS, SUBTREE_VELOCITIES
 
 # These read the contacts of the last substep's collision pass, which a reset empties.
 COLLISION_SENSORS = (
@@ -23,6 +26,8 @@ COLLISION_SENSORS = (
 )
 BODY_EQUALITIES = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 TRANSMISSION_SENSORS = (mujoco.mjtSensor.mjSENS_ACTUATORPOS, mujoco.mjtSensor.mjSENS_ACTUATORVEL)
+Sensors = Literal["none", "contacts", "kept", "all"]
+"""Which sensors a substep computes: none, those of contacts, those that a refresh afterwards keeps, or all."""
 
 
 class Substeps:
@@ -46,43 +51,60 @@ class Substeps:
         one_kernel_rows: bool = False,
         one_kernel_integration: bool = False,
         aside: wp.Stream | None = None,
+        mask: wp.array | None = None,
     ) -> None:
         self.warp_model, self.warp_data_E, self._aside = warp_model, warp_data_E, aside
         sensor_type = mj_model.sensor_type
         has_history = np.any(mj_model.sensor_history > 0, axis=-1)
         # A delayed sensor samples at every substep.
         self._always_senses = bool(has_history.any())
-        self._silent_warp_model = warp_model if self._always_senses else upstream.without_sensors(warp_model)
-        self._warp_model_of_solver: mjw.Model | None = None
+        self._refresh_warp_model, keeping = upstream.sensors_by_refresh(
+            warp_model, skip=has_history | np.isin(sensor_type, COLLISION_SENSORS), sensor_type=sensor_type
+        )
+        self._models: dict[Sensors, mjw.Model] = dict.fromkeys(get_args(Sensors), warp_model)
+        if not self._always_senses:
+            self._models |= {"none": upstream.without_sensors(warp_model), "kept": keeping}
+            self._models["contacts"] = upstream.with_contact_sensors_only(warp_model)
+        self._solve: Callable[..., None] | None = None
         if one_kernel_solver:
             # A world without constraints reaches that acceleration in one step.
-            opt = dataclasses.replace(warp_model.opt, run_qacc_smooth=False)
-            self._warp_model_of_solver = dataclasses.replace(warp_model, opt=opt)
-            self._solve = newton.solver(self._warp_model_of_solver, warp_data_E)
-        self._dynamics = smooth_dynamics(warp_model, warp_data_E) if one_kernel_dynamics else None
+            self._alter(opt=dataclasses.replace(warp_model.opt, run_qacc_smooth=False))
+            self._solve = newton.solver(self._models["all"], warp_data_E)
+        self._dynamics = None
+        if one_kernel_dynamics:
+            self._dynamics = smooth_dynamics(warp_model, warp_data_E, mask=mask)
+            self._refresh_warp_model.sensor_subtree_vel = False
         self.contact_lists: ContactLists | None = None
         self._make_rows: Callable[[], None] | None = None
         self._contacts: ContactReadings | None = None
-        if one_kernel_rows and self._warp_model_of_solver is not None:
+        self._collide: Callable[[], None] | None = None
+        if one_kernel_rows and one_kernel_solver:
             self.contact_lists = ContactLists(warp_model, warp_data_E)
             self._make_rows = constraint_rows(warp_model, warp_data_E, self.contact_lists)
             self._contacts = ContactReadings(mj_model, warp_model, warp_data_E, self.contact_lists)
-            self._warp_model_of_solver = upstream.without_contact_sensors(
-                self._warp_model_of_solver, self._contacts.sensors
+            self._alter(
+                sensor_contact_acc_adr=upstream.contact_sensors_but(warp_model, self._contacts.sensors)
             )
+            if broad_phase_unavailable(warp_model, warp_data_E) is None:
+                self._collide = collisions(warp_model, warp_data_E)
         self._integrate = integration(warp_model, warp_data_E) if one_kernel_integration else None
-        self._refresh_warp_model = upstream.with_refreshable_sensors(
-            warp_model, skip=has_history | np.isin(sensor_type, COLLISION_SENSORS), sensor_type=sensor_type
-        )
         self._needs_transmission = bool(np.isin(sensor_type, TRANSMISSION_SENSORS).any())
         self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any())
         self.refreshed_on_demand: set[str] = set()
         if (sensor_type == mujoco.mjtSensor.mjSENS_TENDONVEL).any():
             self.refreshed_on_demand.add("ten_velocity")
         if warp_model.sensor_subtree_vel:
-            self.refreshed_on_demand |= {"subtree_linvel", "subtree_angmom"}
+            self.refreshed_on_demand |= SUBTREE_VELOCITIES
+        if mujoco.mjtObj.mjOBJ_CAMERA in (*mj_model.sensor_objtype, *mj_model.sensor_reftype):
+            self.refreshed_on_demand |= CAMERAS_AND_LIGHTS
+        else:
+            self._alter(ncam=0, nlight=0)
 
-    def advance(self, *, sensors: bool) -> None:
+    def _alter(self, **fields: Any) -> None:
+        """Change fields of the models of substeps, which share all else with `warp_model`."""
+        self._models = {which: dataclasses.replace(m, **fields) for which, m in self._models.items()}
+
+    def advance(self, *, sensors: Sensors) -> None:
         """Launch one physics step. Sensors never change the state that it reaches."""
         # Callbacks are set at any time, and stand between the stages of the kernel.
         dynamics = None if calls_back(self.warp_model) else self._dynamics
@@ -91,21 +113,30 @@ class Substeps:
             mjw.kinematics(self.warp_model, self.warp_data_E)
             mjw.com_pos(self.warp_model, self.warp_data_E)
             mjw.com_vel(self.warp_model, self.warp_data_E)
-        if self._warp_model_of_solver is not None:
-            sensors = sensors or self._always_senses
-            opt = self._warp_model_of_solver.opt
-            opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
-            stages = self._solve, dynamics, self._make_rows, self._contacts, self._integrate, self._aside
-            newton.step(self._warp_model_of_solver, self.warp_data_E, *stages, sensors=sensors)
-        else:
-            mjw.step(self.warp_model if sensors else self._silent_warp_model, self.warp_data_E)
+        m = self._models[sensors]
+        if self._solve is None:
+            mjw.step(m, self.warp_data_E)
+            return
+        m.opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
+        stages = (
+            self._solve,
+            dynamics,
+            self._make_rows,
+            self._contacts,
+            self._integrate,
+            self._aside,
+            self._collide,
+        )
+        newton.step(m, self.warp_data_E, *stages, sensors=sensors != "none" or self._always_senses)
 
-    def refresh(self) -> None:
+    def refresh(self, *, masked: bool = False) -> None:
         """Launch what recomputes position- and velocity-stage quantities from the present qpos and qvel.
 
-        No collision pass: contacts, forces and the sensors that read them stay as the last substep left them.
+        No collision pass: contacts, forces and the sensors that read them stay as the last substep left them. `masked`
+        leaves worlds alone that are not in the mask, where that takes less time.
         """
-        m, d = self._refresh_warp_model, self.warp_data_E
+        m, d, needed = self._refresh_warp_model, self.warp_data_E, self.refreshed_on_demand
+        sums_momenta = bool(needed & SUBTREE_VELOCITIES)
         if self._dynamics is None:
             mjw.kinematics(m, d)
             mjw.com_pos(m, d)
@@ -113,9 +144,9 @@ class Substeps:
             mjw.tendon(m, d)
             mjw.com_vel(m, d)
         else:
-            self._dynamics(forces_too=False)
-        mjw.camlight(m, d)
-        needed = self.refreshed_on_demand
+            self._dynamics(forces_too=False, sums_momenta=sums_momenta, masked=masked)
+        if needed & CAMERAS_AND_LIGHTS:
+            mjw.camlight(m, d)
         if "M" in needed:
             mjw.crb(m, d)
             upstream.tendon_armature(m, d)
@@ -131,7 +162,7 @@ class Substeps:
             pattern = (d.moment_rownnz, d.moment_rowadr, d.moment_colind)
             self._launch_product(pattern, d.actuator_moment, d.actuator_velocity)
         # A model with sensors of them computes them with these.
-        if needed & {"subtree_linvel", "subtree_angmom"} and not m.sensor_subtree_vel:
+        if sums_momenta and self._dynamics is None and not m.sensor_subtree_vel:
             mjw.subtree_vel(m, d)
         mjw.sensor_pos(m, d)
         mjw.sensor_vel(m, d)

@@ -17,7 +17,11 @@ from jaxtyping import Float32
 # does with quaternions.
 from mujoco_warp._src.bvh import build_hfield_bvh
 from mujoco_warp._src.collision_core import contact_params as contact_params
+
+# What lies between its broad phase and its narrow one, and the second.
+from mujoco_warp._src.collision_core import create_collision_context as create_collision_context
 from mujoco_warp._src.collision_core import write_contact as write_contact
+from mujoco_warp._src.collision_driver import _narrowphase as narrowphase  # noqa: F401
 from mujoco_warp._src.math import make_frame as make_frame
 from mujoco_warp._src.math import mul_quat as mul_quat
 from mujoco_warp._src.math import quat_to_mat as quat_to_mat
@@ -73,37 +77,51 @@ def without_sensors(warp_model: mjw.Model) -> mjw.Model:
     return dataclasses.replace(warp_model, opt=opt)
 
 
-def with_refreshable_sensors(
+def sensors_by_refresh(
     warp_model: mjw.Model, *, skip: np.ndarray, sensor_type: np.ndarray
-) -> mjw.Model:
-    """Return a model on the same arrays that computes only sensors that follow from qpos and qvel alone.
+) -> tuple[mjw.Model, mjw.Model]:
+    """Return two models on the same arrays: with the sensors that follow from qpos and qvel alone, and with the others.
 
     Contact, limit, touch-grid and geom-distance sensors read rows or contacts of the last substep's collision pass.
     They, and those of `skip` (bool [nsensor]), keep that substep's value; rows that reset since then read zero. Sensors
     can only be switched off all at once, so the lists that `put_model` makes, one for each kernel, are replaced.
     """
     none = wp.zeros(0, dtype=int)
-    pos, vel = (
-        wp.array([i for i in ids.numpy() if not skip[i]], dtype=int)
-        for ids in (warp_model.sensor_pos_adr, warp_model.sensor_vel_adr)
+    stages = {name: getattr(warp_model, name).numpy() for name in ("sensor_pos_adr", "sensor_vel_adr")}
+    refreshed, kept = (
+        {name: wp.array([i for i in ids if skip[i] == skips], dtype=int) for name, ids in stages.items()}
+        for skips in (False, True)
     )
     lists = ("limitpos", "limitvel", "contact_pos", "contact_vel", "stage_pos", "stage_vel")
-    skips_rays = np.any(skip & (sensor_type == mujoco.mjtSensor.mjSENS_RANGEFINDER))
-    return dataclasses.replace(
+    keeps_rays = bool(np.any(skip & (sensor_type == mujoco.mjtSensor.mjSENS_RANGEFINDER)))
+    rays, no_rays = {"nrangefinder": warp_model.nrangefinder}, {"nrangefinder": 0}
+    of_refresh = dataclasses.replace(
         warp_model,
-        sensor_pos_adr=pos,
-        sensor_vel_adr=vel,
         **{f"sensor_{name}_adr": none for name in lists},
+        **refreshed,
+        **no_rays if keeps_rays else rays,
         nsensorcollision=0,
         nsensortaxel=0,
-        nrangefinder=0 if skips_rays else warp_model.nrangefinder,
     )
+    sums = dict.fromkeys(("sensor_subtree_vel", "sensor_e_potential", "sensor_e_kinetic"), False)
+    of_substep = dataclasses.replace(warp_model, **kept, **sums, **rays if keeps_rays else no_rays)
+    return of_refresh, of_substep
 
 
-def without_contact_sensors(warp_model: mjw.Model, sensors: Sequence[int]) -> mjw.Model:
-    """Return a model on the same arrays that does not compute some contact sensors with forces."""
+def with_contact_sensors_only(warp_model: mjw.Model) -> mjw.Model:
+    """Return a model on the same arrays that computes no sensors but those of contacts."""
+    none = wp.zeros(0, dtype=int)
+    lists = ("pos", "vel", "acc", "touch", "limitpos", "limitvel", "limitfrc", "tendonactfrc")
+    flags = ("sensor_rne_postconstraint", "sensor_subtree_vel", "sensor_e_potential", "sensor_e_kinetic")
+    counts = dict.fromkeys(("nrangefinder", "nsensorcollision", "nsensortaxel"), 0)
+    own = {f"sensor_{name}_adr": none for name in lists} | dict.fromkeys(flags, False)
+    return dataclasses.replace(warp_model, **own, **counts)
+
+
+def contact_sensors_but(warp_model: mjw.Model, sensors: Sequence[int]) -> wp.array:
+    """Return the contact sensors with forces that MuJoCo Warp computes itself, if it leaves some out."""
     left = [sensor for sensor in warp_model.sensor_contact_acc_adr.numpy() if sensor not in sensors]
-    return dataclasses.replace(warp_model, sensor_contact_acc_adr=wp.array(left, dtype=int))
+    return wp.array(left, dtype=int)
 
 
 def collide_boxes_exactly(warp_model: mjw.Model) -> None:

@@ -21,11 +21,13 @@ _KEPT = (
 )
 # What `refresh` recomputes, and what it recomputes from when on it is read.
 _REFRESHED = (
-    "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat cam_xpos cam_xmat light_xpos "
-    "light_xdir subtree_com cdof cinert cvel cdof_dot ten_J ten_length ten_wrapadr ten_wrapnum wrap_obj wrap_xpos "
-    "flexvert_xpos flexedge_J flexedge_length"
+    "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat subtree_com cdof cinert cvel "
+    "cdof_dot ten_J ten_length ten_wrapadr ten_wrapnum wrap_obj wrap_xpos flexvert_xpos flexedge_J flexedge_length"
 )
-ON_DEMAND = frozenset(("subtree_linvel", "subtree_angmom", "ten_velocity", "M", "qfrc_bias"))
+CAMERAS_AND_LIGHTS = frozenset(("cam_xpos", "cam_xmat", "light_xpos", "light_xdir"))
+SUBTREE_VELOCITIES = frozenset(("subtree_linvel", "subtree_angmom"))
+ON_DEMAND_TOGETHER = (CAMERAS_AND_LIGHTS, SUBTREE_VELOCITIES, {"ten_velocity"}, {"M"}, {"qfrc_bias"})
+ON_DEMAND = frozenset().union(*ON_DEMAND_TOGETHER)
 ACCELERATION_STAGE, SUBSTEP_INPUTS = tuple(_ACCELERATION_STAGE.split()), tuple(_INPUTS.split())
 STATE = (*SUBSTEP_INPUTS, *_KEPT.split(), *ACCELERATION_STAGE)
 READABLE = ON_DEMAND.union(STATE, _REFRESHED.split())

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable, Hashable, Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import mujoco
 import mujoco_warp as mjw
@@ -17,7 +17,7 @@ from ksim_rl.device.kernel_loading import loaded_together
 from ksim_rl.device.memory import memory_for
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.device.streams import checked_device, warp_scope, warp_stream
-from ksim_rl.physics import capacity, kernels, upstream, views
+from ksim_rl.physics import capacity, upstream, views
 from ksim_rl.physics.contacts import follow_the_c_engine
 from ksim_rl.physics.fields import FIXED, GRAVITY, INERT0, const_groups, derived_fields, fields_to_expand
 from ksim_rl.physics.masked_constants import MaskedConstants
@@ -25,13 +25,14 @@ from ksim_rl.physics.model_checks import check_not_simple, warp_model_of
 from ksim_rl.physics.nan_guard.guard import NanGuard, NanReport
 from ksim_rl.physics.newton.solver import one_kernel_unavailable, takes_conditional_nodes
 from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
+from ksim_rl.physics.resets import resets
 from ksim_rl.physics.rows.constraint_rows import one_kernel_rows_unavailable
 from ksim_rl.physics.sim_cfg import SimCfg
 from ksim_rl.physics.smooth.stages import (
     one_kernel_dynamics_unavailable,
     one_kernel_integration_unavailable,
 )
-from ksim_rl.physics.substeps import Substeps
+from ksim_rl.physics.substeps import Sensors, Substeps
 
 
 class World(views.DataViews):
@@ -101,10 +102,7 @@ class World(views.DataViews):
             gravity_EL = upstream.expand_gravity(self.warp_model, num_envs)
             self._overflow = OverflowRecord(self.warp_data_E)
             self._reset_mask = wp.zeros(num_envs, dtype=bool)
-            rows = views.float_rows(self.warp_data_E, views.ACCELERATION_STAGE)
-            widths = [row.shape[1] for row in rows]
-            places = wp.array([row.ptr or 0 for row in rows], dtype=wp.uint64)
-            self._zeroed_at_reset = places, wp.array(widths, dtype=int), max(widths)
+            self._launch_reset = resets(self.warp_model, self.warp_data_E, self._reset_mask)
             models = self.mj_model, self.warp_model, self.warp_data_E
             self.one_kernel_dynamics_unavailable = one_kernel_dynamics_unavailable(
                 self.warp_model, self.sim, solver_unavailable=self.one_kernel_unavailable
@@ -124,6 +122,7 @@ class World(views.DataViews):
                 one_kernel_rows=self.one_kernel_rows_unavailable is None,
                 one_kernel_integration=self.one_kernel_integration_unavailable is None,
                 aside=aside,
+                mask=self._reset_mask,
             )
             self._masked_constants = self._prepare_constants(expanded)
         self._reset_mask_E = wp.to_torch(self._reset_mask)
@@ -155,10 +154,12 @@ class World(views.DataViews):
         *,
         before: Sequence[Callable[[], None]] = (),
         after: Sequence[Callable[[], None]] = (),
-        sensors: Literal["last", "every"] = "last",
+        sensors: Literal["last", "contacts", "every"] = "last",
     ) -> None:
-        """Advance all worlds by `n` substeps under the present `ctrl`, with sensors on the last one or on every one.
+        """Advance all worlds by `n` substeps under the present `ctrl`.
 
+        Sensors are computed on the last one, but for those that `refresh` computes, which read zero until then; with
+        those of contacts on every one; or all on every one.
         Hooks are called, in order, before each substep (such as a motor model that writes `ctrl`) and after it, when
         `refresh` has not run: `qpos` and `qvel` are those of the state reached, poses and sensors those that the
         substep computed on its way. With hooks the substeps are launches of their own, with the hooks' torch work in
@@ -166,27 +167,31 @@ class World(views.DataViews):
         """
         if n < 1:
             raise ValueError(f"n={n}: expected at least 1 substep")
-        check_choice("sensors", sensors, ("last", "every"))
+        check_choice("sensors", sensors, ("last", "contacts", "every"))
         if not before and not after:
             self._graphs.run(("step", n, sensors), lambda: self._launch_substeps(n, sensors))
         else:
             for substep in range(n):
                 for hook in before:
                     hook()
-                reads = sensors == "every" or substep == n - 1
-                self._graphs.run(("substep", reads), lambda reads=reads: self._launch_substep(sensors=reads))
+                which = self._sensors_of(substep, n, sensors)
+                self._graphs.run(("substep", which), lambda which=which: self._launch_substep(which))
                 for hook in after:
                     hook()
         if self._nan_guard is not None:
             self._nan_guard.keep_fields()
 
-    def refresh(self) -> None:
+    def refresh(self, mask_E: Bool[Tensor, " E"] | None = None) -> None:
         """Recompute position- and velocity-stage quantities and sensors from the present `qpos` and `qvel`.
 
         Acceleration-stage quantities keep the last substep's values: there is no collision pass. Actuator lengths and
-        velocities are recomputed only if a sensor reads them.
+        velocities are recomputed only if a sensor reads them. With a mask, rows outside of it must be current already.
         """
-        self._graphs.run("refresh", self._substeps.refresh)
+        if mask_E is None:
+            self._graphs.run("refresh", self._substeps.refresh)
+            return
+        self._take_mask(mask_E)
+        self._graphs.run("refresh of rows", lambda: self._substeps.refresh(masked=True))
 
     def view(self, name: str) -> Shaped[Tensor, "*shape"]:
         """Return the view of an array that is current after `refresh`, and let `refresh` compute it from now on.
@@ -198,7 +203,9 @@ class World(views.DataViews):
                 raise RuntimeError(
                     f"{name} is not computed: let a term of the config read it during construction"
                 )
-            self._substeps.refreshed_on_demand.add(name)
+            self._substeps.refreshed_on_demand |= next(
+                names for names in views.ON_DEMAND_TOGETHER if name in names
+            )
             self._graphs.clear()
             self._record_resets()
         return super().view(name)
@@ -316,7 +323,7 @@ class World(views.DataViews):
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         self._graphs.clear()
-        parts = ("_substeps", "_masked_constants", "_overflow", "_zeroed_at_reset", "_fields")
+        parts = ("_substeps", "_masked_constants", "_overflow", "_launch_reset", "_fields")
         for name in ("warp_data_E", "warp_model", *parts):
             if hasattr(self, name):
                 delattr(self, name)
@@ -325,8 +332,8 @@ class World(views.DataViews):
     def _load_kernels(self) -> None:
         """Compile and load what steps, refreshes and resets launch, before any of them runs."""
         with warp_scope(self.device), loaded_together(self.device):
-            for sensors in (False, True):
-                self._launch_substep(sensors=sensors)
+            for sensors in get_args(Sensors):
+                self._launch_substep(sensors)
             self._substeps.refresh()
             self._launch_reset()
 
@@ -339,6 +346,7 @@ class World(views.DataViews):
         for _ in range(2):
             self.reset(nowhere_E)
             self.refresh()
+            self.refresh(nowhere_E)
 
     def _prepare_constants(self, expanded: Sequence[str]) -> MaskedConstants | None:
         groups = const_groups(expanded)
@@ -378,17 +386,19 @@ class World(views.DataViews):
 
     def _launch_substeps(self, n: int, sensors: str) -> None:
         for substep in range(n):
-            self._launch_substep(sensors=sensors == "every" or substep == n - 1)
+            self._launch_substep(self._sensors_of(substep, n, sensors))
 
-    def _launch_substep(self, *, sensors: bool) -> None:
+    @staticmethod
+    def _sensors_of(substep: int, n: int, sensors: str) -> Sensors:
+        if sensors == "every":
+            return "all"
+        amid = "contacts" if sensors == "contacts" else "none"
+        return "kept" if substep == n - 1 else amid
+
+    def _launch_substep(self, sensors: Sensors) -> None:
         if self._nan_guard is not None:
             self._nan_guard.before_substep()
         self._substeps.advance(sensors=sensors)
         self._overflow.record()
         if self._nan_guard is not None:
             self._nan_guard.after_substep()
-
-    def _launch_reset(self) -> None:
-        mjw.reset_data(self.warp_model, self.warp_data_E, reset=self._reset_mask)
-        mask, places, widths, widest = self._reset_mask, *self._zeroed_at_reset
-        wp.launch(kernels.zero_rows, dim=(self.num_envs, widest), inputs=[mask, places, widths])

@@ -11,24 +11,18 @@ from ksim_rl import dims
 
 def assert_dims(td: TensorDictBase, *names: str) -> None:
     """Check that the batch dims of `td`, and of each tensordict inside, bear `names`, such as "E", "T"."""
-    _assert_dims(td, list(names), "the tensordict")
+    inside = ((f"[{key!r}]", node) for key, node in td.items(True) if isinstance(node, TensorDictBase))
+    for where, node in (("", td), *inside):
+        assert node.names[: len(names)] == [*names], (
+            f"the tensordict{where} has dims {node.names} (batch size {tuple(node.batch_size)}): expected {[*names]}"
+        )
+    assert td.batch_dims == len(names), f"the tensordict has dims {td.names}: expected exactly {[*names]}"
 
 
 def assert_leaf(td: TensorDictBase, key: str | tuple[str, ...], *leaf_shape: int) -> None:
     """Check the shape of a leaf beyond the batch dims: `assert_leaf(rollout_ET, "actor", 48)` for [E, T, 48]."""
     found = tuple(td[key].shape[td.batch_dims :])
     assert found == leaf_shape, f"{key!r} has shape {found} beyond {td.names}: expected {leaf_shape}"
-
-
-def _assert_dims(td: TensorDictBase, names: list[str], where: str) -> None:
-    assert td.names[: len(names)] == names and td.batch_dims >= len(names), (
-        f"{where} has dims {td.names} (batch size {tuple(td.batch_size)}): expected {names}"
-    )
-    if where == "the tensordict":
-        assert td.batch_dims == len(names), f"{where} has dims {td.names}: expected exactly {names}"
-    for key, value in td.items():
-        if isinstance(value, TensorDictBase):
-            _assert_dims(value, names, f"{where}[{key!r}]")
 
 
 SPECS = ("full_observation_spec", "full_action_spec", "full_reward_spec", "full_done_spec")

@@ -69,12 +69,12 @@ def build(
         folder=run_folder / "checkpoint" if run_folder else None,
         config=cfg.to_tree(),
     )
-    if cfg.trainer.warm_up:
-        # Before anything is loaded: a replay need not be kept apart meanwhile.
-        began = time.monotonic()
-        collector.warm_up()
-        if isinstance(update, HasWarmUp):
-            update.warm_up(collector.made_up_rollout())
+    # Before anything is loaded: a replay need not be kept apart meanwhile.
+    began = time.monotonic()
+    collector.warm_up()
+    if cfg.trainer.warm_up and isinstance(update, HasWarmUp):
+        update.warm_up(collector.made_up_rollout())
+    if cfg.trainer.warm_up or collector.compiled_step is not None:
         trainer.warm_up_s = time.monotonic() - began
     if resume_from is not None:
         trainer.load_state_dict(resume_from.state)

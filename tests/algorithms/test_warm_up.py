@@ -6,7 +6,7 @@ from ksim_rl.device import state_tree
 from tests.algorithms import imitation_problems, off_policy_problem
 from tests.trainers.target_env import make_trainer
 
-OF_THE_CLOCK = ("seconds", "throughput/env_states_per_s")
+OF_THE_CLOCK = ("seconds", "throughput/env_states_per_s", "warm_up_s")
 PROBLEMS = {
     "ppo": make_trainer,
     "sac": lambda: off_policy_problem.make_trainer("sac"),

@@ -19,7 +19,7 @@ SMALL = (
     "trainer.video=false",
     "logger.tensorboard=false",
 )
-TIMES = ("seconds", "throughput/env_states_per_s")
+TIMES = ("seconds", "throughput/env_states_per_s", "warm_up_s")
 
 
 def run(*arguments):

@@ -7,6 +7,7 @@ from ksim_rl import envs
 from ksim_rl.collectors import CollectorCfg, RolloutCollector
 from ksim_rl.compiled import compiled_step
 from ksim_rl.compiled.compiled_step import CompiledStep
+from tests.trainers.target_env import TargetEnv
 
 QUICK = ("cartpole_swingup", "pendulum_swingup")
 TASKS = (
@@ -100,3 +101,28 @@ def test_a_term_that_reads_the_device_on_the_host_is_named():
     env.__dict__["step_and_maybe_reset"] = reading
     with pytest.raises(RuntimeError, match="on the host"):
         CompiledStep(env, root_E, tensordict)
+
+
+def test_what_a_step_keeps_elsewhere_than_in_tensors_shows_in_the_second():
+    env, root_E, tensordict = made()
+    step, steps = env.step_and_maybe_reset, iter((1.0, 0.5))
+
+    def weakening(td):
+        return step(td.set("action", td["action"] * next(steps)))
+
+    env.__dict__["step_and_maybe_reset"] = weakening
+    with pytest.raises(RuntimeError, match="another .* than the env in"):
+        CompiledStep(env, root_E, tensordict)
+
+
+def test_steps_of_envs_with_a_world_are_compiled_unless_a_config_says_otherwise():
+    env = envs.make("cartpole_swingup", num_envs=ROWS, device="cpu")
+    foreign = TargetEnv(num_envs=ROWS)
+    for own, cfg, is_compiled in (
+        (env, CollectorCfg(), True),
+        (env, CollectorCfg(compile=False), False),
+        (foreign, CollectorCfg(), False),
+    ):
+        collector = RolloutCollector(own, policy(own), rollout_length=1, cfg=cfg)
+        collector.warm_up()
+        assert (collector.compiled_step is not None) == is_compiled

@@ -68,6 +68,32 @@ def test_what_is_not_finite_stays_in_its_world_bit_for_bit():
 
 
 @pytest.mark.gpu
+@pytest.mark.parametrize("lanes", LANES)
+def test_a_mask_spares_worlds_and_momenta_are_those_of_mujoco_warp(lanes):
+    world, names = worlds(), ("xpos", "cvel", "subtree_linvel", "subtree_angmom")
+    mask_E = torch.rand(NUM_ENVS, device="cuda") > 0.7
+    arrays = {name: wp.to_torch(getattr(world.warp_data_E, name)) for name in names}
+    with wp.ScopedDevice("cuda"):
+        mask = wp.from_torch(mask_E)
+        launch = stages.smooth_dynamics(world.warp_model, world.warp_data_E, lanes=lanes, mask=mask)
+        launch(forces_too=False, sums_momenta=True)
+        whole = {name: array.clone() for name, array in arrays.items()}
+        for array in arrays.values():
+            array.fill_(7.0)
+        launch(forces_too=False, sums_momenta=True, masked=True)
+        wp.synchronize()
+        for name, array in arrays.items():
+            assert torch.equal(array[mask_E], whole[name][mask_E]), name
+            assert (array[~mask_E] == 7.0).all(), name
+        launch(forces_too=False)
+        mjw.subtree_vel(world.warp_model, world.warp_data_E)
+        wp.synchronize()
+    for name in ("subtree_linvel", "subtree_angmom"):
+        scale = 1.0 + arrays[name].abs().max()
+        torch.testing.assert_close(whole[name] / scale, arrays[name] / scale, atol=3e-6, rtol=0, msg=name)
+
+
+@pytest.mark.gpu
 def test_captured_steps_reach_what_mujoco_warps_kernels_reach():
     reached = []
     for one_kernel_dynamics in (None, False):

@@ -64,7 +64,7 @@ def rollouts(name, *, captured, count=3, compile=False):
     collector = RolloutCollector(env, random_policy, rollout_length=8, cfg=cfg)
     torch.manual_seed(0)
     found = [collector.collect().clone() for _ in range(count)]
-    assert (collector._compiled is not None) == compile
+    assert (collector.compiled_step is not None) == compile
     return found
 
 

@@ -24,7 +24,7 @@ from ksim_rl.modules import (
     recurrent_transforms,
     update_normalizers,
 )
-from ksim_rl.modules.recurrent_cells import gru_layer, lstm_layer
+from ksim_rl.modules.recurrent_cells import GRU, LSTM
 from ksim_rl.testing import count_syncs
 from ksim_rl.testing.counter_env import CounterEnv
 
@@ -127,12 +127,10 @@ def test_gradients_are_those_of_finite_differences(kind):
     reset_TB1 = torch.tensor([[False, False], [True, False], [False, False]])[..., None]
     bias = torch.randn(gates * 2, dtype=torch.float64, requires_grad=True)
     if kind == "lstm":
-        assert torch.autograd.gradcheck(
-            lambda *x: lstm_layer(x[0], x[1], x[2:], reset_TB1), (gates_TB, weight, *state)
-        )
+        assert torch.autograd.gradcheck(lambda *x: LSTM.apply(*x, reset_TB1), (gates_TB, weight, *state))
     else:
         assert torch.autograd.gradcheck(
-            lambda *x: gru_layer(*x[:3], x[3:], reset_TB1), (gates_TB, weight, bias, state[0])
+            lambda *x: GRU.apply(*x, reset_TB1), (gates_TB, weight, bias, state[0])
         )
 
 

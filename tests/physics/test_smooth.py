@@ -191,6 +191,32 @@ def test_refresh_leaves_what_belongs_to_the_last_substep():
         np.testing.assert_allclose(world.view(name)[1].numpy().ravel(), theirs, atol=3e-5, err_msg=name)
 
 
+def test_refresh_sums_the_momenta_of_subtrees_if_they_are_read():
+    world = moved()
+    sums = {name: world.view(name) for name in ("subtree_linvel", "subtree_angmom")}
+    world.refresh()
+    for row in range(NUM_ENVS):
+        expected = in_c(world, mixed(), row)
+        mujoco.mj_subtreeVel(mixed(), expected)
+        for name, found in sums.items():
+            np.testing.assert_allclose(
+                found[row], getattr(expected, name), atol=3e-5, rtol=3e-5, err_msg=name
+            )
+
+
+def test_refresh_of_rows_leaves_the_others_alone():
+    world, whole = moved(), moved()
+    named_E = torch.tensor([False, True, False])
+    names = ("xpos", "site_xpos", "site_xmat", "subtree_com", "cdof", "cvel", "cdof_dot")
+    for name in names:
+        world.view(name).fill_(7.0)
+    world.refresh(named_E)
+    whole.refresh()
+    for name in names:
+        assert torch.equal(world.view(name)[named_E], whole.view(name)[named_E]), name
+        assert (world.view(name)[~named_E] == 7.0).all(), name
+
+
 def test_each_world_has_its_own_masses_dampers_and_springs():
     world = moved(per_world_fields=PER_WORLD)
     draw_parameters(world)

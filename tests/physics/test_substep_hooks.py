@@ -66,10 +66,28 @@ def test_sensors_are_read_on_every_substep_only_if_asked():
     assert not torch.equal(readings["every"][0], readings["every"][1])
 
 
+def test_of_contacts_alone_are_those_that_all_on_every_substep_have():
+    readings = {}
+    for which in ("contacts", "every"):
+        world, seen = standing_quadrupeds(), readings.setdefault(which, [])
+        world.step(
+            3,
+            after=[lambda seen=seen, world=world: seen.append(world.sensordata_EL.clone())],
+            sensors=which,
+        )
+    touches, accelerates = (sensor(world, name) for name in ("rear_left_contact", "acceleration"))
+    for own, true in zip(readings["contacts"], readings["every"], strict=True):
+        assert torch.equal(own[:, touches], true[:, touches]) and own[:, touches].any()
+    assert not readings["contacts"][1][:, accelerates].any()
+    assert torch.equal(readings["contacts"][2][:, accelerates], readings["every"][2][:, accelerates])
+
+
 def test_every_without_hooks_reaches_the_same_state():
     last, every = standing_quadrupeds(), standing_quadrupeds()
     last.step(3)
     every.step(3, sensors="every")
+    for world in (last, every):
+        world.refresh()
     for name in STATE:
         assert torch.equal(last.view(name), every.view(name)), name
 

@@ -23,7 +23,7 @@ def test_step_is_bit_identical_to_mujoco_warp():
         for name in ("qpos", "qvel", "ctrl", "qacc_warmstart", "time"):
             wp.to_torch(getattr(d, name)).copy_(world.view(name))
         for _ in range(3):
-            world.step(4)
+            world.step(4, sensors="every")
             for _ in range(4):
                 mjw.step(m, d)
     for name in ("qpos", "qvel", "qacc", "time", "sensordata", "actuator_force"):

@@ -274,7 +274,7 @@ def test_what_a_hook_changes_counts_in_the_next_iteration():
 
 
 def rows_without_times(trainer_rows):
-    timed = ("seconds", "throughput/env_states_per_s")
+    timed = ("seconds", "throughput/env_states_per_s", "warm_up_s")
     return [{name: value for name, value in row.items() if name not in timed} for row in trainer_rows]
 
 

@@ -98,15 +98,19 @@ class PPOUpdate(DatasetUpdate):
         rollout_ET = self.rollout_ET
         if isinstance(self.fused, str):
             steps = self._torch_steps(rollout_ET)
+            self._count()
         else:
-            orders = [self.dataset.epoch_order() for _ in range(self.cfg.num_epochs)]
-            steps, left_out = self.fused(rollout_ET, orders)
+            orders = (self.dataset.epoch_order() for _ in range(self.cfg.num_epochs))
+            steps, left_out = self.fused(rollout_ET, orders, self._count)
             self.dataset.non_finite_count.add_(left_out)
         self._measure_(steps)
+
+    def _count(self) -> None:
         if self._scale_keys:
-            self._std.copy_(torch.stack([rollout_ET.get(key).nanmean() for key in self._scale_keys]).mean())
-        # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
-        update_normalizers(rollout_ET, self.actor, self.critic)
+            scales = [self.rollout_ET.get(key).nanmean() for key in self._scale_keys]
+            self._std.copy_(torch.stack(scales).mean())
+        # All gradient steps see the statistics that the rollout's actions were drawn with.
+        update_normalizers(self.rollout_ET, self.actor, self.critic)
 
     def _torch_steps(self, rollout_ET: TensorDictBase) -> dict[str, Tensor]:
         """Make all gradient steps with torch; return what each measured, [steps]."""

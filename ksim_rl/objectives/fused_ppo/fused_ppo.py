@@ -9,7 +9,7 @@ moved the gradient of each parameter by 0.2 to 0.6 percent of its norm, where to
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ksim_rl import ranks
+from ksim_rl.device.streams import beside, warp_scope, warp_stream
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
 from ksim_rl.objectives.fused_ppo.dataset import FusedDataset, Observe
 from ksim_rl.objectives.fused_ppo.layer_kernels import layer, output_gradients
@@ -137,6 +138,7 @@ class FusedPPO:
         rows = self.batch if mirror is None else 2 * self.batch
         num_steps = cfg.num_epochs * num_minibatches
         device, dtype = networks.parameters[0].device, getattr(torch, cfg.precision)
+        self._side = warp_stream(torch.cuda.Stream(device)) if device.type == "cuda" else None
         self.parameters = FusedParameters(
             networks, layout, optimizer=optimizer, dtype=dtype, num_steps=num_steps
         )
@@ -160,7 +162,7 @@ class FusedPPO:
         dataset, parameters = self.dataset, self.parameters
         zeros = partial(torch.zeros, device=dataset.records.device)
         blocks, dtype = parts(rows, tuning.block), dataset.obs.dtype
-        programs = parts(layout.num_weights, tuning.size) + parts(layout.num_biases, tuning.columns)
+        programs = 2 * parts(layout.num_padded, tuning.size) + 1
         # Where the image of each action comes from, counted from 1, times its sign; see `output_gradients`.
         image_of = torch.arange(1, layout.out + 1, device=dataset.records.device, dtype=torch.int32)
         if mirror is not None:
@@ -190,11 +192,11 @@ class FusedPPO:
             # Tiles at the edge read past the last row.
             "inputs": zeros(2 * rows * layout.inputs + tuning.tile, dtype=dtype),
             "slopes": zeros(2 * rows * layout.gradients + tuning.tile, dtype=dtype),
-            "weight_partials": zeros(tuning.splits, 2, layout.num_weights),
-            "block_partials": zeros(blocks, 2, layout.num_biases + NUM_STATISTICS),
+            "weight_partials": zeros(tuning.splits, 2, layout.num_padded),
+            "block_partials": zeros(blocks, 2, layout.out + NUM_STATISTICS),
             # Of both networks; ranks add them up together with the summary behind them.
             "gradients": zeros(2 * layout.num_padded + self._summary.shape[1]),
-            "squares": zeros(2 * programs),
+            "squares": zeros(programs),
             "image_of": image_of,
             "skipped": self.guard.skipped,
             "skipped_in_a_row": self.guard.skipped_in_a_row,
@@ -207,8 +209,8 @@ class FusedPPO:
             "RECORD": dataset.records.shape[1],
             "NUM_STATISTICS": NUM_STATISTICS,
             "NUM_GRADIENTS": 2 * layout.num_padded,
-            "NUM_SQUARES": 2 * programs,
-            "SQUARES": power_of_two(2 * programs),
+            "NUM_SQUARES": programs,
+            "SQUARES": power_of_two(programs),
             "BLOCKS": blocks,
             "MIRROR": self._mirrored,
             "CLIP_VALUE": clip_value > 0.0,
@@ -218,28 +220,34 @@ class FusedPPO:
         }
 
     def __call__(
-        self, rollout_ET: TensorDictBase, orders: Sequence[Int64[Tensor, " D"]]
+        self, rollout_ET: TensorDictBase, orders: Iterable[Int64[Tensor, " D"]], *aside: Callable[[], None]
     ) -> tuple[dict[str, Float[Tensor, " steps"]], Int64[Tensor, ""]]:
         """Make all gradient steps of an update.
 
         `rollout_ET`, `["E","T"]`, may be time-major in memory, as that of a collector. `orders` has for each epoch the
-        env states in the order of the minibatches, counted env by env. Returned are what each gradient step measured,
-        by the names of `SUMMARY`, and how many env states took no part because an element was not finite.
+        env states in the order of the minibatches, counted env by env; a GPU draws them while it reads the rollout, and
+        does what is `aside` beside the steps, which do not. Returned are what each gradient step measured, by the names
+        of `SUMMARY`, and how many env states took no part because an element was not finite.
         """
         num_envs, length = rollout_ET.batch_size
-        self.parameters.load()
-        left_out = self.dataset.read(rollout_ET, evaluate=self._evaluate)
-        step = 0
-        for order_D in orders:
+        places: list[Tensor] = []
+
+        def place() -> None:
+            order_N = torch.cat([*orders]).to(torch.int32)
             # From env by env to step by step.
-            index_D = (order_D % length) * num_envs + order_D.div(length, rounding_mode="floor")
-            for index_B in index_D.to(torch.int32).split(self.batch):
-                if len(self.dataset.records) > self.dataset.size:
-                    index_B = torch.cat([index_B, index_B + self.dataset.size])
-                self._multiply(index_B)
-                self._improve(step)
-                step += 1
-        self.parameters.store()
+            places.append((order_N % length) * num_envs + order_N.div(length, rounding_mode="floor"))
+
+        with warp_scope(self._summary.device):
+            with beside(self._side, place):
+                self.parameters.load()
+                left_out = self.dataset.read(rollout_ET, evaluate=self._evaluate)
+            with beside(self._side, *aside):
+                for step, index_B in enumerate(places[0].split(self.batch)):
+                    if len(self.dataset.records) > self.dataset.size:
+                        index_B = torch.cat([index_B, index_B + self.dataset.size])
+                    self._multiply(index_B)
+                    self._improve(step)
+                self.parameters.store()
         names = SUMMARY if self._mirrored else SUMMARY[:-1]
         return dict(zip(names, self._summary.unbind(1), strict=False)), left_out
 
@@ -300,7 +308,7 @@ class FusedPPO:
         rate = self.optimizer.param_groups[0]["lr"]
         own = summary if ranks.size() == 1 else given["gradients"][given["NUM_GRADIENTS"] :]
         programs = len(given["squares"])
-        launch(sum_gradients, (programs + 1,), given, learning_rate=rate, summary=own)
+        launch(sum_gradients, (programs,), given, learning_rate=rate, summary=own)
         if ranks.size() > 1:
             ranks.sum_(given["gradients"])
             launch(take_means, (programs,), given, learning_rate=rate, summary=summary)

@@ -38,9 +38,9 @@ def _linear(
 
 @triton.jit
 def layer(
-    inputs, slopes, weights, biases, block_partials,
+    inputs, slopes, weights, biases,
     num_rows, width, length, read_at, slope_at, output_at,
-    FORWARD: tl.constexpr, NUM_PADDED: tl.constexpr, NUM_BIASES: tl.constexpr, NUM_STATISTICS: tl.constexpr,
+    FORWARD: tl.constexpr, NUM_PADDED: tl.constexpr,
     INPUTS: tl.constexpr, GRADIENTS: tl.constexpr, ACTIVATION: tl.constexpr,
     BLOCK: tl.constexpr, TILE: tl.constexpr, DEPTH: tl.constexpr, TILE_STAGES: tl.constexpr,
 ):  # fmt: skip
@@ -78,8 +78,6 @@ def layer(
         right = weights + column[None, :]
         acc = _product(slope_rows + read_at, right, keep, inside, length, width, acc, DEPTH, TILE_STAGES)
         gradient = acc * tl.load(slope_to, mask=keep & inside, other=0.0).to(tl.float32)
-        sums = block_partials + (block * 2 + network) * (NUM_BIASES + NUM_STATISTICS) + slope_at
-        tl.store(sums + column, tl.sum(gradient, 0), mask=column < width)
         tl.store(slope_to, gradient.to(dtype), mask=keep & inside)
 
 
@@ -88,14 +86,14 @@ def output_gradients(
     records, order, inputs, slopes, weights, biases, block_partials, image_of,
     num_rows, fan_in, input_at, slope_at,
     log_ratio_low, log_ratio_high, clip_value, entropy_coeff, critic_coeff, symmetry_coeff,
-    NUM_PADDED: tl.constexpr, NUM_BIASES: tl.constexpr, NUM_STATISTICS: tl.constexpr,
+    NUM_PADDED: tl.constexpr, NUM_STATISTICS: tl.constexpr,
     RECORD: tl.constexpr, INPUTS: tl.constexpr, GRADIENTS: tl.constexpr, ACTIONS: tl.constexpr, OUT: tl.constexpr,
     LOG_STD: tl.constexpr, MIN_STD: tl.constexpr, STATE_STD: tl.constexpr, MIRROR: tl.constexpr,
     CLIP_VALUE: tl.constexpr, BLOCK: tl.constexpr, DEPTH: tl.constexpr, TILE_STAGES: tl.constexpr,
 ):  # fmt: skip
     """Run BLOCK rows through the last layer and the loss: program (i, n) is of network n (0: actor, 1: critic).
 
-    Gradients at the outputs go to `slopes` [2, num_rows, GRADIENTS] from `slope_at` on, their sums and the statistics
+    Gradients at the outputs go to `slopes` [2, num_rows, GRADIENTS] from `slope_at` on, that of the std and statistics
     to `block_partials`, as in `minibatch_gradients`. Weights and biases are the last layer's, NUM_PADDED apart. With
     MIRROR the second half of the rows, images of the first half, has the mirror loss only; `image_of` [OUT] has the
     source of each mirrored action, counted from 1, times its sign.
@@ -110,10 +108,8 @@ def output_gradients(
     weights += network * NUM_PADDED
     biases += network * NUM_PADDED
     inputs += wide * num_rows * INPUTS + input_at
-    partials = block_partials + (block * 2 + network) * (NUM_BIASES + NUM_STATISTICS)
-    out_bias_at = partials + (NUM_BIASES - 2 * OUT)
-    d_std_at = out_bias_at + OUT
-    statistics = partials + NUM_BIASES
+    d_std_at = block_partials + (block * 2 + network) * (OUT + NUM_STATISTICS)
+    statistics = d_std_at + OUT
     dtype = slopes.dtype.element_ty
     slope_rows = slopes + wide * num_rows * GRADIENTS + (rows[:, None] * GRADIENTS + slope_at)
     left = inputs + rows[:, None] * INPUTS
@@ -151,5 +147,4 @@ def output_gradients(
             tl.store(statistics + 5, 0.5 * symmetry_coeff / ACTIONS * tl.sum(gap * gap))
     else:
         d_out = value_gradient(out, record, judged, statistics, clip_value, critic_coeff, OUT, CLIP_VALUE)
-    tl.store(out_bias_at + output, tl.sum(d_out, 0))
     tl.store(slope_rows + output[None, :], d_out.to(dtype), mask=keep)

@@ -131,7 +131,8 @@ class FusedLayout:
         """Return what each program of the weight gradient's kernel computes, on the CPU.
 
         Columns: network, first column among the layer inputs, first among the gradients, first place in the padded
-        form, width of the layer's input, and how many columns of inputs and of gradients the tile has.
+        form, width of the layer's input, how many columns of inputs and of gradients the tile has, and the place of the
+        first of its biases, or -1 where another tile has them.
         """
         tiles = []
         for network in range(2):
@@ -140,7 +141,8 @@ class FusedLayout:
                     for column in range(0, at.fan_in, tile):
                         first = network, at.input + column, at.gradient + row
                         used = min(tile, at.fan_in - column), min(tile, at.fan_out - row)
-                        tiles.append([*first, at.weight + row * at.fan_in + column, at.fan_in, *used, 0])
+                        bias = -1 if column else self.num_weights + at.gradient + row
+                        tiles.append([*first, at.weight + row * at.fan_in + column, at.fan_in, *used, bias])
         return torch.tensor(tiles, dtype=torch.int32)
 
 
@@ -167,8 +169,7 @@ class Tuning:
     tile_warps: int = 8
     splits: int = 8  # programs that share a tile, each with a part of the minibatch
     size: int = 1024  # elements per program in sums and Adam
-    columns: int = 32  # of the blocks in which sums over programs are taken, as are the rows
-    rows: int = 64
+    rows: int = 256  # of the blocks in which sums over programs are taken
 
     @classmethod
     def of(cls, layout: FusedLayout) -> "Tuning":

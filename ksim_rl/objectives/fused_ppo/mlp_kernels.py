@@ -57,10 +57,13 @@ def _outputs(
     column2 = tl.arange(0, H2)
     output = tl.arange(0, OUT)
     acc = tl.zeros((BLOCK, H2), dtype=tl.float32)
+    # Biases are loaded a chunk ahead: those of the same chunk each thread would copy to shared memory, like weights.
+    bias = tl.load(biases + column)
     for first in tl.range(0, H1, CHUNK, num_stages=STAGES):
         weight1 = tl.load(weights + ((first + column)[None, :] * OBS + obs_column[:, None]))
         weight2 = tl.load(weights + (SECOND_AT + column2[None, :] * H1 + (first + column)[:, None]))
-        hidden = tl.dot(observed, weight1) + tl.load(biases + first + column)[None, :]
+        hidden = tl.dot(observed, weight1) + bias[None, :]
+        bias = tl.load(biases + (first + CHUNK) % H1 + column)
         hidden = activate(hidden, ACTIVATION).to(observed.dtype)
         if STORE:
             tl.store(inputs + (input_rows + (OBS + first + column[None, :])), hidden, mask=keep)
@@ -69,10 +72,12 @@ def _outputs(
     if STORE:
         tl.store(inputs + (input_rows + (OBS + H1 + column2[None, :])), second, mask=keep)
     out = tl.zeros((BLOCK, OUT), dtype=tl.float32)
+    bias = tl.load(biases + H1 + H2 + column)
     for first in tl.range(0, H3, CHUNK, num_stages=STAGES):
         weight3 = tl.load(weights + (THIRD_AT + (first + column)[None, :] * H2 + column2[:, None]))
         weight4 = tl.load(weights + (OUT_AT + output[None, :] * H3 + (first + column)[:, None]))
-        hidden = tl.dot(second, weight3) + tl.load(biases + H1 + H2 + first + column)[None, :]
+        hidden = tl.dot(second, weight3) + bias[None, :]
+        bias = tl.load(biases + H1 + H2 + (first + CHUNK) % H3 + column)
         hidden = activate(hidden, ACTIVATION).to(observed.dtype)
         if STORE:
             tl.store(inputs + (input_rows + (OBS + H1 + H2 + first + column[None, :])), hidden, mask=keep)
@@ -101,7 +106,7 @@ def state_values(
 def minibatch_gradients(
     obs, records, order, weights, biases, inputs, slopes, block_partials, num_rows, num_obs,
     log_ratio_low, log_ratio_high, clip_value, entropy_coeff, critic_coeff,
-    NUM_PADDED: tl.constexpr, NUM_BIASES: tl.constexpr, NUM_STATISTICS: tl.constexpr,
+    NUM_PADDED: tl.constexpr, NUM_STATISTICS: tl.constexpr,
     RECORD: tl.constexpr, INPUTS: tl.constexpr, GRADIENTS: tl.constexpr,
     OBS: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr, ACTIONS: tl.constexpr,
     OUT: tl.constexpr, LOG_STD: tl.constexpr, MIN_STD: tl.constexpr, CLIP_VALUE: tl.constexpr,
@@ -111,8 +116,8 @@ def minibatch_gradients(
 
     Program (i, n) takes BLOCK rows of the minibatch, the env states `order` [B], through network n (0: actor, 1:
     critic). It leaves the inputs of all layers [2, B, INPUTS], the gradients of the sum of the losses at all layer
-    outputs [2, B, GRADIENTS], and what the block adds to the gradients of biases and std and to the statistics of the
-    loss: [blocks, 2, NUM_BIASES + NUM_STATISTICS]. Weights and biases are in padded form, [2, NUM_PADDED].
+    outputs [2, B, GRADIENTS], and what the block adds to the gradient of the std and to the statistics of the loss:
+    [blocks, 2, OUT + NUM_STATISTICS]. Weights and biases are in padded form, [2, NUM_PADDED].
     """
     block = tl.program_id(0)
     network = tl.program_id(1)
@@ -134,7 +139,8 @@ def minibatch_gradients(
     obs += wide * num_obs * OBS
     inputs += wide * num_rows * INPUTS
     slopes += wide * num_rows * GRADIENTS
-    partials = block_partials + (block * 2 + network) * (NUM_BIASES + NUM_STATISTICS)
+    d_std_at = block_partials + (block * 2 + network) * (OUT + NUM_STATISTICS)
+    statistics = d_std_at + OUT
     input_rows = rows[:, None] * INPUTS
     gradient_rows = rows[:, None] * GRADIENTS
 
@@ -145,8 +151,6 @@ def minibatch_gradients(
     )
 
     record = records + index.to(tl.int64) * RECORD
-    d_std_at = partials + H1 + H2 + H3 + OUT
-    statistics = partials + NUM_BIASES
     if network == 0:
         raw_std = tl.load(
             biases + H1 + H2 + H3 + OUT + output, mask=output < ACTIONS, other=0.0 if LOG_STD else 1.0
@@ -157,9 +161,6 @@ def minibatch_gradients(
         )  # fmt: skip
     else:
         d_out = value_gradient(out, record, valid, statistics, clip_value, critic_coeff, OUT, CLIP_VALUE)
-        tl.store(d_std_at + output, tl.zeros((OUT,), dtype=tl.float32))
-
-    tl.store(partials + H1 + H2 + H3 + output, tl.sum(d_out, 0))
     d_out = d_out.to(observed.dtype)
     tl.store(slopes + (gradient_rows + (H1 + H2 + H3 + output[None, :])), d_out, mask=keep)
     # From here on threads read hidden layers that others of the block have written.
@@ -172,33 +173,30 @@ def minibatch_gradients(
             inputs + (input_rows + (OBS + H1 + H2 + first + column[None, :])), mask=keep, other=0.0
         )
         slope = tl.dot(d_out, weight4) * slope_of(hidden.to(tl.float32), ACTIVATION)
-        tl.store(partials + H1 + H2 + first + column, tl.sum(slope, 0))
         slope = slope.to(observed.dtype)
         tl.store(slopes + (gradient_rows + (H1 + H2 + first + column[None, :])), slope, mask=keep)
         acc = tl.dot(slope, weight3, acc)
     middle = tl.load(inputs + (input_rows + (OBS + H1 + column2[None, :])), mask=keep, other=0.0)
     second = acc * slope_of(middle.to(tl.float32), ACTIVATION)
-    tl.store(partials + H1 + column2, tl.sum(second, 0))
     second = second.to(observed.dtype)
     tl.store(slopes + (gradient_rows + (H1 + column2[None, :])), second, mask=keep)
     for first in tl.range(0, H1, CHUNK, num_stages=STAGES):
         weight2 = tl.load(weights + (SECOND_AT + column2[:, None] * H1 + (first + column)[None, :]))
         hidden = tl.load(inputs + (input_rows + (OBS + first + column[None, :])), mask=keep, other=0.0)
         slope = tl.dot(second, weight2) * slope_of(hidden.to(tl.float32), ACTIVATION)
-        tl.store(partials + first + column, tl.sum(slope, 0))
         tl.store(slopes + (gradient_rows + (first + column[None, :])), slope.to(observed.dtype), mask=keep)
 
 
 @triton.jit
 def weight_gradients(
     tiles, inputs, slopes, weight_partials, num_rows,
-    NUM_WEIGHTS: tl.constexpr, INPUTS: tl.constexpr, GRADIENTS: tl.constexpr,
+    NUM_PADDED: tl.constexpr, INPUTS: tl.constexpr, GRADIENTS: tl.constexpr,
     ROWS: tl.constexpr, TILE: tl.constexpr, DEPTH: tl.constexpr, TILE_STAGES: tl.constexpr,
 ):  # fmt: skip
     """Multiply gradients by layer inputs: program (i, s) computes tile i of `FusedLayout.weight_tiles` over split s.
 
-    A split has ROWS rows of the minibatch. Of several splits each writes its own sum, [splits, 2, NUM_WEIGHTS], so that
-    the result does not depend on who is first.
+    A split has ROWS rows of the minibatch. Of several splits each writes its own sum, [splits, 2, NUM_PADDED], so that
+    the result does not depend on who is first. Biases have an input of one.
     """
     tile = tiles + tl.program_id(0) * 8
     split = tl.program_id(1)
@@ -209,17 +207,24 @@ def weight_gradients(
     stride = tl.load(tile + 4)
     input_columns = tl.load(tile + 5)
     gradient_columns = tl.load(tile + 6)
+    bias = tl.load(tile + 7)
     row = tl.arange(0, DEPTH)
     lane = tl.arange(0, TILE)
     # Columns past the tile's own belong to the next layer or row: they are multiplied, and not stored.
     inputs += network.to(tl.int64) * num_rows * INPUTS + first_input
     slopes += network.to(tl.int64) * num_rows * GRADIENTS + first_gradient
     acc = tl.zeros((TILE, TILE), dtype=tl.float32)
+    # The smallest product that there is, of which one column is used: a sum over rows of its own would take longer.
+    sums = tl.zeros((TILE, 16), dtype=tl.float32)
+    one = (tl.arange(0, 16)[None, :] == row[:, None] * 0).to(inputs.dtype.element_ty)
     for first in tl.range(0, ROWS, DEPTH, num_stages=TILE_STAGES):
         rows = (split * ROWS + first + row)[:, None]
         layer_input = tl.load(inputs + (rows * INPUTS + lane[None, :]), mask=rows < num_rows, other=0.0)
         gradient = tl.load(slopes + (rows * GRADIENTS + lane[None, :]), mask=rows < num_rows, other=0.0)
         acc = tl.dot(tl.trans(gradient), layer_input, acc)
-    at = (split * 2 + network).to(tl.int64) * NUM_WEIGHTS + place
-    keep = (lane[:, None] < gradient_columns) & (lane[None, :] < input_columns)
-    tl.store(weight_partials + at + (lane[:, None] * stride + lane[None, :]), acc, mask=keep)
+        sums = tl.dot(tl.trans(gradient), one, sums)
+    weight_partials += (split * 2 + network).to(tl.int64) * NUM_PADDED
+    inside = lane < gradient_columns
+    keep = inside[:, None] & (lane[None, :] < input_columns)
+    tl.store(weight_partials + place + (lane[:, None] * stride + lane[None, :]), acc, mask=keep)
+    tl.store(weight_partials + bias + lane, tl.sum(sums, 1), mask=inside & (bias >= 0))

@@ -34,14 +34,8 @@ EPS = tl.constexpr(1.1920929e-07)
 
 @triton.jit
 def _block_sums(
-    partials,
-    column,
-    inside,
-    WIDTH: tl.constexpr,
-    BLOCKS: tl.constexpr,
-    ROWS: tl.constexpr,
-    COLUMNS: tl.constexpr,
-):
+    partials, column, inside, WIDTH: tl.constexpr, BLOCKS: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr
+):  # fmt: skip
     sums = tl.zeros((ROWS, COLUMNS), dtype=tl.float32)
     for first in range(0, BLOCKS, ROWS):
         block = (first + tl.arange(0, ROWS))[:, None]
@@ -88,52 +82,48 @@ def sum_gradients(
     weight_partials, block_partials, gradients, squares, biases, learning_rate, summary, num_rows,
     entropy_coeff, critic_coeff, desired_kl, learning_rate_min, learning_rate_max,
     RANKS: tl.constexpr, SPLITS: tl.constexpr, BLOCKS: tl.constexpr,
-    NUM_WEIGHTS: tl.constexpr, NUM_BIASES: tl.constexpr, NUM_STATISTICS: tl.constexpr,
+    NUM_PADDED: tl.constexpr, NUM_BIASES: tl.constexpr, NUM_STATISTICS: tl.constexpr,
     ACTIONS: tl.constexpr, OUT: tl.constexpr, LOG_STD: tl.constexpr, MIN_STD: tl.constexpr,
     STATE_STD: tl.constexpr, MIRROR: tl.constexpr, ADAPTIVE: tl.constexpr,
-    SIZE: tl.constexpr, COLUMNS: tl.constexpr, ROWS: tl.constexpr,
+    SIZE: tl.constexpr, ROWS: tl.constexpr,
 ):  # fmt: skip
     """Add up what splits and blocks left, divide by the number of env states, and adapt the learning rate.
 
-    The first programs take SIZE weights each, the next COLUMNS biases each, and leave mean gradients [2, NUM_WEIGHTS +
-    NUM_BIASES] and the sum of their squares; the last takes the loss's statistics. Ranks multiply all by their SHARE.
+    The first programs take SIZE weights and biases each, and leave mean gradients [2, NUM_PADDED] and the sum of their
+    squares; the last takes the std and the loss's statistics. Ranks multiply all by their SHARE.
     """
-    WEIGHT_PROGRAMS: tl.constexpr = (NUM_WEIGHTS + SIZE - 1) // SIZE
-    BIAS_PROGRAMS: tl.constexpr = (NUM_BIASES + COLUMNS - 1) // COLUMNS
-    NUM_PADDED: tl.constexpr = NUM_WEIGHTS + NUM_BIASES
-    WIDTH: tl.constexpr = NUM_BIASES + NUM_STATISTICS
+    PROGRAMS: tl.constexpr = (NUM_PADDED + SIZE - 1) // SIZE
+    STD_AT: tl.constexpr = NUM_PADDED - OUT
+    WIDTH: tl.constexpr = OUT + NUM_STATISTICS
     program = tl.program_id(0)
     statistic = tl.arange(0, NUM_STATISTICS)
     # The first statistic of both networks is the number of env states that take part. It may be none.
     of_policy = statistic < (6 if STATE_STD or MIRROR else 4)
-    sums = _block_sums(block_partials, NUM_BIASES + statistic, of_policy, WIDTH, BLOCKS, ROWS, NUM_STATISTICS)
+    sums = _block_sums(block_partials, OUT + statistic, of_policy, WIDTH, BLOCKS, ROWS, NUM_STATISTICS)
     counted = _column(sums, 0, NUM_STATISTICS)
     count = tl.maximum(counted, 1.0)
     divisor = count if RANKS == 1 else num_rows * (1.0 * RANKS)
-    if program < 2 * WEIGHT_PROGRAMS:
-        network = program // WEIGHT_PROGRAMS
-        at = (program % WEIGHT_PROGRAMS) * SIZE + tl.arange(0, SIZE)
-        kept = at < NUM_WEIGHTS
-        weight = tl.zeros((SIZE,), dtype=tl.float32)
+    if program < 2 * PROGRAMS:
+        network = program // PROGRAMS
+        at = (program % PROGRAMS) * SIZE + tl.arange(0, SIZE)
+        kept = at < (NUM_PADDED if STATE_STD else STD_AT)
+        total = tl.zeros((SIZE,), dtype=tl.float32)
         for split in tl.static_range(SPLITS):
-            place = (split * 2 + network) * NUM_WEIGHTS + at
-            weight += tl.load(weight_partials + place, mask=kept, other=0.0)
-        weight = weight / divisor
-        tl.store(gradients + (network * NUM_PADDED + at), weight, mask=kept)
-        tl.store(squares + program, tl.sum(weight * weight))
-    elif program < 2 * (WEIGHT_PROGRAMS + BIAS_PROGRAMS):
-        network = (program - 2 * WEIGHT_PROGRAMS) // BIAS_PROGRAMS
-        bias = ((program - 2 * WEIGHT_PROGRAMS) % BIAS_PROGRAMS) * COLUMNS + tl.arange(0, COLUMNS)
-        inside = bias < NUM_BIASES
-        total = _block_sums(block_partials + network * WIDTH, bias, inside, WIDTH, BLOCKS, ROWS, COLUMNS)
+            place = (split * 2 + network) * NUM_PADDED + at
+            total += tl.load(weight_partials + place, mask=kept, other=0.0)
         total = total / divisor
-        tl.store(gradients + (network * NUM_PADDED + NUM_WEIGHTS + bias), total, mask=inside)
+        tl.store(gradients + (network * NUM_PADDED + at), total, mask=kept)
         tl.store(squares + program, tl.sum(total * total))
     else:
+        output = tl.arange(0, OUT)
+        if not STATE_STD:
+            d_std = _block_sums(block_partials, output, output >= 0, WIDTH, BLOCKS, ROWS, OUT) / divisor
+            tl.store(gradients + STD_AT + output, d_std)
+            tl.store(squares + program, tl.sum(d_std * d_std))
         policy = sums / count
         of_value = statistic < 6
         value_sums = _block_sums(
-            block_partials + WIDTH, NUM_BIASES + statistic, of_value, WIDTH, BLOCKS, ROWS, NUM_STATISTICS
+            block_partials + WIDTH, OUT + statistic, of_value, WIDTH, BLOCKS, ROWS, NUM_STATISTICS
         )
         value = value_sums / count
         objective = _column(policy, 1, NUM_STATISTICS)
@@ -142,12 +132,11 @@ def sum_gradients(
         target = _column(value, 2, NUM_STATISTICS)
         error = _column(value, 4, NUM_STATISTICS)
         of_values = block_partials + WIDTH
-        target_variance = _variance(of_values, NUM_BIASES + 2, NUM_BIASES, target, count, WIDTH, BLOCKS, ROWS)
-        error_variance = _variance(of_values, NUM_BIASES + 4, NUM_BIASES, error, count, WIDTH, BLOCKS, ROWS)
+        target_variance = _variance(of_values, OUT + 2, OUT, target, count, WIDTH, BLOCKS, ROWS)
+        error_variance = _variance(of_values, OUT + 4, OUT, error, count, WIDTH, BLOCKS, ROWS)
         if STATE_STD:
             entropy = _column(policy, 4, NUM_STATISTICS)
         else:
-            output = tl.arange(0, OUT)
             raw = tl.load(
                 biases + (NUM_BIASES - OUT + output), mask=output < ACTIONS, other=0.0 if LOG_STD else 1.0
             )

@@ -122,6 +122,7 @@ def step(
     contacts: ContactReadings | None = None,
     integrate: Callable[[], None] | None = None,
     aside: wp.Stream | None = None,
+    collide: Callable[[], None] | None = None,
     *,
     sensors: bool,
 ) -> None:
@@ -130,8 +131,9 @@ def step(
     The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
     not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel; `make_rows`,
     which needs it, the constraint rows as one, with the lists of contacts that `contacts` reads; and `integrate` what
-    advances the state. On a stream `aside`, dynamics go on beside the collision pass, which reads where geoms are, and
-    the solver orders the worlds, by the last substep. Then it solves beside the sensors of positions and velocities.
+    advances the state. `collide` is a collision pass other than MuJoCo Warp's. On a stream `aside`, dynamics go on
+    beside that pass, which reads where geoms are, and the solver orders the worlds, by the last substep. Then it solves
+    beside the sensors of positions and velocities.
     """
     m, d = warp_model, warp_data_E
     if dynamics is None or m.callback.sensor:
@@ -145,7 +147,7 @@ def step(
         dynamics(goes_on=False)
         with beside(aside, partial(dynamics, places_geoms=False), partial(solve, solves=False)):
             if m.opt.run_collision_detection:
-                mjw.collision(m, d)
+                collide() if collide is not None else mjw.collision(m, d)
         if make_rows is None:
             mjw.make_constraint(m, d)
         else:

@@ -1,6 +1,8 @@
 // Part 3: kinematics (mj_kinematics). A chain from a root to a leaf is one lane's, whatever chains share: it passes the
 // pose on from body to body in registers, and lanes that compute the same body find and write the same.
 
+if (problem.masked && !problem.mask.data[world])
+    return;
 const float* const qpos = row_of(problem.qpos);
 const float* const qpos0 = model_row(problem.qpos0);
 auto first_link = [&](int chain) { return look_up(problem.body_branch_start, chain); };

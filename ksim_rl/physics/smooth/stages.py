@@ -24,8 +24,9 @@ INTEGRATION = ("world", "derivative", "factorization", "free_bodies", "advance")
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
 LANES, CUDA_THREADS = (8, 16, 32), 32
-# Whether it writes where geoms are, goes on after that, and after the velocities to the inertia matrix and the forces.
-WHOLE = {"places_geoms": True, "goes_on": True, "forces_too": True}
+# Whether it writes where geoms are, goes on after that, and after the velocities to the inertia matrix and the forces;
+# or else sums the momenta of subtrees there, and whether a mask says for which worlds it does all that.
+WHOLE = {"places_geoms": True, "goes_on": True, "forces_too": True, "sums_momenta": False, "masked": False}
 _ENUMS = {
     "FREE": mujoco.mjtJoint.mjJNT_FREE,
     "BALL": mujoco.mjtJoint.mjJNT_BALL,
@@ -100,17 +101,19 @@ def one_kernel_integration_unavailable(
 
 
 def smooth_dynamics(
-    warp_model: mjw.Model, warp_data_E: mjw.Data, *, lanes: int | None = None
+    warp_model: mjw.Model, warp_data_E: mjw.Data, *, lanes: int | None = None, mask: wp.array | None = None
 ) -> Callable[..., None]:
     """Return what launches the smooth dynamics of a model that is not `unsuited`, with arrays in their final place.
 
     It computes what MuJoCo Warp's `fwd_position`, `fwd_velocity`, `fwd_actuation` and `fwd_acceleration` do, but for
     cameras, lights, contacts, constraint rows and `qacc_smooth`. With `forces_too=False` it computes of these what
-    positions and velocities alone decide; with `goes_on=False` only what collisions need, `geom_xpos` and `geom_xmat`;
-    and with `places_geoms=False` all but these two. `lanes` is how many threads share a world on CUDA; None takes the
-    fewest that fit.
+    positions and velocities alone decide, and with `sums_momenta=True` what `subtree_vel` does as well; with
+    `goes_on=False` only what collisions need, `geom_xpos` and `geom_xmat`; and with `places_geoms=False` all but these
+    two. With `masked=True` it does so for the worlds of `mask`, bool [E]. `lanes` is how many threads share a world on
+    CUDA; None takes the fewest that fit.
     """
-    launch = _launcher(SMOOTH, warp_model, warp_data_E, lanes)
+    mask = wp.empty(0, dtype=bool, device=warp_data_E.qpos.device) if mask is None else mask
+    launch = _launcher(SMOOTH, warp_model, warp_data_E, lanes, {"mask": mask})
     return partial(launch, **WHOLE)
 
 
@@ -123,11 +126,15 @@ def integration(
     forces disabled (activations without actuation keep still, and implicitfast has the derivatives of what is left),
     and with controls out of range, whose derivative is that of the clamped ones.
     """
-    return _launcher(INTEGRATION, warp_model, warp_data_E, lanes)
+    return _launcher(INTEGRATION, warp_model, warp_data_E, lanes, {})
 
 
 def _launcher(
-    parts: tuple[str, ...], warp_model: mjw.Model, warp_data_E: mjw.Data, lanes: int | None
+    parts: tuple[str, ...],
+    warp_model: mjw.Model,
+    warp_data_E: mjw.Data,
+    lanes: int | None,
+    given: Mapping[str, wp.array],
 ) -> Callable[..., None]:
     m, d = warp_model, warp_data_E
     sizes, device = _sizes(m), d.qpos.device
@@ -141,7 +148,7 @@ def _launcher(
         "eliminated": _eliminated(m),
         "leaves": _leaves(m),
     }
-    own = WHOLE | {name: wp.array(table, dtype=int, device=device) for name, table in tables.items()}
+    own = WHOLE | given | {name: wp.array(table, dtype=int, device=device) for name, table in tables.items()}
     constants = {**_ENUMS, **sizes, "floats": _floats(parts, sizes, lanes)}
     parents = ", ".join(map(str, m.body_parentid.numpy()))
     source = f"constexpr int PARENTS[] = {{{parents}}};\n" + native.source_of("smooth", parts)

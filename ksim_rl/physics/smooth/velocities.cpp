@@ -40,8 +40,24 @@ each(NUM_CHAINS, [&](int chain) {
 });
 sync();
 write(problem.cvel, NUM_BODIES, velocities, 6);
-if (!problem.forces_too)
+if (!problem.forces_too) {
+    if (!problem.sums_momenta)
+        return;
+    // Velocities and angular momenta of subtrees (mj_subtreeVel): summed about the centre of mass of all bodies.
+    each(NUM_BODIES, [&](int body) {
+        const spatial own = times_inertia(inertia(body), velocity(body));
+        const vec3 arm = com(look_up(problem.body_rootid, body)) - com(0), pushed = translation_of(own);
+        force(body) = body == 0 ? spatial() : spatial_of(rotation_of(own) + wp::cross(arm, pushed), pushed);
+    });
+    sync();
+    sum_subtrees(6, [&](int index) { return Column {forces + index, 6}; });
+    each(NUM_BODIES, [&](int body) {
+        const vec3 pushed = translation_of(force(body));
+        row_of(problem.subtree_linvel)[body] = pushed / wp::max(TINY, model_row(problem.body_subtreemass)[body]);
+        row_of(problem.subtree_angmom)[body] = rotation_of(force(body)) - wp::cross(com(body) - com(0), pushed);
+    });
     return;
+}
 write(problem.cacc, NUM_BODIES, forces, 6);
 sync();
 each(NUM_BODIES, [&](int body) {

@@ -138,6 +138,8 @@ _CLOCKS = tuple(name.removesuffix("_EN") for name in ContactState._fields if nam
 class ContactTracker(SensorTracker):
     """Reads one contact sensor once per env step, or at every substep, and runs its clocks."""
 
+    contacts_only = True
+
     def __init__(self, name: str, sensor: ContactSensor, view: WorldView) -> None:
         self._key = f"contact/{name}"
         self._world, self._view, self._strongest = view.world, view, sensor.reduce == "strongest"

@@ -22,10 +22,11 @@ class SensorTracker:
     """Reads one sensor. What it reads on demand belongs in `view.cache`, so that it is read once per state.
 
     With `every_substep`, `update_substep` runs after each physics substep, at which the worlds then compute their
-    sensors.
+    sensors; those of contacts alone with `contacts_only`, if all such trackers have it, which takes less time.
     """
 
     every_substep: bool = False
+    contacts_only: bool = False
 
     def update(self) -> None:
         """Advance by one env step; it runs in each step, after the refresh (nothing by default)."""

@@ -49,7 +49,7 @@ class Simulation:
         self.time_out_offset_E = self.buffers.get("time_out_offset_E", dtype=torch.int64)
         self.before_substep: list[Callable[[], None]] = []
         self.after_substep: list[Callable[[], None]] = []
-        self.substep_sensors: Literal["last", "every"] = "last"
+        self.substep_sensors: Literal["last", "contacts", "every"] = "last"
         self.startup_counter = torch.zeros_like(self.seed)
         self.reader, self.is_frozen, self._is_stale = "", False, False
         self._caches: list[dict[str, Tensor]] = []

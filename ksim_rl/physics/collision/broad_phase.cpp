@@ -1,0 +1,87 @@
+// The broad phase: which pairs of geoms may touch. The tests are those of engine_collision_driver.c: of a plane and a
+// bounding sphere, of two spheres, then of two boxes along the axes of both (Gottschalk et al., OBBTree, 1996).
+//
+// The lanes of a world share its pairs, and take places in the pool for all that pass together: one lane each time, where
+// all threads of all worlds would wait for the same counter.
+
+const auto* const pairs = problem.nxn_geom_pair_filtered.data;
+const auto* const pair_ids = problem.nxn_pairid_filtered.data;
+const int num_pairs = problem.nxn_geom_pair_filtered.shape[0];
+const wp::vec3* const positions = row_of(problem.geom_xpos);
+const wp::mat33* const turns = row_of(problem.geom_xmat);
+auto model_row = [=](auto& array) { return array.data + (array.shape[0] > 1 ? (size_t)world * array.shape[1] : 0); };
+const wp::vec3* const boxes = model_row(problem.geom_boxes);  // centre and half sizes of each geom
+const float* const bounds = model_row(problem.geom_rbound);
+
+auto axis = [](const wp::mat33& turn, int i) { return wp::vec3(turn.data[0][i], turn.data[1][i], turn.data[2][i]); };
+auto reach = [](const wp::vec3& size, float x, float y, float z) {
+    return wp::abs(size[0] * x) + wp::abs(size[1] * y) + wp::abs(size[2] * z);
+};
+auto boxes_are_apart = [&](int a, int b, float margin) {
+    const wp::mat33 turn = turns[a], other = turns[b];
+    const wp::vec3 size = boxes[2 * a + 1], size_b = boxes[2 * b + 1];
+    const wp::vec3 between =
+        wp::mul(other, boxes[2 * b]) + positions[b] - wp::mul(turn, boxes[2 * a]) - positions[a];
+    float along[3][3];
+    for (int i = 0; i < 3; ++i)
+        for (int k = 0; k < 3; ++k)
+            along[i][k] = wp::dot(axis(turn, i), axis(other, k));
+    for (int i = 0; i < 3; ++i) {
+        const float far = size[i] + reach(size_b, along[i][0], along[i][1], along[i][2]);
+        const float far_b = size_b[i] + reach(size, along[0][i], along[1][i], along[2][i]);
+        if (far + margin < wp::abs(wp::dot(between, axis(turn, i)))
+            || far_b + margin < wp::abs(wp::dot(between, axis(other, i))))
+            return true;
+    }
+    return false;
+};
+auto may_touch = [&](int item) {
+    const int a = pairs[item][0], b = pairs[item][1], pair = pair_ids[item][0];
+    if (pair_ids[item][1] >= 0)
+        return true;  // a sensor measures how far they are apart
+    const float margin = pair >= 0 ? model_row(problem.pair_margin)[pair] + model_row(problem.pair_gap)[pair]
+                                   : model_row(problem.geom_margin)[a] + model_row(problem.geom_gap)[a]
+                                         + model_row(problem.geom_margin)[b] + model_row(problem.geom_gap)[b];
+    const wp::vec3 between = positions[b] - positions[a];
+    if (bounds[a] == 0.0f)
+        return wp::dot(between, axis(turns[a], 2)) <= bounds[b] + margin;
+    if (bounds[b] == 0.0f)
+        return -wp::dot(between, axis(turns[b], 2)) <= bounds[a] + margin;
+    const float most = bounds[a] + bounds[b] + margin;
+    return wp::dot(between, between) <= most * most && !boxes_are_apart(a, b, margin);
+};
+
+constexpr int BITS = 32;
+for (int first = 0; first < num_pairs; first += BITS * LANES) {
+    unsigned passing = 0;
+    int count = 0;
+    for (int bit = 0; bit < BITS; ++bit) {
+        const int item = first + bit * LANES + lane;
+        const bool passes = item < num_pairs && may_touch(item);
+        passing |= (unsigned)passes << bit;
+        count += passes;
+    }
+    const int before = sum_before(count), total = of_lane(before + count, LANES - 1);
+    int place = 0;
+    if (lane == 0 && total > 0) {
+#if defined(__CUDA_ARCH__)
+        place = atomicAdd(problem.ncollision.data, total);
+#else
+        place = *problem.ncollision.data;
+        *problem.ncollision.data += total;
+#endif
+    }
+    place = of_lane(place, 0) + before;
+    for (int bit = 0; bit < BITS; ++bit) {
+        if ((passing >> bit & 1u) == 0)
+            continue;
+        if (place < problem.naconmax) {
+            const int item = first + bit * LANES + lane, a = pairs[item][0], b = pairs[item][1];
+            const bool swaps = problem.geom_type.data[a] > problem.geom_type.data[b];
+            problem.collision_pair.data[place] = swaps ? wp::vec2i(b, a) : wp::vec2i(a, b);
+            problem.collision_pairid.data[place] = pair_ids[item];
+            problem.collision_worldid.data[place] = world;
+        }
+        ++place;
+    }
+}
