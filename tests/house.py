@@ -24,14 +24,16 @@ PACKAGE_LINES = 37_000
 ROOMS_AROUND = {
     "adapters": 620,
     "cli": 900,
+    "clips": 900,
     "compiled": 950,
     "diagnosis": 800,
     "export": 2_760,
     "ranks": 900,
     "runs": 800,
     "suites": 1_750,
-    "tables": 600,
+    "tables": 640,
     "testing": 740,
+    "tracking": 1_400,
     "viewer": 1_400,
     "zoo": 300,
 }

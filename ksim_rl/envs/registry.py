@@ -27,7 +27,7 @@ from ksim_rl.transforms.row_transform import follow_level
 
 _CONFIG = "ksim_rl_env"
 # Imported by name when tasks are first asked for: they stand above this room and import it.
-OWN_TASKS = ("ksim_rl.tasks", "ksim_rl.suites")
+OWN_TASKS = ("ksim_rl.tasks", "ksim_rl.suites", "ksim_rl.tracking")
 
 
 def _tasks() -> dict[str, Task]:

@@ -21,7 +21,7 @@ Axis = Literal["x", "y", "z", "roll", "pitch", "yaw"]
 Ranges = Mapping[Axis, Range]
 
 
-def _draw(view: EnvView, ranges: Ranges) -> Float[Tensor, "E 6"]:
+def draw_by_axis(view: EnvView, ranges: Ranges) -> Float[Tensor, "E 6"]:
     """Draw x, y, z, roll, pitch, yaw (m and rad, or m/s and rad/s) uniformly; axes that are left out are 0."""
     pairs = [ranges.get(axis, (0.0, 0.0)) for axis in get_args(Axis)]
     low_6 = constant([float(low) for low, _ in pairs], view.device)
@@ -99,8 +99,8 @@ class ResetRootUniform(OfEntity, EventTerm):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         body = view.entity(self.entity)
-        offset_E6 = _draw(view, self.pose_range)
-        velocity_E6 = _draw(view, self.velocity_range)
+        offset_E6 = draw_by_axis(view, self.pose_range)
+        velocity_E6 = draw_by_axis(view, self.velocity_range)
         turn_E4 = quaternion.from_euler_xyz(*offset_E6[:, 3:].unbind(-1))
         quat_E4 = quaternion.multiply(body.default_root_quat_L.expand(view.num_envs, 4), turn_E4)
         pos_E3 = body.default_root_pos_L + offset_E6[:, :3]
@@ -145,7 +145,7 @@ class PushByVelocity(OfEntity, EventTerm, mode="interval"):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         body = view.entity(self.entity)
-        kick_E6 = _draw(view, self.velocity_range)
+        kick_E6 = draw_by_axis(view, self.velocity_range)
         lin_vel_E3 = body.root_lin_vel_w_EL + kick_E6[:, :3]
         body.write_root_velocity(mask_E, lin_vel_E3, body.root_ang_vel_w_EL + kick_E6[:, 3:])
 
@@ -170,7 +170,7 @@ class PushByForce(EventTerm, mode="interval"):
         """Begin a push in the rows of `mask_E`, and go on with or end those of the others; once per env step."""
         held_E6, applied_E6 = view.buffer("wrench_E6", 6), view.buffer("applied_E6", 6)
         left_E = view.buffer("left_s_E")
-        drawn_E6 = _draw(view, self.wrench_range)
+        drawn_E6 = draw_by_axis(view, self.wrench_range)
         duration_E = view.uniform(1, *self.duration_s)[:, 0].clamp(min=view.step_dt)
         left_E.copy_(torch.where(mask_E, duration_E, left_E - view.step_dt))
         held_E6.copy_(torch.where(mask_E[:, None], drawn_E6, held_E6))

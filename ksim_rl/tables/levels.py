@@ -35,9 +35,11 @@ def thinned(points: Sequence[T], count: int) -> list[T]:
 
 
 def value_of(row: Row, results: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return what the seeds of a row come to: the mean return, or the median of seconds; None is infinite."""
+    """Return what the seeds come to: a mean return, a median of seconds (None is infinite), or a lowest share."""
     if row.measure == "return":
         return statistics.fmean(result["evaluation"]["return_mean"] for result in results)
+    if row.measure == "success":
+        return min(result["trials"]["success"] for result in results)
     seconds = [result["seconds_to_levels"] for result in results]
     middle = statistics.median(math.inf if value is None else value for value in seconds)
     return middle if math.isfinite(middle) else None
@@ -47,7 +49,7 @@ def is_reached(row: Row, results: Sequence[Mapping[str, Any]]) -> bool | None:
     """Return whether a row reaches all its goals; None where it has none."""
     value, found = value_of(row, results), []
     if row.goal is not None:
-        is_good = value is not None and (value >= row.goal if row.measure == "return" else value <= row.goal)
+        is_good = value is not None and (value <= row.goal if row.measure == "seconds" else value >= row.goal)
         found.append(is_good)
     if row.most_falls is not None:
         found.append(max(result["falls"] for result in results) < row.most_falls)

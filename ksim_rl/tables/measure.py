@@ -23,6 +23,7 @@ from ksim_rl.runs.listing import METRICS
 from ksim_rl.runs.whole_file import write_whole
 from ksim_rl.tables.levels import reached, thinned
 from ksim_rl.tables.table import Row, load
+from ksim_rl.tracking.trials import run_trials
 from ksim_rl.trainers import Hook, RunCfg, RunProgress, Trainer, run
 
 KEPT_POINTS = 60
@@ -57,7 +58,9 @@ class _Judge(Hook):
 
     interval = 0
 
-    def __init__(self) -> None:
+    def __init__(self, cfg: RunCfg, row: Row, *, trials: int) -> None:
+        self._cfg, self._trials = cfg, trials if row.measure == "success" else 0
+        self.trials: dict[str, Any] | None = None
         self.falls, self.seconds_in_all, self.ended = 0.0, 0.0, 0.0
 
     def at_end(self, trainer: Trainer) -> None:
@@ -65,11 +68,14 @@ class _Judge(Hook):
         if trainer.evaluator is not None:
             too_early_E = trainer.evaluator.length_E < trainer.evaluator.max_steps
             self.falls = float(too_early_E.double().mean())
+        if self._trials:
+            self.trials = asdict(run_trials(self._cfg, trainer.update.actor, trials=self._trials))
 
 
 def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) -> dict[str, Any]:
     """Train and judge; return plain data. An interrupted run raises, so that it leaves no result."""
-    cfg, judge = run_cfg(row, seed, device=device, smoke=smoke), _Judge()
+    cfg = run_cfg(row, seed, device=device, smoke=smoke)
+    judge = _Judge(cfg, row, trials=8 if smoke else row.episodes)
     progress, began = RunProgress(cfg.trainer.num_iterations), time.monotonic()
     with compile_notice(progress.status):
         outcome = run(cfg, run_folder, progress=progress, hooks=[judge])
@@ -93,6 +99,7 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
         "seconds_before": round(judge.ended - began - judge.seconds_in_all, 2),
         "evaluation": asdict(outcome.evaluation),
         "falls": round(judge.falls, 5),
+        "trials": judge.trials,
         "seconds_to_levels": None if end is None else round(end["seconds"], 2),
         "env_states_to_levels": None if end is None else end["env_states"],
         "curve": thinned(points, KEPT_POINTS),

@@ -20,7 +20,7 @@ PROTOCOL = (
 
 
 def figures_of(table: Table, rows: Mapping[str, Results]) -> dict[str, float]:
-    """Return flat figures: `<table>/<row>`, of rows of seconds `<table>/<row>/seconds` and `/falls`, and the means.
+    """Return flat figures: `<table>/<row>`, with `/seconds` and `/falls`, or `/success` for these measures; means.
 
     What is infinite has no figure, and neither has a mean over a group that lacks a row.
     """
@@ -30,8 +30,10 @@ def figures_of(table: Table, rows: Mapping[str, Results]) -> dict[str, float]:
         if table.rows[name].measure == "seconds":
             figures[f"{key}/falls"] = max(result["falls"] for result in results)
             key += "/seconds"
+        elif table.rows[name].measure == "success":
+            key += "/success"
         if value is not None:
-            figures[key] = round(value, 2)
+            figures[key] = round(value, 4 if key.endswith("/success") else 2)
     for mean_name, mean in table.means.items():
         found = {}
         for group, names in table.groups().items():
@@ -107,6 +109,8 @@ def _cells(row: Row, results: Results) -> list[str]:
     if row.measure == "seconds":
         falls = f"falls {100 * max(result['falls'] for result in results):.1f} %"
         ours = f"{'not reached' if value is None else f'{value:.1f} s'}, {falls}"
+    elif row.measure == "success" and value is not None:
+        ours = f"{100 * value:.1f} % of trials succeed"
     states, seconds, before = (
         statistics.fmean(r[key] for r in results) for key in ("env_states", "seconds", "seconds_before")
     )

@@ -27,9 +27,11 @@ class Row(Checked):
         env_states: that training collects at most: as many iterations as fit.
         seeds: those that count. They are for nothing else: settings are chosen with other ones.
         measure: "return" of the final evaluation, the mean over the seeds; or "seconds" of training until `levels` of
-            training metrics hold, the median over the seeds, one that does not get there counting as infinite.
+            training metrics hold, the median over the seeds, one that does not get there counting as infinite; or
+            "success" of the final policy in `episodes` trials of a tracking task, the lowest over the seeds.
         episodes: of the final evaluation: deterministic actions, fresh envs.
         within_s: seconds in which the levels should be reached.
+        at_least: share of trials that should succeed.
         most_falls: share of these episodes that may end before their time; the worst seed counts.
         published: what others report, by who; `against` says which of them a return should reach, "" none.
     """
@@ -39,10 +41,11 @@ class Row(Checked):
     env_states: Positive
     seeds: tuple[WholeNumber, ...]
     overrides: tuple[str, ...] = ()
-    measure: Literal["return", "seconds"] = "return"
+    measure: Literal["return", "seconds", "success"] = "return"
     episodes: Count = 128
     levels: Mapping[str, float] = field(default_factory=dict)
     within_s: Positive | None = None
+    at_least: Share | None = None
     most_falls: Share | None = None
     published: Mapping[str, float] = field(default_factory=dict)
     against: str = ""
@@ -58,7 +61,9 @@ class Row(Checked):
 
     @property
     def goal(self) -> float | None:
-        """What the measure should reach: a return at least, or seconds at most; None where nothing is asked."""
+        """What the measure should reach: a return or share at least, seconds at most; None where nothing is asked."""
+        if self.measure == "success":
+            return self.at_least
         return self.within_s if self.measure == "seconds" else self.published.get(self.against)
 
 

@@ -3,7 +3,8 @@
 import pytest
 
 from ksim_rl.tables.levels import is_reached, reached, value_of
-from ksim_rl.tables.table import Row
+from ksim_rl.tables.report import figures_of
+from ksim_rl.tables.table import Row, Table
 
 LEVELS = {"linear": 1.4, "angular": 1.0}
 COMMON = {"task": "go1_velocity_flat", "objective": "ppo", "env_states": 1e6, "seeds": (1, 2, 3)}
@@ -42,6 +43,15 @@ def seeds(*seconds, falls=0.0):
 def test_a_seed_that_does_not_get_there_counts_as_infinite(results, value, verdict):
     assert value_of(SECONDS, results) == value
     assert is_reached(SECONDS, results) is verdict
+
+
+def test_the_seed_with_the_fewest_successes_counts():
+    row = Row(**COMMON, measure="success", at_least=0.95)
+    results = [{"trials": {"success": value}} for value in (0.99, 0.95, 1.0)]
+    assert value_of(row, results) == 0.95 and is_reached(row, results) is True
+    assert is_reached(row, [*results, {"trials": {"success": 0.949}}]) is False
+    table = Table(name="tracking", title="", rows={"walk": row})
+    assert figures_of(table, {"walk": results}) == {"tracking/walk/success": 0.95}
 
 
 def test_returns_are_compared_with_what_one_of_the_others_reports():

@@ -60,7 +60,7 @@ def test_a_table_that_does_not_exist_gives_the_near_names():
 
 
 def test_the_shipped_tables_name_tasks_that_exist():
-    assert shipped() == ["dm_control", "humanoids", "manipulation", "velocity"]
+    assert shipped() == ["dm_control", "humanoids", "manipulation", "tracking", "velocity"]
     for name in shipped():
         assert {row.task for row in load(name).rows.values()} <= set(envs.names())
 
@@ -91,6 +91,7 @@ def test_the_other_algorithm_stays_within_its_env_states():
         "humanoids:g1_flat",
         "manipulation:panda_pick_cube",
         "manipulation:leap_cube_reorient",
+        *(f"tracking:{clip}" for clip in ("walk", "squat", "turn", "kick")),
         *(pytest.param(f"dm_control:{row}", marks=pytest.mark.full) for row in load("dm_control").rows),
     ],
 )

@@ -147,7 +147,9 @@ def _launcher(
         "eliminated": _eliminated(m),
         "leaves": _leaves(m),
     }
-    own = {**WHOLE, **given} | {name: wp.array(table, dtype=int, device=device) for name, table in tables.items()}
+    own = {**WHOLE, **given} | {
+        name: wp.array(table, dtype=int, device=device) for name, table in tables.items()
+    }
     constants = {**_ENUMS, **sizes, "floats": _floats(parts, sizes, lanes)}
     parents = ", ".join(map(str, m.body_parentid.numpy()))
     source = f"constexpr int PARENTS[] = {{{parents}}};\n" + native.source_of("smooth", parts)

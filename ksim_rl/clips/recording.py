@@ -1,0 +1,117 @@
+"""A recording is where named points of a body were over time; it is resampled here, and read off a robot's motion."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ksim_rl.checked import Checked, Positive
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording(Checked):
+    """N points in F frames, `fps` of them per second; the world's z axis points up.
+
+    Attributes:
+        names: of the points.
+        pos_FN3: m.
+        quat_FN4: (w, x, y, z), unit: the points' frames in the world.
+    """
+
+    fps: Positive
+    names: tuple[str, ...]
+    pos_FN3: Float[Array, "F N 3"]
+    quat_FN4: Float[Array, "F N 4"]
+
+    def resampled(self, fps: float) -> "Recording":
+        """Return the same at another rate: positions linearly, orientations along the shorter arc."""
+        low_F, share_F = between(len(self.pos_FN3), self.fps, fps)
+        share_F11 = share_F[:, None, None]
+        pos_FN3 = (1.0 - share_F11) * self.pos_FN3[low_F] + share_F11 * self.pos_FN3[low_F + 1]
+        quat_FN4 = slerp(self.quat_FN4[low_F], self.quat_FN4[low_F + 1], share_F11)
+        return Recording(fps=fps, names=self.names, pos_FN3=pos_FN3, quat_FN4=quat_FN4)
+
+
+def between(count: int, fps: float, wanted_fps: float) -> tuple[Array, Float[Array, " F"]]:
+    """Return for each frame at another rate the frame before it, and the part of the way to the next one."""
+    times_F = np.arange(0, int((count - 1) / fps * wanted_fps + 1e-6) + 1) / wanted_fps
+    low_F = np.minimum((times_F * fps + 1e-9).astype(int), count - 2)
+    return low_F, np.clip(times_F * fps - low_F, 0.0, 1.0)
+
+
+def slerp(
+    first: Float[Array, "*batch 4"], second: Float[Array, "*batch 4"], share: Float[Array, "*share 1"]
+) -> Float[Array, "*batch 4"]:
+    """Return unit quaternions on the shorter arc between two, at an even speed."""
+    cosine = (first * second).sum(-1, keepdims=True)
+    second, cosine = np.where(cosine < 0.0, -second, second), np.abs(cosine)
+    angle = np.arccos(np.clip(cosine, 0.0, 1.0))
+    sine = np.sin(angle)
+    is_small = sine < 1e-6
+    safe = np.where(is_small, 1.0, sine)
+    left = np.where(is_small, 1.0 - share, np.sin((1.0 - share) * angle) / safe)
+    right = np.where(is_small, share, np.sin(share * angle) / safe)
+    blend = left * first + right * second
+    return blend / np.linalg.norm(blend, axis=-1, keepdims=True)
+
+
+def multiply(a: Float[Array, "*batch 4"], b: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
+    """Return the Hamilton product of quaternions (w, x, y, z)."""
+    aw, au, bw, bu = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    scalar = aw * bw - (au * bu).sum(-1, keepdims=True)
+    return np.concatenate((scalar, aw * bu + bw * au + np.cross(au, bu)), axis=-1)
+
+
+def rotate(q: Float[Array, "*batch 4"], v: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
+    """Rotate vectors by quaternions."""
+    across = np.cross(q[..., 1:], v)
+    return v + 2.0 * (q[..., :1] * across + np.cross(q[..., 1:], across))
+
+
+def from_rotation_vector(turn: Float[Array, "*batch 3"]) -> Float[Array, "*batch 4"]:
+    """Return the quaternions of rotation vectors, rad."""
+    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
+    half = 0.5 * np.sinc(angle / (2.0 * np.pi))  # sin(angle / 2) / angle, also at zero
+    return np.concatenate((np.cos(0.5 * angle), half * turn), axis=-1)
+
+
+def chain(
+    parents: list[int],
+    offsets_N3: Float[Array, "N 3"],
+    turns_FN4: Float[Array, "F N 4"],
+    root_F3: Float[Array, "F 3"],
+) -> tuple[Float[Array, "F N 3"], Float[Array, "F N 4"]]:
+    """Return where the joints of a skeleton are: each at its offset from its parent, in whose frame it turns.
+
+    Parents come before their children; the root's parent is -1, and the root is at `root_F3`.
+    """
+    pos_FN3, quat_FN4 = np.zeros((*turns_FN4.shape[:2], 3)), turns_FN4.copy()
+    for joint, parent in enumerate(parents):
+        if parent < 0:
+            pos_FN3[:, joint] = root_F3
+            continue
+        quat_FN4[:, joint] = multiply(quat_FN4[:, parent], turns_FN4[:, joint])
+        offset_F3 = np.broadcast_to(offsets_N3[joint], root_F3.shape)
+        pos_FN3[:, joint] = pos_FN3[:, parent] + rotate(quat_FN4[:, parent], offset_F3)
+    return pos_FN3, quat_FN4
+
+
+def of_robot(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: float) -> Recording:
+    """Return where the bodies of a robot are in a motion of it, by the C engine."""
+    data, pos, quat = mujoco.MjData(mj_model), [], []
+    for qpos in qpos_FL:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(mj_model, data)
+        pos.append(data.xpos[1:].copy())
+        quat.append(data.xquat[1:].copy())
+    names = tuple(mj_model.body(i).name for i in range(1, mj_model.nbody))
+    return Recording(fps=fps, names=names, pos_FN3=np.array(pos), quat_FN4=np.array(quat))
+
+
+def refused(path: Path, wrong: str, fix: str) -> ValueError:
+    """Return the error for a file that cannot be read as a motion: what is wrong with it, and what to do."""
+    return ValueError(f"motion {path}: {wrong}: {fix}")

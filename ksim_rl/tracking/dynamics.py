@@ -1,0 +1,120 @@
+"""This module says what a motion asks of a robot: its torques, where the ground must push, and what touches what.
+
+MuJoCo's inverse dynamics (`mj_inverse` without contacts) gives the wrench that the ground must exert on the floating
+root, and the joint torques beside it. Wrenches of two feet that stand are shared by where the zero-moment point lies
+between them, as Vukobratovic ("Zero-moment point: thirty-five years of its life", 2004) describes it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ksim_rl.clips.motion_file import velocities
+
+Array = np.ndarray
+GRAVITY = 9.81
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demand:
+    """What each of F frames asks for.
+
+    Attributes:
+        zmp_F2: the zero-moment point on the ground, m: where the ground's pressure must have its centre.
+        com_F3: the centre of mass, m.
+        force_F3: what the ground must push with, N.
+        torque_FM: of the joints, N m, one column per degree of freedom behind the six of the root.
+    """
+
+    zmp_F2: Float[Array, "F 2"]
+    com_F3: Float[Array, "F 3"]
+    force_F3: Float[Array, "F 3"]
+    torque_FM: Float[Array, "F M"]
+
+
+def demand(
+    mj_model: mujoco.MjModel,
+    qpos_FL: Float[Array, "F L"],
+    fps: float,
+    *,
+    feet: Sequence[str],
+    planted_FN: Bool[Array, "F N"],
+) -> Demand:
+    """Return what a motion of a robot with a free root asks for.
+
+    `feet` are sites at the middles of the soles, `planted_FN` which of them stand. The robot is alone in its model.
+    """
+    qvel_FM = velocities(mj_model, qpos_FL, fps)
+    qacc_FM = np.gradient(qvel_FM, 1.0 / fps, axis=0)
+    model, data = mj_model, mujoco.MjData(mj_model)
+    flags, model_flags = model.opt.disableflags, mujoco.mjtDisableBit
+    model.opt.disableflags |= int(model_flags.mjDSBL_CONTACT) | int(model_flags.mjDSBL_CONSTRAINT)
+    zmp, com, force, torque = [], [], [], []
+    try:
+        for qpos, qvel, qacc, planted in zip(qpos_FL, qvel_FM, qacc_FM, planted_FN, strict=True):
+            data.qpos[:], data.qvel[:], data.qacc[:] = qpos, qvel, qacc
+            mujoco.mj_inverse(model, data)
+            force_3, zmp_2, spin = _ground_wrench(data)
+            zmp.append(zmp_2)
+            com.append(data.subtree_com[0].copy())
+            force.append(force_3)
+            torque.append(_joint_torques(model, data, feet, planted, force_3, zmp_2, spin))
+    finally:
+        model.opt.disableflags = flags
+    return Demand(
+        zmp_F2=np.array(zmp), com_F3=np.array(com), force_F3=np.array(force), torque_FM=np.array(torque)
+    )
+
+
+def _ground_wrench(data: mujoco.MjData) -> tuple[Array, Array, float]:
+    """Return the ground's force, the point at z = 0 about which its moment is vertical, and that moment."""
+    force_3, moment_3 = data.qfrc_inverse[:3].copy(), np.empty(3)
+    mujoco.mju_rotVecQuat(moment_3, data.qfrc_inverse[3:6], data.qpos[3:7])
+    about_origin_3 = moment_3 + np.cross(data.qpos[:3], force_3)
+    # The root's wrench belongs to the ground: p x f with p on the ground has these horizontal moments.
+    zmp_2 = np.array((-about_origin_3[1], about_origin_3[0])) / force_3[2]
+    return force_3, zmp_2, float(about_origin_3[2] - (zmp_2[0] * force_3[1] - zmp_2[1] * force_3[0]))
+
+
+def _joint_torques(
+    mj_model: mujoco.MjModel,
+    data: mujoco.MjData,
+    feet: Sequence[str],
+    planted_N: Array,
+    force_3: Array,
+    zmp_2: Array,
+    spin: float,
+) -> Array:
+    standing = [foot for foot, is_planted in zip(feet, planted_N, strict=True) if is_planted]
+    if not standing:
+        return data.qfrc_inverse[6:].copy()
+    places_N3 = np.stack([data.site(foot).xpos for foot in standing])
+    shares = np.array([1.0])
+    if len(standing) == 2:
+        line_2 = places_N3[1, :2] - places_N3[0, :2]
+        second = np.clip((zmp_2 - places_N3[0, :2]) @ line_2 / (line_2 @ line_2), 0.0, 1.0)
+        shares = np.array([1.0 - second, second])
+    beside_2 = zmp_2 - shares @ places_N3[:, :2]
+    torque_M = data.qfrc_inverse.copy()
+    jacobian_3M, turn_3M = np.zeros((3, mj_model.nv)), np.zeros((3, mj_model.nv))
+    for foot, place_3, share in zip(standing, places_N3, shares, strict=True):
+        point_3 = np.append(place_3[:2] + beside_2, 0.0)
+        mujoco.mj_jac(mj_model, data, jacobian_3M, turn_3M, point_3, int(mj_model.site(foot).bodyid[0]))
+        torque_M -= share * (jacobian_3M.T @ force_3 + turn_3M[2] * spin)
+    return torque_M[6:]
+
+
+def self_contacts(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"]) -> list[str]:
+    """Return which geoms of a robot that is alone in its model run into each other, and in which frame first."""
+    data, found = mujoco.MjData(mj_model), {}
+    for frame, qpos in enumerate(qpos_FL):
+        data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(mj_model, data)
+        for contact in data.contact[: data.ncon]:
+            names = [mj_model.geom(int(geom)).name for geom in contact.geom]
+            if contact.dist < 0.0:
+                found.setdefault(" and ".join(sorted(names)), frame)
+    return [f"{pair} from frame {frame} on" for pair, frame in found.items()]

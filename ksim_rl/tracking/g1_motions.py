@@ -1,0 +1,232 @@
+"""This module has the motions of Unitree G1 that come with the package, as keyframes: walk, squat, turn, kick."""
+
+import math
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ksim_rl.clips.motion_file import write_motion
+from ksim_rl.scene.robots.unitree_g1 import JOINTS, UnitreeG1
+from ksim_rl.tracking.keyframes import Choreography, Figure, FootMove, Keys, perform
+
+ROBOT, FPS = UnitreeG1(), 50.0
+STAND = 0.76
+"""m: the root's height in the default pose."""
+_WIDTH = 0.1185
+"""m: each foot's distance from the middle."""
+_MIDDLE = 0.0388
+"""m: the middle of the soles is ahead of the root."""
+FEET = ((_MIDDLE, _WIDTH, 0.0), (_MIDDLE, -_WIDTH, 0.0))
+_NARROW = ((_MIDDLE, 0.095, 0.0), (_MIDDLE, -0.095, 0.0))
+"""Feet near enough to each other to stand on one without leaning far."""
+_ARMS = {name: 0.5 for name in JOINTS if "shoulder" in name or "elbow" in name or "wrist" in name}
+_WAIST = dict.fromkeys(("waist_yaw_joint", "waist_roll_joint", "waist_pitch_joint"), 0.1)
+# The feet's sites lie 2 mm below the soles.
+FIGURE = Figure(
+    feet=UnitreeG1.foot_sites,  # type: ignore[arg-type]
+    root=UnitreeG1.root_body,
+    torso=UnitreeG1.torso_body,
+    sole_z=-0.002,
+    posture_weights={**_ARMS, **_WAIST},
+)
+
+
+def model() -> mujoco.MjModel:
+    """Return the robot alone."""
+    return ROBOT.spec().compile()
+
+
+def _swing(times: list[float], amplitude: float, *, first: float = 1.0) -> Keys:
+    """Return keys that are zero at the first and last time, and `amplitude` with alternating signs between them."""
+    inner = [(time, first * amplitude * (-1.0) ** number) for number, time in enumerate(times[1:-1])]
+    return ((times[0], 0.0), *inner, (times[-1], 0.0))
+
+
+def _arm_swing(times: list[float], shoulder: float, elbow: float) -> dict[str, Keys]:
+    """Return arms that swing in turn, rad; a bent elbow follows its shoulder."""
+    keys: dict[str, Keys] = {}
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        keys[f"{side}_shoulder_pitch_joint"] = _swing(times, shoulder, first=sign)
+        keys[f"{side}_elbow_joint"] = _swing(times, elbow, first=-sign)
+    return keys
+
+
+def _arms_out(begin_s: float, end_s: float, by: float) -> dict[str, Keys]:
+    """Return arms that are held off the legs, rad."""
+    keys: dict[str, Keys] = {}
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        out = sign * by
+        keys[f"{side}_shoulder_roll_joint"] = (
+            (begin_s, 0.0),
+            (begin_s + 0.6, out),
+            (end_s - 0.6, out),
+            (end_s, 0.0),
+        )
+    return keys
+
+
+def walk() -> Choreography:
+    """Return twelve steps straight ahead."""
+    begin_s, step_s, both_s, stride, count = 0.9, 0.54, 0.1, 0.24, 12
+    moves, at = [], [_MIDDLE, _MIDDLE]
+    for number in range(count):
+        foot = number % 2
+        last = number == count - 1
+        at[foot] = max(at) if last else max(at) + stride * (0.5 if number == 0 else 1.0)
+        start = begin_s + number * step_s
+        swing_s = step_s - both_s
+        moves.append(
+            FootMove(
+                foot=foot,
+                begin_s=start,
+                end_s=start + swing_s,
+                to=(at[foot], (1 - 2 * foot) * _WIDTH, 0.0),
+                lift=((0.5 * swing_s, 0.08),),
+                pitch=((0.4 * swing_s, 0.45),),
+            )
+        )
+    end_s = begin_s + count * step_s
+    times = [begin_s - 0.3, *(begin_s + (n + 0.9) * step_s for n in range(count)), end_s + 0.6]
+    return Choreography(
+        duration_s=end_s + 1.2,
+        feet=FEET,
+        moves=moves,
+        root_height=((0.2, STAND), (0.8, 0.72), (end_s, 0.72), (end_s + 0.7, STAND)),
+        lean=((0.2, 0.0), (0.9, 0.06), (end_s, 0.06), (end_s + 0.6, 0.0)),
+        joints=_arm_swing(times, 0.45, 0.35),
+    )
+
+
+def squat() -> Choreography:
+    """Return four squats with the arms raised ahead at the bottom."""
+    begin_s, cycle_s, count = 0.6, 1.85, 4
+    height, lean, arms, elbows = [(begin_s, STAND)], [(begin_s, 0.0)], [(begin_s, 0.0)], [(begin_s, 0.0)]
+    for number in range(count):
+        down, up = begin_s + (number + 0.45) * cycle_s, begin_s + (number + 1) * cycle_s
+        for keys, low in ((height, 0.47), (lean, 0.35), (arms, -1.4), (elbows, 0.5)):
+            rest = STAND if keys is height else 0.0
+            keys += [(down, low), (down + 0.1 * cycle_s, low), (up, rest)]
+    return Choreography(
+        duration_s=begin_s + count * cycle_s + 0.6,
+        feet=FEET,
+        root_height=height,
+        lean=lean,
+        joints={
+            **{f"{side}_shoulder_pitch_joint": arms for side in ("left", "right")},
+            **{f"{side}_elbow_joint": elbows for side in ("left", "right")},
+        },
+    )
+
+
+def turn() -> Choreography:
+    """Return a full turn to the left on the spot, in steps."""
+    begin_s, step_s, both_s, count = 0.9, 0.5, 0.12, 14
+    moves = []
+    turn_by = 2.0 * math.pi / (count // 2)
+    headings = [0.0, 0.0]
+    for number in range(count):
+        foot = number % 2
+        other = headings[1 - foot]
+        headings[foot] = other + turn_by if foot == 0 else other
+        heading, side = headings[foot], (1 - 2 * foot) * _WIDTH
+        x = _MIDDLE * math.cos(heading) - side * math.sin(heading)
+        y = _MIDDLE * math.sin(heading) + side * math.cos(heading)
+        start, swing_s = begin_s + number * step_s, step_s - both_s
+        moves.append(
+            FootMove(
+                foot=foot,
+                begin_s=start,
+                end_s=start + swing_s,
+                to=(x, y, heading),
+                lift=((0.5 * swing_s, 0.08),),
+            )
+        )
+    end_s = begin_s + count * step_s
+    times = [begin_s - 0.3, *(begin_s + (n + 0.9) * step_s for n in range(count)), end_s + 0.6]
+    return Choreography(
+        duration_s=end_s + 1.2,
+        feet=FEET,
+        moves=moves,
+        root_height=((0.2, STAND), (0.8, 0.7), (end_s, 0.7), (end_s + 0.7, STAND)),
+        joints={**_arm_swing(times, 0.45, 0.4), **_arms_out(0.2, end_s + 0.8, 0.15)},
+    )
+
+
+def kick() -> Choreography:
+    """Return two kicks with the right leg, then two with the left, each pair on the other leg alone."""
+    raise_s, kick_s, rest_s = 0.45, 0.42, 0.35
+    alone_s = raise_s + 4 * kick_s + rest_s
+    moves, begin_s = [], 1.2
+    arms: dict[str, list[tuple[float, float]]] = {name: [(0.6, 0.0)] for name in ("left", "right")}
+    for foot in (1, 0):
+        out = [raise_s + (number + 0.5) * 2 * kick_s for number in range(2)]
+        back = [raise_s, *(raise_s + (number + 1) * 2 * kick_s for number in range(2))]
+        lift = sorted([(time, 0.22) for time in back] + [(time, 0.30) for time in out])
+        forward = sorted([(time, -0.12) for time in back] + [(time, 0.38) for time in out])
+        pitch = sorted([(time, 0.5) for time in back] + [(time, -0.5) for time in out])
+        moves.append(
+            FootMove(
+                foot=foot,
+                begin_s=begin_s,
+                end_s=begin_s + alone_s,
+                to=_NARROW[foot],
+                lift=lift,
+                forward=forward,
+                pitch=pitch,
+            )
+        )
+        for side, sign in (("left", 1.0), ("right", -1.0)):
+            toward = sign if foot == 1 else -sign
+            arms[side] += sorted(
+                [(begin_s + time, 0.7 * toward) for time in back]
+                + [(begin_s + time, -0.7 * toward) for time in out]
+            )
+            arms[side].append((begin_s + alone_s, 0.0))
+        begin_s += alone_s + 1.0
+    joints = _arms_out(0.2, begin_s, 0.3)
+    for side in arms:
+        joints[f"{side}_shoulder_pitch_joint"] = arms[side]
+        joints[f"{side}_elbow_joint"] = [(time, -0.6 * value) for time, value in arms[side]]
+    return Choreography(
+        duration_s=begin_s + 0.2,
+        feet=_NARROW,
+        moves=moves,
+        root_height=((0.3, STAND), (1.0, 0.73), (begin_s - 1.0, 0.73), (begin_s - 0.3, STAND)),
+        joints=joints,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clip:
+    """A motion that comes with the package, `description` one line, and the time in which weight moves between feet."""
+
+    description: str
+    plan: Callable[[], Choreography]
+    shift_s: float = 0.5
+
+
+CLIPS: Mapping[str, Clip] = {
+    "g1_walk": Clip(description="twelve steps straight ahead", plan=walk),
+    "g1_squat": Clip(description="four squats", plan=squat),
+    "g1_turn": Clip(description="a full turn on the spot", plan=turn),
+    "g1_kick": Clip(description="two kicks with each leg", plan=kick, shift_s=0.6),
+}
+"""The motions by the name of their file."""
+
+
+def made(name: str) -> Float[np.ndarray, "F L"]:
+    """Return the qpos of a motion of `CLIPS`, 50 frames per second, made from its keyframes; it takes some seconds."""
+    clip = CLIPS[name]
+    qpos_FL, _, _ = perform(model(), FIGURE, clip.plan(), fps=FPS, shift_s=clip.shift_s)
+    return qpos_FL
+
+
+if __name__ == "__main__":
+    # Writes the files anew: python -m ksim_rl.tracking.g1_motions FOLDER
+    for name in CLIPS:
+        write_motion(Path(sys.argv[1]) / f"{name}.npz", model(), made(name), FPS)

@@ -1,0 +1,115 @@
+"""This module compares a robot's bodies with those of a reference motion, in the world and seen from an anchor body.
+
+An aligned motion is moved and turned about the vertical so that its anchor stands where the robot's does, at its own
+height: a robot that has drifted is not asked to jump back. That is the rule of BeyondMimic (Liao et al., 2025).
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.motion_tracking import OfMotion, OfMotionBodies
+from ksim_rl.scene import quaternion
+from ksim_rl.scene.names import Patterns
+from ksim_rl.scene.state.motion_clock import motion_bodies, motion_time
+
+
+class Poses(NamedTuple):
+    """Positions, m, and orientations (w, x, y, z) of bodies in the world."""
+
+    pos_EN3: Float[Tensor, "E N 3"]
+    quat_EN4: Float[Tensor, "E N 4"]
+
+
+# Per view, the velocities of bodies in each frame of a motion, by file and bodies.
+_VELOCITIES: WeakKeyDictionary[EnvView, dict[tuple[str, tuple[int, ...]], Tensor]] = WeakKeyDictionary()
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfAnchor(OfMotion):
+    """A term of a body, the anchor, in a reference motion and on the robot."""
+
+    anchor: str
+
+    def wanted(self, view: EnvView) -> tuple[Float[Tensor, "E 3"], Float[Tensor, "E 4"]]:
+        """Return where the anchor is in the motion, m, and its orientation there; position stage."""
+        pos_EN3, quat_EN4 = motion_bodies(view, self.file, self.anchor)
+        return pos_EN3[:, 0], quat_EN4[:, 0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfAlignedBodies(OfAnchor, OfMotionBodies):
+    """A term of bodies in a reference motion that is aligned with the robot's anchor."""
+
+    def aligned(self, view: EnvView) -> Poses:
+        """Return where the bodies are in the aligned motion; position stage, computed once per state."""
+        key = f"motion/{self.file}.aligned {self.bodies} with {self.anchor}"
+        if key not in view.cache:
+            own, (pos_E3, quat_E4) = view.body(self.anchor), self.wanted(view)
+            turn_E = quaternion.yaw(quaternion.multiply(own.quat_EL, quaternion.conjugate(quat_E4)))
+            half_E1 = 0.5 * turn_E[:, None]
+            zero_E2 = torch.zeros_like(quat_E4[:, :2])
+            turn_EN4 = torch.cat((torch.cos(half_E1), zero_E2, torch.sin(half_E1)), dim=-1)[:, None]
+            pos_EN3, quat_EN4 = motion_bodies(view, self.file, self.bodies)
+            place_E3 = torch.cat((own.pos_EL[:, :2], pos_E3[:, 2:]), dim=-1)
+            placed_EN3 = place_E3[:, None] + quaternion.rotate(turn_EN4, pos_EN3 - pos_E3[:, None])
+            turned_EN4 = quaternion.multiply(turn_EN4, quat_EN4)
+            view.cache[key] = torch.cat((placed_EN3, turned_EN4), dim=-1)
+        return Poses(view.cache[key][..., :3], view.cache[key][..., 3:])
+
+
+def motion_velocities(
+    view: EnvView, file: str, bodies: Patterns
+) -> tuple[Float[Tensor, "E N 3"], Float[Tensor, "E N 3"]]:
+    """Return linear (m/s) and angular (rad/s) velocities that bodies have in the motion now, world frame.
+
+    Those of the origins of the body frames, from the motion's qpos and qvel; between frames linearly.
+    """
+    key = f"motion/{file}.velocity of {bodies}"
+    if key not in view.cache:
+        motion, table_FN6 = view.motion(file), _velocity_table(view, file, bodies)
+        last = table_FN6.shape[0] - 1
+        frame_E = (motion_time(view, file) * motion.fps).clamp(0.0, float(last))
+        low_E = frame_E.floor().long().clamp(max=last - 1)
+        share_E11 = (frame_E - low_E)[:, None, None]
+        view.cache[key] = torch.lerp(table_FN6[low_E], table_FN6[low_E + 1], share_E11)
+    return view.cache[key][..., :3], view.cache[key][..., 3:]
+
+
+def _velocity_table(view: EnvView, file: str, bodies: Patterns) -> Tensor:
+    tables, key = _VELOCITIES.setdefault(view, {}), (file, view.bodies(bodies).ids)
+    if key not in tables:
+        motion, model = view.motion(file), view.world.mj_model
+        qpos_FL, qvel_FM = motion.qpos_FL.cpu().numpy(), motion.qvel_FL.cpu().numpy()
+        found_FN6 = body_velocities(model, qpos_FL, qvel_FM, key[1])
+        # Outside of inference mode: the table outlives the mode of the call that happens to come first.
+        with torch.inference_mode(False):
+            tables[key] = torch.tensor(found_FN6, dtype=torch.float32, device=view.device)
+    return tables[key]
+
+
+def body_velocities(
+    mj_model: mujoco.MjModel,
+    qpos_FL: Float[np.ndarray, "F L"],
+    qvel_FM: Float[np.ndarray, "F M"],
+    bodies: tuple[int, ...],
+) -> Float[np.ndarray, "F N 6"]:
+    """Return linear, then angular velocities of body frames, world axes, m/s and rad/s, by the C engine."""
+    data, found_FN6 = mujoco.MjData(mj_model), np.zeros((len(qpos_FL), len(bodies), 6))
+    turn_and_move = np.empty(6)
+    for frame, (qpos, qvel) in enumerate(zip(qpos_FL, qvel_FM, strict=True)):
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        mujoco.mj_kinematics(mj_model, data)
+        mujoco.mj_comPos(mj_model, data)
+        mujoco.mj_comVel(mj_model, data)
+        for place, body in enumerate(bodies):
+            mujoco.mj_objectVelocity(mj_model, data, mujoco.mjtObj.mjOBJ_XBODY, body, turn_and_move, 0)
+            found_FN6[frame, place] = np.roll(turn_and_move, 3)
+    return found_FN6

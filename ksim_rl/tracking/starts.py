@@ -1,0 +1,120 @@
+"""This module begins episodes inside of a reference motion, off its states, and more often where robots have failed."""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ksim_rl import ranks
+from ksim_rl.checked import NonNegative, Positive, Share
+from ksim_rl.envs.term import CurriculumTerm
+from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.events import Ranges, draw_by_axis
+from ksim_rl.mdp.motion_tracking import OfMotion, ResetToMotion
+from ksim_rl.scene import quaternion
+from ksim_rl.scene.state.motion_clock import motion_shift, motion_start_time, motion_time
+
+
+def part_weights(view: EnvView, file: str, parts: int) -> Float[Tensor, "E B"]:
+    """Return the buffer of how much likelier than others each part of a motion is as a start; `FailedParts` writes it.
+
+    Parts are of equal length. Zeros stand for parts that are all alike.
+    """
+    return view.buffers.get(f"motion/{file}.part_weights_EB", parts, keep=True)
+
+
+def parts_of(view: EnvView, file: str, part_s: float) -> int:
+    """Return how many parts of about `part_s` seconds a motion has."""
+    return max(1, math.ceil(view.motion(file).duration_s / part_s - 1e-6))
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartInMotion(ResetToMotion):
+    """Put the first robot into a state of the motion, plus drawn errors of the root and of each joint.
+
+    Starts are drawn from `start_range`, shares of the motion's duration; where the curriculum `FailedParts` runs, from
+    its weights instead.
+
+    Attributes:
+        pose_range, velocity_range: what is added to the root: x, y, z (m, m/s), roll, pitch, yaw (rad, rad/s), world.
+        joint_range: rad added to each joint at most, either way; joints stay in their soft limits.
+        part_s: length of the curriculum's parts, s; None: none runs.
+    """
+
+    pose_range: Ranges = field(default_factory=dict)
+    velocity_range: Ranges = field(default_factory=dict)
+    joint_range: NonNegative = 0.0
+    part_s: Positive | None = None
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        motion, start_E, robot = view.motion(self.file), motion_start_time(view, self.file), view.robot
+        drawn_E = self._share(view) * motion.duration_s
+        start_E.copy_(torch.where(mask_E, drawn_E, start_E))
+        qpos_EL, qvel_EL = motion.sample(start_E)
+        view.write_qpos(mask_E, qpos_EL)
+        view.write_qvel(mask_E, qvel_EL)
+
+        moved_E6, kick_E6 = (draw_by_axis(view, ranges) for ranges in (self.pose_range, self.velocity_range))
+        turn_E4 = quaternion.from_euler_xyz(*moved_E6[:, 3:].unbind(-1))
+        pos_E3, quat_E4 = qpos_EL[:, robot.root_qpos][:, :3], qpos_EL[:, robot.root_qpos][:, 3:]
+        shift_E3 = motion_shift(view)
+        pos_E3 = pos_E3 + moved_E6[:, :3] if shift_E3 is None else pos_E3 + moved_E6[:, :3] + shift_E3
+        robot.write_root_pose(mask_E, pos_E3, quaternion.multiply(turn_E4, quat_E4))
+        # As in the motion: what the root's velocity is in the world does not turn with the error of its pose.
+        free = slice(robot.root_qvel.start, robot.root_qvel.start + 3)
+        lin_vel_E3 = qvel_EL[:, free] + kick_E6[:, :3]
+        ang_vel_E3 = quaternion.rotate(quat_E4, qvel_EL[:, free.stop : free.stop + 3]) + kick_E6[:, 3:]
+        robot.write_root_velocity(mask_E, lin_vel_E3, ang_vel_E3)
+
+        joints = view.joints()
+        low_L, high_L = joints.soft_limits_L2.unbind(-1)
+        off_EL = view.uniform(len(joints), -self.joint_range, self.joint_range)
+        joints.write_pos(mask_E, torch.clamp(qpos_EL[:, joints.qpos] + off_EL, low_L, high_L))
+
+    def _share(self, view: EnvView) -> Tensor:
+        """Draw where in the motion each env would begin, as a share of its duration."""
+        drawn_E2 = view.uniform(2)
+        low, high = self.start_range
+        plain_E = low + (high - low) * drawn_E2[:, 0]
+        if self.part_s is None:
+            return plain_E
+        parts = parts_of(view, self.file, self.part_s)
+        reach_EB = torch.cumsum(part_weights(view, self.file, parts), dim=-1)
+        whole_E = reach_EB[:, -1]
+        part_E = (drawn_E2[:, :1] * whole_E[:, None] >= reach_EB).sum(-1).clamp(max=parts - 1)
+        return torch.where(whole_E > 0.0, (part_E + drawn_E2[:, 1]) / parts, plain_E)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FailedParts(OfMotion, CurriculumTerm):
+    """Lets episodes begin more often in the parts of a motion where failures end them; `StartInMotion` reads it.
+
+    Reports the share of starts in the part that has most.
+
+    Attributes:
+        part_s: length of a part, as in `StartInMotion`, s.
+        uniform: share of the starts that are spread evenly over all parts.
+        memory: how many resets with a failure or an end are remembered (an exponential mean).
+    """
+
+    part_s: Positive = 1.0
+    uniform: Share = 0.5
+    memory: Positive = 500.0
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
+        parts = parts_of(view, self.file, self.part_s)
+        failed_B = view.shared("failed_B", [1.0] * parts)
+        weights_EB = part_weights(view, self.file, parts)
+        lived_E = mask_E & (view.episode_step_E > 0)
+        share_E = motion_time(view, self.file) / view.motion(self.file).duration_s
+        part_E = (share_E * parts).long().clamp(0, parts - 1)
+        is_here_EB = part_E[:, None] == torch.arange(parts, device=view.device)
+        counts_B = (is_here_EB & (lived_E & view.terminated_E)[:, None]).sum(0).to(torch.float32)
+        ranks.sum_(counts_B)
+        mixed_B = failed_B + (counts_B - failed_B) / self.memory
+        failed_B.copy_(torch.where(ranks.any_of(lived_E), mixed_B, failed_B))
+        chance_B = self.uniform / parts + (1.0 - self.uniform) * failed_B / failed_B.sum().clamp(min=1e-9)
+        weights_EB.copy_(torch.where(mask_E[:, None], chance_B, weights_EB))
+        return chance_B.max() / chance_B.sum()

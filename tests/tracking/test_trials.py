@@ -1,0 +1,83 @@
+"""Trials: who gets to the end of a motion within the limits succeeds, and nobody else."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+from ksim_rl import conf
+from ksim_rl.scene.motions.motion import motion_path
+from ksim_rl.tracking.starts import StartInMotion
+from ksim_rl.tracking.tasks import HEIGHT_LIMIT, TASKS, UPRIGHT_LIMIT, track_cfg
+from ksim_rl.tracking.trials import run_trials, trial_cfg
+from tests.tracking.g1 import g1_model
+
+STEPS = 12
+
+
+@pytest.fixture(scope="module")
+def short_clip(tmp_path_factory):
+    """The first quarter of a second of the walk, in which the robot stands."""
+    g1_model()
+    path = tmp_path_factory.mktemp("clips") / "short.npz"
+    with np.load(motion_path("g1_walk")) as file:
+        arrays = {name: file[name] for name in file.files}
+    cut = {name: arrays[name][: STEPS + 1] for name in ("qpos", "qvel")}
+    np.savez(path, **{**arrays, **cut})
+    return str(path)
+
+
+def run_cfg(clip, **limits):
+    cfg = conf.compose(["task=g1_track_walk", "device=cpu", "num_envs=4"])
+    task = track_cfg(clip)
+    terminations = {
+        name: dataclasses.replace(term, distance=limits["distance"]) if hasattr(term, "distance") else term
+        for name, term in task.terminations.items()
+    }
+    return dataclasses.replace(cfg, task=dataclasses.replace(task, terminations=terminations))
+
+
+def still():
+    return TensorDictModule(lambda actor_EL: torch.zeros(*actor_EL.shape[:-1], 29), ["actor"], ["action"])
+
+
+def test_all_succeed_whom_no_limit_ends(short_clip):
+    found = run_trials(run_cfg(short_clip, distance=10.0), still(), trials=6)
+    assert (found.trials, found.success) == (6, 1.0)
+    assert 0.005 < found.errors["body_pos_error"] < 0.2
+    assert "100.0% of 6 trials succeed" in str(found)
+
+
+def test_none_succeeds_where_the_limit_is_tight(short_clip):
+    assert run_trials(run_cfg(short_clip, distance=1e-4), still(), trials=6).success == 0.0
+
+
+def test_trials_begin_with_the_motion_and_are_not_pushed():
+    cfg = trial_cfg(track_cfg("g1_walk"))
+    start = cfg.events["start"]
+    assert isinstance(start, StartInMotion)
+    assert (start.start_range, start.part_s, start.joint_range) == ((0.0, 0.0), None, 0.1)
+    assert "push_robot" not in cfg.events and {"foot_friction", "base_com", "default_pose"} <= set(cfg.events)
+    assert cfg.curriculum == {}
+    assert "push_robot" in trial_cfg(track_cfg("g1_walk"), pushes=True).events
+
+
+def test_a_task_without_a_motion_is_refused():
+    cfg = conf.compose(["task=pendulum_swingup"]).task
+    with pytest.raises(ValueError, match="StartInMotion.*g1_track_walk"):
+        trial_cfg(cfg)
+
+
+def test_the_tasks_have_the_limits_of_the_peer():
+    # mjlab, src/mjlab/tasks/tracking/tracking_env_cfg.py at 0eda4e7: anchor_pos, anchor_ori, ee_body_pos.
+    assert (HEIGHT_LIMIT, UPRIGHT_LIMIT) == (0.25, 0.8)
+    for task in TASKS:
+        terminations = task.cfg().terminations
+        assert terminations["anchor_height"].distance == terminations["ends_height"].distance == 0.25
+        assert terminations["anchor_upright"].limit == 0.8
+        assert not any(
+            terminations[name].time_out for name in ("anchor_height", "anchor_upright", "ends_height")
+        )
+        assert terminations["finished"].time_out
