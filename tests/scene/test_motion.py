@@ -89,7 +89,7 @@ def test_what_does_not_fit_the_model_is_refused(model, tmp_path, changes, messag
 
 def test_a_file_that_is_no_archive_is_refused(model, tmp_path):
     file = tmp_path / "clip.npz"
-    with pytest.raises(ValueError, match="no such file, .* with the package: walker_walk"):
+    with pytest.raises(ValueError, match="no such file, .* with the package: .*walker_walk"):
         load_motion(file, model, CPU)
     file.write_bytes(b"PK\x03\x04nothing")
     with pytest.raises(ValueError, match="cannot be read as .npz"):
