@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from ksim_rl.physics import kernels, upstream
-from ksim_rl.physics.collision.collisions import broad_phase_unavailable, collisions
+from ksim_rl.physics.collision.collisions import collisions
 from ksim_rl.physics.contact_sensors import ContactReadings
 from ksim_rl.physics.newton import solver as newton
 from ksim_rl.physics.rows.constraint_rows import constraint_rows
@@ -36,8 +36,9 @@ class Substeps:
     The variants share all arrays with `warp_model`. Build them once its arrays are in their final place. With
     `one_kernel_solver`, `newton` solves, which must suit the model, instead of MuJoCo Warp's own solver. Then, with
     `one_kernel_dynamics`, which must suit it too, one kernel precedes the constraints. Then, with `one_kernel_rows`,
-    one makes their rows, and `contact_lists` besides, from which contact sensors are read, and with
-    `one_kernel_integration` one integrates. What can run beside the rest of a substep does so on the stream `aside`.
+    one makes their rows, and `contact_lists` besides, from which contact sensors are read, with `own_broad_phase` ours
+    finds the pairs of geoms, and with `one_kernel_integration` one kernel integrates. What can run beside the rest of a
+    substep does so on the stream `aside`.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class Substeps:
         one_kernel_solver: bool = False,
         one_kernel_dynamics: bool = False,
         one_kernel_rows: bool = False,
+        own_broad_phase: bool = False,
         one_kernel_integration: bool = False,
         aside: wp.Stream | None = None,
         mask: wp.array | None = None,
@@ -85,8 +87,8 @@ class Substeps:
             self._alter(
                 sensor_contact_acc_adr=upstream.contact_sensors_but(warp_model, self._contacts.sensors)
             )
-            if broad_phase_unavailable(warp_model, warp_data_E) is None:
-                self._collide = collisions(warp_model, warp_data_E)
+        if own_broad_phase:
+            self._collide = collisions(warp_model, warp_data_E)
         self._integrate = integration(warp_model, warp_data_E) if one_kernel_integration else None
         self._needs_transmission = bool(np.isin(sensor_type, TRANSMISSION_SENSORS).any())
         self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any())

@@ -32,7 +32,7 @@ def tables(text):
     """Return the tables by title, each a list of rows without its heads."""
     found: dict[str, list[str]] = {}
     title = ""
-    for line in text.splitlines()[4:]:
+    for line in text.splitlines()[5:]:
         if line and not line.startswith(" "):
             title = line
             found[title] = []
@@ -73,11 +73,13 @@ def test_the_first_line_says_how_many_and_how_long():
 
 
 def test_the_next_lines_say_what_kernels_compute_physics():
-    assert explained().splitlines()[1:4] == [
+    assert explained().splitlines()[1:5] == [
         "constraints are solved by one kernel",
         "what precedes them is computed by MuJoCo Warp's own kernels, "
         "because sim.one_kernel_dynamics is None, on the CPU",
         "their rows are made by MuJoCo Warp's own kernels, because what precedes them is not one kernel",
+        "geoms that may touch are found by MuJoCo Warp's own kernels, because the rows of contacts are not made by one "
+        "kernel",
     ]
     env = puck_env(limit=None, sim=SimCfg(solver="cg", one_kernel_dynamics=True))
     solver, kernels = env.explain().splitlines()[1:3]

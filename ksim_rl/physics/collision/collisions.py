@@ -14,10 +14,16 @@ LANES, CUDA_THREADS = 32, 128
 FILTERS = mjw.BroadphaseFilter.PLANE | mjw.BroadphaseFilter.SPHERE | mjw.BroadphaseFilter.OBB
 
 
-def broad_phase_unavailable(warp_model: mjw.Model, warp_data_E: mjw.Data) -> str | None:
-    """Return why MuJoCo Warp's own broad phase finds a model's pairs, or None where ours does."""
+def broad_phase_unavailable(
+    warp_model: mjw.Model, warp_data_E: mjw.Data, *, rows_unavailable: str | None = None
+) -> str | None:
+    """Return why MuJoCo Warp's own broad phase finds a model's pairs, or None where ours does.
+
+    Contacts stand in another order then, which rows by one kernel do not depend on.
+    """
     m, opt, bits = warp_model, warp_model.opt, mjw.DisableBit
     reasons = {
+        "the rows of contacts are not made by one kernel": rows_unavailable is not None,
         "no contacts are wanted": bool(opt.disableflags & (bits.CONSTRAINT | bits.CONTACT)),
         "there is no room for contacts": warp_data_E.naconmax == 0,
         "it sweeps and prunes, or by other filters": (opt.broadphase, opt.broadphase_filter)
