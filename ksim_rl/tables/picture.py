@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -20,7 +21,7 @@ def draw(table: Table, rows: Mapping[str, Sequence[Mapping[str, Any]]], path: Pa
     height = 1.8 + 0.27 * max(len(names) for _, names in groups)
     figure = Figure(figsize=(6.0 * len(groups), height), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(table.title, fontsize=12)
+    figure.suptitle("\n".join(wrap(table.title, 60 * len(groups))), fontsize=12)
     for column, (group, names) in enumerate(groups):
         axes = figure.add_subplot(1, len(groups), column + 1)
         for line, name in enumerate(names):

@@ -51,7 +51,12 @@ def said() -> dict[str, tuple[str, str]]:
             PAGE,
             f"{scaling['h200/go1_velocity_flat/32768/env_states_per_s'] / 1e6:.2f} million env states per second",
         ),
-        "g1": (PAGE, f"trains at {speed[G1 + 'env_states_per_s'] / 1000:.0f},000 with 4096"),
+        "g1": (PAGE, f"trains at {round(speed[G1 + 'env_states_per_s'], -3):,.0f} with 4096"),
+        "kernels": (
+            PAGE,
+            f"is {speed[GO1 + 'kernels_per_control_step']:.0f} kernels, one of G1 "
+            f"{speed[G1 + 'kernels_per_control_step']:.0f}",
+        ),
         "g1 physics": (PAGE, f"{speed[G1 + 'iteration_over_physics']:.2f} times its raw physics"),
         "peers": (
             PAGE,
