@@ -120,7 +120,9 @@ class Substeps:
             mjw.step(m, self.warp_data_E)
             return
         m.opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
-        stages = (
+        newton.step(
+            m,
+            self.warp_data_E,
             self._solve,
             dynamics,
             self._make_rows,
@@ -128,8 +130,8 @@ class Substeps:
             self._integrate,
             self._aside,
             self._collide,
+            sensors=sensors != "none" or self._always_senses,
         )
-        newton.step(m, self.warp_data_E, *stages, sensors=sensors != "none" or self._always_senses)
 
     def refresh(self, *, masked: bool = False) -> None:
         """Launch what recomputes position- and velocity-stage quantities from the present qpos and qvel.

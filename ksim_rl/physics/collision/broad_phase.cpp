@@ -9,7 +9,6 @@ const auto* const pair_ids = problem.nxn_pairid_filtered.data;
 const int num_pairs = problem.nxn_geom_pair_filtered.shape[0];
 const wp::vec3* const positions = row_of(problem.geom_xpos);
 const wp::mat33* const turns = row_of(problem.geom_xmat);
-auto model_row = [=](auto& array) { return array.data + (array.shape[0] > 1 ? (size_t)world * array.shape[1] : 0); };
 const wp::vec3* const boxes = model_row(problem.geom_boxes);  // centre and half sizes of each geom
 const float* const bounds = model_row(problem.geom_rbound);
 
@@ -92,8 +91,9 @@ auto each_of = [&](unsigned bits, auto body) {
 };
 for (int first = 0; first < num_pairs; first += CHUNK) {
     const unsigned bits = passing(wp::min(CHUNK, num_pairs - first), [&](int item) { return are_near(first + item); });
-    int place = sum_before(number_of(bits));
-    const int count = of_lane(place + number_of(bits), LANES - 1);
+    const int found = number_of(bits);
+    int place = sum_before(found);
+    const int count = of_lane(place + found, LANES - 1);
     each_of(bits, [&](int item) { near[place++] = item; });
     sync();
     const unsigned touching = passing(count, [&](int item) { return may_touch(first + near[item]); });

@@ -6,6 +6,8 @@
 // same formula, and sums are added in one order: the results have the same bits.
 
 auto row_of = [=](auto& array) { return array.data + (size_t)world * array.shape[1]; };
+// Of a field of the model, which has one row for each world or one for all.
+auto model_row = [=](auto& array) { return array.data + (array.shape[0] > 1 ? (size_t)world * array.shape[1] : 0); };
 #if defined(__CUDA_ARCH__)
 const unsigned own_lanes = (LANES == 32 ? 0xffffffffu : (1u << (LANES % 32)) - 1u) << (threadIdx.x % 32 / LANES * LANES);
 #endif

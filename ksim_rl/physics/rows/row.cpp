@@ -10,8 +10,6 @@ using mask64 = unsigned long long;  // of degrees of freedom
 
 constexpr float TINY = 1e-15f, LEAST_IMPEDANCE = 1e-4f, MOST_IMPEDANCE = 0.9999f, PI = 3.14159265f;
 
-// Of a field of the model, which has one row for each world or one for all.
-auto model_row = [=](auto& array) { return array.data + (array.shape[0] > 1 ? (size_t)world * array.shape[1] : 0); };
 auto of_world = [=](auto& array) { return array.data[array.shape[0] > 1 ? world : 0]; };
 const float timestep = of_world(problem.timestep);
 const float* const qpos = row_of(problem.qpos);
