@@ -46,13 +46,14 @@ class CompiledStep:
         self._tape = Tape(recorder, num_rows=env.batch_size[0], returned=returned)
         # The second step shows what the first one kept elsewhere than in tensors.
         expected = [_state(env, root_E, self._next_E), _state(env, root_E, step().select("next"))]
-        env.load_state_dict(before)
-        root_E.update_(root_before_E)
-        found = [_state(env, root_E, self(tensordict)) for _ in expected]
-        env.load_state_dict(before)
-        root_E.update_(root_before_E)
-        for own, true in zip(found, expected, strict=True):
-            _compare(own, true)
+        try:
+            env.load_state_dict(before)
+            root_E.update_(root_before_E)
+            for true in expected:  # one by one, as a state of many envs takes much memory
+                _compare(_state(env, root_E, self(tensordict)), true)
+        finally:
+            env.load_state_dict(before)
+            root_E.update_(root_before_E)
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Make a step, and reset the rows that are done: return the EnvState's `next`, and write the next root.
