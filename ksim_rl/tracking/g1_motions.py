@@ -47,8 +47,12 @@ def _swing(times: list[float], amplitude: float, *, first: float = 1.0) -> Keys:
     return ((times[0], 0.0), *inner, (times[-1], 0.0))
 
 
-def _arm_swing(times: list[float], shoulder: float, elbow: float) -> dict[str, Keys]:
-    """Return arms that swing in turn, rad; a bent elbow follows its shoulder."""
+def _arm_swing(
+    begin_s: float, step_s: float, count: int, *, shoulder: float, elbow: float
+) -> dict[str, Keys]:
+    """Return arms that swing in turn with so many steps, rad; a bent elbow follows its shoulder."""
+    steps = (begin_s + (number + 0.9) * step_s for number in range(count))
+    times = [begin_s - 0.3, *steps, begin_s + count * step_s + 0.6]
     keys: dict[str, Keys] = {}
     for side, sign in (("left", 1.0), ("right", -1.0)):
         keys[f"{side}_shoulder_pitch_joint"] = _swing(times, shoulder, first=sign)
@@ -91,14 +95,13 @@ def walk() -> Choreography:
             )
         )
     end_s = begin_s + count * step_s
-    times = [begin_s - 0.3, *(begin_s + (n + 0.9) * step_s for n in range(count)), end_s + 0.6]
     return Choreography(
         duration_s=end_s + 1.2,
         feet=FEET,
         moves=moves,
         root_height=((0.2, STAND), (0.8, 0.72), (end_s, 0.72), (end_s + 0.7, STAND)),
         lean=((0.2, 0.0), (0.9, 0.06), (end_s, 0.06), (end_s + 0.6, 0.0)),
-        joints=_arm_swing(times, 0.45, 0.35),
+        joints=_arm_swing(begin_s, step_s, count, shoulder=0.45, elbow=0.35),
     )
 
 
@@ -147,13 +150,15 @@ def turn() -> Choreography:
             )
         )
     end_s = begin_s + count * step_s
-    times = [begin_s - 0.3, *(begin_s + (n + 0.9) * step_s for n in range(count)), end_s + 0.6]
     return Choreography(
         duration_s=end_s + 1.2,
         feet=FEET,
         moves=moves,
         root_height=((0.2, STAND), (0.8, 0.7), (end_s, 0.7), (end_s + 0.7, STAND)),
-        joints={**_arm_swing(times, 0.45, 0.4), **_arms_out(0.2, end_s + 0.8, 0.15)},
+        joints={
+            **_arm_swing(begin_s, step_s, count, shoulder=0.45, elbow=0.4),
+            **_arms_out(0.2, end_s + 0.8, 0.15),
+        },
     )
 
 
