@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ksim_rl.checked import Checked, NonNegative, Positive
 from ksim_rl.checks import near
-from ksim_rl.clips.inverse_kinematics import ComGoal, InverseKinematics, PoseGoal
+from ksim_rl.clips.inverse_kinematics import InverseKinematics, PoseGoal
 from ksim_rl.clips.recording import Array, Recording, multiply
 from ksim_rl.config.config_tree import from_tree
 from ksim_rl.config.plain_data import read_yaml
@@ -86,7 +86,9 @@ def retargeted(
     rest_L = (mj_model.key_qpos[0] if mj_model.nkey else mj_model.qpos0).copy()
     pull_M = np.full(mj_model.nv, cfg.posture_weight)
     pull_M[:6] = 0.0
-    keep_M = np.full(mj_model.nv, cfg.stride_weight)
+    # Two pulls on one coordinate are one, to the weighted mean of where they pull to.
+    both_M = np.hypot(pull_M, cfg.stride_weight)
+    share_M = (pull_M / np.maximum(both_M, 1e-12)) ** 2
     found: list[Array] = []
     for frame in range(len(played.pos_FN3)):
         goals = _goals(played, cfg, frame)
@@ -96,9 +98,7 @@ def retargeted(
             patient = InverseKinematics(mj_model, replace(solver.cfg, iterations=400))
             found.append(patient.solve(goals, start_L=start_L, posture_L=start_L, posture_weight_M=pull_M))
             continue
-        # Two pulls on one coordinate are one, to the weighted mean of where they pull to.
-        both_M = np.hypot(pull_M, keep_M)
-        aim_L = _between(mj_model, found[-1], rest_L, (pull_M / np.maximum(both_M, 1e-12)) ** 2)
+        aim_L = _between(mj_model, found[-1], rest_L, share_M)
         found.append(solver.solve(goals, start_L=found[-1], posture_L=aim_L, posture_weight_M=both_M))
     qpos_FL = np.array(found)
     if cfg.soles:
@@ -106,8 +106,8 @@ def retargeted(
     return qpos_FL
 
 
-def _goals(played: Recording, cfg: Retarget, frame: int) -> list[PoseGoal | ComGoal]:
-    goals: list[PoseGoal | ComGoal] = []
+def _goals(played: Recording, cfg: Retarget, frame: int) -> list[PoseGoal]:
+    goals: list[PoseGoal] = []
     for pair in cfg.pairs:
         point = played.names.index(pair.point)
         quat_4 = multiply(played.quat_FN4[frame, point], np.array(pair.quat)) if pair.turn_weight else None
@@ -123,10 +123,9 @@ def _goals(played: Recording, cfg: Retarget, frame: int) -> list[PoseGoal | ComG
     return goals
 
 
-def _facing(rest_L: Array, first: PoseGoal | ComGoal) -> Array:
+def _facing(rest_L: Array, first: PoseGoal) -> Array:
     """Return the default pose with the root where the first pair's part should be, and with its heading."""
     start_L = rest_L.copy()
-    assert isinstance(first, PoseGoal)
     start_L[:3] = first.pos_3
     if first.quat_4 is not None:
         w, x, y, z = first.quat_4
