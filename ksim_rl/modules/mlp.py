@@ -141,8 +141,8 @@ class Layers(nn.Sequential):
         out = features.reshape(1, -1, features.shape[-1]) if alone else features
         parts: list[Any] = list(self)
         linears = [part for part in parts if isinstance(part, nn.Linear | EnsembleLinear)]
-        weights = [layer.weight.mT[None] if alone else layer.weight for layer in linears]
-        rounded = _rounded(weights)
+        weights = [layer.weight for layer in linears]
+        rounded = _rounded([own.mT[None] if alone else own for own in weights])
         while parts:
             layer = parts.pop(0)
             if not isinstance(layer, nn.Linear | EnsembleLinear):
@@ -168,13 +168,15 @@ def rounds(features: Float[Tensor, "*batch L"]) -> bool:
 class _Product(Function):
     """The products [N, B, M] of features [N, B, K] and weights [N, K, M], which are there `rounded` as well.
 
-    The gradient of the weights is a sum over env states in SPLITS parts: its outputs alone, which are few, would occupy
-    a part of the GPU.
+    Those of one network are [M, K], as torch has them. The gradient of the weights is a sum over env states in SPLITS
+    parts: its outputs alone, which are few, would occupy a part of the GPU. It lies in memory as the weights do, since
+    autograd copies what does not.
     """
 
     @staticmethod
-    def forward(ctx: Any, features_NBK: Tensor, weight_NKM: Tensor, rounded: Tensor) -> Tensor:
-        fan_in, fan_out = ctx.sizes = weight_NKM.shape[1:]
+    def forward(ctx: Any, features_NBK: Tensor, weight: Tensor, rounded: Tensor) -> Tensor:
+        ctx.alone = weight.dim() == 2
+        fan_in, fan_out = ctx.sizes = weight.mT.shape if ctx.alone else weight.shape[1:]
         features = _padded(features_NBK, -fan_in % 8)
         ctx.save_for_backward(features, rounded)
         ctx.dtype = features_NBK.dtype
@@ -192,8 +194,11 @@ class _Product(Function):
             networks, rows = features.shape[:2]
             splits = math.gcd(SPLITS, rows)
             parts = [part.reshape(networks * splits, rows // splits, -1) for part in (features, d_out)]
+            if ctx.alone:
+                parts, fan_in, fan_out = parts[::-1], fan_out, fan_in
             sums = torch.bmm(parts[0].mT, parts[1]).unflatten(0, (networks, splits))
-            d_weight = sums.sum(1, dtype=torch.float32)[:, :fan_in, :fan_out]
+            d_weight = sums[..., :fan_in, :fan_out].sum(1, dtype=torch.float32)
+            d_weight = d_weight[0] if ctx.alone else d_weight
         return d_features, d_weight, None
 
 

@@ -19,6 +19,8 @@ FUSED = (nn.ReLU, nn.SiLU)
 EPS = tl.constexpr(1e-5)  # torch's
 # What a thread loads at once (16 bytes of bfloat16), and how many elements of a tile it has.
 VECTOR, ELEMENTS = 8, 32
+# Columns that a program of `sum_parts` adds up: two sectors of memory, and as many programs as a GPU has room for.
+SUMMED = 16
 
 
 @triton.jit
@@ -73,7 +75,7 @@ def normalize_rows_back(
 ):  # fmt: skip
     """Write the gradient at the features of `STEPS * ROWS` rows, and with WEIGHTS the sums of those of the weights.
 
-    `partials` [N, programs, 3, width] get the sums of bias, gain and offset.
+    `partials` [3, N, programs, width] get the sums of bias, gain and offset.
     """
     biases, gains = _of_columns(bias, width, LANES), _of_columns(gain, width, LANES)
     offsets = _of_columns(offset, width, LANES)
@@ -107,11 +109,25 @@ def normalize_rows_back(
             d_bias += tl.sum(slope, 0)
     if WEIGHTS:
         column = tl.arange(0, LANES)
-        program = tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)
-        part = partials + program * 3 * width + column
+        programs = tl.num_programs(0)
+        part = partials + (tl.program_id(1) * programs + tl.program_id(0)) * width + column
+        kind = tl.num_programs(1) * programs * width
         tl.store(part, d_bias, mask=column < width)
-        tl.store(part + width, d_gain, mask=column < width)
-        tl.store(part + 2 * width, d_offset, mask=column < width)
+        tl.store(part + kind, d_gain, mask=column < width)
+        tl.store(part + 2 * kind, d_offset, mask=column < width)
+
+
+@triton.jit
+def sum_parts(parts, sums, count, width, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    """Write the sums of `count` parts [M, count, width] to `sums` [M, width]: program (i, m) takes COLUMNS of m."""
+    column = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
+    inside = column < width
+    parts += tl.program_id(1) * count * width + column[None, :]
+    total = tl.zeros((ROWS, COLUMNS), dtype=tl.float32)
+    for first in range(0, count, ROWS):
+        row = first + tl.arange(0, ROWS)[:, None]
+        total += tl.load(parts + row * width, mask=(row < count) & inside[None, :], other=0.0)
+    tl.store(sums + tl.program_id(1) * width + column, tl.sum(total, 0), mask=inside)
 
 
 class Normalized(Function):
@@ -149,12 +165,17 @@ class Normalized(Function):
         networks, rows, width = features.shape
         programs, tile = _cut(rows, width)
         d_features = torch.empty_like(features)
-        partials = weights[0].new_empty(networks, programs if learns else 0, 3, width)
+        partials = weights[0].new_empty(3, networks, programs if learns else 0, width)
         given = d_out_NBL.contiguous(), *ctx.saved_tensors, d_features, partials
         launch: Any = normalize_rows_back[programs, networks]
         launch(*given, rows, width, ctx.activation, learns, **tile)
-        sums = zip(partials.sum(1).unbind(1), weights, strict=True)
-        return d_features, *(d_weight.view_as(weight) if learns else None for d_weight, weight in sums), None
+        if not learns:
+            return d_features, None, None, None, None
+        # Each gradient in one piece: autograd would copy others.
+        sums = weights[0].new_empty(3, networks, width)
+        launch = sum_parts[-(-width // SUMMED), 3 * networks]
+        launch(partials, sums, programs, width, ROWS=256, COLUMNS=SUMMED, num_warps=8)
+        return d_features, *(own.view_as(weight) for own, weight in zip(sums, weights, strict=True)), None
 
 
 def _cut(rows: int, width: int) -> tuple[int, dict[str, int]]:

@@ -71,6 +71,9 @@ def test_layers_in_half_precision_err_as_torch_does(num_networks, activation, mo
     monkeypatch.setattr(sys.modules[Layers.__module__], "rounds", lambda features: True)
     ours = run()
     assert ours[0].dtype == torch.bfloat16 and ours[0].shape == exact[0].shape
+    # Autograd would copy gradients that lie in memory otherwise than their parameters.
+    for gradient, parameter in zip(ours[1:], layers.parameters(), strict=True):
+        assert gradient.stride() == parameter.stride()
     for one, plain, true in zip(ours, of_torch, exact, strict=True):
         allowed = max(0.02, 1.5 * float((plain - true).norm() / true.norm()))
         assert (one - true).norm() < allowed * true.norm()

@@ -85,7 +85,7 @@ class OffPolicyUpdate(RolloutUpdate):
         self._images = None
         if cfg.symmetry == "augment":
             self._images = SymmetricAugmentation(mirror, read=self._observations, device=self.device)
-        self._read, self._count_ = fast(self._stored), fast(self.guard.count_)
+        self._read, self._count_ = fast(self._stored), fast(self._counted_)
         self._critic_loss, self._actor_losses = fast(loss.critic_loss), fast(loss.actor_losses)
         self.replay = ReplayRing(
             data, num_envs=num_envs, observations=self._observations, gamma=cfg.gamma, device=self.device
@@ -138,14 +138,18 @@ class OffPolicyUpdate(RolloutUpdate):
         of_critic, of_actor, in_a_row = [], [], []
         for step, minibatch_B in enumerate(minibatches, start=1):
             of_critic.append(self._improve_critic(minibatch_B))
-            skipped = of_critic[-1]["skipped"]
+            skipped = [of_critic[-1]["skipped"]]
             if step % self.cfg.policy_delay == 0:
                 of_actor.append(self._improve_actor(minibatch_B))
-                skipped = torch.maximum(skipped, of_actor[-1]["skipped"])
-            self._count_(skipped)
-            in_a_row.append(self.guard.skipped_in_a_row.clone())
+                skipped.append(of_actor[-1]["skipped"])
+            in_a_row.append(self._count_(skipped))
         self._measure_(in_columns(of_critic) | {"skipped_in_a_row": torch.stack(in_a_row)})
         self._means.take_(in_columns(of_actor))
+
+    def _counted_(self, skipped: list[Tensor]) -> Tensor:
+        """Count a gradient step, skipped if one of its parts was; return how many in a row were."""
+        self.guard.count_(torch.stack(skipped).amax())
+        return self.guard.skipped_in_a_row.clone()
 
     def _stored(self, index_B: Int64[Tensor, " B"]) -> TensorDictBase:
         """Return env states of the replay for their indices, every second one in the mirror with a symmetry."""
