@@ -15,7 +15,7 @@ from ksim_rl.checked import Count, check_value
 from ksim_rl.checks import check_choice, check_in_range
 
 Device = torch.device | str | None
-SPLITS = 8  # see `_Product`
+SPLITS = 4  # see `_Product`
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "elu": nn.ELU,
     "gelu": nn.GELU,
