@@ -9,11 +9,11 @@ from pathlib import Path
 
 import torch
 
-from ksim_rl.checks import near
+from ksim_rl.checks import check_in_range, near
 from ksim_rl.tables import report
 from ksim_rl.tables.levels import is_reached
 from ksim_rl.tables.measure import run_cfg
-from ksim_rl.tables.runner import Runs
+from ksim_rl.tables.runner import Runs, gpus_for
 from ksim_rl.tables.table import load, shipped
 
 
@@ -28,6 +28,13 @@ def reproduce(arguments: Sequence[str]) -> int:
         raise ValueError(f"--rows {options.rows}: {table.name} has no such: {near(options.rows, table.rows)}")
     if strangers := set(seeds) - set(known):
         raise ValueError(f"--seeds: {strangers} are none of {known}; try other seeds with ksim-rl train")
+    timed = [name for name, row in rows.items() if row.measure == "seconds"]
+    check_in_range("--per-gpu", options.per_gpu, low=1)
+    if options.per_gpu > 1 and timed:
+        raise ValueError(
+            f"--per-gpu {options.per_gpu}: runs that share a GPU wait for each other, and {timed[0]} measures seconds; "
+            "leave it out, or choose other --rows"
+        )
     default = "benchmarks/results/tables" if Path("benchmarks/results").is_dir() else "tables"
     output = (options.output or Path(default)) / ("smoke" if smoke else "")
     run_folder = options.runs / ("smoke" if smoke else "") / table.name
@@ -39,16 +46,17 @@ def reproduce(arguments: Sequence[str]) -> int:
         print(said, flush=True)
 
     present = {} if smoke else runs.results()
-    # Seed by seed, so that what is cut off has some seeds of all rows.
+    # Seed by seed, so that what is cut off has some seeds of all rows; the longest first, so that all end together.
     jobs = [
         (name, seed)
         for seed in seeds or known
-        for name, row in rows.items()
+        for name, row in sorted(rows.items(), key=lambda item: -item[1].env_states)
         if seed in row.seeds and seed not in present.get(name, {})
     ]
     for name in {name for name, _ in jobs}:
         run_cfg(rows[name], 1, device="cpu", smoke=smoke)  # what is wrong is said before anything runs
-    left = runs.run(jobs, device=device, until=began + 60.0 * options.minutes, note=write)
+    gpus = gpus_for(device, per_gpu=options.per_gpu)
+    left = runs.run(jobs, gpus=gpus, until=began + 60.0 * options.minutes, note=write)
     write(f"{left} runs are missing; the table is {output / table.name}.md")
     done = runs.complete(seeds)
     missed = [name for name in rows if name in done and is_reached(rows[name], done[name]) is False]
@@ -64,6 +72,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--rows", default=".*", help="regular expression of rows, such as 'ppo/Walker.*'")
     parser.add_argument("--seeds", default="", help="some of the table's, such as 1,2")
     parser.add_argument("--device", default="cuda", help="cpu, or cuda where there is a GPU")
+    parser.add_argument(
+        "--per-gpu", type=int, default=1, help="runs that share a GPU, where no row measures seconds"
+    )
     parser.add_argument("--output", type=Path, help="default: benchmarks/results/tables, or tables elsewhere")
     parser.add_argument("--runs", type=Path, default=Path("runs/tables"), help="where the runs lie")
     parser.add_argument("--minutes", type=float, default=math.inf, help="end then; 0 writes what is there")

@@ -45,10 +45,15 @@ class Runs:
                 found[name] = [results[seed] for seed in wanted]
         return found
 
-    def run(self, jobs: Sequence[Job], *, device: str, until: float, note: Callable[[str], None]) -> int:
-        """Run jobs, one per GPU at a time, until a moment of `time.monotonic`; return how many have no result."""
+    def run(
+        self, jobs: Sequence[Job], *, gpus: Sequence[str], until: float, note: Callable[[str], None]
+    ) -> int:
+        """Run jobs, one at a time on each of `gpus`, until a moment of `time.monotonic`; count those without result.
+
+        A GPU that is named twice takes two at a time; "" stands for the CPU.
+        """
         waiting, left = list(jobs), 0
-        running: dict[str, tuple[Job, subprocess.Popen[bytes]]] = {}
+        running: dict[int, tuple[Job, subprocess.Popen[bytes]]] = {}
         try:
             while waiting or running:
                 is_over = time.monotonic() > until
@@ -56,9 +61,9 @@ class Runs:
                     left, waiting = left + len(waiting), []
                     for _, process in running.values():
                         process.kill()
-                for slot in _slots(device):
+                for slot, gpu in enumerate(gpus):
                     if slot not in running and waiting:
-                        running[slot] = waiting[0], self._start(waiting.pop(0), device, slot)
+                        running[slot] = waiting[0], self._start(waiting.pop(0), gpu)
                 for slot, (job, process) in list(running.items()):
                     if (code := process.poll()) is not None:
                         del running[slot]
@@ -73,13 +78,20 @@ class Runs:
                 process.wait()
         return left
 
-    def _start(self, job: Job, device: str, slot: str) -> subprocess.Popen[bytes]:
+    def _start(self, job: Job, gpu: str) -> subprocess.Popen[bytes]:
         log, result = self._log(job), self.folder / job[0] / f"seed_{job[1]}.json"
-        words = [self.source, job[0], str(job[1]), str(result), str(log.with_suffix("")), device]
+        words = [
+            self.source,
+            job[0],
+            str(job[1]),
+            str(result),
+            str(log.with_suffix("")),
+            "cuda" if gpu else "cpu",
+        ]
         command = [sys.executable, "-m", "ksim_rl.tables.measure", *words, "smoke" if self.smoke else ""]
         log.parent.mkdir(parents=True, exist_ok=True)
         result.unlink(missing_ok=True)
-        environment = os.environ | ({"CUDA_VISIBLE_DEVICES": slot} if slot else {})
+        environment = os.environ | ({"CUDA_VISIBLE_DEVICES": gpu} if gpu else {})
         with log.open("wb") as file:
             return subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
 
@@ -87,7 +99,8 @@ class Runs:
         return self.run_folder / job[0] / f"seed_{job[1]}.log"
 
 
-def _slots(device: str) -> list[str]:
-    """Return the GPUs that jobs may have, as `CUDA_VISIBLE_DEVICES` names them; [""] on the CPU: one job at a time."""
+def gpus_for(device: str, *, per_gpu: int) -> list[str]:
+    """Return the GPUs of jobs, as `CUDA_VISIBLE_DEVICES` names them, each `per_gpu` times; [""] on the CPU."""
     every = ",".join(str(index) for index in range(torch.cuda.device_count()))
-    return [""] if device == "cpu" else (os.environ.get("CUDA_VISIBLE_DEVICES") or every).split(",")
+    named = [""] if device == "cpu" else (os.environ.get("CUDA_VISIBLE_DEVICES") or every).split(",")
+    return named * per_gpu if named != [""] else named

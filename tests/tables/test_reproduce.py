@@ -34,9 +34,9 @@ RETURNS = {"ppo/Balance": 100.0, "ppo/Swingup": 200.0, "ppo/Other": 7.0}
 @pytest.fixture
 def reproduce(monkeypatch, tmp_path):
     """Run the command where each job is a process that writes a result, or fails; return code, jobs and table."""
-    started = []
+    started, processes = [], []
 
-    def start(self, job, device, slot):
+    def start(self, job, gpu):
         started.append(job)
         row = self.table.rows[job[0]]
         result = {
@@ -61,7 +61,11 @@ def reproduce(monkeypatch, tmp_path):
         fails = str(int(job == failing.get("job")))
         written = "{" if fails == "1" else json.dumps(result)
         target = str(path.with_suffix(".failed" if fails == "1" else ".json"))
-        return subprocess.Popen([sys.executable, "-c", code, target, written, fails])
+        processes.append(subprocess.Popen([sys.executable, "-c", code, target, written, fails]))
+        reproduce.most_at_once = max(
+            reproduce.most_at_once, sum(process.poll() is None for process in processes)
+        )
+        return processes[-1]
 
     failing = {}
     monkeypatch.setattr(runner.Runs, "_start", start)
@@ -74,6 +78,7 @@ def reproduce(monkeypatch, tmp_path):
     def reproduce(*words, text=TABLE, fail=None):
         path.write_text(text)
         started.clear()
+        reproduce.most_at_once = 0
         failing["job"] = fail
         arguments = [str(path), "--output", str(tmp_path / "out"), "--runs", str(tmp_path / "runs"), *words]
         with pytest.raises(SystemExit) as ended:
@@ -133,6 +138,25 @@ def test_without_time_nothing_runs_and_the_table_is_of_what_is_there(reproduce):
     reproduce("--rows", "ppo/Balance")
     code, started, table = reproduce("--minutes", "0")
     assert (code, started, list(table["figures"])) == (1, [], ["poles/ppo/Balance"])
+
+
+def test_runs_share_a_gpu_where_no_row_measures_seconds(reproduce, monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,2")
+    assert runner.gpus_for("cuda", per_gpu=2) == ["0", "2", "0", "2"]
+    assert runner.gpus_for("cpu", per_gpu=2) == [""]
+    monkeypatch.setattr(reproduce_command, "gpus_for", lambda device, per_gpu: ["0"] * per_gpu)
+    reproduce("--rows", "ppo/Balance")
+    assert reproduce.most_at_once == 1
+    reproduce("--rows", "ppo/Swingup", "--per-gpu", "2")
+    assert reproduce.most_at_once == 2
+    with pytest.raises(ValueError, match="--per-gpu=0"):
+        reproduce_command.reproduce([str(reproduce.folder.parent / "poles.yaml"), "--per-gpu", "0"])
+    timed = TABLE.replace(
+        "Other: {task: reacher}", "Other: {task: reacher, measure: seconds, levels: {episode/return: 5}}"
+    )
+    (reproduce.folder.parent / "poles.yaml").write_text(timed)
+    with pytest.raises(ValueError, match="ppo/Other measures seconds"):
+        reproduce_command.reproduce([str(reproduce.folder.parent / "poles.yaml"), "--per-gpu", "2"])
 
 
 def test_a_row_whose_levels_no_seed_reaches_is_in_the_table(reproduce):
