@@ -31,16 +31,14 @@ def ppo(*, gamma: float = 0.995, env_states: float = PPO_STATES) -> TrainingCfg:
         objective=PPOCfg(
             gamma=gamma,
             num_epochs=8,
-            clip_epsilon=0.3,
             clip_value=False,
             entropy_coeff=0.001,
-            desired_kl=0.02,
             learning_rate_min=1e-4,
             max_grad_norm=100.0,
         ),
         data=data,
         modules=ModulesCfg(
-            actor=ActorCfg(hidden_dims=(256, 128), init_std=0.7),
+            actor=ActorCfg(hidden_dims=(256, 128)),
             critic=CriticCfg(hidden_dims=(256, 256, 128)),
         ),
         trainer=TrainerCfg(
