@@ -48,8 +48,9 @@ class MaskedConstants:
         self._kernel = kernels.constants_kernel(nv, nbody, self._lanes, on_chip)
         # Frames at qpos0 are shared unless a field that moves them differs between worlds.
         num_frames = num_envs if self._moves else 1
+        self._mask, self._everywhere = mask, wp.full(num_frames, True, dtype=bool)
         own = {
-            "mask": wp.full(num_frames, True, dtype=bool),
+            "mask": mask,
             "sums_masses": "body_subtreemass" in expanded,
             "num_actuators": mj_model.nu if has_armature else 0,
             "dof_rotates": wp.array(_rotates(mj_model), dtype=float),
@@ -66,8 +67,12 @@ class MaskedConstants:
             "scratch": wp.zeros((1 if on_chip else num_envs, floats), dtype=float),
         }
         self._constants = filled(kernels.Constants, own, warp_model)
-        wp.launch(kernels.frames, dim=num_frames, inputs=[self._constants])
-        self._constants.mask = mask
+
+    def place_frames(self) -> None:
+        """Launch what must have run once before `launch`, in all worlds."""
+        self._constants.mask = self._everywhere
+        wp.launch(kernels.frames, dim=self._everywhere.shape[0], inputs=[self._constants])
+        self._constants.mask = self._mask
 
     def covers(self, fields: Iterable[str]) -> bool:
         """Return whether the constants that follow from `fields` can be recomputed here, as `World.set_const` says."""

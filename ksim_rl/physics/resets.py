@@ -64,7 +64,10 @@ def empty_contacts(
 
 
 def resets(warp_model: mjw.Model, warp_data_E: mjw.Data, mask: wp.array) -> Callable[[], None]:
-    """Return what puts the worlds of `mask`, bool [E], to the model's `qpos0`, at rest, time 0, without contacts."""
+    """Return what puts the worlds of `mask`, bool [E], to the model's `qpos0`, at rest, time 0, without contacts.
+
+    `mjw.reset_data` must have run once: what sleeps or is awake stays as it is, unless the model has more.
+    """
     m, d, contact = warp_model, warp_data_E, warp_data_E.contact
     names = {field.name for field in dataclasses.fields(contact)} - {"worldid", "efc_address"}
     device = d.qpos.device
@@ -77,7 +80,6 @@ def resets(warp_model: mjw.Model, warp_data_E: mjw.Data, mask: wp.array) -> Call
 
     of_worlds = table([getattr(d, name) for name in ZEROED], d.nworld)
     of_pool = table([getattr(contact, name) for name in sorted(names)], d.naconmax)
-    mjw.reset_data(m, d)  # what sleeps or is awake stays as it is from here on, unless the model has more
     has_more = any(getattr(m, name) for name in HAS_MORE) or bool(m.opt.enableflags & mjw.EnableBit.SLEEP)
 
     def launch() -> None:

@@ -142,6 +142,8 @@ class World(views.DataViews):
         super().__init__(self.warp_data_E)
         if self.device.type == "cuda":
             self._load_kernels()
+        with warp_scope(self.device):
+            self._launch_once()
         self._record_resets()
 
     @property
@@ -336,12 +338,21 @@ class World(views.DataViews):
         self.drop_views()
 
     def _load_kernels(self) -> None:
-        """Compile and load what steps, refreshes and resets launch, before any of them runs."""
+        """Compile and load what steps, refreshes, resets and `set_const` launch, before any of them runs."""
         with warp_scope(self.device), loaded_together(self.device):
+            self._launch_once()
             for sensors in get_args(Sensors):
                 self._launch_substep(sensors)
             self._substeps.refresh()
             self._launch_reset()
+            if self._masked_constants is not None:
+                self._masked_constants.launch(~FIXED)
+
+    def _launch_once(self) -> None:
+        """Launch what has to run before anything else."""
+        mjw.reset_data(self.warp_model, self.warp_data_E)
+        if self._masked_constants is not None:
+            self._masked_constants.place_frames()
 
     def _record_resets(self) -> None:
         """Refresh, and record the graphs of `reset` and `refresh`, which warm-ups of outer captures run per env step.

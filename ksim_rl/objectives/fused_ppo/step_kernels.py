@@ -181,7 +181,8 @@ def take_means(
         tl.store(summary + column, tl.where(column == LEARNING_RATE, rate, means), mask=column < SHARE)
 
 
-@triton.jit
+# One kernel for all steps, whose places are not all whole numbers of 16 bytes.
+@triton.jit(do_not_specialize_on_alignment=["steps"])
 def adam_step(
     parameters, means, variances, places, gradients, weights, exact_weights, squares, summary,
     steps, skipped, skipped_in_a_row,
