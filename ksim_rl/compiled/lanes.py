@@ -134,8 +134,7 @@ def _loads(works: Sequence[Work], read: Mapping[str, str]) -> Iterator[str]:
     known: dict[tuple[str, tuple[int, ...]], str] = {}
     for work in works:
         for _, _, array, text in sorted(work.loop.elements, key=lambda element: -len(element.text)):
-            is_read = set(re.findall(r"\bm\d+", text)) <= read.keys() and not re.search(r"\bk\d|term", text)
-            if text not in work.body or not is_read:
+            if text not in work.body or not set(re.findall(r"\b(?!row|i\d)[a-z]\w*", text)) <= read.keys():
                 continue
             shape = work.shape if re.search(r"\bi\d", text) else ()
             if (text, shape) not in known:
