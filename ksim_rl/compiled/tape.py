@@ -1,8 +1,8 @@
 """This module makes few kernels of what torch computes for the rows of a batch, once that has been recorded.
 
-Operations that keep to their row, one after the other, become one kernel with a thread per row, in C++ of `row_code`;
-what lives in one kernel only lives in that thread's own memory. Other operations are run by torch as they were, and
-launches of Warp are issued anew. A replay uses the memory of the recording and runs no Python of the function, as a
+Operations that keep to their row, one after the other, become one kernel, in C++ of `row_code`, with a thread per row
+or a few `lanes`; what lives in one kernel only lives in a row's own memory. Other operations are run by torch as they
+were, and launches of Warp are issued anew. A replay uses the memory of the recording and runs no Python of the function, as a
 CUDA graph does, and what is fit for that is fit for this.
 """
 
