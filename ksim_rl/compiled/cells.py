@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Shaped
@@ -23,18 +24,36 @@ class NotARowError(Exception):
     """An operation mixes rows, or is not known here: torch runs it."""
 
 
+class Element(NamedTuple):
+    """An element that is used: its tensor, the distance of rows (0 where all use the same), its array, and the C++."""
+
+    tensor: Tensor
+    distance: int
+    name: str
+    text: str
+
+
+class Loop(NamedTuple):
+    """Statements for each place of a shape, rows aside, whose order does not matter, and the elements they use."""
+
+    shape: tuple[int, ...]
+    body: str
+    elements: list[Element]
+
+
 @dataclass(frozen=True)
 class Cells:
     """Where tensors lie, for the operation at hand: `rows` are E, and 0 where it has no rows.
 
-    `address` returns the name of an array, the place in it, and whether it has all rows. `seen` collects which tensors
-    were used, with the distance of their rows; 0 where all rows use the same elements.
+    `address` returns the name of an array, the place in it, and whether it has all rows. `loops` are those of the
+    operation, and `seen` what is used since the last one.
     """
 
     rows: int
     address: Callable[[Tensor], tuple[str, int, bool]]
     device: torch.device
-    seen: list[tuple[Tensor, int]] = field(default_factory=list)
+    loops: list[Loop] = field(default_factory=list)
+    seen: list[Element] = field(default_factory=list)
 
     @property
     def uniform(self) -> "Cells":
@@ -62,14 +81,15 @@ class Cells:
             else:
                 distance = stride
                 terms += [f"row * {stride}LL"] if has_all_rows else []
-        self.seen.append((tensor, distance))
-        return f"{name}[{' + '.join(terms) or '0'}]"
+        text = f"{name}[{' + '.join(terms) or '0'}]"
+        self.seen.append(Element(tensor, distance, name, text))
+        return text
 
-
-def loops(shape: Sequence[int], body: Sequence[str]) -> list[str]:
-    """Return a loop over the indices of a shape, rows aside; nothing for no numbers."""
-    heads = [f"for (int i{k} = 0; i{k} < {size}; ++i{k})" for k, size in enumerate(shape)]
-    return [] if 0 in shape else [" ".join([*heads, "{", *body, "}"])]
+    def loop(self, shape: Sequence[int], body: Sequence[str]) -> None:
+        """Write statements for each place of a shape, of indices `names_of(len(shape))`."""
+        if 0 not in shape:
+            self.loops.append(Loop(tuple(shape), " ".join(body), self.seen[:]))
+        self.seen.clear()
 
 
 def names_of(count: int) -> list[str]:

@@ -1,6 +1,6 @@
 """This module writes operations of torch as C++ for one row of a batch; `tape` makes kernels of it.
 
-Each function returns lines that read and write elements through `Cells`, which knows where a tensor lies: in the
+Each function writes loops that read and write elements through `Cells`, which knows where a tensor lies: in the
 memory of the device, or in an array of the row's own. The operations are those of torch, with its rules for types and
 for numbers that are not finite.
 """
@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ksim_rl.compiled.cells import CTYPES, Cells, NotARowError, literal, loops, names_of
+from ksim_rl.compiled.cells import CTYPES, Cells, NotARowError, literal, names_of
 from ksim_rl.device.recording import Operation
 
 # Operands are a, b, c in the order of the schema, in the type that torch computes in.
@@ -131,8 +131,8 @@ PRELUDE = r"""
 """
 
 
-def lines(operation: Operation, cells: Cells) -> list[str]:
-    """Return the C++ of an operation; a NotARowError where there is none."""
+def write(operation: Operation, cells: Cells) -> None:
+    """Write an operation as loops of the cells; a NotARowError where there is no C++ of it."""
     args, kwargs, outs = operation.args, operation.kwargs, [*operation.made, *operation.written]
     name = operation.name
     if name.endswith("_") and not name.startswith("_"):
@@ -160,17 +160,17 @@ def _inner(tensor: Tensor, cells: Cells) -> list[int]:
     return list(tensor.shape[1:]) if cells.rows else list(tensor.shape)
 
 
-def _fill(out: Tensor, value: Any, cells: Cells) -> list[str]:
+def _fill(out: Tensor, value: Any, cells: Cells) -> None:
     if isinstance(value, Tensor):
         raise NotARowError("fill by a tensor")
     shape = _inner(out, cells)
     number = literal(value, CTYPES[out.dtype])
-    return loops(shape, [f"{cells.at(out, names_of(len(shape)))} = {number};"])
+    cells.loop(shape, [f"{cells.at(out, names_of(len(shape)))} = {number};"])
 
 
 def _pointwise(
     name: str, expression: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells
-) -> list[str]:
+) -> None:
     if kwargs.get("rounding_mode") is not None:
         raise NotARowError("division that rounds")
     operands = list(args)
@@ -220,10 +220,10 @@ def _pointwise(
         if option in expression:
             body.append(f"const {ctype} {option} = {literal(kwargs.get(option, 1), ctype)};")
     body.append(f"{cells.at(out, place)} = ({CTYPES[out.dtype]})({expression});")
-    return loops(shape, body)
+    cells.loop(shape, body)
 
 
-def _pow(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+def _pow(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
     base, exponent = args[:2]
     if isinstance(base, Tensor) and isinstance(exponent, (int, float)):
         expression = {2: "a * a", 1: "a", 0.5: "sqrt(a)", 3: "a * a * a", -1: "1 / a"}.get(
@@ -247,7 +247,7 @@ def _dims(function: Any, args: Sequence[Any], kwargs: dict[str, Any], ndim: int)
 
 def _reduce(
     function: Any, name: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells
-) -> list[str]:
+) -> None:
     source = args[0]
     if source.ndim == 0:
         raise NotARowError("a reduction of a number")
@@ -256,28 +256,27 @@ def _reduce(
         raise NotARowError("a reduction over rows, or of whole numbers")
     start, step, end = _REDUCTIONS[name]
     first = bool(cells.rows)
-    names = dict(zip(range(first, source.ndim), names_of(source.ndim - first), strict=True))
-    kept = [k for k in names if k not in dims]
+    kept = [k for k in range(first, source.ndim) if k not in dims]
+    names = dict(zip(kept, names_of(len(kept)), strict=True)) | {k: f"k{k}" for k in dims}
+    names = dict(sorted(names.items()))
     place = ["0" if k in dims else names[k] for k in names] if keeps else [names[k] for k in kept]
     ctype = "bool" if name in ("any", "all") else CTYPES[out.dtype]
     element = "bool" if name in ("any", "all") else ctype
     count = math.prod(source.shape[k] for k in dims)
     inner = f"const {element} e = ({element}){cells.at(source, list(names.values()))}; {step};"
-    over, each = (
-        " ".join(f"for (int {names[k]} = 0; {names[k]} < {source.shape[k]}; ++{names[k]})" for k in chosen)
-        for chosen in (dims, kept)
-    )
+    over = " ".join(f"for (int {names[k]} = 0; {names[k]} < {source.shape[k]}; ++{names[k]})" for k in dims)
     end = end.replace("count", literal(count, ctype))
-    return [f"{each} {{ {ctype} s = {start}; {over} {{ {inner} }} {cells.at(out, place)} = {end}; }}"]
+    body = f"{ctype} s = {start}; {over} {{ {inner} }} {cells.at(out, place)} = {end};"
+    cells.loop([source.shape[k] for k in kept], [body])
 
 
-def _join(name: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+def _join(name: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
     tensors = [t for t in args[0] if t.numel() or t.ndim > 1]
     dim = (args[1] if len(args) > 1 else kwargs.get("dim", 0)) % out.ndim
     first = int(bool(cells.rows))
     if dim < first:
         raise NotARowError("rows are joined")
-    written, offset = [], 0
+    offset = 0
     for number, tensor in enumerate(tensors):
         shape = list(tensor.shape[first:])
         names = names_of(len(shape))
@@ -287,8 +286,7 @@ def _join(name: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, c
         else:
             place[dim - first] = f"({place[dim - first]} + {offset})"
             offset += tensor.shape[dim]
-        written += loops(shape, [f"{cells.at(out, place)} = ({CTYPES[out.dtype]}){cells.at(tensor, names)};"])
-    return written
+        cells.loop(shape, [f"{cells.at(out, place)} = ({CTYPES[out.dtype]}){cells.at(tensor, names)};"])
 
 
 def _one_index(indices: Sequence[Any]) -> int:
@@ -304,7 +302,7 @@ def _picked(index: Tensor, names: Sequence[str], size: int, cells: Cells) -> str
     return f"({cell} < 0 ? {cell} + {size} : {cell})"
 
 
-def _index(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+def _index(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
     source, indices = args[:2]
     dim = _one_index(indices)
     index, first = indices[dim], int(bool(cells.rows))
@@ -313,18 +311,19 @@ def _index(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cell
     if dim < first:  # each row picks from a table that all have
         picked = _picked(index, names[: index.ndim - 1], source.shape[0], cells)
         place = [picked, *names[index.ndim - 1 :]]
-        return loops(shape, [f"{cells.at(out, names)} = {cells.uniform.at(source, place)};"])
+        cells.loop(shape, [f"{cells.at(out, names)} = {cells.uniform.at(source, place)};"])
+        return
     picked = _picked(index, names[at : at + index.ndim], source.shape[dim], cells.uniform)
     place = [*names[:at], picked, *names[at + index.ndim :]]
-    return loops(shape, [f"{cells.at(out, names)} = {cells.at(source, place)};"])
+    cells.loop(shape, [f"{cells.at(out, names)} = {cells.at(source, place)};"])
 
 
-def _index_select(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+def _index_select(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
     source, dim, index = args
-    return _index((source, [*[None] * (dim % source.ndim), index]), kwargs, out, cells)
+    _index((source, [*[None] * (dim % source.ndim), index]), kwargs, out, cells)
 
 
-def _index_put(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+def _index_put(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
     target, indices, values = args[:3]
     if len(args) > 3 and args[3]:
         raise NotARowError("index_put that adds")
@@ -337,10 +336,10 @@ def _index_put(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: 
     names = names_of(len(shape))
     picked = _picked(index, names[at : at + index.ndim], out.shape[dim], cells.uniform)
     place = [*names[:at], picked, *names[at + index.ndim :]]
-    return loops(shape, [f"{cells.at(out, place)} = {cells.at(values, names)};"])
+    cells.loop(shape, [f"{cells.at(out, place)} = {cells.at(values, names)};"])
 
 
-def _gather(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+def _gather(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
     source, dim, index = args[:3]
     dim, first = dim % source.ndim, int(bool(cells.rows))
     if dim < first:
@@ -348,10 +347,10 @@ def _gather(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cel
     names = names_of(out.ndim - first)
     place = [*names]
     place[dim - first] = f"(int){cells.at(index, names)}"
-    return loops(_inner(out, cells), [f"{cells.at(out, names)} = {cells.at(source, place)};"])
+    cells.loop(_inner(out, cells), [f"{cells.at(out, names)} = {cells.at(source, place)};"])
 
 
-def _cross(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+def _cross(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
     dim = kwargs.get("dim", args[2] if len(args) > 2 else -1) % out.ndim - int(bool(cells.rows))
     if dim < 0:
         raise NotARowError("a cross product of rows")
@@ -368,19 +367,19 @@ def _cross(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cell
     pairs = ((1, 2), (2, 0), (0, 1))
     body += [f"{at(out, k)} = x{i} * y{j} - x{j} * y{i};" for k, (i, j) in enumerate(pairs)]
     shape[dim] = 1
-    return loops(shape, body)
+    cells.loop(shape, body)
 
 
-def _bmm(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+def _bmm(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
     if not cells.rows:
         raise NotARowError("matrices without rows")
     left, right = args
     term = f"s += {cells.at(left, ['i0', 'k'])} * {cells.at(right, ['k', 'i1'])};"
     body = f"{CTYPES[out.dtype]} s = 0; for (int k = 0; k < {left.shape[2]}; ++k) {term}"
-    return loops(out.shape[1:], [body, f"{cells.at(out, ['i0', 'i1'])} = s;"])
+    cells.loop(out.shape[1:], [body, f"{cells.at(out, ['i0', 'i1'])} = s;"])
 
 
-def _draw(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+def _draw(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
     seed, stream, counter, _, first_row, n, kind, low, high, start, span = args
     plain = cells.uniform
     count = cells.at(counter, []) if counter.ndim else plain.at(counter, [])
@@ -388,22 +387,22 @@ def _draw(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells
     value = (f"{low_} + unit(b) * {width}", "normal(b)", f"{start}LL + (long long)((b * {span}ull) >> 32)")[
         kind
     ]
-    body = f"const unsigned b = bits_of(key, (unsigned)i0); {cells.at(out, ['i0'])} = {value};"
     key = f"const RowKey key = key_of({plain.at(seed, [])}, {stream}u, {count}, {first_row} + row);"
-    return ["{ " + key, *loops([n], [body]), "}"]
+    body = f"const unsigned b = bits_of(key, (unsigned)i0); {cells.at(out, ['i0'])} = {value};"
+    cells.loop([n], [key, body])
 
 
-def _count_non_finite(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> list[str]:
+def _count_non_finite(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
     table, term, step, first, count = args
     plain = cells.uniform
     at = f"{plain.at(term, ['i0'])}"
-    body = [f"if (fabsf({cells.at(table, ['i0'])}) <= 3.402823466e38f) continue;", f"const int term = {at};"]
+    body = [f"if (!(fabsf({cells.at(table, ['i0'])}) <= 3.402823466e38f)) {{ const int term = {at};"]
     body += [f"const long long place = {plain.at(step, [])} * {table.shape[0]} + row;"]
-    body += [f"count_up(&{plain.at(count, ['term'])}); least(&{plain.at(first, ['term'])}, place);"]
-    return loops(table.shape[1:], body)
+    body += [f"count_up(&{plain.at(count, ['term'])}); least(&{plain.at(first, ['term'])}, place); }}"]
+    cells.loop(table.shape[1:], body)
 
 
-_SPECIAL: dict[str, Callable[[Sequence[Any], dict[str, Any], Tensor, Cells], list[str]]] = {
+_SPECIAL: dict[str, Callable[[Sequence[Any], dict[str, Any], Tensor, Cells], None]] = {
     "bmm": _bmm,
     "count_non_finite": _count_non_finite,
     "draw": _draw,

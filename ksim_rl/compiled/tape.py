@@ -1,8 +1,8 @@
 """This module makes few kernels of what torch computes for the rows of a batch, once that has been recorded.
 
-Operations that keep to their row, one after the other, become one kernel with a thread per row, in C++ of `row_code`;
-what lives in one kernel only lives in that thread's own memory. Other operations are run by torch as they were, and
-launches of Warp are issued anew. A replay uses the memory of the recording and runs no Python of the function, as a
+Operations that keep to their row, one after the other, become one kernel, in C++ of `row_code`, with a thread per row
+or a few `lanes`; what lives in one kernel only lives in a row's own memory. Other operations are run by torch as they
+were, and launches of Warp are issued anew. A replay uses the memory of the recording and runs no Python of the function, as a
 CUDA graph does, and what is fit for that is fit for this.
 """
 
@@ -15,7 +15,8 @@ from jaxtyping import Shaped
 from torch import Tensor
 
 from ksim_rl.compiled import row_code
-from ksim_rl.compiled.cells import CTYPES, Cells, NotARowError
+from ksim_rl.compiled.cells import CTYPES, Cells, Element, Loop, NotARowError
+from ksim_rl.compiled.lanes import BLOCK, DEAL, LANES, SHARED, Own, Work, schedule, source
 from ksim_rl.device import kernel_loading, random
 from ksim_rl.device.quick_launch import QuickLaunch, arguments_of
 from ksim_rl.device.recording import Operation, Recorder
@@ -24,7 +25,8 @@ MOST_SHARED = 256
 """Numbers without rows that each thread works out for itself."""
 MOST_OPERATIONS = 200
 """Operations of one kernel, whose compilation takes longer the more there are."""
-BLOCK = 32
+MOST_BYTES = 40_000
+"""Memory on the chip for the arrays of the rows of a block."""
 _COUNTS = frozenset(
     {"count_non_finite"}
 )  # all rows add to the same numbers, in an order that does not matter
@@ -170,9 +172,9 @@ class Tape:
     def _use(self, operation: Operation, rows: int) -> _Use:
         """Return how an operation uses memory; a NotARowError where it does not keep to its row."""
         cells = Cells(rows=rows, address=lambda _: ("", 0, True), device=self._device)
-        row_code.lines(operation, cells)
+        row_code.write(operation, cells)
         use, counts = _Use(), operation.name in _COUNTS
-        for tensor, distance in cells.seen:
+        for tensor, distance, _, _ in (element for loop in cells.loops for element in loop.elements):
             root = self._memory.made.get(_storage(tensor))
             if root is not None and root.dtype != tensor.dtype:
                 raise NotARowError("memory of two types")
@@ -217,8 +219,8 @@ class Tape:
         names: dict[int, str] = {}
         given: list[int] = []
         pointed: dict[str, str] = {}
-        begin: list[str] = []
-        end: list[str] = []
+        own: list[Own] = []
+        ends: list[Loop] = []
 
         def address(tensor: Tensor) -> tuple[str, int, bool]:
             place, ctype = self._memory.place(tensor), CTYPES[tensor.dtype]
@@ -227,30 +229,49 @@ class Tape:
             if place not in names:
                 name = names[place] = f"m{len(names)}"
                 if is_own or is_shared:
-                    begin.append(f"{ctype} {name}[{self._own_width(kernel, place)}];")
+                    own.append(Own(name, ctype, self._own_width(kernel, place), tensor.element_size()))
                 else:
                     pointed[name] = ctype
                 if not is_own:
                     given.append(place)
                 if is_shared and not is_own:  # each row works it out, and one hands it on
-                    every = f"for (int i = 0; i < {self._memory.width(place)}; ++i)"
-                    end.append(f"if (row == 0) {every} (({ctype}*)a.{name})[i] = {name}[i];")
+                    end = f"if (row == 0) (({ctype}*)a.{name})[i0] = {name}[i0];"
+                    ends.append(Loop((own[-1].size,), end, [Element(tensor, 0, name, f"{name}[i0]")]))
             offset = (tensor.data_ptr() - place) // tensor.element_size()
             return names[place], offset, not (is_own or is_shared)
 
-        body: list[str] = []
-        for operation, rows in kernel.operations:
-            body += row_code.lines(operation, Cells(rows=rows, address=address, device=self._device))
+        works: list[Work] = []
+        changed: set[str] = set()
+        for number, (operation, rows) in enumerate(kernel.operations):
+            cells = Cells(rows=rows, address=address, device=self._device)
+            row_code.write(operation, cells)
+            outs = {names.get(self._memory.place(one), "") for one in (*operation.made, *operation.written)}
+            changed |= outs
+            works += [
+                Work(loop, number, set() if operation.name in _COUNTS else outs) for loop in cells.loops
+            ]
+        works += [Work(loop, -1, set()) for loop in ends]
         if not given:
             return None
-        # No two of them overlap, so that numbers may be read ahead of what is written.
-        pointers = ", ".join(f"{ctype}* __restrict__ {name}" for name, ctype in pointed.items())
+        kinds = schedule(works, own)
+        on_chip = sum(one.size * one.bytes for one in own if kinds[one.name] == SHARED)
+        lanes = LANES[self._device.type]
+        lanes = lanes if lanes and BLOCK // lanes * on_chip <= MOST_BYTES else 0
+        read = {name: ctype for name, ctype in pointed.items() if name not in changed}
+        # No two of them overlap, so that numbers may be read ahead of what is written, unless by another lane.
+        kept = "" if lanes else "__restrict__"
+        pointers = ", ".join(
+            f"const {ctype}* __restrict__ {name}" if name in read else f"{ctype}* {kept} {name}"
+            for name, ctype in pointed.items()
+        )
         calls = ", ".join(f"({ctype}*)a.{name}" for name, ctype in pointed.items())
-        body = [f"auto run = [&]({pointers}) {{", *begin, *body, *end, "};", f"run({calls});"]
-        source = "\n".join([random.DRAWS, row_code.PRELUDE, *body])
+        body = source(works, own, kinds, read if lanes else None)
+        body = [f"auto run = [&]({pointers}) {{", *body, "};", f"run({calls});"]
+        sizes = f"#define LANES {max(lanes, 1)}\n#define BLOCK {BLOCK}"
+        text = "\n".join([sizes, DEAL, random.DRAWS, row_code.PRELUDE, *body])
         fields = " ".join(names[place] for place in given)
-        launch = QuickLaunch(arguments_of((wp.uint64, fields)), source, block_dim=BLOCK)
-        kernel.launch = partial(launch, self._device, (self._num_rows, 1), *given)
+        launch = QuickLaunch(arguments_of((wp.uint64, fields)), text, block_dim=BLOCK)
+        kernel.launch = partial(launch, self._device, (self._num_rows, max(lanes, 1)), *given)
         # What only the kernel knew is free from here on.
         self._kept += [
             tensor for one, _ in kernel.operations for tensor in one.read() if _storage(tensor) in given
