@@ -47,7 +47,7 @@ class RunningMoments(nn.Module):
 
     def normalized(self, values: Float[Tensor, "*batch L"], eps: float) -> Float[Tensor, "*batch L"]:
         """Return `(values - mean) / sqrt(var + eps)`."""
-        return (values - self.mean) * torch.rsqrt(self.var + eps)
+        return (values - self.mean).mul_(torch.rsqrt(self.var + eps))
 
     @torch.no_grad()
     def update(self, values: Float[Tensor, "*batch L"], valid: Bool[Tensor, "*rows"] | None = None) -> None:

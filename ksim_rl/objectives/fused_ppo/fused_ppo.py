@@ -233,16 +233,17 @@ class FusedPPO:
         places: list[Tensor] = []
 
         def place() -> None:
-            order_N = torch.cat([*orders]).to(torch.int32)
-            # From env by env to step by step.
-            places.append((order_N % length) * num_envs + order_N.div(length, rounding_mode="floor"))
+            for order_D in orders:
+                order_D = order_D.to(torch.int32)
+                # From env by env to step by step.
+                places.extend(((order_D % length) * num_envs + order_D // length).split(self.batch))
 
         with warp_scope(self._summary.device):
             with beside(self._side, place):
                 self.parameters.load()
                 left_out = self.dataset.read(rollout_ET, evaluate=self._evaluate)
             with beside(self._side, *aside):
-                for step, index_B in enumerate(places[0].split(self.batch)):
+                for step, index_B in enumerate(places):
                     if len(self.dataset.records) > self.dataset.size:
                         index_B = torch.cat([index_B, index_B + self.dataset.size])
                     self._multiply(index_B)
