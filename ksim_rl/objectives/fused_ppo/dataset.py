@@ -44,10 +44,10 @@ class FusedDataset:
         self.cfg, self.layout, self.size, self._mirror = cfg, layout, size, mirror
         self._observe = observe_actor, observe_critic
         rows = size if mirror is None else 2 * size
-        self.obs = torch.zeros(2, rows, layout.obs, dtype=dtype, device=device)
+        self.obs = torch.zeros(2, rows, layout.stored, dtype=dtype, device=device)
         width = layout.out
         # A standard deviation must have a logarithm, also where there is no action and where nothing takes part.
-        self._neutral = torch.zeros(3 * width + 16, device=device)
+        self._neutral = torch.zeros(3 * width + 8, device=device)
         self._neutral[2 * width : 3 * width] = 1.0
         self.records = self._neutral.repeat(rows, 1)
         self._signals = torch.zeros(4, size, device=device)
@@ -67,7 +67,7 @@ class FusedDataset:
                 images = slice(self.size + rows.start, self.size + rows.stop)
                 self._take(self._mirror.image(part_ET), self.obs[:, images], self.records[images])
             evaluate(self.obs[1, rows], values_D[rows])
-            next_obs = self.obs.new_zeros(part_ET.numel(), self.layout.obs)
+            next_obs = self.obs.new_zeros(part_ET.numel(), self.layout.stored)
             next_obs[:, : self.layout.obs_dims[1]] = _time_major(self._observe[1](part_ET.get("next")))
             evaluate(next_obs, next_values_D[rows])
             first = rows.stop
