@@ -66,7 +66,7 @@ class RunningMoments(nn.Module):
         if values.shape[-1] != self.dim:
             raise ValueError(f"obs has shape {tuple(values.shape)}: the last dim must be {self.dim}")
         values_NL = values.reshape(-1, self.dim)
-        # No matrix products here: the first one on a stream takes 32 MiB, and this often runs beside other work.
+        # No matrix products here: the first one on a stream takes memory for good, and this runs beside other work.
         valid_N = values_NL.isfinite().all(-1)
         if valid is not None:
             if valid.numel() != valid_N.numel():

@@ -36,10 +36,10 @@ def current_stream_handle(device: torch.device) -> int:
 
 
 def free_cublas_workspaces() -> None:
-    """Forget the memory that matrix products took, 32 MiB for each stream; the next product takes it anew.
+    """Forget the memory that matrix products took, on Hopper 32 MiB for each stream; the next one takes it anew.
 
-    Torch keeps it for ever. Its own graph trees do this before a capture, so that it lies in a graph's pool. Checked
-    with torch 2.13.
+    Torch keeps it for ever. Its own graph trees do this before a capture, so that it lies in a graph's pool. The name
+    is that of torch 2.13.
     """
     torch._C._cuda_clearCublasWorkspaces()
 
