@@ -8,11 +8,13 @@ import threading
 import warnings
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
+from weakref import WeakSet
 
 import torch
 import warp as wp
 
-from ksim_rl.device import recording
+from ksim_rl.device import recording, upstream
 from ksim_rl.device.streams import checked_device, warp_device, warp_scope, warp_stream
 
 
@@ -25,6 +27,13 @@ class _Phase(threading.local):
 
 
 _phase = _Phase()
+# Those that exist, by device, whose pool of memory the next one shares.
+_graphs: dict[torch.device, WeakSet[torch.cuda.CUDAGraph]] = {}
+
+
+@cache
+def _capture_stream(device: torch.device) -> torch.cuda.Stream:
+    return torch.cuda.Stream(device)
 
 
 def is_capturing() -> bool:
@@ -85,11 +94,13 @@ def live_launches(*, warming_up: bool = False, capturing: bool = False) -> Itera
 class Captured:
     """A function without arguments that becomes one CUDA graph; on CPU it stays a plain call.
 
-    The first `warmup` calls run eagerly on a private stream (their work counts), the next one records the graph, and
+    The first `warmup` calls run eagerly on a stream aside (their work counts), the next one records the graph, and
     from then on each call replays it. So `body` must be fit for replay: it reads and writes tensors that stay where
     they are, allocates no size that depends on data, and neither syncs with the host nor branches on tensor values.
     What it does in Python happens only while it is eager or recorded. It may draw from the device's default random
-    generator. With `require_graphs`, a CUDA device without graphs is refused instead of a warning and eager calls.
+    generator. The graphs of a device have their temporaries in the same memory: no two may run at once, and what one
+    makes lasts as long as something refers to it. With `require_graphs`, a CUDA device without graphs is refused
+    instead of a warning and eager calls.
     """
 
     def __init__(
@@ -113,8 +124,8 @@ class Captured:
         self._eager_for_ever = self.device.type == "cpu" or not _refuse_or_warn(
             self.device, require_graphs=require_graphs
         )
-        # Kept as long as the graph: its temporaries belong to this stream.
-        self._stream = None if self._eager_for_ever else torch.cuda.Stream(self.device)
+        # One for all: temporaries belong to the stream that they were made on.
+        self._stream = None if self._eager_for_ever else _capture_stream(self.device)
 
     @property
     def ready(self) -> bool:
@@ -149,15 +160,18 @@ class Captured:
     def _record(self, stream: torch.cuda.Stream) -> tuple[torch.cuda.CUDAGraph, wp.Graph]:
         warp_side = warp_stream(stream)
         torch.cuda.synchronize(self.device)
-        torch.cuda.empty_cache()  # what the eager calls took: a graph has a pool of its own, and would take it again
-        graph = torch.cuda.CUDAGraph()
+        # What the eager calls took: graphs have a pool of their own, and would take it again.
+        upstream.free_cublas_workspaces()
+        torch.cuda.empty_cache()
+        graph, others = torch.cuda.CUDAGraph(), _graphs.setdefault(self.device, WeakSet())
+        pool = next((other.pool() for other in others), None)
         with (
             no_collection(),
             torch.cuda.stream(stream),
             wp.ScopedStream(warp_side, sync_enter=False, sync_exit=False),
             live_launches(capturing=True),
         ):
-            graph.capture_begin(capture_error_mode="thread_local")
+            graph.capture_begin(pool=pool, capture_error_mode="thread_local")
             try:
                 wp.capture_begin(stream=warp_side, external=True)
                 self.body()
@@ -173,6 +187,7 @@ class Captured:
                     f"the body cannot be captured in a CUDA graph: {error}. It must not sync with the host (.item(), "
                     "branching on a tensor, boolean indexing), nor allocate a size that depends on data"
                 ) from error
+        others.add(graph)
         return graph, warp_graph
 
 

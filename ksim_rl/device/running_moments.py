@@ -47,7 +47,7 @@ class RunningMoments(nn.Module):
 
     def normalized(self, values: Float[Tensor, "*batch L"], eps: float) -> Float[Tensor, "*batch L"]:
         """Return `(values - mean) / sqrt(var + eps)`."""
-        return (values - self.mean) * torch.rsqrt(self.var + eps)
+        return (values - self.mean).mul_(torch.rsqrt(self.var + eps))
 
     @torch.no_grad()
     def update(self, values: Float[Tensor, "*batch L"], valid: Bool[Tensor, "*rows"] | None = None) -> None:
@@ -66,8 +66,8 @@ class RunningMoments(nn.Module):
         if values.shape[-1] != self.dim:
             raise ValueError(f"obs has shape {tuple(values.shape)}: the last dim must be {self.dim}")
         values_NL = values.reshape(-1, self.dim)
-        # 0 times what is not finite is NaN, and 0 times anything else is 0.
-        valid_N = (values_NL @ values_NL.new_zeros(self.dim)) == 0
+        # No matrix products here: the first one on a stream takes memory for good, and this runs beside other work.
+        valid_N = values_NL.isfinite().all(-1)
         if valid is not None:
             if valid.numel() != valid_N.numel():
                 raise ValueError(
@@ -81,8 +81,8 @@ class RunningMoments(nn.Module):
         exact_NL = torch.where(valid_N[:, None], values_NL, 0.0).to(torch.float64)
         weight_N = valid_N.to(torch.float64)
         added = weight_N.sum()
-        mean = weight_N @ exact_NL / added.clamp_min(1)
-        sum_of_squares = weight_N @ exact_NL.sub_(mean).square_()
+        mean = exact_NL.sum(0) / added.clamp_min(1)
+        sum_of_squares = exact_NL.sub_(mean).mul_(weight_N[:, None]).square_().sum(0)
 
         # The union of both, as of those of ranks in `ranks.merged`, in place.
         before = self.count.to(torch.float64)

@@ -35,6 +35,15 @@ def current_stream_handle(device: torch.device) -> int:
     return torch._C._cuda_getCurrentRawStream(device.index)  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def free_cublas_workspaces() -> None:
+    """Forget the memory that matrix products took, on Hopper 32 MiB for each stream; the next one takes it anew.
+
+    Torch keeps it for ever. Its own graph trees do this before a capture, so that it lies in a graph's pool. The name
+    is that of torch 2.13.
+    """
+    torch._C._cuda_clearCublasWorkspaces()
+
+
 def recorded_arguments(launch: wp.Launch) -> ctypes.Structure:
     """Return the bytes of the one struct that a recorded launch passes to its kernel, for writing them in one go.
 

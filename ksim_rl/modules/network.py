@@ -74,7 +74,9 @@ def update_normalizers(tensordict: TensorDictBase, *networks: nn.Module) -> None
                 continue
             if id(normalizer) not in seen:
                 seen[id(normalizer)] = normalizer
-                normalizer.count_rows(_observation(tensordict, module, normalizer.dim))
+                # Some steps at a time: what is computed of them on the way takes four times their memory.
+                for part in _observation(tensordict, module, normalizer.dim).chunk(8, -2):
+                    normalizer.count_rows(part)
     publish([*seen.values()])
 
 

@@ -52,6 +52,22 @@ def per_world_fields() -> tuple[str, ...]:
     )
 
 
+def drop_unread(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+    """Free the arrays that only other integrators and sleeping worlds need: a tenth of all, made for each model.
+
+    Whatever MuJoCo Warp launches for this model takes them along unread, if at all.
+    """
+    m, d, kinds = warp_model, warp_data_E, mjw.IntegratorType
+    names = "" if m.opt.integrator == kinds.DISCRETE else "qH qHLD qHDiagInv efm_fluid "
+    names += "" if m.opt.integrator == kinds.IMPLICIT else "qLU "
+    if not m.opt.enableflags & mjw.EnableBit.SLEEP:
+        names += "map_iefc2efc map_efc2iefc efc_islandid map_idof2dof map_dof2idof dof_islandid"
+        d.efc.island = wp.empty((0, d.njmax), dtype=int)
+    for name in names.split():
+        array = getattr(d, name)
+        setattr(d, name, wp.empty((0, *array.shape[1:]), dtype=array.dtype))
+
+
 def expand_gravity(warp_model: mjw.Model, num_envs: int) -> Float32[Tensor, "E 3"]:
     """Give each world its own gravity vector, and return the view, in m/s^2.
 

@@ -101,6 +101,7 @@ class World(views.DataViews):
             self.warp_data_E = mjw.make_data(
                 stored_model, nworld=num_envs, nconmax=self.nconmax, njmax=self.njmax
             )
+            upstream.drop_unread(self.warp_model, self.warp_data_E)
             gravity_EL = upstream.expand_gravity(self.warp_model, num_envs)
             self._overflow = OverflowRecord(self.warp_data_E)
             self._reset_mask = wp.zeros(num_envs, dtype=bool)

@@ -127,7 +127,8 @@ def full(*values):
 @pytest.mark.parametrize(
     ("options", "actor_options"),
     [
-        ({}, {}),
+        # Observations that are stored as 48 columns, and multiplied as 64.
+        ({}, {"actor_obs": 40}),
         (
             {
                 "clip_epsilon": 1.0,

@@ -172,3 +172,25 @@ def test_versions_are_bounded_above(package: str) -> None:
     )
     present = tuple(int(part) for part in metadata.version(package).split("+")[0].split(".")[:2])
     assert present < tuple(int(part) for part in found.split(".")), f"{package} {present} is beyond {found}"
+
+
+@pytest.mark.parametrize("integrator", ["euler", "implicit", "implicitfast", "discrete"])
+@pytest.mark.parametrize("sleeps", [False, True])
+def test_a_step_does_without_the_arrays_that_are_dropped(integrator: str, sleeps: bool) -> None:
+    mj_model = mujoco.MjModel.from_xml_string(MODEL.replace('pos="0 0 1"', 'pos="0 0 0.09"'))
+    mj_model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    mj_model.opt.enableflags |= sleeps * mujoco.mjtEnableBit.mjENBL_SLEEP
+    with wp.ScopedDevice("cpu"):
+        m = mjw.put_model(mj_model)
+        whole, less = (mjw.make_data(mj_model, nworld=2, nconmax=32, njmax=128) for _ in range(2))
+        upstream.drop_unread(m, less)
+        assert (less.qH.size == 0) == (integrator != "discrete")
+        assert (less.qLU.size == 0) == (integrator != "implicit")
+        assert (less.efc_islandid.size == 0) == (not sleeps)
+        for data in (whole, less):
+            for _ in range(3):
+                mjw.step(m, data)
+            assert data.nacon.numpy()[0] > 0
+            mjw.reset_data(m, data, reset=wp.array([False, True], dtype=bool))
+            mjw.step(m, data)
+    assert (whole.qpos.numpy() == less.qpos.numpy()).all()

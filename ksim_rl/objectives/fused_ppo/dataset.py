@@ -9,12 +9,14 @@ from torch import Tensor
 
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
 from ksim_rl.objectives.fused_ppo.layout import FusedLayout, launch, parts
-from ksim_rl.objectives.fused_ppo.loss_kernels import LOG_PROB, MASK, estimate_advantages
+from ksim_rl.objectives.fused_ppo.loss_kernels import ADVANTAGE, LOG_PROB, MASK, estimate_advantages
 from ksim_rl.objectives.masked import standardized
 from ksim_rl.objectives.symmetry import SymmetricAugmentation
 
 # Envs per program.
 ENVS = 32
+# In so many parts a rollout is read: on the way, the observations of one take several times their memory.
+PARTS = 4
 Observe = Callable[[TensorDictBase], Float[Tensor, "*batch L"]]
 Evaluate = Callable[[Float[Tensor, "D L"], Float[Tensor, " D"]], None]
 
@@ -42,11 +44,10 @@ class FusedDataset:
         self.cfg, self.layout, self.size, self._mirror = cfg, layout, size, mirror
         self._observe = observe_actor, observe_critic
         rows = size if mirror is None else 2 * size
-        self.obs = torch.zeros(2, rows, layout.obs, dtype=dtype, device=device)
-        self._next_obs = torch.zeros(size, layout.obs, dtype=dtype, device=device)
+        self.obs = torch.zeros(2, rows, layout.stored, dtype=dtype, device=device)
         width = layout.out
         # A standard deviation must have a logarithm, also where there is no action and where nothing takes part.
-        self._neutral = torch.zeros(3 * width + 16, device=device)
+        self._neutral = torch.zeros(3 * width + 8, device=device)
         self._neutral[2 * width : 3 * width] = 1.0
         self.records = self._neutral.repeat(rows, 1)
         self._signals = torch.zeros(4, size, device=device)
@@ -57,15 +58,20 @@ class FusedDataset:
 
         An env state with an element that is not finite takes no part, as in `DatasetStorage`; returned is how many.
         """
-        following = rollout_ET.get("next")
-        halves = [rollout_ET] if self._mirror is None else [rollout_ET, self._mirror.image(rollout_ET)]
-        for obs_DL, observe, dim in zip(self.obs, self._observe, self.layout.obs_dims, strict=True):
-            for rows_DL, half_ET in zip(obs_DL.split(self.size), halves, strict=True):
-                rows_DL[:, :dim] = _time_major(observe(half_ET))
-        self._next_obs[:, : self.layout.obs_dims[1]] = _time_major(self._observe[1](following))
         values_D, next_values_D, advantages_D, targets_D = self._signals
-        evaluate(self.obs[1, : self.size], values_D)
-        evaluate(self._next_obs, next_values_D)
+        first = 0
+        for part_ET in rollout_ET.chunk(PARTS, 1):
+            rows = slice(first, first + part_ET.numel())
+            self._take(part_ET, self.obs[:, rows], self.records[rows])
+            if self._mirror is not None:
+                images = slice(self.size + rows.start, self.size + rows.stop)
+                self._take(self._mirror.image(part_ET), self.obs[:, images], self.records[images])
+            evaluate(self.obs[1, rows], values_D[rows])
+            next_obs = self.obs.new_zeros(part_ET.numel(), self.layout.stored)
+            next_obs[:, : self.layout.obs_dims[1]] = _time_major(self._observe[1](part_ET.get("next")))
+            evaluate(next_obs, next_values_D[rows])
+            first = rows.stop
+        following = rollout_ET.get("next")
         num_envs, length = rollout_ET.batch_size
         signals = {
             **dict(zip(("values", "next_values", "advantages", "targets"), self._signals, strict=True)),
@@ -79,17 +85,22 @@ class FusedDataset:
             estimated_D = advantages_D.isfinite()
             normal_D = standardized(advantages_D, estimated_D, lowest_std=1e-4)
             advantages_D = torch.where(estimated_D, normal_D, torch.nan)
-        return self._record(halves, torch.stack([advantages_D, values_D, targets_D], 1))
+        return self._record(torch.stack([advantages_D, values_D, targets_D], 1))
 
-    def _record(self, halves: list[TensorDictBase], estimates: Tensor) -> Tensor:
+    def _take(self, part_ET: TensorDictBase, obs_2BL: Tensor, records_B: Tensor) -> None:
+        """Take over what is as the rollout has it, some steps of it."""
         width, actions = self.layout.out, self.layout.actions
-        first, mask = 3 * width + LOG_PROB.value, 3 * width + MASK.value
-        for rows, half_ET in zip(self.records.split(self.size), halves, strict=True):
-            for place, key in enumerate(("action", "loc", "scale")):
-                rows[:, place * width : place * width + actions] = _time_major(half_ET.get(key))
-            rows[:, first] = _time_major(half_ET.get("action_log_prob"))
-            rows[:, first + 1 : mask] = estimates
-            rows[:, mask] = 1.0
+        for obs_BL, observe, dim in zip(obs_2BL, self._observe, self.layout.obs_dims, strict=True):
+            obs_BL[:, :dim] = _time_major(observe(part_ET))
+        for place, key in enumerate(("action", "loc", "scale")):
+            records_B[:, place * width : place * width + actions] = _time_major(part_ET.get(key))
+        records_B[:, 3 * width + LOG_PROB.value] = _time_major(part_ET.get("action_log_prob"))
+
+    def _record(self, estimates: Tensor) -> Tensor:
+        first, mask = (3 * self.layout.out + column.value for column in (ADVANTAGE, MASK))
+        for rows in self.records.split(self.size):
+            rows[:, first:mask] = estimates
+        self.records[:, mask] = 1.0
         finite_D = _finite_rows(self.records) & _finite_rows(self.obs[0]) & _finite_rows(self.obs[1])
         # A zero times NaN is NaN: what takes no part must be finite too. The mask of the neutral row is zero.
         torch.where(finite_D[:, None], self.records, self._neutral, out=self.records)

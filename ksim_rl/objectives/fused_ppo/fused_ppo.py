@@ -9,7 +9,7 @@ moved the gradient of each parameter by 0.2 to 0.6 percent of its norm, where to
 
 import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
@@ -154,6 +154,8 @@ class FusedPPO:
         )
 
         self._summary = torch.zeros(num_steps, power_of_two(len(SUMMARY) + 1), device=device)
+        # Splits whose layer inputs and gradients exist at a time; the loss of a mirror image reads the whole minibatch.
+        self._splits = tuning.splits if self._mirrored else parts(tuning.splits, 2)
         self._arguments = self._all_arguments(rows, mirror)
 
     def _all_arguments(self, rows: int, mirror: SymmetricAugmentation | None) -> dict[str, Any]:
@@ -162,6 +164,7 @@ class FusedPPO:
         dataset, parameters = self.dataset, self.parameters
         zeros = partial(torch.zeros, device=dataset.records.device)
         blocks, dtype = parts(rows, tuning.block), dataset.obs.dtype
+        held = min(rows, self._splits * self._split(rows))
         programs = 2 * parts(layout.num_padded, tuning.size) + 1
         # Where the image of each action comes from, counted from 1, times its sign; see `output_gradients`.
         image_of = torch.arange(1, layout.out + 1, device=dataset.records.device, dtype=torch.int32)
@@ -190,8 +193,8 @@ class FusedPPO:
             "num_rows": rows,
             "tiles": layout.weight_tiles(tuning.tile).to(dataset.records.device),
             # Tiles at the edge read past the last row.
-            "inputs": zeros(2 * rows * layout.inputs + tuning.tile, dtype=dtype),
-            "slopes": zeros(2 * rows * layout.gradients + tuning.tile, dtype=dtype),
+            "inputs": zeros(2 * held * layout.inputs + tuning.tile, dtype=dtype),
+            "slopes": zeros(2 * held * layout.gradients + tuning.tile, dtype=dtype),
             "weight_partials": zeros(tuning.splits, 2, layout.num_padded),
             "block_partials": zeros(blocks, 2, layout.out + NUM_STATISTICS),
             # Of both networks; ranks add them up together with the summary behind them.
@@ -233,16 +236,17 @@ class FusedPPO:
         places: list[Tensor] = []
 
         def place() -> None:
-            order_N = torch.cat([*orders]).to(torch.int32)
-            # From env by env to step by step.
-            places.append((order_N % length) * num_envs + order_N.div(length, rounding_mode="floor"))
+            for order_D in orders:
+                order_D = order_D.to(torch.int32)
+                # From env by env to step by step.
+                places.extend(((order_D % length) * num_envs + order_D // length).split(self.batch))
 
         with warp_scope(self._summary.device):
             with beside(self._side, place):
                 self.parameters.load()
                 left_out = self.dataset.read(rollout_ET, evaluate=self._evaluate)
             with beside(self._side, *aside):
-                for step, index_B in enumerate(places[0].split(self.batch)):
+                for step, index_B in enumerate(places):
                     if len(self.dataset.records) > self.dataset.size:
                         index_B = torch.cat([index_B, index_B + self.dataset.size])
                     self._multiply(index_B)
@@ -251,25 +255,35 @@ class FusedPPO:
         names = SUMMARY if self._mirrored else SUMMARY[:-1]
         return dict(zip(names, self._summary.unbind(1), strict=False)), left_out
 
-    def _multiply(self, index_B: Tensor) -> None:
-        """Run a minibatch through both networks and back, up to the gradients of the weights, in parts."""
-        tuning, rows, given = self.tuning, len(index_B), self._arguments
-        if self.layout.chained:
-            grid = given["BLOCKS"], 2
-            launch(minibatch_gradients, grid, given, num_warps=tuning.warps, order=index_B)
-        else:
-            self._multiply_by_layers(index_B)
-        grid, split = (
-            (len(given["tiles"]), tuning.splits),
-            parts(rows, tuning.splits * tuning.depth) * tuning.depth,
-        )
-        launch(weight_gradients, grid, given, num_warps=tuning.tile_warps, ROWS=split)
+    def _split(self, rows: int) -> int:
+        """Return how many rows of a minibatch are a split: whole blocks, and whole steps of `weight_gradients`."""
+        tuning = self.tuning
+        return parts(rows, tuning.splits * tuning.depth) * tuning.depth
 
-    def _multiply_by_layers(self, index_B: Tensor) -> None:
+    def _multiply(self, index_B: Tensor) -> None:
+        """Run a minibatch through both networks and back, up to the gradients of the weights, some splits at a time."""
+        tuning, split, own = self.tuning, self._split(len(index_B)), self._arguments
+        for number, part_B in enumerate(index_B.split(self._splits * split)):
+            first = number * self._splits
+            given = own | {
+                "order": part_B,
+                "num_rows": len(part_B),
+                "BLOCKS": parts(len(part_B), tuning.block),
+                "block_partials": own["block_partials"][first * split // tuning.block :],
+                "weight_partials": own["weight_partials"][first:],
+            }
+            if self.layout.chained:
+                launch(minibatch_gradients, (given["BLOCKS"], 2), given, num_warps=tuning.warps)
+            else:
+                self._multiply_by_layers(given)
+            grid = len(given["tiles"]), self._splits
+            launch(weight_gradients, grid, given, num_warps=tuning.tile_warps, ROWS=split)
+
+    def _multiply_by_layers(self, given: Mapping[str, Any]) -> None:
         """Leave what `minibatch_gradients` leaves, with kernels of each layer."""
-        layout, tuning, rows, given = self.layout, self.tuning, len(index_B), self._arguments
+        layout, tuning, index_B = self.layout, self.tuning, given["order"]
         weights, biases = self.parameters.weights, self.parameters.biases_2N
-        seen = given["inputs"][: 2 * rows * layout.inputs].view(2, rows, -1)
+        seen = given["inputs"][: 2 * len(index_B) * layout.inputs].view(2, len(index_B), -1)
         seen[..., : layout.obs] = self.dataset.obs[:, index_B]
 
         def run(at: LayerPlace, following: LayerPlace, *, forward: bool) -> None:
@@ -298,7 +312,7 @@ class FusedPPO:
             "slope_at": last.gradient,
         }
         grid = given["BLOCKS"], 2
-        launch(output_gradients, grid, given, num_warps=tuning.tile_warps, order=index_B, **places)
+        launch(output_gradients, grid, given, num_warps=tuning.tile_warps, **places)
         for at, following in reversed(pairs):
             run(at, following, forward=False)
 

@@ -82,7 +82,8 @@ class FusedLayout:
     There are two forms. The flat one, [N], has the parameters end to end as they are, which is what the optimizer
     works on. The padded one, [2, P], has a row for the actor and one for the critic, each with first all weights and
     then all biases and the std, in blocks whose sizes are the same in both rows: the outputs are padded to `out`,
-    a power of two, and so is the observation to `obs` where the kernels are `chained`; what else differs between
+    a power of two, and so is the observation to `obs` where the kernels are `chained`, though it is `stored` as a
+    multiple of 16; what else differs between
     both, or is no multiple of 16, is padded to one. The outputs of a `std_layer` follow those of the last layer, and
     its biases are in the place of the std. Padding is zero, and so is its gradient.
     """
@@ -93,7 +94,8 @@ class FusedLayout:
         self.hidden = tuple(_multiple(max(layer.out_features for layer in pair)) for pair in pairs)
         self.actions = networks.actor[-1].out_features
         self.obs_dims = networks.actor[0].in_features, networks.critic[0].in_features
-        self.obs = (power_of_two if self.chained else _multiple)(max(*self.obs_dims, MIN_WIDTH))
+        self.stored = _multiple(max(*self.obs_dims, MIN_WIDTH))
+        self.obs = power_of_two(self.stored) if self.chained else self.stored
         self.out = power_of_two(max(self.actions, MIN_WIDTH))
         outputs = self.out if networks.std_layer is None else 2 * self.out
         widths = (self.obs, *self.hidden, outputs)

@@ -86,16 +86,23 @@ def _outputs(
 
 
 @triton.jit
+def _observed(obs, rows, keep, STORED: tl.constexpr, OBS: tl.constexpr):
+    """Return those rows of `obs` [D, STORED], padded to OBS columns."""
+    column = tl.arange(0, OBS)[None, :]
+    return tl.load(obs + (rows[:, None] * STORED + column), mask=keep & (column < STORED), other=0.0)
+
+
+@triton.jit
 def state_values(
     obs, weights, biases, values, num_rows,
-    OBS: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr, OUT: tl.constexpr,
-    BLOCK: tl.constexpr, CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr,
+    STORED: tl.constexpr, OBS: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr,
+    OUT: tl.constexpr, BLOCK: tl.constexpr, CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr,
 ):  # fmt: skip
-    """Write the first output of a network for each row of `obs` [D, OBS] to `values` [D]."""
+    """Write the first output of a network for each row of `obs` [D, STORED] to `values` [D]."""
     rows = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     valid = rows < num_rows
     keep = valid[:, None]
-    observed = tl.load(obs + (rows[:, None] * OBS + tl.arange(0, OBS)[None, :]), mask=keep, other=0.0)
+    observed = _observed(obs, rows, keep, STORED, OBS)
     out = _outputs(
         observed, weights, biases, values, rows, keep, H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, False
     )
@@ -108,8 +115,8 @@ def minibatch_gradients(
     log_ratio_low, log_ratio_high, clip_value, entropy_coeff, critic_coeff,
     NUM_PADDED: tl.constexpr, NUM_STATISTICS: tl.constexpr,
     RECORD: tl.constexpr, INPUTS: tl.constexpr, GRADIENTS: tl.constexpr,
-    OBS: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr, ACTIONS: tl.constexpr,
-    OUT: tl.constexpr, LOG_STD: tl.constexpr, MIN_STD: tl.constexpr, CLIP_VALUE: tl.constexpr,
+    STORED: tl.constexpr, OBS: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr,
+    ACTIONS: tl.constexpr, OUT: tl.constexpr, LOG_STD: tl.constexpr, MIN_STD: tl.constexpr, CLIP_VALUE: tl.constexpr,
     BLOCK: tl.constexpr, CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr,
 ):  # fmt: skip
     """Run a block of a minibatch through one network, its loss, and back: all but the products for the weights.
@@ -136,7 +143,7 @@ def minibatch_gradients(
     index = tl.load(order + rows, mask=valid, other=0).to(tl.int32)
     weights += network * NUM_PADDED
     biases += network * NUM_PADDED
-    obs += wide * num_obs * OBS
+    obs += wide * num_obs * STORED
     inputs += wide * num_rows * INPUTS
     slopes += wide * num_rows * GRADIENTS
     d_std_at = block_partials + (block * 2 + network) * (OUT + NUM_STATISTICS)
@@ -144,7 +151,7 @@ def minibatch_gradients(
     input_rows = rows[:, None] * INPUTS
     gradient_rows = rows[:, None] * GRADIENTS
 
-    observed = tl.load(obs + (index[:, None] * OBS + obs_column[None, :]), mask=keep, other=0.0)
+    observed = _observed(obs, index, keep, STORED, OBS)
     tl.store(inputs + (input_rows + obs_column[None, :]), observed, mask=keep)
     out = _outputs(
         observed, weights, biases, inputs, input_rows, keep, H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, True
