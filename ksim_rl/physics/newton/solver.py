@@ -9,13 +9,8 @@ import warp as wp
 
 from ksim_rl.device.streams import beside
 from ksim_rl.physics.contact_sensors import ContactReadings
-from ksim_rl.physics.newton.kernel import (
-    CUDA_LANES,
-    floats_per_world,
-    launcher,
-    put_longest_first,
-    row_stride,
-)
+from ksim_rl.physics.newton.kernel import CUDA_LANES, launcher, layout, put_longest_first
+from ksim_rl.physics.newton.limbs import limbs_of
 from ksim_rl.physics.sim_cfg import SimCfg
 
 # The shared memory that a block has without asking for more, in floats.
@@ -38,7 +33,8 @@ def unsuited(mj_model: mujoco.MjModel, *, njmax: int) -> str | None:
     """Return why the kernel cannot solve this model, or None where it can."""
     opt, nv = mj_model.opt, mj_model.nv
     elliptic = bool(opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC)
-    floats = floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=0)
+    limbs = limbs_of(mj_model.dof_parentid.tolist())
+    floats = layout(nv, njmax, limbs, elliptic=elliptic, rows_on_chip=0)["FLOATS"]
     reasons = {
         "the solver is not Newton's": opt.solver != mujoco.mjtSolver.mjSOL_NEWTON,
         f"the integrator is {mujoco.mjtIntegrator(opt.integrator).name}": opt.integrator not in INTEGRATORS,
@@ -87,21 +83,30 @@ def solver(
     m, d, efc = warp_model, warp_data_E, warp_data_E.efc
     elliptic = bool(m.opt.cone == mjw.ConeType.ELLIPTIC)
     on_cuda = d.qpos.device.is_cuda
-    lanes = CUDA_LANES if on_cuda else 1
+    limbs = limbs_of(m.dof_parentid.numpy().tolist())
+    sizes = layout(m.nv, d.njmax, limbs, elliptic=elliptic, rows_on_chip=0)
+    stride, narrow = sizes["STRIDE"], sizes["NARROW"]
     if rows_on_chip is None:
-        room = FLOATS_PER_WORLD - floats_per_world(m.nv, d.njmax, elliptic=elliptic, rows_on_chip=0)
-        rows_on_chip = min(-(-d.njmax // 2), max(0, room // row_stride(m.nv))) if on_cuda else d.njmax
-    far_floats = (d.njmax - rows_on_chip) * row_stride(m.nv)
+        room = FLOATS_PER_WORLD - sizes["FLOATS"]
+        rows_on_chip = min(-(-d.njmax // 2), max(0, room // narrow)) if on_cuda else d.njmax
+    sizes = layout(m.nv, d.njmax, limbs, elliptic=elliptic, rows_on_chip=rows_on_chip)
+    far_floats = (d.njmax - rows_on_chip * narrow // stride) * stride
     device = d.qpos.device
     own = {
         "efc_J_colind": efc.J_colind.reshape((d.nworld, -1)),
         "efc_J": efc.J.reshape((d.nworld, -1)),
         "scratch": wp.empty((d.nworld, far_floats), dtype=float, device=device),
+        **{name: wp.array(table, dtype=int, device=device) for name, table in limbs.tables(m.nv).items()},
         "order": wp.array(list(range(d.nworld)), dtype=int, device=device),
         "broken": wp.empty(0, dtype=int, device=device) if broken is None else broken,
     }
     solve = launcher(
-        m, d, own, elliptic=elliptic, lanes=lanes, rows_on_chip=rows_on_chip, checked=broken is not None
+        m,
+        d,
+        own,
+        sizes,
+        lanes=CUDA_LANES if on_cuda else 1,
+        checked=broken is not None,
     )
 
     def launch(*, orders: bool = True, solves: bool = True) -> None:
