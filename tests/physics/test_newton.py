@@ -220,6 +220,18 @@ def test_limbs_with_and_without_contacts_between_them_move_as_in_the_c_engine(co
     assert any(touched) == (spacing < 0.1)
 
 
+@pytest.mark.parametrize("floats", [300, 1760, 2400, 3000, 4576, 5536, 12_000])
+def test_registers_are_bounded_so_that_as_many_worlds_run_at_once_as_shared_memory_lets(floats):
+    by_memory = (228 * 1024) // (4 * floats + 1024)
+    registers = newton.most_registers(floats)
+    if registers is None:
+        assert by_memory <= 16
+        return
+    warps_of_a_quarter = 65_536 // 4 // (32 * registers)
+    assert registers % 8 == 0 and 80 <= registers <= 128
+    assert 4 * warps_of_a_quarter >= by_memory or registers == 80
+
+
 def broken_invariants(world: World, substeps: int) -> Invariant:
     with wp.ScopedDevice("cpu"):
         model, data = world.warp_model, world.warp_data_E

@@ -91,6 +91,7 @@ def launcher(
     sizes: Mapping[str, int],
     *,
     lanes: int,
+    max_registers: int | None,
     checked: bool,
 ) -> Callable[[], None]:
     """Return what launches the kernel.
@@ -124,6 +125,7 @@ def launcher(
         lanes=lanes,
         threads=lanes,
         fast_math=True,
+        max_registers=max_registers,
     )
 
 

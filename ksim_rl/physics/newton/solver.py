@@ -15,9 +15,13 @@ from ksim_rl.physics.sim_cfg import SimCfg
 
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
-# What a world may have of a multiprocessor's shared memory: ten such worlds live there at once. On an H200 with 4096
-# worlds of G1 that leaves room for 64 rows and takes 0.39 ms; 32 rows, with 15 worlds at once, take 0.49 ms.
-FLOATS_PER_WORLD = 5600
+# What a world may have of a multiprocessor's shared memory: ten such worlds live there at once. On an H200, 4096 worlds
+# of G1 take 212 us; with 5600 floats (nine worlds) 217, with room for twelve 222 and for thirteen 237.
+FLOATS_PER_WORLD = 5536
+# A multiprocessor has 228 KiB of shared memory, of which each block takes another KiB, and in each quarter, where warps
+# stay, 512 registers for a lane. With 80 of them, the fewest that were measured, 4096 worlds of Go1 take an H200
+# 142 us, with 96 they take 154 and with 106 they take 166. Where more than 128 are left, there is no need of a bound.
+SHARED_BYTES, LEAST_REGISTERS, MOST_REGISTERS = 228 * 1024, 80, 128
 MOST_DOFS = 64
 # MuJoCo Warp's solver ends its loop by a conditional node, which costs more than the few iterations that it saves
 # (H200, 4096 worlds, at most 10 iterations: Go1 8.22 ms without and 8.46 with it, G1 9.88 and 10.17).
@@ -64,6 +68,13 @@ def takes_conditional_nodes(warp_model: mjw.Model, *, supported: bool) -> bool:
     return supported and int(warp_model.opt.iterations) > MOST_UNCONDITIONAL_ITERATIONS
 
 
+def most_registers(floats: int) -> int | None:
+    """Return how many registers let as many worlds run at once as their shared memory does, or None for any number."""
+    worlds = SHARED_BYTES // (4 * floats + 1024)
+    most = max(LEAST_REGISTERS, 512 // -(-worlds // 4) // 8 * 8)
+    return most if most <= MOST_REGISTERS else None
+
+
 def solver(
     warp_model: mjw.Model,
     warp_data_E: mjw.Data,
@@ -106,6 +117,7 @@ def solver(
         own,
         sizes,
         lanes=CUDA_LANES if on_cuda else 1,
+        max_registers=most_registers(sizes["FLOATS"]) if on_cuda else None,
         checked=broken is not None,
     )
 
