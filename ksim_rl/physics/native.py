@@ -32,6 +32,7 @@ def launcher(
     lanes: int,
     threads: int,
     fast_math: bool = False,
+    max_registers: int | None = None,
 ) -> Callable[..., None]:
     """Return what launches C++ over (worlds, lanes) in blocks of `threads`, with arrays in their final place.
 
@@ -41,10 +42,10 @@ def launcher(
     """
     names = dict.fromkeys(re.findall(r"\bproblem\.(\w+)", source))
     owners = own, warp_model, warp_model.opt, warp_data_E
-    types = {name: _type_of(value) for name, value in values_of(names, *owners).items()}
+    types = tuple((name, _type_of(value)) for name, value in values_of(names, *owners).items())
     values = {name.upper(): int(value) for name, value in constants.items()}
     values |= {"LANES": lanes, "THREADS": threads}
-    kernel, struct = _kernel(source, tuple(values.items()), tuple(types.items()), threads, fast_math)
+    kernel, struct = _kernel(source, tuple(values.items()), types, threads, fast_math, max_registers)
     problem, dim, device = filled(struct, *owners), (warp_data_E.nworld, lanes), warp_data_E.qpos.device
 
     def launch(**changes: Any) -> None:
@@ -66,6 +67,7 @@ def _kernel(
     types: tuple[tuple[str, Any], ...],
     threads: int,
     fast_math: bool,
+    max_registers: int | None,
 ) -> tuple[wp.Kernel, Any]:
     """Return the kernel, and the struct that it takes."""
 
@@ -82,6 +84,7 @@ def _kernel(
         module="unique",
         enable_backward=False,
         grid_stride=False,
+        cuda_max_registers=max_registers,
         module_options={"block_dim": threads, "fast_math": fast_math},
     )
     def kernel(problem: struct):

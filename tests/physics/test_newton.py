@@ -14,6 +14,7 @@ from ksim_rl.physics import SimCfg, World, load_model
 from ksim_rl.physics.newton import kernel
 from ksim_rl.physics.newton import solver as newton
 from ksim_rl.physics.newton.kernel import Invariant
+from ksim_rl.physics.newton.limbs import limbs_of
 
 NUM_ENVS = 6
 ROWS_OF_ALL_KINDS = """
@@ -152,6 +153,83 @@ def test_rows_that_find_no_room_on_chip_solve_alike(cone):
     assert found[0].any()
     for other in found[1:]:
         torch.testing.assert_close(other, found[0], rtol=1e-5, atol=1e-5)
+
+
+LIMBS = """
+<mujoco>
+  <option timestep="0.004" integrator="implicitfast" iterations="100" tolerance="1e-8" cone="{cone}" impratio="3"/>
+  <worldbody>
+    <geom type="plane" size="5 5 1" condim="{condim}" friction="0.8 0.02 0.01"/>
+    <body name="trunk" pos="0 0 0.42">
+      <freejoint/>
+      <geom type="box" size="0.2 0.2 0.05" mass="2" contype="0"/>
+      {legs}
+    </body>
+    <body pos="2 0 0.3"><freejoint/><geom size="0.1" contype="0" conaffinity="0"/></body>
+  </worldbody>
+</mujoco>
+"""
+LEG = """
+<body pos="{x} {y} 0">
+  <joint axis="0 1 0" range="-0.3 0.3" limited="true" frictionloss="0.05" armature="0.01"/>
+  <geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.2" mass="0.2" contype="0" conaffinity="0"/>
+  <body pos="0 0 -0.2">
+    <joint axis="1 0 0" armature="0.01"/>
+    <geom size="0.04" pos="0 0 -0.1" mass="0.1" contype="2" conaffinity="1"/>
+    {shank}
+  </body>
+</body>
+"""
+SHANK = """
+<body pos="0 0 -0.1"><joint axis="0 0 1" armature="0.01"/>
+<geom size="0.05" pos="0 0 -0.06" condim="{condim}" mass="0.1" contype="1" conaffinity="3"/></body>
+"""
+
+
+@pytest.mark.parametrize("cone", CONES)
+@pytest.mark.parametrize("spacing", [0.15, 0.03])
+def test_limbs_with_and_without_contacts_between_them_move_as_in_the_c_engine(cone, spacing):
+    condim = 6 if cone == "elliptic" else 3
+    shanks = (SHANK.format(condim=condim), SHANK.format(condim=condim), "", SHANK.format(condim=condim))
+    places = [(x, y) for x in (-spacing, spacing) for y in (-0.15, 0.15)]
+    legs = "".join(LEG.format(x=x, y=y, shank=shank) for (x, y), shank in zip(places, shanks, strict=True))
+    model = load_model(LIMBS.format(cone=cone, condim=condim, legs=legs))
+    limbs = limbs_of(model.dof_parentid.tolist())
+    assert len(limbs.trunk) == 6 and [len(chain) for chain in limbs.chains] == [2, 3, 3, 3, 6]
+    world = World(model, num_envs=NUM_ENVS, sim=SimCfg(njmax=160, nconmax=32, tolerance=1e-8))
+    generator = torch.Generator().manual_seed(1)
+    world.qpos_EL[:, 2] -= 0.02 * torch.rand(NUM_ENVS, generator=generator)
+    world.qvel_EL.copy_(0.7 * torch.randn(world.qvel_EL.shape, generator=generator))
+    rows_of(world)
+    touched = []
+    for rows_on_chip in (world.njmax, 3):
+        world.qacc_EL.zero_()
+        with wp.ScopedDevice("cpu"):
+            newton.solver(world.warp_model, world.warp_data_E, rows_on_chip=rows_on_chip)()
+        for row in range(NUM_ENVS):
+            mj_data = mujoco.MjData(model)
+            mj_data.qpos[:], mj_data.qvel[:] = world.qpos_EL[row], world.qvel_EL[row]
+            mujoco.mj_forward(model, mj_data)
+            assert mj_data.nefc == world.last_substep("nefc")[row] > 0
+            touched += [0 not in model.geom_bodyid[pair] for pair in mj_data.contact.geom]
+            for name, ours in (("qacc", world.qacc_EL), ("qfrc_constraint", world.view("qfrc_constraint"))):
+                theirs = getattr(mj_data, name)
+                scale = 1.0 + np.abs(theirs).max()
+                np.testing.assert_allclose(ours[row] / scale, theirs / scale, atol=3e-4, err_msg=name)
+    # Only limbs that are close together touch each other, and fill the Hessian.
+    assert any(touched) == (spacing < 0.1)
+
+
+@pytest.mark.parametrize("floats", [300, 1760, 2400, 3000, 4576, 5536, 12_000])
+def test_registers_are_bounded_so_that_as_many_worlds_run_at_once_as_shared_memory_lets(floats):
+    by_memory = (228 * 1024) // (4 * floats + 1024)
+    registers = newton.most_registers(floats)
+    if registers is None:
+        assert by_memory <= 16
+        return
+    warps_of_a_quarter = 65_536 // 4 // (32 * registers)
+    assert registers % 8 == 0 and 80 <= registers <= 128
+    assert 4 * warps_of_a_quarter >= by_memory or registers == 80
 
 
 def broken_invariants(world: World, substeps: int) -> Invariant:

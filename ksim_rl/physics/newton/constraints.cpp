@@ -2,29 +2,33 @@
 //
 // MuJoCo orders rows as equalities, dry friction, limits and contacts (computation chapter, "Constraint model").
 // The rows of a contact with an elliptic cone stand one after another: that of the normal, here the head of the
-// cone, and those of its tangents. `kinds` of a head has the number of its rows above the lowest 8 bits.
+// cone, and those of its tangents.
 
 constexpr int EQUALITY = 0, FRICTION = 1, ONE_SIDED = 2, CONE_HEAD = 3, CONE_TANGENT = 4;
+const int* const slots = problem.slots.data;
+const int* const place_of = by_limbs ? problem.places.data : slots;
 
 #pragma unroll 1
 for (int entry = lane; entry < NV * STRIDE; entry += LANES)
     mass[entry] = 0.0f;
 each_row(0, 1, Singly {}, [&](int row, float* jacobian) {
 #pragma unroll 1
-    for (int dof = lane; dof < STRIDE; dof += LANES)
-        jacobian[dof] = 0.0f;
+    for (int place = lane; place < width; place += LANES)
+        jacobian[place] = 0.0f;
 });
 UNROLL
 for (int block = 0; block < BLOCKS; ++block) {
     qacc[block] = row_of(problem.qacc_warmstart)[dof_of(block)];
     qfrc_smooth[block] = row_of(problem.qfrc_smooth)[dof_of(block)];
+    limbs[block] = by_limbs ? problem.limbs.data[dof_of(block)] : -1;
+    places[block] = place_of[dof_of(block)];
     if (is_dof(block))
-        shared[dof_of(block)] = bounded(qacc[block]);
+        shared[slot_of(block)] = bounded(qacc[block]);
 }
 sync();
 #pragma unroll 4
 for (int entry = lane; entry < problem.M_hinit_i.shape[0]; entry += LANES) {
-    const int row = problem.M_hinit_i.data[entry], column = problem.M_colind.data[entry];
+    const int row = slots[problem.M_hinit_i.data[entry]], column = slots[problem.M_colind.data[entry]];
     mass[row * STRIDE + column] = mass[column * STRIDE + row] = row_of(problem.M)[entry];
 }
 each_row(lane, LANES, Singly {}, [&](int row, float* jacobian) {
@@ -36,14 +40,14 @@ each_row(lane, LANES, Singly {}, [&](int row, float* jacobian) {
 #pragma unroll 4
     for (int entry = begin; entry < end; ++entry) {
         require(dofs[entry] >= 0 && dofs[entry] < NV, ROWS_ARE_WHOLE);
-        jacobian[dofs[entry]] = values[entry];
-        product += values[entry] * shared[dofs[entry]];
+        jacobian[place_of[dofs[entry]]] = values[entry];
+        product += values[entry] * shared[slots[dofs[entry]]];
     }
     residual[row] = product - row_of(problem.efc_aref)[row];
     efc_D[row] = row_of(problem.efc_D)[row];
-    kinds[row] = row < equalities ? EQUALITY : row < equalities + frictions ? FRICTION : ONE_SIDED;
+    kinds[row] += row < equalities ? EQUALITY : row < equalities + frictions ? FRICTION : ONE_SIDED;
     bound[row] = row_of(problem.efc_frictionloss)[row];
-    require(efc_D[row] > 0.0f && (kinds[row] != FRICTION || bound[row] >= 0.0f), ROWS_ARE_WHOLE);
+    require(efc_D[row] > 0.0f && (kind_of(row) != FRICTION || bound[row] >= 0.0f), ROWS_ARE_WHOLE);
     if (ELLIPTIC) {
         const int* const types = row_of(problem.efc_type);
         const int* const contacts = row_of(problem.efc_id);
@@ -60,11 +64,11 @@ each_row(lane, LANES, Singly {}, [&](int row, float* jacobian) {
             if (before + after < problem.contact_dim.data[contacts[row]]) {
                 // Of a cone that njmax cuts off, no row pushes, as in mujoco_warp's solver.py (_eval_constraint).
                 for (int entry = begin; entry < end; ++entry)
-                    jacobian[dofs[entry]] = 0.0f;
+                    jacobian[place_of[dofs[entry]]] = 0.0f;
                 residual[row] = efc_D[row] = 0.0f;
                 return;
             }
-            kinds[row] = before > 0 ? CONE_TANGENT : CONE_HEAD + (after << 8);
+            kinds[row] += (before > 0 ? CONE_TANGENT : CONE_HEAD + (after << 4)) - ONE_SIDED;
             bound[row] = before > 0 ? friction[before - 1] : friction[0] * impratio;
             require(before + after >= 3 && before + after <= 6 && bound[row] > 0.0f, CONES_ARE_WHOLE);
         }
@@ -74,7 +78,7 @@ sync();
 #pragma unroll 1
 for (int first = 0; first < rows; first += LANES) {
     const int row = first + lane;
-    const bool counts = row >= equalities && row < rows && (!ELLIPTIC || kinds[row] != CONE_TANGENT);
+    const bool counts = row >= equalities && row < rows && (!ELLIPTIC || kind_of(row) != CONE_TANGENT);
 #if defined(__CUDA_ARCH__)
     const unsigned all = __ballot_sync(0xffffffffu, counts);
     if (counts)

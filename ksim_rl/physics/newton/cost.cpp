@@ -17,7 +17,7 @@ auto cone_Dm = [&](int head) {
 };
 // What a row costs where at(row) is its residual; the head of a cone stands for all of it.
 auto cost_of = [&](int row, auto at) {
-    const int kind = kinds[row] & 255;
+    const int kind = kind_of(row);
     const float here = at(row), quadratic = 0.5f * efc_D[row] * here * here;
     if (kind == CONE_TANGENT || (kind == ONE_SIDED && here >= 0.0f))
         return 0.0f;
@@ -29,7 +29,7 @@ auto cost_of = [&](int row, auto at) {
         return quadratic;
     float tangent2 = 0.0f, of_all = quadratic;
 #pragma unroll 1
-    for (int mate = row + 1; mate < row + (kinds[row] >> 8); ++mate) {
+    for (int mate = row + 1; mate < row + cone_size(row); ++mate) {
         tangent2 += at(mate) * bound[mate] * at(mate) * bound[mate];
         of_all += 0.5f * efc_D[mate] * at(mate) * at(mate);
     }
@@ -41,7 +41,7 @@ auto cost_of = [&](int row, auto at) {
 // where the Hessian is no diagonal, the head has -Dm in the place of its stiffness, and `cones` has the spring
 // force[0] / T that the tangents share (part 4).
 auto update_row = [&](int row) {
-    const int kind = kinds[row] & 255;
+    const int kind = kind_of(row);
     if (kind == CONE_TANGENT)
         return;
     int state = QUADRATIC;
@@ -57,7 +57,7 @@ auto update_row = [&](int row) {
     if (state != QUADRATIC)
         curvature = 0.0f;
     if (ELLIPTIC && kind == CONE_HEAD) {
-        const int end = row + (kinds[row] >> 8);
+        const int end = row + cone_size(row);
         const float mu = bound[row], normal = residual[row] * mu;
         float tangent2 = 0.0f;
 #pragma unroll 1

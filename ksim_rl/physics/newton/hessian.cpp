@@ -1,5 +1,6 @@
-// Part 4: the gradient M qacc - qfrc_smooth - J' force, the Hessian H = M + J' d2s/dr2 J, and the search direction
-// -H^-1 gradient by a Cholesky factorization (computation chapter, "Algorithms", Newton).
+// Part 5: the gradient M qacc - qfrc_smooth - J' force, the Hessian H = M + J' d2s/dr2 J, and the search direction
+// -H^-1 gradient by a Cholesky factorization (computation chapter, "Algorithms", Newton): that of part 4, or here for
+// rows that touch any degrees of freedom.
 
 // M times the vector that the lanes share, of which each has its own entries.
 auto times_mass = [&](float* result, const float* own) {
@@ -8,7 +9,7 @@ UNROLL
         float product = 0.0f;
 UNROLL
         for (int dof = 0; dof < NV; ++dof)
-            product += mass[dof * STRIDE + dof_of(block)] * shared[dof];
+            product += mass[dof * STRIDE + slot_of(block)] * shared[dof];
         result[block] = fabsf(own[block]) <= LARGEST ? product : own[block];
     }
 };
@@ -18,42 +19,51 @@ UNROLL
     for (int block = 0; block < BLOCKS; ++block) {
         qfrc_constraint[block] = 0.0f;
         each_row(0, 1, ByFours {}, [&](int row, const float* jacobian) {
-            qfrc_constraint[block] += jacobian[dof_of(block)] * force[row];
+            if (touches(block, limb_of(row)))
+                qfrc_constraint[block] += jacobian[places[block]] * force[row];
         });
     }
 };
-auto add_outer_product = [&](float scale, const float* vector) {
+auto start_rows = [&] {
+UNROLL
+    for (int block = 0; block < BLOCKS; ++block)
+UNROLL
+        for (int dof = block * LANES; dof < NV; ++dof)
+            hessian[block][dof] = mass[dof * STRIDE + slot_of(block)];
+};
+auto add_outer_product = [&](float scale, float push, const float* vector, int) {
 UNROLL
     for (int block = 0; block < BLOCKS; ++block) {
-        const float weight = scale * vector[dof_of(block)];
-        if (LANES == 1 && weight == 0.0f)
+        const float own = vector[slot_of(block)], weight = scale * own;
+        if (LANES == 1 && own == 0.0f)
             continue;
+        qfrc_constraint[block] += push * own;
 UNROLL
         for (int dof = block * LANES; dof < NV; ++dof)
             hessian[block][dof] += weight * vector[dof];
     }
 };
-// H = M + J' d2s/dr2 J. In the curved zone of a cone s = 1/2 Dm g^2 with g = N - mu T, so that
+// H = M + J' d2s/dr2 J, and J' force of the same rows. In the curved zone of a cone s = 1/2 Dm g^2 with
+// g = N - mu T, so that
 //
 //     d2s = Dm dg dg' + Dm g d2g = Dm dg dg' + spring (I - t t'),   spring = force[0] / T,
 //
 // over the tangents scaled by their frictions, t being the direction of their slip. Of these terms spring I is the
 // stiffness of the rows of the tangents. With slip = sum_i t[i] friction[i] J[i], the others are
 // Dm gap gap' - spring slip slip', where gap = mu (J[0] - slip).
-auto build_hessian = [&] {
+auto build_hessian = [&](auto start, auto add) {
+    start();
 UNROLL
     for (int block = 0; block < BLOCKS; ++block)
-UNROLL
-        for (int dof = block * LANES; dof < NV; ++dof)
-            hessian[block][dof] = mass[dof * STRIDE + dof_of(block)];
+        qfrc_constraint[block] = 0.0f;
     each_row(0, 1, Singly {}, [&](int row, const float* jacobian) {
-        if (stiffness[row] > 0.0f)
-            add_outer_product(stiffness[row], jacobian);
+        if (stiffness[row] != 0.0f || force[row] != 0.0f)
+            add(wp::max(stiffness[row], 0.0f), force[row], jacobian, limb_of(row));
     });
     if (!ELLIPTIC)
         return;
-    float* const gap = columns;
-    float* const slip = columns + COLUMN;
+    float* const slip = spread - width;
+    float* const gap = slip - width;
 #pragma unroll 1
     for (int unit = 0; unit < num_units; ++unit) {
         const int head = units[unit];
@@ -65,17 +75,17 @@ UNROLL
         for (int block = 0; block < BLOCKS; ++block) {
             float along = 0.0f;
 #pragma unroll 1
-            for (int mate = head + 1; mate < head + (kinds[head] >> 8); ++mate)
-                along += force[mate] * jacobian_of(mate)[dof_of(block)];
+            for (int mate = head + 1; mate < head + cone_size(head); ++mate)
+                along += force[mate] * jacobian_of(mate)[places[block]];
             along *= by_push;
-            if (is_dof(block)) {
-                slip[dof_of(block)] = along;
-                gap[dof_of(block)] = mu * (jacobian_of(head)[dof_of(block)] - along);
+            if (is_dof(block) && touches(block, limb_of(head))) {
+                slip[places[block]] = along;
+                gap[places[block]] = mu * (jacobian_of(head)[places[block]] - along);
             }
         }
         sync();
-        add_outer_product(Dm, gap);
-        add_outer_product(-cones[4 * head], slip);
+        add(Dm, 0.0f, gap, limb_of(head));
+        add(-cones[4 * head], 0.0f, slip, limb_of(head));
         sync();
     }
 };
@@ -114,7 +124,7 @@ UNROLL
 UNROLL
             for (int block = own; block < BLOCKS; ++block) {
                 const bool below = block > own || lane > pivot;
-                const float entry = block == own ? hessian[own][begin + slot] : column[beyond + dof_of(block)];
+                const float entry = block == own ? hessian[own][begin + slot] : column[beyond + slot_of(block)];
                 const float factor = below ? entry * by_pivot : 0.0f;
                 if (block == own && lane == pivot)
                     inverse_pivot[own] = by_pivot;
@@ -150,6 +160,7 @@ struct SecondBlock {
 struct AnyBlock {
     int INDEX;
 };
+// Returns gradient' H^-1 gradient, from y and D of L D L' = H.
 auto factorize = [&] {
 #if defined(__CUDA_ARCH__)
     eliminate(FirstBlock {});
@@ -159,6 +170,11 @@ auto factorize = [&] {
     for (int block = 0; block < BLOCKS; ++block)
         eliminate(AnyBlock {block});
 #endif
+    float decrement = 0.0f;
+UNROLL
+    for (int block = 0; block < BLOCKS; ++block)
+        decrement += is_dof(block) ? gradient[block] * gradient[block] * inverse_pivot[block] : 0.0f;
+    return total(decrement);
 };
 // The search direction, the negated solution of D L' search = y, in the place of y and for all lanes to read.
 auto back_substitute = [&] {
@@ -175,7 +191,7 @@ UNROLL
     for (int block = 0; block < BLOCKS; ++block) {
         search[block] *= -inverse_pivot[block];
         if (is_dof(block))
-            shared[dof_of(block)] = bounded(search[block]);
+            shared[slot_of(block)] = bounded(search[block]);
     }
     sync();
 };

@@ -5,7 +5,7 @@ world waits for another, and what an iteration computes stays on the chip. The a
 by bracketed Newton steps, and the same tests of convergence, so that the results agree up to rounding. It is written in
 C++, since its matrix lies in registers, which needs loops that are unrolled, shuffles and shared memory; the CPU
 compiles the same source, for a warp of one lane. Read its parts in their order: layout.cpp, constraints.cpp, cost.cpp,
-hessian.cpp, line_search.cpp, newton.cpp.
+limbs.cpp, hessian.cpp, line_search.cpp, newton.cpp.
 
 Source of the algorithm: https://mujoco.readthedocs.io/en/stable/computation/index.html; of its bounds, line
 search and tests of convergence: mujoco_warp/_src/solver.py.
@@ -21,10 +21,11 @@ import mujoco_warp as mjw
 import warp as wp
 
 from ksim_rl.physics import native
+from ksim_rl.physics.newton.limbs import Limbs, padded
 
 CUDA_LANES = 32
 SORTING_THREADS = 1024
-_PARTS = ("layout", "constraints", "cost", "hessian", "line_search", "newton")
+_PARTS = ("layout", "constraints", "cost", "limbs", "hessian", "line_search", "newton")
 _SOURCE = native.source_of("newton", _PARTS)
 
 
@@ -45,56 +46,65 @@ class Invariant(enum.IntFlag):
     """A line search never returns a point that costs more than its start."""
 
 
-def row_stride(nv: int) -> int:
-    """Return the floats from a row of J or M to the next."""
-    # Whole groups of four, which are loaded at once; an odd number of them, so that the lanes' rows lie in other banks.
-    return 4 * (-(-nv // 4) | 1)
-
-
-def floats_per_world(nv: int, njmax: int, *, elliptic: bool, rows_on_chip: int) -> int:
-    """Return how many floats the lanes of a world share."""
-    stride, padded_rows = row_stride(nv), _padded(njmax)
-    cones = 4 * (padded_rows + 4) if elliptic else 0
-    return (nv + rows_on_chip) * stride + 2 * _column(nv) + stride + 7 * padded_rows + cones
-
-
-def _padded(njmax: int) -> int:
-    return 4 * -(-njmax // 4)
-
-
-def _column(nv: int) -> int:
+def layout(nv: int, njmax: int, limbs: Limbs, *, elliptic: bool, rows_on_chip: int) -> dict[str, int]:
+    """Return the sizes of what the lanes of a world share, by the names of the C++, and all of it in `FLOATS`."""
+    arms, chains, trunk = len(limbs.trunk) + 1, len(limbs.chains), padded(len(limbs.trunk))
+    limb = len(limbs.chains[-1]) if chains else 1
+    stride = _row_stride(nv)
+    narrow = _row_stride(trunk + limb) if chains else stride
     # A column of a whole block has the entries of the block twice; one more is that of the gradient.
-    return _padded(nv + 1 + (CUDA_LANES if nv >= CUDA_LANES else 0))
+    column = padded(nv + 1 + (CUDA_LANES if nv >= CUDA_LANES else 0))
+    # Part 4 of the C++ has blocks and arms of limbs, then the trunk; part 5 has two columns, or in the end two rows.
+    of_limbs = chains * (limb + arms) * padded(limb) + max(padded(arms * (arms + 1) // 2), 2 * narrow)
+    workspace, spread = max(2 * column, 2 * stride, of_limbs), trunk + chains * padded(limb)
+    rows = padded(njmax)
+    floats = (nv + 1) * stride + rows_on_chip * narrow + workspace + spread + 6 * rows
+    return {
+        "NV": nv,
+        "NJ": njmax,
+        "PADDED_ROWS": rows,
+        "STRIDE": stride,
+        "NARROW": narrow,
+        "TRUNK": len(limbs.trunk),
+        "LIMBS": chains,
+        "LIMB": limb,
+        "LIMB_BEGIN": trunk,
+        "LIMB_STRIDE": padded(limb),
+        "SPREAD": spread,
+        "WORKSPACE": workspace,
+        "COLUMN": column,
+        "ROWS_ON_CHIP": rows_on_chip,
+        "ELLIPTIC": elliptic,
+        "FLOATS": floats + (4 * (rows + 4) if elliptic else 0),
+    }
+
+
+def _row_stride(entries: int) -> int:
+    # Whole groups of four, which are loaded at once; an odd number of them, so that the lanes' rows lie in other banks.
+    return 4 * (-(-entries // 4) | 1)
 
 
 def launcher(
     warp_model: mjw.Model,
     warp_data_E: mjw.Data,
     own: Mapping[str, wp.array],
+    sizes: Mapping[str, int],
     *,
-    elliptic: bool,
     lanes: int,
-    rows_on_chip: int,
+    max_registers: int | None,
     checked: bool,
 ) -> Callable[[], None]:
     """Return what launches the kernel.
 
-    There are 32 lanes on CUDA and 1 on the CPU. Rows beyond those on the chip (in shared memory) are in the scratch. A
-    `checked` (debug) build writes each world's broken `Invariant`s. Of `own` it takes `efc_J_colind` and `efc_J`, the
-    `scratch`, the `order` in which the worlds are taken up, and `broken`.
+    The `sizes` are those of a `layout`. There are 32 lanes on CUDA and 1 on the CPU. Rows beyond those on the chip (in
+    shared memory) are in the scratch. A `checked` (debug) build writes each world's broken `Invariant`s. Of `own` it
+    takes `efc_J_colind` and `efc_J`, the `scratch`, the tables of `limbs`, the `order` in which the worlds are taken
+    up, and `broken`.
     """
-    nv, njmax = warp_model.nv, warp_data_E.njmax
     states, rows = mujoco.mjtConstraintState, mujoco.mjtConstraint
     constants = {
-        "NV": nv,
-        "NJ": njmax,
-        "PADDED_ROWS": _padded(njmax),
-        "STRIDE": row_stride(nv),
-        "COLUMN": _column(nv),
-        "ROWS_ON_CHIP": rows_on_chip,
-        "FLOATS": floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=rows_on_chip),
+        **sizes,
         "MOST_TRIALS": warp_model.opt.ls_iterations,
-        "ELLIPTIC": elliptic,
         "ELLIPTIC_CONTACT": rows.mjCNSTR_CONTACT_ELLIPTIC,
         "SATISFIED": states.mjCNSTRSTATE_SATISFIED,
         "QUADRATIC": states.mjCNSTRSTATE_QUADRATIC,
@@ -107,7 +117,15 @@ def launcher(
         **{str(invariant.name): invariant for invariant in Invariant},
     }
     return native.launcher(
-        _SOURCE, constants, own, warp_model, warp_data_E, lanes=lanes, threads=lanes, fast_math=True
+        _SOURCE,
+        constants,
+        own,
+        warp_model,
+        warp_data_E,
+        lanes=lanes,
+        threads=lanes,
+        fast_math=True,
+        max_registers=max_registers,
     )
 
 

@@ -14,6 +14,9 @@
 // each it has the row of the Hessian from the block's first column on: on CUDA these rows lie in registers, and
 // with one lane, on the CPU, they are the upper triangle. J and M lie on the chip as whole rows, zeros included:
 // then sums over them have no index to look up, and the lanes read one address or adjacent ones.
+//
+// Here the degrees of freedom are in the order of their slots: the trunk of the kinematic tree, then its limbs (see
+// limbs.py). Where no row of J touches two limbs, rows are narrow: the trunk's entries, then those of one limb.
 
 world = problem.order.data[world];
 
@@ -34,16 +37,18 @@ static float memory[FLOATS];
 #endif
 float* const mass = memory;  // M
 float* const chip = mass + NV * STRIDE;  // J of the rows that find room
-float* const columns = chip + ROWS_ON_CHIP * STRIDE;  // two
-float* const shared = columns + 2 * COLUMN;  // a vector of the degrees of freedom, for all lanes to read
+float* const columns = chip + ROWS_ON_CHIP * NARROW;  // two, or what part 4 has of the Hessian
+float* const spread = columns + WORKSPACE;  // `shared` with LIMB_STRIDE entries of each limb
+float* const shared = spread + SPREAD;  // a vector of the degrees of freedom, for all lanes to read
 float* const residual = shared + STRIDE;  // J qacc - aref
 float* const rate = residual + PADDED_ROWS;  // J search, during a line search
 float* const stiffness = rate;  // d2s/dr2, between two line searches; 0 where a row is slack
 float* const force = rate + PADDED_ROWS;  // -ds/dr
 float* const efc_D = force + PADDED_ROWS;
 float* const bound = efc_D + PADDED_ROWS;  // most dry friction, mu of a cone's head, friction of its tangents
-int* const kinds = (int*)(bound + PADDED_ROWS);
-int* const units = kinds + PADDED_ROWS;  // the rows whose cost is measured: all but equalities and tangents
+// Of each row its kind, 16 times the rows of its cone, and 256 times its limb.
+unsigned short* const kinds = (unsigned short*)(bound + PADDED_ROWS);
+short* const units = (short*)kinds + PADDED_ROWS;  // the rows whose cost is measured: all but equalities and tangents
 float* const cones = (float*)(units + PADDED_ROWS);
 int num_units = 0;
 
@@ -53,6 +58,7 @@ float qacc[BLOCKS], M_qacc[BLOCKS], M_search[BLOCKS], qfrc_smooth[BLOCKS], qfrc_
 float search[BLOCKS], inverse_pivot[BLOCKS];
 auto& gradient = search;
 float hessian[BLOCKS][NV];
+int limbs[BLOCKS], places[BLOCKS];  // the limb of each, -1 in the trunk, and its place in a row
 
 // The arrays of this world.
 auto row_of = [=](auto& array) { return array.data + (size_t)world * array.shape[1]; };
@@ -63,8 +69,6 @@ const float impratio = of_world(problem.impratio_invsqrt);
 const float tolerance = of_world(problem.tolerance);
 const float ls_tolerance = of_world(problem.ls_tolerance);
 int* const states = row_of(problem.efc_state);
-const int near_rows = wp::min(rows, ROWS_ON_CHIP);
-float* const far = row_of(problem.scratch) - near_rows * STRIDE;
 
 // A debug build notes which invariants do not hold; any other one compiles to nothing here.
 auto require = [&](bool holds, int invariant) {
@@ -91,6 +95,12 @@ UNROLL
 #endif
     return value;
 };
+auto any = [](bool holds) {
+#if defined(__CUDA_ARCH__)
+    holds = __any_sync(0xffffffffu, holds);
+#endif
+    return holds;
+};
 auto of_lane = [](float value, int lane) {
 #if defined(__CUDA_ARCH__)
     value = __shfl_sync(0xffffffffu, value, lane);
@@ -102,7 +112,29 @@ auto bounded = [](float value) { return wp::clamp(value, -LARGEST, LARGEST); };
 auto ratio = [](float dividend, float divisor) { return dividend / (divisor == 0.0f ? TINY : divisor); };
 // A lane beyond the last degree of freedom does what the lane of the last one does, and writes nothing.
 auto is_dof = [&](int block) { return block * LANES + lane < NV; };
-auto dof_of = [&](int block) { return wp::min(block * LANES + lane, NV - 1); };
+auto slot_of = [&](int block) { return wp::min(block * LANES + lane, NV - 1); };
+auto dof_of = [&](int block) { return problem.dofs.data[slot_of(block)]; };
+auto kind_of = [&](int row) { return kinds[row] & 15; };
+auto cone_size = [&](int row) { return kinds[row] >> 4 & 15; };
+auto limb_of = [&](int row) { return kinds[row] >> 8; };
+auto touches = [&](int block, int limb) { return limbs[block] < 0 || limbs[block] == limb; };
+
+bool couples = false;
+#pragma unroll 1
+for (int row = lane; row < rows; row += LANES) {
+    const int begin = row_of(problem.efc_J_rowadr)[row], end = begin + row_of(problem.efc_J_rownnz)[row];
+    int limb = -1;
+#pragma unroll 4
+    for (int entry = begin; entry < end; ++entry) {
+        const int other = problem.limbs.data[row_of(problem.efc_J_colind)[entry]];
+        couples |= limb >= 0 && other >= 0 && other != limb;
+        limb = wp::max(limb, other);
+    }
+    kinds[row] = wp::max(limb, 0) << 8;
+}
+const bool by_limbs = LIMBS > 0 && !any(couples);
+const int width = by_limbs ? NARROW : STRIDE, near_rows = wp::min(rows, ROWS_ON_CHIP * NARROW / width);
+float* const far = row_of(problem.scratch) - near_rows * width;
 // Calls body(row, its J) for the rows first, first + stride, ...: those on chip, then those that found no
 // room there.
 struct Singly {
@@ -114,10 +146,10 @@ struct ByFours {
 auto each_row = [&](int first, int stride, auto pace, auto body) {
 #pragma unroll decltype(pace)::AT_ONCE
     for (int row = first; row < near_rows; row += stride)
-        body(row, chip + row * STRIDE);
-    if (ROWS_ON_CHIP < NJ)
+        body(row, chip + row * width);
+    if (ROWS_ON_CHIP * NARROW < NJ * STRIDE)
 #pragma unroll 1
         for (int row = near_rows + first; row < rows; row += stride)
-            body(row, far + row * STRIDE);
+            body(row, far + row * width);
 };
-auto jacobian_of = [&](int row) { return (row < near_rows ? chip : far) + row * STRIDE; };
+auto jacobian_of = [&](int row) { return (row < near_rows ? chip : far) + row * width; };

@@ -1,4 +1,4 @@
-// Part 5: the exact line search along qacc + alpha search (computation chapter, "Algorithms"; mujoco_warp's
+// Part 6: the exact line search along qacc + alpha search (computation chapter, "Algorithms"; mujoco_warp's
 // solver.py, _linesearch_iterative_kernel). Along it a row's residual is r + alpha rate, and the cost a sum of
 // functions of alpha, of each of which its value relative to alpha = 0, its slope and its curvature are needed.
 
@@ -105,7 +105,7 @@ auto measure = [&](float alpha, int first, int stride) {
     Point sum {0.0f, 0.0f, 0.0f};
 #pragma unroll 1
     for (int unit = first; unit < num_units; unit += stride) {
-        const int row = units[unit], kind = kinds[row] & 255;
+        const int row = units[unit], kind = kind_of(row);
         Point point;
         if (ELLIPTIC && kind == CONE_HEAD)
             point = cone_point(*(const Cone*)(cones + 4 * row), alpha);

@@ -1,7 +1,9 @@
-// Part 6: Newton's method, from its start to the accelerations and forces (computation chapter, "Algorithms").
+// Part 7: Newton's method, from its start to the accelerations and forces (computation chapter, "Algorithms").
 // It ends, as mujoco_warp's solver.py (_solve_done) does, once the scaled gradient, Newton decrement or improvement
 // is below the tolerance, or a line search finds nothing better.
 
+if (by_limbs)
+    clear_limbs();
 times_mass(M_qacc, qacc);
 // The start is the warm start, or zero where that is cheaper; C compares with the unconstrained acceleration, which
 // nothing here computes. Without rows it is zero: the one step from there rounds by what it finds, not by how far away
@@ -32,40 +34,45 @@ UNROLL
 float trace = 0.0f;
 UNROLL
 for (int block = 0; block < BLOCKS; ++block)
-    trace += is_dof(block) ? mass[dof_of(block) * (STRIDE + 1)] : 0.0f;
+    trace += is_dof(block) ? mass[slot_of(block) * (STRIDE + 1)] : 0.0f;
 const float scale = 1.0f / wp::max(TINY, total(trace));
 
 int iteration = 0;
 bool last = false;
-while (true) {
-#pragma unroll 1
-    for (int row = lane; row < rows; row += LANES)
-        update_row(row);
-    sync();
-    pull_back();
+// Sets the gradient, then the search direction, or returns that the accelerations are good enough or the last.
+auto find_search = [&](auto start, auto add, auto eliminate, auto substitute) {
+    build_hessian(start, add);
     float gradient2 = 0.0f;
 UNROLL
     for (int block = 0; block < BLOCKS; ++block) {
         gradient[block] = M_qacc[block] - qfrc_smooth[block] - qfrc_constraint[block];
         gradient2 += is_dof(block) ? gradient[block] * gradient[block] : 0.0f;
     }
-    if (last || (iteration > 0 && scale * sqrtf(total(gradient2)) < tolerance))
-        break;
-    build_hessian();
-    factorize();
-    // gradient' H^-1 gradient, from y and D of L D L' = H.
-    float decrement = 0.0f;
-UNROLL
-    for (int block = 0; block < BLOCKS; ++block)
-        decrement += is_dof(block) ? gradient[block] * gradient[block] * inverse_pivot[block] : 0.0f;
-    if (iteration > 0 && 0.5f * scale * total(decrement) < tolerance)
-        break;
+    if (iteration > 0 && scale * sqrtf(total(gradient2)) < tolerance)
+        return true;
+    const float decrement = eliminate();
+    if (iteration > 0 && 0.5f * scale * decrement < tolerance)
+        return true;
     if (iteration == problem.iterations) {
         if (lane == 0)
             wp::atomic_or(problem.overflow.data + world, OUT_OF_ITERATIONS);
+        return true;
+    }
+    substitute();
+    return false;
+};
+while (true) {
+#pragma unroll 1
+    for (int row = lane; row < rows; row += LANES)
+        update_row(row);
+    sync();
+    if (last) {
+        pull_back();
         break;
     }
-    back_substitute();
+    if (by_limbs ? find_search(start_own_rows, add_to_own_rows, factorize_limbs, search_along_limbs)
+                 : find_search(start_rows, add_outer_product, factorize, back_substitute))
+        break;
 
     // Along the search direction: M search, J search, and the terms of the cost that are quadratic everywhere.
     times_mass(M_search, search);
@@ -79,9 +86,19 @@ UNROLL
         }
     each_row(lane, LANES, Singly {}, [&](int row, const float* jacobian) {
         float product = 0.0f;
+        if (by_limbs) {
+            const float* const of_limb = spread + limb_of(row) * LIMB_STRIDE;
 UNROLL
-        for (int dof = 0; dof < NV; ++dof)
-            product += jacobian[dof] * shared[dof];
+            for (int place = 0; place < TRUNK; ++place)
+                product += jacobian[place] * spread[place];
+UNROLL
+            for (int place = LIMB_BEGIN; place < LIMB_BEGIN + LIMB; ++place)
+                product += jacobian[place] * of_limb[place];
+        } else {
+UNROLL
+            for (int dof = 0; dof < NV; ++dof)
+                product += jacobian[dof] * shared[dof];
+        }
         rate[row] = product;
         noise += fabsf(force[row] * product);
         if (row < equalities) {
@@ -97,8 +114,8 @@ UNROLL
     if (ELLIPTIC) {
 #pragma unroll 1
         for (int unit = lane; unit < num_units; unit += LANES)
-            if ((kinds[units[unit]] & 255) == CONE_HEAD)
-                prepare_cone(units[unit], kinds[units[unit]] >> 8);
+            if (kind_of(units[unit]) == CONE_HEAD)
+                prepare_cone(units[unit], cone_size(units[unit]));
         sync();
     }
 

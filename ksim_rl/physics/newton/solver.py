@@ -9,20 +9,19 @@ import warp as wp
 
 from ksim_rl.device.streams import beside
 from ksim_rl.physics.contact_sensors import ContactReadings
-from ksim_rl.physics.newton.kernel import (
-    CUDA_LANES,
-    floats_per_world,
-    launcher,
-    put_longest_first,
-    row_stride,
-)
+from ksim_rl.physics.newton.kernel import CUDA_LANES, launcher, layout, put_longest_first
+from ksim_rl.physics.newton.limbs import limbs_of
 from ksim_rl.physics.sim_cfg import SimCfg
 
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
-# What a world may have of a multiprocessor's shared memory: ten such worlds live there at once. On an H200 with 4096
-# worlds of G1 that leaves room for 64 rows and takes 0.39 ms; 32 rows, with 15 worlds at once, take 0.49 ms.
-FLOATS_PER_WORLD = 5600
+# What a world may have of a multiprocessor's shared memory: ten such worlds live there at once. On an H200, 4096 worlds
+# of G1 take 212 us; with 5600 floats (nine worlds) 217, with room for twelve 222 and for thirteen 237.
+FLOATS_PER_WORLD = 5536
+# A multiprocessor has 228 KiB of shared memory, of which each block takes another KiB, and in each quarter, where warps
+# stay, 512 registers for a lane. With 80 of them, the fewest that were measured, 4096 worlds of Go1 take an H200
+# 142 us, with 96 they take 154 and with 106 they take 166. Where more than 128 are left, there is no need of a bound.
+SHARED_BYTES, LEAST_REGISTERS, MOST_REGISTERS = 228 * 1024, 80, 128
 MOST_DOFS = 64
 # MuJoCo Warp's solver ends its loop by a conditional node, which costs more than the few iterations that it saves
 # (H200, 4096 worlds, at most 10 iterations: Go1 8.22 ms without and 8.46 with it, G1 9.88 and 10.17).
@@ -38,7 +37,8 @@ def unsuited(mj_model: mujoco.MjModel, *, njmax: int) -> str | None:
     """Return why the kernel cannot solve this model, or None where it can."""
     opt, nv = mj_model.opt, mj_model.nv
     elliptic = bool(opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC)
-    floats = floats_per_world(nv, njmax, elliptic=elliptic, rows_on_chip=0)
+    limbs = limbs_of(mj_model.dof_parentid.tolist())
+    floats = layout(nv, njmax, limbs, elliptic=elliptic, rows_on_chip=0)["FLOATS"]
     reasons = {
         "the solver is not Newton's": opt.solver != mujoco.mjtSolver.mjSOL_NEWTON,
         f"the integrator is {mujoco.mjtIntegrator(opt.integrator).name}": opt.integrator not in INTEGRATORS,
@@ -68,6 +68,13 @@ def takes_conditional_nodes(warp_model: mjw.Model, *, supported: bool) -> bool:
     return supported and int(warp_model.opt.iterations) > MOST_UNCONDITIONAL_ITERATIONS
 
 
+def most_registers(floats: int) -> int | None:
+    """Return how many registers let as many worlds run at once as their shared memory does, or None for any number."""
+    worlds = SHARED_BYTES // (4 * floats + 1024)
+    most = max(LEAST_REGISTERS, 512 // -(-worlds // 4) // 8 * 8)
+    return most if most <= MOST_REGISTERS else None
+
+
 def solver(
     warp_model: mjw.Model,
     warp_data_E: mjw.Data,
@@ -87,21 +94,31 @@ def solver(
     m, d, efc = warp_model, warp_data_E, warp_data_E.efc
     elliptic = bool(m.opt.cone == mjw.ConeType.ELLIPTIC)
     on_cuda = d.qpos.device.is_cuda
-    lanes = CUDA_LANES if on_cuda else 1
+    limbs = limbs_of(m.dof_parentid.numpy().tolist())
+    sizes = layout(m.nv, d.njmax, limbs, elliptic=elliptic, rows_on_chip=0)
+    stride, narrow = sizes["STRIDE"], sizes["NARROW"]
     if rows_on_chip is None:
-        room = FLOATS_PER_WORLD - floats_per_world(m.nv, d.njmax, elliptic=elliptic, rows_on_chip=0)
-        rows_on_chip = min(-(-d.njmax // 2), max(0, room // row_stride(m.nv))) if on_cuda else d.njmax
-    far_floats = (d.njmax - rows_on_chip) * row_stride(m.nv)
+        room = FLOATS_PER_WORLD - sizes["FLOATS"]
+        rows_on_chip = min(-(-d.njmax // 2), max(0, room // narrow)) if on_cuda else d.njmax
+    sizes = layout(m.nv, d.njmax, limbs, elliptic=elliptic, rows_on_chip=rows_on_chip)
+    far_floats = (d.njmax - rows_on_chip * narrow // stride) * stride
     device = d.qpos.device
     own = {
         "efc_J_colind": efc.J_colind.reshape((d.nworld, -1)),
         "efc_J": efc.J.reshape((d.nworld, -1)),
         "scratch": wp.empty((d.nworld, far_floats), dtype=float, device=device),
+        **{name: wp.array(table, dtype=int, device=device) for name, table in limbs.tables(m.nv).items()},
         "order": wp.array(list(range(d.nworld)), dtype=int, device=device),
         "broken": wp.empty(0, dtype=int, device=device) if broken is None else broken,
     }
     solve = launcher(
-        m, d, own, elliptic=elliptic, lanes=lanes, rows_on_chip=rows_on_chip, checked=broken is not None
+        m,
+        d,
+        own,
+        sizes,
+        lanes=CUDA_LANES if on_cuda else 1,
+        max_registers=most_registers(sizes["FLOATS"]) if on_cuda else None,
+        checked=broken is not None,
     )
 
     def launch(*, orders: bool = True, solves: bool = True) -> None:
