@@ -111,15 +111,8 @@ def solver(
         "order": wp.array(list(range(d.nworld)), dtype=int, device=device),
         "broken": wp.empty(0, dtype=int, device=device) if broken is None else broken,
     }
-    solve = launcher(
-        m,
-        d,
-        own,
-        sizes,
-        lanes=CUDA_LANES if on_cuda else 1,
-        max_registers=most_registers(sizes["FLOATS"]) if on_cuda else None,
-        checked=broken is not None,
-    )
+    lanes, registers = (CUDA_LANES, most_registers(sizes["FLOATS"])) if on_cuda else (1, None)
+    solve = launcher(m, d, own, sizes, lanes=lanes, max_registers=registers, checked=broken is not None)
 
     def launch(*, orders: bool = True, solves: bool = True) -> None:
         if orders and on_cuda:
