@@ -215,12 +215,7 @@ def exclude_contacts(spec: mujoco.MjSpec, pairs: Iterable[tuple[str, str]]) -> N
 
 
 def set_keyframe(
-    spec: mujoco.MjSpec,
-    name: str,
-    *,
-    init_pos: Vector,
-    init_quat: Vector,
-    joint_pos: Mapping[str, float],
+    spec: mujoco.MjSpec, name: str, *, init_pos: Vector, init_quat: Vector, joint_pos: Mapping[str, float]
 ) -> None:
     """Replace all keyframes by one: the root pose, `joint_pos`, and the controls of servos that hold those joints.
 
