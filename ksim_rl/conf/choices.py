@@ -61,18 +61,15 @@ def store_choices() -> None:
     choices = {group: dict(own) for group, own in CHOICES.items()}
     for name in algorithms.names():
         algorithm = algorithms.algorithm(name)
-        chosen = {group: _name_of(group, algorithm) for group in ("data", "modules")}
-        for group, choice in chosen.items():
-            choices[group].setdefault(choice, getattr(algorithm, group))
+        chosen = {}
+        for group in ("data", "modules"):
+            cfg = getattr(algorithm, group)
+            chosen[group] = next((choice for choice, own in CHOICES[group].items() if own == cfg), name)
+            choices[group].setdefault(chosen[group], cfg)
         upstream.store_config("objective", name, partial(_objective, algorithm, chosen))
     for group, own in choices.items():
         for name, cfg in own.items():
             upstream.store_config(group, name, partial(to_tree, cfg, HINTS[group]))
-
-
-def _name_of(group: str, algorithm: Algorithm) -> str:
-    cfg = getattr(algorithm, group)
-    return next((name for name, choice in CHOICES[group].items() if choice == cfg), algorithm.name)
 
 
 def _objective(algorithm: Algorithm, chosen: Mapping[str, str]) -> dict[str, Any]:

@@ -11,6 +11,8 @@ from ksim_rl.config import plugins
 TARGET = "_target_"
 OWN = "ksim_rl"
 
+_PLANAR = ("cheetah_run", "hopper", "walker", "walker_amp", "walker_motion")
+_CONTROL_SUITE = ("cartpole", "pendulum_swingup", "reacher")
 MOVED = {
     "ksim_rl.envs.actuators": "ksim_rl.scene.actuators",
     "ksim_rl.envs.mdp": "ksim_rl.mdp",
@@ -20,17 +22,8 @@ MOVED = {
     "ksim_rl.envs.tasks": "ksim_rl.tasks",
     "ksim_rl.envs.terrains": "ksim_rl.scene.terrains",
     "ksim_rl.envs.transforms": "ksim_rl.transforms",
-    **dict.fromkeys(
-        [
-            f"ksim_rl.tasks.{task}"
-            for task in ("cheetah_run", "hopper", "walker", "walker_amp", "walker_motion")
-        ],
-        "ksim_rl.tasks.planar",
-    ),
-    **dict.fromkeys(
-        [f"ksim_rl.tasks.{task}" for task in ("cartpole", "pendulum_swingup", "reacher")],
-        "ksim_rl.tasks.control_suite",
-    ),
+    **{f"ksim_rl.tasks.{task}": "ksim_rl.tasks.planar" for task in _PLANAR},
+    **{f"ksim_rl.tasks.{task}": "ksim_rl.tasks.control_suite" for task in _CONTROL_SUITE},
 }
 """Paths of 0.1 and where their classes are now, applied in turn; else a class is found by its package's exports."""
 GONE = {("SimCfg", "deterministic")}

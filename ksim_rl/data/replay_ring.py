@@ -122,7 +122,10 @@ class PrioritySampler(SavedByStateDict, Sampler):
                 f"the storage has ndim={storage.ndim}: PrioritySampler draws from storages of one dim; use ndim=1 and "
                 "extend by data with one batch dim"
             )
-        score_N = self._scores(storage)
+        # (priority + eps)^alpha of what is stored, and 0 elsewhere.
+        score_N = (self._priority_N.to(torch.float64) + self.eps).pow(self.alpha)
+        is_ring = isinstance(storage, ReplayStorage)
+        score_N = torch.where(storage.available, score_N, 0.0) if is_ring else score_N[: stored(storage)]
         # Whole numbers, whose sum has no order: a GPU adds floats up otherwise each time. One takes up to 2^62 / N.
         unit = score_N.amax().clamp_min(1e-300) * (score_N.shape[0] / 2.0**62)
         upto_N = (score_N / unit).to(torch.int64).cumsum(0)
@@ -155,13 +158,6 @@ class PrioritySampler(SavedByStateDict, Sampler):
     def _default(self) -> Tensor:
         """Return the highest priority so far, [], or 1 where there is none above zero."""
         return torch.where(self._highest > 0.0, self._highest, 1.0)
-
-    def _scores(self, storage: Storage) -> Tensor:
-        """Return (priority + eps)^alpha of what is stored and 0 elsewhere, float64 [N]."""
-        score_N = (self._priority_N.to(torch.float64) + self.eps).pow(self.alpha)
-        if isinstance(storage, ReplayStorage):
-            return torch.where(storage.available, score_N, 0.0)
-        return score_N[: stored(storage)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,9 +38,7 @@ def memory_for(
             raise
         taken = 0 if free is None else max(0, free - (free_bytes(device) or 0))
         per_env = max(1, (taken + asked) // num_envs)
-        if isinstance(
-            error, TooManyEnvsError
-        ):  # which was raised nearer to it, before anything was given back
+        if isinstance(error, TooManyEnvsError):  # raised nearer to it, before anything was given back
             per_env = max(per_env, error.per_env)
         most, fits = num_envs, ""
         if free is not None:

@@ -21,14 +21,6 @@ from ksim_rl.device.streams import CPU_LOCK, current_warp_stream, warp_scope
 MAX_RECORDED = 64
 """Records that one kernel keeps, one per device and size; a batch size that never comes again must not pile up."""
 
-_CODES = {
-    ctypes.c_int32: "i",
-    ctypes.c_uint32: "I",
-    ctypes.c_int64: "q",
-    ctypes.c_uint64: "Q",
-    ctypes.c_float: "f",
-}
-
 
 def arguments_of(*fields: tuple[type, str]) -> Any:
     """Return the struct of a `QuickLaunch` with these fields in order: types, each with names and blanks between."""
@@ -96,8 +88,8 @@ class QuickLaunch:
                 record_cmd=True,
                 block_dim=self._block_dim,
             )
-        packed = upstream.recorded_arguments(launch)
-        self._packer = struct.Struct("@" + "".join(_CODES[field[1]] for field in packed._fields_))
+        packed: Any = upstream.recorded_arguments(launch)
+        self._packer = struct.Struct("@" + "".join(kind._type_ for _, kind in packed._fields_))
         self._recorded[device, dim] = launch, packed
         return launch, packed
 

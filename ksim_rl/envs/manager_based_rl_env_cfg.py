@@ -40,9 +40,7 @@ class ManagerBasedRlEnvCfg(Checked):
     seed: Seed = None  # None draws one; the env stores the seed that it used in its own `cfg`
     sim: SimCfg = field(default_factory=SimCfg)
     viewer: ViewerCfg = field(default_factory=ViewerCfg)  # the camera of `render()`
-    episode_length_s: NonNegative = (
-        0.0  # 0: no episode ends by time, and there must be no time-out termination
-    )
+    episode_length_s: NonNegative = 0.0  # 0: no episode ends by time, and no term may be a time-out
     rewards: Mapping[str, RewardTerm] = field(default_factory=dict)  # a term of weight 0 is not computed
     terminations: Mapping[str, TerminationTerm] = field(default_factory=dict)  # always: non-finite physics
     commands: Mapping[str, CommandTerm] = field(default_factory=dict)  # emitted as `("command", name)`

@@ -12,10 +12,7 @@ from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_o
 _NEVER = 2**62
 
 
-_ARGUMENTS = arguments_of(
-    (int, "width num_envs"),
-    (wp.uint64, "table term_of_column step first count"),
-)
+_ARGUMENTS = arguments_of((int, "width num_envs"), (wp.uint64, "table term_of_column step first count"))
 _quick = QuickLaunch(
     _ARGUMENTS,
     """

@@ -282,15 +282,11 @@ def _layer_parameters(cfg: RecurrentCfg, input_dim: int) -> dict[str, Tensor]:
     if cfg.kind == "lstm":
         bias_hh[1] = 1.0
     return {
-        "weight_ih": torch.cat([_orthogonal(hidden, input_dim) for _ in range(gates)]),
-        "weight_hh": torch.cat([_orthogonal(hidden, hidden) for _ in range(gates)]),
+        "weight_ih": torch.cat([nn.init.orthogonal_(torch.empty(hidden, input_dim)) for _ in range(gates)]),
+        "weight_hh": torch.cat([nn.init.orthogonal_(torch.empty(hidden, hidden)) for _ in range(gates)]),
         "bias_ih": torch.zeros(gates * hidden),
         "bias_hh": bias_hh.flatten(),
     }
-
-
-def _orthogonal(rows: int, columns: int) -> Tensor:
-    return nn.init.orthogonal_(torch.empty(rows, columns))
 
 
 class CarriedState:

@@ -144,9 +144,7 @@ class AMPCfg(PPOCfg):
     and as many of the policy, from the last `replay_rollouts` rollouts.
     """
 
-    motions: Annotated[
-        tuple[str, ...], Filled(A_MOTION)
-    ] = ()  # by name or file; the env sees their states in `style_group`
+    motions: Annotated[tuple[str, ...], Filled(A_MOTION)] = ()  # by name or file
     style_group: str = "style"
     task_coeff: NonNegative = 0.5
     style_coeff: NonNegative = 0.5

@@ -113,7 +113,9 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
 
         losses = {"loss_objective": -gain_B}
         logged = {"clip_fraction": clipped_B.to(gain_B.dtype), "kl_approx": kl_approx_B}
-        logged["kl"] = _kl(dist_old, dist, log_behavior_weight_B)
+        with torch.no_grad():
+            exact_B = None if dist_old is None else policy_kl(dist_old, dist)
+            logged["kl"] = estimated_kl(log_behavior_weight_B) if exact_B is None else exact_B.unsqueeze(-1)
         out = TensorDict({})
         if self.entropy_bonus:
             entropy_B = self._get_entropy(dist, adv_shape=adv_B.shape[:-1])
@@ -210,12 +212,6 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
             dist, (self.samples_mc_entropy,), reparameterize=bool(dist.has_rsample)
         )
         return -log_prob.mean(0)
-
-
-def _kl(old: Distribution | None, new: Distribution, log_ratio_B: Tensor) -> Tensor:
-    with torch.no_grad():
-        exact = None if old is None else policy_kl(old, new)
-        return estimated_kl(log_ratio_B) if exact is None else exact.unsqueeze(-1)
 
 
 def _entropy_key(key: NestedKey) -> NestedKey:

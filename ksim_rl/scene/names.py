@@ -29,19 +29,13 @@ class NameResolver:
 
     def __init__(self, mj_model: mujoco.MjModel, device: torch.device) -> None:
         self._device = device
-        self._tables: dict[str, list[str]] = {
-            "body": _names(mj_model, mujoco.mjtObj.mjOBJ_BODY, mj_model.nbody),
-            "geom": _names(mj_model, mujoco.mjtObj.mjOBJ_GEOM, mj_model.ngeom),
-            "site": _names(mj_model, mujoco.mjtObj.mjOBJ_SITE, mj_model.nsite),
-            "joint": [mj_model.joint(i).name for i in scalar_joint_ids(mj_model)],
-            "actuator": _names(mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, mj_model.nu),
-            "sensor": _names(mj_model, mujoco.mjtObj.mjOBJ_SENSOR, mj_model.nsensor),
-            "tendon": _names(mj_model, mujoco.mjtObj.mjOBJ_TENDON, mj_model.ntendon),
-            "pair": _names(mj_model, mujoco.mjtObj.mjOBJ_PAIR, mj_model.npair),
-            "camera": _names(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, mj_model.ncam),
-            "light": _names(mj_model, mujoco.mjtObj.mjOBJ_LIGHT, mj_model.nlight),
-            "material": _names(mj_model, mujoco.mjtObj.mjOBJ_MATERIAL, mj_model.nmat),
-        }
+        m = mj_model
+        counts = {"body": m.nbody, "geom": m.ngeom, "site": m.nsite, "actuator": m.nu, "sensor": m.nsensor}
+        counts |= {"tendon": m.ntendon, "pair": m.npair, "camera": m.ncam, "light": m.nlight}
+        counts["material"] = m.nmat
+        ids: dict[str, Sequence[int]] = {kind: range(count) for kind, count in counts.items()}
+        ids["joint"] = scalar_joint_ids(m)
+        self._tables = {kind: [getattr(m, kind)(i).name for i in own] for kind, own in ids.items()}
         self._ids: dict[tuple[str, tuple[str, ...]], tuple[int, ...]] = {}
         self._indices: dict[tuple[str, tuple[str, ...]], Index] = {}
 
@@ -94,10 +88,6 @@ def as_index(ids: Sequence[int], device: torch.device) -> Index:
     if ids and ids == list(range(ids[0], ids[0] + len(ids))):
         return slice(ids[0], ids[0] + len(ids))
     return torch.tensor(ids, device=device, dtype=torch.int64)
-
-
-def _names(mj_model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> list[str]:
-    return [mujoco.mj_id2name(mj_model, kind, i) or "" for i in range(count)]
 
 
 def match_names(kind: str, patterns: Sequence[str], table: Sequence[str]) -> tuple[int, ...]:

@@ -79,16 +79,11 @@ class Runs:
         return left
 
     def _start(self, job: Job, gpu: str) -> subprocess.Popen[bytes]:
-        log, result = self._log(job), self.folder / job[0] / f"seed_{job[1]}.json"
-        words = [
-            self.source,
-            job[0],
-            str(job[1]),
-            str(result),
-            str(log.with_suffix("")),
-            "cuda" if gpu else "cpu",
-        ]
-        command = [sys.executable, "-m", "ksim_rl.tables.measure", *words, "smoke" if self.smoke else ""]
+        (name, seed), log = job, self._log(job)
+        result = self.folder / name / f"seed_{seed}.json"
+        words = [self.source, name, seed, result, log.with_suffix(""), "cuda" if gpu else "cpu"]
+        command = [sys.executable, "-m", "ksim_rl.tables.measure", *map(str, words)]
+        command.append("smoke" if self.smoke else "")
         log.parent.mkdir(parents=True, exist_ok=True)
         result.unlink(missing_ok=True)
         environment = os.environ | ({"CUDA_VISIBLE_DEVICES": gpu} if gpu else {})

@@ -125,10 +125,7 @@ def _training(num_iterations: int) -> TrainingCfg:
         num_envs=2048,
         objective=PPOCfg(entropy_coeff=0.003, clip_value=False),
         data=DatasetCfg(num_env_states_per_minibatch=12288, num_minibatches=4),
-        modules=ModulesCfg(
-            actor=ActorCfg(hidden_dims=(256, 128)),
-            critic=CriticCfg(hidden_dims=(256, 128)),
-        ),
+        modules=ModulesCfg(actor=ActorCfg(hidden_dims=(256, 128)), critic=CriticCfg(hidden_dims=(256, 128))),
         trainer=TrainerCfg(num_iterations=num_iterations, eval_interval=50),
     )
 

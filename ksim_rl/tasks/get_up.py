@@ -91,7 +91,7 @@ def get_up_cfg(
     *,
     standing_height: float,
     drop_height: tuple[float, float],
-    bend: float,
+    bend: float = 0.6,
     action_scale: Mapping[str, float],
     viewer: ViewerCfg,
 ) -> ManagerBasedRlEnvCfg:
@@ -158,7 +158,6 @@ def quadruped_get_up() -> ManagerBasedRlEnvCfg:
         robot,
         standing_height=0.29,
         drop_height=(0.12, 0.2),
-        bend=0.6,
         action_scale={".*_roll": 0.4, ".*_(hip|knee)": 0.6},
         viewer=ViewerCfg(body=robot.root_body, distance=1.6, elevation=-15.0, azimuth=120.0),
     )
@@ -171,7 +170,6 @@ def humanoid_get_up() -> ManagerBasedRlEnvCfg:
         robot,
         standing_height=0.48,
         drop_height=(0.05, 0.15),
-        bend=0.6,
         action_scale={".*": 0.7},
         viewer=ViewerCfg(body=robot.root_body, distance=2.2, elevation=-12.0, azimuth=130.0),
     )

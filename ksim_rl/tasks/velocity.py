@@ -364,12 +364,7 @@ PATCHES: Mapping[str, TerrainPatch] = {
 
 
 def on_rough_ground(
-    flat: ManagerBasedRlEnvCfg,
-    *,
-    root_height: float,
-    njmax: int,
-    nconmax: int,
-    patches: Mapping[str, TerrainPatch] = PATCHES,
+    flat: ManagerBasedRlEnvCfg, *, root_height: float, njmax: int, nconmax: int
 ) -> ManagerBasedRlEnvCfg:
     """Return the config of a flat velocity task on rough ground.
 
@@ -377,7 +372,7 @@ def on_rough_ground(
     envs move through the levels by how far their robots walk. Heights are seen relative to the soles of a robot whose
     root stands at `root_height`, m. `njmax` and `nconmax` make room for edges, where a foot touches in several places.
     """
-    scan, terrain = mdp.HeightScan(offset=root_height), TerrainGrid(patches=patches)
+    scan, terrain = mdp.HeightScan(offset=root_height), TerrainGrid(patches=PATCHES)
     groups = {}
     for name, seen in (("actor", noisy(scan, 0.1)), ("critic", ObservationTermCfg(term=scan))):
         group = flat.observations[name]

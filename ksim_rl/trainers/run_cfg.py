@@ -68,9 +68,7 @@ class TrainerCfg(Checked):
     keep_checkpoints: Count = 3  # how many of the newest stay
     log_interval: Count = 1  # between rows of the logs and lines of progress
     overlap: bool | None = None
-    warm_up: bool = (
-        False  # compile and capture the update before the first env step, and so before its seconds
-    )
+    warm_up: bool = False  # compile and capture updates before the first env step and its seconds
     # Where threads cannot be made, torch ends the process instead of raising.
     num_threads: Annotated[int, Within(low=1, high=1024)] | None = None
     matmul_precision: Literal["highest", "high", "medium"] = "high"  # of float32 on CUDA; "high" is TF32

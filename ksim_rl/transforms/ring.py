@@ -133,7 +133,8 @@ def _launch(
     `draw_count_E`, the resets of each row, these rows also draw new lags: those of `ksim_rl.device.random.integers` at
     the counts that they reach. Lags and counts are changed in place.
     """
-    if not _has_whole_rows(value_E):
+    # Columns of a wider tensor stay there: each env's value is contiguous.
+    if value_E.ndim > 2 or value_E.ndim == 2 and value_E.stride(1) != 1:
         value_E = value_E.contiguous()
     num_rows, num_slots, *leaf = ring_EM.shape
     device, item_size = value_E.device, value_E.element_size()
@@ -153,11 +154,6 @@ def _launch(
     tensors = age_E.data_ptr(), address(lag_E), address(mask_E), address(parts), value
     _quick(device, (num_rows, lanes), *layout, *draws, *tensors, ring_EM.data_ptr(), out_EL.data_ptr())
     return out_EL
-
-
-def _has_whole_rows(value_E: Tensor) -> bool:
-    """Whether each env's value is contiguous, as in columns of a wider tensor."""
-    return value_E.ndim == 1 or value_E.ndim == 2 and value_E.stride(1) == 1 or value_E.is_contiguous()
 
 
 turn = as_operator(

@@ -16,7 +16,7 @@ from torchrl.envs.transforms import Transform
 from ksim_rl import checks
 from ksim_rl.device import random
 from ksim_rl.transforms import upstream
-from ksim_rl.transforms.specs import Device, batch_dims_of, drop_leaf, leaf_spec, set_leaf_spec, spell
+from ksim_rl.transforms.specs import Device, drop_leaf, leaf_spec, set_leaf_spec, spell
 
 Keys = Sequence[NestedKey] | NestedKey
 _NO_SEED = -(1 << 63)
@@ -85,7 +85,8 @@ class CheckedKeys(Transform):
         for key, spec in zip(in_keys, found, strict=True):
             if is_floating:
                 self._check_floating(key, spec.dtype)
-        batch_dims = [batch_dims_of(specs, key) for key in in_keys]
+        # Of the TensorDict around each key: a nested one may have more than the env.
+        batch_dims = [(specs if isinstance(key, str) else specs[key[:-1]]).ndim for key in in_keys]
         if is_inverse:
             self.batch_dims_inv = batch_dims
         else:

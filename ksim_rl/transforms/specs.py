@@ -32,12 +32,6 @@ def leaf_spec(observation_spec: Composite, key: NestedKey, owner: str) -> Tensor
     return observation_spec[key]
 
 
-def batch_dims_of(specs: Composite, key: NestedKey) -> int:
-    """Return the number of batch dims of the TensorDict around `key`; a nested one may have more than the env."""
-    above = specs if isinstance(key, str) else specs[key[:-1]]
-    return above.ndim
-
-
 def set_leaf_spec(observation_spec: Composite, key: NestedKey, spec: TensorSpec) -> None:
     """Set the spec of `key`, with the nested specs above it, if its shape begins with the batch size of these."""
     path = path_of(key)

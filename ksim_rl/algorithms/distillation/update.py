@@ -17,12 +17,7 @@ from ksim_rl.data import DatasetCfg
 from ksim_rl.device import state_tree
 from ksim_rl.envs.signal_keys import signal_keys
 from ksim_rl.modules import MixedPolicy, update_normalizers
-from ksim_rl.objectives import (
-    DistillationCfg,
-    DistillationLoss,
-    distribution_keys,
-    observation_keys,
-)
+from ksim_rl.objectives import DistillationCfg, DistillationLoss, distribution_keys, observation_keys
 from ksim_rl.trainers.algorithm import part_of
 from ksim_rl.trainers.run_cfg import RunCfg
 

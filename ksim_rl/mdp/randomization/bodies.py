@@ -125,7 +125,8 @@ class RandomizePseudoInertia(Randomize):
             view, len(ids), [self.alpha, *[self.stretch] * 3, *[self.shear] * 3, *[self.shift] * 3]
         )
         density_EN1, shift_EN3 = torch.exp(2.0 * drawn[..., 0:1]), drawn[..., 7:10]
-        map_EN33 = _upper_triangle(torch.exp(drawn[..., 1:4]), drawn[..., 4:7])
+        map_EN33 = torch.diag_embed(torch.exp(drawn[..., 1:4]))
+        map_EN33[..., 0, 1:], map_EN33[..., 1, 2] = drawn[..., 4:6], drawn[..., 6]
 
         # Second moments about the moved centre of mass; the inertia is trace * 1 minus these.
         spread_EN33 = density_EN1[..., None] * product(map_EN33 * spread_N3[:, None, :], map_EN33.mT)
@@ -140,13 +141,6 @@ class RandomizePseudoInertia(Randomize):
         }
         for name, value_ENC in values.items():
             write_entries(view.field(name), ids, range(value_ENC.shape[-1]), mask_E, value_ENC)
-
-
-def _upper_triangle(diagonal: Tensor, shear: Tensor) -> Tensor:
-    """Return the matrices [..., 3, 3] of a diagonal [..., 3] and of entries 12, 13, 23 [..., 3]."""
-    (first, second, third), (s12, s13, s23) = diagonal.unbind(-1), shear.unbind(-1)
-    zero = torch.zeros_like(first)
-    return torch.stack((first, s12, s13, zero, second, s23, zero, zero, third), dim=-1).unflatten(-1, (3, 3))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,12 +12,7 @@ from torch import Tensor
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant
 from ksim_rl.mdp.fields import OfSites
-from ksim_rl.mdp.randomization.randomize import (
-    Pair,
-    RandomizeField,
-    RandomizeModelField,
-    write_entries,
-)
+from ksim_rl.mdp.randomization.randomize import Pair, RandomizeField, RandomizeModelField, write_entries
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
 

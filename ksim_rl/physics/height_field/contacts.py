@@ -129,12 +129,7 @@ def ball_touches(
 
 @wp.func
 def capsule_touches(
-    field: Field,
-    data: wp.array[float],
-    center: wp.vec3,
-    axis: wp.vec3,
-    radius: float,
-    margin: float,
+    field: Field, data: wp.array[float], center: wp.vec3, axis: wp.vec3, radius: float, margin: float
 ) -> Touches:
     """Return the contacts of a capsule: one at each end, and one where a ridge presses into its side."""
     touches = Touches()

@@ -14,12 +14,7 @@ import numpy as np
 from ksim_rl.checks import near
 from ksim_rl.physics import World
 from ksim_rl.physics.fields import write_fields
-from ksim_rl.scene.rendering.visualizer import (
-    DebugVisualizer,
-    add_geoms,
-    place,
-    visible_groups,
-)
+from ksim_rl.scene.rendering.visualizer import DebugVisualizer, add_geoms, place, visible_groups
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 
 _PROBE = "import mujoco; context = mujoco.GLContext(16, 16); context.make_current(); context.free()"

@@ -52,13 +52,18 @@ class CollisionGeom:
 def capsule(name: str, body: str, radius: float, fromto: Vector, **attributes: Any) -> CollisionGeom:
     """Return a capsule between two points; `attributes` are fields of `CollisionGeom`."""
     kind = mujoco.mjtGeom.mjGEOM_CAPSULE
-    return CollisionGeom(name=name, body=body, type=int(kind), size=(radius,), fromto=fromto, **attributes)
+    return CollisionGeom(name=name, body=body, type=kind, size=(radius,), fromto=fromto, **attributes)
 
 
 def sphere(name: str, body: str, radius: float, pos: Vector, **attributes: Any) -> CollisionGeom:
     """Return a sphere; `attributes` are fields of `CollisionGeom`."""
     kind = mujoco.mjtGeom.mjGEOM_SPHERE
-    return CollisionGeom(name=name, body=body, type=int(kind), size=(radius,), pos=pos, **attributes)
+    return CollisionGeom(name=name, body=body, type=kind, size=(radius,), pos=pos, **attributes)
+
+
+def box(name: str, body: str, half_edges: Vector, **attributes: Any) -> CollisionGeom:
+    """Return a box about the body's origin; `attributes` are fields of `CollisionGeom`."""
+    return CollisionGeom(name=name, body=body, type=mujoco.mjtGeom.mjGEOM_BOX, size=half_edges, **attributes)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,12 +215,7 @@ def exclude_contacts(spec: mujoco.MjSpec, pairs: Iterable[tuple[str, str]]) -> N
 
 
 def set_keyframe(
-    spec: mujoco.MjSpec,
-    name: str,
-    *,
-    init_pos: Vector,
-    init_quat: Vector,
-    joint_pos: Mapping[str, float],
+    spec: mujoco.MjSpec, name: str, *, init_pos: Vector, init_quat: Vector, joint_pos: Mapping[str, float]
 ) -> None:
     """Replace all keyframes by one: the root pose, `joint_pos`, and the controls of servos that hold those joints.
 

@@ -147,8 +147,5 @@ class UnitreeG1(MenagerieRobot, name="g1", root_body="pelvis", joint_names=JOINT
     overlaps: ClassVar[tuple[tuple[str, str], ...]] = tuple(
         pair
         for side in SIDES
-        for pair in (
-            ("pelvis", f"{side}_hip_roll_link"),
-            (f"{side}_elbow_link", f"{side}_wrist_pitch_link"),
-        )
+        for pair in (("pelvis", f"{side}_hip_roll_link"), (f"{side}_elbow_link", f"{side}_wrist_pitch_link"))
     )

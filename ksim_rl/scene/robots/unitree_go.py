@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import mujoco
 
 from ksim_rl.scene.actuators import Actuator, IdealPDActuator, PositionActuator
-from ksim_rl.scene.robots.edit import CollisionGeom, Site, capsule, sphere, spread
+from ksim_rl.scene.robots.edit import CollisionGeom, Site, box, capsule, sphere, spread
 from ksim_rl.scene.robots.legged_robot import MenagerieRobot
 
 LEGS = ("FR", "FL", "RR", "RL")
@@ -69,15 +69,6 @@ def _go1_leg_geoms(leg: str) -> tuple[CollisionGeom, ...]:
     )
 
 
-_GO1_TRUNK = CollisionGeom(
-    name="trunk_collision",
-    body="trunk",
-    type=mujoco.mjtGeom.mjGEOM_BOX,
-    size=(0.13, 0.09, 0.05),
-    **_GO1_SMOOTH,
-)
-
-
 @dataclass(frozen=True, kw_only=True)
 class UnitreeGo1(UnitreeQuadruped, name="go1", root_body="trunk", model="unitree_go1/go1"):
     """Go1's facts, with reflected motor inertia and position servos, and `spec()`, the model that they describe."""
@@ -87,7 +78,7 @@ class UnitreeGo1(UnitreeQuadruped, name="go1", root_body="trunk", model="unitree
     actuators: tuple[Actuator, ...] = GO1_SERVOS
 
     collision_geoms: ClassVar[tuple[CollisionGeom, ...]] = (
-        _GO1_TRUNK,
+        box("trunk_collision", "trunk", (0.13, 0.09, 0.05), **_GO1_SMOOTH),
         sphere("head_collision", "trunk", 0.06, (0.24, 0.0, 0.0), **_GO1_SMOOTH),
         *(geom for leg in LEGS for geom in _go1_leg_geoms(leg)),
     )
@@ -126,12 +117,6 @@ def _go2_leg_geoms(leg: str) -> tuple[CollisionGeom, ...]:
     )
 
 
-_GO2_SIZE = (0.1881, 0.04675, 0.057)
-_GO2_BASE = CollisionGeom(
-    name="base_collision", body="base", type=mujoco.mjtGeom.mjGEOM_BOX, size=_GO2_SIZE, **_GO2_SMOOTH
-)
-
-
 @dataclass(frozen=True, kw_only=True)
 class UnitreeGo2(UnitreeQuadruped, name="go2", root_body="base", model="unitree_go2/go2"):
     """Go2's facts, with plain torque motors under PD control, and `spec()`, the model that they describe."""
@@ -141,7 +126,7 @@ class UnitreeGo2(UnitreeQuadruped, name="go2", root_body="base", model="unitree_
     actuators: tuple[Actuator, ...] = GO2_MOTORS
 
     collision_geoms: ClassVar[tuple[CollisionGeom, ...]] = (
-        _GO2_BASE,
+        box("base_collision", "base", (0.1881, 0.04675, 0.057), **_GO2_SMOOTH),
         sphere("head_collision", "base", 0.06, (0.29, 0.0, -0.02), **_GO2_SMOOTH),
         *(geom for leg in LEGS for geom in _go2_leg_geoms(leg)),
     )

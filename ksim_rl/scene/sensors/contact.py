@@ -13,7 +13,7 @@ from torch import Tensor
 from ksim_rl.physics.contact_sensors import NET, STRONGEST
 from ksim_rl.scene.names import as_index, match_names
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
-from ksim_rl.scene.sensors.sensor import Sensor, SensorTracker, check_present, sensor_columns
+from ksim_rl.scene.sensors.sensor import Sensor, SensorTracker, check_present
 from ksim_rl.scene.small_matrices import product
 from ksim_rl.scene.state.world_view import WorldView
 
@@ -145,8 +145,9 @@ class ContactTracker(SensorTracker):
         self._world, self._view, self._strongest = view.world, view, sensor.reduce == "strongest"
         elements = sensor.elements(view.resolver.names(_TABLES[sensor.kind]))
         self._count = len(elements)
-        columns = [sensor_columns(self._world.mj_model, f"{name}_{element}") for element in elements]
-        self._columns = as_index([address for of_one in columns for address in of_one], view.device)
+        found = [self._world.mj_model.sensor(f"{name}_{element}") for element in elements]
+        columns = [int(one.adr[0]) + place for one in found for place in range(int(one.dim[0]))]
+        self._columns = as_index(columns, view.device)
         self._clocks = {clock: view.buffers.get(f"{self._key}.{clock}", self._count) for clock in _CLOCKS}
         self._history_ESN3: Tensor | None = None
         self._substep = 0

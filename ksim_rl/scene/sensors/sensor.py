@@ -68,12 +68,6 @@ def check_present(name: str, kind: str, wanted: str | None, elements: Sequence[A
         )
 
 
-def sensor_columns(mj_model: mujoco.MjModel, name: str) -> range:
-    """Return where the reading of an MJCF sensor stands in `sensordata_EL`."""
-    found = mj_model.sensor(name)
-    return range(int(found.adr[0]), int(found.adr[0] + found.dim[0]))
-
-
 @dataclass(frozen=True, kw_only=True)
 class MountedSensor(Sensor, ABC):
     """A sensor at a `site` of the model, or on a `body` at `pos` (m, in its frame, whose axes the sensor then has)."""

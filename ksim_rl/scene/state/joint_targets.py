@@ -10,14 +10,7 @@ from torch import Tensor
 
 from ksim_rl.checks import near
 from ksim_rl.physics import World
-from ksim_rl.scene.names import (
-    Index,
-    NameResolver,
-    Patterns,
-    as_index,
-    as_patterns,
-    scalar_joint_ids,
-)
+from ksim_rl.scene.names import Index, NameResolver, Patterns, as_index, as_patterns, scalar_joint_ids
 from ksim_rl.scene.state.buffers import Buffers
 
 TargetKind = Literal["pos", "vel", "effort"]

@@ -219,10 +219,7 @@ class WorldView:
         return self._simulation.shared_values.get(self._simulation.scoped(name), initial)
 
     def uniform(
-        self,
-        n: int,
-        low: float | Float[Tensor, "*low"] = 0.0,
-        high: float | Float[Tensor, "*high"] = 1.0,
+        self, n: int, low: float | Float[Tensor, "*low"] = 0.0, high: float | Float[Tensor, "*high"] = 1.0
     ) -> Float[Tensor, "E L"]:
         """Draw float32 from [low, high); the numbers depend on seed, term, env and moment only."""
         return random.uniform(self.next_keys(), n, low, high)

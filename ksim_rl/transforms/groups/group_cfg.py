@@ -134,7 +134,7 @@ def compile_groups(
         ]
         frames = history_cfg(cfg.history)
         if frames is not None and not frames.flat:
-            stacked.append(_history([group], [group], frames))
+            stacked.append(ObservationHistory([group], [group], **vars(frames)))
         if any(term.is_image for term in terms.values()):
             images.append(RenameTransform(keys, [group], create_copy=bool(plain) or cfg.keep_terms))
             continue
@@ -193,12 +193,8 @@ def _chain(group: str, cfg: ObservationGroupCfg, terms: Mapping[str, Observation
         if (frames := history_cfg(term.history)) is not None:
             by_frames.setdefault(frames, []).append(name)
     for frames, names in sorted(by_frames.items(), key=lambda item: (item[0].length, item[0].stride)):
-        transforms.append(_history(*advance(names), frames))
+        transforms.append(ObservationHistory(*advance(names), **vars(frames)))
     return transforms
-
-
-def _history(in_keys: list[NestedKey], out_keys: list[NestedKey], frames: HistoryCfg) -> Transform:
-    return ObservationHistory(in_keys, out_keys, length=frames.length, stride=frames.stride, flat=frames.flat)
 
 
 def _has_chain(term: ObservationTermCfg) -> bool:
