@@ -137,11 +137,8 @@ def _changes(tree: Mapping[str, Any], base: Mapping[str, Any]) -> Tree:
     changes = {}
     for key, value in tree.items():
         below = base.get(key)
-        if (
-            isinstance(value, dict)
-            and isinstance(below, dict)
-            and value.get("_target_") == below.get("_target_")
-        ):
+        are_trees = isinstance(value, dict) and isinstance(below, dict)
+        if are_trees and value.get("_target_") == below.get("_target_"):
             if inner := _changes(value, below):
                 changes[key] = inner
         elif key not in base or value != below:
