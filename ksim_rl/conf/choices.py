@@ -136,12 +136,9 @@ def _changes(tree: Mapping[str, Any], base: Mapping[str, Any]) -> Tree:
     """Return the part of a tree in which it differs from another; where classes differ, that is all of it."""
     changes = {}
     for key, value in tree.items():
-        below = base.get(key)
-        if (
-            isinstance(value, dict)
-            and isinstance(below, dict)
-            and value.get("_target_") == below.get("_target_")
-        ):
+        below: Any = base.get(key)
+        are_trees = isinstance(value, dict) and isinstance(below, dict)
+        if are_trees and value.get("_target_") == below.get("_target_"):
             if inner := _changes(value, below):
                 changes[key] = inner
         elif key not in base or value != below:

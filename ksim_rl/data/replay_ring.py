@@ -44,7 +44,8 @@ class ReplaySampler(Stateless, Sampler):
             env += first_S.repeat_interleave(batch_size // self.shards)
         # float64: float32 cannot tell the places of a ring of more than 2^24.
         unit = ranks.rand(shape, dim=1, dtype=torch.float64, device=device)
-        age = 1 + (unit * ranks.most_of(storage.max_age).clamp_min(1)).to(torch.int64)
+        oldest = ranks.most_of(storage.filled_E.amax())
+        age = 1 + (unit * oldest.clamp_min(1)).to(torch.int64)
         index = storage.index(env, age)
         first = storage.available[index].to(torch.uint8).argmax(0, keepdim=True)
         index_B = index.gather(0, first).squeeze(0)

@@ -75,11 +75,6 @@ class ReplayStorage(SavedByStateDict, Storage):
         self.non_finite_count = torch.zeros((), dtype=torch.int64, device=self.device)
         self._env_E = torch.arange(num_envs, device=self.device)
 
-    @property
-    def max_age(self) -> Int64[Tensor, ""]:
-        """How many places behind its newest observation the oldest env state of any env lies."""
-        return self.filled_E.amax()
-
     def index(self, env: Int64[Tensor, "*batch"], age: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
         """Return the index of the env state that lies `age` >= 1 places behind the newest observation of `env`."""
         return (self.head_E[env] - age) % self.places * self.num_envs + env

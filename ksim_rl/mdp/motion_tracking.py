@@ -85,8 +85,7 @@ class TrackMotionJointPos(OfMotion, OfJoints, GaussianReward):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         pos_EL, _ = motion_joints(view, self.file, self.joints)
-        own_EL = view.joints(self.joints).pos_EL
-        return self.rate((own_EL - pos_EL).square().sum(-1))
+        return self.rate((view.joints(self.joints).pos_EL - pos_EL).square().sum(-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,8 +94,7 @@ class TrackMotionJointVel(OfMotion, OfJoints, GaussianReward):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         _, vel_EL = motion_joints(view, self.file, self.joints)
-        own_EL = view.joints(self.joints).vel_EL
-        return self.rate((own_EL - vel_EL).square().sum(-1))
+        return self.rate((view.joints(self.joints).vel_EL - vel_EL).square().sum(-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,8 +122,7 @@ class FarFromMotion(OfMotionBodies, TerminationTerm):
     distance: Positive
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
-        offset_EN3 = self.offset(view)
-        return (torch.linalg.vector_norm(offset_EN3, dim=-1) > self.distance).any(-1)
+        return (torch.linalg.vector_norm(self.offset(view), dim=-1) > self.distance).any(-1)
 
 
 @dataclass(frozen=True, kw_only=True)

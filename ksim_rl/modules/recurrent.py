@@ -299,6 +299,8 @@ class CarriedState:
     """
 
     def __init__(self, network: nn.Module, *, acting: nn.Module) -> None:
+        acts = recurrent_modules(acting)
+        self._recurrent = [module for module in recurrent_modules(network) if module not in acts]
         for module in recurrent_modules(network):
             if not isinstance(module, RecurrentModule):
                 raise ValueError(
@@ -306,9 +308,6 @@ class CarriedState:
                     "modules give for the last step of a sequence only; use a RecurrentModule (make_recurrent_critic), "
                     "or a critic that is not recurrent"
                 )
-        self._recurrent = [
-            module for module in recurrent_modules(network) if module not in recurrent_modules(acting)
-        ]
         self._state_E: dict[Any, Tensor] = {}
 
     @property

@@ -41,11 +41,6 @@ class OverflowReport:
         return not self.messages
 
     @property
-    def bits(self) -> int:
-        """The overflow bits (`mujoco_warp.OverflowType`) that any world raised."""
-        return sum(1 << index for index, name in enumerate(BIT_NAMES) if self.worlds[name])
-
-    @property
     def nconmax(self) -> int:
         """Places in the pool of contacts, per world."""
         return self.naconmax // self.num_envs

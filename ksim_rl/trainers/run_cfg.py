@@ -116,8 +116,7 @@ class ModulesCfg(Checked):
         """Return what the networks read of an EnvState; given "actor" or "critic", what that one reads."""
         shared = () if self.trunk is None else self.trunk.in_keys
         own = [key for name in names or ("actor", "critic") for key in self._read_by(name)]
-        keys = dict.fromkeys((*shared, *own))
-        return [key for key in keys if key != FEATURES]
+        return [key for key in dict.fromkeys((*shared, *own)) if key != FEATURES]
 
     def _read_by(self, name: str) -> tuple[ObservationKey, ...]:
         # The networks of off-policy methods read the group of their own name.

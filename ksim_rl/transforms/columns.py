@@ -48,8 +48,7 @@ def split(
     """Return views of the columns in the shapes of these values, which `side_by_side` has joined."""
     if len(likes) == 1:
         return [joined_EL if joined_EL.shape == likes[0].shape else joined_EL.reshape(likes[0].shape)]
-    num_rows = joined_EL.shape[0]
-    sizes = [like.numel() // max(num_rows, 1) for like in likes]
+    sizes = [like.numel() // max(joined_EL.shape[0], 1) for like in likes]
     parts = joined_EL.split(sizes, dim=1)
     return [
         part if part.shape == like.shape else part.reshape(like.shape)

@@ -3,7 +3,7 @@
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, ClassVar, NoReturn, Self
+from typing import Any, ClassVar, NoReturn, Self, TypeVar
 
 import torch
 from jaxtyping import Float32, Shaped
@@ -19,6 +19,7 @@ from ksim_rl.transforms import upstream
 from ksim_rl.transforms.specs import Device, drop_leaf, leaf_spec, set_leaf_spec, spell
 
 Keys = Sequence[NestedKey] | NestedKey
+Held = TypeVar("Held", bound=Transform)
 _NO_SEED = -(1 << 63)
 
 
@@ -214,8 +215,7 @@ class KeyedTransform(RowTransform):
     Draws in a step are keyed by `step_count`, which counts env steps; draws at a reset by `reset_count_E`, which counts
     each row's own resets. So a reset of one row never changes another row's numbers, and TorchRL's reset of the rows
     that are done equals a masked reset at every step. `seed` holds until `seed_` or the env's `set_seed` gives another;
-    None draws one from torch's generator at the first reset, another in each worker process. The `stream` of draws is
-    named after the transform in a config, else after its class and keys.
+    None draws one from torch's generator at the first reset, another in each worker process.
     """
 
     purposes: ClassVar[tuple[str, ...]] = ()
@@ -286,19 +286,19 @@ class KeyedTransform(RowTransform):
         return random.row_keys(self.seed_value, self._stream_ids[purpose], self.reset_count_E, self.num_rows)
 
 
-def keyed_transforms(env: EnvBase) -> Iterator[KeyedTransform]:
-    """Yield each transform with draws or counters of its own, also those of a `TransformedEnv` further inside."""
+def held_transforms(env: EnvBase, kind: type[Held]) -> Iterator[Held]:
+    """Yield each transform of a kind that an env holds, also those of a `TransformedEnv` further inside."""
     inner: Any = env
     while isinstance(inner, TransformedEnv):
         for module in inner.transform.modules():
-            if isinstance(module, KeyedTransform):
+            if isinstance(module, kind):
                 yield module
         inner = inner.base_env
 
 
 def seed_transforms(env: EnvBase, seed: int) -> None:
-    """Seed all `keyed_transforms` of an env."""
-    for transform in keyed_transforms(env):
+    """Seed all transforms of an env that have draws or counters of their own."""
+    for transform in held_transforms(env, KeyedTransform):
         transform.seed_(seed)
 
 

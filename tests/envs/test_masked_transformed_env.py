@@ -11,7 +11,7 @@ from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
 from ksim_rl.testing import CounterEnv, assert_dims, check_env, count_syncs
 from ksim_rl.transforms import GaussianNoise, ObservationNoise
-from ksim_rl.transforms.row_transform import keyed_transforms
+from ksim_rl.transforms.row_transform import KeyedTransform, held_transforms
 from tests.transforms.chains import (
     actions,
     assert_same,
@@ -208,7 +208,7 @@ def test_seeds_reach_env_and_transforms():
     assert not torch.equal(env.reset(seed=12)["actor"], first["actor"])
     drawn = env.seed()
     assert drawn >= 0
-    assert {int(transform.seed_value) for transform in keyed_transforms(env)} == {drawn}
+    assert {int(transform.seed_value) for transform in held_transforms(env, KeyedTransform)} == {drawn}
 
 
 def test_a_state_dict_continues_bit_exactly():

@@ -22,7 +22,7 @@ from ksim_rl.transforms import (
     ObservationScale,
     UniformNoise,
 )
-from ksim_rl.transforms.row_transform import keyed_transforms
+from ksim_rl.transforms.row_transform import KeyedTransform, held_transforms
 
 VECTOR = ("obs", "vector")
 NOISY, COUNT, DRAWN = (("actor_terms", name) for name in ("vector", "count", "drawn"))
@@ -63,7 +63,7 @@ def counter(
 def seed_all(env: TransformedEnv, seed: int) -> None:
     """Seed env and transforms, in a stock env too, which reaches only itself."""
     env.set_seed(seed)
-    for transform in keyed_transforms(env):
+    for transform in held_transforms(env, KeyedTransform):
         transform.seed_(seed)
 
 

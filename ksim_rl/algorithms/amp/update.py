@@ -72,12 +72,9 @@ class AMPUpdate(RolloutUpdate):
         super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, **options)
         # So that the first scores are of features in a fitting range. Ranks add up what they have counted.
         self.discriminator.normalizer.update(self.reference_N2L[ranks.rank() :: ranks.size()])
-        own = {
-            "learning_rate": cfg.discriminator_learning_rate,
-            "weight_decay": cfg.discriminator_weight_decay,
-            "schedule": "fixed",
-        }
-        self.optimizer = make_optimizer(dataclasses.replace(cfg, **own), self.discriminator)
+        rate, decay = cfg.discriminator_learning_rate, cfg.discriminator_weight_decay
+        own = dataclasses.replace(cfg, learning_rate=rate, weight_decay=decay, schedule="fixed")
+        self.optimizer = make_optimizer(own, self.discriminator)
         num_steps = ppo.num_env_states // num_envs
         kept = ReplayCfg(
             num_env_states_per_minibatch=cfg.num_transitions_per_step,

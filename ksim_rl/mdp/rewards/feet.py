@@ -85,8 +85,7 @@ class FootSlip(OfFeet, RewardWhileCommanded):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         speed2_EF = view.sites(self.sites).lin_vel_EN3[..., :2].square().sum(-1)
-        cost_E = (speed2_EF * self.contact(view).found_EN).sum(-1)
-        return self.while_commanded(view, cost_E)
+        return self.while_commanded(view, (speed2_EF * self.contact(view).found_EN).sum(-1))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -194,8 +194,7 @@ class Pose(OfCommand, OfJoints, RewardTerm):
         running_L = per_joint(view, "std_running", self.std_running, self.joints)
         moving_EL = torch.where(speed_E1 < self.running_threshold, walking_L, running_L)
         std_EL = torch.where(speed_E1 < self.walking_threshold, standing_L, moving_EL)
-        error_EL = view.joints(self.joints).pos_rel_EL
-        return torch.exp(-(error_EL / std_EL).square().mean(-1))
+        return torch.exp(-(view.joints(self.joints).pos_rel_EL / std_EL).square().mean(-1))
 
 
 @dataclass(frozen=True, kw_only=True)

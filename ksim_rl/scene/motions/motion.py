@@ -161,10 +161,8 @@ def _read(path: Path) -> Mapping[str, np.ndarray]:
         )
     try:
         data = io.BytesIO(read_bytes(path, limit=MOST_DATA_BYTES, follows_links=True))
-        if (
-            zipfile.is_zipfile(data)
-            and sum(entry.file_size for entry in zipfile.ZipFile(data).filelist) > MOST_DATA_BYTES
-        ):
+        entries = zipfile.ZipFile(data).filelist if zipfile.is_zipfile(data) else ()
+        if sum(entry.file_size for entry in entries) > MOST_DATA_BYTES:
             raise ValueError(f"its arrays are larger than {MOST_DATA_BYTES} bytes")
         data.seek(0)
         archive = np.load(data, allow_pickle=False)

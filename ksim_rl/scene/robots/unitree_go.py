@@ -93,14 +93,12 @@ class UnitreeGo1(UnitreeQuadruped, name="go1", root_body="trunk", model="unitree
         return spec
 
 
-def _go2_motor(joints: tuple[str, ...], effort_limit: float) -> IdealPDActuator:
-    """Return PD control with the gains that the robot's own low-level interface is commonly run with."""
-    return IdealPDActuator(
-        joints=joints, effort_limit=effort_limit, armature=0.01, stiffness=30.0, damping=1.0
-    )
-
-
-GO2_MOTORS = (_go2_motor(_LIGHT_JOINTS, 23.7), _go2_motor(_CALF_JOINTS, 45.43))
+# The gains that the robot's own low-level interface is commonly run with.
+_GO2_GAINS: dict[str, Any] = {"armature": 0.01, "stiffness": 30.0, "damping": 1.0}
+GO2_MOTORS = (
+    IdealPDActuator(joints=_LIGHT_JOINTS, effort_limit=23.7, **_GO2_GAINS),
+    IdealPDActuator(joints=_CALF_JOINTS, effort_limit=45.43, **_GO2_GAINS),
+)
 _GO2_TREAD: dict[str, Any] = {"friction": (0.8, 0.02, 0.01), "priority": 1, "solref": (0.01, 1.0)}
 _GO2_FOOT = (-0.002, 0.0, -0.213)
 """The centre of a foot's ball in the calf's frame, m; its radius is 0.022 m."""

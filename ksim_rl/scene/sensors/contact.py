@@ -208,9 +208,8 @@ class ContactTracker(SensorTracker):
         # What stands on the ground at the start of an episode has not flown.
         ends_flight = lands & (clock["air_time"] > 0)
         clock["last_air_time"].copy_(torch.where(ends_flight, flight_EN, clock["last_air_time"]))
-        clock["last_contact_time"].copy_(
-            torch.where(leaves, clock["contact_time"], clock["last_contact_time"])
-        )
+        stood_EN = torch.where(leaves, clock["contact_time"], clock["last_contact_time"])
+        clock["last_contact_time"].copy_(stood_EN)
         clock["air_time"].copy_(torch.where(touches, 0.0, flight_EN))
         clock["contact_time"].copy_(torch.where(touches, clock["contact_time"] + dt, 0.0))
         clock["found"].copy_(touches)

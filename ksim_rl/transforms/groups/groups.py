@@ -7,11 +7,11 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Composite, TensorSpec, Unbounded
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from ksim_rl import checks
 from ksim_rl.transforms.columns import side_by_side
-from ksim_rl.transforms.row_transform import CheckedKeys, as_keys
+from ksim_rl.transforms.row_transform import CheckedKeys, as_keys, held_transforms
 from ksim_rl.transforms.specs import Device, bounded, bounds, drop_leaf, leaf_spec, set_leaf_spec, spell
 
 
@@ -158,14 +158,10 @@ class ObservationGroups(CheckedKeys):
 
 def group_specs(env: EnvBase) -> dict[NestedKey, GroupSpec]:
     """Return which columns of each group's vector belong to which term, of all `ObservationGroups` of an env."""
+    assert env.output_spec is not None  # making the specs is what counts the columns
     found: dict[NestedKey, GroupSpec] = {}
-    inner: Any = env
-    while isinstance(inner, TransformedEnv):
-        assert inner.output_spec is not None  # making the specs is what counts the columns
-        for module in inner.transform.modules():
-            if isinstance(module, ObservationGroups):
-                found = module.group_specs | found
-        inner = inner.base_env
+    for groups in held_transforms(env, ObservationGroups):
+        found = groups.group_specs | found
     return found
 
 

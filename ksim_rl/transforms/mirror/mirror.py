@@ -183,9 +183,8 @@ class Mirror(KeyedTransform):
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._sized()
         for index, (key, out_key) in enumerate(zip(self.in_keys, self.out_keys, strict=True)):
-            next_tensordict.set(
-                out_key, self._seen(index, next_tensordict.get(key), next_tensordict.batch_size)
-            )
+            seen = self._seen(index, next_tensordict.get(key), next_tensordict.batch_size)
+            next_tensordict.set(out_key, seen)
         return next_tensordict
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -99,11 +99,8 @@ def _sign(mj_model: mujoco.MjModel, data: mujoco.MjData, joint: int, other: int)
     handed = -1.0 if mj_model.jnt_type[joint] == _HINGE else 1.0
     agreement = float(handed * reflection * data.xaxis[joint] @ data.xaxis[other])
     extent = max(float(mj_model.stat.extent), _TOLERANCE)
-    if (
-        mj_model.jnt_type[joint] != mj_model.jnt_type[other]
-        or abs(abs(agreement) - 1) > _TOLERANCE
-        or apart > 0.02 * extent
-    ):
+    differs = mj_model.jnt_type[joint] != mj_model.jnt_type[other] or abs(abs(agreement) - 1) > _TOLERANCE
+    if differs or apart > 0.02 * extent:
         raise ValueError(
             f"joints {mj_model.joint(joint).name!r} and {mj_model.joint(other).name!r} are no mirror images of each "
             f"other in the plane y = 0: axes {data.xaxis[joint]} and {data.xaxis[other]}, anchors {apart:.3g} m apart"
