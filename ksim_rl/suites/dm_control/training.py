@@ -20,10 +20,11 @@ FAST_SAC_STATES = 20e6
 def ppo(*, gamma: float = 0.995, env_states: float = PPO_STATES) -> TrainingCfg:
     """Return the settings of PPO: 64 steps of each env and 128 gradient steps in turn.
 
-    Rewards lie in [0, 1] per step, so that values reach 1 / (1 - gamma) and gradients hundreds: clipping the change of
-    values to 0.2, or gradients to 1, would stop the critic from learning. Standard deviations fall to some hundredths,
-    where actions of a network in bfloat16 are too coarse: WalkerRun came to 267 after 20 M env states, in float32 to 676.
-    Many actions have a large divergence in sum, which would hold the adaptive learning rate at its usual floor of 1e-5.
+    Rewards lie in [0, 1] per step, so that values reach 1 / (1 - gamma) and gradients hundreds: clipping the change
+    of values to 0.2, or gradients to 1, would stop the critic from learning. Standard deviations fall to some
+    hundredths, where actions of a network in bfloat16 are too coarse: WalkerRun came to 267 after 20 M env states,
+    in float32 to 676. Many actions have a large divergence in sum, which would hold the adaptive learning rate at
+    its usual floor of 1e-5.
     """
     data = DatasetCfg(num_env_states_per_minibatch=8192, num_minibatches=16)
     return TrainingCfg(
