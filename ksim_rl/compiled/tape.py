@@ -2,8 +2,8 @@
 
 Operations that keep to their row, one after the other, become one kernel, in C++ of `row_code`, with a thread per row
 or a few `lanes`; what lives in one kernel only lives in a row's own memory. Other operations are run by torch as they
-were, and launches of Warp are issued anew. A replay uses the memory of the recording and runs no Python of the function, as a
-CUDA graph does, and what is fit for that is fit for this.
+were, and launches of Warp are issued anew. A replay uses the memory of the recording and runs no Python of the
+function, as a CUDA graph does, and what is fit for that is fit for this.
 """
 
 from collections.abc import Callable, Sequence
