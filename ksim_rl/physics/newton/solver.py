@@ -15,13 +15,14 @@ from ksim_rl.physics.sim_cfg import SimCfg
 
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
-# What a world may have of a multiprocessor's shared memory: ten such worlds live there at once. On an H200, 4096 worlds
-# of G1 take 212 us; with 5600 floats (nine worlds) 217, with room for twelve 222 and for thirteen 237.
+# What a world may have of a multiprocessor's shared memory: ten such worlds live there at once. On an H200 a prototype
+# took 212 us for 4096 worlds of G1; with 5600 floats (nine worlds) 217, with room for twelve 222 and for thirteen 237.
 FLOATS_PER_WORLD = 5536
 # A multiprocessor has 228 KiB of shared memory, of which each block takes another KiB, and in each quarter, where warps
-# stay, 512 registers for a lane. With 80 of them, the fewest that were measured, 4096 worlds of Go1 take an H200
-# 142 us, with 96 they take 154 and with 106 they take 166. Where more than 128 are left, there is no need of a bound.
-SHARED_BYTES, LEAST_REGISTERS, MOST_REGISTERS = 228 * 1024, 80, 128
+# stay, 512 registers for a lane. With 72 of them (28 worlds at once, as the memory lets), 4096 worlds of Go1 take an H200
+# 153 us, with 80 (24 worlds) 162, and with the 92 that the compiler likes (20 worlds) 168; 32768 worlds take 894, 911 and
+# 954. Where more than 128 are left, there is no need of a bound.
+SHARED_BYTES, LEAST_REGISTERS, MOST_REGISTERS = 228 * 1024, 64, 128
 MOST_DOFS = 64
 # MuJoCo Warp's solver ends its loop by a conditional node, which costs more than the few iterations that it saves
 # (H200, 4096 worlds, at most 10 iterations: Go1 8.22 ms without and 8.46 with it, G1 9.88 and 10.17).
