@@ -32,6 +32,7 @@ usage: ksim-rl <command> [arguments]
   envs     list the tasks, or print what one is made of: ksim-rl envs cartpole_swingup
   robot    analyse a robot's model: ksim-rl robot unitree_a1/a1 [--code]
   new      a package around it:     ksim-rl new robot PATH.xml
+  motion   a recording as a motion: ksim-rl motion bvh dance.bvh dance.npz --pairs pairs.yaml
   reproduce  run a table of results: ksim-rl reproduce dm_control --rows 'ppo/Cart.*'
 
 RUN is a run folder (its newest checkpoint) or one of its checkpoints.
@@ -61,6 +62,7 @@ COMMANDS = {
     "envs": "ksim_rl.cli.run_commands:list_envs",
     "robot": "ksim_rl.cli.run_commands:robot",
     "new": "ksim_rl.cli.new:new",
+    "motion": "ksim_rl.clips.command:motion",
     "reproduce": "ksim_rl.tables.reproduce:reproduce",
 }
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import yaml
 
-from ksim_rl.clips.__main__ import main
+from ksim_rl.cli.main import main
 from ksim_rl.clips.recording import of_robot
 from ksim_rl.clips.retarget import Pair, Retarget, read_retarget, retargeted
 from ksim_rl.scene.motions.motion import motion_path
@@ -91,13 +91,19 @@ def test_the_command_turns_a_persons_archive_into_a_motion_file(tmp_path, capsys
         point="left_ankle", to="left_ankle_roll_link"
     )
     source, made = str(tmp_path / "person.npz"), str(tmp_path / "made.npz")
-    assert main(["amass", source, made, "--pairs", str(tmp_path / "pairs.yaml")]) == 0
+
+    def code(*words: str) -> int:
+        with pytest.raises(SystemExit) as ended:
+            main(["motion", *words])
+        return ended.value.code  # pyright: ignore[reportReturnType]
+
+    assert code("amass", source, made, "--pairs", str(tmp_path / "pairs.yaml")) == 0
     assert "11 frames, 0.20 s" in capsys.readouterr().out
     assert np.load(made)["qpos"].shape == (11, model.nq)
-    assert main(["csv", source, made]) == 2
+    assert code("csv", source, made) == 2
     assert "it is no text" in capsys.readouterr().err
     (tmp_path / "pairs.yaml").write_text("[1, 2]")
-    assert main(["amass", source, made, "--pairs", str(tmp_path / "pairs.yaml")]) == 2
+    assert code("amass", source, made, "--pairs", str(tmp_path / "pairs.yaml")) == 2
     assert "expected a mapping with `pairs`" in capsys.readouterr().err
-    assert main(["csv", source, made, "--robot", "g2"]) == 2
+    assert code("csv", source, made, "--robot", "g2") == 2
     assert "valid: g1, humanoid, t1" in capsys.readouterr().err

@@ -1,7 +1,6 @@
-"""`python -m ksim_rl.clips` turns recordings into motion files of a robot: from CSV, BVH or AMASS-like archives."""
+"""`ksim-rl motion` turns recordings into motion files of a robot: from CSV, BVH or AMASS-like archives."""
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -30,33 +29,29 @@ def model_of(robot: str) -> mujoco.MjModel:
     return load_spec(robot).compile()
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Convert one file; the code is 2 where something is wrong with it, which one line says."""
+def motion(arguments: Sequence[str]) -> int:
+    """Convert one file; a ValueError says what is wrong with it."""
     options = _parser().parse_args(arguments)
-    try:
-        model = model_of(options.robot)
-        if options.kind == "csv":
-            joints = options.joints.split(",") if options.joints else None
-            qpos_FL = read_csv(
-                options.source, model, fps=options.source_fps, wanted_fps=options.fps, joints=joints
-            )
-        else:
-            recording = (
-                read_bvh(options.source, scale=options.unit, y_up=not options.z_up)
-                if options.kind == "bvh"
-                else read_amass(options.source, height=options.height)
-            )
-            qpos_FL = retargeted(recording, model, read_retarget(options.pairs), fps=options.fps)
-        write_motion(options.motion, model, qpos_FL, options.fps)
-    except ValueError as error:
-        print(f"python -m ksim_rl.clips: {error}", file=sys.stderr)
-        return 2
+    model = model_of(options.robot)
+    if options.kind == "csv":
+        joints = options.joints.split(",") if options.joints else None
+        qpos_FL = read_csv(
+            options.source, model, fps=options.source_fps, wanted_fps=options.fps, joints=joints
+        )
+    else:
+        recording = (
+            read_bvh(options.source, scale=options.unit, y_up=not options.z_up)
+            if options.kind == "bvh"
+            else read_amass(options.source, height=options.height)
+        )
+        qpos_FL = retargeted(recording, model, read_retarget(options.pairs), fps=options.fps)
+    write_motion(options.motion, model, qpos_FL, options.fps)
     print(f"{options.motion}: {len(qpos_FL)} frames, {(len(qpos_FL) - 1) / options.fps:.2f} s")
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m ksim_rl.clips", description=__doc__)
+    parser = argparse.ArgumentParser(prog="ksim-rl motion", description=__doc__)
     kinds = parser.add_subparsers(dest="kind", required=True)
     for kind, said in (
         ("csv", "root position, quaternion (x, y, z, w) and joints of the robot itself"),
@@ -79,7 +74,3 @@ def _parser() -> argparse.ArgumentParser:
         else:
             one.add_argument("--height", type=float, default=HEIGHT, help="of the person, m")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())
