@@ -94,9 +94,11 @@ def _near_multiples(value: int, factor: int) -> str:
 
 
 def _near_divisors(number: int, value: int) -> str:
-    below = next(divisor for divisor in range(value, 0, -1) if number % divisor == 0)
-    above = next((divisor for divisor in range(value, number + 1) if number % divisor == 0), None)
-    return f"{below}" if above is None else f"{below} or {above}"
+    small = [divisor for divisor in range(1, math.isqrt(number) + 1) if number % divisor == 0]
+    divisors = sorted({*small, *(number // divisor for divisor in small)})
+    near = [divisor for divisor in divisors if divisor < value][-1:]
+    near += [divisor for divisor in divisors if divisor > value][:1]
+    return " or ".join(str(divisor) for divisor in near)
 
 
 class DatasetBuffer(ReplayBuffer):
