@@ -2,9 +2,10 @@
 
 It computes what `GAE`, `ClipPPOLoss` and `ppo_step` compute for an actor and a critic of `FusedNetworks`, from the same
 config, in the same order of env states, and on the state of the same optimizer: a run can change from one to the other
-at any update. With bfloat16 the weights, observations, hidden layers and their gradients are rounded to 8 significant
-bits where they are multiplied; parameters, sums, losses and Adam stay float32. For networks of 512, 256 and 128 that
-moved the gradient of each parameter by 0.2 to 0.6 percent of its norm, where torch's TF32 moves it by 0.05 to 0.5.
+at any update. Where they are multiplied, weights, observations, hidden layers and their gradients are rounded to 8
+significant bits with bfloat16, with float32 to 11 (TF32); parameters, sums, losses and Adam stay float32. For networks
+of 512, 256 and 128 bfloat16 moved the gradient of each parameter by 0.2 to 0.6 percent of its norm, where torch's TF32
+moves it by 0.05 to 0.5.
 """
 
 import itertools

@@ -170,7 +170,7 @@ def minibatch_gradients(
     tl.store(inputs + (input_rows + obs_column[None, :]), observed, mask=keep)
     out = _outputs(
         observed, weights, biases, inputs, input_rows, keep, H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, TF32, True
-    )
+    )  # fmt: skip
 
     record = records + index.to(tl.int64) * RECORD
     if network == 0:
