@@ -178,8 +178,8 @@ class Tuning:
     @classmethod
     def of(cls, layout: FusedLayout, dtype: torch.dtype) -> "Tuning":
         """Return what suits a layout: chained, the first and the third width must be whole numbers of chunks."""
-        # An element of float32 takes twice the registers and shared memory.
-        wide: Any = {"tile": 64, "tile_warps": 4} if dtype is torch.float32 else {}
+        # An element of float32 takes twice the registers and shared memory: so two programs share a multiprocessor.
+        wide: Any = {"stages": 2, "tile": 64, "tile_warps": 4} if dtype is torch.float32 else {}
         if not layout.chained:
             return cls(block=64 if wide else 128, **wide)
         chunk = math.gcd(cls.chunk, layout.hidden[0], layout.hidden[2])
