@@ -98,8 +98,8 @@ class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
         precision: of what layers multiply in the gradient steps: "float32" (on CUDA as `trainer.matmul_precision`
             says), or "bfloat16", which has 8 significant bits and moves the gradient by about half a percent of its
             norm; "auto" is "bfloat16" on CUDA and "float32" elsewhere. All else is always float32.
-        kernels: of a bfloat16 update: "auto" takes a few fused kernels where they fit device and networks, "torch"
-            never does. They differ by the order of sums. The metric `update/fused` says which it is.
+        kernels: "auto" takes a few fused kernels for the gradient steps where they fit device, precision and networks,
+            "torch" never does. They differ by the order of sums. The metric `update/fused` says which it is.
     """
 
     advantage: Literal["gae", "td_lambda", "vtrace"] = "gae"

@@ -13,6 +13,7 @@ from ksim_rl.data import DatasetCfg
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
 from ksim_rl.objectives import PPOCfg, StepGuard, SymmetricAugmentation
 from ksim_rl.objectives.fused_ppo import FusedLayout, Tuning, why_not_fused
+from ksim_rl.suites.dm_control import training
 from ksim_rl.transforms import MirrorMap
 
 ENVS, STEPS, ACTIONS, ACTOR_OBS, CRITIC_OBS = 8, 6, 3, 20, 24
@@ -119,6 +120,13 @@ def assert_equal_states(one, other, *, atol=1e-4):
         )
 
 
+@pytest.fixture
+def tf32():
+    torch.set_float32_matmul_precision("high")
+    yield
+    torch.set_float32_matmul_precision("highest")
+
+
 def full(*values):
     return pytest.param(*values, marks=pytest.mark.full)
 
@@ -172,7 +180,7 @@ def test_updates_equal_those_of_torch(fused_ppo, options, actor_options):
         data = rollout(actor, seed=seed)
         torch_s(data.clone())
         fused(data)
-    assert_equal_states(torch_s, fused)
+    assert_equal_states(torch_s, fused, atol=1e-5)
     ours, theirs = fused.metrics(), torch_s.metrics()
     assert ours.keys() == theirs.keys()
     assert ours["update/non_finite_env_states"] == 4
@@ -299,12 +307,47 @@ def test_a_symmetry_without_a_mirror_is_refused(fused_ppo):
         )
 
 
-def test_what_the_kernels_cannot_do_is_said():
+@needs_interpreter
+@pytest.mark.parametrize("hidden", [HIDDEN, (48, 16)])
+def test_what_tensor_cores_would_cut_off_is_rounded(fused_ppo, tf32, hidden):
+    actor, critic = networks(hidden=hidden)
+    data = rollout(actor)
+    # Not clipped: the mean of Adam is a sum of gradients.
+    cfg = PPOCfg(num_epochs=1, schedule="fixed", learning_rate=1e-6, max_grad_norm=None)
+    made, exact = update(cfg, actor, critic, fused_ppo), update(cfg, actor, critic)
+    for one in (made, exact):
+        one(data.clone())
+    parameters = made.fused.parameters
+    mantissa, exponent = torch.frexp(parameters.exact)
+    torch.testing.assert_close(parameters.weights, torch.ldexp((mantissa * 2**11).round() / 2**11, exponent))
+    arguments = made.fused._arguments
+    for operands in (made.fused.dataset.obs, parameters.weights, arguments["inputs"], arguments["slopes"]):
+        assert operands.count_nonzero() and not (operands.view(torch.int32) & 0x1FFF).any()
+    ours, theirs = (
+        torch.cat([one.optimizer.state[own]["exp_avg"].flatten() for own in one.loss.parameters()])
+        for one in (made, exact)
+    )
+    assert 1e-5 < (ours - theirs).norm() / theirs.norm() < 3e-3
+
+
+def test_rounding_keeps_what_is_not_finite(fused_ppo):
+    as_tf32 = importlib.import_module("ksim_rl.objectives.fused_ppo.dataset").as_tf32
+    odd = torch.tensor([0x7FFFFFFF, -1, 0x7F800000, -0x800000], dtype=torch.int32).view(torch.float32)
+    assert as_tf32(odd)[:2].isnan().all() and torch.equal(as_tf32(odd)[2:], odd[2:])
+
+
+def test_what_the_kernels_cannot_do_is_said(tf32):
     bounded = ActorCfg(distribution="tanh_gaussian", action_bound=1.0)
     actor, critic = networks()
     made = fused_networks(actor, critic)
     assert why_not_fused(PPOCfg(precision="bfloat16"), made, **SIZES) is None
-    assert "float32" in why_not_fused(PPOCfg(), made, **SIZES)
+    assert why_not_fused(PPOCfg(), made, **SIZES) is None
+    torch.set_float32_matmul_precision("highest")
+    assert "matmul_precision='highest'" in why_not_fused(PPOCfg(), made, **SIZES)
+    torch.set_float32_matmul_precision("high")
+    wide = fused_networks(*networks(hidden=(272, 32)))
+    assert "wider than 256" in why_not_fused(PPOCfg(), wide, **SIZES)
+    assert why_not_fused(PPOCfg(precision="bfloat16"), wide, **SIZES) is None
     for option in (
         {"kernels": "torch"},
         {"advantage": "vtrace"},
@@ -329,6 +372,16 @@ def test_what_the_kernels_cannot_do_is_said():
     assert "too many" in why_not_fused(PPOCfg(precision="bfloat16", symmetry="augment"), made, **rows)
     assert isinstance(fused_networks(actor, torch.nn.Identity()), str)
     assert update(PPOCfg(), actor, critic).metrics()["update/fused"] == 0.0
+
+
+def test_the_settings_of_the_control_suite_are_fused(tf32):
+    cfg = training.ppo()
+    # The sizes of a humanoid of CMU, which has the most.
+    actor = make_actor(cfg.modules.actor, obs_dim=137, action_dim=56)
+    made = fused_networks(actor, make_critic(cfg.modules.critic, obs_dim=137))
+    sizes = {name: getattr(cfg.data, name) for name in SIZES}
+    assert why_not_fused(cfg.objective, made, **sizes) is None
+    assert made.chained
 
 
 def test_on_the_cpu_torch_makes_the_steps():

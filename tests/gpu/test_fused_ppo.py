@@ -19,6 +19,13 @@ ENVS, STEPS, OBS = 256, 24, 48
 DEVICE = torch.device("cuda")
 
 
+@pytest.fixture
+def tf32():
+    torch.set_float32_matmul_precision("high")
+    yield
+    torch.set_float32_matmul_precision("highest")
+
+
 def networks(*, hidden_dims=(512, 256, 128), action_dim=12, obs=OBS, activation="elu", **actor_options):
     torch.manual_seed(2)
     actor_cfg = ActorCfg(hidden_dims=hidden_dims, activation=activation, **actor_options)
@@ -89,7 +96,7 @@ def test_the_gradient_is_that_of_exact_products(network_options, symmetry):
     # One step, not clipped: the mean of Adam is then a tenth of the gradient.
     one = {"minibatches": 1, "num_epochs": 1, "max_grad_norm": None, "symmetry": symmetry}
     fused = update(actor, critic, **one)
-    exact = update(actor, critic, precision="float32", **one)
+    exact = update(actor, critic, precision="float32", kernels="torch", **one)
     plain = update(actor, critic, kernels="torch", **one)
     assert fused.metrics()["update/fused"] == 1.0
     assert exact.metrics()["update/fused"] == plain.metrics()["update/fused"] == 0.0
@@ -103,6 +110,31 @@ def test_the_gradient_is_that_of_exact_products(network_options, symmetry):
     assert ours["update/non_finite_env_states"] == theirs["update/non_finite_env_states"] == 1
     for name in ("loss/policy", "loss/value", "loss/entropy", "policy/std"):
         torch.testing.assert_close(ours[name], theirs[name], atol=1e-3, rtol=1e-2)
+
+
+@pytest.mark.parametrize(
+    "network_options",
+    [
+        {"hidden_dims": (256, 256, 128), "action_dim": 21, "obs": 67, "init_std": 0.03},
+        {"hidden_dims": (256, 128)},
+    ],
+)
+def test_float32_is_rounded_as_by_torch(tf32, network_options):
+    actor, critic = networks(**network_options)
+    rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE, obs=network_options.get("obs", OBS))
+    one = {"precision": "float32", "minibatches": 1, "num_epochs": 1, "max_grad_norm": None}
+    fused, plain = update(actor, critic, **one), update(actor, critic, kernels="torch", **one)
+    assert (fused.metrics()["update/fused"], plain.metrics()["update/fused"]) == (1.0, 0.0)
+    fused(rollout_ET.clone())
+    plain(rollout_ET.clone())
+    torch.set_float32_matmul_precision("highest")
+    exact = update(actor, critic, kernels="torch", **one)
+    exact(rollout_ET.clone())
+    of_torch = errors(plain, exact)
+    for layer, error in errors(fused, exact).items():
+        assert error < max(0.005, 1.5 * of_torch[layer]), (layer, error, of_torch[layer])
+    # The policy is the one that acted; narrow as it is, it must be to a small part of its standard deviation.
+    assert fused.metrics()["update/kl"] < 1e-3
 
 
 def test_the_fused_kernels_equal_torch_in_bfloat16():

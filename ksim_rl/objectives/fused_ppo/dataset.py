@@ -38,10 +38,11 @@ class FusedDataset:
         observe_critic: Observe,
         size: int,
         dtype: torch.dtype,
+        tf32: bool,
         device: torch.device,
         mirror: SymmetricAugmentation | None = None,
     ) -> None:
-        self.cfg, self.layout, self.size, self._mirror = cfg, layout, size, mirror
+        self.cfg, self.layout, self.size, self._tf32, self._mirror = cfg, layout, size, tf32, mirror
         self._observe = observe_actor, observe_critic
         rows = size if mirror is None else 2 * size
         self.obs = torch.zeros(2, rows, layout.stored, dtype=dtype, device=device)
@@ -68,7 +69,7 @@ class FusedDataset:
                 self._take(self._mirror.image(part_ET), self.obs[:, images], self.records[images])
             evaluate(self.obs[1, rows], values_D[rows])
             next_obs = self.obs.new_zeros(part_ET.numel(), self.layout.stored)
-            next_obs[:, : self.layout.obs_dims[1]] = _time_major(self._observe[1](part_ET.get("next")))
+            next_obs[:, : self.layout.obs_dims[1]] = self._observed(1, part_ET.get("next"))
             evaluate(next_obs, next_values_D[rows])
             first = rows.stop
         following = rollout_ET.get("next")
@@ -90,11 +91,15 @@ class FusedDataset:
     def _take(self, part_ET: TensorDictBase, obs_2BL: Tensor, records_B: Tensor) -> None:
         """Take over what is as the rollout has it, some steps of it."""
         width, actions = self.layout.out, self.layout.actions
-        for obs_BL, observe, dim in zip(obs_2BL, self._observe, self.layout.obs_dims, strict=True):
-            obs_BL[:, :dim] = _time_major(observe(part_ET))
+        for network, dim in enumerate(self.layout.obs_dims):
+            obs_2BL[network, :, :dim] = self._observed(network, part_ET)
         for place, key in enumerate(("action", "loc", "scale")):
             records_B[:, place * width : place * width + actions] = _time_major(part_ET.get(key))
         records_B[:, 3 * width + LOG_PROB.value] = _time_major(part_ET.get("action_log_prob"))
+
+    def _observed(self, network: int, part_ET: TensorDictBase) -> Tensor:
+        obs_BL = _time_major(self._observe[network](part_ET))
+        return as_tf32(obs_BL) if self._tf32 else obs_BL
 
     def _record(self, estimates: Tensor) -> Tensor:
         first, mask = (3 * self.layout.out + column.value for column in (ADVANTAGE, MASK))
@@ -106,6 +111,16 @@ class FusedDataset:
         torch.where(finite_D[:, None], self.records, self._neutral, out=self.records)
         self.obs.masked_fill_(~finite_D[None, :, None], 0.0)
         return (~finite_D[: self.size]).sum()
+
+
+def as_tf32(values: Float[Tensor, "*?shape"]) -> Float[Tensor, "*?shape"]:
+    """Return float32 rounded to the 11 significant bits that tensor cores read of it.
+
+    They cut the others off, which makes each product smaller by 0.07 percent in the mean, and outputs by several times
+    that: for an action with a standard deviation of a hundredth, a large change of its probability.
+    """
+    rounded = (values.view(torch.int32) + 0x1000 & -0x2000).view(torch.float32)
+    return torch.where(values.isnan(), values, rounded)
 
 
 def _time_major(leaf_ET: Tensor) -> Tensor:

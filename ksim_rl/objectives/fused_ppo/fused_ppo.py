@@ -2,9 +2,10 @@
 
 It computes what `GAE`, `ClipPPOLoss` and `ppo_step` compute for an actor and a critic of `FusedNetworks`, from the same
 config, in the same order of env states, and on the state of the same optimizer: a run can change from one to the other
-at any update. With bfloat16 the weights, observations, hidden layers and their gradients are rounded to 8 significant
-bits where they are multiplied; parameters, sums, losses and Adam stay float32. For networks of 512, 256 and 128 that
-moved the gradient of each parameter by 0.2 to 0.6 percent of its norm, where torch's TF32 moves it by 0.05 to 0.5.
+at any update. Where they are multiplied, weights, observations, hidden layers and their gradients are rounded to 8
+significant bits with bfloat16, with float32 to 11 (TF32); parameters, sums, losses and Adam stay float32. For networks
+of 512, 256 and 128 bfloat16 moved the gradient of each parameter by 0.2 to 0.6 percent of its norm, where torch's TF32
+moves it by 0.05 to 0.5.
 """
 
 import itertools
@@ -22,7 +23,7 @@ from torch.nn import functional
 from ksim_rl import ranks
 from ksim_rl.device.streams import beside, warp_scope, warp_stream
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
-from ksim_rl.objectives.fused_ppo.dataset import FusedDataset, Observe
+from ksim_rl.objectives.fused_ppo.dataset import FusedDataset, Observe, as_tf32
 from ksim_rl.objectives.fused_ppo.layer_kernels import layer, output_gradients
 from ksim_rl.objectives.fused_ppo.layout import (
     ACTIVATIONS,
@@ -57,9 +58,10 @@ class FusedParameters:
         *,
         optimizer: torch.optim.Adam,
         dtype: torch.dtype,
+        tf32: bool,
         num_steps: int,
     ) -> None:
-        self._parameters, self._optimizer = networks.parameters, optimizer
+        self._parameters, self._optimizer, self._tf32 = networks.parameters, optimizer, tf32
         device = self._parameters[0].device
         # Parameters, and the optimizer's means and variances, each [N].
         self.flat = [torch.zeros(layout.num_flat, device=device) for _ in range(3)]
@@ -88,7 +90,7 @@ class FusedParameters:
             torch._foreach_copy_(views, tensors)
         self.steps[0].copy_(self._optimizer.state[self._parameters[0]]["step"])
         self.exact.view(-1)[self.places] = self.flat[0]
-        self.weights.copy_(self.exact)
+        self.weights.copy_(as_tf32(self.exact) if self._tf32 else self.exact)
 
     @torch.no_grad()
     def store(self) -> None:
@@ -132,15 +134,16 @@ class FusedPPO:
         self.cfg, self.networks, self.optimizer, self.guard = cfg, networks, optimizer, guard
         self._mirrored = cfg.symmetry == "loss"
         self.layout = layout = FusedLayout(networks, chained=networks.chained and not self._mirrored)
-        self.tuning = tuning = tuning or Tuning.of(layout)
+        device, dtype = networks.parameters[0].device, getattr(torch, cfg.precision)
+        tf32 = self._tf32 = dtype is torch.float32 and torch.get_float32_matmul_precision() != "highest"
+        self.tuning = tuning = tuning or Tuning.of(layout, dtype)
         self.batch = num_env_states_per_minibatch
         # With the mirror images behind.
         rows = self.batch if mirror is None else 2 * self.batch
         num_steps = cfg.num_epochs * num_minibatches
-        device, dtype = networks.parameters[0].device, getattr(torch, cfg.precision)
         self._side = warp_stream(torch.cuda.Stream(device)) if device.type == "cuda" else None
         self.parameters = FusedParameters(
-            networks, layout, optimizer=optimizer, dtype=dtype, num_steps=num_steps
+            networks, layout, optimizer=optimizer, dtype=dtype, tf32=tf32, num_steps=num_steps
         )
         self.dataset = FusedDataset(
             cfg,
@@ -149,6 +152,7 @@ class FusedPPO:
             observe_critic=observe_critic,
             size=num_env_states_per_minibatch * num_minibatches,
             dtype=dtype,
+            tf32=tf32,
             device=device,
             mirror=mirror,
         )
@@ -217,6 +221,7 @@ class FusedPPO:
             "BLOCKS": blocks,
             "MIRROR": self._mirrored,
             "CLIP_VALUE": clip_value > 0.0,
+            "TF32": self._tf32,
             "ADAPTIVE": cfg.schedule == "adaptive",
             "RANKS": ranks.size(),
             "CLIP": cfg.max_grad_norm is not None,

@@ -10,7 +10,7 @@ import triton
 import triton.language as tl
 
 from ksim_rl.objectives.fused_ppo.loss_kernels import MASK, policy_gradient, value_gradient
-from ksim_rl.objectives.fused_ppo.mlp_kernels import activate, slope_of
+from ksim_rl.objectives.fused_ppo.mlp_kernels import activate, operand, slope_of
 
 
 @triton.jit
@@ -41,7 +41,7 @@ def layer(
     inputs, slopes, weights, biases,
     num_rows, width, length, read_at, slope_at, output_at,
     FORWARD: tl.constexpr, NUM_PADDED: tl.constexpr,
-    INPUTS: tl.constexpr, GRADIENTS: tl.constexpr, ACTIVATION: tl.constexpr,
+    INPUTS: tl.constexpr, GRADIENTS: tl.constexpr, ACTIVATION: tl.constexpr, TF32: tl.constexpr,
     BLOCK: tl.constexpr, TILE: tl.constexpr, DEPTH: tl.constexpr, TILE_STAGES: tl.constexpr,
 ):  # fmt: skip
     """Compute TILE of `width` hidden units for BLOCK rows, FORWARD or back: program (i, j, n) is of network n.
@@ -72,13 +72,13 @@ def layer(
             slope = gate + hidden * (1.0 - gate)
         else:
             slope = slope_of(hidden, ACTIVATION)
-        tl.store(input_rows + (output_at + column[None, :]), hidden.to(dtype), mask=keep & inside)
+        tl.store(input_rows + (output_at + column[None, :]), operand(hidden, dtype, TF32), mask=keep & inside)
         tl.store(slope_to, slope.to(dtype), mask=keep & inside)
     else:
         right = weights + column[None, :]
         acc = _product(slope_rows + read_at, right, keep, inside, length, width, acc, DEPTH, TILE_STAGES)
         gradient = acc * tl.load(slope_to, mask=keep & inside, other=0.0).to(tl.float32)
-        tl.store(slope_to, gradient.to(dtype), mask=keep & inside)
+        tl.store(slope_to, operand(gradient, dtype, TF32), mask=keep & inside)
 
 
 @triton.jit
@@ -89,7 +89,7 @@ def output_gradients(
     NUM_PADDED: tl.constexpr, NUM_STATISTICS: tl.constexpr,
     RECORD: tl.constexpr, INPUTS: tl.constexpr, GRADIENTS: tl.constexpr, ACTIONS: tl.constexpr, OUT: tl.constexpr,
     LOG_STD: tl.constexpr, MIN_STD: tl.constexpr, STATE_STD: tl.constexpr, MIRROR: tl.constexpr,
-    CLIP_VALUE: tl.constexpr, BLOCK: tl.constexpr, DEPTH: tl.constexpr, TILE_STAGES: tl.constexpr,
+    CLIP_VALUE: tl.constexpr, TF32: tl.constexpr, BLOCK: tl.constexpr, DEPTH: tl.constexpr, TILE_STAGES: tl.constexpr,
 ):  # fmt: skip
     """Run BLOCK rows through the last layer and the loss: program (i, n) is of network n (0: actor, 1: critic).
 
@@ -132,7 +132,7 @@ def output_gradients(
             ACTIONS, OUT, LOG_STD, MIN_STD, STATE_STD
         )  # fmt: skip
         if STATE_STD:
-            tl.store(slope_rows + (OUT + output[None, :]), d_std.to(dtype), mask=keep)
+            tl.store(slope_rows + (OUT + output[None, :]), operand(d_std, dtype, TF32), mask=keep)
         if MIRROR:
             # A mirror map is its own inverse, so that both of a pair have the same gradient: at what the one says,
             # against the image of what the other one says. The image of outputs is that of the weights' rows.
@@ -147,4 +147,4 @@ def output_gradients(
             tl.store(statistics + 5, 0.5 * symmetry_coeff / ACTIONS * tl.sum(gap * gap))
     else:
         d_out = value_gradient(out, record, judged, statistics, clip_value, critic_coeff, OUT, CLIP_VALUE)
-    tl.store(slope_rows + output[None, :], d_out.to(dtype), mask=keep)
+    tl.store(slope_rows + output[None, :], operand(d_out, dtype, TF32), mask=keep)

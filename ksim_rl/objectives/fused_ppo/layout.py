@@ -20,6 +20,8 @@ ACTIVATIONS = (nn.ELU, nn.ReLU, nn.Tanh, nn.SiLU)
 CHAINED_OBS = 256
 CHAINED_SECOND = (16, 32, 64, 128, 256)
 MAX_WIDTH = 1024
+# In float32: as TF32 wider layers are no faster than torch's.
+MAX_TF32_WIDTH = 256
 MAX_ACTIONS = 64
 MAX_PLACES = 2**31
 
@@ -174,11 +176,14 @@ class Tuning:
     rows: int = 256  # of the blocks in which sums over programs are taken
 
     @classmethod
-    def of(cls, layout: FusedLayout) -> "Tuning":
+    def of(cls, layout: FusedLayout, dtype: torch.dtype) -> "Tuning":
         """Return what suits a layout: chained, the first and the third width must be whole numbers of chunks."""
+        # An element of float32 takes twice the registers and shared memory: so two programs share a multiprocessor.
+        wide: Any = {"stages": 2, "tile": 64, "tile_warps": 4} if dtype is torch.float32 else {}
         if not layout.chained:
-            return cls(block=128)
-        return cls(chunk=math.gcd(cls.chunk, layout.hidden[0], layout.hidden[2]))
+            return cls(block=64 if wide else 128, **wide)
+        chunk = math.gcd(cls.chunk, layout.hidden[0], layout.hidden[2])
+        return cls(block=32 if wide else cls.block, chunk=chunk, **wide)
 
 
 def why_not_fused(
@@ -187,9 +192,6 @@ def why_not_fused(
     """Return why the kernels cannot make the gradient steps of `cfg`, or None if they can."""
     if cfg.kernels == "torch":
         return "kernels='torch'"
-    if cfg.precision == "float32":
-        # As TF32 they would be no faster than torch's.
-        return "precision='float32', and the kernels multiply bfloat16"
     refused = {
         "advantage": cfg.advantage != "gae",
         "estimate_each_epoch": cfg.estimates_each_epoch,
@@ -203,6 +205,11 @@ def why_not_fused(
         return f"actor and critic have hidden layers of {hidden[0]} and {hidden[1]}, not one or more, and as many"
     if max(map(max, hidden)) > MAX_WIDTH or networks.actor[-1].out_features > MAX_ACTIONS:
         return f"a hidden layer is wider than {MAX_WIDTH}, or there are more than {MAX_ACTIONS} actions"
+    if cfg.precision == "float32":
+        if torch.get_float32_matmul_precision() == "highest":
+            return "precision='float32' with matmul_precision='highest', and the kernels multiply float32 as TF32"
+        if max(map(max, hidden)) > MAX_TF32_WIDTH:
+            return f"precision='float32', and a hidden layer is wider than {MAX_TF32_WIDTH}: torch is as fast there"
     layout = FusedLayout(networks)
     rows = num_env_states_per_minibatch * (1 if cfg.symmetry == "none" else 2)
     columns = max(layout.inputs, layout.gradients, num_minibatches * layout.obs)

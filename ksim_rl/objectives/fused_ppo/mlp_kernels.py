@@ -1,7 +1,8 @@
 """This module has the Triton kernels that run a whole MLP, forward and back, for a block of env states at a time.
 
 The widest hidden layer never exists as a whole: its columns are computed in chunks, and each chunk is multiplied into
-the next layer at once. Products take the dtype of the weights (bfloat16, or float32 as TF32) and add up in float32.
+the next layer at once. Products take the dtype of the weights (bfloat16, or float32, as TF32 on a GPU) and add up in
+float32.
 
 `docs/fused_ppo.md` has a diagram of the memory and derives the gradients. D env states are in the dataset, B in the
 minibatch; OBS and OUT are the padded widths of observation and outputs, H1 to H3 those between, and ACTIONS
@@ -12,6 +13,16 @@ import triton
 import triton.language as tl
 
 from ksim_rl.objectives.fused_ppo.loss_kernels import policy_gradient, value_gradient
+
+
+@triton.jit
+def operand(value, dtype, TF32: tl.constexpr):
+    """Return `value` as products take it; with TF32 rounded to 11 significant bits, as `as_tf32` does."""
+    if TF32:
+        bits = value.to(tl.int32, bitcast=True)
+        rounded = ((bits + 0x1000) & -0x2000).to(tl.float32, bitcast=True)
+        value = tl.where(value == value, rounded, value)
+    return value.to(dtype)
 
 
 @triton.jit
@@ -44,7 +55,8 @@ def slope_of(value, ACTIVATION: tl.constexpr):
 def _outputs(
     observed, weights, biases, inputs, input_rows, keep,
     H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr, OUT: tl.constexpr,
-    CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr, STORE: tl.constexpr,
+    CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr, TF32: tl.constexpr,
+    STORE: tl.constexpr,
 ):  # fmt: skip
     """Return the outputs [BLOCK, OUT] for `observed` [BLOCK, OBS]; STORE keeps the hidden layers in `inputs`."""
     BLOCK: tl.constexpr = observed.shape[0]
@@ -64,11 +76,12 @@ def _outputs(
         weight2 = tl.load(weights + (SECOND_AT + column2[None, :] * H1 + (first + column)[:, None]))
         hidden = tl.dot(observed, weight1) + bias[None, :]
         bias = tl.load(biases + (first + CHUNK) % H1 + column)
-        hidden = activate(hidden, ACTIVATION).to(observed.dtype)
+        hidden = operand(activate(hidden, ACTIVATION), observed.dtype, TF32)
         if STORE:
             tl.store(inputs + (input_rows + (OBS + first + column[None, :])), hidden, mask=keep)
         acc = tl.dot(hidden, weight2, acc)
-    second = activate(acc + tl.load(biases + H1 + column2)[None, :], ACTIVATION).to(observed.dtype)
+    second = activate(acc + tl.load(biases + H1 + column2)[None, :], ACTIVATION)
+    second = operand(second, observed.dtype, TF32)
     if STORE:
         tl.store(inputs + (input_rows + (OBS + H1 + column2[None, :])), second, mask=keep)
     out = tl.zeros((BLOCK, OUT), dtype=tl.float32)
@@ -78,7 +91,7 @@ def _outputs(
         weight4 = tl.load(weights + (OUT_AT + output[None, :] * H3 + (first + column)[:, None]))
         hidden = tl.dot(second, weight3) + bias[None, :]
         bias = tl.load(biases + H1 + H2 + (first + CHUNK) % H3 + column)
-        hidden = activate(hidden, ACTIVATION).to(observed.dtype)
+        hidden = operand(activate(hidden, ACTIVATION), observed.dtype, TF32)
         if STORE:
             tl.store(inputs + (input_rows + (OBS + H1 + H2 + first + column[None, :])), hidden, mask=keep)
         out = tl.dot(hidden, weight4, out)
@@ -97,6 +110,7 @@ def state_values(
     obs, weights, biases, values, num_rows,
     STORED: tl.constexpr, OBS: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr,
     OUT: tl.constexpr, BLOCK: tl.constexpr, CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr,
+    TF32: tl.constexpr,
 ):  # fmt: skip
     """Write the first output of a network for each row of `obs` [D, STORED] to `values` [D]."""
     rows = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -104,7 +118,7 @@ def state_values(
     keep = valid[:, None]
     observed = _observed(obs, rows, keep, STORED, OBS)
     out = _outputs(
-        observed, weights, biases, values, rows, keep, H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, False
+        observed, weights, biases, values, rows, keep, H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, TF32, False
     )
     tl.store(values + rows, tl.sum(tl.where(tl.arange(0, OUT)[None, :] == 0, out, 0.0), 1), mask=valid)
 
@@ -118,6 +132,7 @@ def minibatch_gradients(
     STORED: tl.constexpr, OBS: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr,
     ACTIONS: tl.constexpr, OUT: tl.constexpr, LOG_STD: tl.constexpr, MIN_STD: tl.constexpr, CLIP_VALUE: tl.constexpr,
     BLOCK: tl.constexpr, CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr,
+    TF32: tl.constexpr,
 ):  # fmt: skip
     """Run a block of a minibatch through one network, its loss, and back: all but the products for the weights.
 
@@ -154,8 +169,8 @@ def minibatch_gradients(
     observed = _observed(obs, index, keep, STORED, OBS)
     tl.store(inputs + (input_rows + obs_column[None, :]), observed, mask=keep)
     out = _outputs(
-        observed, weights, biases, inputs, input_rows, keep, H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, True
-    )
+        observed, weights, biases, inputs, input_rows, keep, H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, TF32, True
+    )  # fmt: skip
 
     record = records + index.to(tl.int64) * RECORD
     if network == 0:
@@ -168,7 +183,7 @@ def minibatch_gradients(
         )  # fmt: skip
     else:
         d_out = value_gradient(out, record, valid, statistics, clip_value, critic_coeff, OUT, CLIP_VALUE)
-    d_out = d_out.to(observed.dtype)
+    d_out = operand(d_out, observed.dtype, TF32)
     tl.store(slopes + (gradient_rows + (H1 + H2 + H3 + output[None, :])), d_out, mask=keep)
     # From here on threads read hidden layers that others of the block have written.
     tl.debug_barrier()
@@ -180,18 +195,19 @@ def minibatch_gradients(
             inputs + (input_rows + (OBS + H1 + H2 + first + column[None, :])), mask=keep, other=0.0
         )
         slope = tl.dot(d_out, weight4) * slope_of(hidden.to(tl.float32), ACTIVATION)
-        slope = slope.to(observed.dtype)
+        slope = operand(slope, observed.dtype, TF32)
         tl.store(slopes + (gradient_rows + (H1 + H2 + first + column[None, :])), slope, mask=keep)
         acc = tl.dot(slope, weight3, acc)
     middle = tl.load(inputs + (input_rows + (OBS + H1 + column2[None, :])), mask=keep, other=0.0)
     second = acc * slope_of(middle.to(tl.float32), ACTIVATION)
-    second = second.to(observed.dtype)
+    second = operand(second, observed.dtype, TF32)
     tl.store(slopes + (gradient_rows + (H1 + column2[None, :])), second, mask=keep)
     for first in tl.range(0, H1, CHUNK, num_stages=STAGES):
         weight2 = tl.load(weights + (SECOND_AT + column2[:, None] * H1 + (first + column)[None, :]))
         hidden = tl.load(inputs + (input_rows + (OBS + first + column[None, :])), mask=keep, other=0.0)
         slope = tl.dot(second, weight2) * slope_of(hidden.to(tl.float32), ACTIVATION)
-        tl.store(slopes + (gradient_rows + (first + column[None, :])), slope.to(observed.dtype), mask=keep)
+        slope = operand(slope, observed.dtype, TF32)
+        tl.store(slopes + (gradient_rows + (first + column[None, :])), slope, mask=keep)
 
 
 @triton.jit

@@ -7,6 +7,7 @@ import triton
 import triton.language as tl
 
 from ksim_rl.objectives.fused_ppo.loss_kernels import HALF_LOG_2_PI
+from ksim_rl.objectives.fused_ppo.mlp_kernels import operand
 
 SUMMARY = (
     "loss_objective",
@@ -188,7 +189,7 @@ def adam_step(
     steps, skipped, skipped_in_a_row,
     beta1, beta2, log_beta1, log_beta2, adam_eps, weight_decay, max_grad_norm,
     SIZE: tl.constexpr, NUM_SQUARES: tl.constexpr, SQUARES: tl.constexpr, CLIP: tl.constexpr,
-    BLOCK: tl.constexpr,
+    TF32: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Make one step of Adam (Kingma and Ba, arXiv 1412.6980), as torch's, on the clipped gradient.
 
@@ -226,7 +227,7 @@ def adam_step(
     tl.store(parameters + at, parameter, mask=inside)
     tl.store(means + at, tl.where(made, new_mean, mean), mask=inside)
     tl.store(variances + at, tl.where(made, new_variance, variance), mask=inside)
-    tl.store(weights + place, parameter.to(weights.dtype.element_ty), mask=inside)
+    tl.store(weights + place, operand(parameter, weights.dtype.element_ty, TF32), mask=inside)
     tl.store(exact_weights + place, parameter, mask=inside)
     if tl.program_id(0) == 0:
         miss = tl.where(made, 0, 1).to(tl.int64)

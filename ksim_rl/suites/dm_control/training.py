@@ -40,7 +40,7 @@ def ppo(*, gamma: float = 0.995, env_states: float = PPO_STATES) -> TrainingCfg:
         ),
         data=data,
         modules=ModulesCfg(
-            actor=ActorCfg(hidden_dims=(256, 128)),
+            actor=ActorCfg(hidden_dims=(256, 256, 128)),
             critic=CriticCfg(hidden_dims=(256, 256, 128)),
         ),
         trainer=TrainerCfg(
