@@ -36,10 +36,11 @@ _THREADS = torch.get_num_threads()
 
 @pytest.fixture(autouse=True)
 def _fresh_torch():
-    """Start each test from the same seed and threads, with nothing compiled: tests share code that compiles."""
+    """Start each test from the same seed, threads and exact products, with nothing compiled: tests share code."""
     if torch.get_num_threads() != _THREADS:
         torch.set_num_threads(_THREADS)
     torch.manual_seed(0)
+    torch.set_float32_matmul_precision("highest")
     torch.compiler.reset()
 
 

@@ -120,13 +120,6 @@ def assert_equal_states(one, other, *, atol=1e-4):
         )
 
 
-@pytest.fixture
-def tf32():
-    torch.set_float32_matmul_precision("high")
-    yield
-    torch.set_float32_matmul_precision("highest")
-
-
 def full(*values):
     return pytest.param(*values, marks=pytest.mark.full)
 
@@ -309,7 +302,8 @@ def test_a_symmetry_without_a_mirror_is_refused(fused_ppo):
 
 @needs_interpreter
 @pytest.mark.parametrize("hidden", [HIDDEN, (48, 16)])
-def test_what_tensor_cores_would_cut_off_is_rounded(fused_ppo, tf32, hidden):
+def test_what_tensor_cores_would_cut_off_is_rounded(fused_ppo, hidden):
+    torch.set_float32_matmul_precision("high")
     actor, critic = networks(hidden=hidden)
     data = rollout(actor)
     # Not clipped: the mean of Adam is a sum of gradients.
@@ -336,15 +330,14 @@ def test_rounding_keeps_what_is_not_finite(fused_ppo):
     assert as_tf32(odd)[:2].isnan().all() and torch.equal(as_tf32(odd)[2:], odd[2:])
 
 
-def test_what_the_kernels_cannot_do_is_said(tf32):
+def test_what_the_kernels_cannot_do_is_said():
     bounded = ActorCfg(distribution="tanh_gaussian", action_bound=1.0)
     actor, critic = networks()
     made = fused_networks(actor, critic)
     assert why_not_fused(PPOCfg(precision="bfloat16"), made, **SIZES) is None
-    assert why_not_fused(PPOCfg(), made, **SIZES) is None
-    torch.set_float32_matmul_precision("highest")
     assert "matmul_precision='highest'" in why_not_fused(PPOCfg(), made, **SIZES)
     torch.set_float32_matmul_precision("high")
+    assert why_not_fused(PPOCfg(), made, **SIZES) is None
     wide = fused_networks(*networks(hidden=(272, 32)))
     assert "wider than 256" in why_not_fused(PPOCfg(), wide, **SIZES)
     assert why_not_fused(PPOCfg(precision="bfloat16"), wide, **SIZES) is None
@@ -374,7 +367,8 @@ def test_what_the_kernels_cannot_do_is_said(tf32):
     assert update(PPOCfg(), actor, critic).metrics()["update/fused"] == 0.0
 
 
-def test_the_settings_of_the_control_suite_are_fused(tf32):
+def test_the_settings_of_the_control_suite_are_fused():
+    torch.set_float32_matmul_precision("high")
     cfg = training.ppo()
     # The sizes of a humanoid of CMU, which has the most.
     actor = make_actor(cfg.modules.actor, obs_dim=137, action_dim=56)

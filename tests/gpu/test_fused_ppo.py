@@ -19,13 +19,6 @@ ENVS, STEPS, OBS = 256, 24, 48
 DEVICE = torch.device("cuda")
 
 
-@pytest.fixture
-def tf32():
-    torch.set_float32_matmul_precision("high")
-    yield
-    torch.set_float32_matmul_precision("highest")
-
-
 def networks(*, hidden_dims=(512, 256, 128), action_dim=12, obs=OBS, activation="elu", **actor_options):
     torch.manual_seed(2)
     actor_cfg = ActorCfg(hidden_dims=hidden_dims, activation=activation, **actor_options)
@@ -119,7 +112,8 @@ def test_the_gradient_is_that_of_exact_products(network_options, symmetry):
         {"hidden_dims": (256, 128)},
     ],
 )
-def test_float32_is_rounded_as_by_torch(tf32, network_options):
+def test_float32_is_rounded_as_by_torch(network_options):
+    torch.set_float32_matmul_precision("high")
     actor, critic = networks(**network_options)
     rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE, obs=network_options.get("obs", OBS))
     one = {"precision": "float32", "minibatches": 1, "num_epochs": 1, "max_grad_norm": None}
