@@ -13,6 +13,7 @@ from torchrl.data import Composite
 
 from ksim_rl.checked import Checked, Count, Filled, Name, NonNegative
 from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.device.memory import ROLLOUT_PARTS
 from ksim_rl.device.running_moments import RunningMoments, publish
 from ksim_rl.modules.mlp import ACTIVATIONS, Device, mlp
 
@@ -74,8 +75,7 @@ def update_normalizers(tensordict: TensorDictBase, *networks: nn.Module) -> None
                 continue
             if id(normalizer) not in seen:
                 seen[id(normalizer)] = normalizer
-                # Some steps at a time: what is computed of them on the way takes four times their memory.
-                for part in _observation(tensordict, module, normalizer.dim).chunk(8, -2):
+                for part in _observation(tensordict, module, normalizer.dim).chunk(ROLLOUT_PARTS, -2):
                     normalizer.count_rows(part)
     publish([*seen.values()])
 
