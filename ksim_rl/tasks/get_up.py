@@ -22,8 +22,6 @@ from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.fields import root_height
 from ksim_rl.scene.robots.legged_robot import LeggedRobot
 from ksim_rl.scene.robots.own_robots import Humanoid, Quadruped
-from ksim_rl.scene.scene import SceneCfg
-from ksim_rl.scene.terrains import PlaneTerrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import velocity
 from ksim_rl.tasks.planar import upright
@@ -102,12 +100,7 @@ def get_up_cfg(
     return ManagerBasedRlEnvCfg(
         decimation=4,
         sim=velocity.sim(),
-        scene=SceneCfg(
-            robots={robot.name: robot},
-            terrain=PlaneTerrain(),
-            num_envs=4096,
-            soft_joint_pos_limit_factor=robot.soft_joint_pos_limit_factor,
-        ),
+        scene=velocity.on_plane(robot),
         observations=_observations(robot),
         actions={"joint_pos": mdp.JointPositionAction(joints=robot.joint_names, scale=action_scale)},
         rewards={
