@@ -135,11 +135,16 @@ class ObservingNetwork(nn.Module):
 
     def __init__(self, cfg: NetworkCfg, *, obs_dim: int, device: Device = None) -> None:
         super().__init__()
+        self.obs_dim = obs_dim
         self.normalizer = ObservationNormalizer(obs_dim, device=device) if cfg.obs_normalization else None
 
     def observe(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch L"]:
-        """Return what the first layer reads: observations side by side, normalized."""
+        """Return what the first layer reads: observations side by side, normalized; a ValueError for another number."""
         obs = side_by_side(observations)
+        if obs.shape[-1] != self.obs_dim:
+            raise ValueError(
+                f"the network was built for obs_dim={self.obs_dim}, and reads observations of {obs.shape[-1]} numbers"
+            )
         return obs if self.normalizer is None else self.normalizer(obs)
 
 
