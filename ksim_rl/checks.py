@@ -7,11 +7,11 @@ from numbers import Real
 from typing import NoReturn
 
 
-def near(name: str, choices: Iterable[str], *, limit: int = 3) -> str:
+def near(name: str, choices: Iterable[str]) -> str:
     """Return a hint with the choices that resemble `name`, or with all of them when none does."""
     choices = sorted(set(choices))
     lower = {choice.lower(): choice for choice in choices}
-    close = [lower[match] for match in difflib.get_close_matches(name.lower(), lower, n=limit, cutoff=0.6)]
+    close = [lower[match] for match in difflib.get_close_matches(name.lower(), lower, n=3, cutoff=0.6)]
     if close:
         return f"did you mean {' or '.join(repr(choice) for choice in close)}?"
     if not choices:

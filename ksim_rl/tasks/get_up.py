@@ -89,13 +89,12 @@ def get_up_cfg(
     *,
     standing_height: float,
     drop_height: tuple[float, float],
-    bend: float = 0.6,
     action_scale: Mapping[str, float],
     viewer: ViewerCfg,
 ) -> ManagerBasedRlEnvCfg:
     """Return the config: 50 Hz control for 6 s, for a root that stands at `standing_height`, m.
 
-    Episodes start `drop_height` (m) above that, with joints up to `bend` (rad) from the default pose.
+    Episodes start `drop_height` (m) above that, with joints up to 0.6 rad from the default pose.
     """
     return ManagerBasedRlEnvCfg(
         decimation=4,
@@ -119,7 +118,7 @@ def get_up_cfg(
                     **dict.fromkeys(("roll", "pitch", "yaw"), (-math.pi, math.pi)),
                 }
             ),
-            "bend": mdp.ResetJoints(position_range=(-bend, bend)),
+            "bend": mdp.ResetJoints(position_range=(-0.6, 0.6)),
             "encoder_bias": mdp.RandomizeEncoderBias(ranges=(-0.015, 0.015)),
             "foot_friction": velocity.foot_friction(robot, low=0.4, high=1.2),
         },
