@@ -1,15 +1,17 @@
 """These checks refuse values by a ValueError, which names the field, the value and what would be valid."""
 
+import argparse
 import difflib
 from collections.abc import Iterable
 from numbers import Real
+from typing import NoReturn
 
 
-def near(name: str, choices: Iterable[str], *, limit: int = 3) -> str:
+def near(name: str, choices: Iterable[str]) -> str:
     """Return a hint with the choices that resemble `name`, or with all of them when none does."""
     choices = sorted(set(choices))
     lower = {choice.lower(): choice for choice in choices}
-    close = [lower[match] for match in difflib.get_close_matches(name.lower(), lower, n=limit, cutoff=0.6)]
+    close = [lower[match] for match in difflib.get_close_matches(name.lower(), lower, n=3, cutoff=0.6)]
     if close:
         return f"did you mean {' or '.join(repr(choice) for choice in close)}?"
     if not choices:
@@ -65,3 +67,11 @@ def check_pair(field: str, value: object, *, low: float | None = None, high: flo
         check_in_range(f"{field}[{index}]", number, low=low, high=high)
     if value[0] > value[1]:
         raise ValueError(f"{field}={value!r}: low exceeds high; expected a pair (low, high)")
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Refuses the arguments of a command by a ValueError too, which `ksim-rl` says in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise it, for `ksim-rl` to report."""
+        raise ValueError(f"{message} (see {self.prog} --help)")

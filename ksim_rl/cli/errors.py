@@ -1,6 +1,5 @@
 """This module turns an error into one line for the user and an exit code."""
 
-import argparse
 import os
 import signal
 import sys
@@ -8,7 +7,6 @@ import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NoReturn
 
 REFUSED, FAILED = 2, 3
 
@@ -54,11 +52,3 @@ def say(text: str) -> None:
     """Print one line of the program's own on stderr, and which of several ranks says it."""
     rank = f"rank {os.environ['RANK']}: " if os.environ.get("WORLD_SIZE", "1") != "1" else ""
     print(f"ksim-rl: {rank}{text}", file=sys.stderr)
-
-
-class OneLineParser(argparse.ArgumentParser):
-    """Answers wrong arguments in one line, as all other errors."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raise what `main` reports."""
-        raise ValueError(f"{message} (see {self.prog} --help)")

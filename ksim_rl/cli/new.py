@@ -11,7 +11,7 @@ from string import Template
 from rich.pretty import pretty_repr
 
 from ksim_rl import envs
-from ksim_rl.cli.errors import OneLineParser
+from ksim_rl.checks import OneLineParser
 from ksim_rl.cli.report import shown, shown_working
 from ksim_rl.physics import load_spec
 from ksim_rl.scene.robots import analyse

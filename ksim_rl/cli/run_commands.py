@@ -6,7 +6,8 @@ from pathlib import Path
 import torch
 
 from ksim_rl import conf, envs, ranks
-from ksim_rl.cli.errors import OneLineParser, say
+from ksim_rl.checks import OneLineParser, check_count
+from ksim_rl.cli.errors import say
 from ksim_rl.cli.report import run_and_report, shown_working, verdict
 from ksim_rl.cli.runs import print_table
 from ksim_rl.config.plain_data import check_links
@@ -14,6 +15,7 @@ from ksim_rl.envs.contract import part
 from ksim_rl.objectives import AMPCfg
 from ksim_rl.scene.robots import analyse
 from ksim_rl.scene.robots.analysis import TRIAL_S
+from ksim_rl.tracking.trials import run_trials
 from ksim_rl.trainers import RunCfg, checkpoint
 from ksim_rl.trainers.build import build_evaluator, solved_at
 from ksim_rl.trainers.run_cfg import check_run_tree
@@ -83,20 +85,31 @@ def _on_these_ranks(cfg: RunCfg, saved: checkpoint.Checkpoint) -> RunCfg:
 def evaluate(arguments: list[str]) -> int:
     """Evaluate a policy and print the verdict."""
     parser = _parser("eval", "Evaluate a policy: deterministic actions, fresh envs, whole episodes.")
-    parser.add_argument("--episodes", type=int, help="default: as the run was configured")
+    number = parser.add_mutually_exclusive_group()
+    number.add_argument("--episodes", type=int, help="default: as the run was configured")
+    number.add_argument("--trials", type=int, help="of a tracking run: how many follow the motion to its end")
+    parser.add_argument("--pushes", action="store_true", help="of trials: push the robot as in training")
     parser.add_argument("--seed", type=int, help="of the initial states; default: the run's evaluation seed")
     options = parser.parse_args(arguments)
-    if options.episodes is not None and options.episodes < 1:
-        raise ValueError(f"--episodes {options.episodes}: expected at least 1")
+    for name in ("episodes", "trials"):
+        if getattr(options, name) is not None:
+            check_count(f"--{name}", getattr(options, name))
+    if options.pushes and options.trials is None:
+        raise ValueError("--pushes: it is of trials: give their number, --trials 1024")
     with shown_working("evaluating"):
         run = locate(options.run, note=say)
         policy = policy_of(checkpoint.load_latest(run, note=say), device=options.device)
+        judged = f"{policy.cfg.task_name}, iteration {policy.iteration}"
+        if options.trials is not None:
+            how = {"trials": options.trials, "seed": options.seed, "pushes": options.pushes}
+            print(f"{judged}: {run_trials(policy.cfg, policy.actor, **how)}")
+            return 0
         episodes = options.episodes or policy.cfg.trainer.eval_episodes or 100
         evaluate = build_evaluator(policy.cfg, policy.actor, episodes=episodes, seed=options.seed)
         evaluation = evaluate()
     assert evaluation is not None
     threshold = solved_at(policy.cfg)
-    print(f"{policy.cfg.task_name}, iteration {policy.iteration}: {verdict(evaluation, threshold)}")
+    print(f"{judged}: {verdict(evaluation, threshold)}")
     return 0 if threshold is None or evaluation.return_mean >= threshold else 1
 
 

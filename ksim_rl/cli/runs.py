@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ksim_rl.cli.errors import OneLineParser
+from ksim_rl.checks import OneLineParser
 from ksim_rl.cli.report import shown
 from ksim_rl.runs import comparison, listing
 

@@ -1,12 +1,11 @@
 """`ksim-rl motion` turns recordings into motion files of a robot: from CSV, BVH or AMASS-like archives."""
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
 
-from ksim_rl.checks import near
+from ksim_rl.checks import OneLineParser, near
 from ksim_rl.clips.amass import HEIGHT, read_amass
 from ksim_rl.clips.bvh import read_bvh
 from ksim_rl.clips.motion_file import write_motion
@@ -50,8 +49,8 @@ def motion(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="ksim-rl motion", description=__doc__)
+def _parser() -> OneLineParser:
+    parser = OneLineParser(prog="ksim-rl motion", description=__doc__)
     kinds = parser.add_subparsers(dest="kind", required=True)
     for kind, said in (
         ("csv", "root position, quaternion (x, y, z, w) and joints of the robot itself"),

@@ -203,6 +203,15 @@ def _default_class(annotation: Any) -> Any:
 
 
 def _describe(annotation: Any) -> str:
-    if isinstance(annotation, type) and typing.get_origin(annotation) is None:
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin in (Union, types.UnionType):
+        return " or ".join(map(_describe, arguments))
+    if origin in (tuple, list, collections.abc.Sequence):
+        return f"a list of {', '.join(_describe(kind) for kind in arguments if kind is not ...)}"
+    if origin in _MAPPINGS:
+        return f"a mapping from {_describe(arguments[0])} to {_describe(arguments[1])}"
+    if annotation in (None, types.NoneType):
+        return "null"
+    if isinstance(annotation, type):
         return annotation.__name__
     return str(annotation).replace("typing.", "").replace("collections.abc.", "")

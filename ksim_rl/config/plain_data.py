@@ -2,7 +2,7 @@
 
 import os
 import stat
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -81,6 +81,15 @@ def check_plain(tree: Any, where: str) -> None:
             check_plain(entry, f"{where}[{index}]")
     elif isinstance(tree, str) and "${" in tree:
         raise ValueError(f"{where}={tree[:80]!r}: an interpolation, and a run's config holds values only")
+
+
+def flat(tree: Mapping[Any, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield what is in a tree by dotted path, mappings that have entries by these."""
+    for key, value in tree.items():
+        if isinstance(value, Mapping) and value:
+            yield from flat(value, f"{path}{key}.")
+        else:
+            yield f"{path}{key}", value
 
 
 def check_links(folder: Path, *, below: Sequence[str]) -> None:

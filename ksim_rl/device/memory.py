@@ -10,6 +10,8 @@ import torch
 
 from ksim_rl.device.upstream import ALLOCATION_REFUSALS
 
+# In so many parts a rollout is read: what is computed of one on the way takes several times its memory.
+ROLLOUT_PARTS = 4
 _UNITS = {None: 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 
 

@@ -1,11 +1,11 @@
 """`ksim-rl diagnose RUN` names the faults of learning that the metrics of a run show, and what to change."""
 
-import argparse
 import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from ksim_rl.checks import OneLineParser
 from ksim_rl.diagnosis.curves import LEAST_ROWS, Curves, read_run
 from ksim_rl.diagnosis.faults import EXPLAINS, FAULTS
 
@@ -55,7 +55,7 @@ def one_line(folder: Path, name: str) -> str:
 
 def command(arguments: Sequence[str]) -> int:
     """Run `ksim-rl diagnose <arguments>`; the exit code is 1 where there is a fault."""
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="ksim-rl diagnose",
         description="Name the faults of learning that the metrics of a run show; the run may be under way.",
     )

@@ -3,7 +3,6 @@
 What it prints is meant for a bug report: no names of host and user are in it. A fault is one line, and the exit code 1.
 """
 
-import argparse
 import getpass
 import os
 import subprocess
@@ -17,6 +16,7 @@ from pathlib import Path
 import torch
 import warp as wp
 
+from ksim_rl.checks import OneLineParser
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.device.streams import start_warp, warp_device
 from ksim_rl.diagnosis.self_test import try_device
@@ -74,7 +74,7 @@ def examine(*, test_devices: bool = True) -> Report:
 
 def command(arguments: Sequence[str]) -> int:
     """Run `ksim-rl doctor <arguments>`; the exit code is 1 where there is a fault."""
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="ksim-rl doctor",
         description="Check this machine, and print what a bug report needs. The first time, kernels are compiled.",
     )

@@ -16,6 +16,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ksim_rl import dims
+from ksim_rl.device.state_tree import copy_into
 from ksim_rl.device.streams import checked_device
 from ksim_rl.envs.contract import DifficultyLevels, EpisodeClock, EpisodeSums, Pictures, SimulatedWorld
 from ksim_rl.envs.drawing import Drawing, drawings
@@ -339,19 +340,8 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             kept = self.world.state_dict()
             of_world = kept | {name: value for name, value in of_world.items() if name in kept}
             given = {name: given.get(name, buffer) for name, buffer in own.items()}
-        if own.keys() != given.keys():
-            raise ValueError(
-                f"state of another env: missing {sorted(own.keys() - given.keys())}, "
-                f"unknown {sorted(given.keys() - own.keys())}"
-            )
-        for name, buffer in own.items():
-            if buffer.shape != given[name].shape:
-                raise ValueError(
-                    f"state of another env: {name} has shape {tuple(given[name].shape)}, expected {tuple(buffer.shape)}"
-                )
-            buffer.copy_(given[name])
+        copy_into(own, given, what="state of an env (of the same config and num_envs)")
         self.world.load_state_dict(of_world)
-        self.world.refresh()
         self.driver.refreshed()
         self.cfg = dataclasses.replace(self.cfg, seed=int(self.view.seed))
 

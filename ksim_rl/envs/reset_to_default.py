@@ -17,11 +17,5 @@ class ResetToDefault(EventTerm):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Write positions; the masked reset has already zeroed the velocities."""
         qpos_EL = view.default_qpos_L.expand(view.num_envs, -1)
-        if not view.terrain.is_flat:
-            qpos_EL = qpos_EL.clone()
-            for entity in view.entities.values():
-                if entity.free_root:
-                    start = entity.root_qpos.start
-                    qpos_EL[:, start : start + 3] += view.terrain.origins_E3
-        view.write_qpos(mask_E, qpos_EL)
+        view.write_qpos(mask_E, qpos_EL if view.terrain.is_flat else view.at_origins(qpos_EL))
         view.write_qvel(mask_E, torch.zeros_like(view.world.qvel_EL))

@@ -200,7 +200,7 @@ def _ratios(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     return np.where(still, 1.0, (ours * theirs).sum(0) / np.where(still, 1.0, power))
 
 
-def _order(ours: np.ndarray, theirs: np.ndarray, tolerance: float = LIKE) -> list[int] | None:
+def _order(ours: np.ndarray, theirs: np.ndarray) -> list[int] | None:
     """Return the order of our columns in which they match theirs, or None if there is no other one that does."""
     if ours.shape[1] < 2:
         return None
@@ -210,7 +210,7 @@ def _order(ours: np.ndarray, theirs: np.ndarray, tolerance: float = LIKE) -> lis
     own = np.arange(len(order))
     order = np.where(apart[own, own] <= apart[own, order] + 1e-9, own, order)
     is_other = sorted(order) == list(own) and (order != own).any()
-    matches = _error(ours[:, order], theirs) <= tolerance
+    matches = _error(ours[:, order], theirs) <= LIKE
     return order.tolist() if is_other and matches else None
 
 

@@ -1,6 +1,5 @@
 """This module is the commands `ksim-rl export` and `ksim-rl sim2sim`, and the report of the second one."""
 
-import argparse
 import json
 import subprocess
 import sys
@@ -12,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ksim_rl.checks import OneLineParser
 from ksim_rl.export.causes import Cause, find_causes
 from ksim_rl.export.folder import export, runner_source
 from ksim_rl.export.standalone.signals import read_arrays, read_json
@@ -120,7 +120,7 @@ def ratio_error(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 def run_export(arguments: Sequence[str]) -> int:
     """Run `ksim-rl export RUN`."""
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="ksim-rl export", description="Write a policy into a folder that runs without this library."
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="a run folder, or one of its checkpoints")
@@ -140,7 +140,7 @@ def run_export(arguments: Sequence[str]) -> int:
 
 def run_sim2sim(arguments: Sequence[str]) -> int:
     """Run `ksim-rl sim2sim DIR`; the code is 1 where single steps differ."""
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="ksim-rl sim2sim", description="Run an exported policy on MuJoCo's C engine, and compare."
     )
     parser.add_argument("folder", type=Path, metavar="DIR", help="what `ksim-rl export` wrote")

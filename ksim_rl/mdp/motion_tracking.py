@@ -145,14 +145,11 @@ class ResetToMotion(OfMotion, EventTerm):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         motion, start_E = view.motion(self.file), motion_start_time(view, self.file)
-        drawn_E = view.uniform(1, *self.start_range)[:, 0] * motion.duration_s
-        start_E.copy_(torch.where(mask_E, drawn_E, start_E))
+        start_E.copy_(torch.where(mask_E, self.draw_share(view) * motion.duration_s, start_E))
         qpos_EL, qvel_EL = motion.sample(start_E)
-        shift_E3 = motion_shift(view)
-        if shift_E3 is not None:
-            for entity in view.entities.values():
-                if entity.free_root:
-                    start = entity.root_qpos.start
-                    qpos_EL[:, start : start + 3] += shift_E3
-        view.write_qpos(mask_E, qpos_EL)
+        view.write_qpos(mask_E, qpos_EL if motion_shift(view) is None else view.at_origins(qpos_EL))
         view.write_qvel(mask_E, qvel_EL)
+
+    def draw_share(self, view: EnvView) -> Float[Tensor, " E"]:
+        """Draw where in the motion each env would begin, as a share of its duration."""
+        return view.uniform(1, *self.start_range)[:, 0]

@@ -6,7 +6,6 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Float
 from tensordict.nn import TensorDictModule
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType
@@ -97,25 +96,21 @@ class SquashedPolicy(BoundedActor):
         return loc, (low + 0.5 * (high - low) * (raw.tanh() + 1.0)).exp()
 
 
-def make_deterministic_actor(
-    cfg: DeterministicActorCfg, *, in_key: NestedKey = "actor", **network: Any
-) -> TensorDictModule:
-    """Build a policy that reads `in_key` and writes "action" [..., action_dim], within the bounds of the spec."""
+def make_deterministic_actor(cfg: DeterministicActorCfg, **network: Any) -> TensorDictModule:
+    """Build a policy that reads "actor" and writes "action" [..., action_dim], within the bounds of the spec."""
     policy = DeterministicPolicy(cfg, **network)
-    return TensorDictModule(policy, in_keys=[in_key], out_keys=["action"])
+    return TensorDictModule(policy, in_keys=["actor"], out_keys=["action"])
 
 
-def make_squashed_actor(
-    cfg: SquashedActorCfg, *, in_key: NestedKey = "actor", **network: Any
-) -> ProbabilisticActor:
+def make_squashed_actor(cfg: SquashedActorCfg, **network: Any) -> ProbabilisticActor:
     """Build the policy as TorchRL's `ProbabilisticActor`, within the spec's bounds.
 
-    It reads `in_key` [..., obs_dim] and writes `loc`, `scale` (before squashing) and `action` [..., action_dim]. It
+    It reads "actor" [..., obs_dim] and writes `loc`, `scale` (before squashing) and `action` [..., action_dim]. It
     samples unless TorchRL's exploration type says otherwise; `ExplorationType.DETERMINISTIC` gives the median.
     """
     policy = SquashedPolicy(cfg, **network)
     return ProbabilisticActor(
-        TensorDictModule(policy, in_keys=[in_key], out_keys=["loc", "scale"]),
+        TensorDictModule(policy, in_keys=["actor"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         out_keys=["action"],
         distribution_class=TanhGaussian,

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from tensordict.nn import TensorDictModule
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import ValueOperator
 
@@ -89,15 +88,15 @@ class QNetwork(ObservingNetwork):
 
 
 def make_q_network(
-    cfg: QNetworkCfg, *, obs_dim: int, action_dim: int, in_key: NestedKey = "critic", device: Device = None
+    cfg: QNetworkCfg, *, obs_dim: int, action_dim: int, device: Device = None
 ) -> TensorDictModule:
-    """Build the networks as a TensorDict module, which reads `in_key` [..., obs_dim] and "action" [..., action_dim].
+    """Build the networks as a TensorDict module, which reads "critic" [..., obs_dim] and "action" [..., action_dim].
 
     It writes "state_action_value" [..., N], or with atoms "state_action_logits" [..., N, A].
     """
     network = QNetwork(cfg, obs_dim=obs_dim, action_dim=action_dim, device=device)
     out_key = "state_action_value" if cfg.num_atoms == 1 else "state_action_logits"
-    return TensorDictModule(network, in_keys=[in_key, "action"], out_keys=[out_key])
+    return TensorDictModule(network, in_keys=["critic", "action"], out_keys=[out_key])
 
 
 class Discriminator(nn.Module):

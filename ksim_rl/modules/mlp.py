@@ -35,7 +35,6 @@ def mlp(
     *,
     activation: str = "elu",
     layer_norm: bool = False,
-    hidden_gain: float = math.sqrt(2.0),
     output_gain: float = 1.0,
     num_networks: int | None = None,
     device: Device = None,
@@ -58,7 +57,7 @@ def mlp(
         layer, norm = partial(EnsembleLinear, num_networks), partial(EnsembleLayerNorm, num_networks)
     layers, width = nn.Sequential() if num_networks is None and not layer_norm else Layers(), input_dim
     for hidden_dim in hidden_dims:
-        layers.append(layer(width, hidden_dim, gain=hidden_gain, device=device))
+        layers.append(layer(width, hidden_dim, gain=math.sqrt(2.0), device=device))
         if layer_norm:
             layers.append(norm(hidden_dim, device=device))
         layers.append(ACTIVATIONS[activation]())

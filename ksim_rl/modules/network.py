@@ -13,6 +13,7 @@ from torchrl.data import Composite
 
 from ksim_rl.checked import Checked, Count, Filled, Name, NonNegative
 from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.device.memory import ROLLOUT_PARTS
 from ksim_rl.device.running_moments import RunningMoments, publish
 from ksim_rl.modules.mlp import ACTIVATIONS, Device, mlp
 
@@ -74,8 +75,7 @@ def update_normalizers(tensordict: TensorDictBase, *networks: nn.Module) -> None
                 continue
             if id(normalizer) not in seen:
                 seen[id(normalizer)] = normalizer
-                # Some steps at a time: what is computed of them on the way takes four times their memory.
-                for part in _observation(tensordict, module, normalizer.dim).chunk(8, -2):
+                for part in _observation(tensordict, module, normalizer.dim).chunk(ROLLOUT_PARTS, -2):
                     normalizer.count_rows(part)
     publish([*seen.values()])
 
@@ -135,11 +135,16 @@ class ObservingNetwork(nn.Module):
 
     def __init__(self, cfg: NetworkCfg, *, obs_dim: int, device: Device = None) -> None:
         super().__init__()
+        self.obs_dim = obs_dim
         self.normalizer = ObservationNormalizer(obs_dim, device=device) if cfg.obs_normalization else None
 
     def observe(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch L"]:
-        """Return what the first layer reads: observations side by side, normalized."""
+        """Return what the first layer reads: observations side by side, normalized; a ValueError for another number."""
         obs = side_by_side(observations)
+        if obs.shape[-1] != self.obs_dim:
+            raise ValueError(
+                f"the network was built for obs_dim={self.obs_dim}, and reads observations of {obs.shape[-1]} numbers"
+            )
         return obs if self.normalizer is None else self.normalizer(obs)
 
 

@@ -215,17 +215,17 @@ class RecurrentModule(TensorDictModule):
 
 
 def make_recurrent_actor(
-    cfg: RecurrentCfg, actor: ActorCfg, *, obs_dim: int, name: str = "actor", **options: Any
+    cfg: RecurrentCfg, actor: ActorCfg, *, obs_dim: int, **options: Any
 ) -> ProbabilisticTensorDictSequential:
     """Build a policy behind a recurrent module, which reads and normalizes what the policy would; see `make_actor`."""
-    return _made_behind(make_actor, cfg, actor, obs_dim=obs_dim, name=name, options=options)
+    return _made_behind(make_actor, cfg, actor, obs_dim=obs_dim, name="actor", options=options)
 
 
 def make_recurrent_critic(
-    cfg: RecurrentCfg, critic: CriticCfg, *, obs_dim: int, name: str = "critic", **options: Any
+    cfg: RecurrentCfg, critic: CriticCfg, *, obs_dim: int, **options: Any
 ) -> TensorDictModule:
     """Build a critic behind a recurrent module of its own; as `make_recurrent_actor`."""
-    return _made_behind(make_critic, cfg, critic, obs_dim=obs_dim, name=name, options=options)
+    return _made_behind(make_critic, cfg, critic, obs_dim=obs_dim, name="critic", options=options)
 
 
 def behind(recurrent: RecurrentModule, network: AnyModule) -> AnyModule:

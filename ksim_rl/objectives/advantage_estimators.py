@@ -52,8 +52,8 @@ class RolloutEstimator(ValueEstimatorBase):
     The forward reads no tensor value on the host: it can be captured in a CUDA graph and compiled. The value after a
     step is V of the true next observation, which at a truncation is the last one of the episode, before the reset;
     after a termination it is zero. Gradients are not tracked. The `critic` (`value_network` for TorchRL) computes
-    `state_value` and `("next", "state_value")` always anew; without one the data has them. With `flatten` it takes all
-    env states in one batch dim. A recurrent critic needs batch dims [E, T]: it runs through the rollout from the state
+    `state_value` and `("next", "state_value")` always anew; without one the data has them. It takes all env
+    states in one batch dim. A recurrent critic needs batch dims [E, T]: it runs through the rollout from the state
     of the first step, and the value after a step is that of the true next observation and the state after the step.
 
     A step whose reward or values are not finite gets a NaN advantage, so that `DatasetBuffer` removes it, and the
@@ -72,7 +72,6 @@ class RolloutEstimator(ValueEstimatorBase):
         critic: TensorDictModule | None = None,
         normalize_advantage: bool = False,
         time_dim: int = -1,
-        flatten: bool = True,
         device: torch.device | str | None = None,
         value_network: TensorDictModule | None = None,
         **options: Any,
@@ -87,7 +86,7 @@ class RolloutEstimator(ValueEstimatorBase):
             device=None if device is None else torch.device(device),
             **options,
         )
-        self.flatten, self.normalize_advantage = flatten, normalize_advantage
+        self.normalize_advantage = normalize_advantage
 
     @abstractmethod
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
@@ -185,7 +184,7 @@ class RolloutEstimator(ValueEstimatorBase):
         self, network: Callable[[TensorDictBase], Tensor], inputs: TensorDictBase, time_dim: int
     ) -> Tensor:
         """Return what `network` gives for `inputs` in one batch dim, with the batch dims of `inputs` again."""
-        if not self.flatten or inputs.batch_dims < 2:
+        if inputs.batch_dims < 2:
             return network(inputs)
         # Rows are taken in the order of the memory, which saves a copy of all observations.
         leaf = next(iter(inputs.values(include_nested=True, leaves_only=True)))

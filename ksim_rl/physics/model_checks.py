@@ -22,12 +22,29 @@ ENUM_FIELDS = {
     "geom_type": mujoco.mjtGeom,
     "sensor_type": mujoco.mjtSensor,
 }
-# What nobody means with a sign.
 MOST_TIMESTEP = 0.1
-_OPTIONS = "iterations ls_iterations ccd_iterations noslip_iterations sdf_iterations sdf_initpoints"
-NOT_NEGATIVE_OPTIONS = (*_OPTIONS.split(), "density", "viscosity", "impratio")
-_FIELDS = "dof_damping dof_frictionloss dof_armature tendon_damping tendon_frictionloss geom_friction"
-NOT_NEGATIVE_FIELDS = (*_FIELDS.split(), "pair_friction", "actuator_damping")
+# What nobody means with a sign.
+NOT_NEGATIVE_OPTIONS = (
+    "iterations",
+    "ls_iterations",
+    "ccd_iterations",
+    "noslip_iterations",
+    "sdf_iterations",
+    "sdf_initpoints",
+    "density",
+    "viscosity",
+    "impratio",
+)
+NOT_NEGATIVE_FIELDS = (
+    "dof_damping",
+    "dof_frictionloss",
+    "dof_armature",
+    "tendon_damping",
+    "tendon_frictionloss",
+    "geom_friction",
+    "pair_friction",
+    "actuator_damping",
+)
 CALLBACKS = {field: getattr(mujoco, f"get_mjcb_act_{field}") for field in ("dyn", "gain", "bias")}
 
 

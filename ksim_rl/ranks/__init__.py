@@ -9,5 +9,5 @@ from ksim_rl.ranks.group import first_row, rank, size
 from ksim_rl.ranks.heartbeat import at
 from ksim_rl.ranks.reduce import any_of, combined, gather, mean_, merged, most_of, sum_
 from ksim_rl.ranks.shards import dealt, gathered, share_of
-from ksim_rl.ranks.start import by_first, check_same, device, from_first, joined, restarted, run_folder
+from ksim_rl.ranks.start import by_first, check_same, device, joined, restarted, run_folder
 from ksim_rl.ranks.timing import Timing

@@ -91,11 +91,6 @@ def check_same(values: Mapping[str, Any], *, what: str) -> None:
                 )
 
 
-def from_first(value: str) -> str:
-    """Return the text that rank 0 has."""
-    return by_first(lambda: value)
-
-
 def by_first(function: Callable[[], str]) -> str:
     """Return what a function returns on rank 0, which alone calls it; an OSError there is raised on all ranks."""
     if group.size() == 1:

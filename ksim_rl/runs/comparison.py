@@ -1,13 +1,12 @@
 """Runs are compared: their figures, the fields of their configs that differ, and their curves in one picture."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ksim_rl.config.plain_data import read_yaml
+from ksim_rl.config.plain_data import flat, read_yaml
 from ksim_rl.runs import curves
 from ksim_rl.runs.csv_table import STEP
 from ksim_rl.runs.listing import CONFIG, HEADS, METRICS, line, metric_rows, numbers, summarize, written
@@ -39,7 +38,7 @@ def figures(folders: Sequence[Path]) -> list[list[str]]:
 
     A ValueError names a folder that is no run, or whose config cannot be read.
     """
-    configs = [dict(_flat(_config(folder))) for folder in folders]
+    configs = [_config(folder) for folder in folders]
     lines = [line(summarize(folder), name=name) for folder, name in zip(folders, names(folders), strict=True)]
     rows = [[head, *cells] for head, *cells in zip(HEADS, *lines, strict=True)]
     returns = [
@@ -79,16 +78,8 @@ def draw(folders: Sequence[Path], picture: Path) -> None:
     figure.savefig(picture, dpi=110)
 
 
-def _config(folder: Path) -> Mapping[str, Any]:
+def _config(folder: Path) -> dict[str, str]:
     tree = read_yaml(folder / CONFIG)
     if not isinstance(tree, dict):
         raise ValueError(f"{folder / CONFIG}: expected the config of a run")
-    return tree
-
-
-def _flat(tree: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, str]]:
-    for key, value in tree.items():
-        if isinstance(value, Mapping) and value:
-            yield from _flat(value, f"{path}{printable(str(key))}.")
-        else:
-            yield f"{path}{printable(str(key))}", printable(str(value))[:MOST_LETTERS]
+    return {printable(name): printable(str(value))[:MOST_LETTERS] for name, value in flat(tree)}

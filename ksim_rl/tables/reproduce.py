@@ -1,6 +1,5 @@
 """`ksim-rl reproduce TABLE` runs what a table lacks, and writes it as JSON, Markdown and a picture."""
 
-import argparse
 import math
 import re
 import time
@@ -9,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from ksim_rl.checks import check_in_range, near
+from ksim_rl.checks import OneLineParser, check_in_range, near
 from ksim_rl.tables import report
 from ksim_rl.tables.levels import is_reached
 from ksim_rl.tables.measure import run_cfg
@@ -63,8 +62,8 @@ def reproduce(arguments: Sequence[str]) -> int:
     return 1 if left or (missed and not smoke) else 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def _parser() -> OneLineParser:
+    parser = OneLineParser(
         prog="ksim-rl reproduce",
         description="Run what is missing of a table of results, and write the table. Results that are there stay.",
     )

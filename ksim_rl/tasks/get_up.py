@@ -22,8 +22,6 @@ from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.fields import root_height
 from ksim_rl.scene.robots.legged_robot import LeggedRobot
 from ksim_rl.scene.robots.own_robots import Humanoid, Quadruped
-from ksim_rl.scene.scene import SceneCfg
-from ksim_rl.scene.terrains import PlaneTerrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import velocity
 from ksim_rl.tasks.planar import upright
@@ -91,23 +89,17 @@ def get_up_cfg(
     *,
     standing_height: float,
     drop_height: tuple[float, float],
-    bend: float = 0.6,
     action_scale: Mapping[str, float],
     viewer: ViewerCfg,
 ) -> ManagerBasedRlEnvCfg:
     """Return the config: 50 Hz control for 6 s, for a root that stands at `standing_height`, m.
 
-    Episodes start `drop_height` (m) above that, with joints up to `bend` (rad) from the default pose.
+    Episodes start `drop_height` (m) above that, with joints up to 0.6 rad from the default pose.
     """
     return ManagerBasedRlEnvCfg(
         decimation=4,
         sim=velocity.sim(),
-        scene=SceneCfg(
-            robots={robot.name: robot},
-            terrain=PlaneTerrain(),
-            num_envs=4096,
-            soft_joint_pos_limit_factor=robot.soft_joint_pos_limit_factor,
-        ),
+        scene=velocity.on_plane(robot),
         observations=_observations(robot),
         actions={"joint_pos": mdp.JointPositionAction(joints=robot.joint_names, scale=action_scale)},
         rewards={
@@ -126,7 +118,7 @@ def get_up_cfg(
                     **dict.fromkeys(("roll", "pitch", "yaw"), (-math.pi, math.pi)),
                 }
             ),
-            "bend": mdp.ResetJoints(position_range=(-bend, bend)),
+            "bend": mdp.ResetJoints(position_range=(-0.6, 0.6)),
             "encoder_bias": mdp.RandomizeEncoderBias(ranges=(-0.015, 0.015)),
             "foot_friction": velocity.foot_friction(robot, low=0.4, high=1.2),
         },

@@ -69,6 +69,15 @@ class ForwardSpeed(MetricTerm):
         return forward_speed(view)
 
 
+def _own_state(motors: str) -> dict[str, ObservationTermCfg]:
+    """Return what each planar robot sees of itself."""
+    return {
+        "gravity": ObservationTermCfg(term=mdp.ProjectedGravity()),
+        "joint_pos": ObservationTermCfg(term=mdp.JointPos(joints=("root_z", motors))),
+        "joint_vel": ObservationTermCfg(term=mdp.JointVel()),
+    }
+
+
 def planar_cfg(
     robot: Robot, *, motors: str, reward: RewardTerm, decimation: int, step_dt: float, distance: float
 ) -> ManagerBasedRlEnvCfg:
@@ -77,16 +86,12 @@ def planar_cfg(
     The robot has the joints "root_x", "root_z" and "root_y", a root body "torso" and a sensor "com_velocity". The
     camera's `distance` is in m.
     """
-    terms = {
-        "gravity": ObservationTermCfg(term=mdp.ProjectedGravity()),
-        "joint_pos": ObservationTermCfg(term=mdp.JointPos(joints=("root_z", motors))),
-        "joint_vel": ObservationTermCfg(term=mdp.JointVel()),
-    }
+    seen = ObservationGroupCfg(terms=_own_state(motors))
     return ManagerBasedRlEnvCfg(
         decimation=decimation,
         scene=SceneCfg(robots={"robot": robot}, terrain=PlaneTerrain(), num_envs=2048),
         sim=SIM,
-        observations={"actor": ObservationGroupCfg(terms=terms), "critic": ObservationGroupCfg(terms=terms)},
+        observations={"actor": seen, "critic": seen},
         actions={"torque": mdp.JointEffortAction(joints=motors)},
         events={
             "height": mdp.ResetJoints(joints="root_z", position_range=(0.02, 0.08)),
@@ -291,17 +296,12 @@ def _motion_cfg(
     terms: Mapping[str, ObservationTermCfg], groups: Sequence[str] = ("actor", "critic"), **parts: Any
 ) -> ManagerBasedRlEnvCfg:
     """Put together what both tasks share: the robot, what it observes of itself and `terms`, and its servos."""
-    own = {
-        "gravity": ObservationTermCfg(term=mdp.ProjectedGravity()),
-        "joint_pos": ObservationTermCfg(term=mdp.JointPos(joints=("root_z", Walker.joints))),
-        "joint_vel": ObservationTermCfg(term=mdp.JointVel()),
-    }
-    robot = Walker(actuators=WALKER_SERVOS)
+    robot, seen = Walker(actuators=WALKER_SERVOS), {**_own_state(Walker.joints), **terms}
     return ManagerBasedRlEnvCfg(
         decimation=4,
         scene=SceneCfg(robots={"walker": robot}, terrain=PlaneTerrain(), num_envs=2048),
         sim=SIM,
-        observations=dict.fromkeys(groups, ObservationGroupCfg(terms={**own, **terms})),
+        observations=dict.fromkeys(groups, ObservationGroupCfg(terms=seen)),
         actions={"legs": mdp.JointPositionAction(joints=Walker.joints, scale=0.5)},
         episode_length_s=8.0,
         viewer=ViewerCfg(body="torso", distance=4.0, elevation=-10.0, azimuth=90.0),

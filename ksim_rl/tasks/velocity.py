@@ -220,6 +220,17 @@ def velocity_command() -> mdp.UniformVelocityCommand:
     )
 
 
+def on_plane(robot: LeggedRobot, sensors: Mapping[str, Sensor] | None = None) -> SceneCfg:
+    """Return the scene of a robot on a plane, 4096 times."""
+    return SceneCfg(
+        robots={robot.name: robot},
+        terrain=PlaneTerrain(),
+        sensors=sensors or {},
+        num_envs=4096,
+        soft_joint_pos_limit_factor=robot.soft_joint_pos_limit_factor,
+    )
+
+
 def velocity_cfg(
     robot: LeggedRobot,
     *,
@@ -246,13 +257,7 @@ def velocity_cfg(
     return ManagerBasedRlEnvCfg(
         decimation=4,
         sim=sim,
-        scene=SceneCfg(
-            robots={robot.name: robot},
-            terrain=PlaneTerrain(),
-            sensors={FEET: feet, **(sensors or {})},
-            num_envs=4096,
-            soft_joint_pos_limit_factor=robot.soft_joint_pos_limit_factor,
-        ),
+        scene=on_plane(robot, {FEET: feet, **(sensors or {})}),
         observations=observations,
         actions={"joint_pos": mdp.JointPositionAction(joints=robot.joint_names, scale=robot.action_scale)},
         commands={COMMAND: velocity_command() if command is None else command},

@@ -14,7 +14,7 @@ from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.events import Ranges, draw_by_axis
 from ksim_rl.mdp.motion_tracking import OfMotion, ResetToMotion
 from ksim_rl.scene import quaternion
-from ksim_rl.scene.state.motion_clock import motion_shift, motion_start_time, motion_time
+from ksim_rl.scene.state.motion_clock import motion_time
 
 
 def part_weights(view: EnvView, file: str, parts: int) -> Float[Tensor, "E B"]:
@@ -49,32 +49,22 @@ class StartInMotion(ResetToMotion):
     part_s: Positive | None = None
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        motion, start_E, robot = view.motion(self.file), motion_start_time(view, self.file), view.robot
-        drawn_E = self._share(view) * motion.duration_s
-        start_E.copy_(torch.where(mask_E, drawn_E, start_E))
-        qpos_EL, qvel_EL = motion.sample(start_E)
-        view.write_qpos(mask_E, qpos_EL)
-        view.write_qvel(mask_E, qvel_EL)
-
+        super().__call__(view, mask_E)
+        robot, joints = view.robot, view.joints()
+        # Velocities are those in the world, as in the motion: they do not turn with the error of the root's pose.
+        lin_vel_E3, ang_vel_E3 = robot.root_lin_vel_w_EL, robot.root_ang_vel_w_EL
         moved_E6, kick_E6 = (draw_by_axis(view, ranges) for ranges in (self.pose_range, self.velocity_range))
-        turn_E4 = quaternion.from_euler_xyz(*moved_E6[:, 3:].unbind(-1))
-        pos_E3, quat_E4 = qpos_EL[:, robot.root_qpos][:, :3], qpos_EL[:, robot.root_qpos][:, 3:]
-        shift_E3 = motion_shift(view)
-        pos_E3 = pos_E3 + moved_E6[:, :3] if shift_E3 is None else pos_E3 + moved_E6[:, :3] + shift_E3
-        robot.write_root_pose(mask_E, pos_E3, quaternion.multiply(turn_E4, quat_E4))
-        # As in the motion: what the root's velocity is in the world does not turn with the error of its pose.
-        free = slice(robot.root_qvel.start, robot.root_qvel.start + 3)
-        lin_vel_E3 = qvel_EL[:, free] + kick_E6[:, :3]
-        ang_vel_E3 = quaternion.rotate(quat_E4, qvel_EL[:, free.stop : free.stop + 3]) + kick_E6[:, 3:]
-        robot.write_root_velocity(mask_E, lin_vel_E3, ang_vel_E3)
-
-        joints = view.joints()
+        quat_E4 = quaternion.multiply(
+            quaternion.from_euler_xyz(*moved_E6[:, 3:].unbind(-1)), robot.root_quat_EL
+        )
+        robot.write_root_pose(mask_E, robot.root_pos_EL + moved_E6[:, :3], quat_E4)
+        robot.write_root_velocity(mask_E, lin_vel_E3 + kick_E6[:, :3], ang_vel_E3 + kick_E6[:, 3:])
         low_L, high_L = joints.soft_limits_L2.unbind(-1)
         off_EL = view.uniform(len(joints), -self.joint_range, self.joint_range)
-        joints.write_pos(mask_E, torch.clamp(qpos_EL[:, joints.qpos] + off_EL, low_L, high_L))
+        joints.write_pos(mask_E, torch.clamp(joints.pos_EL + off_EL, low_L, high_L))
 
-    def _share(self, view: EnvView) -> Tensor:
-        """Draw where in the motion each env would begin, as a share of its duration."""
+    def draw_share(self, view: EnvView) -> Float[Tensor, " E"]:
+        """Draw it from the curriculum's weights where there are some, else from the range."""
         drawn_E2 = view.uniform(2)
         low, high = self.start_range
         plain_E = low + (high - low) * drawn_E2[:, 0]

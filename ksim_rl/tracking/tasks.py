@@ -18,8 +18,6 @@ from ksim_rl.envs.term import EventTerm, RewardTerm
 from ksim_rl.modules import ActorCfg
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.scene.robots.unitree_g1 import SIDES, UnitreeG1
-from ksim_rl.scene.scene import SceneCfg
-from ksim_rl.scene.terrains import PlaneTerrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import velocity
 from ksim_rl.tasks.velocity import noisy
@@ -134,13 +132,7 @@ def track_cfg(file: str) -> ManagerBasedRlEnvCfg:
         decimation=4,
         # A robot that lies on its arms needs 221 rows, more than the probe of the model finds.
         sim=dataclasses.replace(velocity.sim(), njmax=256),
-        scene=SceneCfg(
-            robots={ROBOT.name: ROBOT},
-            terrain=PlaneTerrain(),
-            sensors=velocity.self_contact(ROBOT),
-            num_envs=4096,
-            soft_joint_pos_limit_factor=ROBOT.soft_joint_pos_limit_factor,
-        ),
+        scene=velocity.on_plane(ROBOT, velocity.self_contact(ROBOT)),
         observations=observations(file),
         actions={
             "joint_pos": terms.JointPositionAroundMotion(

@@ -15,6 +15,7 @@ from ksim_rl.checked import Positive
 from ksim_rl.envs.term import MetricTerm, ObservationTerm, TerminationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.actions import JointAction
+from ksim_rl.mdp.constants import constant
 from ksim_rl.mdp.fields import GaussianReward
 from ksim_rl.mdp.motion_tracking import OfMotion, OfMotionBodies
 from ksim_rl.scene import quaternion
@@ -25,19 +26,8 @@ from ksim_rl.tracking.reference import OfAlignedBodies, OfAnchor, motion_velocit
 
 def first_axes(quat_EN4: Float[Tensor, "E N 4"]) -> Float[Tensor, "E L"]:
     """Return the x, then the y axis of orientations, which say all of a rotation without a jump anywhere; flat."""
-    w_EN, x_EN, y_EN, z_EN = quat_EN4.unbind(-1)
-    axes_EN6 = torch.stack(
-        (
-            1.0 - 2.0 * (y_EN * y_EN + z_EN * z_EN),
-            2.0 * (x_EN * y_EN + w_EN * z_EN),
-            2.0 * (x_EN * z_EN - w_EN * y_EN),
-            2.0 * (x_EN * y_EN - w_EN * z_EN),
-            1.0 - 2.0 * (x_EN * x_EN + z_EN * z_EN),
-            2.0 * (y_EN * z_EN + w_EN * x_EN),
-        ),
-        dim=-1,
-    )
-    return axes_EN6.flatten(start_dim=1)
+    axes_1123 = constant((1.0, 0.0, 0.0, 0.0, 1.0, 0.0), quat_EN4.device).view(1, 1, 2, 3)
+    return quaternion.rotate(quat_EN4[:, :, None], axes_1123).flatten(start_dim=1)
 
 
 # -- observations ----------------------------------------------------------------------------------------------------

@@ -1,20 +1,14 @@
 """This module counts how often a policy follows a motion from its start to its end, over many trials in drawn worlds.
 
-    python -m ksim_rl.tracking.trials RUN [--trials 1024] [--pushes]
-
-The protocol is that of mjlab 1.x's evaluation of tracking policies (src/mjlab/tasks/tracking/scripts/evaluate.py):
-sensor noise, drawn worlds and errors at the start are on, pushes are off unless they are asked for, and a trial
-succeeds if the motion ends before a limit on errors ends the trial: 0.25 m in the height of the anchor and of feet and
-hands, 0.8 in how upright the anchor is (`ksim_rl.tracking.tasks`).
+`ksim-rl eval RUN --trials 1024` runs them. The protocol is that of mjlab 1.x's evaluation of tracking policies
+(src/mjlab/tasks/tracking/scripts/evaluate.py): sensor noise, drawn worlds and errors at the start are on, pushes are
+off unless they are asked for, and a trial succeeds if the motion ends before a limit on errors ends the trial: 0.25 m
+in the height of the anchor and of feet and hands, 0.8 in how upright the anchor is (`ksim_rl.tracking.tasks`).
 """
 
-import argparse
 import dataclasses
 import math
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -25,12 +19,9 @@ from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.mdp.events import PushByVelocity
 from ksim_rl.tracking.starts import StartInMotion
-from ksim_rl.trainers import RunCfg, checkpoint
+from ksim_rl.trainers import RunCfg
 from ksim_rl.trainers.build import EVALUATION_SEED_OFFSET, build_env
 from ksim_rl.trainers.evaluation import Evaluator
-from ksim_rl.trainers.run_folder import policy_of
-
-TRIALS = 1024
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +86,7 @@ def run_trials(
     cfg: RunCfg,
     actor: TensorDictModuleBase,
     *,
-    trials: int = TRIALS,
+    trials: int,
     seed: int | None = None,
     pushes: bool = False,
 ) -> Trials:
@@ -117,26 +108,3 @@ def run_trials(
     success = float(runner.ended_well_E.double().mean())
     env.close(raise_if_closed=False)
     return Trials(trials=trials, success=success, errors=dict(zip(base.cfg.metrics, errors, strict=True)))
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run trials of a run folder's policy and print what came of them."""
-    parser = argparse.ArgumentParser(
-        prog="python -m ksim_rl.tracking.trials", description="How often does a policy follow its motion?"
-    )
-    parser.add_argument("run", type=Path, metavar="RUN", help="a run folder, or one of its checkpoints")
-    parser.add_argument("--trials", type=int, default=TRIALS)
-    parser.add_argument("--seed", type=int, help="default: the run's evaluation seed")
-    parser.add_argument("--pushes", action="store_true", help="push the robot as in training")
-    parser.add_argument("--device", default="auto", help="cpu, cuda or auto")
-    options = parser.parse_args(arguments)
-    policy = policy_of(checkpoint.load_latest(options.run, note=print), device=options.device)
-    found = run_trials(
-        policy.cfg, policy.actor, trials=options.trials, seed=options.seed, pushes=options.pushes
-    )
-    print(f"{policy.cfg.task_name}, iteration {policy.iteration}: {found}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

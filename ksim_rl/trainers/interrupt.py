@@ -9,10 +9,12 @@ from types import FrameType
 class InterruptRequest:
     """While entered, the first signal is remembered instead of raised; a second one interrupts at once.
 
-    Outside the main thread, where Python allows no handlers, nothing is installed.
+    What is `said` then is what follows from it. Outside the main thread, where Python allows no handlers, nothing is
+    installed.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, said: str = "the run ends after this iteration; once more ends it at once") -> None:
+        self._said = said
         self.signal: signal.Signals | None = None
         self._previous: dict[signal.Signals, object] = {}
 
@@ -35,5 +37,4 @@ class InterruptRequest:
             raise KeyboardInterrupt(number)
         self.signal = signal.Signals(number)
         # Not through sys.stderr, which the signal may have found in the middle of a line.
-        text = f"ksim-rl: {self.signal.name}: the run ends after this iteration; once more ends it at once\n"
-        os.write(2, text.encode())
+        os.write(2, f"ksim-rl: {self.signal.name}: {self._said}\n".encode())

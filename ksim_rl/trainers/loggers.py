@@ -4,7 +4,7 @@ import importlib.util
 import os
 import re
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -113,18 +113,10 @@ def open_mlflow(cfg: MLflowCfg, run_folder: Path, config: Mapping[str, Any]) -> 
     if not resumes:
         path.write_text(logger.experiment.info.run_id)
         mlflow.set_tag("mlflow.runName", cfg.name or run_folder.name)
-        params = list(_flat(config))
+        params = [(name, str(value)[:_MAX_LETTERS]) for name, value in plain_data.flat(config)]
         for first in range(0, len(params), _MAX_PARAMS):
             mlflow.log_params(dict(params[first : first + _MAX_PARAMS]))
     return logger
-
-
-def _flat(tree: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, str]]:
-    for key, value in tree.items():
-        if isinstance(value, Mapping) and value:
-            yield from _flat(value, f"{path}{key}.")
-        else:
-            yield f"{path}{key}", str(value)[:_MAX_LETTERS]
 
 
 @dataclass(frozen=True, kw_only=True)

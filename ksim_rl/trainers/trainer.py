@@ -429,11 +429,11 @@ class Trainer:
         self.update.load_state_dict(state["update"])
         try:
             self.collector.env.load_state_dict(state["env"])
-        except RuntimeError as error:  # what torch raises for names and shapes
-            reason = " ".join(str(error).split())
+        except (RuntimeError, ValueError) as error:  # torch raises the first for names and shapes
+            reason = " ".join(str(error).split()).rstrip(".")
             raise ValueError(
-                f"the checkpoint is of another env, or of one that an earlier ksim_rl built: {reason} Its networks may "
-                "still fit: ksim-rl train checkpoint=RUN"
+                f"the checkpoint is of another env, or of one that an earlier ksim_rl built: {reason}. Its networks "
+                "may still fit: ksim-rl train checkpoint=RUN"
             ) from error
         self.collector.load_state_dict(state["collector"])
         for index, hook in enumerate(self._own_hooks):

@@ -1,5 +1,6 @@
 """A video of a policy consists of the pictures that its env renders while it acts."""
 
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl.envs.contract import Pictures, part
 from ksim_rl.runs.whole_file import whole_file
+from ksim_rl.trainers.interrupt import InterruptRequest
 
 # Pictures per second of simulated time. Software takes 50 to 90 ms for each, many times what a step of one env takes.
 FPS = 25.0
@@ -87,7 +89,11 @@ def _write(path: Path, first: np.ndarray, rest: Iterator[np.ndarray], *, fps: fl
     with whole_file(path) as temporary:
         writer: Any = imageio.get_writer(temporary, **options)
         with writer:
-            writer.append_data(first)
+            # Python drops what a handler raises while a process forks, as this one does for the encoder.
+            with InterruptRequest("the run ends when the encoder has started") as interrupt:
+                writer.append_data(first)
+            if interrupt.signal is not None:
+                signal.raise_signal(interrupt.signal)
             for frame in rest:
                 writer.append_data(frame)
     return path

@@ -27,10 +27,8 @@ def check_display() -> None:
     glfw.terminate()
 
 
-def show(
-    session: Session, *, note: Callable[[str], None], goes_on: Callable[[], bool] = lambda: True
-) -> None:
-    """Show a session in a window until that is closed, or `goes_on` says no; keys are those of `HELP`.
+def show(session: Session, *, note: Callable[[str], None]) -> None:
+    """Show a session in a window until that is closed; keys are those of `HELP`.
 
     Without a display it waits forever: see `check_display`.
     """
@@ -46,7 +44,7 @@ def show(
     window = mujoco.viewer.launch_passive(mj_model, data, key_callback=pressed, show_left_ui=False)
     said = ""
     with window:
-        while window.is_running() and goes_on():
+        while window.is_running():
             start = time.monotonic()
             session.advance()
             if session.error and session.error != said:

@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ksim_rl import conf
-from ksim_rl.checks import check_count, check_in_range
+from ksim_rl.checks import OneLineParser, check_count, check_in_range
 from ksim_rl.config.plain_data import check_links
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, record_video
@@ -108,8 +108,8 @@ def check_viser() -> None:
         raise ValueError('the browser viewer needs viser: pip install "ksim_rl[viewer]"')
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def _parser() -> OneLineParser:
+    parser = OneLineParser(
         prog="ksim-rl play",
         description="Show a policy, or with --agent a task without one: a video, or with --live a viewer to drive it.",
     )

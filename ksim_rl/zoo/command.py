@@ -1,12 +1,12 @@
 """This module is the command `ksim-rl zoo`, which lists the policies that come with the package and adds one."""
 
-import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ksim_rl.checks import OneLineParser
 from ksim_rl.zoo import adding
 from ksim_rl.zoo.cards import FOLDER, cards, read_card
 
@@ -15,7 +15,7 @@ ROW = "{:<20}{:<26}{:>12}{:>16}{:>10}  {}"
 
 def zoo(arguments: Sequence[str]) -> int:
     """List the policies, show one's card, or make an entry out of a run."""
-    parser = argparse.ArgumentParser(prog="ksim-rl zoo", description="List or add policies of the package.")
+    parser = OneLineParser(prog="ksim-rl zoo", description="List or add policies of the package.")
     parser.add_argument(
         "words", nargs="*", metavar="NAME | add RUN NAME", help="show a card, or make an entry"
     )

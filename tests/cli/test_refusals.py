@@ -3,6 +3,7 @@
 import pytest
 
 from ksim_rl.cli import run_commands
+from ksim_rl.cli.main import COMMANDS
 from ksim_rl.trainers import checkpoint
 from tests.conf.test_command_line import run
 
@@ -59,9 +60,10 @@ def test_a_run_folder_alone_is_answered_with_what_can_be_done_with_it(work, caps
         assert way in output.err
 
 
-@pytest.mark.parametrize("command", ["eval", "resume", "runs", "envs", "robot"])
+@pytest.mark.parametrize("command", sorted({*COMMANDS} - {"train", "warmup"}))
 def test_flags_that_do_not_exist_are_one_line_of_any_command(capsys, command):
-    code, output = run(capsys, command, "x", "--no-such-flag")
+    kind = {"new": ["robot"], "motion": ["csv", "source"]}.get(command, [])
+    code, output = run(capsys, command, *kind, "x", "--no-such-flag")
     assert code == 2 and output.err.count("\n") == 1 and "--no-such-flag" in output.err
 
 

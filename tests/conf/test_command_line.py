@@ -19,6 +19,11 @@ def run(capsys, *arguments):
 WRONG = [
     ("task=cartpole_balanc", "unknown task 'cartpole_balanc': did you mean 'cartpole_balance'"),
     ("taks=cartpole_balance", "unknown field 'taks': did you mean 'task'"),
+    (
+        "rewards.balance.weight=2",
+        "unknown field 'rewards.balance.weight': did you mean 'task.rewards.balance.weight'",
+    ),
+    ("gamma=0.9", "unknown field 'gamma': did you mean 'objective.gamma'"),
     ("objective=ppoo", "unknown objective 'ppoo': did you mean 'ppo'"),
     ("nun_envs=3", "did you mean 'num_envs'"),
     ("objective.learning_rat=1", "objective has no field 'learning_rat': did you mean 'learning_rate'"),

@@ -249,7 +249,7 @@ def test_state_dict_continues_bit_exactly():
 
 
 def test_state_of_another_env_is_refused():
-    with pytest.raises(ValueError, match="another env"):
+    with pytest.raises(ValueError, match="state of an env .of the same config and num_envs"):
         puck_env(num_envs=2).load_state_dict(puck_env(num_envs=3).state_dict())
 
 

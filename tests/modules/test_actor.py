@@ -32,6 +32,12 @@ def test_writes_what_torchrl_losses_read(cfg, shape):
     torch.testing.assert_close(out["action_log_prob"], expected)
 
 
+@pytest.mark.parametrize("cfg", CFGS)
+def test_observations_of_another_size_are_refused(cfg):
+    with pytest.raises(ValueError, match="built for obs_dim=7, and reads observations of 5 numbers"):
+        make_actor(cfg, obs_dim=7, action_dim=2)(_data(4))
+
+
 def test_first_policy_acts_around_zero_with_init_std():
     actor = make_actor(ActorCfg(hidden_dims=(64, 64), init_std=0.5), obs_dim=5, action_dim=2)
     out = actor(_data(1000))

@@ -22,9 +22,9 @@ def test_no_hidden_layer_is_linear():
 
 
 def test_weights_are_orthogonal_with_the_gains():
-    network = mlp(32, (32, 32), 32, hidden_gain=1.5, output_gain=0.01)
+    network = mlp(32, (32, 32), 32, output_gain=0.01)
     weights = [layer.weight for layer in network if isinstance(layer, torch.nn.Linear)]
-    for weight, gain in zip(weights, (1.5, 1.5, 0.01), strict=True):
+    for weight, gain in zip(weights, (2.0**0.5, 2.0**0.5, 0.01), strict=True):
         torch.testing.assert_close(weight @ weight.T, gain**2 * torch.eye(32), atol=1e-5, rtol=1e-4)
 
 

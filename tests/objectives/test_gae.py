@@ -42,12 +42,10 @@ def test_memory_layout_names_and_time_dim_do_not_matter():
     layouts = {
         "transposed view": (time_major.transpose(0, 1), -1),
         "time first": (time_major, 0),
-        "no flattening": (data.clone(), -1),
         "names": (data.clone().refine_names(..., "T"), 1),
     }
     layouts["names"][0].names = ["time", "E"]
     for name, (layout, time_dim) in layouts.items():
-        gae.flatten = name != "no flattening"
         out = gae(layout, time_dim=time_dim)
         for key in OUT_KEYS:
             leaf = out[key].transpose(0, 1) if time_dim == 0 else out[key]

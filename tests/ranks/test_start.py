@@ -21,7 +21,7 @@ def test_a_process_alone_joins_nobody(monkeypatch):
     monkeypatch.delenv("WORLD_SIZE", raising=False)
     with ranks.joined("train"):
         assert (ranks.rank(), ranks.size(), ranks.first_row(8), ranks.device("cuda")) == (0, 1, 0, "cuda")
-    assert ranks.from_first("here") == "here"
+    assert ranks.by_first(lambda: "here") == "here"
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,12 @@ def everything():
     except ValueError as error:
         refused = str(error)
     others = [{"seed": 2, "task": {"dt": 0.01}}, {"seed": 1, "task": {}}, {"seed": 1, "task": {"dt": 0.01}}]
-    return [said(values) for values in others], one_error(), ranks.from_first(f"of {ranks.rank()}"), refused
+    return (
+        [said(values) for values in others],
+        one_error(),
+        ranks.by_first(lambda: f"of {ranks.rank()}"),
+        refused,
+    )
 
 
 def test_ranks_with_other_configs_are_refused_on_all_of_them(tmp_path):

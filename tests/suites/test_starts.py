@@ -101,7 +101,7 @@ def test_the_variants_of_the_pendulum_start_over_all_angles_and_over_half():
 
 
 def test_without_the_package_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("ksim_rl.suites.dm_control.models.find_spec", lambda name: None)
+    monkeypatch.setattr("ksim_rl.suites.foreign_models.find_spec", lambda name: None)
     assert "dm_control_humanoid_walk" in envs.names()
     with pytest.raises(ValueError, match=r"pip install 'ksim_rl\[dm_control\]'"):
         DmControlModel(domain="humanoid").spec()

@@ -77,7 +77,7 @@ def test_failures_in_one_part_bring_more_starts_there():
     assert weights_B.sum().item() == pytest.approx(1.0)
     assert weights_B.argmax() == part and level.item() == pytest.approx(0.5 + 0.5 / 9, abs=0.02)
     with env.driver.scope("events/start", view.reset_count_E):
-        share_E = env.cfg.events["start"]._share(view)
+        share_E = env.cfg.events["start"].draw_share(view)
     begins = np.histogram(share_E.numpy(), bins=9, range=(0.0, 1.0))[0] / 256
     assert begins[part] == pytest.approx(weights_B[part].item(), abs=0.1)
     assert (begins > 0.01).all(), "half of the starts are spread evenly"

@@ -8,10 +8,13 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from ksim_rl import conf
+from ksim_rl.cli import run_commands
 from ksim_rl.scene.motions.motion import motion_path
 from ksim_rl.tracking.starts import StartInMotion
 from ksim_rl.tracking.tasks import HEIGHT_LIMIT, TASKS, UPRIGHT_LIMIT, track_cfg
 from ksim_rl.tracking.trials import run_trials, trial_cfg
+from ksim_rl.trainers.run_folder import Policy
+from tests.conf.test_command_line import run
 from tests.tracking.g1 import g1_model
 
 STEPS = 12
@@ -48,6 +51,21 @@ def test_all_succeed_whom_no_limit_ends(short_clip):
     assert (found.trials, found.success) == (6, 1.0)
     assert 0.005 < found.errors["body_pos_error"] < 0.2
     assert "100.0% of 6 trials succeed" in str(found)
+
+
+def test_the_command_says_how_many_succeed(short_clip, monkeypatch, capsys):
+    policy = Policy(cfg=run_cfg(short_clip, distance=10.0), actor=still(), iteration=7)
+    monkeypatch.setattr(run_commands.checkpoint, "load_latest", lambda path, note: None)
+    monkeypatch.setattr(run_commands, "policy_of", lambda saved, device: policy)
+    code, output = run(capsys, "eval", "some_run", "--trials", "6")
+    assert code == 0 and "g1_track_walk, iteration 7: 100.0% of 6 trials succeed" in output.out
+    for words, message in (
+        (("--trials", "0"), "--trials=0: expected a whole number >= 1"),
+        (("--trials", "6", "--episodes", "6"), "not allowed with argument --trials"),
+        (("--pushes",), "give their number"),
+    ):
+        code, output = run(capsys, "eval", "some_run", *words)
+        assert code == 2 and message in output.err
 
 
 def test_none_succeeds_where_the_limit_is_tight(short_clip):

@@ -122,6 +122,18 @@ def test_a_checkpoint_of_another_transform_is_refused_and_its_networks_still_fit
         assert torch.equal(value, saved.state["update"]["actor"][key])
 
 
+def test_what_an_env_refuses_of_a_checkpoint_is_said_with_the_way_out(tmp_path, monkeypatch):
+    trained(tmp_path, iterations=1)
+    trainer = make_trainer()
+
+    def refuse(*_, **__):
+        raise ValueError("state of an env: the checkpoint has no 'clock'")
+
+    monkeypatch.setattr(trainer.collector.env, "load_state_dict", refuse)
+    with pytest.raises(ValueError, match="another env.* has no 'clock'. Its networks.*train checkpoint=RUN"):
+        trainer.load_state_dict(checkpoint.load_latest(tmp_path).state)
+
+
 def test_a_resumed_run_in_real_physics_is_bit_identical(tmp_path):
     overrides = [
         "task=cartpole_swingup",

@@ -36,6 +36,9 @@ def test_plain_data_rebuilds_an_equal_config(cfg):
         ("trainer.matmul_precision", "hig", r"trainer.matmul_precision='hig': did you mean 'high'"),
         ("trainer.video_s", -1.0, r"trainer.video_s=-1.0: expected a finite number in \(0"),
         ("objective.gamma", 1.5, r"objective.gamma=1.5: expected a finite number in"),
+        ("modules.actor.hidden_dims", 64, "modules.actor.hidden_dims=64: expected a list of int"),
+        ("trainer.stop_at", 3, "trainer.stop_at=3: expected a mapping from str to float or null"),
+        ("task.scene.robots", 3, "task.scene.robots=3: expected a mapping from str to Robot"),
         ("modules.actor.hidden_dims", [64, "x"], r"modules.actor.hidden_dims\[1\]='x': expected int"),
         (
             "modules.actor.activatio",

@@ -1,5 +1,9 @@
 """Videos of what `env.render()` shows."""
 
+import os
+import signal
+from contextlib import suppress
+
 import imageio.v2 as imageio
 import numpy as np
 import pytest
@@ -85,6 +89,35 @@ def test_without_an_encoder_there_is_a_gif(tmp_path, monkeypatch):
     assert path.name == "video.gif"
     assert len(imageio.mimread(path)) == 4
     assert imageio.get_reader(path).get_meta_data()["duration"] == pytest.approx(40.0)
+
+
+def test_a_signal_that_comes_while_the_encoder_is_forked_is_not_lost(tmp_path, monkeypatch):
+    class Forking:
+        frames = 0
+
+        def append_data(self, frame):
+            with suppress(KeyboardInterrupt):  # Python drops what is raised in its hooks around a fork
+                os.kill(os.getpid(), signal.SIGTERM)
+            self.frames += 1
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+    def interrupt(number, _frame):
+        raise KeyboardInterrupt(number)
+
+    writer = Forking()
+    monkeypatch.setattr(imageio, "get_writer", lambda *_, **__: writer)
+    previous = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            record(filmed(Camera()), still(), tmp_path / "video.mp4", steps=4, step_dt=0.04)
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+    assert writer.frames == 1 and list(tmp_path.iterdir()) == []
 
 
 def test_without_opengl_the_reason_and_the_fix_are_passed_on(tmp_path):

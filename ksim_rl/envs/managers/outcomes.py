@@ -34,7 +34,7 @@ class _OutcomeManager:
             if value_E.shape != shape or dtype not in (None, value_E.dtype):
                 raise ValueError(
                     f"{self.kind} term {name!r} returns {value_E.dtype} {tuple(value_E.shape)}: expected "
-                    f"{dtype or 'any dtype'} {shape}"
+                    f"{dtype or 'any dtype'} {shape}, one value per env"
                 )
             values.append(value_E)
         return values

@@ -61,8 +61,9 @@ def read(path: Path, most: int = MOST_BYTES) -> bytes:
 
 def read_json(path: Path) -> dict[str, Any]:
     """Return an export's metadata; a ValueError says what is wrong with the file."""
+    content = read(path, 2**26)
     try:
-        found = json.loads(read(path, 2**26))
+        found = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: {error}") from None
     if not isinstance(found, dict) or found.get("format") != 1:

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int64
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from ksim_rl.device.memory import ROLLOUT_PARTS
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
 from ksim_rl.objectives.fused_ppo.layout import FusedLayout, launch, parts
 from ksim_rl.objectives.fused_ppo.loss_kernels import ADVANTAGE, LOG_PROB, MASK, estimate_advantages
@@ -15,8 +16,6 @@ from ksim_rl.objectives.symmetry import SymmetricAugmentation
 
 # Envs per program.
 ENVS = 32
-# In so many parts a rollout is read: on the way, the observations of one take several times their memory.
-PARTS = 4
 Observe = Callable[[TensorDictBase], Float[Tensor, "*batch L"]]
 Evaluate = Callable[[Float[Tensor, "D L"], Float[Tensor, " D"]], None]
 
@@ -61,7 +60,7 @@ class FusedDataset:
         """
         values_D, next_values_D, advantages_D, targets_D = self._signals
         first = 0
-        for part_ET in rollout_ET.chunk(PARTS, 1):
+        for part_ET in rollout_ET.chunk(ROLLOUT_PARTS, 1):
             rows = slice(first, first + part_ET.numel())
             self._take(part_ET, self.obs[:, rows], self.records[rows])
             if self._mirror is not None:

@@ -38,9 +38,9 @@ class DebugVisualizer:
             end = np.asarray(origin) + scale * np.asarray(rotation)[:, axis]
             self._connector(mujoco.mjtGeom.mjGEOM_CYLINDER, scale / 20, origin, end, rgba)
 
-    def line(self, start: Vector, end: Vector, *, rgba: Rgba, width: float = 2.0) -> None:
-        """Draw a line; `width` in pixels."""
-        self._connector(mujoco.mjtGeom.mjGEOM_LINE, width, start, end, rgba)
+    def line(self, start: Vector, end: Vector, *, rgba: Rgba) -> None:
+        """Draw a line, two pixels wide."""
+        self._connector(mujoco.mjtGeom.mjGEOM_LINE, 2.0, start, end, rgba)
 
     def ghost(self, qpos: np.ndarray, *, rgba: Rgba) -> None:
         """Draw the robot in another pose, transparently."""

@@ -135,11 +135,11 @@ def reset_options(spec: mujoco.MjSpec) -> None:
     spec.option = mujoco.MjSpec().option
 
 
-def set_passive_joints(spec: mujoco.MjSpec, *, damping: float = 0.0, frictionloss: float = 0.0) -> None:
-    """Set damping and dry friction of every joint with one degree of freedom."""
+def clear_joint_losses(spec: mujoco.MjSpec) -> None:
+    """Take damping and dry friction from every joint with one degree of freedom."""
     for joint in _single_dof_joints(spec):
-        joint.damping = [damping, 0.0, 0.0]
-        joint.frictionloss = frictionloss
+        joint.damping = [0.0, 0.0, 0.0]
+        joint.frictionloss = 0.0
 
 
 def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom]) -> None:
@@ -193,7 +193,7 @@ def replace_sensors(spec: mujoco.MjSpec, sensors: Iterable[Sensor]) -> None:
         spec.add_sensor(**vars(sensor))
 
 
-def set_sites(spec: mujoco.MjSpec, sites: Iterable[Site], *, group: int = 5) -> None:
+def set_sites(spec: mujoco.MjSpec, sites: Iterable[Site]) -> None:
     """Move the sites that exist, to another body too (whose axes they then have), and add the others."""
     present = {site.name: site for site in spec.sites}
     bodies = {body.name: body for body in spec.bodies}
@@ -205,7 +205,7 @@ def set_sites(spec: mujoco.MjSpec, sites: Iterable[Site], *, group: int = 5) -> 
             spec.delete(placed)
             placed = None
         placed = placed or bodies[site.body].add_site(name=site.name)
-        placed.pos, placed.size, placed.group = site.pos, [site.radius] * 3, group
+        placed.pos, placed.size, placed.group = site.pos, [site.radius] * 3, 5
 
 
 def exclude_contacts(spec: mujoco.MjSpec, pairs: Iterable[tuple[str, str]]) -> None:

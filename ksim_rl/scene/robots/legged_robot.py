@@ -70,7 +70,7 @@ class MenagerieRobot(Checked):
         """
         spec = load_spec(self.model)
         edit.reset_options(spec)
-        edit.set_passive_joints(spec)
+        edit.clear_joint_losses(spec)
         set_actuators(spec, self.actuators)
         edit.replace_collision_geoms(spec, self.collision_geoms)
         edit.set_sites(spec, self.sites)

@@ -166,6 +166,15 @@ class WorldView:
             )
         return self.entities[name]
 
+    def at_origins(self, qpos_EL: Float[Tensor, "E L"]) -> Float[Tensor, "E L"]:
+        """Return generalized positions in which all free roots have moved with the origins of their envs."""
+        qpos_EL = qpos_EL.clone()
+        for entity in self.entities.values():
+            if entity.free_root:
+                start = entity.root_qpos.start
+                qpos_EL[:, start : start + 3] += self.terrain.origins_E3
+        return qpos_EL
+
     # -- sensors, motions, time -------------------------------------------------------------------------------------
 
     def sensor(self, name: str) -> Float[Tensor, "E L"]:

@@ -3,8 +3,6 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Literal
 
 import mujoco
@@ -12,10 +10,9 @@ import mujoco
 from ksim_rl.checked import Checked, NonNegative
 from ksim_rl.checks import unknown_name
 from ksim_rl.physics import load_spec
+from ksim_rl.suites.foreign_models import HIDDEN_GROUP, package_folder
 
 Variant = Literal["dm_control", "playground"]
-# Geoms and sites of this group are not drawn unless a viewer is asked to.
-HIDDEN_GROUP = 4
 NUM_SWIMMER_LINKS = 6
 
 
@@ -54,14 +51,6 @@ class DmControlModel(Checked):
         if self.variant == "playground":
             _change(spec, self.domain)
         return spec
-
-
-def package_folder(package: str, *, of: str, extra: str) -> Path:
-    """Return where a package of models lies, which is not imported; a ValueError says how to install it."""
-    found = find_spec(package.replace("-", "_"))
-    if found is None or not found.submodule_search_locations:
-        raise ValueError(f"{of} need the models of the package {package}: pip install 'ksim_rl[{extra}]'")
-    return Path(found.submodule_search_locations[0])
 
 
 def _add_links(spec: mujoco.MjSpec, count: int) -> None:

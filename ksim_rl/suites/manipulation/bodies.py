@@ -14,7 +14,7 @@ from ksim_rl.envs.term import EventTerm, TerminationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
 from ksim_rl.physics import load_spec
-from ksim_rl.suites.dm_control.models import HIDDEN_GROUP, package_folder
+from ksim_rl.suites.foreign_models import HIDDEN_GROUP, package_folder
 
 Axis = Literal["x", "y", "z"]
 AXES: tuple[Axis, ...] = ("x", "y", "z")

