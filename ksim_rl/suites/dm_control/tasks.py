@@ -33,7 +33,7 @@ from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, Observation
 
 EPISODE_STEPS = 1000
 # Env states of the tasks that take long: of PPO, and of FastSAC.
-LONG, FAST_SAC_LONG = 100e6, 12e6
+LONG, FAST_SAC_LONG = 100e6, 10e6
 # s of a control step.
 CONTROL_S = {
     "acrobot": 0.01, "ball_in_cup": 0.02, "cartpole": 0.01, "cheetah": 0.01, "finger": 0.02, "fish": 0.04,

@@ -14,7 +14,7 @@ from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg
 NUM_ENVS = 2048
 # Env states that MuJoCo Playground gives PPO.
 PPO_STATES = 60e6
-FAST_SAC_STATES = 6e6
+FAST_SAC_STATES = 5e6
 
 
 def ppo(*, gamma: float = 0.995, env_states: float = PPO_STATES) -> TrainingCfg:
