@@ -8,36 +8,21 @@ import warp as wp
 from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import QuickLaunch, address, as_operator
+from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator
 from ksim_rl.device.random import DRAWS, RowKeys
 
 
-@wp.struct
-class _Draw:
-    elements: int
-    columns: int
-    shared: int
-    kind: int
-    operation: int
-    cut: float
-    lanes: int
-    world_stride: int
-    element_stride: int
-    followers: int
-    counter_stride: int
-    first_row: int
-    stream: wp.uint32
-    seed: wp.uint64
-    counter: wp.uint64
-    mask: wp.uint64
-    table: wp.uint64
-    field: wp.uint64
-    follower: wp.uint64
-
-
+# The fields of the layout stand first.
+_ARGUMENTS = arguments_of(
+    (int, "elements columns shared kind operation"),
+    (float, "cut"),
+    (int, "lanes world_stride element_stride followers counter_stride first_row"),
+    (wp.uint32, "stream"),
+    (wp.uint64, "seed counter mask table field follower"),
+)
 # A follower is a field that grows in proportion to the only column that is drawn; it has as many elements.
 _quick = QuickLaunch(
-    _Draw,
+    _ARGUMENTS,
     DRAWS
     + r"""
     if (a.mask && !((const unsigned char*)a.mask)[row]) return;
@@ -71,7 +56,7 @@ def draw_entries(
     layout: tuple[float, ...],
     follower_ENF: Float32[Tensor, "E N F"] | None = None,
 ) -> None:
-    """Draw entries as the layout, the first fields of `_Draw`, says, in the worlds of `mask_E` or in all.
+    """Draw entries as the layout, the first fields of `_ARGUMENTS`, says, in the worlds of `mask_E` or in all.
 
     The table has the low and the high ends (means, deviations) and places of the columns, the rows of the elements,
     the model's own values, and how much the follower has of each.
