@@ -20,7 +20,6 @@ from ksim_rl.objectives.gradient_step import (
     StepGuard,
     adapt_learning_rate_,
     clip_and_guard,
-    descend,
     go_back,
     make_optimizer,
 )

@@ -99,23 +99,6 @@ def make_optimizer(cfg: OnPolicyCfg, *modules: nn.Module) -> torch.optim.Adam:
     )
 
 
-def descend(
-    loss: Float[Tensor, ""],
-    optimizer: torch.optim.Optimizer,
-    *,
-    max_grad_norm: float | None,
-    mask: Bool[Tensor, "*rows"] | None = None,
-) -> tuple[Float32[Tensor, ""], Float32[Tensor, ""]]:
-    """Make one gradient step on the parameters of a fused optimizer, unless loss or gradient are not finite.
-
-    It can be captured in a CUDA graph. The loss is a mean over the rows that `mask` marks, or over all: with several
-    ranks it becomes that over the rows of all of them. Returned are the norm before clipping, and 1 if the step was
-    skipped, else 0.
-    """
-    go_back({"loss": loss}, {"loss": optimizer}, mask=mask)
-    return step(optimizer, loss, max_grad_norm=max_grad_norm)
-
-
 def go_back(
     losses: Mapping[str, Float[Tensor, ""]],
     optimizers: Mapping[str, torch.optim.Optimizer],
@@ -125,7 +108,8 @@ def go_back(
 ) -> None:
     """Compute the gradients of each loss, means over all ranks; losses and what is `beside` become means in place.
 
-    Each rank weighs as much as it has rows that `mask` marks. No loss may reach a parameter of another's optimizer.
+    A loss is a mean over the rows that `mask` marks, or over all: each rank weighs as much as it has of these. No loss
+    may reach a parameter of another's optimizer.
     """
     for name in losses:
         optimizers[name].zero_grad(set_to_none=True)
@@ -141,7 +125,10 @@ def go_back(
 def step(
     optimizer: torch.optim.Optimizer, loss: Float[Tensor, ""], *, max_grad_norm: float | None
 ) -> tuple[Float32[Tensor, ""], Float32[Tensor, ""]]:
-    """Make the gradient step whose gradients are there; see `descend`."""
+    """Make the step of a fused optimizer whose gradients are there, unless the loss or one of these is not finite.
+
+    It can be captured in a CUDA graph. Returned are the norm before clipping, and 1 if the step was skipped, else 0.
+    """
     grad_norm, found_inf = clip_and_guard(_parameters(optimizer), max_grad_norm, loss=loss.detach())
     # Fused optimizers read these two, which torch's GradScaler sets as well, and skip the step on the device.
     optimizer.grad_scale, optimizer.found_inf = None, found_inf  # type: ignore[attr-defined]
