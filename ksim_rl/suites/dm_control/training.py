@@ -35,6 +35,8 @@ def ppo(*, gamma: float = 0.995, env_states: float = PPO_STATES) -> TrainingCfg:
             clip_value=False,
             entropy_coeff=0.001,
             learning_rate_min=1e-4,
+            learning_rate_max=1e-3,
+            anneal_learning_rate=True,
             max_grad_norm=100.0,
         ),
         data=data,
