@@ -87,8 +87,8 @@ class Substeps:
             self._alter(
                 sensor_contact_acc_adr=upstream.contact_sensors_but(warp_model, self._contacts.sensors)
             )
-        if own_broad_phase:
-            self._collide = collisions(warp_model, warp_data_E)
+            if own_broad_phase:
+                self._collide = collisions(warp_model, warp_data_E, self.contact_lists)
         self._integrate = integration(warp_model, warp_data_E) if one_kernel_integration else None
         self._needs_transmission = bool(np.isin(sensor_type, TRANSMISSION_SENSORS).any())
         self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any())

@@ -20,7 +20,7 @@ PARTS = ("layout", "order", "row", "joints", "contacts")
 # The degrees of freedom that move a geom are bits of a number, and a body or geom of a pair is 16 bits of another.
 MOST_DOFS, MOST_GEOMS = 64, 1 << 16
 _ENUMS = {
-    **{name.removeprefix("mjCNSTR_"): kind for name, kind in mujoco.mjtConstraint.__members__.items()},
+    **native.names_of(mujoco.mjtConstraint),
     "BALL": mujoco.mjtJoint.mjJNT_BALL,
     "OUT_OF_NONZEROS": mjw.OverflowType.NJMAX_NNZ,
 }

@@ -6,7 +6,7 @@ auto activation_rate = [&](int actuator, float ctrl, float act) {
     const int type = look_up(problem.actuator_dyntype, actuator);
     if (type == INTEGRATOR)
         return ctrl;
-    if (type == FILTER || type == FILTER_EXACT)
+    if (type == FILTER || type == FILTEREXACT)
         return (ctrl - act) / wp::max(TINY, model_row(problem.actuator_dynprm)[actuator][0]);
     return 0.0f;
 };

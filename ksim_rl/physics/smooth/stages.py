@@ -28,15 +28,7 @@ LANES, CUDA_THREADS = (8, 16, 32), 32
 # or else sums the momenta of subtrees there, and whether a mask says for which worlds it does all that.
 WHOLE = {"places_geoms": True, "goes_on": True, "forces_too": True, "sums_momenta": False, "masked": False}
 _ENUMS = {
-    "FREE": mujoco.mjtJoint.mjJNT_FREE,
-    "BALL": mujoco.mjtJoint.mjJNT_BALL,
-    "SLIDE": mujoco.mjtJoint.mjJNT_SLIDE,
-    "HINGE": mujoco.mjtJoint.mjJNT_HINGE,
-    "JOINT": mujoco.mjtTrn.mjTRN_JOINT,
-    "JOINT_IN_PARENT": mujoco.mjtTrn.mjTRN_JOINTINPARENT,
-    "INTEGRATOR": mujoco.mjtDyn.mjDYN_INTEGRATOR,
-    "FILTER": mujoco.mjtDyn.mjDYN_FILTER,
-    "FILTER_EXACT": mujoco.mjtDyn.mjDYN_FILTEREXACT,
+    **native.names_of(mujoco.mjtJoint, mujoco.mjtTrn, mujoco.mjtDyn),
     "AFFINE_GAIN": mujoco.mjtGain.mjGAIN_AFFINE,
     "AFFINE_BIAS": mujoco.mjtBias.mjBIAS_AFFINE,
     "OUT_OF_ROWS": mjw.OverflowType.NEFC,
@@ -46,13 +38,10 @@ _ENUMS = {
 FORCE_CALLBACKS = ("passive", "control", "act_dyn", "act_gain", "act_bias")
 HINGES = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 AFFINE = {
-    "actuator_trntype": (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT),
-    "actuator_dyntype": (
-        *(mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_INTEGRATOR),
-        *(mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT),
-    ),
-    "actuator_gaintype": (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE),
-    "actuator_biastype": (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE),
+    mujoco.mjtTrn: ("JOINT", "JOINTINPARENT"),
+    mujoco.mjtDyn: ("NONE", "INTEGRATOR", "FILTER", "FILTEREXACT"),
+    mujoco.mjtGain: ("FIXED", "AFFINE"),
+    mujoco.mjtBias: ("NONE", "AFFINE"),
 }
 
 
@@ -222,8 +211,10 @@ def _leaves(warp_model: mjw.Model) -> np.ndarray:
 
 def _has_affine_actuators(warp_model: mjw.Model) -> bool:
     m = warp_model
-    if not all(np.isin(getattr(m, name).numpy(), kinds).all() for name, kinds in AFFINE.items()):
-        return False
+    for enum, names in AFFINE.items():
+        known = [native.names_of(enum)[name] for name in names]
+        if not np.isin(getattr(m, f"actuator_{enum.__name__[3:].lower()}type").numpy(), known).all():
+            return False
     return bool(np.isin(m.jnt_type.numpy()[m.actuator_trnid.numpy()[:, 0]], HINGES).all())
 
 
