@@ -8,25 +8,6 @@ import warp as wp
 
 
 @wp.kernel(enable_backward=False)
-def record_overflow(
-    overflow: wp.array[int],
-    nefc: wp.array[int],
-    nacon: wp.array[int],
-    ncollision: wp.array[int],
-    sticky: wp.array[int],
-    most_nefc: wp.array[int],
-    most_pool: wp.array[int],
-):
-    """Keep each world's overflow bits and its largest need; world 0 does so for the pool of contacts."""
-    world = wp.tid()
-    sticky[world] = sticky[world] | overflow[world]
-    most_nefc[world] = wp.max(most_nefc[world], nefc[world])
-    if world == 0:
-        most_pool[0] = wp.max(most_pool[0], nacon[0])
-        most_pool[1] = wp.max(most_pool[1], ncollision[0])
-
-
-@wp.kernel(enable_backward=False)
 def sparse_velocity(
     rownnz: wp.array2d[int],
     rowadr: wp.array2d[int],

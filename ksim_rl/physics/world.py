@@ -103,7 +103,7 @@ class World(views.DataViews):
             )
             upstream.drop_unread(self.warp_model, self.warp_data_E)
             gravity_EL = upstream.expand_gravity(self.warp_model, num_envs)
-            self._overflow = OverflowRecord(self.warp_data_E)
+            self._overflow = OverflowRecord(self.warp_model, self.warp_data_E)
             self._reset_mask = wp.zeros(num_envs, dtype=bool)
             self._launch_reset = resets(self.warp_model, self.warp_data_E, self._reset_mask)
             models = self.mj_model, self.warp_model, self.warp_data_E
@@ -129,6 +129,7 @@ class World(views.DataViews):
                 one_kernel_integration=self.one_kernel_integration_unavailable is None,
                 aside=aside,
                 mask=self._reset_mask,
+                record=self._overflow.arrays,
             )
             self._masked_constants = self._prepare_constants(expanded)
         self._reset_mask_E = wp.to_torch(self._reset_mask)
@@ -403,7 +404,7 @@ class World(views.DataViews):
 
     def _launch_substeps(self, n: int, sensors: str) -> None:
         for substep in range(n):
-            self._launch_substep(self._sensors_of(substep, n, sensors))
+            self._launch_substep(self._sensors_of(substep, n, sensors), is_last=substep == n - 1)
 
     @staticmethod
     def _sensors_of(substep: int, n: int, sensors: str) -> Sensors:
@@ -412,10 +413,11 @@ class World(views.DataViews):
         amid = "contacts" if sensors == "contacts" else "none"
         return "kept" if substep == n - 1 else amid
 
-    def _launch_substep(self, sensors: Sensors) -> None:
+    def _launch_substep(self, sensors: Sensors, *, is_last: bool = True) -> None:
         if self._nan_guard is not None:
             self._nan_guard.before_substep()
-        self._substeps.advance(sensors=sensors)
-        self._overflow.record()
+        self._substeps.advance(sensors=sensors, is_last=is_last)
+        if self.one_kernel_integration_unavailable is not None:
+            self._overflow.record()
         if self._nan_guard is not None:
             self._nan_guard.after_substep()

@@ -22,6 +22,7 @@ class ContactLists:
     Attributes:
         count, ids: int32 [E], how many contacts a world has, and [E, room], their places in the pool.
         are_appended: whether the collision pass launches the first half.
+        order: launches the second, where no kernel of constraint rows does so on its way.
     """
 
     def __init__(self, warp_model: mjw.Model, warp_data_E: mjw.Data, *, room: int | None = None) -> None:
@@ -36,7 +37,7 @@ class ContactLists:
         self.constants = {"room": self.room, "sdf": bool(m.has_sdf_geom), "has_rows": HAS_ROWS}
         self.lanes, self.threads = (LANES, CUDA_THREADS) if device.is_cuda else (1, 1)
         sources = [native.source_of("rows", parts) for parts in (("append",), ("layout", "order"))]
-        self._append, self._order = (
+        self._append, self.order = (
             native.launcher(source, self.constants, vars(self), m, d, lanes=self.lanes, threads=self.threads)
             for source in sources
         )
@@ -47,7 +48,3 @@ class ContactLists:
         if not self.are_appended:
             self.appended.zero_()
             self._append()
-
-    def order(self) -> None:
-        """Launch the second half, where no kernel of constraint rows does so on its way."""
-        self._order()
