@@ -24,8 +24,8 @@ def test_hooks_that_do_nothing_change_nothing():
 
 
 def test_substeps_that_nobody_reads_end_as_those_that_hooks_read():
-    kwargs = {"sim": SimCfg(njmax=80, nconmax=40, one_kernel_dynamics=True)}
-    plain, hooked, by_hand = (standing_quadrupeds(**kwargs) for _ in range(3))
+    sim = SimCfg(njmax=80, nconmax=40, one_kernel_dynamics=True)
+    plain, hooked, by_hand = (standing_quadrupeds(sim=sim) for _ in range(3))
     assert plain.one_kernel_integration_unavailable is None
     poses, seen = [], []
     for _ in range(2):
