@@ -110,7 +110,7 @@ def _summary(cfg: ManagerBasedRlEnvCfg, driver: EnvDriver) -> str:
         f"constraints are solved by {_kernels(driver.world.one_kernel_unavailable, 'solver')}\n"
         f"what precedes them is computed by {_kernels(driver.world.one_kernel_dynamics_unavailable, 'kernels')}\n"
         f"their rows are made by {_kernels(driver.world.one_kernel_rows_unavailable, 'kernels')}\n"
-        f"geoms that may touch are found by {_kernels(driver.world.broad_phase_unavailable, 'kernels')}"
+        f"contacts are found by {_kernels(driver.world.one_kernel_collisions_unavailable, 'kernels')}"
         + "".join(f"\n{line}" for line in driver.non_finite.lines())
     )
 

@@ -76,6 +76,7 @@ class ContactReadings:
 
     def list(self) -> None:
         """List each world's contacts, where no kernel of constraint rows has."""
+        self._lists.are_appended = False
         self._lists.append()
         self._lists.order()
 

@@ -22,6 +22,11 @@ def source_of(folder: str, parts: tuple[str, ...]) -> str:
     return "".join((files("ksim_rl.physics") / folder / f"{part}.cpp").read_text() for part in parts)
 
 
+def names_of(*enums: Any) -> dict[str, int]:
+    """Return the members of enums of MuJoCo's, without what their names begin with."""
+    return {name.partition("_")[2]: int(kind) for enum in enums for name, kind in enum.__members__.items()}
+
+
 def launcher(
     source: str,
     constants: Mapping[str, int],

@@ -10,7 +10,7 @@ import warp as wp
 from jaxtyping import Int
 from torch import Tensor
 
-from ksim_rl.physics import kernels
+from ksim_rl.physics import native
 
 # The solver stopping at its iteration limit is a setting, not a loss of contacts.
 METRIC_BITS = ("ITERATIONS", "LS_ITERATIONS")
@@ -56,21 +56,19 @@ class OverflowReport:
 
 
 class OverflowRecord:
-    """Sticky overflow bits and running maxima on the device, which `counts` sums up there."""
+    """Sticky overflow bits and running maxima on the device, which `counts` sums up there.
 
-    def __init__(self, warp_data_E: mjw.Data) -> None:
-        self._warp_data_E = warp_data_E
-        self._kept = [wp.zeros(size, dtype=int) for size in (warp_data_E.nworld, warp_data_E.nworld, 2)]
-        self.sticky_E, self.most_nefc_E, self.most_pool = map(wp.to_torch, self._kept)
+    After each substep, so before any reset clears them, the integration updates its arrays, or `record` launches that.
+    """
 
-    def record(self) -> None:
-        """Launch the update of bits and maxima; runs after each substep, so before any reset clears them."""
-        d = self._warp_data_E
-        wp.launch(
-            kernels.record_overflow,
-            dim=d.nworld,
-            inputs=[d.overflow, d.nefc, d.nacon, d.ncollision],
-            outputs=self._kept,
+    def __init__(self, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+        self._warp_data_E, threads = warp_data_E, 128 if warp_data_E.qpos.device.is_cuda else 1
+        sizes = {"sticky": warp_data_E.nworld, "most_nefc": warp_data_E.nworld, "most_pool": 2}
+        self.arrays = {name: wp.zeros(size, dtype=int) for name, size in sizes.items()}
+        self.sticky_E, self.most_nefc_E, self.most_pool = map(wp.to_torch, self.arrays.values())
+        source = native.source_of("smooth", ("record",))
+        self.record = native.launcher(
+            source, {}, self.arrays, warp_model, warp_data_E, lanes=1, threads=threads
         )
 
     def clear(self) -> None:

@@ -1,7 +1,8 @@
 """This module launches the substeps of a world with the sensors that are wanted, and the refresh of what derives."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Literal, get_args
 
 import mujoco
@@ -36,9 +37,9 @@ class Substeps:
     The variants share all arrays with `warp_model`. Build them once its arrays are in their final place. With
     `one_kernel_solver`, `newton` solves, which must suit the model, instead of MuJoCo Warp's own solver. Then, with
     `one_kernel_dynamics`, which must suit it too, one kernel precedes the constraints. Then, with `one_kernel_rows`,
-    one makes their rows, and `contact_lists` besides, from which contact sensors are read, with `own_broad_phase` ours
-    finds the pairs of geoms, and with `one_kernel_integration` one kernel integrates. What can run beside the rest of a
-    substep does so on the stream `aside`.
+    one makes their rows, and `contact_lists` besides, from which contact sensors are read, with `own_broad_phase` one
+    finds contacts, and with `one_kernel_integration` one kernel integrates and keeps a `record` of overflow. What can
+    run beside the rest of a substep does so on the stream `aside`.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class Substeps:
         one_kernel_integration: bool = False,
         aside: wp.Stream | None = None,
         mask: wp.array | None = None,
+        record: Mapping[str, wp.array] | None = None,
     ) -> None:
         self.warp_model, self.warp_data_E, self._aside = warp_model, warp_data_E, aside
         sensor_type = mj_model.sensor_type
@@ -87,9 +89,11 @@ class Substeps:
             self._alter(
                 sensor_contact_acc_adr=upstream.contact_sensors_but(warp_model, self._contacts.sensors)
             )
-        if own_broad_phase:
-            self._collide = collisions(warp_model, warp_data_E)
-        self._integrate = integration(warp_model, warp_data_E) if one_kernel_integration else None
+            if own_broad_phase:
+                self._collide = collisions(warp_model, warp_data_E, self.contact_lists)
+        self._integrate: Callable[[], None] | None = None
+        if one_kernel_integration:
+            self._integrate = integration(warp_model, warp_data_E, record=record)
         self._needs_transmission = bool(np.isin(sensor_type, TRANSMISSION_SENSORS).any())
         self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any())
         self.refreshed_on_demand: set[str] = set()
@@ -106,8 +110,8 @@ class Substeps:
         """Change fields of the models of substeps, which share all else with `warp_model`."""
         self._models = {which: dataclasses.replace(m, **fields) for which, m in self._models.items()}
 
-    def advance(self, *, sensors: Sensors) -> None:
-        """Launch one physics step. Sensors never change the state that it reaches."""
+    def advance(self, *, sensors: Sensors, is_last: bool = True) -> None:
+        """Launch one physics step. Sensors never change the state that it reaches; after the last, all may be read."""
         # Callbacks are set at any time, and stand between the stages of the kernel.
         dynamics = None if calls_back(self.warp_model) else self._dynamics
         if self._ties_bodies and dynamics is None:
@@ -120,6 +124,9 @@ class Substeps:
             mjw.step(m, self.warp_data_E)
             return
         m.opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
+        is_read = is_last or sensors != "none" or self._always_senses or m.opt.run_rne_postconstraint
+        if dynamics is not None and self._make_rows is not None and self._integrate is not None:
+            dynamics = partial(dynamics, is_read=is_read)
         newton.step(
             m,
             self.warp_data_E,

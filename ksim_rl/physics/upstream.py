@@ -35,6 +35,7 @@ from mujoco_warp._src.smooth import tendon_bias as tendon_bias
 from mujoco_warp._src.types import ContactType as ContactType
 from torch import Tensor
 
+GEOM_TYPES = {kind.name: int(kind) for kind in mjw.GeomType}
 FIXED = int(mjw.SetConstGroup.FIXED)
 # The two columns of `nxn_pairid` for a pair that never makes a contact, and for one that no sensor measures.
 NO_CONTACT, NO_SENSOR = -2, -1
@@ -154,6 +155,14 @@ def geom_pairs(warp_model: mjw.Model) -> tuple[np.ndarray, np.ndarray]:
     return warp_model.nxn_geom_pair.numpy(), warp_model.nxn_pairid.numpy()
 
 
+def pair_type_counts(warp_model: mjw.Model, pairs: np.ndarray) -> tuple[int, ...]:
+    """Return the number of pairs of geoms [N, 2] by their types, in the order of a matrix's upper triangle."""
+    types, kinds = warp_model.geom_type.numpy()[pairs], len(mjw.GeomType)
+    low, high = types.min(-1), types.max(-1)
+    places = (low * (2 * kinds - low - 1)) // 2 + high
+    return tuple(np.bincount(places, minlength=kinds * (kinds + 1) // 2).tolist())
+
+
 def drop_pairs(warp_model: mjw.Model, dropped: np.ndarray) -> None:
     """Let MuJoCo Warp make no contacts of some geom pairs, in place: it has no setting for a pair.
 
@@ -162,14 +171,10 @@ def drop_pairs(warp_model: mjw.Model, dropped: np.ndarray) -> None:
     pairs, pair_ids = geom_pairs(warp_model)
     left_ids = np.where(dropped[:, None], (NO_CONTACT, NO_SENSOR), pair_ids)
     may_touch = (left_ids[:, 0] > NO_CONTACT) | (left_ids[:, 1] > NO_SENSOR)
-    types = warp_model.geom_type.numpy()[pairs[may_touch]]
-    # The number of pairs by their types, in the order of the upper triangle of a matrix.
-    kinds, low, high = len(mjw.GeomType), types.min(-1), types.max(-1)
-    counts = np.bincount((low * (2 * kinds - low - 1)) // 2 + high, minlength=kinds * (kinds + 1) // 2)
     warp_model.nxn_pairid = wp.array(left_ids, dtype=wp.vec2i)
     warp_model.nxn_pairid_filtered = wp.array(left_ids[may_touch], dtype=wp.vec2i)
     warp_model.nxn_geom_pair_filtered = wp.array(pairs[may_touch], dtype=wp.vec2i)
-    warp_model.geom_pair_type_count = tuple(counts.tolist())
+    warp_model.geom_pair_type_count = pair_type_counts(warp_model, pairs[may_touch])
 
 
 def add_height_fields(context: mjw.RenderContext, mj_model: mujoco.MjModel) -> None:

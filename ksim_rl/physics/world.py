@@ -18,7 +18,7 @@ from ksim_rl.device.memory import memory_for
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.device.streams import checked_device, warp_scope, warp_stream
 from ksim_rl.physics import capacity, upstream, views
-from ksim_rl.physics.collision.collisions import broad_phase_unavailable
+from ksim_rl.physics.collision.collisions import broad_phase_unavailable, pairs_left
 from ksim_rl.physics.contacts import follow_the_c_engine
 from ksim_rl.physics.fields import FIXED, GRAVITY, INERT0, const_groups, derived_fields, fields_to_expand
 from ksim_rl.physics.masked_constants import MaskedConstants
@@ -56,7 +56,7 @@ class World(views.DataViews):
         one_kernel_dynamics_unavailable: why MuJoCo Warp's own kernels compute what precedes the constraints; None where
             one kernel does (`SimCfg.one_kernel_dynamics`).
         one_kernel_rows_unavailable: the same of the constraint rows.
-        broad_phase_unavailable: why MuJoCo Warp's own broad phase finds the pairs of geoms that may touch.
+        one_kernel_collisions_unavailable: why MuJoCo Warp's own kernels find contacts, or some of them.
         one_kernel_integration_unavailable: why MuJoCo Warp's own kernels advance the state; None where one kernel does,
             which the same setting asks for.
     """
@@ -103,7 +103,7 @@ class World(views.DataViews):
             )
             upstream.drop_unread(self.warp_model, self.warp_data_E)
             gravity_EL = upstream.expand_gravity(self.warp_model, num_envs)
-            self._overflow = OverflowRecord(self.warp_data_E)
+            self._overflow = OverflowRecord(self.warp_model, self.warp_data_E)
             self._reset_mask = wp.zeros(num_envs, dtype=bool)
             self._launch_reset = resets(self.warp_model, self.warp_data_E, self._reset_mask)
             models = self.mj_model, self.warp_model, self.warp_data_E
@@ -113,9 +113,8 @@ class World(views.DataViews):
             self.one_kernel_rows_unavailable = one_kernel_rows_unavailable(
                 self.warp_model, dynamics_unavailable=self.one_kernel_dynamics_unavailable
             )
-            self.broad_phase_unavailable = broad_phase_unavailable(
-                *models[1:], rows_unavailable=self.one_kernel_rows_unavailable
-            )
+            no_pairs = broad_phase_unavailable(*models[1:], rows_unavailable=self.one_kernel_rows_unavailable)
+            self.one_kernel_collisions_unavailable = no_pairs or pairs_left(self.warp_model)
             self.one_kernel_integration_unavailable = one_kernel_integration_unavailable(
                 self.warp_model, dynamics_unavailable=self.one_kernel_dynamics_unavailable
             )
@@ -126,10 +125,11 @@ class World(views.DataViews):
                 one_kernel_solver=self.has_one_kernel_solver,
                 one_kernel_dynamics=self.one_kernel_dynamics_unavailable is None,
                 one_kernel_rows=self.one_kernel_rows_unavailable is None,
-                own_broad_phase=self.broad_phase_unavailable is None,
+                own_broad_phase=no_pairs is None,
                 one_kernel_integration=self.one_kernel_integration_unavailable is None,
                 aside=aside,
                 mask=self._reset_mask,
+                record=self._overflow.arrays,
             )
             self._masked_constants = self._prepare_constants(expanded)
         self._reset_mask_E = wp.to_torch(self._reset_mask)
@@ -404,7 +404,7 @@ class World(views.DataViews):
 
     def _launch_substeps(self, n: int, sensors: str) -> None:
         for substep in range(n):
-            self._launch_substep(self._sensors_of(substep, n, sensors))
+            self._launch_substep(self._sensors_of(substep, n, sensors), is_last=substep == n - 1)
 
     @staticmethod
     def _sensors_of(substep: int, n: int, sensors: str) -> Sensors:
@@ -413,10 +413,11 @@ class World(views.DataViews):
         amid = "contacts" if sensors == "contacts" else "none"
         return "kept" if substep == n - 1 else amid
 
-    def _launch_substep(self, sensors: Sensors) -> None:
+    def _launch_substep(self, sensors: Sensors, *, is_last: bool = True) -> None:
         if self._nan_guard is not None:
             self._nan_guard.before_substep()
-        self._substeps.advance(sensors=sensors)
-        self._overflow.record()
+        self._substeps.advance(sensors=sensors, is_last=is_last)
+        if self.one_kernel_integration_unavailable is not None:
+            self._overflow.record()
         if self._nan_guard is not None:
             self._nan_guard.after_substep()

@@ -78,8 +78,7 @@ def test_the_next_lines_say_what_kernels_compute_physics():
         "what precedes them is computed by MuJoCo Warp's own kernels, "
         "because sim.one_kernel_dynamics is None, on the CPU",
         "their rows are made by MuJoCo Warp's own kernels, because what precedes them is not one kernel",
-        "geoms that may touch are found by MuJoCo Warp's own kernels, because the rows of contacts are not made by one "
-        "kernel",
+        "contacts are found by MuJoCo Warp's own kernels, because the rows of contacts are not made by one kernel",
     ]
     env = puck_env(limit=None, sim=SimCfg(solver="cg", one_kernel_dynamics=True))
     solver, kernels = env.explain().splitlines()[1:3]

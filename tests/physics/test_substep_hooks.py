@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from ksim_rl.device.capture import live_launches
+from ksim_rl.physics import SimCfg
+from ksim_rl.physics.views import arrays
 from ksim_rl.testing import count_syncs
 from tests.physics.models import sensor, standing_quadrupeds
 
@@ -19,6 +21,24 @@ def test_hooks_that_do_nothing_change_nothing():
     assert called == ["before", "after"] * 8
     for name in STATE:
         assert torch.equal(plain.view(name), hooked.view(name)), name
+
+
+def test_substeps_that_nobody_reads_end_as_those_that_hooks_read():
+    sim = SimCfg(njmax=80, nconmax=40, one_kernel_dynamics=True)
+    plain, hooked, by_hand = (standing_quadrupeds(sim=sim) for _ in range(3))
+    assert plain.one_kernel_integration_unavailable is None
+    poses, seen = [], []
+    for _ in range(2):
+        plain.step(4)
+        hooked.step(4, after=[lambda: poses.append(hooked.last_substep("xmat").clone())])
+        for _ in range(4):
+            by_hand.step(1)
+            seen.append(by_hand.last_substep("xmat").clone())
+    assert torch.equal(torch.stack(poses), torch.stack(seen))
+    own, theirs = (arrays(world.warp_data_E) for world in (plain, hooked))
+    for name, array in own.items():
+        assert array.numpy().tobytes() == theirs[name].numpy().tobytes(), name
+    assert plain.overflow_report() == hooked.overflow_report()
 
 
 def test_each_substep_takes_the_controls_that_the_hook_before_it_wrote():

@@ -1,12 +1,14 @@
-// The broad phase: which pairs of geoms may touch. The tests are those of engine_collision_driver.c: of a plane and a
-// bounding sphere, of two spheres, then of two boxes along the axes of both (Gottschalk et al., OBBTree, 1996).
+// Part 1, the broad phase: which pairs of geoms may touch. The tests are those of engine_collision_driver.c: of a plane
+// and a bounding sphere, of two spheres, then of two boxes along the axes of both (Gottschalk et al., OBBTree, 1996).
 //
 // The lanes of a world share its pairs, and take places in the pool for all that pass together: one lane each time, where
 // all threads of all worlds would wait for the same counter.
 
-const auto* const pairs = problem.nxn_geom_pair_filtered.data;
+using vec3 = wp::vec3;
+
+const auto* const pairs = problem.pairs.data;  // the lower type first, and how many contacts they may have
 const auto* const pair_ids = problem.nxn_pairid_filtered.data;
-const int num_pairs = problem.nxn_geom_pair_filtered.shape[0];
+const int num_pairs = problem.pairs.shape[0];
 const wp::vec3* const positions = row_of(problem.geom_xpos);
 const wp::mat33* const turns = row_of(problem.geom_xmat);
 const wp::vec3* const boxes = model_row(problem.geom_boxes);  // centre and half sizes of each geom
@@ -60,62 +62,3 @@ auto may_touch = [&](int item) {
         return true;
     return !boxes_are_apart(a, b, margin_of(a, b, HAS_MARGINS ? pair_ids[item][0] : -1));
 };
-
-// Few pairs are near each other: they are listed first, so that no lane waits for the boxes of another's.
-constexpr int BITS = 32, CHUNK = BITS * LANES;
-#if defined(__CUDA_ARCH__)
-__shared__ unsigned short listed[THREADS / LANES][CHUNK];
-unsigned short* const near = listed[threadIdx.x / LANES];
-#else
-unsigned short near[CHUNK];
-#endif
-// The bits of the items of this lane that pass, the first item of which is `lane`.
-auto passing = [&](int count, auto test) {
-    unsigned bits = 0;
-    for (int bit = 0; bit * LANES < count; ++bit) {
-        const int item = bit * LANES + lane;
-        bits |= (unsigned)(item < count && test(item)) << bit;
-    }
-    return bits;
-};
-auto number_of = [](unsigned bits) {
-    int number = 0;
-    for (; bits != 0; bits &= bits - 1)
-        ++number;
-    return number;
-};
-auto each_of = [&](unsigned bits, auto body) {
-    for (int bit = 0; bit < BITS; ++bit)
-        if (bits >> bit & 1u)
-            body(bit * LANES + lane);
-};
-for (int first = 0; first < num_pairs; first += CHUNK) {
-    const unsigned bits = passing(wp::min(CHUNK, num_pairs - first), [&](int item) { return are_near(first + item); });
-    const int found = number_of(bits);
-    int place = sum_before(found);
-    const int count = of_lane(place + found, LANES - 1);
-    each_of(bits, [&](int item) { near[place++] = item; });
-    sync();
-    const unsigned touching = passing(count, [&](int item) { return may_touch(first + near[item]); });
-    const int own = number_of(touching), before = sum_before(own), total = of_lane(before + own, LANES - 1);
-    if (lane == 0 && total > 0) {
-#if defined(__CUDA_ARCH__)
-        place = atomicAdd(problem.ncollision.data, total);
-#else
-        place = *problem.ncollision.data;
-        *problem.ncollision.data += total;
-#endif
-    }
-    place = of_lane(place, 0) + before;
-    each_of(touching, [&](int item) {
-        if (place < problem.naconmax) {
-            const int pair = first + near[item], a = pairs[pair][0], b = pairs[pair][1];
-            const bool swaps = problem.geom_type.data[a] > problem.geom_type.data[b];
-            problem.collision_pair.data[place] = swaps ? wp::vec2i(b, a) : wp::vec2i(a, b);
-            problem.collision_pairid.data[place] = pair_ids[pair];
-            problem.collision_worldid.data[place] = world;
-        }
-        ++place;
-    });
-    sync();
-}

@@ -1,26 +1,36 @@
-"""This module launches the collision pass of a substep, with a broad phase of our own before MuJoCo Warp's narrow one.
+"""This module launches the collision pass of a substep: one kernel, which owns a world, and MuJoCo Warp's for the rest.
 
-MuJoCo Warp's has a thread for each pair of geoms, and each that passes waits for the one counter of all worlds.
+MuJoCo Warp's has a thread for each pair of geoms, and each that passes waits for the one counter of all worlds, as each
+contact does afterwards. Read the parts in their order: broad_phase.cpp, shapes.cpp, narrow_phase.cpp.
 """
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Iterator
 
 import mujoco_warp as mjw
+import numpy as np
+import warp as wp
 
 from ksim_rl.physics import native, upstream
+from ksim_rl.physics.contacts import align_steep_capsules
+from ksim_rl.physics.rows.contact_lists import HAS_ROWS, ContactLists
 
-# Lanes of a world on CUDA, and threads of a block, which shares nothing.
-LANES, CUDA_THREADS = 32, 128
+# Lanes of a world on CUDA, threads of a block, which shares nothing, and registers: as many as let 4096 worlds be on an
+# H200 at once. Most of the 103 that the compiler likes are for capsules with boxes, which are few.
+LANES, CUDA_THREADS, REGISTERS = 32, 128, 64
 FILTERS = mjw.BroadphaseFilter.PLANE | mjw.BroadphaseFilter.SPHERE | mjw.BroadphaseFilter.OBB
+# How many contacts a pair of these types has at most.
+MOST_CONTACTS = {
+    "plane": {"sphere": 1, "capsule": 2, "cylinder": 4, "box": 8},
+    "sphere": {"sphere": 1, "capsule": 1, "box": 1},
+    "capsule": {"capsule": 2, "box": 2},
+}
 
 
 def broad_phase_unavailable(
     warp_model: mjw.Model, warp_data_E: mjw.Data, *, rows_unavailable: str | None = None
 ) -> str | None:
-    """Return why MuJoCo Warp's own broad phase finds a model's pairs, or None where ours does.
-
-    Contacts stand in another order then, which rows by one kernel do not depend on.
-    """
+    """Return why MuJoCo Warp's own broad phase finds a model's pairs, or None where ours does."""
     m, opt, bits = warp_model, warp_model.opt, mjw.DisableBit
     reasons = {
         "the rows of contacts are not made by one kernel": rows_unavailable is not None,
@@ -28,43 +38,78 @@ def broad_phase_unavailable(
         "there is no room for contacts": warp_data_E.naconmax == 0,
         "it sweeps and prunes, or by other filters": (opt.broadphase, opt.broadphase_filter)
         != (mjw.BroadphaseType.NXN, FILTERS),
-        "worlds may sleep": bool(opt.enableflags & mjw.EnableBit.SLEEP),
-        "there are flexes": m.nflex > 0,
-        "surfaces move": bool(m.flg_surfacevel),
         "worlds have other meshes": m.geom_dataid.shape[0] > 1,
     }
     return next((reason for reason, holds in reasons.items() if holds), None)
 
 
+def pairs_left(warp_model: mjw.Model) -> str | None:
+    """Return whose contacts MuJoCo Warp's narrow phase finds after our broad one, or None."""
+    left = {" and ".join(kinds) for *_, kinds, most in _pairs(warp_model) if not most}
+    return f"{', '.join(sorted(left))} meet, whose contacts they alone find" if left else None
+
+
+def _pairs(warp_model: mjw.Model) -> Iterator[tuple[int, int, list[str], int]]:
+    """Yield each pair, the geom of the lower type first, its types, and how many contacts the kernel finds at most."""
+    pairs, types = warp_model.nxn_geom_pair_filtered.numpy(), warp_model.geom_type.numpy()
+    for pair, (_, sensor) in zip(pairs.tolist(), warp_model.nxn_pairid_filtered.numpy(), strict=True):
+        a, b = sorted(pair, key=types.__getitem__)
+        kinds = [mjw.GeomType(types[geom]).name.lower() for geom in (a, b)]
+        # A sensor that measures a pair reads contacts that have no rows, too.
+        known = sensor == upstream.NO_SENSOR
+        yield a, b, kinds, MOST_CONTACTS.get(kinds[0], {}).get(kinds[1], 0) if known else 0
+
+
 def collisions(
-    warp_model: mjw.Model, warp_data_E: mjw.Data, *, lanes: int | None = None
+    warp_model: mjw.Model, warp_data_E: mjw.Data, lists: ContactLists, *, lanes: int | None = None
 ) -> Callable[[], None]:
     """Return what launches `mjw.collision` for a model for which it is available, with arrays in their final place.
 
-    It finds the same contacts; their places in the pool that all worlds share are others, as they are on a GPU in each
-    run. `lanes` is how many threads share a world on CUDA; None takes the usual.
+    Contacts have other places in the pool that all worlds share, as in each run on a GPU. It appends them to the lists,
+    unless others come to the pool. `lanes` is how many threads share a world on CUDA; None takes the usual.
     """
     m, d = warp_model, warp_data_E
-    context = upstream.create_collision_context(d.naconmax)
-    aabb = m.geom_aabb
-    own = vars(context) | {"geom_boxes": aabb.reshape((aabb.shape[0], -1))}
-    on_gpu = d.qpos.device.is_cuda
-    source = native.source_of("rows", ("layout",)) + native.source_of("collision", ("broad_phase",))
-    lanes, threads = (lanes or LANES, CUDA_THREADS) if on_gpu else (1, 1)
+    device, aabb = d.qpos.device, m.geom_aabb
+    pairs = np.array([(a, b, most) for a, b, _, most in _pairs(m)], dtype=np.int32).reshape(-1, 3)
+    others = pairs[pairs[:, 2] == 0, :2]
+    context = upstream.create_collision_context(d.naconmax if others.size else 0)
+    own = {
+        **vars(context),
+        **vars(lists),
+        "geom_boxes": aabb.reshape((aabb.shape[0], -1)),
+        "pairs": wp.array(pairs, dtype=wp.vec3i, device=device),
+        "lists": 1,
+    }
+    source = native.source_of("rows", ("layout",))
+    source += native.source_of("collision", ("broad_phase", "shapes", "narrow_phase"))
+    lanes, threads, registers = (lanes or LANES, CUDA_THREADS, REGISTERS) if device.is_cuda else (1, 1, None)
     margins = m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap
     constants = {
+        **upstream.GEOM_TYPES,
         # Those of each world's own may be drawn at any time.
         "has_margins": any(field.shape[0] > 1 or bool(field.numpy().any()) for field in margins),
+        "has_pairs": m.pair_dim.size > 0,
         "measures": bool((m.nxn_pairid_filtered.numpy()[:, 1] > upstream.NO_SENSOR).any()),
+        "others": others.size > 0,
+        "has_rows": HAS_ROWS,
     }
-    find_pairs = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads)
+    collide = native.launcher(
+        source, constants, own, m, d, lanes=lanes, threads=threads, max_registers=registers
+    )
+    theirs = dataclasses.replace(m, geom_pair_type_count=upstream.pair_type_counts(m, others))
 
     def launch() -> None:
-        d.ncollision.zero_()
+        hook = m.callback.contactfilter
+        if hook is align_steep_capsules and not others.size:
+            hook = None
+        lists.are_appended = not others.size and hook is None
         d.nacon.zero_()
-        find_pairs()
-        upstream.narrowphase(m, d, context)
-        if m.callback.contactfilter:
-            m.callback.contactfilter(m, d)
+        if others.size:
+            d.ncollision.zero_()
+        collide(lists=int(lists.are_appended))
+        if others.size:
+            upstream.narrowphase(theirs, d, context)
+        if hook:
+            hook(m, d)
 
     return launch

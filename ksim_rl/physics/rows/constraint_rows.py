@@ -19,8 +19,11 @@ from ksim_rl.physics.rows.contact_lists import ContactLists
 PARTS = ("layout", "order", "row", "joints", "contacts")
 # The degrees of freedom that move a geom are bits of a number, and a body or geom of a pair is 16 bits of another.
 MOST_DOFS, MOST_GEOMS = 64, 1 << 16
+# The compiler likes 104 registers, with which this many threads are on a multiprocessor at once. Where there are more,
+# 80 take less time: 6.435 ms instead of 6.566 for a control step of 32768 worlds of Go1 on an H200.
+THREADS_AT_ONCE, REGISTERS = 512, 80
 _ENUMS = {
-    **{name.removeprefix("mjCNSTR_"): kind for name, kind in mujoco.mjtConstraint.__members__.items()},
+    **native.names_of(mujoco.mjtConstraint),
     "BALL": mujoco.mjtJoint.mjJNT_BALL,
     "OUT_OF_NONZEROS": mjw.OverflowType.NJMAX_NNZ,
 }
@@ -72,8 +75,10 @@ def constraint_rows(
         "refsafe": not flags & bits.REFSAFE,
     }
     lanes = lanes if lanes and device.is_cuda else lists.lanes
+    threads, waits = lists.threads, device.is_cuda and d.nworld * lanes > THREADS_AT_ONCE * device.sm_count
+    most = REGISTERS if waits else None
     source = native.source_of("rows", PARTS)
-    launch = native.launcher(source, constants, own, m, d, lanes=lanes, threads=lists.threads)
+    launch = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, max_registers=most)
 
     def make_rows() -> None:
         lists.append()

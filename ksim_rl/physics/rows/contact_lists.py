@@ -3,8 +3,6 @@
 MuJoCo Warp's threads take places in the pool as they come, otherwise in each run on a GPU.
 """
 
-# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false
-
 import mujoco_warp as mjw
 import warp as wp
 
@@ -12,7 +10,7 @@ from ksim_rl.physics import native, upstream
 
 # Lanes of a world on CUDA, and threads of a block, which shares nothing.
 LANES, CUDA_THREADS = 16, 128
-HAS_ROWS = wp.constant(int(upstream.ContactType.CONSTRAINT))
+HAS_ROWS = int(upstream.ContactType.CONSTRAINT)
 
 
 class ContactLists:
@@ -23,6 +21,8 @@ class ContactLists:
 
     Attributes:
         count, ids: int32 [E], how many contacts a world has, and [E, room], their places in the pool.
+        are_appended: whether the collision pass launches the first half.
+        order: launches the second, where no kernel of constraint rows does so on its way.
     """
 
     def __init__(self, warp_model: mjw.Model, warp_data_E: mjw.Data, *, room: int | None = None) -> None:
@@ -34,37 +34,17 @@ class ContactLists:
         self.ids, self.found = (wp.zeros((d.nworld, self.room), dtype=int, device=device) for _ in range(2))
         self.keys = wp.empty((d.nworld, self.room), dtype=wp.uint64, device=device)
         # For the kernels that read them, too.
-        self.constants = {"room": self.room, "sdf": bool(m.has_sdf_geom)}
+        self.constants = {"room": self.room, "sdf": bool(m.has_sdf_geom), "has_rows": HAS_ROWS}
         self.lanes, self.threads = (LANES, CUDA_THREADS) if device.is_cuda else (1, 1)
-        source = native.source_of("rows", ("layout", "order"))
-        self._order = native.launcher(
-            source, self.constants, vars(self), m, d, lanes=self.lanes, threads=self.threads
+        sources = [native.source_of("rows", parts) for parts in (("append",), ("layout", "order"))]
+        self._append, self.order = (
+            native.launcher(source, self.constants, vars(self), m, d, lanes=self.lanes, threads=self.threads)
+            for source in sources
         )
-        self._pool = [d.nacon, d.contact.type, d.contact.worldid]
+        self.are_appended = False
 
     def append(self) -> None:
-        """Launch the first half, after a collision pass: the lists in any order."""
-        nacon, kind, world = self._pool
-        inputs, device = [nacon, kind, world, self.appended, self.found], self.count.device
-        wp.launch(append_contacts, dim=kind.size, inputs=inputs, device=device)
-
-    def order(self) -> None:
-        """Launch the second half, where no kernel of constraint rows does so on its way."""
-        self._order()
-
-
-@wp.kernel(enable_backward=False)
-def append_contacts(
-    nacon: wp.array[int],
-    kind: wp.array[int],
-    world_of: wp.array[int],
-    appended: wp.array[int],
-    found: wp.array2d[int],
-):
-    """Append a contact of the pool to its world's list."""
-    contact = wp.tid()
-    if contact < nacon[0] and (kind[contact] & HAS_ROWS) != 0:
-        world = world_of[contact]
-        place = wp.atomic_add(appended, world, 1)
-        if place < found.shape[1]:
-            found[world, place] = contact
+        """Launch the first half, after a collision pass that has not: the lists in any order."""
+        if not self.are_appended:
+            self.appended.zero_()
+            self._append()

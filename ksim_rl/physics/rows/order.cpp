@@ -39,7 +39,5 @@ each(contacts, [&](int item) {
     ids[place] = found[item];
 });
 sync();
-if (lane == 0) {
+if (lane == 0)
     problem.count.data[world] = contacts;
-    problem.appended.data[world] = 0;  // for the next substep
-}

@@ -6,7 +6,7 @@ auto activation_rate = [&](int actuator, float ctrl, float act) {
     const int type = look_up(problem.actuator_dyntype, actuator);
     if (type == INTEGRATOR)
         return ctrl;
-    if (type == FILTER || type == FILTER_EXACT)
+    if (type == FILTER || type == FILTEREXACT)
         return (ctrl - act) / wp::max(TINY, model_row(problem.actuator_dynprm)[actuator][0]);
     return 0.0f;
 };
@@ -15,12 +15,14 @@ each(NUM_ACTUATORS, [&](int actuator) {
     const int joint = problem.actuator_trnid.data[actuator][0], dof = look_up(problem.jnt_dofadr, joint);
     const float gear = model_row(problem.actuator_gear)[actuator][0];
     const float length = qpos[look_up(problem.jnt_qposadr, joint)] * gear, speed = gear * qvel[dof];
-    row_of(problem.actuator_length)[actuator] = length;
-    row_of(problem.actuator_velocity)[actuator] = speed;
-    row_of(problem.moment_rownnz)[actuator] = 1;
-    row_of(problem.moment_rowadr)[actuator] = actuator;
-    row_of(problem.moment_colind)[actuator] = dof;
-    row_of(problem.actuator_moment)[actuator] = gear;
+    if (problem.is_read) {
+        row_of(problem.actuator_length)[actuator] = length;
+        row_of(problem.actuator_velocity)[actuator] = speed;
+        row_of(problem.moment_rownnz)[actuator] = 1;
+        row_of(problem.moment_rowadr)[actuator] = actuator;
+        row_of(problem.moment_colind)[actuator] = dof;
+        row_of(problem.actuator_moment)[actuator] = gear;
+    }
     float rate = 0.0f, found = 0.0f;
     const int address = activation_of(actuator);
     if (address >= 0) {
@@ -93,7 +95,8 @@ each(NUM_DOFS, [&](int dof) {
             sum += wp::dot(spin, translation_of(push));
         }
     }
-    row_of(problem.qfrc_bias)[dof] = bias;
+    if (problem.is_read)
+        row_of(problem.qfrc_bias)[dof] = bias;
     row_of(problem.qfrc_actuator)[dof] = driven;
     row_of(problem.qfrc_smooth)[dof] = sum;
 });

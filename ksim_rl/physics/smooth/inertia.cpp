@@ -72,4 +72,5 @@ each(NUM_BODIES, [&](int body) {
     inertia(body) = found;
 });
 sync();
-write(problem.cinert, NUM_BODIES, inertias, POSE);
+if (problem.is_read)
+    write(problem.cinert, NUM_BODIES, inertias, POSE);

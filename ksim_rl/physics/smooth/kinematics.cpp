@@ -81,21 +81,22 @@ each(NUM_BODIES, [&](int body) {
     center(body) = position(body) + rotate(model_row(problem.body_ipos)[body], turn(body));
 });
 sync();
-write(problem.xpos, NUM_BODIES, poses, POSE);
-write(problem.xquat, NUM_BODIES, poses + 3, POSE);
-write(problem.xipos, NUM_BODIES, poses + 7, POSE);
-write(problem.xanchor, NUM_JOINTS, joints, 6);
-write(problem.xaxis, NUM_JOINTS, joints + 3, 6);
-
 auto inertial_frame = [&](int body) {
     return matrix(product(turn(body), model_row(problem.body_iquat)[body]));
 };
-compute_row(problem.xmat, NUM_BODIES, itself, [&](int body) { return matrix(turn(body)); });
-compute_row(problem.ximat, NUM_BODIES, itself, inertial_frame);
-compute_row(problem.site_xpos, NUM_SITES, itself, [&](int site) {
-    const int body = look_up(problem.site_bodyid, site);
-    return position(body) + rotate(model_row(problem.site_pos)[site], turn(body));
-});
-compute_row(problem.site_xmat, NUM_SITES, itself, [&](int site) {
-    return matrix(product(turn(look_up(problem.site_bodyid, site)), model_row(problem.site_quat)[site]));
-});
+write(problem.xipos, NUM_BODIES, poses + 7, POSE);
+if (problem.is_read) {
+    write(problem.xpos, NUM_BODIES, poses, POSE);
+    write(problem.xquat, NUM_BODIES, poses + 3, POSE);
+    write(problem.xanchor, NUM_JOINTS, joints, 6);
+    write(problem.xaxis, NUM_JOINTS, joints + 3, 6);
+    compute_row(problem.xmat, NUM_BODIES, itself, [&](int body) { return matrix(turn(body)); });
+    compute_row(problem.ximat, NUM_BODIES, itself, inertial_frame);
+    compute_row(problem.site_xpos, NUM_SITES, itself, [&](int site) {
+        const int body = look_up(problem.site_bodyid, site);
+        return position(body) + rotate(model_row(problem.site_pos)[site], turn(body));
+    });
+    compute_row(problem.site_xmat, NUM_SITES, itself, [&](int site) {
+        return matrix(product(turn(look_up(problem.site_bodyid, site)), model_row(problem.site_quat)[site]));
+    });
+}

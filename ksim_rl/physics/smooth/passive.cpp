@@ -33,8 +33,11 @@ each(NUM_JOINTS, [&](int joint) {
         const bool damps = damping.linear != 0.0f || damping.more[0] != 0.0f || damping.more[1] != 0.0f;
         const float speed = qvel[dof + i];
         const float damper = damps ? -speed * rate_at(damping.linear, damping.more, wp::abs(speed)) : 0.0f;
+        passive[dof + i] = spring[i] + damper;
+        if (!problem.is_read)
+            continue;
         row_of(problem.qfrc_spring)[dof + i] = spring[i];
         row_of(problem.qfrc_damper)[dof + i] = damper;
-        row_of(problem.qfrc_passive)[dof + i] = passive[dof + i] = spring[i] + damper;
+        row_of(problem.qfrc_passive)[dof + i] = passive[dof + i];
     }
 });

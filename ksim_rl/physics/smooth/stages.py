@@ -24,19 +24,15 @@ INTEGRATION = ("world", "derivative", "factorization", "free_bodies", "advance")
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
 LANES, CUDA_THREADS = (8, 16, 32), 32
-# Whether it writes where geoms are, goes on after that, and after the velocities to the inertia matrix and the forces;
-# or else sums the momenta of subtrees there, and whether a mask says for which worlds it does all that.
-WHOLE = {"places_geoms": True, "goes_on": True, "forces_too": True, "sums_momenta": False, "masked": False}
+# Whether it writes where geoms are, goes on after that, and after the velocities to the inertia matrix and the forces,
+# and whether others than a substep read what it writes; or else sums momenta of subtrees there, and for masked worlds.
+WHOLE = {
+    **dict.fromkeys(("places_geoms", "goes_on", "forces_too", "is_read"), True),
+    "sums_momenta": False,
+    "masked": False,
+}
 _ENUMS = {
-    "FREE": mujoco.mjtJoint.mjJNT_FREE,
-    "BALL": mujoco.mjtJoint.mjJNT_BALL,
-    "SLIDE": mujoco.mjtJoint.mjJNT_SLIDE,
-    "HINGE": mujoco.mjtJoint.mjJNT_HINGE,
-    "JOINT": mujoco.mjtTrn.mjTRN_JOINT,
-    "JOINT_IN_PARENT": mujoco.mjtTrn.mjTRN_JOINTINPARENT,
-    "INTEGRATOR": mujoco.mjtDyn.mjDYN_INTEGRATOR,
-    "FILTER": mujoco.mjtDyn.mjDYN_FILTER,
-    "FILTER_EXACT": mujoco.mjtDyn.mjDYN_FILTEREXACT,
+    **native.names_of(mujoco.mjtJoint, mujoco.mjtTrn, mujoco.mjtDyn),
     "AFFINE_GAIN": mujoco.mjtGain.mjGAIN_AFFINE,
     "AFFINE_BIAS": mujoco.mjtBias.mjBIAS_AFFINE,
     "OUT_OF_ROWS": mjw.OverflowType.NEFC,
@@ -46,13 +42,10 @@ _ENUMS = {
 FORCE_CALLBACKS = ("passive", "control", "act_dyn", "act_gain", "act_bias")
 HINGES = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 AFFINE = {
-    "actuator_trntype": (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT),
-    "actuator_dyntype": (
-        *(mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_INTEGRATOR),
-        *(mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT),
-    ),
-    "actuator_gaintype": (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE),
-    "actuator_biastype": (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE),
+    mujoco.mjtTrn: ("JOINT", "JOINTINPARENT"),
+    mujoco.mjtDyn: ("NONE", "INTEGRATOR", "FILTER", "FILTEREXACT"),
+    mujoco.mjtGain: ("FIXED", "AFFINE"),
+    mujoco.mjtBias: ("NONE", "AFFINE"),
 }
 
 
@@ -108,7 +101,8 @@ def smooth_dynamics(
     cameras, lights, contacts, constraint rows and `qacc_smooth`. With `forces_too=False` it computes of these what
     positions and velocities alone decide, and with `sums_momenta=True` what `subtree_vel` does as well; with
     `goes_on=False` only what collisions need, `geom_xpos` and `geom_xmat`; and with `places_geoms=False` all but these
-    two. With `masked=True` it does so for the worlds of `mask`, bool [E]. `lanes` is how many threads share a world on
+    two. With `masked=True` it does so for the worlds of `mask`, bool [E]; with `is_read=False` it writes only what the
+    other kernels of a substep read. `lanes` is how many threads share a world on
     CUDA; None takes the fewest that fit.
     """
     mask = wp.empty(0, dtype=bool, device=warp_data_E.qpos.device) if mask is None else mask
@@ -117,15 +111,20 @@ def smooth_dynamics(
 
 
 def integration(
-    warp_model: mjw.Model, warp_data_E: mjw.Data, *, lanes: int | None = None
+    warp_model: mjw.Model,
+    warp_data_E: mjw.Data,
+    *,
+    lanes: int | None = None,
+    record: Mapping[str, wp.array] | None = None,
 ) -> Callable[[], None]:
     """Return what launches the integration of a model for which it is available: MuJoCo Warp's `euler` or `implicit`.
 
-    Each sum has one order, whatever the number of lanes. Where MuJoCo Warp differs from the C engine it follows C: with
-    forces disabled (activations without actuation keep still, and implicitfast has the derivatives of what is left),
-    and with controls out of range, whose derivative is that of the clamped ones.
+    It updates the arrays of a `record` of overflow, too. Each sum has one order, whatever the number of lanes. Where
+    MuJoCo Warp differs from the C engine it follows C: with forces disabled (activations without actuation keep still,
+    and implicitfast has the derivatives of what is left), and with controls out of range, whose derivative is that of
+    the clamped ones.
     """
-    return _launcher(INTEGRATION, warp_model, warp_data_E, lanes, {})
+    return _launcher(INTEGRATION, warp_model, warp_data_E, lanes, record or {})
 
 
 def _launcher(
@@ -152,6 +151,7 @@ def _launcher(
     }
     constants = {**_ENUMS, **sizes, "floats": _floats(parts, sizes, lanes)}
     parents = ", ".join(map(str, m.body_parentid.numpy()))
+    parts += ("record",) if "sticky" in given else ()
     source = f"constexpr int PARENTS[] = {{{parents}}};\n" + native.source_of("smooth", parts)
     return native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads)
 
@@ -222,8 +222,10 @@ def _leaves(warp_model: mjw.Model) -> np.ndarray:
 
 def _has_affine_actuators(warp_model: mjw.Model) -> bool:
     m = warp_model
-    if not all(np.isin(getattr(m, name).numpy(), kinds).all() for name, kinds in AFFINE.items()):
-        return False
+    for enum, names in AFFINE.items():
+        known = [native.names_of(enum)[name] for name in names]
+        if not np.isin(getattr(m, f"actuator_{enum.__name__[3:].lower()}type").numpy(), known).all():
+            return False
     return bool(np.isin(m.jnt_type.numpy()[m.actuator_trnid.numpy()[:, 0]], HINGES).all())
 
 

@@ -21,7 +21,8 @@ each(NUM_CHAINS, [&](int chain) {
             // A free joint's first three axes are those of the world, which nothing turns.
             if (type == FREE)
                 for (const int end = dof + 3; dof < end; ++dof) {
-                    row_of(problem.cdof_dot)[dof] = spatial();
+                    if (problem.is_read)
+                        row_of(problem.cdof_dot)[dof] = spatial();
                     moving = moving + motion(dof) * qvel[dof];
                 }
             // The axes of a ball turn together, with the velocity before all three.
@@ -29,7 +30,8 @@ each(NUM_CHAINS, [&](int chain) {
             const spatial before = moving;
             for (const int end = dof + count; dof < end; ++dof) {
                 const spatial rate = cross_motion(before, motion(dof));
-                row_of(problem.cdof_dot)[dof] = rate;
+                if (problem.is_read)
+                    row_of(problem.cdof_dot)[dof] = rate;
                 rising = rising + rate * qvel[dof];
                 moving = moving + motion(dof) * qvel[dof];
             }
@@ -39,7 +41,8 @@ each(NUM_CHAINS, [&](int chain) {
     }
 });
 sync();
-write(problem.cvel, NUM_BODIES, velocities, 6);
+if (problem.is_read)
+    write(problem.cvel, NUM_BODIES, velocities, 6);
 if (!problem.forces_too) {
     if (!problem.sums_momenta)
         return;
@@ -58,7 +61,8 @@ if (!problem.forces_too) {
     });
     return;
 }
-write(problem.cacc, NUM_BODIES, forces, 6);
+if (problem.is_read)
+    write(problem.cacc, NUM_BODIES, forces, 6);
 sync();
 each(NUM_BODIES, [&](int body) {
     const spatial pushed = times_inertia(inertia(body), force(body));
@@ -69,7 +73,8 @@ sync();
 sum_subtrees(16, [&](int index) {
     return index < 10 ? Column {inertias + index, POSE} : Column {forces + index - 10, 6};
 });
-write(problem.cfrc_int, NUM_BODIES, forces, 6);
+if (problem.is_read)
+    write(problem.cfrc_int, NUM_BODIES, forces, 6);
 if (NUM_FREE_BODIES > 0)
     write(problem.crb, NUM_BODIES, inertias, POSE);  // the integration reads it
 

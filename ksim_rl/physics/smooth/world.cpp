@@ -82,7 +82,7 @@ auto each_actuator_of = [&](int joint, auto body) {
         body(only);
     for (int actuator = 0; only < -1 && actuator < NUM_ACTUATORS; ++actuator) {
         const int type = look_up(problem.actuator_trntype, actuator);
-        if ((type == JOINT || type == JOINT_IN_PARENT) && problem.actuator_trnid.data[actuator][0] == joint)
+        if ((type == JOINT || type == JOINTINPARENT) && problem.actuator_trnid.data[actuator][0] == joint)
             body(actuator);
     }
 };
@@ -111,7 +111,7 @@ auto next_activation = [&](int actuator, int address, float rate) {
     const float timestep = of_world(problem.timestep);
     const float own = row_of(problem.act)[address];
     float found = own + rate * timestep;
-    if (look_up(problem.actuator_dyntype, actuator) == FILTER_EXACT) {
+    if (look_up(problem.actuator_dyntype, actuator) == FILTEREXACT) {
         const float time_constant = wp::max(TINY, model_row(problem.actuator_dynprm)[actuator][0]);
         found = own + rate * time_constant * (1.0f - wp::exp(-timestep / time_constant));
     }
