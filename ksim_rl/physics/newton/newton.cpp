@@ -107,18 +107,14 @@ UNROLL
         }
     });
     sync();
-    search2 = total(search2);
-    slope = total(slope);
-    half_curvature = total(half_curvature);
-    noise = NOISE * (total(noise) + fabsf(slope));
-    if (ELLIPTIC) {
-#pragma unroll 1
-        for (int unit = lane; unit < num_units; unit += LANES)
-            if (kind_of(units[unit]) == CONE_HEAD)
-                prepare_cone(units[unit], cone_size(units[unit]));
-        sync();
+    if (LANES > 1) {
+        const float pool = pooled(search2, slope, half_curvature, noise, LANES);
+        search2 = of_lane(pool, 0);
+        slope = of_lane(pool, 1);
+        half_curvature = of_lane(pool, 2);
+        noise = of_lane(pool, 3);
     }
-
+    noise = NOISE * (noise + fabsf(slope));
     const float enough = wp::max(tolerance * ls_tolerance * sqrtf(search2) / scale, 1e-6f);
     const Step step = search_line(slope, half_curvature, enough, noise);
     require(step.alpha >= 0.0f && step.improvement >= 0.0f, COST_FALLS);
