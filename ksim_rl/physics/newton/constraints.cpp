@@ -69,7 +69,8 @@ each_row(lane, LANES, Singly {}, [&](int row, float* jacobian) {
                 residual[row] = efc_D[row] = 0.0f;
                 return;
             }
-            kinds[row] += (before > 0 ? CONE_TANGENT : CONE_HEAD) - ONE_SIDED + ((before + after) << 4) + (before << 12);
+            kinds[row] += (before > 0 ? CONE_TANGENT : CONE_HEAD) - ONE_SIDED;
+            kinds[row] += ((before + after) << 4) + (before << 12);
             bound[row] = before > 0 ? friction[before - 1] : friction[0] * impratio;
             require(before + after >= 3 && before + after <= 6 && bound[row] > 0.0f, CONES_ARE_WHOLE);
         }

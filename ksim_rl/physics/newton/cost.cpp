@@ -39,7 +39,7 @@ auto cost_of = [&](int row, auto at) {
 };
 // Sets the force, the stiffness and the state of a row; each row of a cone looks at all of them. In the curved zone,
 // where the Hessian is no diagonal, the head has -Dm in the place of its stiffness, and `cones` has the spring
-// force[0] / T that the tangents share (part 5).
+// force[0] / T that the tangents share (part 6).
 auto update_row = [&](int row) {
     const int kind = kind_of(row);
     int state = QUADRATIC;

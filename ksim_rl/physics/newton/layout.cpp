@@ -50,6 +50,7 @@ float* const bound = efc_D + PADDED_ROWS;  // most dry friction, mu of a cone's 
 unsigned short* const kinds = (unsigned short*)(bound + PADDED_ROWS);
 short* const units = (short*)kinds + PADDED_ROWS;  // the rows whose cost is measured: all but equalities and tangents
 float* const cones = (float*)(units + PADDED_ROWS);
+short* const listed = (short*)(memory + FLOATS) - PADDED_ROWS;  // with tiles (part 5): the rows, limb by limb
 int num_units = 0;
 
 // What a lane has of the vectors of the degrees of freedom, and of the Hessian. The gradient, then y of
@@ -95,8 +96,8 @@ UNROLL
 #endif
     return value;
 };
-// What each lane has of four sums, added up over `lanes` neighbours: in the end lane i of them has the i-th. To halve what
-// they add they exchange the other half, in 5 steps for a warp where one sum after another takes 20.
+// What each lane has of four sums, added up over `lanes` neighbours, of which lane i then has the i-th. Lanes exchange
+// what they do not go on with, so that a warp shuffles 6 times where four sums, one by one, take 20.
 auto pooled = [=](float a, float b, float c, float d, int lanes) {
 #if defined(__CUDA_ARCH__)
     const bool odd = lane & 1, late = lane & 2;
@@ -114,6 +115,12 @@ auto any = [](bool holds) {
     holds = __any_sync(0xffffffffu, holds);
 #endif
     return holds;
+};
+auto across = [](float value, int distance) {
+#if defined(__CUDA_ARCH__)
+    value = __shfl_xor_sync(0xffffffffu, value, distance);
+#endif
+    return value;
 };
 auto of_lane = [](float value, int lane) {
 #if defined(__CUDA_ARCH__)

@@ -1,4 +1,4 @@
-// Part 6: the exact line search along qacc + alpha search (computation chapter, "Algorithms"; mujoco_warp's
+// Part 7: the exact line search along qacc + alpha search (computation chapter, "Algorithms"; mujoco_warp's
 // solver.py, _linesearch_iterative_kernel). Along it a row's residual is r + alpha rate, and the cost a sum of
 // functions of alpha, of each of which its value relative to alpha = 0, its slope and its curvature are needed.
 
@@ -126,7 +126,8 @@ struct Step {
 auto search_line = [&](float slope, float half_curvature, float enough, float noise) {
     float alpha = rows == 0 ? 1.0f : 0.0f, improvement = 0.0f, accepted = wp::max(enough, noise);
     constexpr int TEAM = LANES > 1 ? 8 : 1;
-    const int own_unit = lane % TEAM, own_row = own_unit < num_units ? units[own_unit] : 0, own_kind = kind_of(own_row);
+    const int own_unit = lane % TEAM, own_row = own_unit < num_units ? units[own_unit] : 0;
+    const int own_kind = kind_of(own_row);
     Cone own_cone;
     if (ELLIPTIC && rows > 0 && own_kind == CONE_HEAD)
         own_cone = prepare_cone(own_row);
