@@ -44,12 +44,14 @@ auto update_row = [&](int row) {
     const int kind = kind_of(row);
     int state = QUADRATIC;
     float curvature = efc_D[row], push = -efc_D[row] * residual[row];
-    if (kind == ONE_SIDED && residual[row] >= 0.0f)
+    if (kind == ONE_SIDED && residual[row] >= 0.0f) {
         state = SATISFIED;
-    if (kind == FRICTION) {
+        push = curvature = 0.0f;
+    } else if (kind == FRICTION) {
         const float most = bound[row], reach = ratio(most, efc_D[row]);
         state = residual[row] <= -reach ? LINEAR_NEGATIVE : residual[row] >= reach ? LINEAR_POSITIVE : QUADRATIC;
         push = state == LINEAR_NEGATIVE ? most : state == LINEAR_POSITIVE ? -most : push;
+        curvature = state == QUADRATIC ? curvature : 0.0f;
     }
     if (ELLIPTIC && kind >= CONE_HEAD) {
         const int head = head_of(row), size = cone_size(row);
@@ -65,6 +67,8 @@ UNROLL
         state = cone_zone(normal, tangent, mu);
         const float Dm = cone_Dm(head), of_head = Dm * (mu * tangent - normal) * mu;
         const float spring = state == CURVED ? of_head / tangent : 0.0f;
+        if (state == SATISFIED)
+            push = curvature = 0.0f;
         if (state == CURVED) {
             curvature = kind == CONE_HEAD ? -Dm : spring * bound[row] * bound[row];
             push = kind == CONE_HEAD ? of_head : -curvature * residual[row];
@@ -79,10 +83,6 @@ UNROLL
         const float most = state == SATISFIED ? 0.0f : state == CURVED ? of_head : -efc_D[head] * residual[head];
         require(state == SATISFIED || sqrtf(pull2) <= most * (1.0f + 1e-3f), FORCES_ARE_ADMISSIBLE);
     }
-    if (state == SATISFIED)
-        push = 0.0f;
-    if (state != QUADRATIC && state != CURVED)
-        curvature = 0.0f;
     require(
         kind == EQUALITY || kind == CONE_TANGENT || (kind == FRICTION ? fabsf(push) <= bound[row] : push >= 0.0f),
         FORCES_ARE_ADMISSIBLE

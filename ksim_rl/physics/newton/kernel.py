@@ -78,7 +78,7 @@ def layout(nv: int, njmax: int, limbs: Limbs, *, elliptic: bool, rows_on_chip: i
         "ROWS_ON_CHIP": rows_on_chip,
         "TILE": tile,
         "ELLIPTIC": elliptic,
-        "FLOATS": floats + (4 * (rows + 4) if elliptic else 0) + (rows // 2 if tile else 0),
+        "FLOATS": floats + (4 * rows if elliptic else 0) + (rows // 2 if tile else 0),
     }
 
 

@@ -104,9 +104,9 @@ auto cone_point = [&](const Cone& cone, float alpha) {
     return Point {change, cone.Dm * gap * gap_rate, cone.Dm * (gap_rate * gap_rate - cone.mu * gap * bend)};
 };
 // What a unit costs at a point of the search direction.
-auto unit_point = [&](int row, int kind, const Cone& cone, float alpha) {
+auto unit_point = [&](int row, int kind, float alpha) {
     if (ELLIPTIC && kind == CONE_HEAD)
-        return cone_point(cone, alpha);
+        return cone_point(*(const Cone*)(cones + 4 * row), alpha);
     if (kind == FRICTION)
         return dry_friction(residual[row], rate[row], efc_D[row], bound[row], alpha);
     return one_sided(residual[row], rate[row], efc_D[row], alpha);
@@ -121,31 +121,23 @@ struct Step {
     float alpha, improvement;
 };
 // The search keeps two points whose slopes it drives to zero, and takes the better one. Its trials measure three
-// points each, on CUDA by a team of eight lanes each; the first trial is of the start and of the Newton step. A lane keeps
-// the cone of its first unit, and those of further units are on the chip.
+// points each, on CUDA by a team of eight lanes each; the first trial is of the start and of the Newton step.
 auto search_line = [&](float slope, float half_curvature, float enough, float noise) {
     float alpha = rows == 0 ? 1.0f : 0.0f, improvement = 0.0f, accepted = wp::max(enough, noise);
     constexpr int TEAM = LANES > 1 ? 8 : 1;
-    const int own_unit = lane % TEAM, own_row = own_unit < num_units ? units[own_unit] : 0;
-    const int own_kind = kind_of(own_row);
-    Cone own_cone;
-    if (ELLIPTIC && rows > 0 && own_kind == CONE_HEAD)
-        own_cone = prepare_cone(own_row);
-    if (ELLIPTIC && num_units > TEAM) {
+    if (ELLIPTIC) {
 #pragma unroll 1
-        for (int unit = TEAM + lane; unit < num_units; unit += LANES)
+        for (int unit = lane; unit < num_units; unit += LANES)
             if (kind_of(units[unit]) == CONE_HEAD)
                 *(Cone*)(cones + 4 * units[unit]) = prepare_cone(units[unit]);
         sync();
     }
     auto measure = [&](float alpha) {
         Point sum {0.0f, 0.0f, 0.0f};
-        if (own_unit < num_units)
-            sum = unit_point(own_row, own_kind, own_cone, alpha);
 #pragma unroll 1
-        for (int unit = own_unit + TEAM; unit < num_units; unit += TEAM) {
+        for (int unit = lane % TEAM; unit < num_units; unit += TEAM) {
             const int row = units[unit];
-            const Point point = unit_point(row, kind_of(row), *(const Cone*)(cones + 4 * row), alpha);
+            const Point point = unit_point(row, kind_of(row), alpha);
             sum.cost += point.cost;
             sum.slope += point.slope;
             sum.curvature += point.curvature;
