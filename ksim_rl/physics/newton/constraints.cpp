@@ -4,6 +4,7 @@
 // The rows of a contact with an elliptic cone stand one after another: that of the normal, here the head of the
 // cone, and those of its tangents.
 
+constexpr int MOST_OF_CONE = 6;
 constexpr int EQUALITY = 0, FRICTION = 1, ONE_SIDED = 2, CONE_HEAD = 3, CONE_TANGENT = 4;
 const int* const slots = problem.slots.data;
 const int* const place_of = by_limbs ? problem.places.data : slots;
@@ -68,7 +69,8 @@ each_row(lane, LANES, Singly {}, [&](int row, float* jacobian) {
                 residual[row] = efc_D[row] = 0.0f;
                 return;
             }
-            kinds[row] += (before > 0 ? CONE_TANGENT : CONE_HEAD + (after << 4)) - ONE_SIDED;
+            kinds[row] += (before > 0 ? CONE_TANGENT : CONE_HEAD) - ONE_SIDED;
+            kinds[row] += ((before + after) << 4) + (before << 12);
             bound[row] = before > 0 ? friction[before - 1] : friction[0] * impratio;
             require(before + after >= 3 && before + after <= 6 && bound[row] > 0.0f, CONES_ARE_WHOLE);
         }

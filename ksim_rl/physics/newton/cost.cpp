@@ -37,57 +37,56 @@ auto cost_of = [&](int row, auto at) {
     const int state = cone_zone(here * mu, tangent, mu);
     return state == SATISFIED ? 0.0f : state == QUADRATIC ? of_all : 0.5f * cone_Dm(row) * gap * gap;
 };
-// Sets the force, the stiffness and the state of a row, and those of a whole cone at its head. In the curved zone,
+// Sets the force, the stiffness and the state of a row; each row of a cone looks at all of them. In the curved zone,
 // where the Hessian is no diagonal, the head has -Dm in the place of its stiffness, and `cones` has the spring
-// force[0] / T that the tangents share (part 4).
+// force[0] / T that the tangents share (part 6).
 auto update_row = [&](int row) {
     const int kind = kind_of(row);
-    if (kind == CONE_TANGENT)
-        return;
     int state = QUADRATIC;
     float curvature = efc_D[row], push = -efc_D[row] * residual[row];
     if (kind == ONE_SIDED && residual[row] >= 0.0f) {
         state = SATISFIED;
-        push = 0.0f;
+        push = curvature = 0.0f;
     } else if (kind == FRICTION) {
         const float most = bound[row], reach = ratio(most, efc_D[row]);
         state = residual[row] <= -reach ? LINEAR_NEGATIVE : residual[row] >= reach ? LINEAR_POSITIVE : QUADRATIC;
         push = state == LINEAR_NEGATIVE ? most : state == LINEAR_POSITIVE ? -most : push;
+        curvature = state == QUADRATIC ? curvature : 0.0f;
     }
-    if (state != QUADRATIC)
-        curvature = 0.0f;
-    if (ELLIPTIC && kind == CONE_HEAD) {
-        const int end = row + cone_size(row);
-        const float mu = bound[row], normal = residual[row] * mu;
+    if (ELLIPTIC && kind >= CONE_HEAD) {
+        const int head = head_of(row), size = cone_size(row);
+        const float mu = bound[head], normal = residual[head] * mu;
         float tangent2 = 0.0f;
-#pragma unroll 1
-        for (int mate = row + 1; mate < end; ++mate)
-            tangent2 += residual[mate] * bound[mate] * residual[mate] * bound[mate];
+UNROLL
+        for (int mate = 1; mate < MOST_OF_CONE; ++mate)
+            if (mate < size) {
+                const float slip = residual[head + mate] * bound[head + mate];
+                tangent2 += slip * slip;
+            }
         const float tangent = sqrtf(tangent2);
         state = cone_zone(normal, tangent, mu);
-        float spring = 0.0f;
+        const float Dm = cone_Dm(head), of_head = Dm * (mu * tangent - normal) * mu;
+        const float spring = state == CURVED ? of_head / tangent : 0.0f;
         if (state == SATISFIED)
             push = curvature = 0.0f;
         if (state == CURVED) {
-            const float Dm = cone_Dm(row);
-            push = Dm * (mu * tangent - normal) * mu;
-            spring = push / tangent;
-            curvature = -Dm;
+            curvature = kind == CONE_HEAD ? -Dm : spring * bound[row] * bound[row];
+            push = kind == CONE_HEAD ? of_head : -curvature * residual[row];
         }
-        cones[4 * row] = spring;
+        if (kind == CONE_HEAD)
+            cones[4 * row] = spring;
         float pull2 = 0.0f;
-#pragma unroll 1
-        for (int mate = row + 1; mate < end; ++mate) {
-            const float each = state == QUADRATIC ? efc_D[mate] : spring * bound[mate] * bound[mate];
-            force[mate] = -each * residual[mate];
-            stiffness[mate] = each;
-            states[mate] = state;
-            if (CHECKED)
-                pull2 += force[mate] * force[mate] / (bound[mate] * bound[mate]);
+        for (int mate = head + 1; CHECKED && mate < head + size; ++mate) {
+            const float each = state == QUADRATIC ? efc_D[mate] / bound[mate] : spring * bound[mate];
+            pull2 += each * each * residual[mate] * residual[mate];
         }
-        require(sqrtf(pull2) <= push * (1.0f + 1e-3f), FORCES_ARE_ADMISSIBLE);
+        const float most = state == SATISFIED ? 0.0f : state == CURVED ? of_head : -efc_D[head] * residual[head];
+        require(state == SATISFIED || sqrtf(pull2) <= most * (1.0f + 1e-3f), FORCES_ARE_ADMISSIBLE);
     }
-    require(kind == EQUALITY || (kind == FRICTION ? fabsf(push) <= bound[row] : push >= 0.0f), FORCES_ARE_ADMISSIBLE);
+    require(
+        kind == EQUALITY || kind == CONE_TANGENT || (kind == FRICTION ? fabsf(push) <= bound[row] : push >= 0.0f),
+        FORCES_ARE_ADMISSIBLE
+    );
     force[row] = push;
     stiffness[row] = curvature;
     states[row] = state;

@@ -1,4 +1,4 @@
-// Part 5: the gradient M qacc - qfrc_smooth - J' force, the Hessian H = M + J' d2s/dr2 J, and the search direction
+// Part 6: the gradient M qacc - qfrc_smooth - J' force, the Hessian H = M + J' d2s/dr2 J, and the search direction
 // -H^-1 gradient by a Cholesky factorization (computation chapter, "Algorithms", Newton): that of part 4, or here for
 // rows that touch any degrees of freedom.
 
@@ -9,7 +9,7 @@ UNROLL
         float product = 0.0f;
 UNROLL
         for (int dof = 0; dof < NV; ++dof)
-            product += mass[dof * STRIDE + slot_of(block)] * shared[dof];
+            product += mass[slot_of(block) * STRIDE + dof] * shared[dof];
         result[block] = fabsf(own[block]) <= LARGEST ? product : own[block];
     }
 };

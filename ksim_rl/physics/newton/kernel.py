@@ -5,7 +5,7 @@ world waits for another, and what an iteration computes stays on the chip. The a
 by bracketed Newton steps, and the same tests of convergence, so that the results agree up to rounding. It is written in
 C++, since its matrix lies in registers, which needs loops that are unrolled, shuffles and shared memory; the CPU
 compiles the same source, for a warp of one lane. Read its parts in their order: layout.cpp, constraints.cpp, cost.cpp,
-limbs.cpp, hessian.cpp, line_search.cpp, newton.cpp.
+limbs.cpp, tiles.cpp, hessian.cpp, line_search.cpp, newton.cpp.
 
 Source of the algorithm: https://mujoco.readthedocs.io/en/stable/computation/index.html; of its bounds, line
 search and tests of convergence: mujoco_warp/_src/solver.py.
@@ -25,7 +25,9 @@ from ksim_rl.physics.newton.limbs import Limbs, padded
 
 CUDA_LANES = 32
 SORTING_THREADS = 1024
-_PARTS = ("layout", "constraints", "cost", "limbs", "hessian", "line_search", "newton")
+# A lane has four rows of so many entries in its registers.
+MOST_OF_TILE = 12
+_PARTS = ("layout", "constraints", "cost", "limbs", "tiles", "hessian", "line_search", "newton")
 _SOURCE = native.source_of("newton", _PARTS)
 
 
@@ -54,10 +56,10 @@ def layout(nv: int, njmax: int, limbs: Limbs, *, elliptic: bool, rows_on_chip: i
     narrow = _row_stride(trunk + limb) if chains else stride
     # A column of a whole block has the entries of the block twice; one more is that of the gradient.
     column = padded(nv + 1 + (CUDA_LANES if nv >= CUDA_LANES else 0))
-    # Part 4 of the C++ has blocks and arms of limbs, then the trunk; part 5 has two columns, or in the end two rows.
+    # Part 4 of the C++ has blocks and arms of limbs, then the trunk; part 6 has two columns, or in the end two rows.
     of_limbs = chains * (limb + arms) * padded(limb) + max(padded(arms * (arms + 1) // 2), 2 * narrow)
     workspace, spread = max(2 * column, 2 * stride, of_limbs), trunk + chains * padded(limb)
-    rows = padded(njmax)
+    rows, tile = padded(njmax), _tile(chains, len(limbs.trunk) + limb)
     floats = (nv + 1) * stride + rows_on_chip * narrow + workspace + spread + 6 * rows
     return {
         "NV": nv,
@@ -74,9 +76,16 @@ def layout(nv: int, njmax: int, limbs: Limbs, *, elliptic: bool, rows_on_chip: i
         "WORKSPACE": workspace,
         "COLUMN": column,
         "ROWS_ON_CHIP": rows_on_chip,
+        "TILE": tile,
         "ELLIPTIC": elliptic,
-        "FLOATS": floats + (4 * (rows + 4) if elliptic else 0),
+        "FLOATS": floats + (4 * rows if elliptic else 0) + (rows // 2 if tile else 0),
     }
+
+
+def _tile(limbs: int, dofs: int) -> int:
+    # So many lanes sum the tile of a limb: a power of two, so that a tile's sums find those of others by a shuffle.
+    lanes = 1 << (CUDA_LANES // limbs).bit_length() - 1 if limbs else 0
+    return lanes if dofs <= min(lanes + 1, MOST_OF_TILE) else 0
 
 
 def _row_stride(entries: int) -> int:

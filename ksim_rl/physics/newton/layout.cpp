@@ -46,10 +46,11 @@ float* const stiffness = rate;  // d2s/dr2, between two line searches; 0 where a
 float* const force = rate + PADDED_ROWS;  // -ds/dr
 float* const efc_D = force + PADDED_ROWS;
 float* const bound = efc_D + PADDED_ROWS;  // most dry friction, mu of a cone's head, friction of its tangents
-// Of each row its kind, 16 times the rows of its cone, and 256 times its limb.
+// Of each row its kind, 16 times the rows of its cone, 256 times its limb, and 4096 times its place in the cone.
 unsigned short* const kinds = (unsigned short*)(bound + PADDED_ROWS);
 short* const units = (short*)kinds + PADDED_ROWS;  // the rows whose cost is measured: all but equalities and tangents
 float* const cones = (float*)(units + PADDED_ROWS);
+short* const listed = (short*)(memory + FLOATS) - PADDED_ROWS;  // with tiles (part 5): the rows, limb by limb
 int num_units = 0;
 
 // What a lane has of the vectors of the degrees of freedom, and of the Hessian. The gradient, then y of
@@ -95,11 +96,31 @@ UNROLL
 #endif
     return value;
 };
+// What each lane has of four sums, added up over `lanes` neighbours, of which lane i then has the i-th. Lanes exchange
+// what they do not go on with, so that a warp shuffles 6 times where four sums, one by one, take 20.
+auto pooled = [=](float a, float b, float c, float d, int lanes) {
+#if defined(__CUDA_ARCH__)
+    const bool odd = lane & 1, late = lane & 2;
+    const float ab = (odd ? b : a) + __shfl_xor_sync(0xffffffffu, odd ? a : b, 1);
+    const float cd = (odd ? d : c) + __shfl_xor_sync(0xffffffffu, odd ? c : d, 1);
+    a = (late ? cd : ab) + __shfl_xor_sync(0xffffffffu, late ? ab : cd, 2);
+UNROLL
+    for (int distance = 4; distance < lanes; distance <<= 1)
+        a += __shfl_xor_sync(0xffffffffu, a, distance);
+#endif
+    return a;
+};
 auto any = [](bool holds) {
 #if defined(__CUDA_ARCH__)
     holds = __any_sync(0xffffffffu, holds);
 #endif
     return holds;
+};
+auto across = [](float value, int distance) {
+#if defined(__CUDA_ARCH__)
+    value = __shfl_xor_sync(0xffffffffu, value, distance);
+#endif
+    return value;
 };
 auto of_lane = [](float value, int lane) {
 #if defined(__CUDA_ARCH__)
@@ -116,7 +137,8 @@ auto slot_of = [&](int block) { return wp::min(block * LANES + lane, NV - 1); };
 auto dof_of = [&](int block) { return problem.dofs.data[slot_of(block)]; };
 auto kind_of = [&](int row) { return kinds[row] & 15; };
 auto cone_size = [&](int row) { return kinds[row] >> 4 & 15; };
-auto limb_of = [&](int row) { return kinds[row] >> 8; };
+auto limb_of = [&](int row) { return kinds[row] >> 8 & 15; };
+auto head_of = [&](int row) { return row - (kinds[row] >> 12); };
 auto touches = [&](int block, int limb) { return limbs[block] < 0 || limbs[block] == limb; };
 
 bool couples = false;

@@ -15,6 +15,8 @@ constexpr int GROUP = LIMBS > 0 && LIMBS < LANES ? LANES / LIMBS : 1, GROUPS = L
 constexpr int ARMS = TRUNK + 1;  // columns of A_k', of which the last is that of the gradient
 constexpr int ENTRIES = ARMS * (ARMS + 1) / 2;
 
+constexpr bool TILED = TILE > 0 && LANES > 1;  // part 5 has shared out all but the gradient
+
 float own_row[BLOCKS][NARROW];  // the trunk's entries of the Hessian's row, then the limb's
 float rest[ENTRIES];
 float* const limb_blocks = columns;  // H_k by rows, then L_k with the inverse of its diagonal
@@ -46,7 +48,7 @@ UNROLL
         const float* const of_limb = mass + (slot_of(block) - wp::max(places[block] - LIMB_BEGIN, 0)) * STRIDE;
 UNROLL
         for (int place = 0; place < TRUNK; ++place)
-            own_row[block][place] = mass[place * STRIDE + slot_of(block)];
+            own_row[block][place] = mass[slot_of(block) * STRIDE + place];
 UNROLL
         for (int place = 0; place < LIMB; ++place)
             own_row[block][LIMB_BEGIN + place] = of_limb[place * STRIDE + slot_of(block)];
@@ -76,16 +78,16 @@ UNROLL
         if (limb < 0) {
 UNROLL
             for (int other = 0; other < TRUNK; ++other)
-                if (other <= place)
+                if (!TILED && other <= place)
                     trunk[entry_of(place, other)] = own_row[block][other];
             trunk[entry_of(TRUNK, place)] = bounded(gradient[block]);
         } else {
 UNROLL
-            for (int other = 0; other < TRUNK; ++other)
+            for (int other = 0; other < (TILED ? 0 : TRUNK); ++other)
                 arm_of(limb, other)[place - LIMB_BEGIN] = own_row[block][other];
             arm_of(limb, TRUNK)[place - LIMB_BEGIN] = bounded(gradient[block]);
 UNROLL
-            for (int other = 0; other < LIMB; ++other)
+            for (int other = 0; other < (TILED ? 0 : LIMB); ++other)
                 block_of(limb, place - LIMB_BEGIN)[other] = own_row[block][LIMB_BEGIN + other];
         }
     }

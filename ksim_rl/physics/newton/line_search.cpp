@@ -1,4 +1,4 @@
-// Part 6: the exact line search along qacc + alpha search (computation chapter, "Algorithms"; mujoco_warp's
+// Part 7: the exact line search along qacc + alpha search (computation chapter, "Algorithms"; mujoco_warp's
 // solver.py, _linesearch_iterative_kernel). Along it a row's residual is r + alpha rate, and the cost a sum of
 // functions of alpha, of each of which its value relative to alpha = 0, its slope and its curvature are needed.
 
@@ -31,41 +31,44 @@ auto dry_friction = [&](float at_start, float rate, float efc_D, float most, flo
 };
 // A cone along the direction: N + alpha N_rate, and a slip whose part along its own rate is `along` + alpha
 // `speed`, while the square of its part across is `aside2` throughout. So T^2 = (along + alpha speed)^2 + aside2.
-struct Cone {
+struct alignas(16) Cone {
     float mu, N, N_rate, along, speed, aside2, Dm, cost, slope, half_curvature, T, state;
 };
-auto prepare_cone = [&](int head, int size) {
+auto prepare_cone = [&](int head) {
+    const int size = cone_size(head);
     Cone cone {};
     cone.mu = bound[head];
     cone.N = residual[head] * cone.mu;
     cone.N_rate = rate[head] * cone.mu;
     cone.Dm = cone_Dm(head);
-    float slip_slip = 0.0f, slip_rate = 0.0f, rate_rate = 0.0f;
-#pragma unroll 1
-    for (int row = head; row < head + size; ++row) {
-        const float push = efc_D[row] * residual[row];
-        cone.cost += 0.5f * push * residual[row];
-        cone.slope += push * rate[row];
-        cone.half_curvature += 0.5f * efc_D[row] * rate[row] * rate[row];
-        if (row == head)
-            continue;
-        const float slip = residual[row] * bound[row], faster = rate[row] * bound[row];
-        slip_slip += slip * slip;
-        slip_rate += slip * faster;
-        rate_rate += faster * faster;
-    }
+    float slip[MOST_OF_CONE] {}, faster[MOST_OF_CONE] {}, slip_rate = 0.0f, rate_rate = 0.0f;
+UNROLL
+    for (int mate = 0; mate < MOST_OF_CONE; ++mate)
+        if (mate < size) {
+            const int row = head + mate;
+            const float push = efc_D[row] * residual[row];
+            cone.cost += 0.5f * push * residual[row];
+            cone.slope += push * rate[row];
+            cone.half_curvature += 0.5f * efc_D[row] * rate[row] * rate[row];
+            if (mate > 0) {
+                slip[mate] = residual[row] * bound[row];
+                faster[mate] = rate[row] * bound[row];
+                slip_rate += slip[mate] * faster[mate];
+                rate_rate += faster[mate] * faster[mate];
+            }
+        }
     cone.speed = sqrtf(rate_rate);
     cone.along = rate_rate > 0.0f ? slip_rate / cone.speed : 0.0f;
     const float when = rate_rate > 0.0f ? slip_rate / rate_rate : 0.0f;
     // The part of the slip across its rate, term by term: as a difference of squares it would cancel.
-#pragma unroll 1
-    for (int row = head + 1; row < head + size; ++row) {
-        const float across = (residual[row] - when * rate[row]) * bound[row];
+UNROLL
+    for (int mate = 1; mate < MOST_OF_CONE; ++mate) {
+        const float across = slip[mate] - when * faster[mate];
         cone.aside2 += across * across;
     }
     cone.T = sqrtf(cone.along * cone.along + cone.aside2);
     cone.state = (float)cone_zone(cone.N, cone.T, cone.mu);
-    *(Cone*)(cones + 4 * head) = cone;
+    return cone;
 };
 auto cone_point = [&](const Cone& cone, float alpha) {
     const int state_0 = (int)cone.state;
@@ -100,24 +103,13 @@ auto cone_point = [&](const Cone& cone, float alpha) {
     }
     return Point {change, cone.Dm * gap * gap_rate, cone.Dm * (gap_rate * gap_rate - cone.mu * gap * bend)};
 };
-// What the rows cost at a point of the search direction, summed over the units first, first + stride, ...
-auto measure = [&](float alpha, int first, int stride) {
-    Point sum {0.0f, 0.0f, 0.0f};
-#pragma unroll 1
-    for (int unit = first; unit < num_units; unit += stride) {
-        const int row = units[unit], kind = kind_of(row);
-        Point point;
-        if (ELLIPTIC && kind == CONE_HEAD)
-            point = cone_point(*(const Cone*)(cones + 4 * row), alpha);
-        else if (kind == FRICTION)
-            point = dry_friction(residual[row], rate[row], efc_D[row], bound[row], alpha);
-        else
-            point = one_sided(residual[row], rate[row], efc_D[row], alpha);
-        sum.cost += point.cost;
-        sum.slope += point.slope;
-        sum.curvature += point.curvature;
-    }
-    return sum;
+// What a unit costs at a point of the search direction.
+auto unit_point = [&](int row, int kind, float alpha) {
+    if (ELLIPTIC && kind == CONE_HEAD)
+        return cone_point(*(const Cone*)(cones + 4 * row), alpha);
+    if (kind == FRICTION)
+        return dry_friction(residual[row], rate[row], efc_D[row], bound[row], alpha);
+    return one_sided(residual[row], rate[row], efc_D[row], alpha);
 };
 auto in_bracket = [](const Point& end, const Point& point) {
     return end.slope * point.slope > 0.0f && fabsf(point.slope) < fabsf(end.slope);
@@ -129,9 +121,29 @@ struct Step {
     float alpha, improvement;
 };
 // The search keeps two points whose slopes it drives to zero, and takes the better one. Its trials measure three
-// points each, on CUDA by eight lanes each; the first trial is of the start and of the Newton step.
+// points each, on CUDA by a team of eight lanes each; the first trial is of the start and of the Newton step.
 auto search_line = [&](float slope, float half_curvature, float enough, float noise) {
     float alpha = rows == 0 ? 1.0f : 0.0f, improvement = 0.0f, accepted = wp::max(enough, noise);
+    constexpr int TEAM = LANES > 1 ? 8 : 1;
+    if (ELLIPTIC) {
+#pragma unroll 1
+        for (int unit = lane; unit < num_units; unit += LANES)
+            if (kind_of(units[unit]) == CONE_HEAD)
+                *(Cone*)(cones + 4 * units[unit]) = prepare_cone(units[unit]);
+        sync();
+    }
+    auto measure = [&](float alpha) {
+        Point sum {0.0f, 0.0f, 0.0f};
+#pragma unroll 1
+        for (int unit = lane % TEAM; unit < num_units; unit += TEAM) {
+            const int row = units[unit];
+            const Point point = unit_point(row, kind_of(row), alpha);
+            sum.cost += point.cost;
+            sum.slope += point.slope;
+            sum.curvature += point.curvature;
+        }
+        return sum;
+    };
     float alphas[3] = {0.0f, 1.0f, 1.0f}, low_alpha = 0.0f, high_alpha = 0.0f;
     Point low {0.0f, 0.0f, 0.0f}, high = low;
 #pragma unroll 1
@@ -148,24 +160,19 @@ auto search_line = [&](float slope, float half_curvature, float enough, float no
         }
         Point points[3];
 #if defined(__CUDA_ARCH__)
-        const int mine = lane >> 3;
+        const int mine = lane / TEAM;
         const float at = mine == 0 ? alphas[0] : mine == 1 ? alphas[1] : alphas[2];
-        Point sum = measure(at, mine == 3 ? NJ : lane & 7, 8);
-UNROLL
-        for (int distance = 4; distance > 0; distance >>= 1) {
-            sum.cost += __shfl_xor_sync(0xffffffffu, sum.cost, distance);
-            sum.slope += __shfl_xor_sync(0xffffffffu, sum.slope, distance);
-            sum.curvature += __shfl_xor_sync(0xffffffffu, sum.curvature, distance);
-        }
+        Point sum = measure(at);
+        const float pool = pooled(sum.cost, sum.slope, sum.curvature, 0.0f, TEAM);
 #endif
 UNROLL
         for (int i = 0; i < 3; ++i) {
 #if defined(__CUDA_ARCH__)
-            points[i].cost = __shfl_sync(0xffffffffu, sum.cost, 8 * i);
-            points[i].slope = __shfl_sync(0xffffffffu, sum.slope, 8 * i);
-            points[i].curvature = __shfl_sync(0xffffffffu, sum.curvature, 8 * i);
+            points[i].cost = of_lane(pool, TEAM * i);
+            points[i].slope = of_lane(pool, TEAM * i + 1);
+            points[i].curvature = of_lane(pool, TEAM * i + 2);
 #else
-            points[i] = i == 2 && trial < 0 ? points[1] : measure(alphas[i], 0, 1);
+            points[i] = i == 2 && trial < 0 ? points[1] : measure(alphas[i]);
 #endif
         }
 UNROLL

@@ -1,9 +1,11 @@
-// Part 7: Newton's method, from its start to the accelerations and forces (computation chapter, "Algorithms").
+// Part 8: Newton's method, from its start to the accelerations and forces (computation chapter, "Algorithms").
 // It ends, as mujoco_warp's solver.py (_solve_done) does, once the scaled gradient, Newton decrement or improvement
 // is below the tolerance, or a line search finds nothing better.
 
 if (by_limbs)
     clear_limbs();
+if (TILED && by_limbs)
+    list_rows();
 times_mass(M_qacc, qacc);
 // The start is the warm start, or zero where that is cheaper; C compares with the unconstrained acceleration, which
 // nothing here computes. Without rows it is zero: the one step from there rounds by what it finds, not by how far away
@@ -40,8 +42,8 @@ const float scale = 1.0f / wp::max(TINY, total(trace));
 int iteration = 0;
 bool last = false;
 // Sets the gradient, then the search direction, or returns that the accelerations are good enough or the last.
-auto find_search = [&](auto start, auto add, auto eliminate, auto substitute) {
-    build_hessian(start, add);
+auto find_search = [&](auto sum, auto eliminate, auto substitute) {
+    sum();
     float gradient2 = 0.0f;
 UNROLL
     for (int block = 0; block < BLOCKS; ++block) {
@@ -61,6 +63,13 @@ UNROLL
     substitute();
     return false;
 };
+auto sum_by_limbs = [&] {
+    if (TILED)
+        sum_tiles();
+    else
+        build_hessian(start_own_rows, add_to_own_rows);
+};
+auto sum_densely = [&] { build_hessian(start_rows, add_outer_product); };
 while (true) {
 #pragma unroll 1
     for (int row = lane; row < rows; row += LANES)
@@ -70,8 +79,8 @@ while (true) {
         pull_back();
         break;
     }
-    if (by_limbs ? find_search(start_own_rows, add_to_own_rows, factorize_limbs, search_along_limbs)
-                 : find_search(start_rows, add_outer_product, factorize, back_substitute))
+    if (by_limbs ? find_search(sum_by_limbs, factorize_limbs, search_along_limbs)
+                 : find_search(sum_densely, factorize, back_substitute))
         break;
 
     // Along the search direction: M search, J search, and the terms of the cost that are quadratic everywhere.
@@ -107,18 +116,14 @@ UNROLL
         }
     });
     sync();
-    search2 = total(search2);
-    slope = total(slope);
-    half_curvature = total(half_curvature);
-    noise = NOISE * (total(noise) + fabsf(slope));
-    if (ELLIPTIC) {
-#pragma unroll 1
-        for (int unit = lane; unit < num_units; unit += LANES)
-            if (kind_of(units[unit]) == CONE_HEAD)
-                prepare_cone(units[unit], cone_size(units[unit]));
-        sync();
+    if (LANES > 1) {
+        const float pool = pooled(search2, slope, half_curvature, noise, LANES);
+        search2 = of_lane(pool, 0);
+        slope = of_lane(pool, 1);
+        half_curvature = of_lane(pool, 2);
+        noise = of_lane(pool, 3);
     }
-
+    noise = NOISE * (noise + fabsf(slope));
     const float enough = wp::max(tolerance * ls_tolerance * sqrtf(search2) / scale, 1e-6f);
     const Step step = search_line(slope, half_curvature, enough, noise);
     require(step.alpha >= 0.0f && step.improvement >= 0.0f, COST_FALLS);
