@@ -13,7 +13,6 @@ from torchrl.data import Composite
 
 from ksim_rl.checked import Checked, Count, Filled, Name, NonNegative
 from ksim_rl.checks import check_choice, check_in_range
-from ksim_rl.device.memory import ROLLOUT_PARTS
 from ksim_rl.device.running_moments import RunningMoments, publish
 from ksim_rl.modules.mlp import ACTIVATIONS, Device, mlp
 
@@ -75,8 +74,8 @@ def update_normalizers(tensordict: TensorDictBase, *networks: nn.Module) -> None
                 continue
             if id(normalizer) not in seen:
                 seen[id(normalizer)] = normalizer
-                for part in _observation(tensordict, module, normalizer.dim).chunk(ROLLOUT_PARTS, -2):
-                    normalizer.count_rows(part)
+                # Step by step, as the memory of a rollout is.
+                normalizer.count_rows(_observation(tensordict, module, normalizer.dim).transpose(0, -2))
     publish([*seen.values()])
 
 
