@@ -138,13 +138,18 @@ class ObservingNetwork(nn.Module):
         self.normalizer = ObservationNormalizer(obs_dim, device=device) if cfg.obs_normalization else None
 
     def observe(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch L"]:
-        """Return what the first layer reads: observations side by side, normalized; a ValueError for another number."""
+        """Return what the first layer reads: observations side by side, normalized."""
+        obs = self.joined(*observations)
+        return obs if self.normalizer is None else self.normalizer(obs)
+
+    def joined(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch L"]:
+        """Return observations side by side; a ValueError for another number than the network was built for."""
         obs = side_by_side(observations)
         if obs.shape[-1] != self.obs_dim:
             raise ValueError(
                 f"the network was built for obs_dim={self.obs_dim}, and reads observations of {obs.shape[-1]} numbers"
             )
-        return obs if self.normalizer is None else self.normalizer(obs)
+        return obs
 
 
 FEATURES = "features"

@@ -292,8 +292,8 @@ def test_a_symmetry_without_a_mirror_is_refused(fused_ppo):
         fused_ppo(
             PPOCfg(symmetry="loss"),
             fused_networks(*networks()),
-            observe_actor=lambda td: td["actor"],
-            observe_critic=lambda td: td["critic"],
+            observe_actor=observer(networks()[0][0]),
+            observe_critic=observer(networks()[1]),
             optimizer=torch.optim.Adam([torch.zeros(1)]),
             guard=StepGuard(),
             num_env_states_per_minibatch=8,

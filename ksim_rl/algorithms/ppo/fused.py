@@ -1,20 +1,18 @@
 """This module says whether the gradient steps of a PPO run can be fused kernels, and builds these for it."""
 
 import importlib.util
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
-from jaxtyping import Float
-from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
-from torch import Tensor, nn
+from torch import nn
 
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate
 from ksim_rl.data import EpochSampler
 from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, ValueNetwork
 from ksim_rl.modules.actor import MIN_STD, GaussianHead
 from ksim_rl.objectives import SymmetricAugmentation
-from ksim_rl.objectives.fused_ppo import ACTIVATIONS, FusedNetworks, why_not_fused
+from ksim_rl.objectives.fused_ppo import ACTIVATIONS, FusedNetworks, Observer, why_not_fused
 from ksim_rl.transforms import MirrorMap
 
 if TYPE_CHECKING:
@@ -79,8 +77,12 @@ def _layers(network: nn.Sequential) -> list[nn.Linear]:
     return [layer for layer in network if isinstance(layer, nn.Linear)]
 
 
-def observer(module: Any) -> Callable[[TensorDictBase], Float[Tensor, "B L"]]:
-    """Return what gives the input of the first layer of a network from `make_actor` or `make_critic`."""
+def observer(module: Any) -> Observer:
+    """Return what the first layer of a network from `make_actor` or `make_critic` takes."""
     network: PolicyNetwork | ValueNetwork = module.module
-    keys = list(module.in_keys)
-    return lambda env_states: network.observe(*(env_states.get(key) for key in keys))
+    keys, moments = list(module.in_keys), network.normalizer
+    return Observer(
+        read=lambda env_states: network.joined(*(env_states.get(key) for key in keys)),
+        moments=moments,
+        eps=0.0 if moments is None else moments.eps,
+    )

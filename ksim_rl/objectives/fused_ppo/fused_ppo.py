@@ -21,15 +21,17 @@ from torch import Tensor
 from torch.nn import functional
 
 from ksim_rl import ranks
+from ksim_rl.device.memory import ROLLOUT_PARTS
 from ksim_rl.device.streams import beside, warp_scope, warp_stream
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
-from ksim_rl.objectives.fused_ppo.dataset import FusedDataset, Observe, as_tf32
+from ksim_rl.objectives.fused_ppo.dataset import FusedDataset, as_tf32
 from ksim_rl.objectives.fused_ppo.layer_kernels import layer, output_gradients
 from ksim_rl.objectives.fused_ppo.layout import (
     ACTIVATIONS,
     FusedLayout,
     FusedNetworks,
     LayerPlace,
+    Observer,
     Tuning,
     launch,
     parts,
@@ -111,7 +113,7 @@ class FusedPPO:
     """Makes the gradient steps of one update after another; all memory is allocated once, and nothing syncs.
 
     `why_not_fused` has no reason against its config. The first layers take what `observe_actor` and `observe_critic`
-    give, [..., L]. Moments, step counts and learning rate are those of `optimizer`, from `make_optimizer`. A symmetry
+    say. Moments, step counts and learning rate are those of `optimizer`, from `make_optimizer`. A symmetry
     of the config needs the `mirror`; else a ValueError is raised.
     """
 
@@ -120,8 +122,8 @@ class FusedPPO:
         cfg: PPOCfg,
         networks: FusedNetworks,
         *,
-        observe_actor: Observe,
-        observe_critic: Observe,
+        observe_actor: Observer,
+        observe_critic: Observer,
         optimizer: torch.optim.Adam,
         guard: StepGuard,
         num_env_states_per_minibatch: int,
@@ -233,30 +235,35 @@ class FusedPPO:
         """Make all gradient steps of an update.
 
         `rollout_ET`, `["E","T"]`, may be time-major in memory, as that of a collector. `orders` has for each epoch the
-        env states in the order of the minibatches, counted env by env; a GPU draws them while it reads the rollout, and
-        does what is `aside` beside the steps, which do not. Returned are what each gradient step measured, by the names
-        of `SUMMARY`, and how many env states took no part because an element was not finite.
+        env states in the order of the minibatches, counted env by env; a GPU draws one while it reads the rollout or
+        makes the steps of the epoch before, and does what is `aside` beside the first steps, which do not. Returned are
+        what each gradient step measured, by the names of `SUMMARY`, and how many env states took no part because an
+        element was not finite.
         """
         num_envs, length = rollout_ET.batch_size
-        places: list[Tensor] = []
+        upcoming, epochs = iter(orders), []
 
         def place() -> None:
-            for order_D in orders:
+            for order_D in itertools.islice(upcoming, 1):
                 order_D = order_D.to(torch.int32)
                 # From env by env to step by step.
-                places.extend(((order_D % length) * num_envs + order_D // length).split(self.batch))
+                epochs.append(((order_D % length) * num_envs + order_D // length).split(self.batch))
 
         with warp_scope(self._summary.device):
             with beside(self._side, place):
                 self.parameters.load()
                 left_out = self.dataset.read(rollout_ET, evaluate=self._evaluate)
-            with beside(self._side, *aside):
-                for step, index_B in enumerate(places):
-                    if len(self.dataset.records) > self.dataset.size:
-                        index_B = torch.cat([index_B, index_B + self.dataset.size])
-                    self._multiply(index_B)
-                    self._improve(step)
-                self.parameters.store()
+            step = itertools.count()
+            # Grows beside the steps; what was placed must stay until all is done, as another stream allocated it.
+            for indices in epochs:
+                with beside(self._side, place, *aside):
+                    for index_B in indices:
+                        if len(self.dataset.records) > self.dataset.size:
+                            index_B = torch.cat([index_B, index_B + self.dataset.size])
+                        self._multiply(index_B)
+                        self._improve(next(step))
+                aside = ()
+            self.parameters.store()
         names = SUMMARY if self._mirrored else SUMMARY[:-1]
         return dict(zip(names, self._summary.unbind(1), strict=False)), left_out
 
@@ -344,8 +351,10 @@ class FusedPPO:
             return
         *layers, last = self.networks.critic
         activation = self.networks.activation()
-        hidden_DL = obs_DL[:, : self.layout.obs_dims[1]]
-        for below in layers:
-            weight, bias = below.weight.to(obs_DL.dtype), below.bias.to(obs_DL.dtype)
-            hidden_DL = activation(functional.linear(hidden_DL, weight, bias))
-        values_D.copy_(last(hidden_DL.to(values_D.dtype)).squeeze(-1))
+        # The hidden layers of some env states at a time: they take several times the memory of these.
+        for obs_BL, values_B in zip(obs_DL.chunk(ROLLOUT_PARTS), values_D.chunk(ROLLOUT_PARTS), strict=True):
+            hidden_BL = obs_BL[:, : self.layout.obs_dims[1]]
+            for below in layers:
+                weight, bias = below.weight.to(obs_DL.dtype), below.bias.to(obs_DL.dtype)
+                hidden_BL = activation(functional.linear(hidden_BL, weight, bias))
+            values_B.copy_(last(hidden_BL.to(values_D.dtype)).squeeze(-1))

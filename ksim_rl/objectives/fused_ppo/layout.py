@@ -2,14 +2,16 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int32
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from ksim_rl.device.running_moments import RunningMoments
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
 
 # The smallest dim that a tensor core multiplies.
@@ -65,6 +67,15 @@ class FusedNetworks:
             and not any(width % MIN_WIDTH for width in hidden)
             and max(self.actor[0].in_features, self.critic[0].in_features) <= CHAINED_OBS
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observer:
+    """What the first layer of a network takes: what `read` gives, [..., L], normalized by the `moments`, if any."""
+
+    read: Callable[[TensorDictBase], Float[Tensor, "*batch L"]]
+    moments: RunningMoments | None = None
+    eps: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
