@@ -37,7 +37,12 @@ from ksim_rl.objectives.fused_ppo.layout import (
     parts,
     power_of_two,
 )
-from ksim_rl.objectives.fused_ppo.mlp_kernels import minibatch_gradients, state_values, weight_gradients
+from ksim_rl.objectives.fused_ppo.mlp_kernels import (
+    lower_gradients,
+    minibatch_gradients,
+    state_values,
+    weight_gradients,
+)
 from ksim_rl.objectives.fused_ppo.step_kernels import SUMMARY, adam_step, sum_gradients, take_means
 from ksim_rl.objectives.gradient_step import StepGuard
 from ksim_rl.objectives.symmetry import SymmetricAugmentation
@@ -160,8 +165,9 @@ class FusedPPO:
         )
 
         self._summary = torch.zeros(num_steps, power_of_two(len(SUMMARY) + 1), device=device)
-        # Splits whose layer inputs and gradients exist at a time; the loss of a mirror image reads the whole minibatch.
-        self._splits = tuning.splits if self._mirrored else parts(tuning.splits, 2)
+        # Splits whose layer inputs and gradients exist at a time. The loss of a mirror image reads the whole minibatch;
+        # chained kernels leave out half of its columns.
+        self._splits = tuning.splits if self._mirrored or layout.chained else parts(tuning.splits, 2)
         self._arguments = self._all_arguments(rows, mirror)
 
     def _all_arguments(self, rows: int, mirror: SymmetricAugmentation | None) -> dict[str, Any]:
@@ -286,6 +292,8 @@ class FusedPPO:
             }
             if self.layout.chained:
                 launch(minibatch_gradients, (given["BLOCKS"], 2), given, num_warps=tuning.warps)
+                grid = self.layout.hidden[0] // tuning.lower, self._splits, 2
+                launch(lower_gradients, grid, given, num_warps=tuning.lower_warps, ROWS=split)
             else:
                 self._multiply_by_layers(given)
             grid = len(given["tiles"]), self._splits
@@ -303,7 +311,7 @@ class FusedPPO:
             grid = given["BLOCKS"], parts(at.fan_out, tuning.tile), 2
             places = {
                 "weights": weights[:, own.weight :],
-                "biases": biases[:, at.gradient :],
+                "biases": biases[:, at.bias :],
                 "width": at.fan_out,
                 "length": at.fan_in if forward else following.fan_out,
                 "read_at": at.input if forward else following.gradient,
@@ -318,7 +326,7 @@ class FusedPPO:
         last = layout.places[-1]
         places = {
             "weights": weights[:, last.weight :],
-            "biases": biases[:, last.gradient :],
+            "biases": biases[:, last.bias :],
             "fan_in": last.fan_in,
             "input_at": last.input,
             "slope_at": last.gradient,
