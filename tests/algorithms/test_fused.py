@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from ksim_rl.algorithms.ppo.fused import fused_networks, make_fused_ppo, observer
+from ksim_rl.algorithms.ppo.fused import fused_networks, make_fused_ppo
 from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.data import DatasetCfg
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
@@ -91,8 +91,6 @@ def update(cfg, actor, critic, fused_ppo=None, *, data=DATA):
             cfg,
             description,
             mirror=None if cfg.symmetry == "none" else SymmetricAugmentation(MIRROR),
-            observe_actor=observer(made.actor[0]),
-            observe_critic=observer(made.critic),
             optimizer=made.optimizer,
             guard=made.guard,
             num_env_states_per_minibatch=DATA.num_env_states_per_minibatch,
@@ -299,8 +297,6 @@ def test_a_symmetry_without_a_mirror_is_refused(fused_ppo):
         fused_ppo(
             PPOCfg(symmetry="loss"),
             fused_networks(*networks()),
-            observe_actor=observer(networks()[0][0]),
-            observe_critic=observer(networks()[1]),
             optimizer=torch.optim.Adam([torch.zeros(1)]),
             guard=StepGuard(),
             num_env_states_per_minibatch=8,

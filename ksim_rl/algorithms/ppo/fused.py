@@ -12,7 +12,8 @@ from ksim_rl.data import EpochSampler
 from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, ValueNetwork
 from ksim_rl.modules.actor import MIN_STD, GaussianHead
 from ksim_rl.objectives import SymmetricAugmentation
-from ksim_rl.objectives.fused_ppo import ACTIVATIONS, FusedNetworks, Observer, why_not_fused
+from ksim_rl.objectives.fused_ppo import ACTIVATIONS, FusedNetworks, why_not_fused
+from ksim_rl.objectives.fused_ppo.layout import Observer
 from ksim_rl.transforms import MirrorMap
 
 if TYPE_CHECKING:
@@ -45,8 +46,6 @@ def make_fused_ppo(update: DatasetUpdate, mirror: Mapping[Any, MirrorMap] | None
         mirror=None
         if cfg.symmetry == "none"
         else SymmetricAugmentation(mirror, read=read, device=update.device),
-        observe_actor=observer(actor[0]),
-        observe_critic=observer(critic),
         optimizer=update.optimizer,
         guard=update.guard,
         **sizes,
@@ -70,15 +69,17 @@ def fused_networks(
         return f"the activations are {names[0]}, and not all one of {names[1]}"
     (activation,) = activations
     std: Any = {"std_A": head.std, "std_layer": head.std_layer, "log_std": head.std_type == "log"}
-    return FusedNetworks(actor=layers[0], critic=layers[1], activation=activation, min_std=MIN_STD, **std)
+    observers = _observer(actor[0]), _observer(critic)
+    return FusedNetworks(
+        actor=layers[0], critic=layers[1], observers=observers, activation=activation, min_std=MIN_STD, **std
+    )
 
 
 def _layers(network: nn.Sequential) -> list[nn.Linear]:
     return [layer for layer in network if isinstance(layer, nn.Linear)]
 
 
-def observer(module: Any) -> Observer:
-    """Return what the first layer of a network from `make_actor` or `make_critic` takes."""
+def _observer(module: Any) -> Observer:
     network: PolicyNetwork | ValueNetwork = module.module
     keys, moments = list(module.in_keys), network.normalizer
     return Observer(

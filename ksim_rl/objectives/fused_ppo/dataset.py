@@ -1,6 +1,7 @@
 """This module lays out for the kernels what the gradient steps of an update read of a rollout."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int64
@@ -24,7 +25,7 @@ class FusedDataset:
     """Normalized observations, and one record for each env state, in the order of a collector's rollout: step by step.
 
     `obs` [2, D, L] is for actor and critic, padded with zeros, in the `dtype` of the products; `records` [D, columns]
-    are described in `loss_kernels`. `observe_actor` and `observe_critic` say what the first layers take.
+    are described in `loss_kernels`. The `observers` say what the first layers take.
     With a `mirror`, rows D to 2 D of both are the mirror images of those before.
     """
 
@@ -33,20 +34,34 @@ class FusedDataset:
         cfg: PPOCfg,
         layout: FusedLayout,
         *,
-        observe_actor: Observer,
-        observe_critic: Observer,
+        observers: tuple[Observer, Observer],
         size: int,
         dtype: torch.dtype,
         tf32: bool,
         device: torch.device,
         mirror: SymmetricAugmentation | None = None,
     ) -> None:
-        self.cfg, self.layout, self.size, self._tf32, self._mirror = cfg, layout, size, tf32, mirror
-        self._observers = observe_actor, observe_critic
+        self.layout, self.size, self._mirror, self._observers = layout, size, mirror, observers
         rows = size if mirror is None else 2 * size
         self.obs = torch.zeros(2, rows, layout.stored, dtype=dtype, device=device)
         self.records = torch.zeros(rows, 3 * layout.out + 8, device=device)
         self._signals = torch.zeros(4, size, device=device)
+        # What kernels get, by the names of their parameters.
+        self._arguments: dict[str, Any] = {
+            **dict(zip(("values", "next_values", "advantages", "targets"), self._signals, strict=True)),
+            **{name.upper(): getattr(layout, name) for name in ("actions", "out", "stored")},
+            "obs": self.obs,
+            "records": self.records,
+            "num_obs": rows,
+            "size": size,
+            "gamma": cfg.gamma,
+            "decay": cfg.gamma * cfg.lmbda,
+            "LANES": power_of_two(layout.stored),
+            "RECORD": self.records.shape[1],
+            "RECORD_LANES": power_of_two(self.records.shape[1]),
+            "TF32": tf32,
+            "STANDARDIZED": cfg.normalize_advantage == "dataset",
+        }
 
     @torch.no_grad()
     def read(self, rollout_ET: TensorDictBase, *, evaluate: Evaluate) -> Int64[Tensor, ""]:
@@ -54,7 +69,6 @@ class FusedDataset:
 
         An env state with an element that is not finite takes no part, as in `DatasetStorage`; returned is how many.
         """
-        values_D, next_values_D, advantages_D, targets_D = self._signals
         first = 0
         # Mirror images exist for some steps at a time.
         for part_ET in [rollout_ET] if self._mirror is None else rollout_ET.chunk(ROLLOUT_PARTS, 1):
@@ -64,82 +78,55 @@ class FusedDataset:
             first += part_ET.numel()
         following = rollout_ET.get("next")
         next_obs = torch.empty_like(self.obs[1, : self.size])
-        self._read_observations(1, following, next_obs)
-        evaluate(self.obs[1, : self.size], values_D)
-        evaluate(next_obs, next_values_D)
+        self._take_observations(1, following, next_obs)
+        evaluate(self.obs[1, : self.size], self._signals[0])
+        evaluate(next_obs, self._signals[1])
         num_envs, length = rollout_ET.batch_size
         programs = parts(num_envs, ENVS)
-        signals = {
-            **dict(zip(("values", "next_values", "advantages", "targets"), self._signals, strict=True)),
-            "rewards": _time_major(following.get("reward")),
-            **{key: _time_major(following.get(key)) for key in ("done", "terminated")},
-            "moments": self.records.new_empty(programs, 3),
-        }
-        gamma, decay = self.cfg.gamma, self.cfg.gamma * self.cfg.lmbda
-        sizes = {"num_envs": num_envs, "gamma": gamma, "decay": decay, "STEPS": length, "BLOCK": ENVS}
-        launch(estimate_advantages, (programs,), signals, num_warps=1, **sizes)
-        signals["moments"] = moments = torch.cat(ranks.gather(signals["moments"]))
-        lanes = {
-            "RECORD_LANES": power_of_two(self.records.shape[1]),
-            "LANES": power_of_two(self.layout.stored),
-        }
-        block = _block(max(lanes.values()))
+        moments = self.records.new_empty(programs, 3)
+        signals = {key: _time_major(following.get(key)) for key in ("reward", "done", "terminated")}
+        sizes = {"num_envs": num_envs, "STEPS": length, "BLOCK": ENVS}
+        given = self._arguments | signals | sizes
+        launch(estimate_advantages, (programs,), given, num_warps=1, moments=moments)
+        moments = torch.cat(ranks.gather(moments))
+        block = _block(max(self._arguments["LANES"], self._arguments["RECORD_LANES"]))
         left_out = torch.empty(parts(len(self.records), block), dtype=torch.int32, device=self.records.device)
-        given = {
-            **signals,
-            **lanes,
-            "obs": self.obs,
-            "records": self.records,
-            "left_out": left_out,
-            "num_obs": len(self.records),
-            "size": self.size,
-            "num_moments": len(moments),
-            "RECORD": self.records.shape[1],
-            "OUT": self.layout.out,
-            "STORED": self.layout.stored,
-            "MOMENTS": power_of_two(len(moments)),
-            "NORMALIZED": self.cfg.normalize_advantage == "dataset",
-            "BLOCK": block,
-        }
-        launch(write_estimates, (len(left_out),), given)
+        given = self._arguments | {"moments": moments, "num_moments": len(moments), "left_out": left_out}
+        launch(write_estimates, (len(left_out),), given, MOMENTS=power_of_two(len(moments)), BLOCK=block)
         return left_out.sum()
 
     def _take(self, part_ET: TensorDictBase, first: int) -> None:
         """Take over what is as the rollout has it, some steps of it, from row `first` on."""
         for network, obs_DL in enumerate(self.obs):
-            self._read_observations(network, part_ET, obs_DL[first:])
-        keys = {"action": "action", "loc": "loc", "scale": "scale", "log_prob": "action_log_prob"}
-        num_rows, block = part_ET.numel(), _block(self.layout.out)
-        given = {
-            **{name: _time_major(part_ET.get(key)) for name, key in keys.items()},
-            "records": self.records[first:],
-            "num_rows": num_rows,
-            "RECORD": self.records.shape[1],
-            "ACTIONS": self.layout.actions,
-            "OUT": self.layout.out,
-            "BLOCK": block,
-        }
-        launch(read_actions, (parts(num_rows, block),), given)
+            self._take_observations(network, part_ET, obs_DL[first:])
+        keys = ("action", "loc", "scale", "action_log_prob")
+        rows, block = part_ET.numel(), _block(self.layout.out)
+        given = self._arguments | {key: _time_major(part_ET.get(key)) for key in keys}
+        launch(
+            read_actions,
+            (parts(rows, block),),
+            given,
+            records=self.records[first:],
+            num_rows=rows,
+            BLOCK=block,
+        )
 
-    def _read_observations(self, network: int, part_ET: TensorDictBase, obs: Tensor) -> None:
-        observer, lanes = self._observers[network], power_of_two(self.layout.stored)
-        moments, block = observer.moments, _block(lanes)
-        given = {
-            "source": (source := _time_major(observer.read(part_ET))),
-            # Read only where there are any.
-            "mean": source if moments is None else moments.mean,
-            "var": source if moments is None else moments.var,
+    def _take_observations(self, network: int, part_ET: TensorDictBase, obs: Tensor) -> None:
+        observer = self._observers[network]
+        source, block = _time_major(observer.read(part_ET)), _block(self._arguments["LANES"])
+        # Not read where there are none.
+        mean, var = (
+            (source, source) if observer.moments is None else (observer.moments.mean, observer.moments.var)
+        )
+        given = self._arguments | {
+            "source": source,
+            "mean": mean,
+            "var": var,
             "obs": obs,
-            "num_rows": len(source),
             "eps": observer.eps,
-            "DIM": source.shape[1],
-            "STORED": self.layout.stored,
-            "LANES": lanes,
-            "NORMALIZED": moments is not None,
-            "TF32": self._tf32,
-            "BLOCK": block,
         }
-        launch(read_observations, (parts(len(source), block),), given)
+        sizes = {"num_rows": len(source), "DIM": source.shape[1], "NORMALIZED": observer.moments is not None}
+        launch(read_observations, (parts(len(source), block),), given, BLOCK=block, **sizes)
 
 
 def as_tf32(values: Float[Tensor, "*?shape"]) -> Float[Tensor, "*?shape"]:

@@ -27,7 +27,7 @@ def read_observations(
 
 @triton.jit
 def read_actions(
-    action, loc, scale, log_prob, records, num_rows,
+    action, loc, scale, action_log_prob, records, num_rows,
     RECORD: tl.constexpr, ACTIONS: tl.constexpr, OUT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write what the rollout holds of actions [D, ACTIONS] to their records; padding has a standard deviation of 1."""
@@ -39,19 +39,19 @@ def read_actions(
     tl.store(record + output, tl.load(action + at, mask=used, other=0.0), mask=keep)
     tl.store(record + OUT + output, tl.load(loc + at, mask=used, other=0.0), mask=keep)
     tl.store(record + 2 * OUT + output, tl.load(scale + at, mask=used, other=1.0), mask=keep)
-    tl.store(record + (3 * OUT + LOG_PROB), tl.load(log_prob + row, mask=keep, other=0.0), mask=keep)
+    tl.store(record + (3 * OUT + LOG_PROB), tl.load(action_log_prob + row, mask=keep, other=0.0), mask=keep)
 
 
 @triton.jit
 def write_estimates(
     obs, records, advantages, values, targets, moments, left_out, num_obs, size, num_moments,
     RECORD: tl.constexpr, RECORD_LANES: tl.constexpr, OUT: tl.constexpr, STORED: tl.constexpr,
-    LANES: tl.constexpr, MOMENTS: tl.constexpr, NORMALIZED: tl.constexpr, BLOCK: tl.constexpr,
+    LANES: tl.constexpr, MOMENTS: tl.constexpr, STANDARDIZED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write advantages, values and targets [D], as many as `size`, to the records, the same to those of images.
 
     What is not finite takes no part: its record is neutral, its mask 0, its observations are zeros, as a zero times NaN
-    is NaN. `left_out` [programs] counts it, without images. NORMALIZED advantages have a mean of 0 and a standard
+    is NaN. `left_out` [programs] counts it, without images. STANDARDIZED advantages have a mean of 0 and a standard
     deviation of 1, by the `moments` [num_moments, 3] that `estimate_advantages` left.
     """
     rows = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -59,7 +59,7 @@ def write_estimates(
     advantage = tl.load(advantages + rows % size, mask=valid, other=0.0)
     value = tl.load(values + rows % size, mask=valid, other=0.0)
     target = tl.load(targets + rows % size, mask=valid, other=0.0)
-    if NORMALIZED:
+    if STANDARDIZED:
         part = tl.arange(0, MOMENTS)
         counts = tl.load(moments + 3 * part, mask=part < num_moments, other=0.0)
         means = tl.load(moments + 3 * part + 1, mask=part < num_moments, other=0.0)

@@ -31,7 +31,6 @@ from ksim_rl.objectives.fused_ppo.layout import (
     FusedLayout,
     FusedNetworks,
     LayerPlace,
-    Observer,
     Tuning,
     launch,
     parts,
@@ -117,9 +116,8 @@ class FusedParameters:
 class FusedPPO:
     """Makes the gradient steps of one update after another; all memory is allocated once, and nothing syncs.
 
-    `why_not_fused` has no reason against its config. The first layers take what `observe_actor` and `observe_critic`
-    say. Moments, step counts and learning rate are those of `optimizer`, from `make_optimizer`. A symmetry
-    of the config needs the `mirror`; else a ValueError is raised.
+    `why_not_fused` has no reason against its config. Moments, step counts and learning rate are those of `optimizer`,
+    from `make_optimizer`. A symmetry of the config needs the `mirror`; else a ValueError is raised.
     """
 
     def __init__(
@@ -127,8 +125,6 @@ class FusedPPO:
         cfg: PPOCfg,
         networks: FusedNetworks,
         *,
-        observe_actor: Observer,
-        observe_critic: Observer,
         optimizer: torch.optim.Adam,
         guard: StepGuard,
         num_env_states_per_minibatch: int,
@@ -155,8 +151,7 @@ class FusedPPO:
         self.dataset = FusedDataset(
             cfg,
             layout,
-            observe_actor=observe_actor,
-            observe_critic=observe_critic,
+            observers=networks.observers,
             size=num_env_states_per_minibatch * num_minibatches,
             dtype=dtype,
             tf32=tf32,

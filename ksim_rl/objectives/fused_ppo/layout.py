@@ -29,16 +29,26 @@ MAX_PLACES = 2**31
 
 
 @dataclass(frozen=True, kw_only=True)
+class Observer:
+    """What the first layer of a network takes: what `read` gives, [..., L], normalized by the `moments`, if any."""
+
+    read: Callable[[TensorDictBase], Float[Tensor, "*batch L"]]
+    moments: RunningMoments | None = None
+    eps: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class FusedNetworks:
     """What the kernels need to know of an actor and a critic: two MLPs of as many layers, and a gaussian.
 
     The activation follows each linear layer but the last. The standard deviations, or their logarithms, are a parameter
     `std_A`, or what a `std_layer` makes of the last hidden layer: logarithms, or what a softplus makes positive. The
-    gradient passes the bound `min_std`.
+    gradient passes the bound `min_std`. What actor and critic read is what their `observers` say.
     """
 
     actor: Sequence[nn.Linear]
     critic: Sequence[nn.Linear]
+    observers: tuple[Observer, Observer]
     std_A: Float[Tensor, " A"] | None = None
     std_layer: nn.Linear | None = None
     log_std: bool
@@ -67,15 +77,6 @@ class FusedNetworks:
             and not any(width % MIN_WIDTH for width in hidden)
             and max(self.actor[0].in_features, self.critic[0].in_features) <= CHAINED_OBS
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Observer:
-    """What the first layer of a network takes: what `read` gives, [..., L], normalized by the `moments`, if any."""
-
-    read: Callable[[TensorDictBase], Float[Tensor, "*batch L"]]
-    moments: RunningMoments | None = None
-    eps: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

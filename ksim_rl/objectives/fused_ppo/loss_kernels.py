@@ -127,7 +127,7 @@ def value_gradient(
 
 @triton.jit
 def estimate_advantages(
-    values, next_values, rewards, done, terminated, advantages, targets, moments, num_envs, gamma, decay,
+    values, next_values, reward, done, terminated, advantages, targets, moments, num_envs, gamma, decay,
     STEPS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write advantages and value targets of BLOCK envs; all signals are time-major, [STEPS, num_envs].
@@ -146,10 +146,9 @@ def estimate_advantages(
         at = (STEPS - back) * num_envs + env
         value = tl.load(values + at, mask=inside, other=0.0)
         following = gamma * tl.load(next_values + at, mask=inside, other=0.0)
-        reward = tl.load(rewards + at, mask=inside, other=0.0)
         ended = tl.load(done + at, mask=inside, other=1) != 0
         bootstrap = tl.where(tl.load(terminated + at, mask=inside, other=1) != 0, 0.0, following)
-        delta = reward + bootstrap - value
+        delta = tl.load(reward + at, mask=inside, other=0.0) + bootstrap - value
         finite = tl.abs(delta) < float("inf")
         carried = tl.where(finite & (ended == 0), decay, 0.0) * advantage
         advantage = tl.where(finite, delta, 0.0) + carried
