@@ -1,6 +1,6 @@
 """This module lays out for the kernels what the gradient steps of an update read of a rollout."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 from ksim_rl import ranks
 from ksim_rl.device.memory import ROLLOUT_PARTS
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
-from ksim_rl.objectives.fused_ppo.dataset_kernels import read_actions, read_observations, write_estimates
+from ksim_rl.objectives.fused_ppo.dataset_kernels import read_observations, write_records
 from ksim_rl.objectives.fused_ppo.layout import FusedLayout, Observer, launch, parts, power_of_two
 from ksim_rl.objectives.fused_ppo.loss_kernels import estimate_advantages
 from ksim_rl.objectives.symmetry import SymmetricAugmentation
@@ -69,13 +69,9 @@ class FusedDataset:
 
         An env state with an element that is not finite takes no part, as in `DatasetStorage`; returned is how many.
         """
-        first = 0
-        # Mirror images exist for some steps at a time.
-        for part_ET in [rollout_ET] if self._mirror is None else rollout_ET.chunk(ROLLOUT_PARTS, 1):
-            self._take(part_ET, first)
-            if self._mirror is not None:
-                self._take(self._mirror.image(part_ET), self.size + first)
-            first += part_ET.numel()
+        for part_ET, first in self._parts(rollout_ET):
+            for network, obs_DL in enumerate(self.obs):
+                self._take_observations(network, part_ET, obs_DL[first:])
         following = rollout_ET.get("next")
         next_obs = torch.empty_like(self.obs[1, : self.size])
         self._take_observations(1, following, next_obs)
@@ -89,27 +85,28 @@ class FusedDataset:
         given = self._arguments | signals | sizes
         launch(estimate_advantages, (programs,), given, num_warps=1, moments=moments)
         moments = torch.cat(ranks.gather(moments))
-        block = _block(max(self._arguments["LANES"], self._arguments["RECORD_LANES"]))
-        left_out = torch.empty(parts(len(self.records), block), dtype=torch.int32, device=self.records.device)
-        given = self._arguments | {"moments": moments, "num_moments": len(moments), "left_out": left_out}
-        launch(write_estimates, (len(left_out),), given, MOMENTS=power_of_two(len(moments)), BLOCK=block)
-        return left_out.sum()
+        left_out = [self._take_records(part_ET, first, moments) for part_ET, first in self._parts(rollout_ET)]
+        return torch.cat(left_out).sum()
 
-    def _take(self, part_ET: TensorDictBase, first: int) -> None:
-        """Take over what is as the rollout has it, some steps of it, from row `first` on."""
-        for network, obs_DL in enumerate(self.obs):
-            self._take_observations(network, part_ET, obs_DL[first:])
+    def _parts(self, rollout_ET: TensorDictBase) -> Iterator[tuple[TensorDictBase, int]]:
+        """Yield the rollout, or some steps at a time and their mirror images, and at which row each begins."""
+        first = 0
+        for part_ET in [rollout_ET] if self._mirror is None else rollout_ET.chunk(ROLLOUT_PARTS, 1):
+            yield part_ET, first
+            if self._mirror is not None:
+                yield self._mirror.image(part_ET), self.size + first
+            first += part_ET.numel()
+
+    def _take_records(self, part_ET: TensorDictBase, first: int, moments: Tensor) -> Tensor:
+        """Write records, and return of each program how many env states it left out."""
+        rows, block = part_ET.numel(), _block(max(self._arguments["LANES"], self._arguments["RECORD_LANES"]))
+        left_out = torch.empty(parts(rows, block), dtype=torch.int32, device=self.records.device)
+        own = {"obs": self.obs[0, first:], "records": self.records[first:], "first": first, "num_rows": rows}
+        own |= {"moments": moments, "num_moments": len(moments), "left_out": left_out, "BLOCK": block}
         keys = ("action", "loc", "scale", "action_log_prob")
-        rows, block = part_ET.numel(), _block(self.layout.out)
-        given = self._arguments | {key: _time_major(part_ET.get(key)) for key in keys}
-        launch(
-            read_actions,
-            (parts(rows, block),),
-            given,
-            records=self.records[first:],
-            num_rows=rows,
-            BLOCK=block,
-        )
+        given = self._arguments | {key: _time_major(part_ET.get(key)) for key in keys} | own
+        launch(write_records, (len(left_out),), given, MOMENTS=power_of_two(len(moments)))
+        return left_out
 
     def _take_observations(self, network: int, part_ET: TensorDictBase, obs: Tensor) -> None:
         observer = self._observers[network]

@@ -26,73 +26,70 @@ def read_observations(
 
 
 @triton.jit
-def read_actions(
-    action, loc, scale, action_log_prob, records, num_rows,
-    RECORD: tl.constexpr, ACTIONS: tl.constexpr, OUT: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Write what the rollout holds of actions [D, ACTIONS] to their records; padding has a standard deviation of 1."""
-    row = (tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK))[:, None]
-    output = tl.arange(0, OUT)[None, :]
-    keep = row < num_rows
-    at, used = row * ACTIONS + output, keep & (output < ACTIONS)
-    record = records + row * RECORD
-    tl.store(record + output, tl.load(action + at, mask=used, other=0.0), mask=keep)
-    tl.store(record + OUT + output, tl.load(loc + at, mask=used, other=0.0), mask=keep)
-    tl.store(record + 2 * OUT + output, tl.load(scale + at, mask=used, other=1.0), mask=keep)
-    tl.store(record + (3 * OUT + LOG_PROB), tl.load(action_log_prob + row, mask=keep, other=0.0), mask=keep)
+def _counted_odd(value):
+    # How many elements of each row are not finite.
+    return tl.sum(tl.where(tl.abs(value.to(tl.float32)) < float("inf"), 0, 1), 1)
 
 
 @triton.jit
-def write_estimates(
-    obs, records, advantages, values, targets, moments, left_out, num_obs, size, num_moments,
-    RECORD: tl.constexpr, RECORD_LANES: tl.constexpr, OUT: tl.constexpr, STORED: tl.constexpr,
+def write_records(
+    action, loc, scale, action_log_prob, advantages, values, targets, moments, obs, records, left_out,
+    num_rows, num_obs, first, size, num_moments,
+    RECORD: tl.constexpr, RECORD_LANES: tl.constexpr, ACTIONS: tl.constexpr, OUT: tl.constexpr, STORED: tl.constexpr,
     LANES: tl.constexpr, MOMENTS: tl.constexpr, STANDARDIZED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write advantages, values and targets [D], as many as `size`, to the records, the same to those of images.
+    """Write the records of some steps, or of their images, which begin at row `first`; padding has a std of 1.
 
     What is not finite takes no part: its record is neutral, its mask 0, its observations are zeros, as a zero times NaN
     is NaN. `left_out` [programs] counts it, without images. STANDARDIZED advantages have a mean of 0 and a standard
     deviation of 1, by the `moments` [num_moments, 3] that `estimate_advantages` left.
     """
     rows = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    valid = rows < num_obs
-    advantage = tl.load(advantages + rows % size, mask=valid, other=0.0)
-    value = tl.load(values + rows % size, mask=valid, other=0.0)
-    target = tl.load(targets + rows % size, mask=valid, other=0.0)
+    valid = rows < num_rows
+    estimated = (first + rows) % size
+    advantage = tl.load(advantages + estimated, mask=valid, other=0.0)
     if STANDARDIZED:
         part = tl.arange(0, MOMENTS)
-        counts = tl.load(moments + 3 * part, mask=part < num_moments, other=0.0)
-        means = tl.load(moments + 3 * part + 1, mask=part < num_moments, other=0.0)
+        known = part < num_moments
+        counts = tl.load(moments + 3 * part, mask=known, other=0.0)
+        means = tl.load(moments + 3 * part + 1, mask=known, other=0.0)
         count = tl.sum(counts)
         mean = tl.sum(counts * means) / tl.maximum(count, 1.0)
         gap = means - mean
-        squares = tl.sum(
-            tl.load(moments + 3 * part + 2, mask=part < num_moments, other=0.0) + counts * gap * gap
-        )
+        squares = tl.sum(tl.load(moments + 3 * part + 2, mask=known, other=0.0) + counts * gap * gap)
         std = tl.sqrt(squares / tl.maximum(count - 1.0, 1.0))
         advantage = (advantage - mean) / tl.maximum(std, 1e-4)
-    column = tl.arange(0, RECORD_LANES)[None, :]
-    places = records + rows[:, None] * RECORD + column
-    read = valid[:, None] & (column <= 3 * OUT + LOG_PROB)
-    record = tl.load(places, mask=read, other=0.0)
-    record = tl.where(column == 3 * OUT + ADVANTAGE, advantage[:, None], record)
-    record = tl.where(column == 3 * OUT + VALUE, value[:, None], record)
-    record = tl.where(column == 3 * OUT + TARGET, target[:, None], record)
-    record = tl.where(column == 3 * OUT + MASK, 1.0, record)
-    odd = tl.sum(tl.where(tl.abs(record) < float("inf"), 0, 1), 1)
+    row, column = rows[:, None], tl.arange(0, RECORD_LANES)[None, :]
+    kind, output = column // OUT, column % OUT
+    own, used = row * ACTIONS + output, valid[:, None] & (output < ACTIONS)
+    neutral = tl.where(kind == 2, 1.0, 0.0)
+    record = tl.where(used, 0.0, neutral)
+    record += tl.load(action + own, mask=used & (kind == 0), other=0.0)
+    record += tl.load(loc + own, mask=used & (kind == 1), other=0.0)
+    record += tl.load(scale + own, mask=used & (kind == 2), other=0.0)
+    signal = column - 3 * OUT
+    log_prob = tl.load(action_log_prob + rows, mask=valid, other=0.0)
+    value = tl.load(values + estimated, mask=valid, other=0.0)
+    target = tl.load(targets + estimated, mask=valid, other=0.0)
+    record = tl.where(signal == LOG_PROB, log_prob[:, None], record)
+    record = tl.where(signal == ADVANTAGE, advantage[:, None], record)
+    record = tl.where(signal == VALUE, value[:, None], record)
+    record = tl.where(signal == TARGET, target[:, None], record)
+    record = tl.where(signal == MASK, 1.0, record)
     lane = tl.arange(0, LANES)[None, :]
-    at, inside = obs + rows[:, None] * STORED + lane, valid[:, None] & (lane < STORED)
-    next_at = at + num_obs.to(tl.int64) * STORED
-    odd += tl.sum(
-        tl.where(tl.abs(tl.load(at, mask=inside, other=0.0).to(tl.float32)) < float("inf"), 0, 1), 1
-    )
-    odd += tl.sum(
-        tl.where(tl.abs(tl.load(next_at, mask=inside, other=0.0).to(tl.float32)) < float("inf"), 0, 1), 1
-    )
+    inside = valid[:, None] & (lane < STORED)
+    of_actor = obs + row * STORED + lane
+    of_critic = of_actor + num_obs.to(tl.int64) * STORED
+    odd = _counted_odd(record)
+    odd += _counted_odd(tl.load(of_actor, mask=inside, other=0.0))
+    odd += _counted_odd(tl.load(of_critic, mask=inside, other=0.0))
     is_odd = (odd > 0)[:, None]
-    neutral = tl.where((column >= 2 * OUT) & (column < 3 * OUT), 1.0, 0.0)
-    tl.store(places, tl.where(is_odd, neutral, record), mask=valid[:, None] & (column < RECORD))
+    tl.store(
+        records + row * RECORD + column,
+        tl.where(is_odd, neutral, record),
+        mask=valid[:, None] & (column < RECORD),
+    )
     none = tl.zeros((BLOCK, LANES), dtype=obs.dtype.element_ty)
-    tl.store(at, none, mask=inside & is_odd)
-    tl.store(next_at, none, mask=inside & is_odd)
-    tl.store(left_out + tl.program_id(0), tl.sum(tl.where(valid & (odd > 0) & (rows < size), 1, 0)))
+    tl.store(of_actor, none, mask=inside & is_odd)
+    tl.store(of_critic, none, mask=inside & is_odd)
+    tl.store(left_out + tl.program_id(0), tl.sum(tl.where(valid & (odd > 0) & (first + rows < size), 1, 0)))
