@@ -95,4 +95,4 @@ def test_moments_of_equal_rows_are_equal_and_those_of_the_cpu():
             taken[place].update(rows.to(place), torch.arange(len(rows), device=place) % 3 > 0)
     for name, buffer in taken["cuda"].named_buffers():
         assert torch.equal(buffer, taken["cuda:0"].get_buffer(name)), name
-        torch.testing.assert_close(buffer.cpu(), taken["cpu"].get_buffer(name), rtol=1e-10, atol=0.0)
+        torch.testing.assert_close(buffer.cpu(), taken["cpu"].get_buffer(name), rtol=1e-6, atol=0.0)
