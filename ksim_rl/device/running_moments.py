@@ -3,19 +3,97 @@
 from collections.abc import Sequence
 
 import torch
+import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ksim_rl import ranks
 from ksim_rl.checks import check_in_range
+from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator
+
+# Parts of a batch whose moments are taken side by side: at most so many, of at least so many rows.
+MOST_PARTS, LEAST_ROWS = 512, 16
+# Stages 0 to 2 are of a row (which rows count), of a column of a part, and of a column of the batch.
+_quick = QuickLaunch(
+    arguments_of(
+        (int, "stage num_rows dim rows parts ranks"),
+        (wp.int64, "until"),
+        (wp.uint64, "values valid counts moments count mean squares"),
+    ),
+    r"""
+    const size_t dim = a.dim, size = a.parts * dim;
+    const float* values = (const float*)a.values;
+    unsigned char* counts = (unsigned char*)a.counts;
+    double *means = (double*)a.moments, *squares = means + size, *weights = squares + size;
+    const long long before = *(const long long*)a.count;
+    if (a.stage == 0) {
+        bool is_counted = a.until < 0 || before * a.ranks < a.until;
+        if (a.valid) is_counted &= ((const unsigned char*)a.valid)[row] != 0;
+        for (size_t i = row * dim; i < (row + 1) * dim; ++i) is_counted &= fabsf(values[i]) <= 3.402823466e38f;
+        counts[row] = is_counted;
+    } else if (a.stage == 1) {
+        const size_t begin = (size_t)row * a.rows, end = begin + a.rows < a.num_rows ? begin + a.rows : a.num_rows;
+        double weight = 0.0, sum = 0.0, square = 0.0;
+        for (size_t i = begin; i < end; ++i) {
+            weight += counts[i];
+            sum += counts[i] ? (double)values[i * dim + lane] : 0.0;
+        }
+        const double mean = weight > 0.0 ? sum / weight : 0.0;
+        for (size_t i = begin; i < end; ++i) {
+            const double error = counts[i] ? (double)values[i * dim + lane] - mean : 0.0;
+            square += error * error;
+        }
+        means[row * dim + lane] = mean;
+        squares[row * dim + lane] = square;
+        if (lane == 0) weights[row] = weight;
+    } else {
+        double added = 0.0, sum = 0.0, square = 0.0;
+        for (int part = 0; part < a.parts; ++part) {
+            added += weights[part];
+            sum += weights[part] * means[part * dim + lane];
+        }
+        const double mean = sum / (added > 1.0 ? added : 1.0);
+        for (int part = 0; part < a.parts; ++part) {
+            const double error = means[part * dim + lane] - mean;
+            square += squares[part * dim + lane] + weights[part] * error * error;
+        }
+        // The union of both, as of those of ranks in `ranks.merged`.
+        const double total = before + added, share = added / (total > 1.0 ? total : 1.0);
+        double* exact_mean = (double*)a.mean + lane;
+        const double delta = mean - *exact_mean;
+        *exact_mean += delta * share;
+        ((double*)a.squares)[lane] += square + delta * delta * share * before;
+        if (lane == 0) weights[a.parts] = total;
+    }
+""",
+)
+
+
+def _count(
+    values_NL: Tensor, valid_N: Tensor | None, count: Tensor, mean_L: Tensor, squares_L: Tensor, until: int
+) -> None:
+    """Count rows into moments, in place: all numbers are added in one order, in float64."""
+    num_rows, dim = values_NL.shape
+    rows = max(LEAST_ROWS, -(-num_rows // MOST_PARTS))
+    parts = -(-num_rows // rows)
+    counts_N = torch.empty(num_rows, dtype=torch.uint8, device=count.device)
+    moments = torch.empty((2 * dim + 1) * parts + 1, dtype=torch.float64, device=count.device)
+    held = (counts_N, moments, count, mean_L, squares_L)
+    given = values_NL.data_ptr(), address(valid_N), *(own.data_ptr() for own in held)
+    for stage, size in enumerate(((num_rows, 1), (parts, dim), (1, dim))):
+        _quick(count.device, size, stage, num_rows, dim, rows, parts, ranks.size(), until, *given)
+    count.copy_(moments[-1])
+
+
+_count_rows = as_operator("count_rows", _count, lambda *_: None, mutates=("count", "mean_L", "squares_L"))
 
 
 class RunningMoments(nn.Module):
     """Mean and population variance of all rows counted so far.
 
     Batches are merged as in Chan, Golub and LeVeque, "Updating formulae and a pairwise algorithm for computing sample
-    variances" (1979), in float64, and equal the two-pass mean and variance of everything seen. No method makes the
-    host wait or moves a buffer, so all can be captured in a CUDA graph.
+    variances" (1979), in float64, and equal the two-pass mean and variance of everything seen. They are added in one
+    order. No method makes the host wait or moves a buffer, so all can be captured in a CUDA graph.
 
     With several ranks, each keeps the moments of its own rows, and `publish` merges those of all ranks into `mean` and
     `var`: bit-identical everywhere, and equal to one process that saw all the rows.
@@ -66,32 +144,16 @@ class RunningMoments(nn.Module):
         if values.shape[-1] != self.dim:
             raise ValueError(f"obs has shape {tuple(values.shape)}: the last dim must be {self.dim}")
         values_NL = values.reshape(-1, self.dim)
-        # No matrix products here: the first one on a stream takes memory for good, and this runs beside other work.
-        valid_N = values_NL.isfinite().all(-1)
-        if valid is not None:
-            if valid.numel() != valid_N.numel():
-                raise ValueError(
-                    f"valid has shape {tuple(valid.shape)}: expected one element per row of obs, "
-                    f"whose shape is {tuple(values.shape)}"
-                )
-            valid_N = valid_N & valid.reshape(-1)
-        if self.until is not None:
-            valid_N = valid_N & (self.count < self.until / ranks.size())
-
-        exact_NL = torch.where(valid_N[:, None], values_NL, 0.0).to(torch.float64)
-        weight_N = valid_N.to(torch.float64)
-        added = weight_N.sum()
-        mean = exact_NL.sum(0) / added.clamp_min(1)
-        sum_of_squares = exact_NL.sub_(mean).mul_(weight_N[:, None]).square_().sum(0)
-
-        # The union of both, as of those of ranks in `ranks.merged`, in place.
-        before = self.count.to(torch.float64)
-        total = before + added
-        share = added / total.clamp_min(1)
-        delta = mean.sub_(self.exact_mean)
-        self.exact_mean.addcmul_(delta, share)
-        self.exact_sum_of_squares.add_(sum_of_squares.addcmul_(delta.square_(), share * before))
-        self.count.copy_(total)
+        if valid is not None and valid.numel() != len(values_NL):
+            raise ValueError(
+                f"valid has shape {tuple(valid.shape)}: expected one element per row of obs, "
+                f"whose shape is {tuple(values.shape)}"
+            )
+        valid_N = None if valid is None else valid.reshape(-1).contiguous()
+        until = -1 if self.until is None else self.until
+        exact = self.count, self.exact_mean, self.exact_sum_of_squares
+        if len(values_NL):
+            _count_rows(values_NL.to(torch.float32).contiguous(), valid_N, *exact, until)
 
 
 @torch.no_grad()

@@ -13,7 +13,6 @@ from torchrl.data import Composite
 
 from ksim_rl.checked import Checked, Count, Filled, Name, NonNegative
 from ksim_rl.checks import check_choice, check_in_range
-from ksim_rl.device.memory import ROLLOUT_PARTS
 from ksim_rl.device.running_moments import RunningMoments, publish
 from ksim_rl.modules.mlp import ACTIVATIONS, Device, mlp
 
@@ -75,8 +74,8 @@ def update_normalizers(tensordict: TensorDictBase, *networks: nn.Module) -> None
                 continue
             if id(normalizer) not in seen:
                 seen[id(normalizer)] = normalizer
-                for part in _observation(tensordict, module, normalizer.dim).chunk(ROLLOUT_PARTS, -2):
-                    normalizer.count_rows(part)
+                # Step by step, as the memory of a rollout is.
+                normalizer.count_rows(_observation(tensordict, module, normalizer.dim).transpose(0, -2))
     publish([*seen.values()])
 
 
@@ -139,13 +138,18 @@ class ObservingNetwork(nn.Module):
         self.normalizer = ObservationNormalizer(obs_dim, device=device) if cfg.obs_normalization else None
 
     def observe(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch L"]:
-        """Return what the first layer reads: observations side by side, normalized; a ValueError for another number."""
+        """Return what the first layer reads: observations side by side, normalized."""
+        obs = self.joined(*observations)
+        return obs if self.normalizer is None else self.normalizer(obs)
+
+    def joined(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch L"]:
+        """Return observations side by side; a ValueError for another number than the network was built for."""
         obs = side_by_side(observations)
         if obs.shape[-1] != self.obs_dim:
             raise ValueError(
                 f"the network was built for obs_dim={self.obs_dim}, and reads observations of {obs.shape[-1]} numbers"
             )
-        return obs if self.normalizer is None else self.normalizer(obs)
+        return obs
 
 
 FEATURES = "features"

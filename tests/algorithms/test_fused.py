@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from ksim_rl.algorithms.ppo.fused import fused_networks, make_fused_ppo, observer
+from ksim_rl.algorithms.ppo.fused import fused_networks, make_fused_ppo
 from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.data import DatasetCfg
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
@@ -22,7 +22,8 @@ SIZES = {"num_env_states_per_minibatch": 24, "num_minibatches": 2}
 DATA = DatasetCfg(**SIZES)
 HIDDEN = (32, 32, 16)
 # Blocks that do not divide the 24 rows of a minibatch or the layers; few, since the interpreter is slow.
-TUNING = Tuning(block=16, chunk=16, stages=1, depth=16, tile=32, tile_stages=1, splits=2, size=1024)
+LOWER = {"lower": 16, "lower_depth": 16, "lower_stages": 1}
+TUNING = Tuning(block=16, chunk=16, stages=1, depth=16, tile=32, tile_stages=1, splits=2, size=1024, **LOWER)
 # A layer is a grid of programs; few of them are still more than one in each direction.
 LAYERED = Tuning(block=32, stages=1, depth=32, tile=32, tile_stages=1, splits=2, size=4096)
 MIRROR = {
@@ -90,8 +91,6 @@ def update(cfg, actor, critic, fused_ppo=None, *, data=DATA):
             cfg,
             description,
             mirror=None if cfg.symmetry == "none" else SymmetricAugmentation(MIRROR),
-            observe_actor=observer(made.actor[0]),
-            observe_critic=observer(made.critic),
             optimizer=made.optimizer,
             guard=made.guard,
             num_env_states_per_minibatch=DATA.num_env_states_per_minibatch,
@@ -293,11 +292,17 @@ def test_layout_places_every_parameter_once(options):
     index = layout.padded_index(made)
     assert len(index) == layout.num_flat == sum(parameter.numel() for parameter in made.parameters)
     assert len(index.unique()) == len(index)
-    # The weights' tiles cover the padded weights of both networks once each.
-    covered = torch.zeros(2, layout.num_weights, dtype=torch.int64)
-    for network, _, _, place, stride, columns, rows, _ in layout.weight_tiles(16).tolist():
+    # The weights' tiles cover the padded weights of both networks once each, and so do they the biases; chained kernels
+    # have those of the first layer, and the weights of the second, elsewhere.
+    covered = torch.zeros(2, layout.num_padded - layout.out, dtype=torch.int64)
+    for network, _, _, place, stride, columns, rows, bias in layout.weight_tiles(16).tolist():
         for row in range(rows):
             covered[network, place + row * stride : place + row * stride + columns] += 1
+        if bias >= 0:
+            covered[network, bias : bias + rows] += 1
+    if layout.chained:
+        covered[:, : layout.places[2].weight] += 1
+        covered[:, layout.num_weights :][:, : layout.hidden[0]] += 1
     assert (covered == 1).all()
     assert index[0] == 0
     last_bias = layout.num_padded + layout.num_weights + sum(layout.hidden)
@@ -314,8 +319,6 @@ def test_a_symmetry_without_a_mirror_is_refused(fused_ppo):
         fused_ppo(
             PPOCfg(symmetry="loss"),
             fused_networks(*networks()),
-            observe_actor=lambda td: td["actor"],
-            observe_critic=lambda td: td["critic"],
             optimizer=torch.optim.Adam([torch.zeros(1)]),
             guard=StepGuard(),
             num_env_states_per_minibatch=8,

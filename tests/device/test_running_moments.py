@@ -1,5 +1,6 @@
 """Exact moments; `test_observation_normalizer` and `test_normalization` hold the rest, with several ranks too."""
 
+import pytest
 import torch
 
 from ksim_rl.device.running_moments import RunningMoments, publish
@@ -29,3 +30,19 @@ def test_counted_rows_show_once_they_are_published():
     assert (moments.mean.item(), moments.var.item()) == (0.0, 1.0)
     publish([moments])
     assert (moments.mean.item(), moments.var.item()) == (2.0, 1.0)
+
+
+@pytest.mark.parametrize("num_rows", [1, 17, 9000])
+def test_rows_in_many_parts_equal_two_passes(num_rows):
+    rows = torch.randn(num_rows, 3) * torch.tensor([1.0, 1e-2, 1e3]) + torch.tensor([0.0, 1e4, -1e3])
+    rows[num_rows // 2, 1] = torch.nan
+    valid = torch.rand(num_rows) < 0.8
+    moments = RunningMoments(3)
+    for _ in range(2):
+        moments.update(rows, valid)
+    seen = rows[valid & rows.isfinite().all(-1)].double()
+    assert int(moments.count) == 2 * len(seen)
+    mean = seen.mean(0) if len(seen) else torch.zeros(3)
+    torch.testing.assert_close(moments.exact_mean, mean, rtol=1e-12, atol=1e-12, check_dtype=False)
+    squares = 2 * (seen - mean).square().sum(0)
+    torch.testing.assert_close(moments.exact_sum_of_squares, squares, rtol=1e-10, atol=0, check_dtype=False)

@@ -9,6 +9,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from ksim_rl import conf
 from ksim_rl.data import PrioritySampler
+from ksim_rl.device.running_moments import RunningMoments
 from ksim_rl.physics import Captured
 from ksim_rl.trainers.build import build_env
 
@@ -80,3 +81,18 @@ def test_prioritized_draws_from_equal_priorities_are_equal():
         torch.manual_seed(1)
         drawn.append(buffer.sample()["number"])
     assert torch.equal(*drawn)
+
+
+@pytest.mark.gpu
+def test_moments_of_equal_rows_are_equal_and_those_of_the_cpu():
+    torch.manual_seed(0)
+    rows = torch.randn(98304, 48) * torch.logspace(-3, 3, 48) + torch.linspace(-1e3, 1e3, 48)
+    rows[5, 7] = torch.nan
+    taken = {}
+    for place in ("cpu", "cuda", "cuda:0"):
+        taken[place] = RunningMoments(48, device=place)
+        for _ in range(2):
+            taken[place].update(rows.to(place), torch.arange(len(rows), device=place) % 3 > 0)
+    for name, buffer in taken["cuda"].named_buffers():
+        assert torch.equal(buffer, taken["cuda:0"].get_buffer(name)), name
+        torch.testing.assert_close(buffer.cpu(), taken["cpu"].get_buffer(name), rtol=1e-6, atol=0.0)

@@ -1,13 +1,11 @@
 """This module says whether the gradient steps of a PPO run can be fused kernels, and builds these for it."""
 
 import importlib.util
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
-from jaxtyping import Float
-from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
-from torch import Tensor, nn
+from torch import nn
 
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate
 from ksim_rl.data import EpochSampler
@@ -15,6 +13,7 @@ from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, ValueNetwork
 from ksim_rl.modules.actor import MIN_STD, GaussianHead
 from ksim_rl.objectives import SymmetricAugmentation
 from ksim_rl.objectives.fused_ppo import ACTIVATIONS, FusedNetworks, why_not_fused
+from ksim_rl.objectives.fused_ppo.layout import Observer
 from ksim_rl.transforms import MirrorMap
 
 if TYPE_CHECKING:
@@ -47,8 +46,6 @@ def make_fused_ppo(update: DatasetUpdate, mirror: Mapping[Any, MirrorMap] | None
         mirror=None
         if cfg.symmetry == "none"
         else SymmetricAugmentation(mirror, read=read, device=update.device),
-        observe_actor=observer(actor[0]),
-        observe_critic=observer(critic),
         optimizer=update.optimizer,
         guard=update.guard,
         **sizes,
@@ -72,15 +69,21 @@ def fused_networks(
         return f"the activations are {names[0]}, and not all one of {names[1]}"
     (activation,) = activations
     std: Any = {"std_A": head.std, "std_layer": head.std_layer, "log_std": head.std_type == "log"}
-    return FusedNetworks(actor=layers[0], critic=layers[1], activation=activation, min_std=MIN_STD, **std)
+    observers = _observer(actor[0]), _observer(critic)
+    return FusedNetworks(
+        actor=layers[0], critic=layers[1], observers=observers, activation=activation, min_std=MIN_STD, **std
+    )
 
 
 def _layers(network: nn.Sequential) -> list[nn.Linear]:
     return [layer for layer in network if isinstance(layer, nn.Linear)]
 
 
-def observer(module: Any) -> Callable[[TensorDictBase], Float[Tensor, "B L"]]:
-    """Return what gives the input of the first layer of a network from `make_actor` or `make_critic`."""
+def _observer(module: Any) -> Observer:
     network: PolicyNetwork | ValueNetwork = module.module
-    keys = list(module.in_keys)
-    return lambda env_states: network.observe(*(env_states.get(key) for key in keys))
+    keys, moments = list(module.in_keys), network.normalizer
+    return Observer(
+        read=lambda env_states: network.joined(*(env_states.get(key) for key in keys)),
+        moments=moments,
+        eps=0.0 if moments is None else moments.eps,
+    )

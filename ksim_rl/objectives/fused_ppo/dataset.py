@@ -1,22 +1,23 @@
 """This module lays out for the kernels what the gradient steps of an update read of a rollout."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int64
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from ksim_rl import ranks
 from ksim_rl.device.memory import ROLLOUT_PARTS
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
-from ksim_rl.objectives.fused_ppo.layout import FusedLayout, launch, parts
-from ksim_rl.objectives.fused_ppo.loss_kernels import ADVANTAGE, LOG_PROB, MASK, estimate_advantages
-from ksim_rl.objectives.masked import standardized
+from ksim_rl.objectives.fused_ppo.dataset_kernels import read_observations, write_records
+from ksim_rl.objectives.fused_ppo.layout import FusedLayout, Observer, launch, parts, power_of_two
+from ksim_rl.objectives.fused_ppo.loss_kernels import estimate_advantages
 from ksim_rl.objectives.symmetry import SymmetricAugmentation
 
 # Envs per program.
 ENVS = 32
-Observe = Callable[[TensorDictBase], Float[Tensor, "*batch L"]]
 Evaluate = Callable[[Float[Tensor, "D L"], Float[Tensor, " D"]], None]
 
 
@@ -24,7 +25,7 @@ class FusedDataset:
     """Normalized observations, and one record for each env state, in the order of a collector's rollout: step by step.
 
     `obs` [2, D, L] is for actor and critic, padded with zeros, in the `dtype` of the products; `records` [D, columns]
-    are described in `loss_kernels`. `observe_actor` and `observe_critic` give what the first layers take, [..., L].
+    are described in `loss_kernels`. The `observers` say what the first layers take.
     With a `mirror`, rows D to 2 D of both are the mirror images of those before.
     """
 
@@ -33,24 +34,34 @@ class FusedDataset:
         cfg: PPOCfg,
         layout: FusedLayout,
         *,
-        observe_actor: Observe,
-        observe_critic: Observe,
+        observers: tuple[Observer, Observer],
         size: int,
         dtype: torch.dtype,
         tf32: bool,
         device: torch.device,
         mirror: SymmetricAugmentation | None = None,
     ) -> None:
-        self.cfg, self.layout, self.size, self._tf32, self._mirror = cfg, layout, size, tf32, mirror
-        self._observe = observe_actor, observe_critic
+        self.layout, self.size, self._mirror, self._observers = layout, size, mirror, observers
         rows = size if mirror is None else 2 * size
         self.obs = torch.zeros(2, rows, layout.stored, dtype=dtype, device=device)
-        width = layout.out
-        # A standard deviation must have a logarithm, also where there is no action and where nothing takes part.
-        self._neutral = torch.zeros(3 * width + 8, device=device)
-        self._neutral[2 * width : 3 * width] = 1.0
-        self.records = self._neutral.repeat(rows, 1)
+        self.records = torch.zeros(rows, 3 * layout.out + 8, device=device)
         self._signals = torch.zeros(4, size, device=device)
+        # What kernels get, by the names of their parameters.
+        self._arguments: dict[str, Any] = {
+            **dict(zip(("values", "next_values", "advantages", "targets"), self._signals, strict=True)),
+            **{name.upper(): getattr(layout, name) for name in ("actions", "out", "stored")},
+            "obs": self.obs,
+            "records": self.records,
+            "num_obs": rows,
+            "size": size,
+            "gamma": cfg.gamma,
+            "decay": cfg.gamma * cfg.lmbda,
+            "LANES": power_of_two(layout.stored),
+            "RECORD": self.records.shape[1],
+            "RECORD_LANES": power_of_two(self.records.shape[1]),
+            "TF32": tf32,
+            "STANDARDIZED": cfg.normalize_advantage == "dataset",
+        }
 
     @torch.no_grad()
     def read(self, rollout_ET: TensorDictBase, *, evaluate: Evaluate) -> Int64[Tensor, ""]:
@@ -58,58 +69,61 @@ class FusedDataset:
 
         An env state with an element that is not finite takes no part, as in `DatasetStorage`; returned is how many.
         """
-        values_D, next_values_D, advantages_D, targets_D = self._signals
-        first = 0
-        for part_ET in rollout_ET.chunk(ROLLOUT_PARTS, 1):
-            rows = slice(first, first + part_ET.numel())
-            self._take(part_ET, self.obs[:, rows], self.records[rows])
-            if self._mirror is not None:
-                images = slice(self.size + rows.start, self.size + rows.stop)
-                self._take(self._mirror.image(part_ET), self.obs[:, images], self.records[images])
-            evaluate(self.obs[1, rows], values_D[rows])
-            next_obs = self.obs.new_zeros(part_ET.numel(), self.layout.stored)
-            next_obs[:, : self.layout.obs_dims[1]] = self._observed(1, part_ET.get("next"))
-            evaluate(next_obs, next_values_D[rows])
-            first = rows.stop
+        for part_ET, first in self._parts(rollout_ET):
+            for network, obs_DL in enumerate(self.obs):
+                self._take_observations(network, part_ET, obs_DL[first:])
         following = rollout_ET.get("next")
+        next_obs = torch.empty_like(self.obs[1, : self.size])
+        self._take_observations(1, following, next_obs)
+        evaluate(self.obs[1, : self.size], self._signals[0])
+        evaluate(next_obs, self._signals[1])
         num_envs, length = rollout_ET.batch_size
-        signals = {
-            **dict(zip(("values", "next_values", "advantages", "targets"), self._signals, strict=True)),
-            "rewards": _time_major(following.get("reward")),
-            **{key: _time_major(following.get(key)) for key in ("done", "terminated")},
+        programs = parts(num_envs, ENVS)
+        moments = self.records.new_empty(programs, 3)
+        signals = {key: _time_major(following.get(key)) for key in ("reward", "done", "terminated")}
+        sizes = {"num_envs": num_envs, "STEPS": length, "BLOCK": ENVS}
+        given = self._arguments | signals | sizes
+        launch(estimate_advantages, (programs,), given, num_warps=1, moments=moments)
+        moments = torch.cat(ranks.gather(moments))
+        left_out = [self._take_records(part_ET, first, moments) for part_ET, first in self._parts(rollout_ET)]
+        return torch.cat(left_out).sum()
+
+    def _parts(self, rollout_ET: TensorDictBase) -> Iterator[tuple[TensorDictBase, int]]:
+        """Yield the rollout, or some steps at a time and their mirror images, and at which row each begins."""
+        first = 0
+        for part_ET in [rollout_ET] if self._mirror is None else rollout_ET.chunk(ROLLOUT_PARTS, 1):
+            yield part_ET, first
+            if self._mirror is not None:
+                yield self._mirror.image(part_ET), self.size + first
+            first += part_ET.numel()
+
+    def _take_records(self, part_ET: TensorDictBase, first: int, moments: Tensor) -> Tensor:
+        """Write records, and return of each program how many env states it left out."""
+        rows, block = part_ET.numel(), _block(max(self._arguments["LANES"], self._arguments["RECORD_LANES"]))
+        left_out = torch.empty(parts(rows, block), dtype=torch.int32, device=self.records.device)
+        own = {"obs": self.obs[0, first:], "records": self.records[first:], "first": first, "num_rows": rows}
+        own |= {"moments": moments, "num_moments": len(moments), "left_out": left_out, "BLOCK": block}
+        keys = ("action", "loc", "scale", "action_log_prob")
+        given = self._arguments | {key: _time_major(part_ET.get(key)) for key in keys} | own
+        launch(write_records, (len(left_out),), given, MOMENTS=power_of_two(len(moments)))
+        return left_out
+
+    def _take_observations(self, network: int, part_ET: TensorDictBase, obs: Tensor) -> None:
+        observer = self._observers[network]
+        source, block = _time_major(observer.read(part_ET)), _block(self._arguments["LANES"])
+        # Not read where there are none.
+        mean, var = (
+            (source, source) if observer.moments is None else (observer.moments.mean, observer.moments.var)
+        )
+        given = self._arguments | {
+            "source": source,
+            "mean": mean,
+            "var": var,
+            "obs": obs,
+            "eps": observer.eps,
         }
-        gamma, decay = self.cfg.gamma, self.cfg.gamma * self.cfg.lmbda
-        sizes = {"num_envs": num_envs, "gamma": gamma, "decay": decay, "STEPS": length, "BLOCK": ENVS}
-        launch(estimate_advantages, (parts(num_envs, ENVS),), signals, num_warps=1, **sizes)
-        if self.cfg.normalize_advantage == "dataset":
-            estimated_D = advantages_D.isfinite()
-            normal_D = standardized(advantages_D, estimated_D, lowest_std=1e-4)
-            advantages_D = torch.where(estimated_D, normal_D, torch.nan)
-        return self._record(torch.stack([advantages_D, values_D, targets_D], 1))
-
-    def _take(self, part_ET: TensorDictBase, obs_2BL: Tensor, records_B: Tensor) -> None:
-        """Take over what is as the rollout has it, some steps of it."""
-        width, actions = self.layout.out, self.layout.actions
-        for network, dim in enumerate(self.layout.obs_dims):
-            obs_2BL[network, :, :dim] = self._observed(network, part_ET)
-        for place, key in enumerate(("action", "loc", "scale")):
-            records_B[:, place * width : place * width + actions] = _time_major(part_ET.get(key))
-        records_B[:, 3 * width + LOG_PROB.value] = _time_major(part_ET.get("action_log_prob"))
-
-    def _observed(self, network: int, part_ET: TensorDictBase) -> Tensor:
-        obs_BL = _time_major(self._observe[network](part_ET))
-        return as_tf32(obs_BL) if self._tf32 else obs_BL
-
-    def _record(self, estimates: Tensor) -> Tensor:
-        first, mask = (3 * self.layout.out + column.value for column in (ADVANTAGE, MASK))
-        for rows in self.records.split(self.size):
-            rows[:, first:mask] = estimates
-        self.records[:, mask] = 1.0
-        finite_D = _finite_rows(self.records) & _finite_rows(self.obs[0]) & _finite_rows(self.obs[1])
-        # A zero times NaN is NaN: what takes no part must be finite too. The mask of the neutral row is zero.
-        torch.where(finite_D[:, None], self.records, self._neutral, out=self.records)
-        self.obs.masked_fill_(~finite_D[None, :, None], 0.0)
-        return (~finite_D[: self.size]).sum()
+        sizes = {"num_rows": len(source), "DIM": source.shape[1], "NORMALIZED": observer.moments is not None}
+        launch(read_observations, (parts(len(source), block),), given, BLOCK=block, **sizes)
 
 
 def as_tf32(values: Float[Tensor, "*?shape"]) -> Float[Tensor, "*?shape"]:
@@ -123,11 +137,10 @@ def as_tf32(values: Float[Tensor, "*?shape"]) -> Float[Tensor, "*?shape"]:
 
 
 def _time_major(leaf_ET: Tensor) -> Tensor:
-    """Return `["E","T", ...]` as [T * E, ...]; a view where the memory is time-major."""
-    return leaf_ET.transpose(0, 1).flatten(0, 1)
+    """Return `["E","T", ...]` as [T * E, ...] in one piece; a view where the memory is time-major."""
+    return leaf_ET.transpose(0, 1).flatten(0, 1).contiguous()
 
 
-def _finite_rows(table_DL: Tensor) -> Tensor:
-    """Return whether all elements of a row are finite, bool [D]: a sum is not where one of them is not."""
-    # A product with ones reads the table at full speed, which a reduction of its short rows does not.
-    return (table_DL @ table_DL.new_ones(table_DL.shape[1])).isfinite()
+def _block(lanes: int) -> int:
+    """Return how many rows of so many lanes a program takes: 32 elements a thread."""
+    return max(4096 // lanes, 1)

@@ -21,9 +21,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from ksim_rl import ranks
+from ksim_rl.device.memory import ROLLOUT_PARTS
 from ksim_rl.device.streams import beside, warp_scope, warp_stream
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
-from ksim_rl.objectives.fused_ppo.dataset import FusedDataset, Observe, as_tf32
+from ksim_rl.objectives.fused_ppo.dataset import FusedDataset, as_tf32
 from ksim_rl.objectives.fused_ppo.layer_kernels import layer, output_gradients
 from ksim_rl.objectives.fused_ppo.layout import (
     ACTIVATIONS,
@@ -35,7 +36,12 @@ from ksim_rl.objectives.fused_ppo.layout import (
     parts,
     power_of_two,
 )
-from ksim_rl.objectives.fused_ppo.mlp_kernels import minibatch_gradients, state_values, weight_gradients
+from ksim_rl.objectives.fused_ppo.mlp_kernels import (
+    lower_gradients,
+    minibatch_gradients,
+    state_values,
+    weight_gradients,
+)
 from ksim_rl.objectives.fused_ppo.step_kernels import SUMMARY, adam_step, sum_gradients, take_means
 from ksim_rl.objectives.gradient_step import StepGuard, rate_bounds
 from ksim_rl.objectives.symmetry import SymmetricAugmentation
@@ -110,9 +116,8 @@ class FusedParameters:
 class FusedPPO:
     """Makes the gradient steps of one update after another; all memory is allocated once, and nothing syncs.
 
-    `why_not_fused` has no reason against its config. The first layers take what `observe_actor` and `observe_critic`
-    give, [..., L]. Moments, step counts and learning rate are those of `optimizer`, from `make_optimizer`. A symmetry
-    of the config needs the `mirror`; else a ValueError is raised.
+    `why_not_fused` has no reason against its config. Moments, step counts and learning rate are those of `optimizer`,
+    from `make_optimizer`. A symmetry of the config needs the `mirror`; else a ValueError is raised.
     """
 
     def __init__(
@@ -120,8 +125,6 @@ class FusedPPO:
         cfg: PPOCfg,
         networks: FusedNetworks,
         *,
-        observe_actor: Observe,
-        observe_critic: Observe,
         optimizer: torch.optim.Adam,
         guard: StepGuard,
         num_env_states_per_minibatch: int,
@@ -148,8 +151,7 @@ class FusedPPO:
         self.dataset = FusedDataset(
             cfg,
             layout,
-            observe_actor=observe_actor,
-            observe_critic=observe_critic,
+            observers=networks.observers,
             size=num_env_states_per_minibatch * num_minibatches,
             dtype=dtype,
             tf32=tf32,
@@ -158,8 +160,9 @@ class FusedPPO:
         )
 
         self._summary = torch.zeros(num_steps, power_of_two(len(SUMMARY) + 1), device=device)
-        # Splits whose layer inputs and gradients exist at a time; the loss of a mirror image reads the whole minibatch.
-        self._splits = tuning.splits if self._mirrored else parts(tuning.splits, 2)
+        # Splits whose layer inputs and gradients exist at a time. The loss of a mirror image reads the whole minibatch;
+        # chained kernels leave out half of its columns.
+        self._splits = tuning.splits if self._mirrored or layout.chained else parts(tuning.splits, 2)
         self._arguments = self._all_arguments(rows, mirror)
 
     def _all_arguments(self, rows: int, mirror: SymmetricAugmentation | None) -> dict[str, Any]:
@@ -234,30 +237,35 @@ class FusedPPO:
         """Make all gradient steps of an update.
 
         `rollout_ET`, `["E","T"]`, may be time-major in memory, as that of a collector. `orders` has for each epoch the
-        env states in the order of the minibatches, counted env by env; a GPU draws them while it reads the rollout, and
-        does what is `aside` beside the steps, which do not. Returned are what each gradient step measured, by the names
-        of `SUMMARY`, and how many env states took no part because an element was not finite.
+        env states in the order of the minibatches, counted env by env; a GPU draws one while it reads the rollout or
+        makes the steps of the epoch before, and does what is `aside` beside the first steps, which do not. Returned are
+        what each gradient step measured, by the names of `SUMMARY`, and how many env states took no part because an
+        element was not finite.
         """
         num_envs, length = rollout_ET.batch_size
-        places: list[Tensor] = []
+        upcoming, epochs = iter(orders), []
 
         def place() -> None:
-            for order_D in orders:
+            for order_D in itertools.islice(upcoming, 1):
                 order_D = order_D.to(torch.int32)
                 # From env by env to step by step.
-                places.extend(((order_D % length) * num_envs + order_D // length).split(self.batch))
+                epochs.append(((order_D % length) * num_envs + order_D // length).split(self.batch))
 
         with warp_scope(self._summary.device):
             with beside(self._side, place):
                 self.parameters.load()
                 left_out = self.dataset.read(rollout_ET, evaluate=self._evaluate)
-            with beside(self._side, *aside):
-                for step, index_B in enumerate(places):
-                    if len(self.dataset.records) > self.dataset.size:
-                        index_B = torch.cat([index_B, index_B + self.dataset.size])
-                    self._multiply(index_B)
-                    self._improve(step)
-                self.parameters.store()
+            step = itertools.count()
+            # Grows beside the steps; what was placed must stay until all is done, as another stream allocated it.
+            for indices in epochs:
+                with beside(self._side, place, *aside):
+                    for index_B in indices:
+                        if len(self.dataset.records) > self.dataset.size:
+                            index_B = torch.cat([index_B, index_B + self.dataset.size])
+                        self._multiply(index_B)
+                        self._improve(next(step))
+                aside = ()
+            self.parameters.store()
         names = SUMMARY if self._mirrored else SUMMARY[:-1]
         return dict(zip(names, self._summary.unbind(1), strict=False)), left_out
 
@@ -280,6 +288,8 @@ class FusedPPO:
             }
             if self.layout.chained:
                 launch(minibatch_gradients, (given["BLOCKS"], 2), given, num_warps=tuning.warps)
+                grid = self.layout.hidden[0] // tuning.lower, self._splits, 2
+                launch(lower_gradients, grid, given, num_warps=tuning.lower_warps, ROWS=split)
             else:
                 self._multiply_by_layers(given)
             grid = len(given["tiles"]), self._splits
@@ -297,7 +307,7 @@ class FusedPPO:
             grid = given["BLOCKS"], parts(at.fan_out, tuning.tile), 2
             places = {
                 "weights": weights[:, own.weight :],
-                "biases": biases[:, at.gradient :],
+                "biases": biases[:, at.bias :],
                 "width": at.fan_out,
                 "length": at.fan_in if forward else following.fan_out,
                 "read_at": at.input if forward else following.gradient,
@@ -312,7 +322,7 @@ class FusedPPO:
         last = layout.places[-1]
         places = {
             "weights": weights[:, last.weight :],
-            "biases": biases[:, last.gradient :],
+            "biases": biases[:, last.bias :],
             "fan_in": last.fan_in,
             "input_at": last.input,
             "slope_at": last.gradient,
@@ -345,8 +355,10 @@ class FusedPPO:
             return
         *layers, last = self.networks.critic
         activation = self.networks.activation()
-        hidden_DL = obs_DL[:, : self.layout.obs_dims[1]]
-        for below in layers:
-            weight, bias = below.weight.to(obs_DL.dtype), below.bias.to(obs_DL.dtype)
-            hidden_DL = activation(functional.linear(hidden_DL, weight, bias))
-        values_D.copy_(last(hidden_DL.to(values_D.dtype)).squeeze(-1))
+        # The hidden layers of some env states at a time: they take several times the memory of these.
+        for obs_BL, values_B in zip(obs_DL.chunk(ROLLOUT_PARTS), values_D.chunk(ROLLOUT_PARTS), strict=True):
+            hidden_BL = obs_BL[:, : self.layout.obs_dims[1]]
+            for below in layers:
+                weight, bias = below.weight.to(obs_DL.dtype), below.bias.to(obs_DL.dtype)
+                hidden_BL = activation(functional.linear(hidden_BL, weight, bias))
+            values_B.copy_(last(hidden_BL.to(values_D.dtype)).squeeze(-1))

@@ -2,14 +2,16 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int32
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from ksim_rl.device.running_moments import RunningMoments
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
 
 # The smallest dim that a tensor core multiplies.
@@ -27,16 +29,26 @@ MAX_PLACES = 2**31
 
 
 @dataclass(frozen=True, kw_only=True)
+class Observer:
+    """What the first layer of a network takes: what `read` gives, [..., L], normalized by the `moments`, if any."""
+
+    read: Callable[[TensorDictBase], Float[Tensor, "*batch L"]]
+    moments: RunningMoments | None = None
+    eps: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class FusedNetworks:
     """What the kernels need to know of an actor and a critic: two MLPs of as many layers, and a gaussian.
 
     The activation follows each linear layer but the last. The standard deviations, or their logarithms, are a parameter
     `std_A`, or what a `std_layer` makes of the last hidden layer: logarithms, or what a softplus makes positive. The
-    gradient passes the bound `min_std`.
+    gradient passes the bound `min_std`. What actor and critic read is what their `observers` say.
     """
 
     actor: Sequence[nn.Linear]
     critic: Sequence[nn.Linear]
+    observers: tuple[Observer, Observer]
     std_A: Float[Tensor, " A"] | None = None
     std_layer: nn.Linear | None = None
     log_std: bool
@@ -69,11 +81,12 @@ class FusedNetworks:
 
 @dataclass(frozen=True, kw_only=True)
 class LayerPlace:
-    """Where a layer is: its first weight, and its first columns among layer inputs, and among gradients and biases."""
+    """Where a layer is: its first weight and bias, and its first columns among layer inputs and among gradients."""
 
     fan_in: int
     fan_out: int
     weight: int
+    bias: int
     input: int
     gradient: int
 
@@ -102,16 +115,19 @@ class FusedLayout:
         outputs = self.out if networks.std_layer is None else 2 * self.out
         widths = (self.obs, *self.hidden, outputs)
         self.places: list[LayerPlace] = []
-        weight = column = gradient = 0
-        for fan_in, fan_out in itertools.pairwise(widths):
-            at = {"weight": weight, "input": column, "gradient": gradient}
+        weight = bias = column = gradient = 0
+        for number, (fan_in, fan_out) in enumerate(itertools.pairwise(widths)):
+            at = {"weight": weight, "bias": bias, "input": column, "gradient": gradient}
             self.places.append(LayerPlace(fan_in=fan_in, fan_out=fan_out, **at))
-            weight, column, gradient = weight + fan_in * fan_out, column + fan_in, gradient + fan_out
+            weight, bias = weight + fan_in * fan_out, bias + fan_out
+            column += 0 if self.chained and number == 1 else fan_in
+            gradient += 0 if self.chained and number == 0 else fan_out
         self.num_weights = weight
         self.num_biases = sum(self.hidden) + 2 * self.out
         self.num_padded = self.num_weights + self.num_biases
         self.num_flat = sum(parameter.numel() for parameter in networks.parameters)
-        # Columns of a row of all layer inputs (observation first), and of all gradients of layer outputs.
+        # Columns of a row of layer inputs (observation first), and of gradients of layer outputs. Where the kernels are
+        # chained neither are of the first hidden layer.
         self.inputs, self.gradients = column, gradient
 
     def padded_index(self, networks: FusedNetworks) -> Int32[Tensor, " N"]:
@@ -123,7 +139,7 @@ class FusedLayout:
             for layer, at in zip(layers, self.places, strict=True):
                 block = row[at.weight :][: at.fan_in * at.fan_out].view(at.fan_out, at.fan_in)
                 index.append(block[: layer.out_features, : layer.in_features])
-                index.append(row[self.num_weights + at.gradient :][: layer.out_features])
+                index.append(row[self.num_weights + at.bias :][: layer.out_features])
             if layers is networks.actor:
                 if networks.std_layer is not None:
                     rows = block[self.out : self.out + actions, : layer.in_features]
@@ -136,16 +152,18 @@ class FusedLayout:
 
         Columns: network, first column among the layer inputs, first among the gradients, first place in the padded
         form, width of the layer's input, how many columns of inputs and of gradients the tile has, and the place of the
-        first of its biases, or -1 where another tile has them.
+        first of its biases, or -1 where another tile has them. Where they are chained, `lower_gradients` has the first
+        two layers but for the second one's biases, whose tiles have no columns of inputs.
         """
         tiles = []
         for network in range(2):
-            for at in self.places:
-                for row in range(0, at.fan_out, tile):
-                    for column in range(0, at.fan_in, tile):
+            for number, at in enumerate(self.places):
+                for row in range(0, 0 if self.chained and number == 0 else at.fan_out, tile):
+                    fan_in = 0 if self.chained and number == 1 else at.fan_in
+                    for column in range(0, max(fan_in, 1), tile):
                         first = network, at.input + column, at.gradient + row
-                        used = min(tile, at.fan_in - column), min(tile, at.fan_out - row)
-                        bias = -1 if column else self.num_weights + at.gradient + row
+                        used = min(tile, fan_in - column), min(tile, at.fan_out - row)
+                        bias = -1 if column else self.num_weights + at.bias + row
                         tiles.append([*first, at.weight + row * at.fan_in + column, at.fan_in, *used, bias])
         return torch.tensor(tiles, dtype=torch.int32)
 
@@ -161,7 +179,7 @@ def power_of_two(number: int) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class Tuning:
-    """How the work is cut. The defaults were the fastest on an H200 for chained layers of 512, 256 and 128."""
+    """How the work is cut. The defaults were the fastest on an H200 for layers of 512, 256 and 128, but for `lower`."""
 
     block: int = 64  # rows of a minibatch that one program takes through a network, or through one layer
     chunk: int = 32  # columns of the widest layer that exist at a time
@@ -171,6 +189,10 @@ class Tuning:
     depth: int = 64  # rows of a minibatch, or inputs of a layer, that it multiplies at a time
     tile_stages: int = 3
     tile_warps: int = 8
+    lower: int = 64  # elements of the first hidden layer that one program of `lower_gradients` has
+    lower_depth: int = 32  # rows of a minibatch that it multiplies at a time
+    lower_stages: int = 3
+    lower_warps: int = 4
     splits: int = 8  # programs that share a tile, each with a part of the minibatch
     size: int = 1024  # elements per program in sums and Adam
     rows: int = 256  # of the blocks in which sums over programs are taken
@@ -183,7 +205,11 @@ class Tuning:
         if not layout.chained:
             return cls(block=64 if wide else 128, **wide)
         chunk = math.gcd(cls.chunk, layout.hidden[0], layout.hidden[2])
-        return cls(block=32 if wide else cls.block, chunk=chunk, **wide)
+        lower = math.gcd(32 if wide else cls.lower, layout.hidden[0])
+        # Two programs of `lower_gradients` share a multiprocessor, where their sums fit into registers.
+        wide |= {"block": 32, "lower_depth": 16} if wide else {}
+        stages, warps = 3 if not wide and layout.obs <= 64 else 2, 4 if not wide and layout.obs <= 128 else 8
+        return cls(chunk=chunk, lower=lower, lower_stages=stages, lower_warps=warps, splits=16, **wide)
 
 
 def why_not_fused(

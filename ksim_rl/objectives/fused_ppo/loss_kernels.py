@@ -127,27 +127,42 @@ def value_gradient(
 
 @triton.jit
 def estimate_advantages(
-    values, next_values, rewards, done, terminated, advantages, targets, num_envs, gamma, decay,
+    values, next_values, reward, done, terminated, advantages, targets, moments, num_envs, gamma, decay,
     STEPS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write advantages and value targets of BLOCK envs; all signals are time-major, [STEPS, num_envs].
 
     As `GAE`: a step whose delta is not finite gets a NaN advantage, and the recursion starts anew before it. `decay` is
-    gamma * lambda.
+    gamma * lambda. `moments` [programs, 3] get how many advantages are finite, their mean, and their sum of squares
+    about it.
     """
     env = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = env < num_envs
     advantage = tl.zeros((BLOCK,), dtype=tl.float32)
+    counts = tl.zeros((BLOCK,), dtype=tl.float32)
+    means = tl.zeros((BLOCK,), dtype=tl.float32)
+    squares = tl.zeros((BLOCK,), dtype=tl.float32)
     for back in range(1, STEPS + 1):
         at = (STEPS - back) * num_envs + env
         value = tl.load(values + at, mask=inside, other=0.0)
         following = gamma * tl.load(next_values + at, mask=inside, other=0.0)
-        reward = tl.load(rewards + at, mask=inside, other=0.0)
         ended = tl.load(done + at, mask=inside, other=1) != 0
         bootstrap = tl.where(tl.load(terminated + at, mask=inside, other=1) != 0, 0.0, following)
-        delta = reward + bootstrap - value
+        delta = tl.load(reward + at, mask=inside, other=0.0) + bootstrap - value
         finite = tl.abs(delta) < float("inf")
         carried = tl.where(finite & (ended == 0), decay, 0.0) * advantage
         advantage = tl.where(finite, delta, 0.0) + carried
         tl.store(targets + at, advantage + value, mask=inside)
         tl.store(advantages + at, tl.where(finite, advantage, float("nan")), mask=inside)
+        # Welford, "Note on a method for calculating corrected sums of squares and products" (1962).
+        counted = inside & finite
+        counts += tl.where(counted, 1.0, 0.0)
+        gap = tl.where(counted, advantage - means, 0.0)
+        means += gap / tl.maximum(counts, 1.0)
+        squares += gap * tl.where(counted, advantage - means, 0.0)
+    count = tl.sum(counts)
+    mean = tl.sum(counts * means) / tl.maximum(count, 1.0)
+    moments += tl.program_id(0) * 3
+    tl.store(moments, count)
+    tl.store(moments + 1, mean)
+    tl.store(moments + 2, tl.sum(squares + counts * (means - mean) * (means - mean)))

@@ -58,7 +58,7 @@ def _outputs(
     CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr, TF32: tl.constexpr,
     STORE: tl.constexpr,
 ):  # fmt: skip
-    """Return the outputs [BLOCK, OUT] for `observed` [BLOCK, OBS]; STORE keeps the hidden layers in `inputs`."""
+    """Return the outputs [BLOCK, OUT] for `observed` [BLOCK, OBS]; STORE keeps all but the first hidden layer."""
     BLOCK: tl.constexpr = observed.shape[0]
     OBS: tl.constexpr = observed.shape[1]
     SECOND_AT: tl.constexpr = H1 * OBS
@@ -77,13 +77,11 @@ def _outputs(
         hidden = tl.dot(observed, weight1) + bias[None, :]
         bias = tl.load(biases + (first + CHUNK) % H1 + column)
         hidden = operand(activate(hidden, ACTIVATION), observed.dtype, TF32)
-        if STORE:
-            tl.store(inputs + (input_rows + (OBS + first + column[None, :])), hidden, mask=keep)
         acc = tl.dot(hidden, weight2, acc)
     second = activate(acc + tl.load(biases + H1 + column2)[None, :], ACTIVATION)
     second = operand(second, observed.dtype, TF32)
     if STORE:
-        tl.store(inputs + (input_rows + (OBS + H1 + column2[None, :])), second, mask=keep)
+        tl.store(inputs + (input_rows + (OBS + column2[None, :])), second, mask=keep)
     out = tl.zeros((BLOCK, OUT), dtype=tl.float32)
     bias = tl.load(biases + H1 + H2 + column)
     for first in tl.range(0, H3, CHUNK, num_stages=STAGES):
@@ -93,7 +91,7 @@ def _outputs(
         bias = tl.load(biases + H1 + H2 + (first + CHUNK) % H3 + column)
         hidden = operand(activate(hidden, ACTIVATION), observed.dtype, TF32)
         if STORE:
-            tl.store(inputs + (input_rows + (OBS + H1 + H2 + first + column[None, :])), hidden, mask=keep)
+            tl.store(inputs + (input_rows + (OBS + H2 + first + column[None, :])), hidden, mask=keep)
         out = tl.dot(hidden, weight4, out)
     return out + tl.load(biases + H1 + H2 + H3 + output)[None, :]
 
@@ -137,9 +135,10 @@ def minibatch_gradients(
     """Run a block of a minibatch through one network, its loss, and back: all but the products for the weights.
 
     Program (i, n) takes BLOCK rows of the minibatch, the env states `order` [B], through network n (0: actor, 1:
-    critic). It leaves the inputs of all layers [2, B, INPUTS], the gradients of the sum of the losses at all layer
-    outputs [2, B, GRADIENTS], and what the block adds to the gradient of the std and to the statistics of the loss:
-    [blocks, 2, OUT + NUM_STATISTICS]. Weights and biases are in padded form, [2, NUM_PADDED].
+    critic). It leaves what layers read [2, B, INPUTS] and the gradients of the sum of the losses at layer outputs [2,
+    B, GRADIENTS], but not those of the first hidden layer (see `lower_gradients`), and what the block adds to the
+    gradient of the std and to the statistics of the loss: [blocks, 2, OUT + NUM_STATISTICS]. Weights and biases are in
+    padded form, [2, NUM_PADDED].
     """
     block = tl.program_id(0)
     network = tl.program_id(1)
@@ -184,30 +183,68 @@ def minibatch_gradients(
     else:
         d_out = value_gradient(out, record, valid, statistics, clip_value, critic_coeff, OUT, CLIP_VALUE)
     d_out = operand(d_out, observed.dtype, TF32)
-    tl.store(slopes + (gradient_rows + (H1 + H2 + H3 + output[None, :])), d_out, mask=keep)
+    tl.store(slopes + (gradient_rows + (H2 + H3 + output[None, :])), d_out, mask=keep)
     # From here on threads read hidden layers that others of the block have written.
     tl.debug_barrier()
     acc = tl.zeros((BLOCK, H2), dtype=tl.float32)
     for first in tl.range(0, H3, CHUNK, num_stages=STAGES):
         weight4 = tl.load(weights + (OUT_AT + output[:, None] * H3 + (first + column)[None, :]))
         weight3 = tl.load(weights + (THIRD_AT + (first + column)[:, None] * H2 + column2[None, :]))
-        hidden = tl.load(
-            inputs + (input_rows + (OBS + H1 + H2 + first + column[None, :])), mask=keep, other=0.0
-        )
+        hidden = tl.load(inputs + (input_rows + (OBS + H2 + first + column[None, :])), mask=keep, other=0.0)
         slope = tl.dot(d_out, weight4) * slope_of(hidden.to(tl.float32), ACTIVATION)
         slope = operand(slope, observed.dtype, TF32)
-        tl.store(slopes + (gradient_rows + (H1 + H2 + first + column[None, :])), slope, mask=keep)
+        tl.store(slopes + (gradient_rows + (H2 + first + column[None, :])), slope, mask=keep)
         acc = tl.dot(slope, weight3, acc)
-    middle = tl.load(inputs + (input_rows + (OBS + H1 + column2[None, :])), mask=keep, other=0.0)
+    middle = tl.load(inputs + (input_rows + (OBS + column2[None, :])), mask=keep, other=0.0)
     second = acc * slope_of(middle.to(tl.float32), ACTIVATION)
     second = operand(second, observed.dtype, TF32)
-    tl.store(slopes + (gradient_rows + (H1 + column2[None, :])), second, mask=keep)
-    for first in tl.range(0, H1, CHUNK, num_stages=STAGES):
-        weight2 = tl.load(weights + (SECOND_AT + column2[:, None] * H1 + (first + column)[None, :]))
-        hidden = tl.load(inputs + (input_rows + (OBS + first + column[None, :])), mask=keep, other=0.0)
-        slope = tl.dot(second, weight2) * slope_of(hidden.to(tl.float32), ACTIVATION)
+    tl.store(slopes + (gradient_rows + column2[None, :]), second, mask=keep)
+
+
+@triton.jit
+def lower_gradients(
+    inputs, slopes, weights, biases, weight_partials, num_rows,
+    NUM_PADDED: tl.constexpr, NUM_WEIGHTS: tl.constexpr, INPUTS: tl.constexpr, GRADIENTS: tl.constexpr,
+    OBS: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, ROWS: tl.constexpr, LOWER: tl.constexpr,
+    LOWER_DEPTH: tl.constexpr, LOWER_STAGES: tl.constexpr, ACTIVATION: tl.constexpr, TF32: tl.constexpr,
+):  # fmt: skip
+    """Sum the gradients of both layers around the first hidden one, which is computed here anew.
+
+    Program (i, s, n) has LOWER of its elements, whose weights stay on the chip, over the ROWS of split s, in network n;
+    neither they nor the gradients at them are ever in memory. It writes to the places of its split, as
+    `weight_gradients` does, all but the biases of the second layer. All is transposed: what is computed here is the
+    first factor of the next product, as which it stays in registers.
+    """
+    split = tl.program_id(1)
+    network = tl.program_id(2)
+    SECOND_AT: tl.constexpr = H1 * OBS
+    element = (tl.program_id(0) * LOWER + tl.arange(0, LOWER))[:, None]
+    obs_column = tl.arange(0, OBS)[None, :]
+    column2 = tl.arange(0, H2)[None, :]
+    inputs += network.to(tl.int64) * num_rows * INPUTS
+    slopes += network.to(tl.int64) * num_rows * GRADIENTS
+    weights += network * NUM_PADDED
+    weight_partials += (split * 2 + network).to(tl.int64) * NUM_PADDED
+    weight1 = tl.load(weights + (element * OBS + obs_column))
+    weight2 = tl.load(weights + (SECOND_AT + column2 * H1 + element))
+    bias = tl.load(biases + network * NUM_PADDED + element)
+    d_weight1 = tl.zeros((LOWER, OBS), dtype=tl.float32)
+    d_weight2 = tl.zeros((LOWER, H2), dtype=tl.float32)
+    d_bias = tl.zeros((LOWER,), dtype=tl.float32)
+    for first in tl.range(0, ROWS, LOWER_DEPTH, num_stages=LOWER_STAGES):
+        rows = (split * ROWS + first + tl.arange(0, LOWER_DEPTH))[:, None]
+        observed = tl.load(inputs + (rows * INPUTS + obs_column), mask=rows < num_rows, other=0.0)
+        above = tl.load(slopes + (rows * GRADIENTS + column2), mask=rows < num_rows, other=0.0)
+        hidden = activate(tl.dot(weight1, tl.trans(observed)) + bias, ACTIVATION)
+        hidden = operand(hidden, observed.dtype, TF32)
+        d_weight2 = tl.dot(hidden, above, d_weight2)
+        slope = tl.dot(weight2, tl.trans(above)) * slope_of(hidden.to(tl.float32), ACTIVATION)
         slope = operand(slope, observed.dtype, TF32)
-        tl.store(slopes + (gradient_rows + (first + column[None, :])), slope, mask=keep)
+        d_weight1 = tl.dot(slope, observed, d_weight1)
+        d_bias += tl.sum(slope.to(tl.float32), 1)
+    tl.store(weight_partials + (element * OBS + obs_column), d_weight1)
+    tl.store(weight_partials + (SECOND_AT + column2 * H1 + element), d_weight2)
+    tl.store(weight_partials + NUM_WEIGHTS + element, d_bias[:, None])
 
 
 @triton.jit

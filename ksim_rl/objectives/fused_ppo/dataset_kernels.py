@@ -1,0 +1,95 @@
+"""This module has the Triton kernels that read a rollout into observations, records and advantages."""
+
+import triton
+import triton.language as tl
+
+from ksim_rl.objectives.fused_ppo.loss_kernels import ADVANTAGE, LOG_PROB, MASK, TARGET, VALUE
+from ksim_rl.objectives.fused_ppo.mlp_kernels import operand
+
+
+@triton.jit
+def read_observations(
+    source, mean, var, obs, num_rows, eps,
+    DIM: tl.constexpr, STORED: tl.constexpr, LANES: tl.constexpr, NORMALIZED: tl.constexpr, TF32: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Write `source` [D, DIM], normalized or not, to `obs` [D, STORED], as products take it; padding is zero."""
+    row = (tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK))[:, None]
+    column = tl.arange(0, LANES)[None, :]
+    used = column < DIM
+    value = tl.load(source + row * DIM + column, mask=(row < num_rows) & used, other=0.0).to(tl.float32)
+    if NORMALIZED:
+        shift = tl.load(mean + column, mask=used, other=0.0)
+        value = (value - shift) / tl.sqrt(tl.load(var + column, mask=used, other=1.0) + eps)
+    value = operand(value, obs.dtype.element_ty, TF32)
+    tl.store(obs + row * STORED + column, value, mask=(row < num_rows) & (column < STORED))
+
+
+@triton.jit
+def _counted_odd(value):
+    # How many elements of each row are not finite.
+    return tl.sum(tl.where(tl.abs(value.to(tl.float32)) < float("inf"), 0, 1), 1)
+
+
+@triton.jit
+def write_records(
+    action, loc, scale, action_log_prob, advantages, values, targets, moments, obs, records, left_out,
+    num_rows, num_obs, first, size, num_moments,
+    RECORD: tl.constexpr, RECORD_LANES: tl.constexpr, ACTIONS: tl.constexpr, OUT: tl.constexpr, STORED: tl.constexpr,
+    LANES: tl.constexpr, MOMENTS: tl.constexpr, STANDARDIZED: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Write the records of some steps, or of their images, which begin at row `first`; padding has a std of 1.
+
+    What is not finite takes no part: its record is neutral, its mask 0, its observations are zeros, as a zero times NaN
+    is NaN. `left_out` [programs] counts it, without images. STANDARDIZED advantages have a mean of 0 and a standard
+    deviation of 1, by the `moments` [num_moments, 3] that `estimate_advantages` left.
+    """
+    rows = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    valid = rows < num_rows
+    estimated = (first + rows) % size
+    advantage = tl.load(advantages + estimated, mask=valid, other=0.0)
+    if STANDARDIZED:
+        part = tl.arange(0, MOMENTS)
+        known = part < num_moments
+        counts = tl.load(moments + 3 * part, mask=known, other=0.0)
+        means = tl.load(moments + 3 * part + 1, mask=known, other=0.0)
+        count = tl.sum(counts)
+        mean = tl.sum(counts * means) / tl.maximum(count, 1.0)
+        gap = means - mean
+        squares = tl.sum(tl.load(moments + 3 * part + 2, mask=known, other=0.0) + counts * gap * gap)
+        std = tl.sqrt(squares / tl.maximum(count - 1.0, 1.0))
+        advantage = (advantage - mean) / tl.maximum(std, 1e-4)
+    row, column = rows[:, None], tl.arange(0, RECORD_LANES)[None, :]
+    kind, output = column // OUT, column % OUT
+    own, used = row * ACTIONS + output, valid[:, None] & (output < ACTIONS)
+    neutral = tl.where(kind == 2, 1.0, 0.0)
+    record = tl.where(used, 0.0, neutral)
+    record += tl.load(action + own, mask=used & (kind == 0), other=0.0)
+    record += tl.load(loc + own, mask=used & (kind == 1), other=0.0)
+    record += tl.load(scale + own, mask=used & (kind == 2), other=0.0)
+    signal = column - 3 * OUT
+    log_prob = tl.load(action_log_prob + rows, mask=valid, other=0.0)
+    value = tl.load(values + estimated, mask=valid, other=0.0)
+    target = tl.load(targets + estimated, mask=valid, other=0.0)
+    record = tl.where(signal == LOG_PROB, log_prob[:, None], record)
+    record = tl.where(signal == ADVANTAGE, advantage[:, None], record)
+    record = tl.where(signal == VALUE, value[:, None], record)
+    record = tl.where(signal == TARGET, target[:, None], record)
+    record = tl.where(signal == MASK, 1.0, record)
+    lane = tl.arange(0, LANES)[None, :]
+    inside = valid[:, None] & (lane < STORED)
+    of_actor = obs + row * STORED + lane
+    of_critic = of_actor + num_obs.to(tl.int64) * STORED
+    odd = _counted_odd(record)
+    odd += _counted_odd(tl.load(of_actor, mask=inside, other=0.0))
+    odd += _counted_odd(tl.load(of_critic, mask=inside, other=0.0))
+    is_odd = (odd > 0)[:, None]
+    tl.store(
+        records + row * RECORD + column,
+        tl.where(is_odd, neutral, record),
+        mask=valid[:, None] & (column < RECORD),
+    )
+    none = tl.zeros((BLOCK, LANES), dtype=obs.dtype.element_ty)
+    tl.store(of_actor, none, mask=inside & is_odd)
+    tl.store(of_critic, none, mask=inside & is_odd)
+    tl.store(left_out + tl.program_id(0), tl.sum(tl.where(valid & (odd > 0) & (first + rows < size), 1, 0)))
