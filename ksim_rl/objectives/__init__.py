@@ -19,6 +19,7 @@ from ksim_rl.objectives.gradient_step import (
     NonFiniteStepsError,
     StepGuard,
     adapt_learning_rate_,
+    anneal_learning_rate_,
     clip_and_guard,
     go_back,
     make_optimizer,

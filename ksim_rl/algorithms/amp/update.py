@@ -60,6 +60,7 @@ class AMPUpdate(RolloutUpdate):
             )
         self.cfg, self.ppo, self.notes = cfg, ppo, ppo.notes
         self.actor = self.behavior = ppo.actor
+        self.set_progress = ppo.set_progress  # the discriminator's learning rate stays
         self.num_env_states = ppo.num_env_states
         self.reference_N2L = reference_N2L.to(ppo.device)
         self.discriminator = Discriminator(
