@@ -74,7 +74,7 @@ class Substeps:
             # A world without constraints reaches that acceleration in one step.
             self._alter(opt=dataclasses.replace(warp_model.opt, run_qacc_smooth=False))
             self._solve = newton.solver(self._models["all"], warp_data_E)
-        self._dynamics = None
+        self._dynamics = self._integrate = None
         if one_kernel_dynamics:
             self._dynamics = smooth_dynamics(warp_model, warp_data_E, mask=mask)
             self._refresh_warp_model.sensor_subtree_vel = False
@@ -91,7 +91,6 @@ class Substeps:
             )
             if own_broad_phase:
                 self._collide = collisions(warp_model, warp_data_E, self.contact_lists)
-        self._integrate: Callable[[], None] | None = None
         if one_kernel_integration:
             self._integrate = integration(warp_model, warp_data_E, record=record)
         self._needs_transmission = bool(np.isin(sensor_type, TRANSMISSION_SENSORS).any())
@@ -125,8 +124,10 @@ class Substeps:
             return
         m.opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
         is_read = is_last or sensors != "none" or self._always_senses or m.opt.run_rne_postconstraint
-        if dynamics is not None and self._make_rows is not None and self._integrate is not None:
-            dynamics = partial(dynamics, is_read=is_read)
+        is_read |= self._make_rows is None or self._integrate is None
+        if dynamics is not None:
+            empties_pool = self._collide is not None and m.opt.run_collision_detection
+            dynamics = partial(dynamics, is_read=is_read, empties_pool=empties_pool)
         newton.step(
             m,
             self.warp_data_E,

@@ -87,6 +87,7 @@ def check(world: World, **kwargs: int) -> None:
         mjw.collision(m, d)
         wp.synchronize()
         expected = found(world)
+        d.nacon.zero_()
         collisions(m, d, ContactLists(m, d), **kwargs)()
         wp.synchronize()
     contacts = found(world)
@@ -177,6 +178,7 @@ def check_against_c(device: str = "cpu", **kwargs: int) -> None:
     assert pairs_left(m) is None
     lists = ContactLists(m, d)
     with wp.ScopedDevice(str(world.device)):
+        d.nacon.zero_()
         collisions(m, d, lists, **kwargs)()
     number, room = int(d.nacon.numpy()[0]), lists.found.numpy()
     contact = SimpleNamespace(**{name: getattr(d.contact, name).numpy()[:number] for name in FIELDS})
@@ -209,6 +211,7 @@ def test_more_contacts_than_there_is_room_for_are_counted():
         mjw.collision(m, d)
         number, lists = int(d.nacon.numpy()[0]), ContactLists(m, d)
         d.naconmax = number // 2
+        d.nacon.zero_()
         collisions(m, d, lists)()
     assert int(d.nacon.numpy()[0]) > d.naconmax == lists.appended.numpy().sum()
 

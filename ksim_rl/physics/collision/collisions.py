@@ -65,8 +65,8 @@ def collisions(
 ) -> Callable[[], None]:
     """Return what launches `mjw.collision` for a model for which it is available, with arrays in their final place.
 
-    Contacts have other places in the pool that all worlds share, as in each run on a GPU. It appends them to the lists,
-    unless others come to the pool. `lanes` is how many threads share a world on CUDA; None takes the usual.
+    The pool has to be empty (`nacon`). Places in it are others, as in each run on a GPU; contacts are appended to the
+    lists, unless others come to the pool. `lanes` is how many threads share a world on CUDA; None takes the usual.
     """
     m, d = warp_model, warp_data_E
     device, aabb = d.qpos.device, m.geom_aabb
@@ -103,7 +103,6 @@ def collisions(
         if hook is align_steep_capsules and not others.size:
             hook = None
         lists.are_appended = not others.size and hook is None
-        d.nacon.zero_()
         if others.size:
             d.ncollision.zero_()
         collide(lists=int(lists.are_appended))

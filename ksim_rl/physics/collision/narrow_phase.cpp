@@ -57,7 +57,7 @@ auto frame_of = [](const vec3& normal, const vec3& wanted) {
         normal[0], normal[1], normal[2], tangent[0], tangent[1], tangent[2], last[0], last[1], last[2]
     );
 };
-auto write = [&](const Found& found, int place) {
+auto write = [&](const Found& found, int place, bool is_listed) {
     const int a = pairs[found.pair][0], b = pairs[found.pair][1], pair = HAS_PAIRS ? pair_ids[found.pair][0] : -1;
     const bool follows = problem.geom_type.data[a] == PLANE && problem.geom_type.data[b] == CAPSULE;
     float margin = 0.0f, adhesion = 0.0f;
@@ -117,7 +117,8 @@ auto write = [&](const Found& found, int place) {
     problem.contact_type.data[place] = HAS_ROWS;
     problem.contact_geomcollisionid.data[place] = found.which;
     problem.contact_adhesion.data[place] = adhesion;
-    const int most = problem.contact_efc_address.shape[1];
+    // The kernel of the rows writes those of contacts that are listed.
+    const int most = is_listed ? 0 : problem.contact_efc_address.shape[1];
     for (int row = 0; row < most; ++row)
         problem.contact_efc_address.data[place * most + row] = -1;
 };
@@ -127,8 +128,9 @@ auto flush = [&] {
         const int first = take(problem.nacon.data, num_contacts);
         const int kept = wp::clamp(problem.naconmax - first, 0, num_contacts);
         each(kept, [&](int item) {
-            write(contacts[item], first + item);
-            if (problem.lists && num_listed + item < problem.found.shape[1])
+            const bool is_listed = problem.lists && num_listed + item < problem.found.shape[1];
+            write(contacts[item], first + item, is_listed);
+            if (is_listed)
                 row_of(problem.found)[num_listed + item] = first + item;
         });
         num_listed += kept;

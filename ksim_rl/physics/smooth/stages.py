@@ -25,11 +25,11 @@ INTEGRATION = ("world", "derivative", "factorization", "free_bodies", "advance")
 SHARED_FLOATS = 48 * 1024 // 4
 LANES, CUDA_THREADS = (8, 16, 32), 32
 # Whether it writes where geoms are, goes on after that, and after the velocities to the inertia matrix and the forces,
-# and whether others than a substep read what it writes; or else sums momenta of subtrees there, and for masked worlds.
+# and whether others than a substep read what it writes. Or else it sums momenta of subtrees there, takes the worlds of
+# a mask alone, or empties the pool of contacts where it does not go on.
 WHOLE = {
     **dict.fromkeys(("places_geoms", "goes_on", "forces_too", "is_read"), True),
-    "sums_momenta": False,
-    "masked": False,
+    **dict.fromkeys(("sums_momenta", "masked", "empties_pool"), False),
 }
 _ENUMS = {
     **native.names_of(mujoco.mjtJoint, mujoco.mjtTrn, mujoco.mjtDyn),
