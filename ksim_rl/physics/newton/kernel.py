@@ -25,8 +25,6 @@ from ksim_rl.physics.newton.limbs import Limbs, padded
 
 CUDA_LANES = 32
 SORTING_THREADS = 1024
-# A lane has four rows of so many entries in its registers.
-MOST_OF_TILE = 12
 _PARTS = ("layout", "constraints", "cost", "limbs", "tiles", "hessian", "line_search", "newton")
 _SOURCE = native.source_of("newton", _PARTS)
 
@@ -59,19 +57,18 @@ def layout(nv: int, njmax: int, limbs: Limbs, *, elliptic: bool, rows_on_chip: i
     # Part 4 of the C++ has blocks and arms of limbs, then the trunk; part 6 has two columns, or in the end two rows.
     of_limbs = chains * (limb + arms) * padded(limb) + max(padded(arms * (arms + 1) // 2), 2 * narrow)
     workspace, spread = max(2 * column, 2 * stride, of_limbs), trunk + chains * padded(limb)
-    rows, tile = padded(njmax), _tile(chains, len(limbs.trunk) + limb)
+    # So many lanes sum the tile of a limb: a power of two. A lane has three rows of it in its registers.
+    lanes = 1 << (CUDA_LANES // chains).bit_length() - 1 if chains else 0
+    rows, tile = padded(njmax), lanes if len(limbs.trunk) + limb <= min(lanes + 1, 12) else 0
     floats = (nv + 1) * stride + rows_on_chip * narrow + workspace + spread + 6 * rows
     return {
         "NV": nv,
         "NJ": njmax,
-        "PADDED_ROWS": rows,
         "STRIDE": stride,
         "NARROW": narrow,
         "TRUNK": len(limbs.trunk),
         "LIMBS": chains,
         "LIMB": limb,
-        "LIMB_BEGIN": trunk,
-        "LIMB_STRIDE": padded(limb),
         "SPREAD": spread,
         "WORKSPACE": workspace,
         "COLUMN": column,
@@ -80,12 +77,6 @@ def layout(nv: int, njmax: int, limbs: Limbs, *, elliptic: bool, rows_on_chip: i
         "ELLIPTIC": elliptic,
         "FLOATS": floats + (4 * rows if elliptic else 0) + (rows // 2 if tile else 0),
     }
-
-
-def _tile(limbs: int, dofs: int) -> int:
-    # So many lanes sum the tile of a limb: a power of two, so that a tile's sums find those of others by a shuffle.
-    lanes = 1 << (CUDA_LANES // limbs).bit_length() - 1 if limbs else 0
-    return lanes if dofs <= min(lanes + 1, MOST_OF_TILE) else 0
 
 
 def _row_stride(entries: int) -> int:

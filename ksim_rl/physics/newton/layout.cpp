@@ -29,6 +29,7 @@ world = problem.order.data[world];
 constexpr float TINY = 1e-15f, LARGEST = 3e38f;
 constexpr float NOISE = 8.0f * 1.1920929e-07f;  // rounding of a sum of some float32 terms
 constexpr int BLOCKS = (NV + LANES - 1) / LANES;
+constexpr int LIMB_BEGIN = (TRUNK + 3) / 4 * 4, LIMB_STRIDE = (LIMB + 3) / 4 * 4, PADDED_ROWS = (NJ + 3) / 4 * 4;
 
 #if defined(__CUDA_ARCH__)
 __shared__ __align__(16) float memory[FLOATS];

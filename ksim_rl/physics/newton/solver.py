@@ -19,9 +19,8 @@ SHARED_FLOATS = 48 * 1024 // 4
 # took 212 us for 4096 worlds of G1; with 5600 floats (nine worlds) 217, with room for twelve 222 and for thirteen 237.
 FLOATS_PER_WORLD = 5536
 # A multiprocessor has 228 KiB of shared memory, of which each block takes another KiB, and in each quarter, where
-# warps stay, 512 registers for a lane. With 72 of them (28 worlds at once, as the memory lets), 4096 worlds of Go1
-# take an H200 153 us, with 80 (24 worlds) 162, and with the 92 that the compiler likes (20 worlds) 168; 32768 worlds
-# take 894, 911 and 954. Where more than 128 are left, there is no need of a bound.
+# warps stay, 512 registers for a lane. With 72 of them as many worlds of Go1 run at once as the memory lets, 28, and
+# with 80 only 24 do. Where more than 128 are left, there is no need of a bound.
 SHARED_BYTES, LEAST_REGISTERS, MOST_REGISTERS = 228 * 1024, 64, 128
 MOST_DOFS = 64
 # MuJoCo Warp's solver ends its loop by a conditional node, which costs more than the few iterations that it saves
