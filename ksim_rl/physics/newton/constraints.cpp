@@ -50,19 +50,16 @@ each_row(lane, LANES, Singly {}, [&](int row, float* jacobian) {
     bound[row] = row_of(problem.efc_frictionloss)[row];
     require(efc_D[row] > 0.0f && (kind_of(row) != FRICTION || bound[row] >= 0.0f), ROWS_ARE_WHOLE);
     if (ELLIPTIC) {
-        const int* const types = row_of(problem.efc_type);
-        const int* const contacts = row_of(problem.efc_id);
-        auto is_of_cone = [&](int mate) {
-            return mate >= 0 && mate < rows && types[mate] == ELLIPTIC_CONTACT && contacts[mate] == contacts[row];
-        };
-        if (is_of_cone(row)) {
-            const float* const friction = (const float*)(problem.contact_friction.data + contacts[row]);
+        const int contact = contact_of[row];
+        auto is_of_cone = [&](int mate) { return mate >= 0 && mate < rows && contact_of[mate] == contact; };
+        if (contact >= 0) {
+            const float* const friction = (const float*)(problem.contact_friction.data + contact);
             int before = 0, after = 1;
             while (is_of_cone(row - before - 1))
                 ++before;
             while (is_of_cone(row + after))
                 ++after;
-            if (before + after < problem.contact_dim.data[contacts[row]]) {
+            if (before + after < problem.contact_dim.data[contact]) {
                 // Of a cone that njmax cuts off, no row pushes, as in mujoco_warp's solver.py (_eval_constraint).
                 for (int entry = begin; entry < end; ++entry)
                     jacobian[place_of[dofs[entry]]] = 0.0f;

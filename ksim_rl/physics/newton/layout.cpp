@@ -45,6 +45,7 @@ float* const residual = shared + STRIDE;  // J qacc - aref
 float* const rate = residual + PADDED_ROWS;  // J search, during a line search
 float* const stiffness = rate;  // d2s/dr2, between two line searches; 0 where a row is slack
 float* const force = rate + PADDED_ROWS;  // -ds/dr
+int* const contact_of = (int*)force;  // of a row with a cone, or -1, until there are forces
 float* const efc_D = force + PADDED_ROWS;
 float* const bound = efc_D + PADDED_ROWS;  // most dry friction, mu of a cone's head, friction of its tangents
 // Of each row its kind, 16 times the rows of its cone, 256 times its limb, and 4096 times its place in the cone.
@@ -154,6 +155,8 @@ for (int row = lane; row < rows; row += LANES) {
         limb = wp::max(limb, other);
     }
     kinds[row] = wp::max(limb, 0) << 8;
+    if (ELLIPTIC)
+        contact_of[row] = row_of(problem.efc_type)[row] == ELLIPTIC_CONTACT ? row_of(problem.efc_id)[row] : -1;
 }
 const bool by_limbs = LIMBS > 0 && !any(couples);
 const int width = by_limbs ? NARROW : STRIDE, near_rows = wp::min(rows, ROWS_ON_CHIP * NARROW / width);

@@ -47,7 +47,7 @@ auto sum_tiles = [&] {
     const int limb = wp::min(lane / TILE_LANES, LIMBS - 1), own = wp::min(lane % TILE_LANES, LAST);
     const int own_place = own < TRUNK ? own : own - TRUNK + LIMB_BEGIN;
     auto slot_in_tile = [&](int row) { return row < TRUNK ? row : row - TRUNK + tile_slot; };
-    auto place_in_tile = [](int row) { return row < TRUNK ? row : row - TRUNK + LIMB_BEGIN; };
+    auto place_in_tile = [&](int row) { return row < TRUNK ? row : row - TRUNK + LIMB_BEGIN; };
     const float* const own_mass = mass + slot_in_tile(own) * STRIDE;
     float tile[TILE_ROWS], slip[TILE_ROWS];
     float corner = mass[slot_in_tile(LAST) * (STRIDE + 1)], pull = 0.0f, last_pull = 0.0f, own_slip = 0.0f;
