@@ -15,7 +15,7 @@ from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
 from ksim_rl.envs.signal_keys import STANDARD, SignalKeys
 from ksim_rl.modules import burnt_in, recurrent_modules
-from ksim_rl.objectives import NonFiniteStepsError, StepGuard, make_optimizer, ppo_step
+from ksim_rl.objectives import NonFiniteStepsError, StepGuard, anneal_learning_rate_, make_optimizer, ppo_step
 
 
 def in_columns(steps: Sequence[Mapping[str, Num[Tensor, ""]]]) -> dict[str, Num[Tensor, " steps"]]:
@@ -160,6 +160,10 @@ class DatasetUpdate(RolloutUpdate):
         self.dataset = DatasetBuffer(
             data, keys=loss.dataset_keys, seed=seed, sampler=sampler, device=self.device
         )
+
+    def set_progress(self, done: float) -> None:
+        """Say what share of the run is done before the next update: where the learning rate is annealed, it follows."""
+        anneal_learning_rate_(self.cfg, self.optimizer, done=done)
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return what the last update measured; see `RolloutUpdate`."""

@@ -19,8 +19,8 @@ from ksim_rl.objectives.gradient_step import (
     NonFiniteStepsError,
     StepGuard,
     adapt_learning_rate_,
+    anneal_learning_rate_,
     clip_and_guard,
-    descend,
     go_back,
     make_optimizer,
 )

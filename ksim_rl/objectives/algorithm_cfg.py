@@ -63,6 +63,7 @@ class OnPolicyCfg(GradientCfg, learns_on_sequences=True, max_grad_norm=1.0):
 
     The "adaptive" schedule changes the learning rate before each gradient step, within its bounds, so that the
     divergence of the policy from the one that collected the rollout stays near `desired_kl` nats.
+    `anneal_learning_rate` multiplies `learning_rate_max`, or the "fixed" rate, by the share of the run that is left.
     """
 
     num_epochs: Count = 1
@@ -71,6 +72,7 @@ class OnPolicyCfg(GradientCfg, learns_on_sequences=True, max_grad_norm=1.0):
     desired_kl: Positive = 0.01
     learning_rate_min: Positive = 1e-5
     learning_rate_max: Positive = 1e-2
+    anneal_learning_rate: bool = False
 
     def _check_fields(self) -> None:
         low, high = self.learning_rate_min, self.learning_rate_max

@@ -65,8 +65,8 @@ def adapt_learning_rate_(
     *,
     desired_kl: float,
     factor: float = 1.5,
-    lr_min: float = 1e-5,
-    lr_max: float = 1e-2,
+    lr_min: float | Float32[Tensor, ""] = 1e-5,
+    lr_max: float | Float32[Tensor, ""] = 1e-2,
 ) -> Float32[Tensor, ""]:
     """Divide `lr` by `factor` if `kl`, in nats, exceeds twice the desired one, multiply it if below half, in place.
 
@@ -79,6 +79,28 @@ def adapt_learning_rate_(
     too_far = kl > 2.0 * desired_kl
     too_near = (kl < 0.5 * desired_kl) & (kl > 0.0)
     return lr.copy_(torch.where(too_far, slower, torch.where(too_near, faster, lr)))
+
+
+def rate_bounds(cfg: OnPolicyCfg, optimizer: torch.optim.Optimizer) -> Float32[Tensor, "2"]:
+    """Return the least and the greatest learning rate, on the device, where `anneal_learning_rate_` changes them."""
+    group = optimizer.param_groups[0]
+    if "lr_bounds" not in group:
+        bounds = cfg.learning_rate_min, cfg.learning_rate_max
+        group["lr_bounds"] = torch.tensor(bounds, dtype=torch.float32, device=group["lr"].device)
+    return group["lr_bounds"]
+
+
+@torch.no_grad()
+def anneal_learning_rate_(cfg: OnPolicyCfg, optimizer: torch.optim.Optimizer, *, done: float) -> None:
+    """Bound the learning rate for what follows on a share `done`, in [0, 1], of the run, if `cfg` anneals it."""
+    if not 0.0 <= done <= 1.0:
+        raise ValueError(f"done={done!r}: expected the share of the run that is done, in [0, 1]")
+    if cfg.anneal_learning_rate:
+        adapts = cfg.schedule == "adaptive"
+        ceiling = (cfg.learning_rate_max if adapts else cfg.learning_rate) * (1.0 - done)
+        low, high = rate_bounds(cfg, optimizer)
+        low.fill_(min(cfg.learning_rate_min, ceiling) if adapts else ceiling)
+        optimizer.param_groups[0]["lr"].clamp_(low, high.fill_(ceiling))
 
 
 def make_optimizer(cfg: OnPolicyCfg, *modules: nn.Module) -> torch.optim.Adam:
@@ -99,23 +121,6 @@ def make_optimizer(cfg: OnPolicyCfg, *modules: nn.Module) -> torch.optim.Adam:
     )
 
 
-def descend(
-    loss: Float[Tensor, ""],
-    optimizer: torch.optim.Optimizer,
-    *,
-    max_grad_norm: float | None,
-    mask: Bool[Tensor, "*rows"] | None = None,
-) -> tuple[Float32[Tensor, ""], Float32[Tensor, ""]]:
-    """Make one gradient step on the parameters of a fused optimizer, unless loss or gradient are not finite.
-
-    It can be captured in a CUDA graph. The loss is a mean over the rows that `mask` marks, or over all: with several
-    ranks it becomes that over the rows of all of them. Returned are the norm before clipping, and 1 if the step was
-    skipped, else 0.
-    """
-    go_back({"loss": loss}, {"loss": optimizer}, mask=mask)
-    return step(optimizer, loss, max_grad_norm=max_grad_norm)
-
-
 def go_back(
     losses: Mapping[str, Float[Tensor, ""]],
     optimizers: Mapping[str, torch.optim.Optimizer],
@@ -125,7 +130,8 @@ def go_back(
 ) -> None:
     """Compute the gradients of each loss, means over all ranks; losses and what is `beside` become means in place.
 
-    Each rank weighs as much as it has rows that `mask` marks. No loss may reach a parameter of another's optimizer.
+    A loss is a mean over the rows that `mask` marks, or over all: each rank weighs as much as it has of these. No loss
+    may reach a parameter of another's optimizer.
     """
     for name in losses:
         optimizers[name].zero_grad(set_to_none=True)
@@ -141,7 +147,10 @@ def go_back(
 def step(
     optimizer: torch.optim.Optimizer, loss: Float[Tensor, ""], *, max_grad_norm: float | None
 ) -> tuple[Float32[Tensor, ""], Float32[Tensor, ""]]:
-    """Make the gradient step whose gradients are there; see `descend`."""
+    """Make the step of a fused optimizer whose gradients are there, unless the loss or one of these is not finite.
+
+    It can be captured in a CUDA graph. Returned are the norm before clipping, and 1 if the step was skipped, else 0.
+    """
     grad_norm, found_inf = clip_and_guard(_parameters(optimizer), max_grad_norm, loss=loss.detach())
     # Fused optimizers read these two, which torch's GradScaler sets as well, and skip the step on the device.
     optimizer.grad_scale, optimizer.found_inf = None, found_inf  # type: ignore[attr-defined]

@@ -16,7 +16,7 @@ from torch import Tensor
 from ksim_rl.objectives.advantage_estimators import GAE, RolloutEstimator, TDLambda, VTrace
 from ksim_rl.objectives.algorithm_cfg import OnPolicyCfg, PPOCfg
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
-from ksim_rl.objectives.gradient_step import StepGuard, adapt_learning_rate_, go_back, step
+from ksim_rl.objectives.gradient_step import StepGuard, adapt_learning_rate_, go_back, rate_bounds, step
 from ksim_rl.objectives.masked import MASK_KEY
 from ksim_rl.objectives.symmetry import Loss, SymmetricAugmentation, mirror_loss
 from ksim_rl.transforms import MirrorMap
@@ -123,12 +123,11 @@ def ppo_step(
     mask = minibatch_B.get(MASK_KEY, None)
     go_back({"loss": total}, {"loss": optimizer}, mask=mask, beside=measured.values())
     if cfg.schedule == "adaptive":
+        low, high = cfg.learning_rate_min, cfg.learning_rate_max
+        if cfg.anneal_learning_rate:
+            low, high = rate_bounds(cfg, optimizer)
         adapt_learning_rate_(
-            learning_rate,
-            measured["kl"],
-            desired_kl=cfg.desired_kl,
-            lr_min=cfg.learning_rate_min,
-            lr_max=cfg.learning_rate_max,
+            learning_rate, measured["kl"], desired_kl=cfg.desired_kl, lr_min=low, lr_max=high
         )
     grad_norm, found_inf = step(optimizer, total, max_grad_norm=cfg.max_grad_norm)
     if guard is not None:

@@ -28,22 +28,12 @@ from ksim_rl.modules import ActorCfg, QNetworkCfg
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.physics import SimCfg
 from ksim_rl.physics.load import Source
+from ksim_rl.scene import terrains
 from ksim_rl.scene.robots import stance
 from ksim_rl.scene.robots.analysis import RobotAnalysis, analyse, robot_name
 from ksim_rl.scene.robots.legged_robot import LeggedRobot, ModelRobot
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.sensors import ContactSensor, Sensor
-from ksim_rl.scene.terrains import (
-    DiscreteObstacles,
-    FlatPatch,
-    PlaneTerrain,
-    PyramidSlope,
-    PyramidStairs,
-    RoughGround,
-    TerrainGrid,
-    TerrainPatch,
-    Waves,
-)
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
@@ -224,7 +214,7 @@ def on_plane(robot: LeggedRobot, sensors: Mapping[str, Sensor] | None = None) ->
     """Return the scene of a robot on a plane, 4096 times."""
     return SceneCfg(
         robots={robot.name: robot},
-        terrain=PlaneTerrain(),
+        terrain=terrains.PlaneTerrain(),
         sensors=sensors or {},
         num_envs=4096,
         soft_joint_pos_limit_factor=robot.soft_joint_pos_limit_factor,
@@ -355,15 +345,15 @@ def _proposed_cfg(proposed: ModelRobot, analysis: RobotAnalysis) -> ManagerBased
     )
 
 
-PATCHES: Mapping[str, TerrainPatch] = {
-    "flat": FlatPatch(),
-    "stairs_down": PyramidStairs(proportion=2.0),
-    "stairs_up": PyramidStairs(proportion=2.0, inverted=True),
-    "slope_down": PyramidSlope(),
-    "slope_up": PyramidSlope(inverted=True),
-    "rough": RoughGround(),
-    "obstacles": DiscreteObstacles(),
-    "waves": Waves(),
+PATCHES: Mapping[str, terrains.TerrainPatch] = {
+    "flat": terrains.FlatPatch(),
+    "stairs_down": terrains.PyramidStairs(proportion=2.0),
+    "stairs_up": terrains.PyramidStairs(proportion=2.0, inverted=True),
+    "slope_down": terrains.PyramidSlope(),
+    "slope_up": terrains.PyramidSlope(inverted=True),
+    "rough": terrains.RoughGround(),
+    "obstacles": terrains.DiscreteObstacles(),
+    "waves": terrains.Waves(),
 }
 """Up to 20 cm of step and 27 degrees of slope. A pyramid's top is where envs start, so that they walk down."""
 
@@ -377,7 +367,7 @@ def on_rough_ground(
     envs move through the levels by how far their robots walk. Heights are seen relative to the soles of a robot whose
     root stands at `root_height`, m. `njmax` and `nconmax` make room for edges, where a foot touches in several places.
     """
-    scan, terrain = mdp.HeightScan(offset=root_height), TerrainGrid(patches=PATCHES)
+    scan, terrain = mdp.HeightScan(offset=root_height), terrains.TerrainGrid(patches=PATCHES)
     groups = {}
     for name, seen in (("actor", noisy(scan, 0.1)), ("critic", ObservationTermCfg(term=scan))):
         group = flat.observations[name]

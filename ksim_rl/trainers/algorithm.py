@@ -85,6 +85,13 @@ class HasWarmUp(Protocol):
     def warm_up(self, rollout_ET: TensorDictBase) -> None: ...  # noqa: D102
 
 
+@runtime_checkable
+class HasProgress(Protocol):
+    """An update that depends on what share of the run, in [0, 1], is done before it, such as by its learning rate."""
+
+    def set_progress(self, done: float) -> None: ...  # noqa: D102
+
+
 def notes_of(update: Update, *, warm_up: bool) -> list[str]:
     """Return what is to be said of an update at the start of a run, one line each."""
     lacks = f"trainer.warm_up=true does nothing here: {type(update).__name__} has no warm_up(rollout_ET)"

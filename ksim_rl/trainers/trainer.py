@@ -15,7 +15,7 @@ from ksim_rl.diagnosis.iteration_warnings import warnings_of
 from ksim_rl.diagnosis.probes import probed
 from ksim_rl.envs.contract import EpisodeClock, EpisodeSums, missing_parts, part
 from ksim_rl.trainers import checkpoint
-from ksim_rl.trainers.algorithm import Update, notes_of
+from ksim_rl.trainers.algorithm import HasProgress, Update, notes_of
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
 from ksim_rl.trainers.interrupt import InterruptRequest
 from ksim_rl.trainers.loggers import MetricLogger
@@ -254,6 +254,8 @@ class Trainer:
         self.collecting.begin(self.iteration + 1)
         self.rollout_ET = rollout_ET = self.collector.collect()
         self.collecting.end()
+        if isinstance(self.update, HasProgress):
+            self.update.set_progress(min(self.iteration / self.cfg.num_iterations, 1.0))
         self.update(rollout_ET)
         self.iteration += 1
         self.watch()

@@ -191,6 +191,28 @@ def test_updates_equal_those_of_torch(fused_ppo, options, actor_options):
 
 
 @needs_interpreter
+@pytest.mark.parametrize("desired_kl", [1e3, 1e-12])
+def test_an_annealed_rate_is_that_of_torch(fused_ppo, desired_kl):
+    limits = {"learning_rate": 3e-3, "learning_rate_min": 2e-3, "learning_rate_max": 4e-3}
+    cfg = PPOCfg(num_epochs=1, desired_kl=desired_kl, anneal_learning_rate=True, **limits)
+    actor, critic = networks()
+    torch_s, fused = update(cfg, actor, critic), update(cfg, actor, critic, fused_ppo)
+    plain = update(replace(cfg, anneal_learning_rate=False), actor, critic, fused_ppo)
+    plain(rollout(actor))
+    for done, high in ((0.0, 4e-3), (0.5, 2e-3), (0.75, 1e-3)):
+        for made in (torch_s, fused):
+            made.set_progress(done)
+            made(rollout(actor))
+        # The floor is no higher than the ceiling.
+        rate = high if desired_kl > 1.0 else min(2e-3, high)
+        for made in (torch_s, fused):
+            assert made.metrics()["update/learning_rate"].item() == pytest.approx(rate, rel=1e-6)
+        if done == 0.0:
+            assert_equal_states(plain, fused, atol=0.0)
+    assert_equal_states(torch_s, fused, atol=1e-4)
+
+
+@needs_interpreter
 @pytest.mark.filterwarnings("error")
 def test_what_takes_no_part_may_be_anything_and_no_part_at_all_is_a_loss_of_zero(fused_ppo):
     """Padding acts with zeros on an observation of zeros: the density of 16 such narrow gaussians is infinite."""

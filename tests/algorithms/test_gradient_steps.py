@@ -5,6 +5,7 @@ import torch
 
 from ksim_rl.algorithms.gradient_steps import RolloutUpdate, StepMeans
 from ksim_rl.objectives import NonFiniteStepsError
+from tests.algorithms.imitation_problems import make_amp, make_distillation
 from tests.trainers.target_env import make_trainer
 
 
@@ -46,3 +47,16 @@ def test_a_run_ends_even_if_steps_are_made_after_those_in_a_row():
     assert update.guard.skipped == 5 and update.guard.skipped_in_a_row == 0
     with pytest.raises(NonFiniteStepsError, match="5 gradient steps in a row"):
         update.check({name: value.item() for name, value in update.metrics().items()})
+
+
+@pytest.mark.parametrize("make", [make_amp, make_distillation])
+def test_amp_and_distillation_anneal_the_rate_of_the_policy_too(make):
+    cfg = {"learning_rate": 3e-3, "schedule": "fixed", "anneal_learning_rate": True}
+    trainer = make(iterations=3, num_envs=16, cfg=cfg)
+    trainer.train()
+    assert trainer.metrics["update/learning_rate"] == pytest.approx(1e-3, rel=1e-6)
+    # As a loop of somebody's own may go on.
+    trainer.iterate()
+    assert trainer.metrics["update/learning_rate"] == 0.0
+    if make is make_amp:  # whose discriminator has a rate of its own
+        assert trainer.update.optimizer.param_groups[0]["lr"].item() == pytest.approx(1e-3)

@@ -119,3 +119,45 @@ def test_advantages_are_estimated_once_or_before_each_epoch(ppo, estimates, monk
     with count_syncs() as syncs:
         trainer.update(rollout_ET)
     assert syncs.total == 0, syncs.report()
+
+
+# The divergence is always small, or always large, beside these: the rate is at its ceiling, or at its floor.
+UP, DOWN = {"desired_kl": 1e3}, {"desired_kl": 1e-12}
+
+
+@pytest.mark.parametrize("ppo", [UP, DOWN, {"schedule": "fixed"}], ids=str)
+def test_annealing_at_the_start_of_a_run_changes_no_bit(ppo):
+    limits = {"learning_rate_min": 1e-3, "learning_rate_max": 5e-3}
+    plain, annealed = (
+        make_trainer(ppo={**ppo, **limits, "anneal_learning_rate": anneals}) for anneals in (False, True)
+    )
+    for trainer in (plain, annealed):
+        torch.manual_seed(1)
+        for _ in range(2):
+            # It makes no difference to one that is not annealed.
+            trainer.update.set_progress(0.0 if trainer is annealed else 0.9)
+            trainer.update(trainer.collector.collect())
+    ours, theirs = (learned(trainer.update) for trainer in (plain, annealed))
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    rates = [trainer.update.metrics()["update/learning_rate"] for trainer in (plain, annealed)]
+    assert torch.equal(*rates)
+
+
+@pytest.mark.parametrize(
+    ("ppo", "rates"),
+    [
+        (UP, (4e-3, 2e-3, 1e-3)),
+        (DOWN, (1.5e-3, 1.5e-3, 1e-3)),
+        ({"schedule": "fixed"}, (3e-3, 1.5e-3, 7.5e-4)),
+    ],
+    ids=str,
+)
+def test_gradient_steps_keep_to_the_bounds_of_their_share_of_the_run(ppo, rates):
+    limits = {"learning_rate_min": 1.5e-3, "learning_rate_max": 4e-3}
+    trainer = make_trainer(ppo={**ppo, **limits, "anneal_learning_rate": True})
+    for done, rate in zip((0.0, 0.5, 0.75), rates, strict=True):
+        trainer.update.set_progress(done)
+        trainer.update(trainer.collector.collect())
+        assert trainer.update.metrics()["update/learning_rate"].item() == pytest.approx(rate, rel=1e-6)
+    with pytest.raises(ValueError, match="share of the run"):
+        trainer.update.set_progress(1.5)

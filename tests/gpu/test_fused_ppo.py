@@ -147,6 +147,42 @@ def test_the_fused_kernels_equal_torch_in_bfloat16():
         torch.testing.assert_close(fused.metrics()[name], plain.metrics()[name], atol=0.01, rtol=0.03)
 
 
+@pytest.mark.parametrize(
+    "options", [{"desired_kl": 1e3}, {"desired_kl": 1e-12}, {"schedule": "fixed"}], ids=str
+)
+def test_annealed_rates_are_those_of_torch_also_in_a_graph(options):
+    limits = {"learning_rate": 3e-3, "learning_rate_min": 2e-3, "learning_rate_max": 4e-3}
+    actor, critic = networks()
+    rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE)
+    annealed = {**limits, **options, "anneal_learning_rate": True}
+    fused, plain = update(actor, critic, **annealed), update(actor, critic, kernels="torch", **annealed)
+    assert (fused.metrics()["update/fused"], plain.metrics()["update/fused"]) == (1.0, 0.0)
+    for done in (0.0, 0.1, 0.4, 0.5, 0.75, 0.9, 1.0):
+        high = (3e-3 if "schedule" in options else 4e-3) * (1.0 - done)
+        low = 2e-3 if options.get("desired_kl") == 1e-12 else high
+        for made in (fused, plain):
+            made.set_progress(done)
+            made(rollout_ET)
+            assert float(made.metrics()["update/learning_rate"]) == pytest.approx(min(low, high), rel=1e-6)
+    # The later ones are replays.
+    assert fused._run.ready and plain._run.ready
+    with no_syncs():
+        fused.set_progress(0.5)
+
+
+def test_annealing_at_the_start_of_a_run_changes_no_bit():
+    actor, critic = networks()
+    rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE)
+    annealed, plain = update(actor, critic, anneal_learning_rate=True), update(actor, critic)
+    for _ in range(4):
+        annealed.set_progress(0.0)
+        for made in (annealed, plain):
+            made(rollout_ET)
+    assert all(
+        torch.equal(one, other) for one, other in zip(parameters(annealed), parameters(plain), strict=True)
+    )
+
+
 @pytest.mark.parametrize("hidden_dims", [(512, 256, 128), (512, 256)])
 def test_captured_steps_are_the_eager_ones_bit_for_bit(hidden_dims):
     actor, critic = networks(hidden_dims=hidden_dims)

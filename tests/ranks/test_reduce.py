@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ksim_rl import ranks
-from ksim_rl.objectives import descend
+from ksim_rl.objectives import gradient_step
 from ksim_rl.objectives.masked import masked_mean
 from tests.ranks.gloo import results
 
@@ -21,7 +21,9 @@ def step(num_taking_part):
         rows, mask = rows[ranks.rank()], mask[ranks.rank()]
     weight = torch.nn.Parameter(torch.ones(WIDTH))
     loss = masked_mean((rows @ weight).square(), mask)
-    descend(loss, torch.optim.SGD([weight], lr=1.0, fused=True), max_grad_norm=None, mask=mask)
+    optimizer = torch.optim.SGD([weight], lr=1.0, fused=True)
+    gradient_step.go_back({"loss": loss}, {"loss": optimizer}, mask=mask)
+    gradient_step.step(optimizer, loss, max_grad_norm=None)
     return loss.detach(), weight.detach()
 
 

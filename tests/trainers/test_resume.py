@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from ksim_rl import conf
+from ksim_rl.algorithms.gradient_steps import DatasetUpdate
 from ksim_rl.device import state_tree
 from ksim_rl.trainers import build, checkpoint
-from tests.trainers.target_env import make_trainer
+from tests.trainers.target_env import MemoryLogger, make_trainer
 
 
 def parts(trainer):
@@ -42,6 +43,34 @@ def test_a_resumed_run_is_bit_identical(tmp_path):
     assert resumed.iteration == 3
     resumed.train()
     assert_same(straight, resumed)
+
+
+@pytest.mark.parametrize("ppo", [{"desired_kl": 1e3}, {"schedule": "fixed"}], ids=str)
+def test_an_annealed_run_ends_near_zero_and_resumes_with_the_same_rates(tmp_path, ppo):
+    ppo = {**ppo, "learning_rate": 3e-3, "learning_rate_max": 3e-3, "anneal_learning_rate": True}
+    straight_log, resumed_log = MemoryLogger(), MemoryLogger()
+    straight = trained(iterations=6, ppo=ppo, loggers=[straight_log])
+    half = make_trainer(tmp_path, iterations=6, ppo=ppo)
+    for _ in range(3):
+        half.iterate()
+    half.save()
+    resumed = make_trainer(iterations=6, seed=123, ppo=ppo, loggers=[resumed_log])
+    resumed.load(tmp_path)
+    resumed.train()
+    assert_same(straight, resumed)
+    rates, rates_after = (
+        [row["update/learning_rate"] for row in log.rows if "update/learning_rate" in row]
+        for log in (straight_log, resumed_log)
+    )
+    assert rates == pytest.approx([3e-3 * left / 6 for left in (6, 5, 4, 3, 2, 1)], rel=1e-6)
+    assert rates_after == rates[3:]
+
+
+@pytest.mark.parametrize("ppo", [{"desired_kl": 1e3}, {"schedule": "fixed"}], ids=str)
+def test_a_run_that_is_not_annealed_is_the_same_as_one_that_knows_no_progress(ppo, monkeypatch):
+    trainer = trained(iterations=3, ppo=ppo)
+    monkeypatch.setattr(DatasetUpdate, "set_progress", lambda *_: None)
+    assert_same(trainer, trained(iterations=3, ppo=ppo))
 
 
 IN_A_NEW_PROCESS = """

@@ -20,7 +20,8 @@ from ksim_rl.device import state_tree
 from ksim_rl.envs.signal_keys import STANDARD
 from ksim_rl.mdp.motion_observations import observe_motion
 from ksim_rl.modules import Discriminator
-from ksim_rl.objectives import AMPCfg, descend, discriminator_loss, make_optimizer, style_reward
+from ksim_rl.objectives import AMPCfg, discriminator_loss, go_back, make_optimizer, style_reward
+from ksim_rl.objectives.gradient_step import step
 from ksim_rl.trainers.run_cfg import RunCfg
 
 # Names of the logged means, by the names that `discriminator_loss` gives them.
@@ -59,6 +60,7 @@ class AMPUpdate(RolloutUpdate):
             )
         self.cfg, self.ppo, self.notes = cfg, ppo, ppo.notes
         self.actor = self.behavior = ppo.actor
+        self.set_progress = ppo.set_progress  # the discriminator's learning rate stays
         self.num_env_states = ppo.num_env_states
         self.reference_N2L = reference_N2L.to(ppo.device)
         self.discriminator = Discriminator(
@@ -141,7 +143,8 @@ class AMPUpdate(RolloutUpdate):
                 mask_B=mask_B,
             )
             loss = loss + self.cfg.logit_decay * net.logit_weight_1L.square().sum()
-            _, skipped = descend(loss, self.optimizer, max_grad_norm=self.cfg.max_grad_norm, mask=mask_B)
+            go_back({"loss": loss}, {"loss": self.optimizer}, mask=mask_B)
+            _, skipped = step(self.optimizer, loss, max_grad_norm=self.cfg.max_grad_norm)
             self.guard.count_(skipped)
             made.append(
                 logged | {"skipped": skipped, "skipped_in_a_row": self.guard.skipped_in_a_row.clone()}

@@ -5,39 +5,21 @@ At each step a few worlds reset, so that what counts is how many kernels a draw 
 """
 
 import warp as wp
-from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import QuickLaunch, address, as_operator
-from ksim_rl.device.random import DRAWS, RowKeys
+from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator
+from ksim_rl.device.random import DRAWS
 
-
-@wp.struct
-class _Draw:
-    elements: int
-    columns: int
-    shared: int
-    kind: int
-    operation: int
-    cut: float
-    lanes: int
-    world_stride: int
-    element_stride: int
-    followers: int
-    counter_stride: int
-    first_row: int
-    stream: wp.uint32
-    seed: wp.uint64
-    counter: wp.uint64
-    mask: wp.uint64
-    table: wp.uint64
-    field: wp.uint64
-    follower: wp.uint64
-
-
+_ARGUMENTS = arguments_of(
+    (int, "elements columns shared kind operation"),
+    (float, "cut"),
+    (int, "lanes world_stride element_stride followers counter_stride first_row"),
+    (wp.uint32, "stream"),
+    (wp.uint64, "seed counter mask table field follower"),
+)
 # A follower is a field that grows in proportion to the only column that is drawn; it has as many elements.
 _quick = QuickLaunch(
-    _Draw,
+    _ARGUMENTS,
     DRAWS
     + r"""
     if (a.mask && !((const unsigned char*)a.mask)[row]) return;
@@ -63,25 +45,7 @@ _quick = QuickLaunch(
 )
 
 
-def draw_entries(
-    field_ENC: Float32[Tensor, "E N C"],
-    mask_E: Bool[Tensor, " E"] | None,
-    keys: RowKeys,
-    table_L: Float32[Tensor, " L"],
-    layout: tuple[float, ...],
-    follower_ENF: Float32[Tensor, "E N F"] | None = None,
-) -> None:
-    """Draw entries as the layout, the first fields of `_Draw`, says, in the worlds of `mask_E` or in all.
-
-    The table has the low and the high ends (means, deviations) and places of the columns, the rows of the elements,
-    the model's own values, and how much the follower has of each.
-    """
-    *numbers, cut = layout
-    own = list(map(int, numbers)), cut, keys.stream, keys.first_row
-    _draw(field_ENC, mask_E, keys.seed, keys.counter, table_L, follower_ENF, *own)
-
-
-def _draw_now(
+def _launch(
     field_ENC: Tensor,
     mask_E: Tensor | None,
     seed: Tensor,
@@ -93,6 +57,11 @@ def _draw_now(
     stream: int,
     first_row: int,
 ) -> None:
+    """Draw entries of a field [E, N, C] in the worlds of `mask_E`, or in all.
+
+    The table has the low and the high ends (means, deviations) and places of the columns, the rows of the elements,
+    the model's own values, and how much the follower [E, N, F] has of each. The numbers are the first `_ARGUMENTS`.
+    """
     lanes = 32 if field_ENC.is_cuda else 1
     mask_E = None if mask_E is None else mask_E.contiguous()
     followers = 0 if follower_ENF is None else follower_ENF.shape[-1]
@@ -101,4 +70,4 @@ def _draw_now(
     _quick(field_ENC.device, (field_ENC.shape[0], lanes), *numbers, cut, *where, *map(address, tensors))
 
 
-_draw = as_operator("draw_entries", _draw_now, lambda *_: None, mutates=("field_ENC", "follower_ENF"))
+draw_entries = as_operator("draw_entries", _launch, lambda *_: None, mutates=("field_ENC", "follower_ENF"))

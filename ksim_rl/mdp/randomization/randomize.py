@@ -67,8 +67,9 @@ class Randomize(EventTerm, mode="startup"):
         low, high = zip(*pairs.values(), strict=True)
         table_L = constant((*low, *high, *pairs, *ids, *own_NC.flat, *follower[1]), view.device)
         kinds = get_args(Distribution).index(self.distribution), get_args(Operation).index(operation)
-        layout = *own_NC.shape, self.shared, *kinds, CUT
-        draw_entries(field_ENC, mask_E, view.next_keys(), table_L, layout, follower[0])
+        numbers, keys = [*own_NC.shape, int(self.shared), *kinds], view.next_keys()
+        given = keys.seed, keys.counter, table_L, follower[0], numbers, CUT, keys.stream, keys.first_row
+        draw_entries(field_ENC, mask_E, *given)
 
     def combine(
         self, nominal: Float[Tensor, "*own"], drawn: Float[Tensor, "*draws"]

@@ -43,7 +43,7 @@ from ksim_rl.objectives.fused_ppo.mlp_kernels import (
     weight_gradients,
 )
 from ksim_rl.objectives.fused_ppo.step_kernels import SUMMARY, adam_step, sum_gradients, take_means
-from ksim_rl.objectives.gradient_step import StepGuard
+from ksim_rl.objectives.gradient_step import StepGuard, rate_bounds
 from ksim_rl.objectives.symmetry import SymmetricAugmentation
 
 # Sums that each block leaves beside its gradients.
@@ -210,6 +210,7 @@ class FusedPPO:
             "gradients": zeros(2 * layout.num_padded + self._summary.shape[1]),
             "squares": zeros(programs),
             "image_of": image_of,
+            "rate_bounds": rate_bounds(cfg, self.optimizer),
             "skipped": self.guard.skipped,
             "skipped_in_a_row": self.guard.skipped_in_a_row,
             "clip_value": clip_value,

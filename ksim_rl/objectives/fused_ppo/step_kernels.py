@@ -67,11 +67,11 @@ def _column(values, index: tl.constexpr, SIZE: tl.constexpr):
 
 
 @triton.jit
-def _adapt(learning_rate, kl, desired_kl, low, high, ADAPTIVE: tl.constexpr):
+def _adapt(learning_rate, kl, desired_kl, bounds, ADAPTIVE: tl.constexpr):
     """Return the learning rate, after `adapt_learning_rate_` if it is ADAPTIVE."""
     rate = tl.load(learning_rate)
     if ADAPTIVE:  # comparisons with NaN are False
-        slower, faster = tl.maximum(rate / 1.5, low), tl.minimum(rate * 1.5, high)
+        slower, faster = tl.maximum(rate / 1.5, tl.load(bounds)), tl.minimum(rate * 1.5, tl.load(bounds + 1))
         too_near = (kl < 0.5 * desired_kl) & (kl > 0.0)
         rate = tl.where(kl > 2.0 * desired_kl, slower, tl.where(too_near, faster, rate))
         tl.store(learning_rate, rate)
@@ -81,7 +81,7 @@ def _adapt(learning_rate, kl, desired_kl, low, high, ADAPTIVE: tl.constexpr):
 @triton.jit
 def sum_gradients(
     weight_partials, block_partials, gradients, squares, biases, learning_rate, summary, num_rows,
-    entropy_coeff, critic_coeff, desired_kl, learning_rate_min, learning_rate_max,
+    entropy_coeff, critic_coeff, desired_kl, rate_bounds,
     RANKS: tl.constexpr, SPLITS: tl.constexpr, BLOCKS: tl.constexpr,
     NUM_PADDED: tl.constexpr, NUM_BIASES: tl.constexpr, NUM_STATISTICS: tl.constexpr,
     ACTIONS: tl.constexpr, OUT: tl.constexpr, LOG_STD: tl.constexpr, MIN_STD: tl.constexpr,
@@ -144,7 +144,7 @@ def sum_gradients(
             std = tl.maximum(tl.exp(raw) if LOG_STD else raw, MIN_STD)
             entropy = tl.sum(tl.where(output < ACTIONS, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0))
         alone: tl.constexpr = ADAPTIVE and RANKS == 1
-        rate = _adapt(learning_rate, kl, desired_kl, learning_rate_min, learning_rate_max, alone)
+        rate = _adapt(learning_rate, kl, desired_kl, rate_bounds, alone)
         share = counted / divisor  # zero, as all means, where no env state takes part
         tl.store(summary + SHARE, share)
         tl.store(summary, objective * share)
@@ -164,7 +164,7 @@ def sum_gradients(
 
 @triton.jit
 def take_means(
-    gradients, squares, learning_rate, summary, desired_kl, learning_rate_min, learning_rate_max,
+    gradients, squares, learning_rate, summary, desired_kl, rate_bounds,
     NUM_GRADIENTS: tl.constexpr, ADAPTIVE: tl.constexpr, SIZE: tl.constexpr,
 ):  # fmt: skip
     """Make means, and sums of squares, of what `sum_gradients` left, added up over ranks; adapt the learning rate."""
@@ -176,7 +176,7 @@ def take_means(
     tl.store(squares + tl.program_id(0), tl.sum(mean * mean))
     if tl.program_id(0) == 0:
         kl = tl.load(sums + 3) / share
-        rate = _adapt(learning_rate, kl, desired_kl, learning_rate_min, learning_rate_max, ADAPTIVE)
+        rate = _adapt(learning_rate, kl, desired_kl, rate_bounds, ADAPTIVE)
         column = tl.arange(0, SIZE)
         means = tl.load(sums + column, mask=column < SHARE) / share
         tl.store(summary + column, tl.where(column == LEARNING_RATE, rate, means), mask=column < SHARE)

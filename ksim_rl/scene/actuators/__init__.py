@@ -5,7 +5,7 @@ entry says by name or pattern which joints it drives.
 """
 
 from ksim_rl.scene.actuators.actuator import Actuator
-from ksim_rl.scene.actuators.builtin import GeneralActuator, MotorActuator, PositionActuator, VelocityActuator
+from ksim_rl.scene.actuators.builtin import MotorActuator, PositionActuator, VelocityActuator
 from ksim_rl.scene.actuators.joint_drives import JointDrives, set_actuators
 from ksim_rl.scene.actuators.motors import DCMotorActuator, DelayedActuator, IdealPDActuator
 from ksim_rl.scene.actuators.nets import LSTMActuator, MLPActuator

@@ -6,18 +6,13 @@ MuJoCo's effort is `gain * ctrl + bias`, clamped to `forcerange`, times the gear
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
 
 import mujoco
 
-from ksim_rl.checked import NonNegative, Positive, Range
+from ksim_rl.checked import NonNegative, Positive
 from ksim_rl.scene.actuators.actuator import Drive, JointActuator, Law
 from ksim_rl.scene.names import Patterns
-from ksim_rl.scene.state.joint_targets import TargetKind, control_kind
-
-_NUM_PARAMETERS = 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,54 +86,3 @@ class MotorActuator(BuiltinActuator, takes=frozenset({"effort"})):
         if self.effort_limit is not None:
             actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
             actuator.ctrlrange = [-self.effort_limit, self.effort_limit]
-
-
-@dataclass(frozen=True, kw_only=True)
-class GeneralActuator(BuiltinActuator):
-    """MuJoCo's general actuator, as in MJCF: up to ten numbers each, others 0; the first of `gear`; ranges clamp."""
-
-    gaintype: Literal["fixed", "affine", "muscle"] = "fixed"
-    gainprm: tuple[float, ...] = (1.0,)
-    biastype: Literal["none", "affine", "muscle"] = "none"
-    biasprm: tuple[float, ...] = ()
-    dyntype: Literal["none", "integrator", "filter", "filterexact", "muscle"] = "none"
-    dynprm: tuple[float, ...] = (1.0,)
-    gear: float = 1.0
-    ctrlrange: Range | None = None
-    actrange: Range | None = None
-
-    def _check_fields(self) -> None:
-        for name in ("gainprm", "biasprm", "dynprm"):
-            numbers = getattr(self, name)
-            if len(numbers) > _NUM_PARAMETERS:
-                raise ValueError(f"{name} has {len(numbers)} numbers: expected at most {_NUM_PARAMETERS}")
-
-    @property
-    def _enums(self) -> dict[str, Any]:
-        """The members of MuJoCo's mjtGain, mjtBias and mjtDyn that the types name."""
-        types = {"gain": self.gaintype, "bias": self.biastype, "dyn": self.dyntype}
-        return {
-            kind: getattr(getattr(mujoco, f"mjt{kind.title()}"), f"mj{kind.upper()}_{name.upper()}")
-            for kind, name in types.items()
-        }
-
-    @property
-    def takes(self) -> frozenset[TargetKind]:
-        return frozenset({control_kind(self._enums["bias"], _padded(self.biasprm), self._enums["dyn"])})
-
-    def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
-        super().configure(actuator, joint)
-        kinds = self._enums
-        actuator.gaintype, actuator.gainprm = kinds["gain"], _padded(self.gainprm)
-        actuator.biastype, actuator.biasprm = kinds["bias"], _padded(self.biasprm)
-        actuator.dyntype, actuator.dynprm = kinds["dyn"], _padded(self.dynprm)
-        actuator.gear = [self.gear, 0.0, 0.0, 0.0, 0.0, 0.0]
-        if self.ctrlrange is not None:
-            actuator.ctrllimited, actuator.ctrlrange = mujoco.mjtLimited.mjLIMITED_TRUE, self.ctrlrange
-        actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
-        if self.actrange is not None:
-            actuator.actlimited, actuator.actrange = mujoco.mjtLimited.mjLIMITED_TRUE, self.actrange
-
-
-def _padded(numbers: Sequence[float]) -> list[float]:
-    return [*numbers, *[0.0] * (_NUM_PARAMETERS - len(numbers))]

@@ -31,11 +31,6 @@ class Ground:
         """The level of difficulty of each env, in [0, num_levels)."""
         return self._zeros_E
 
-    @property
-    def types_E(self) -> Int64[Tensor, " E"]:
-        """The kind of ground of each env, as an index into the terrain's kinds."""
-        return self._zeros_E
-
     def heights(self, points_EN2: Float[Tensor, "E N 2"]) -> Float[Tensor, "E N"]:
         """Return the height of the ground at x, y (world frame, m), m; beyond the edge that of the nearest point."""
         return torch.zeros_like(points_EN2[..., 0])

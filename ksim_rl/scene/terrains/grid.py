@@ -143,7 +143,7 @@ class PatchedGround(Ground):
         super().__init__(view.num_envs, view.device)
         mj_model, device = view.world.mj_model, view.device
         self.num_levels, self._num_columns = grid.num_levels, grid.num_columns
-        kinds, max_initial_level = list(grid.patches), min(grid.max_initial_level, grid.num_levels - 1)
+        max_initial_level = min(grid.max_initial_level, grid.num_levels - 1)
         spawn_heights = [grid.spawn_height(heights_RC) for _, heights_RC in grid.named_heights()]
         # A robot's own model may have height fields too.
         first = int(mj_model.hfield(patch_name(0, 0)).id)
@@ -167,9 +167,6 @@ class PatchedGround(Ground):
         self._column_E = place_E * self._num_columns // num_places
         first_E = -(-self._column_E * num_places // self._num_columns)
         self._first_level_E = (place_E - first_E) % (max_initial_level + 1)
-        self._types_E = torch.tensor([kinds.index(kind) for kind in grid.columns], device=device)[
-            self._column_E
-        ]
         # Buffers start at zero, so what is kept is how far each env has moved.
         self._moved_E = view.buffers.get("terrain.moved_E", dtype=torch.int64, keep=True)
         self._place(torch.ones(view.num_envs, dtype=torch.bool, device=device))
@@ -177,10 +174,6 @@ class PatchedGround(Ground):
     @property
     def levels_E(self) -> Int64[Tensor, " E"]:
         return self._first_level_E + self._moved_E
-
-    @property
-    def types_E(self) -> Int64[Tensor, " E"]:
-        return self._types_E
 
     @property
     def patches_E(self) -> Int64[Tensor, " E"]:

@@ -26,7 +26,6 @@ def ppo(*, gamma: float = 0.995, env_states: float = PPO_STATES) -> TrainingCfg:
     in float32 to 676. Many actions have a large divergence in sum, which would hold the adaptive learning rate at
     its usual floor of 1e-5.
     """
-    data = DatasetCfg(num_env_states_per_minibatch=8192, num_minibatches=16)
     return TrainingCfg(
         num_envs=NUM_ENVS,
         objective=PPOCfg(
@@ -35,12 +34,13 @@ def ppo(*, gamma: float = 0.995, env_states: float = PPO_STATES) -> TrainingCfg:
             clip_value=False,
             entropy_coeff=0.001,
             learning_rate_min=1e-4,
+            learning_rate_max=1e-3,
+            anneal_learning_rate=True,
             max_grad_norm=100.0,
         ),
-        data=data,
+        data=DatasetCfg(num_env_states_per_minibatch=8192, num_minibatches=16),
         modules=ModulesCfg(
-            actor=ActorCfg(hidden_dims=(256, 128)),
-            critic=CriticCfg(hidden_dims=(256, 256, 128)),
+            actor=ActorCfg(hidden_dims=(256, 128)), critic=CriticCfg(hidden_dims=(256, 256, 128))
         ),
         trainer=TrainerCfg(
             num_iterations=math.ceil(env_states / (8192 * 16)), eval_interval=50, stop_when_solved=False

@@ -10,7 +10,6 @@ from ksim_rl.envs import MjcfRobot
 from ksim_rl.scene.actuators import (
     DCMotorActuator,
     DelayedActuator,
-    GeneralActuator,
     IdealPDActuator,
     MotorActuator,
     PositionActuator,
@@ -81,17 +80,6 @@ def test_built_in_ones_compile_to_what_mjcf_of_their_own_says():
     model = compiled(
         PositionActuator(joints="a", stiffness=20.0, damping=1.5, effort_limit=6.0, armature=0.07),
         VelocityActuator(joints="b", damping=2.5, effort_limit=3.0, frictionloss=0.9),
-        GeneralActuator(
-            joints="c",
-            gainprm=(2.0, 0.1),
-            biastype="affine",
-            biasprm=(0.5, -3.0, -0.2),
-            dyntype="filter",
-            dynprm=(0.05,),
-            gear=4.0,
-            ctrlrange=(-1.0, 2.0),
-            actrange=(-0.5, 0.5),
-        ),
         MotorActuator(joints="d", effort_limit=8.0),
     )
     plain = 'class="plain" ctrllimited="false"'
@@ -106,14 +94,12 @@ def test_built_in_ones_compile_to_what_mjcf_of_their_own_says():
               <general name="cable" tendon="cable" gear="2"/>
               <position name="a" joint="a" kp="20" kv="1.5" forcerange="-6 6" {plain}/>
               <velocity name="b" joint="b" kv="2.5" forcerange="-3 3" {plain}/>
-              <general name="c" joint="c" gainprm="2 0.1" biasprm="0.5 -3 -0.2" dyntype="filter" dynprm="0.05"
-                gear="4" ctrlrange="-1 2" actlimited="true" actrange="-0.5 0.5"/>
               <motor name="d" joint="d" class="plain" ctrlrange="-8 8" forcerange="-8 8"/>""",
             sensors='<actuatorfrc name="torque" actuator="a"/>',
         )
     )
     names = [by_hand.actuator(i).name for i in range(by_hand.nu)]
-    assert [model.actuator(i).name for i in range(model.nu)] == names == ["cable", "a", "b", "c", "d"]
+    assert [model.actuator(i).name for i in range(model.nu)] == names == ["cable", "a", "b", "d"]
     for field in FIELDS:
         ours, theirs = (getattr(m, f"actuator_{field}") for m in (model, by_hand))
         np.testing.assert_array_equal(ours, theirs, err_msg=field)
@@ -175,8 +161,6 @@ def test_a_joint_with_two_entries_or_a_pattern_without_joint_is_named(patterns, 
         (lambda: VelocityActuator(joints="a", damping=math.nan), "damping=nan"),
         (lambda: MotorActuator(joints="a", effort_limit=0.0), "effort_limit=0.0"),
         (lambda: MotorActuator(joints="a", armature=-1.0), "armature=-1.0"),
-        (lambda: GeneralActuator(joints="a", gaintype="afine"), "gaintype='afine'.*affine"),
-        (lambda: GeneralActuator(joints="a", biasprm=(0.0,) * 11), "biasprm has 11"),
         (
             lambda: DelayedActuator(actuator=MotorActuator(joints="a"), min_lag=3, max_lag=2),
             "min_lag=3 exceeds",

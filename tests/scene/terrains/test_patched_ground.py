@@ -40,8 +40,9 @@ def on_ground(bench, place_E2, height):
 
 
 def test_each_level_and_kind_has_its_env(bench):
-    assert bench.ground.types_E.tolist() == [kind for kind in range(5) for _ in range(3)]
     assert bench.ground.levels_E.tolist() == [0, 1, 2] * 5
+    columns_E = bench.ground.patches_E - 5 * bench.ground.levels_E
+    assert columns_E.tolist() == [column for column in range(5) for _ in range(3)]
     assert bench.ground.half_width == 2.0 and bench.ground.num_levels == 3 and not bench.ground.is_flat
 
 
@@ -174,6 +175,6 @@ def test_flat_ground_is_zero_without_end():
     assert torch.equal(ground.heights(points[..., :2]), torch.zeros(3, 4))
     assert torch.equal(ground.clearance(points), points[..., 2])
     assert torch.equal(ground.origins_E3, torch.zeros(3, 3))
-    assert ground.levels_E.tolist() == ground.types_E.tolist() == [0, 0, 0]
+    assert ground.levels_E.tolist() == [0, 0, 0]
     with pytest.raises(ValueError, match="TerrainGrid"):
         ground.set_levels(torch.ones(3, dtype=torch.bool), torch.zeros(3, dtype=torch.int64))
