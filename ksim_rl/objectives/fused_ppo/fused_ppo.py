@@ -184,6 +184,8 @@ class FusedPPO:
             **vars(cfg),
             **{name.upper(): value for part in described for name, value in vars(part).items()},
             **dict(zip(("H1", "H2", "H3"), layout.hidden, strict=False)),
+            # As TF32, observations in two pieces take more registers than in one.
+            **({"HEAD": layout.obs, "REST": 0} if self._tf32 else {}),
             **dict(zip(("parameters", "means", "variances"), parameters.flat, strict=True)),
             **dict(zip(("beta1", "beta2"), cfg.betas, strict=True)),
             **{

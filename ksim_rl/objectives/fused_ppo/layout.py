@@ -111,6 +111,11 @@ class FusedLayout:
         self.obs_dims = networks.actor[0].in_features, networks.critic[0].in_features
         self.stored = _multiple(max(*self.obs_dims, MIN_WIDTH))
         self.obs = power_of_two(self.stored) if self.chained else self.stored
+        # What is stored as two powers of two, where these are less than `obs`.
+        self.head = 1 << (self.stored.bit_length() - 1)
+        self.rest = power_of_two(self.stored - self.head) if self.stored > self.head else 0
+        if self.head + self.rest >= self.obs:
+            self.head, self.rest = self.obs, 0
         self.out = power_of_two(max(self.actions, MIN_WIDTH))
         outputs = self.out if networks.std_layer is None else 2 * self.out
         widths = (self.obs, *self.hidden, outputs)
@@ -205,10 +210,10 @@ class Tuning:
         if not layout.chained:
             return cls(block=64 if wide else 128, **wide)
         chunk = math.gcd(cls.chunk, layout.hidden[0], layout.hidden[2])
-        lower = math.gcd(32 if wide else cls.lower, layout.hidden[0])
+        lower, read = math.gcd(32 if wide else cls.lower, layout.hidden[0]), layout.head + layout.rest
         # Two programs of `lower_gradients` share a multiprocessor, where their sums fit into registers.
         wide |= {"block": 32, "lower_depth": 16} if wide else {}
-        stages, warps = 3 if not wide and layout.obs <= 64 else 2, 4 if not wide and layout.obs <= 128 else 8
+        stages, warps = 3 if not wide and read <= 96 else 2, 4 if not wide and read <= 128 else 8
         return cls(chunk=chunk, lower=lower, lower_stages=stages, lower_warps=warps, splits=16, **wide)
 
 

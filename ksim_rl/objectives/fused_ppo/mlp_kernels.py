@@ -205,44 +205,57 @@ def minibatch_gradients(
 def lower_gradients(
     inputs, slopes, weights, biases, weight_partials, num_rows,
     NUM_PADDED: tl.constexpr, NUM_WEIGHTS: tl.constexpr, INPUTS: tl.constexpr, GRADIENTS: tl.constexpr,
-    OBS: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, ROWS: tl.constexpr, LOWER: tl.constexpr,
-    LOWER_DEPTH: tl.constexpr, LOWER_STAGES: tl.constexpr, ACTIVATION: tl.constexpr, TF32: tl.constexpr,
+    OBS: tl.constexpr, HEAD: tl.constexpr, REST: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, ROWS: tl.constexpr,
+    LOWER: tl.constexpr, LOWER_DEPTH: tl.constexpr, LOWER_STAGES: tl.constexpr,
+    ACTIVATION: tl.constexpr, TF32: tl.constexpr,
 ):  # fmt: skip
     """Sum the gradients of both layers around the first hidden one, which is computed here anew.
 
     Program (i, s, n) has LOWER of its elements, whose weights stay on the chip, over the ROWS of split s, in network n;
     neither they nor the gradients at them are ever in memory. It writes to the places of its split, as
     `weight_gradients` does, all but the biases of the second layer. All is transposed: what is computed here is the
-    first factor of the next product, as which it stays in registers.
+    first factor of the next product, as which it stays in registers. Observations are HEAD columns and REST more, both
+    powers of two, which are fewer than OBS.
     """
     split = tl.program_id(1)
     network = tl.program_id(2)
     SECOND_AT: tl.constexpr = H1 * OBS
     element = (tl.program_id(0) * LOWER + tl.arange(0, LOWER))[:, None]
-    obs_column = tl.arange(0, OBS)[None, :]
+    head_column = tl.arange(0, HEAD)[None, :]
     column2 = tl.arange(0, H2)[None, :]
     inputs += network.to(tl.int64) * num_rows * INPUTS
     slopes += network.to(tl.int64) * num_rows * GRADIENTS
     weights += network * NUM_PADDED
     weight_partials += (split * 2 + network).to(tl.int64) * NUM_PADDED
-    weight1 = tl.load(weights + (element * OBS + obs_column))
+    weight1 = tl.load(weights + (element * OBS + head_column))
     weight2 = tl.load(weights + (SECOND_AT + column2 * H1 + element))
     bias = tl.load(biases + network * NUM_PADDED + element)
-    d_weight1 = tl.zeros((LOWER, OBS), dtype=tl.float32)
+    d_weight1 = tl.zeros((LOWER, HEAD), dtype=tl.float32)
+    if REST:
+        rest_column = HEAD + tl.arange(0, REST)[None, :]
+        weight_rest = tl.load(weights + (element * OBS + rest_column))
+        d_weight_rest = tl.zeros((LOWER, REST), dtype=tl.float32)
     d_weight2 = tl.zeros((LOWER, H2), dtype=tl.float32)
     d_bias = tl.zeros((LOWER,), dtype=tl.float32)
     for first in tl.range(0, ROWS, LOWER_DEPTH, num_stages=LOWER_STAGES):
         rows = (split * ROWS + first + tl.arange(0, LOWER_DEPTH))[:, None]
-        observed = tl.load(inputs + (rows * INPUTS + obs_column), mask=rows < num_rows, other=0.0)
+        observed = tl.load(inputs + (rows * INPUTS + head_column), mask=rows < num_rows, other=0.0)
         above = tl.load(slopes + (rows * GRADIENTS + column2), mask=rows < num_rows, other=0.0)
-        hidden = activate(tl.dot(weight1, tl.trans(observed)) + bias, ACTIVATION)
-        hidden = operand(hidden, observed.dtype, TF32)
+        hidden = tl.dot(weight1, tl.trans(observed))
+        if REST:
+            rest = tl.load(inputs + (rows * INPUTS + rest_column), mask=rows < num_rows, other=0.0)
+            hidden = tl.dot(weight_rest, tl.trans(rest), hidden)
+        hidden = operand(activate(hidden + bias, ACTIVATION), observed.dtype, TF32)
         d_weight2 = tl.dot(hidden, above, d_weight2)
         slope = tl.dot(weight2, tl.trans(above)) * slope_of(hidden.to(tl.float32), ACTIVATION)
         slope = operand(slope, observed.dtype, TF32)
         d_weight1 = tl.dot(slope, observed, d_weight1)
+        if REST:
+            d_weight_rest = tl.dot(slope, rest, d_weight_rest)
         d_bias += tl.sum(slope.to(tl.float32), 1)
-    tl.store(weight_partials + (element * OBS + obs_column), d_weight1)
+    tl.store(weight_partials + (element * OBS + head_column), d_weight1)
+    if REST:
+        tl.store(weight_partials + (element * OBS + rest_column), d_weight_rest)
     tl.store(weight_partials + (SECOND_AT + column2 * H1 + element), d_weight2)
     tl.store(weight_partials + NUM_WEIGHTS + element, d_bias[:, None])
 
