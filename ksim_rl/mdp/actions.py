@@ -158,4 +158,5 @@ class ActuatorAction(ActionTerm):
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         index = view.resolver.index("actuator", self.actuators)
         limits_K2 = view.ctrl_limits_L2[index]
-        view.write_ctrl(index, torch.clamp(action_EK * self.scale, limits_K2[:, 0], limits_K2[:, 1]))
+        ctrl_EK = torch.clamp(action_EK * self.scale, limits_K2[:, 0], limits_K2[:, 1])
+        view.world.ctrl_EL[:, index] = ctrl_EK
