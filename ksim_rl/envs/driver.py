@@ -1,6 +1,7 @@
 """This module is what an env and its managers drive terms with; terms themselves see the driver's view only."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from typing import Any
 
 from ksim_rl.envs.non_finite import NonFiniteTerms
 from ksim_rl.envs.view import EnvView, Readings
@@ -10,22 +11,16 @@ from ksim_rl.scene.state.simulation import Simulation
 
 
 class EnvDriver(Simulation):
-    """A `Simulation` with `readings`, what managers and sensors write, and `view`, what terms read."""
+    """A `Simulation` with `readings`, what managers and sensors write, and `view`, what terms read.
 
-    def __init__(
-        self,
-        world: World,
-        *,
-        step_dt: float,
-        max_episode_length: int = 0,
-        soft_joint_pos_limit_factor: float = 1.0,
-        entities: Sequence[str] = (),
-    ) -> None:
+    The `parts` are the other arguments of the view; see `WorldView`.
+    """
+
+    def __init__(self, world: World, *, step_dt: float, max_episode_length: int = 0, **parts: Any) -> None:
         super().__init__(world, step_dt=step_dt, max_episode_length=max_episode_length)
         self.readings = Readings(self)
         self.non_finite = NonFiniteTerms(self.num_envs, self.step_count)
-        factor = soft_joint_pos_limit_factor
-        self.view = EnvView(self, self.readings, soft_joint_pos_limit_factor=factor, entities=entities)
+        self.view = EnvView(self, self.readings, **parts)
 
     def add_sensors(self, sensors: Mapping[str, Sensor]) -> None:
         """Let sensors read the worlds from now on."""

@@ -59,21 +59,13 @@ class MaskedReset(EnvBase):
     """
 
     # A reference, so that it costs nothing per step. Inside a captured graph it points to the graph's static output.
-    _last_root: TensorDictBase | None = None
+    last_root: TensorDictBase | None = None
+    """The root values that the next action answers to; a caller that replays a graph sets it after a replay."""
     seed = _Seed()
-
-    @property
-    def last_root(self) -> TensorDictBase | None:
-        """The root values that the next action answers to; a caller that replays a graph sets it after a replay."""
-        return self._last_root
-
-    @last_root.setter
-    def last_root(self, tensordict: TensorDictBase | None) -> None:
-        self._remember(tensordict)
 
     def _remember(self, root: TensorDictBase | None) -> None:
         # Past `nn.Module.__setattr__`, which takes longer than the rest of this.
-        object.__setattr__(self, "_last_root", root)
+        object.__setattr__(self, "last_root", root)
 
     @property
     def dim_names(self) -> list[str | None]:

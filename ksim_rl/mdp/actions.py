@@ -12,8 +12,8 @@ from ksim_rl.envs.term import ActionTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant, values_by_name
 from ksim_rl.scene.names import Patterns
-from ksim_rl.transforms.elementwise import clipped, scaled
-from ksim_rl.transforms.low_pass import low_pass_, smoothing
+from ksim_rl.transforms.elementwise import clipped
+from ksim_rl.transforms.low_pass import smoothing
 
 PerJoint = float | Mapping[str, float]
 
@@ -58,11 +58,11 @@ class JointAction(ActionTerm):
             action_EK = clipped(action_EK, self.clip)
         if self.tanh:
             action_EK = torch.tanh(action_EK)
-        action_EK = scaled(action_EK, per_joint(view, field, scale, self.joints))
+        action_EK = action_EK * per_joint(view, field, scale, self.joints)
         if self.cutoff_hz is None:
             return action_EK
         filtered_EK = view.buffer(f"filtered_{field}_EK", action_EK.shape[1])
-        return low_pass_(filtered_EK, action_EK, smoothing(self.cutoff_hz, view.step_dt))
+        return filtered_EK.lerp_(action_EK, smoothing(self.cutoff_hz, view.step_dt))
 
 
 def per_joint(view: EnvView, field: str, value: PerJoint, joints: Patterns) -> float | Float[Tensor, " K"]:
@@ -158,4 +158,5 @@ class ActuatorAction(ActionTerm):
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         index = view.resolver.index("actuator", self.actuators)
         limits_K2 = view.ctrl_limits_L2[index]
-        view.write_ctrl(index, torch.clamp(scaled(action_EK, self.scale), limits_K2[:, 0], limits_K2[:, 1]))
+        ctrl_EK = torch.clamp(action_EK * self.scale, limits_K2[:, 0], limits_K2[:, 1])
+        view.world.ctrl_EL[:, index] = ctrl_EK

@@ -21,7 +21,7 @@ from ksim_rl.envs.term import CurriculumTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
 from ksim_rl.mdp.fields import OfCommand, OfEntity, distance_from_origin
-from ksim_rl.transforms.row_transform import by_level, moved_level
+from ksim_rl.transforms.row_transform import by_level
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,8 +82,11 @@ class SteppedLevel(LevelCurriculum):
         total_2 = held_2 + added_2
         is_enough = total_2[0] >= (self.min_episodes or view.num_envs * ranks.size())
         mean = total_2[1] / total_2[0].clamp(min=1.0)
-        level = moved_level(view.level, mean, 1.0 / self.num_levels, self.raise_above, self.lower_below)
-        view.level.copy_(torch.where(is_enough, level, view.level))
+        step = 1.0 / self.num_levels
+        level = torch.where(mean > self.raise_above, view.level + step, view.level)
+        if self.lower_below is not None:
+            level = torch.where(mean < self.lower_below, level - step, level)
+        view.level.copy_(torch.where(is_enough, level.clamp(0.0, 1.0), view.level))
         held_2.copy_(torch.where(is_enough, 0.0, total_2))
         return view.level.clone()
 

@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import reduce
 from operator import add
 from typing import Any
@@ -364,14 +364,15 @@ class Categorical(Distribution):
 
     def log_prob(self, value: Shaped[Tensor, "*value"]) -> Float[Tensor, "*shape"]:
         """Return the log probability of `value`, summed over the choices."""
-        return _sum(
+        chosen = (
             log_probs.expand(*index.shape, -1).gather(-1, index.unsqueeze(-1)).squeeze(-1)
             for log_probs, index in zip(self._log_probs, self._as_indices(value), strict=True)
         )
+        return reduce(add, chosen)
 
     def entropy(self) -> Float[Tensor, "*batch"]:
         """Return the entropy in nats, summed over the choices."""
-        return _sum(-(log_probs.exp() * log_probs).sum(-1) for log_probs in self._log_probs)
+        return reduce(add, (-(log_probs.exp() * log_probs).sum(-1) for log_probs in self._log_probs))
 
     def _as_value(self, indices: Sequence[Tensor]) -> Tensor:
         if self.one_hot:
@@ -394,8 +395,4 @@ class Categorical(Distribution):
 @register_kl(Categorical, Categorical)
 def _kl(p: Categorical, q: Categorical) -> Tensor:
     pairs = zip(p._log_probs, q._log_probs, strict=True)
-    return _sum((log_p.exp() * (log_p - log_q)).sum(-1) for log_p, log_q in pairs)
-
-
-def _sum(terms: Iterable[Tensor]) -> Tensor:
-    return reduce(add, terms)
+    return reduce(add, ((log_p.exp() * (log_p - log_q)).sum(-1) for log_p, log_q in pairs))

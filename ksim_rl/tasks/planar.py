@@ -25,7 +25,7 @@ from ksim_rl.objectives import AMPCfg, PPOCfg
 from ksim_rl.physics import SimCfg
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.robots.control_models import WALKER_SERVOS, Cheetah, Hopper, Walker
-from ksim_rl.scene.scene import Robot, SceneCfg
+from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.terrains import PlaneTerrain
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg
@@ -79,13 +79,10 @@ def _own_state(motors: str) -> dict[str, ObservationTermCfg]:
 
 
 def planar_cfg(
-    robot: Robot, *, motors: str, reward: RewardTerm, decimation: int, step_dt: float, distance: float
+    robot: Cheetah | Hopper | Walker, *, reward: RewardTerm, decimation: int, step_dt: float, distance: float
 ) -> ManagerBasedRlEnvCfg:
-    """Put a planar task together, for joints that match `motors`; an env step lasts `step_dt`, s.
-
-    The robot has the joints "root_x", "root_z" and "root_y", a root body "torso" and a sensor "com_velocity". The
-    camera's `distance` is in m.
-    """
+    """Put a planar task together; an env step lasts `step_dt`, s, and the camera's `distance` is in m."""
+    motors = robot.joints
     seen = ObservationGroupCfg(terms=_own_state(motors))
     return ManagerBasedRlEnvCfg(
         decimation=decimation,
@@ -149,9 +146,7 @@ class CheetahReward(RewardTerm):
 
 def cheetah_run() -> ManagerBasedRlEnvCfg:
     """Return the config of running as fast as 8 m/s."""
-    return planar_cfg(
-        Cheetah(), motors=Cheetah.joints, reward=CheetahReward(), decimation=2, step_dt=0.01, distance=3.5
-    )
+    return planar_cfg(Cheetah(), reward=CheetahReward(), decimation=2, step_dt=0.01, distance=3.5)
 
 
 # 5.9 m/s from 1 s on (5.9 / 8 in 900 of 1000 steps), after a start that is uniformly faster (half of that in 100).
@@ -184,7 +179,7 @@ class HopperReward(RewardTerm):
 
 def _hopper_cfg(speed: float) -> ManagerBasedRlEnvCfg:
     reward = HopperReward(speed=speed)
-    return planar_cfg(Hopper(), motors=Hopper.joints, reward=reward, decimation=4, step_dt=0.02, distance=3.5)
+    return planar_cfg(Hopper(), reward=reward, decimation=4, step_dt=0.02, distance=3.5)
 
 
 def hopper_stand() -> ManagerBasedRlEnvCfg:
@@ -228,9 +223,7 @@ class WalkerReward(RewardTerm):
 
 def _walker_cfg(speed: float) -> ManagerBasedRlEnvCfg:
     reward = WalkerReward(speed=speed)
-    return planar_cfg(
-        Walker(), motors=Walker.joints, reward=reward, decimation=5, step_dt=0.025, distance=4.0
-    )
+    return planar_cfg(Walker(), reward=reward, decimation=5, step_dt=0.025, distance=4.0)
 
 
 def walker_stand() -> ManagerBasedRlEnvCfg:

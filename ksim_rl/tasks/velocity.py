@@ -271,16 +271,17 @@ def flat_cfg(
     robot: LeggedRobot,
     pose: PoseStd,
     *,
-    feet: ContactSensor,
-    viewer: ViewerCfg,
     is_biped: bool = False,
     torso: str | None = None,
     foot_height: float = 0.1,
     friction: Mapping[str, EventTerm] | None = None,
     physics: SimCfg | None = None,
-    command: mdp.UniformVelocityCommand | None = None,
+    **others: Any,
 ) -> ManagerBasedRlEnvCfg:
-    """Return `velocity_cfg` with the parts of this module; bipeds are calmer, and keep their limbs apart."""
+    """Return `velocity_cfg`, to which `others` go, with the parts of this module.
+
+    Bipeds are calmer, and keep their limbs apart.
+    """
     calm: dict[str, Any] = {"body_ang_vel": -0.05, "angular_momentum": -0.02} if is_biped else {}
     earned = rewards(robot, pose=pose, torso=torso, foot_height=foot_height, **calm)
     if is_biped:
@@ -289,13 +290,11 @@ def flat_cfg(
     return velocity_cfg(
         robot,
         sim=physics or sim(),
-        feet=feet,
         rewards=earned,
         events={**events(robot, torso=torso), **slip},
-        viewer=viewer,
         observations=observations(robot),
-        command=command,
         sensors=self_contact(robot) if is_biped else {},
+        **others,
     )
 
 

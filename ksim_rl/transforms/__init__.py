@@ -5,7 +5,6 @@ A transform is public once it is imported here.
 
 from types import ModuleType
 
-from ksim_rl.transforms.command_curriculum import RandomCommandCurriculum
 from ksim_rl.transforms.delay import ActionDelay, DelayCfg, ObservationDelay
 from ksim_rl.transforms.elementwise import (
     ActionClip,

@@ -12,7 +12,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from ksim_rl import checks
 from ksim_rl.transforms.noise.cfg import PerDim
 from ksim_rl.transforms.row_transform import CheckedKeys, FollowsLevel, Keys, by_level, one_per_key
-from ksim_rl.transforms.specs import add_bounds, bounded, bounds, multiply_bounds
+from ksim_rl.transforms.specs import bounded, bounds, multiply_bounds
 
 Range = tuple[float | None, float | None]
 
@@ -20,17 +20,6 @@ Range = tuple[float | None, float | None]
 def clipped(value: Num[Tensor, "*leaf"], clip: Range) -> Num[Tensor, "*leaf"]:
     """Return a value within [low, high], of which one may be None; NaN stays NaN."""
     return torch.clamp(value, *clip)
-
-
-def scaled(
-    value: Num[Tensor, "*leaf"],
-    scale: float | Num[Tensor, "*scale"],
-    offset: Num[Tensor, "*offset"] | None = None,
-) -> Num[Tensor, "*leaf"]:
-    """Return `scale * value + offset`."""
-    if offset is None or not isinstance(scale, Tensor):
-        return value * scale
-    return torch.addcmul(offset, value, scale)
 
 
 class _Map(CheckedKeys):
@@ -193,7 +182,7 @@ class ObservationScale(ObservationMap):
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
     def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
-        return scaled(value, getattr(self, f"factor_{index}")).to(value.dtype)
+        return (value * getattr(self, f"factor_{index}")).to(value.dtype)
 
 
 class RewardScale(FollowsLevel, RewardMap):
@@ -225,14 +214,12 @@ class RewardScale(FollowsLevel, RewardMap):
         low, high = bounds(spec)
         scales = self.scale, self.scale if self.first_scale is None else self.first_scale
         factors = torch.full_like(low, min(scales)), torch.full_like(low, max(scales))
-        shift = torch.full_like(low, self.offset)
-        low, high = add_bounds(multiply_bounds((low, high), factors), (shift, shift))
+        low, high = (end + self.offset for end in multiply_bounds((low, high), factors))
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
     def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
         scale = self.scale if self.first_scale is None else by_level(self.first_scale, self.scale, self.level)
-        reward = scaled(value, scale)
-        return reward + self.offset if self.offset else reward
+        return value * scale + self.offset if self.offset else value * scale
 
 
 class ActionScale(ActionMap):
@@ -299,7 +286,7 @@ class ActionScale(ActionMap):
         scale, offset = self._buffers[f"scale_{index}"], self._buffers[f"offset_{index}"]
         if scale is None or offset is None:
             raise RuntimeError("ActionScale knows its numbers once an env holds it and has made its specs")
-        return scaled(value, scale, offset)
+        return torch.addcmul(offset, value, scale)
 
 
 def check_scale(field: str, scale: PerDim) -> None:

@@ -3,7 +3,6 @@
 import math
 
 import torch
-from jaxtyping import Float
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
@@ -15,13 +14,6 @@ from ksim_rl.transforms.row_transform import Keys, RowTransform, checked_action
 def smoothing(cutoff_hz: float, step_s: float) -> float:
     """Return alpha, what a filter of that cut-off takes of the way to a constant input in a step of `step_s`."""
     return 1.0 - math.exp(-2.0 * math.pi * cutoff_hz * step_s)
-
-
-def low_pass_(
-    filtered_E: Float[Tensor, " E *leaf"], action_E: Float[Tensor, " E *leaf"], alpha: float
-) -> Float[Tensor, " E *leaf"]:
-    """Move `filtered_E`, in place, by the share alpha of the way to the action."""
-    return filtered_E.lerp_(action_E, alpha)
 
 
 class ActionLowPass(RowTransform):
@@ -69,7 +61,7 @@ class ActionLowPass(RowTransform):
             action_E = action.reshape(filtered_E.shape)
             fresh_E = self.fresh_E.reshape(-1, *[1] * (action_E.ndim - 1))
             before_E = action_E if self.initial is None else self.initial
-            low_pass_(filtered_E.copy_(torch.where(fresh_E, before_E, filtered_E)), action_E, self.alpha)
+            filtered_E.copy_(torch.where(fresh_E, before_E, filtered_E)).lerp_(action_E, self.alpha)
             # In memory of its own: the kept one changes in place.
             tensordict.set(key, filtered_E.clone().reshape(action.shape))
         self.fresh_E.zero_()

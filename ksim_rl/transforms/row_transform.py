@@ -347,22 +347,6 @@ def by_level(
     return start + (end - start) * level
 
 
-def moved_level(
-    level: Float32[Tensor, "*envs"],
-    score: Float32[Tensor, "*envs"],
-    step: float,
-    raise_above: float | None,
-    lower_below: float | None,
-) -> Float32[Tensor, "*envs"]:
-    """Return the level in [0, 1] after a mean score: a step up above one bound, a step down below the other."""
-    moved = level
-    if raise_above is not None:
-        moved = torch.where(score > raise_above, moved + step, moved)
-    if lower_below is not None:
-        moved = torch.where(score < lower_below, moved - step, moved)
-    return moved.clamp(0.0, 1.0)
-
-
 def as_keys(keys: Keys) -> list[NestedKey]:
     """Return a list of keys from one key or a list of them; a tuple is one key, and ("a",) is "a"."""
     listed: list[NestedKey] = [keys] if isinstance(keys, str | tuple) else list(keys)

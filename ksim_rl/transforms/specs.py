@@ -75,11 +75,6 @@ def bounded(
     return Bounded(low=low.to(dtype), high=high.to(dtype), shape=low.shape, dtype=dtype, device=device)
 
 
-def add_bounds(a: Ends, b: Ends) -> Ends:
-    """Return the range of x + y for x in a, y in b."""
-    return a[0] + b[0], a[1] + b[1]
-
-
 def multiply_bounds(a: Ends, b: Ends) -> Ends:
     """Return the range of x * y for x in a, y in b; 0 times infinity is 0, as no finite x exceeds it."""
     corners = torch.stack(

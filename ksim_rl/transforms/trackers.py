@@ -23,15 +23,6 @@ def time_left(horizon: int, step_E: Shaped[Tensor, " E"]) -> Float32[Tensor, " E
     return (horizon - step_E).clamp_(min=0).to(torch.float32)
 
 
-def kept_value(
-    reduce: str, kept_E: Shaped[Tensor, " E *leaf"], now_E: Shaped[Tensor, " E *leaf"]
-) -> Shaped[Tensor, " E *leaf"]:
-    """Return what is kept of an episode after one more step: the "last" value, the greatest ("max") or the "sum"."""
-    if reduce == "last":
-        return now_E
-    return torch.maximum(kept_E, now_E) if reduce == "max" else kept_E + now_E
-
-
 class _Tracker(RowTransform):
     """What is kept of each episode, from 0 at its reset; copies go out, as the kept ones change in place."""
 
@@ -170,7 +161,7 @@ class SuccessTracker(_Tracker):
         self._sized()
         for key, success_E in zip(self.in_keys, self._kept(), strict=True):
             now_E = (next_tensordict.get(key) > self.threshold).reshape(success_E.shape)
-            success_E.copy_(kept_value("last" if self.reduce == "last" else "max", success_E, now_E))
+            success_E.copy_(now_E if self.reduce == "last" else torch.maximum(success_E, now_E))
         return self._write(next_tensordict)
 
     def _kept(self) -> list[Tensor]:

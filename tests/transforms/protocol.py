@@ -38,7 +38,6 @@ from ksim_rl.transforms import (
     ObservationNoise,
     ObservationNormalization,
     ObservationScale,
-    RandomCommandCurriculum,
     RewardClip,
     RewardScale,
     SuccessTracker,
@@ -50,7 +49,6 @@ from tests.transforms.transform_checks import has_episodes
 
 LATE = DelayCfg(min_lag=1, max_lag=1)
 NOISE = GaussianNoise(std=0.1, bias=UniformNoise(low=0.0, high=1.0))
-ENDS = {"start": [(0.0, 0.1)], "end": [(0.0, 1.0)], "raise_above": 0.0}
 TURNED, SWAPPED = MirrorMap(source=(2, 1, 0)), MirrorMap(source=(1, 0))
 
 SHAPES: dict[str, Callable[[], LeafEnv]] = {
@@ -94,8 +92,6 @@ KINDS: dict[str, Callable[[LeafEnv], Transform]] = {
     "Mirror": lambda env: Mirror(
         env.key, None, env.action_name, maps={env.key: TURNED, env.action_name: SWAPPED}, probability=1.0
     ),
-    "RandomCommandCurriculum": lambda env: RandomCommandCurriculum(env.reward_name, **ENDS),
-    "RandomCommandCurriculum by observation": lambda env: RandomCommandCurriculum(env.key, **ENDS),
 }
 
 

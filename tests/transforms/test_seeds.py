@@ -21,7 +21,6 @@ from ksim_rl.transforms import (
     MirrorMap,
     ObservationDelay,
     ObservationNoise,
-    RandomCommandCurriculum,
     UniformNoise,
 )
 from tests.transforms.chains import assert_same, fixed_rollout
@@ -35,10 +34,6 @@ DRAWN = {
         "transform",
     ),
     "action lag": (lambda: ActionDelay(delay=DelayCfg(max_lag=1000)), "transform"),
-    "command": (
-        lambda: RandomCommandCurriculum([], ["out", "level"], start=[(0.0, 1.0)], end=[(0.0, 1.0)], resample_every=2),
-        "out",
-    ),
 }  # fmt: skip
 
 

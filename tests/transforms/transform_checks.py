@@ -28,7 +28,6 @@ from ksim_rl.transforms import (
     ObservationNoise,
     ObservationNormalization,
     ObservationScale,
-    RandomCommandCurriculum,
     RewardClip,
     RewardScale,
     SuccessTracker,
@@ -94,10 +93,6 @@ KINDS: dict[str, Callable[[], Transform]] = {
     "mirror_renamed": lambda: Mirror(
         VECTOR, None, "action", "wish", maps={VECTOR: AXIAL, "action": SWAP}, probability=1.0
     ),
-    "commands": lambda: RandomCommandCurriculum(
-        start=[(0.0, 0.5), (0.0, 0.0)], end=[(-1.0, 2.0), (-1.0, 1.0)], raise_above=0.1, lower_below=-0.1,
-        resample_every=2,
-    ),
 }  # fmt: skip
 
 # One per class, for any env with three observed numbers under a key and one action in [-2, 2].
@@ -119,9 +114,6 @@ PORTABLE: dict[str, Callable[[NestedKey], Transform]] = {
     "EpisodeTracker": lambda key: EpisodeTracker(),
     "SuccessTracker": lambda key: SuccessTracker("reward", threshold=-0.1),
     "Mirror": lambda key: Mirror(key, maps={key: POLAR, "action": TURN}),
-    "RandomCommandCurriculum": lambda key: RandomCommandCurriculum(
-        start=[(0.0, 0.1)], end=[(-1.0, 1.0)], raise_above=-1.0
-    ),
 }
 
 

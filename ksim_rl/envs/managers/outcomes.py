@@ -10,7 +10,6 @@ from torch import Tensor
 from ksim_rl.checks import near
 from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.term import CurriculumTerm, MetricTerm, RewardTerm, TerminationTerm
-from ksim_rl.transforms.trackers import kept_value
 
 
 class _OutcomeManager:
@@ -139,12 +138,12 @@ class MetricManager(_OutcomeManager):
         value_EM = torch.where(finite_E[:, None], torch.stack(values, dim=-1), 0.0)
         self._driver.non_finite.watch(self.kind, value_EM, self.names)
         held_EM = self._held_EM
-        next_EM = kept_value("sum", held_EM, value_EM)
+        next_EM = held_EM + value_EM
         if "last" in self._occurring:
-            next_EM = torch.where(self._is_last_M, kept_value("last", held_EM, value_EM), next_EM)
+            next_EM = torch.where(self._is_last_M, value_EM, next_EM)
         if "max" in self._occurring:
             is_first_E1 = self._view.episode_step_E[:, None] <= 1
-            peak_EM = kept_value("max", torch.where(is_first_E1, value_EM, held_EM), value_EM)
+            peak_EM = torch.maximum(torch.where(is_first_E1, value_EM, held_EM), value_EM)
             next_EM = torch.where(self._is_max_M, peak_EM, next_EM)
         held_EM.copy_(next_EM)
 

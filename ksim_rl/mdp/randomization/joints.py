@@ -149,7 +149,7 @@ class RandomizeActuator(OfJoints, Randomize, operation="scale"):
         explicit = [i for i, joint in enumerate(joints) if joint in owners]
         if explicit:
             columns = index_constant([joints[i] for i in explicit], view.device)
-            own_N = view.nominal_actuator_param(name)[columns]
+            own_N = view.actuator_params.nominal(name)[columns]
             explicit_EN = drawn_EN[:, index_constant(explicit, view.device)]
             value_EN, held_EL = self.combine(own_N, explicit_EN).clamp(min=0.0), view.actuator_param(name)
             held_EL[:, columns] = torch.where(mask_E[:, None], value_EN, held_EL[:, columns])

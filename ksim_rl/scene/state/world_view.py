@@ -12,7 +12,7 @@ from ksim_rl.checks import near
 from ksim_rl.device import random
 from ksim_rl.physics import World
 from ksim_rl.scene.motions.motion import ReferenceMotion, load_motion
-from ksim_rl.scene.names import Index, NameResolver, Patterns, as_index, as_patterns, scalar_joint_ids
+from ksim_rl.scene.names import NameResolver, Patterns, as_index, as_patterns, scalar_joint_ids
 from ksim_rl.scene.state.buffers import ActuatorParams
 from ksim_rl.scene.state.elements import Bodies, Body, Joints, JointTables, Site, Sites
 from ksim_rl.scene.state.entity import Entity
@@ -209,10 +209,6 @@ class WorldView:
         """
         return self.actuator_params.get(name, () if joints is None else self.resolver.ids("joint", joints))
 
-    def nominal_actuator_param(self, name: str) -> Float[Tensor, " L"]:
-        """Return the numbers of `actuator_param` as the config gives them."""
-        return self.actuator_params.nominal(name)
-
     # -- what terms keep and draw --------------------------------------------------------------------------------
 
     def buffer(
@@ -266,10 +262,6 @@ class WorldView:
     def write_joint_effort_target(self, joints: Patterns, target_EK: Float[Tensor, "E K"]) -> None:
         """Ask joints for efforts, N m or N, in all rows; those of the MJCF's motors are clamped, then geared."""
         self.targets.write("effort", joints, target_EK)
-
-    def write_ctrl(self, actuators: Index, ctrl_EN: Float[Tensor, "E N"]) -> None:
-        """Set the controls of `actuators` in all rows."""
-        self.world.ctrl_EL[:, actuators] = ctrl_EN
 
     def field(self, name: str) -> Shaped[Tensor, " E *shape"]:
         """Return a model field with one row per world, to be written in place (see `EventTerm.per_world_fields`)."""

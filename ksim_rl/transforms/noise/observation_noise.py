@@ -15,7 +15,7 @@ from ksim_rl.transforms.noise import kernel as noise_kernel
 from ksim_rl.transforms.noise.cfg import NoiseCfg, per_dim
 from ksim_rl.transforms.noise.kernel import HAS_BIAS, HAS_DROPOUT, HAS_WALK, add_noise
 from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, Keys, RowTransform, one_per_key
-from ksim_rl.transforms.specs import Device, add_bounds, bounded, bounds, multiply_bounds
+from ksim_rl.transforms.specs import Device, bounded, bounds, multiply_bounds
 
 
 class ObservationNoise(FollowsLevel, KeyedTransform):
@@ -256,5 +256,7 @@ def _noisy(
         noise = (offset - reach).expand(low.shape), (offset + reach).expand(low.shape)
     else:
         noise = offset.expand(low.shape), (offset + spread).expand(low.shape)
-    noisy_low, noisy_high = (multiply_bounds if cfg.operation == "multiply" else add_bounds)(ends, noise)
+    noisy_low, noisy_high = low + noise[0], high + noise[1]
+    if cfg.operation == "multiply":
+        noisy_low, noisy_high = multiply_bounds(ends, noise)
     return torch.minimum(low, noisy_low), torch.maximum(high, noisy_high)

@@ -51,7 +51,7 @@ def test_each_world_may_have_its_own_numbers(pd):
     knee = JOINTS.index("knee")
     stiffness_EL = pd.view.actuator_param("stiffness", "knee")
     torch.testing.assert_close(
-        pd.view.nominal_actuator_param("stiffness"), torch.tensor([4.0, 3.0, 4.0, 0.0, 0.0, 0.0])
+        pd.view.actuator_params.nominal("stiffness"), torch.tensor([4.0, 3.0, 4.0, 0.0, 0.0, 0.0])
     )
     stiffness_EL[:, knee] = torch.tensor([1.0, 2.0, 3.0])
     pd.view.actuator_param("effort_limit")[:, knee] = torch.tensor([9.0, 9.0, 0.5])
