@@ -34,7 +34,7 @@ constexpr int LIMB_BEGIN = (TRUNK + 3) / 4 * 4, LIMB_STRIDE = (LIMB + 3) / 4 * 4
 #if defined(__CUDA_ARCH__)
 __shared__ __align__(16) float memory[FLOATS];
 #else
-static float memory[FLOATS];
+alignas(16) static float memory[FLOATS];
 #endif
 float* const mass = memory;  // M
 float* const chip = mass + NV * STRIDE;  // J of the rows that find room

@@ -104,7 +104,8 @@ auto cone_point = [&](const Cone& cone, float alpha) {
     return Point {change, cone.Dm * gap * gap_rate, cone.Dm * (gap_rate * gap_rate - cone.mu * gap * bend)};
 };
 // What a unit costs at a point of the search direction.
-auto unit_point = [&](int row, int kind, float alpha) {
+auto unit_point = [&](int row, float alpha) {
+    const int kind = kind_of(row);
     if (ELLIPTIC && kind == CONE_HEAD)
         return cone_point(*(const Cone*)(cones + 4 * row), alpha);
     if (kind == FRICTION)
@@ -132,12 +133,11 @@ auto search_line = [&](float slope, float half_curvature, float enough, float no
                 *(Cone*)(cones + 4 * units[unit]) = prepare_cone(units[unit]);
         sync();
     }
-    auto measure = [&](float alpha) {
+    auto measure = [&](float there) {
         Point sum {0.0f, 0.0f, 0.0f};
 #pragma unroll 1
         for (int unit = lane % TEAM; unit < num_units; unit += TEAM) {
-            const int row = units[unit];
-            const Point point = unit_point(row, kind_of(row), alpha);
+            const Point point = unit_point(units[unit], there);
             sum.cost += point.cost;
             sum.slope += point.slope;
             sum.curvature += point.curvature;

@@ -41,8 +41,7 @@ UNROLL
 #else
 auto list_rows = [] {};
 #endif
-// In the curved zone of a cone (part 6) the terms along its slip follow its last
-// row, from what its rows have left in the lane.
+// In the curved zone of a cone (part 6) the terms along its slip follow its last row, from what its rows have left.
 auto sum_tiles = [&] {
     const int limb = wp::min(lane / TILE_LANES, LIMBS - 1), own = wp::min(lane % TILE_LANES, LAST);
     const int own_place = own < TRUNK ? own : own - TRUNK + LIMB_BEGIN;
