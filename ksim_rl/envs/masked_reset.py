@@ -4,13 +4,14 @@ import functools
 import random
 import secrets
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Shaped
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Composite
 from torchrl.envs import EnvBase
 
 from ksim_rl import checks, dims
@@ -19,6 +20,7 @@ from ksim_rl.transforms.upstream import base_of
 
 upstream.let_none_keep_names()
 _RESET = "_reset"
+Tree = TypeVar("Tree", TensorDictBase, Composite)
 _RESET_KEYWORDS = ("tensordict", "seed", "env_ids", "options", "set_state", "select_reset_only")
 
 
@@ -188,10 +190,10 @@ class MaskedReset(EnvBase):
             root.set(key, new)
         return self._labelled(root)
 
-    def _labelled(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if tensordict.batch_dims == len(self.batch_size) and tensordict.batch_dims:
-            tensordict.names = self.dim_names
-        return tensordict
+    def _labelled(self, tree: Tree) -> Tree:
+        if tree.ndim == len(self.batch_size) and tree.ndim:
+            tree.names = self.dim_names
+        return tree
 
     def _complete_with_last_root(self, tensordict: TensorDictBase) -> None:
         """Give a partial reset the root values that it was not given."""

@@ -12,7 +12,6 @@ from torchrl.data import Composite
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
-from ksim_rl import dims
 from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.transforms.row_transform import seed_transforms
 
@@ -51,25 +50,16 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
         return copy.deepcopy(self)
 
     def _make_output_spec(self) -> Composite:
-        return self._labelled_spec(super()._make_output_spec())
+        return self._labelled(super()._make_output_spec())
 
     def _make_input_spec(self) -> Composite:
-        return self._labelled_spec(super()._make_input_spec())  # pyright: ignore[reportArgumentType]
-
-    def _labelled_spec(self, spec: Composite) -> Composite:
-        if spec.ndim == len(self.batch_size) and spec.ndim:
-            spec.names = self.dim_names
-        return spec
+        return self._labelled(super()._make_input_spec())  # pyright: ignore[reportArgumentType]
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Seed the base env and each transform; return the next seed, as TorchRL does."""
         if seed is not None:
-            self.seed_transforms_(seed)
+            seed_transforms(self, seed)
         return self.base_env.set_seed(seed, static_seed=static_seed)
-
-    def seed_transforms_(self, seed: int) -> None:
-        """Seed the transforms alone, as `set_seed` does: for a base env that has its seed already."""
-        seed_transforms(self, seed)
 
     def state_dict(self, *args: Any, **kwargs: Any) -> OrderedDict[str, Any]:
         """Return a copy of all that a bit-exact continuation needs: base env, transforms, the last root values."""
@@ -103,4 +93,4 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
         if parts[_ROOT]:
             leaves = {key: value.clone() for key, value in parts[_ROOT].items()}
             root = TensorDict(leaves, batch_size=self.batch_size, device=self.device).unflatten_keys("/")
-            self.last_root = dims.name(root, *self.dim_names) if self.batch_size else root  # pyright: ignore
+            self.last_root = self._labelled(root)

@@ -23,7 +23,7 @@ from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
 from ksim_rl.envs.task import Task
 from ksim_rl.transforms.groups.group_cfg import compile_groups
-from ksim_rl.transforms.row_transform import follow_level
+from ksim_rl.transforms.row_transform import follow_level, seed_transforms
 
 _CONFIG = "ksim_rl_env"
 # Imported by name when tasks are first asked for: they stand above this room and import it.
@@ -124,7 +124,7 @@ def build(
             raise ValueError(f"task.transforms.{name}: {reason}") from error
     seed = base_env.cfg.seed
     assert seed is not None  # an env stores the seed that it drew
-    env.seed_transforms_(seed)
+    seed_transforms(env, seed)  # alone: the base env has its seed already
     return env
 
 

@@ -1,6 +1,5 @@
 """This module finds the keys under which an env says what a step was worth and whether the episode ended."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from tensordict import TensorDictBase
@@ -43,12 +42,9 @@ def signal_keys(env: EnvBase) -> SignalKeys:
             "LineariseRewards"
         )
     done, terminated, truncated = (
-        _named(env.done_keys, name) for name in ("done", "terminated", "truncated")
+        next((key for key in env.done_keys if key == name or key[-1] == name), None)
+        for name in ("done", "terminated", "truncated")
     )
     ended = done or terminated
     assert ended is not None, "TorchRL completes the flags of every env"
     return SignalKeys(env.reward_keys[0], ended, terminated or ended, truncated)
-
-
-def _named(keys: Sequence[NestedKey], name: str) -> NestedKey | None:
-    return next((key for key in keys if key == name or key[-1] == name), None)

@@ -29,7 +29,7 @@ from ksim_rl.transforms import (
     mirror_group,
     mirror_joints,
 )
-from ksim_rl.transforms.mirror.mirror import concatenate, unchanged
+from ksim_rl.transforms.mirror.mirror import concatenate
 
 _SENSORS = {
     **dict.fromkeys(("GYRO", "TORQUE", "FRAMEANGVEL", "FRAMEANGACC", "BALLANGVEL", "SUBTREEANGMOM"), AXIAL),
@@ -95,7 +95,7 @@ _FIXED = {
     **dict.fromkeys((mdp.RootPos, mdp.RootLinVel, mdp.ProjectedGravity), POLAR),
     mdp.RootAngVel: AXIAL,
     mdp.RootQuat: QUATERNION,
-    **dict.fromkeys((mdp.EpisodeTime, mdp.RemainingTime), unchanged(1)),
+    **dict.fromkeys((mdp.EpisodeTime, mdp.RemainingTime), MirrorMap(source=(0,))),
     mdp.UniformVelocityCommand: PLANAR_VELOCITY,
 }
 for _kind, _image in _FIXED.items():
@@ -147,7 +147,7 @@ def _(term: JointAction, env: ManagerBasedRlEnv) -> MirrorMap:
         raise ValueError(
             f"clip={term.clip} is not symmetric, and some joints turn the other way in the mirror"
         )
-    return mirror.repeat(term.size(view) // mirror.size)
+    return concatenate([mirror] * (term.size(view) // mirror.size))
 
 
 def _action(env: ManagerBasedRlEnv) -> MirrorMap:

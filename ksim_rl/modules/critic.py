@@ -114,13 +114,6 @@ class Discriminator(nn.Module):
         self.normalizer = ObservationNormalizer(dim, device=device)
         self.layers = mlp(2 * dim, hidden_dims, 1, activation=activation, device=device)
 
-    @property
-    def logit_weight_1L(self) -> Float[Tensor, "1 L"]:
-        """The weights of the last layer."""
-        last = self.layers[-1]
-        assert isinstance(last, nn.Linear)
-        return last.weight
-
     def normalized(self, transition: Float[Tensor, "*batch 2 L"]) -> Float[Tensor, "*batch L+L"]:
         """Return what the layers read of transitions."""
         return self.normalizer(transition).flatten(-2)

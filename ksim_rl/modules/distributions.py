@@ -96,11 +96,6 @@ class DiagonalGaussian(VectorDistribution):
     mode = mean
 
     @property
-    def stddev(self) -> Float[Tensor, "*batch L"]:
-        """The standard deviation."""
-        return self.scale
-
-    @property
     def variance(self) -> Float[Tensor, "*batch L"]:
         """The variance."""
         return self.scale.square()

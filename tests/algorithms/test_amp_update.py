@@ -75,7 +75,7 @@ def test_logit_decay_keeps_the_last_layer_small():
     for logit_decay in (0.0, 20.0):
         trainer = make_amp(cfg={"logit_decay": logit_decay})
         trainer.iterate()
-        norms.append(trainer.update.discriminator.logit_weight_1L.norm())
+        norms.append(trainer.update.discriminator.layers[-1].weight.norm())
     assert norms[1] < 0.99 * norms[0]
 
 

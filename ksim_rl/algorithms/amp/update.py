@@ -142,7 +142,8 @@ class AMPUpdate(RolloutUpdate):
                 gradient_penalty=self.cfg.gradient_penalty,
                 mask_B=mask_B,
             )
-            loss = loss + self.cfg.logit_decay * net.logit_weight_1L.square().sum()
+            last: Any = net.layers[-1]
+            loss = loss + self.cfg.logit_decay * last.weight.square().sum()
             go_back({"loss": loss}, {"loss": self.optimizer}, mask=mask_B)
             _, skipped = step(self.optimizer, loss, max_grad_norm=self.cfg.max_grad_norm)
             self.guard.count_(skipped)

@@ -20,15 +20,13 @@ class ObservationManager:
         self._view = view = driver.view
         self.terms = {name: cfg.term for group in groups.values() for name, cfg in group.terms.items()}
         for name, reading in self.read().items():
-            image = getattr(self.terms[name], "is_image", False)
-            fits = reading.ndim in (3, 4) and reading.dtype in IMAGE_DTYPES
-            if not image:
+            if getattr(self.terms[name], "is_image", False):
+                fits = reading.ndim in (3, 4) and reading.dtype in IMAGE_DTYPES
+                expected = f"[{view.num_envs}, H, W] or [{view.num_envs}, H, W, C], float32, int32 or uint8"
+            else:
                 fits = reading.ndim == 2 and reading.dtype == torch.float32
-            if not fits or reading.shape[0] != view.num_envs:
                 expected = f"torch.float32 [{view.num_envs}, L], one row per env"
-                if image:
-                    whole = f"{view.num_envs}, H, W"
-                    expected = f"[{whole}] or [{whole}, C], float32, int32 or uint8"
+            if not fits or reading.shape[0] != view.num_envs:
                 raise ValueError(
                     f"observation term {name!r} returns {reading.dtype} {tuple(reading.shape)}: expected {expected}"
                 )

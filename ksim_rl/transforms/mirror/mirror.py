@@ -56,10 +56,6 @@ class MirrorMap:
         """Return source (int64; None if no column moves) and signs (float32), [L]."""
         return _tensors(self, device)
 
-    def repeat(self, times: int) -> "MirrorMap":
-        """Return the map of `times` such vectors one after another: a flat history, say."""
-        return concatenate([self] * times)
-
 
 def image(
     vector: Shaped[Tensor, "*batch L"], source_L: Int64[Tensor, " L"] | None, signs_L: Float32[Tensor, " L"]
@@ -85,11 +81,6 @@ def concatenate(maps: Sequence[MirrorMap]) -> MirrorMap:
         source += [start + column for column in mirror.source]
         signs += mirror.signs
     return MirrorMap(source=tuple(source), signs=tuple(signs))
-
-
-def unchanged(size: int) -> MirrorMap:
-    """Return the map of a vector that is its own mirror image: heights, phases common to both sides."""
-    return MirrorMap(source=tuple(range(size)))
 
 
 POLAR = MirrorMap(source=(0, 1, 2), signs=(1, -1, 1))

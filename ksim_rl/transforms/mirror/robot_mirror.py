@@ -124,5 +124,5 @@ def mirror_group(group: GroupSpec, terms: Mapping[NestedKey, MirrorMap]) -> Mirr
             raise ValueError(
                 f"term {key!r} has {size} columns, and its mirror map {mirror.size}: expected a multiple"
             )
-        maps.append(mirror.repeat(size // mirror.size))
+        maps += [mirror] * (size // mirror.size)
     return concatenate(maps)
