@@ -9,7 +9,7 @@ UNROLL
         float product = 0.0f;
 UNROLL
         for (int dof = 0; dof < NV; ++dof)
-            product += mass[slot_of(block) * STRIDE + dof] * shared[dof];
+            product += mass[dof * STRIDE + slot_of(block)] * shared[dof];
         result[block] = fabsf(own[block]) <= LARGEST ? product : own[block];
     }
 };

@@ -48,7 +48,7 @@ UNROLL
         const float* const of_limb = mass + (slot_of(block) - wp::max(places[block] - LIMB_BEGIN, 0)) * STRIDE;
 UNROLL
         for (int place = 0; place < TRUNK; ++place)
-            own_row[block][place] = mass[slot_of(block) * STRIDE + place];
+            own_row[block][place] = mass[place * STRIDE + slot_of(block)];
 UNROLL
         for (int place = 0; place < LIMB; ++place)
             own_row[block][LIMB_BEGIN + place] = of_limb[place * STRIDE + slot_of(block)];
