@@ -15,16 +15,16 @@ T = TypeVar("T")
 def reached(points: Sequence[Point], levels: Mapping[str, float]) -> Point | None:
     """Return the end of the first `HELD_STATES` env states over which all levels hold in the mean; None: never.
 
-    Points have "env_states" and metrics by name. A metric that a point lacks is minus infinite.
+    Points have "env_states" and metrics by name. One that a point lacks, as no episode ended then, counts in no mean; a
+    level of a metric that none of these points has does not hold.
     """
     for index, point in enumerate(points):
         end = point["env_states"] + HELD_STATES
         held = [other for other in points[index:] if other["env_states"] <= end]
         if points[-1]["env_states"] < end:
             return None
-        if all(
-            statistics.fmean(p.get(name, -math.inf) for p in held) >= level for name, level in levels.items()
-        ):
+        logged = {name: [other[name] for other in held if name in other] for name in levels}
+        if all(values and statistics.fmean(values) >= levels[name] for name, values in logged.items()):
             return held[-1]
     return None
 

@@ -26,6 +26,14 @@ def test_a_level_must_hold_in_the_mean_over_a_million_env_states():
     assert reached(curve(1.5, 1.5, 1.5), LEVELS | {"absent": 0.0}) is None
 
 
+def test_a_point_without_ended_episodes_counts_in_no_mean():
+    points = curve(1.5, 1.5, 1.5)
+    del points[1]["linear"], points[1]["angular"]
+    assert reached(points, LEVELS) is points[2]
+    points[2]["linear"] = 1.2
+    assert reached(points, LEVELS) is None, "1.35 in the mean of those that are there"
+
+
 def seeds(*seconds, falls=0.0):
     return [{"seconds_to_levels": value, "falls": falls} for value in seconds]
 
