@@ -70,7 +70,7 @@ def takes_conditional_nodes(warp_model: mjw.Model, *, supported: bool) -> bool:
 
 
 def most_registers(floats: int) -> int | None:
-    """Return how many registers let as many worlds run at once as their shared memory does, or None for any number."""
+    """Return how many registers let as many worlds run at once as shared memory does, at least 80, or None for any."""
     worlds = SHARED_BYTES // (4 * floats + 1024)
     most = max(LEAST_REGISTERS, 512 // -(-worlds // 4) // 8 * 8)
     return most if most <= MOST_REGISTERS else None
