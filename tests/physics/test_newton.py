@@ -228,8 +228,8 @@ def test_registers_are_bounded_so_that_as_many_worlds_run_at_once_as_shared_memo
         assert by_memory <= 16
         return
     warps_of_a_quarter = 65_536 // 4 // (32 * registers)
-    assert registers % 8 == 0 and 80 <= registers <= 128
-    assert 4 * warps_of_a_quarter >= by_memory or registers == 80, "with fewer, values would lie in memory"
+    assert registers % 8 == 0 and newton.LEAST_REGISTERS <= registers <= 128
+    assert 4 * warps_of_a_quarter >= by_memory or registers == newton.LEAST_REGISTERS
 
 
 def broken_invariants(world: World, substeps: int) -> Invariant:

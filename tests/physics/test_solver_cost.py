@@ -6,6 +6,7 @@ import pytest
 
 from benchmarks.agreement_models import QUADRUPED
 from ksim_rl.physics import load_model
+from ksim_rl.physics.newton import solver as newton
 from tests.physics.solver_models import SYNTHETIC, check_cost
 
 # Of these, one has all kinds of rows, and one a ball a thousand times lighter than its links: rounding eats pivots of
@@ -30,6 +31,23 @@ def test_the_cost_on_a_robot():
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_the_cost_on_menagerie_robots(robot):
     check_cost(load_model(robot), num_envs=16)
+
+
+@pytest.mark.parametrize("index", SHORT)
+def test_a_solver_that_stops_early_fails(index, monkeypatch):
+    whole = newton.solver
+
+    def stops_early(m, d):
+        def solve(**what):
+            with monkeypatch.context() as context:
+                context.setattr(m.opt, "iterations", 1)
+                whole(m, d)(**what)
+
+        return solve
+
+    monkeypatch.setattr(newton, "solver", stops_early)
+    with pytest.raises(AssertionError, match="MuJoCo Warp"):
+        check_cost(load_model(SYNTHETIC[index].xml()), num_envs=64)
 
 
 def test_the_models_cover_what_a_solver_meets():
