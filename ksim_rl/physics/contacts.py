@@ -4,8 +4,9 @@ from collections.abc import Callable
 
 import mujoco_warp as mjw
 import numpy as np
+import warp as wp
 
-from ksim_rl.physics import native, upstream
+from ksim_rl.physics import kernels, upstream
 from ksim_rl.physics.height_field.contacts import take_over_height_fields
 
 
@@ -19,7 +20,7 @@ def follow_the_c_engine(warp_model: mjw.Model) -> None:
     if height_fields := take_over_height_fields(warp_model):
         hooks.append(height_fields)
     types = warp_model.geom_type.numpy()[upstream.geom_pairs(warp_model)[0]]
-    if (np.sort(types) == (mjw.GeomType.PLANE, mjw.GeomType.CAPSULE)).all(-1).any():
+    if (np.sort(types) == (kernels.PLANE, kernels.CAPSULE)).all(-1).any():
         hooks.append(align_steep_capsules)
     if hooks:
         # MuJoCo Warp calls it after its own collision pass.
@@ -30,10 +31,6 @@ def follow_the_c_engine(warp_model: mjw.Model) -> None:
 
 def align_steep_capsules(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
     """Launch what turns the contacts of steep capsules with planes, which our own narrow phase need not."""
-    source, threads = (
-        native.source_of("collision", ("steep_capsules",)),
-        32 if warp_data_E.qpos.device.is_cuda else 1,
-    )
-    native.launcher(
-        source, upstream.GEOM_TYPES, {}, warp_model, warp_data_E, lanes=threads, threads=threads
-    )()
+    contact = warp_data_E.contact
+    inputs = [warp_model.geom_type, warp_data_E.geom_xmat, contact.geom, contact.worldid, warp_data_E.nacon]
+    wp.launch(kernels.align_steep_capsules, dim=warp_data_E.naconmax, inputs=inputs, outputs=[contact.frame])

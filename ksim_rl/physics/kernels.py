@@ -4,7 +4,38 @@
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false
 
+import mujoco_warp as mjw
 import warp as wp
+
+PLANE, CAPSULE = int(mjw.GeomType.PLANE), int(mjw.GeomType.CAPSULE)
+# Below this tilt, rad, the direction of a capsule is rounding of float32.
+UPRIGHT = wp.constant(1.0e-6)
+
+
+@wp.kernel(enable_backward=False)
+def align_steep_capsules(
+    geom_type: wp.array[int],
+    geom_xmat: wp.array2d[wp.mat33],
+    geom: wp.array[wp.vec2i],
+    world: wp.array[int],
+    nacon: wp.array[int],
+    frame: wp.array[wp.mat33],
+):
+    """Let the first tangent of a contact of plane and capsule follow the capsule, however steep it stands."""
+    contact = wp.tid()
+    if contact >= nacon[0]:
+        return
+    plane, capsule = geom[contact][0], geom[contact][1]
+    if plane < 0 or capsule < 0 or geom_type[plane] != PLANE or geom_type[capsule] != CAPSULE:
+        return
+    turn, normal = geom_xmat[world[contact], capsule], frame[contact][0]
+    axis = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
+    tangent = axis - wp.dot(axis, normal) * normal
+    length = wp.length(tangent)
+    # MuJoCo Warp does so itself from a length of 0.5 on; an upright capsule has no direction to follow.
+    if length < 0.5 and length > UPRIGHT:
+        tangent = tangent / length
+        frame[contact] = wp.matrix_from_rows(normal, tangent, wp.cross(normal, tangent))
 
 
 @wp.kernel(enable_backward=False)
