@@ -145,6 +145,7 @@ def _launcher(
         "drivers": np.argsort(driven, kind="stable"),
         "eliminated": _eliminated(m),
         "leaves": _leaves(m),
+        **_changes(m),
     }
     own = {**WHOLE, **given} | {
         name: wp.array(table, dtype=int, device=device) for name, table in tables.items()
@@ -218,6 +219,19 @@ def _leaves(warp_model: mjw.Model) -> np.ndarray:
     m = warp_model
     row, column = m.M_hinit_i.numpy(), m.M_colind.numpy()
     return np.setdiff1d(_eliminated(m), column[row != column])
+
+
+def _changes(warp_model: mjw.Model) -> dict[str, list[int]]:
+    """Return which entries change as each degree of freedom is eliminated, and where those of each begin."""
+    m, changes, first = warp_model, [], [0]
+    starts, columns = m.M_rowadr.numpy(), m.M_colind.numpy()
+    for dof in _eliminated(m):
+        ancestors = columns[starts[dof] : starts[dof] + m.M_rownnz.numpy()[dof] - 1]
+        for other, ancestor in enumerate(ancestors):
+            changes += [starts[ancestor] + place << 14 | place << 7 | other for place in range(other + 1)]
+            changes.append(columns.size + ancestor << 14 | other << 7 | len(ancestors))
+        first.append(len(changes))
+    return {"changes": changes, "first_change": first}
 
 
 def _has_affine_actuators(warp_model: mjw.Model) -> bool:
