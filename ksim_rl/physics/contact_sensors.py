@@ -1,13 +1,15 @@
 """This module reads contact sensors, and the forces that contacts exert on bodies, from each world's list of contacts.
 
 MuJoCo Warp sums and chooses in the order in which its threads come, which on a GPU is another one in each run. The
-kernels are rows/wrench.cpp with rows/sensors.cpp, and with rows/bodies.cpp.
+kernels are rows/wrench.cpp with rows/sensors.cpp, and with rows/bodies.cpp. The first reads accelerometers as well, for
+which MuJoCo Warp computes accelerations and forces of all bodies.
 """
 
 import dataclasses
 
 import mujoco
 import mujoco_warp as mjw
+import numpy as np
 import warp as wp
 
 from ksim_rl.physics import native
@@ -37,8 +39,14 @@ def read_by_us(mj_model: mujoco.MjModel) -> list[int]:
     ]
 
 
+def accelerometers(mj_model: mujoco.MjModel) -> list[int]:
+    """Return the accelerometers that the kernel reads: those without delay and cutoff."""
+    plain = ~mj_model.sensor_history.any(-1) & (mj_model.sensor_cutoff == 0.0)
+    return np.flatnonzero(plain & (mj_model.sensor_type == mujoco.mjtSensor.mjSENS_ACCELEROMETER)).tolist()
+
+
 class ContactReadings:
-    """What a substep reads of its contacts once their forces are known.
+    """What a substep reads of its contacts, and of accelerations, once their forces are known.
 
     Attributes:
         sensors: the ids of the sensors that `read_sensors` reads, and MuJoCo Warp need not.
@@ -48,7 +56,8 @@ class ContactReadings:
         self, mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data, lists: ContactLists
     ) -> None:
         m, d = warp_model, warp_data_E
-        self.sensors = read_by_us(mj_model)
+        of_contacts, of_accelerations = read_by_us(mj_model), accelerometers(mj_model)
+        self.sensors = of_contacts + of_accelerations
         own = {
             **vars(lists),
             "sensors": wp.array(self.sensors, dtype=int, device=d.qpos.device),
@@ -62,13 +71,17 @@ class ContactReadings:
             "njmax": d.njmax,
             "elliptic": m.opt.cone == mjw.ConeType.ELLIPTIC,
             "bodies": m.nbody,
-            "sensors": len(self.sensors),
+            "sensors": len(of_contacts),
+            "accelerometers": len(of_accelerations),
+            "num_dofs": m.nv,
+            "gravity": not m.opt.disableflags & mjw.DisableBit.GRAVITY,
             "sum": NET[1],
             "nothing": NOTHING,
             "geom": GEOM,
             "subtree": SUBTREE,
         }
-        sources = [native.source_of("rows", ("layout", "wrench", part)) for part in ("sensors", "bodies")]
+        parts = ("sensors", "accelerometers"), ("bodies",)
+        sources = [native.source_of("rows", ("layout", "wrench", *own_parts)) for own_parts in parts]
         self._read_sensors, self._sum_forces = (
             native.launcher(source, constants, own, m, d, lanes=lists.lanes, threads=lists.threads)
             for source in sources
@@ -81,7 +94,7 @@ class ContactReadings:
         self._lists.order()
 
     def read_sensors(self) -> None:
-        """Write the sensors that contacts match; the others have to be zero before."""
+        """Write accelerometers and the sensors that contacts match; the others have to be zero before."""
         if self.sensors:
             self._read_sensors()
 

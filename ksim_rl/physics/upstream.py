@@ -39,6 +39,11 @@ GEOM_TYPES = {kind.name: int(kind) for kind in mjw.GeomType}
 FIXED = int(mjw.SetConstGroup.FIXED)
 # The two columns of `nxn_pairid` for a pair that never makes a contact, and for one that no sensor measures.
 NO_CONTACT, NO_SENSOR = -2, -1
+# Those for which it computes accelerations and forces of all bodies.
+FORCE_SENSORS = [
+    getattr(mujoco.mjtSensor, f"mjSENS_{name}")
+    for name in ("ACCELEROMETER", "FORCE", "TORQUE", "FRAMELINACC", "FRAMEANGACC")
+]
 
 
 def per_world_fields() -> tuple[str, ...]:
@@ -135,10 +140,19 @@ def with_contact_sensors_only(warp_model: mjw.Model) -> mjw.Model:
     return dataclasses.replace(warp_model, **own, **counts)
 
 
-def contact_sensors_but(warp_model: mjw.Model, sensors: Sequence[int]) -> wp.array:
-    """Return the contact sensors with forces that MuJoCo Warp computes itself, if it leaves some out."""
-    left = [sensor for sensor in warp_model.sensor_contact_acc_adr.numpy() if sensor not in sensors]
-    return wp.array(left, dtype=int)
+def without(sensors: Sequence[int], warp_model: mjw.Model) -> mjw.Model:
+    """Return a model on the same arrays that leaves out these sensors of contacts and accelerations.
+
+    It computes forces of all bodies only if a sensor that is left reads them.
+    """
+    lists = {name: getattr(warp_model, name).numpy() for name in ("sensor_contact_acc_adr", "sensor_acc_adr")}
+    left = {name: ids[~np.isin(ids, sensors)] for name, ids in lists.items()}
+    reads_forces = np.isin(warp_model.sensor_type.numpy()[left["sensor_acc_adr"]], FORCE_SENSORS).any()
+    return dataclasses.replace(
+        warp_model,
+        **{name: wp.array(ids, dtype=int) for name, ids in left.items()},
+        sensor_rne_postconstraint=bool(warp_model.sensor_rne_postconstraint and reads_forces),
+    )
 
 
 def collide_boxes_exactly(warp_model: mjw.Model) -> None:
