@@ -126,7 +126,7 @@ class Substeps:
             return
         m.opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
         if sensors in ("kept", "all"):
-            m.sensor_rne_postconstraint |= FORCES_OF_BODIES <= self.refreshed_on_demand
+            m.sensor_rne_postconstraint |= self.refreshed_on_demand >= FORCES_OF_BODIES
         is_read = is_last or sensors != "none" or self._always_senses or m.opt.run_rne_postconstraint
         is_read |= self._make_rows is None or self._integrate is None
         if dynamics is not None:
