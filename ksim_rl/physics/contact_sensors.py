@@ -20,29 +20,19 @@ _FOUND, _FORCE, _POSITION, _NORMAL, _TANGENT = 1 << 0, 1 << 1, 1 << 4, 1 << 5, 1
 NET = (_FOUND | _FORCE | _POSITION, 3, 1)
 # A single contact's force is in the axes of that contact, which are needed to turn it.
 STRONGEST = (NET[0] | _NORMAL | _TANGENT, 2, 1)
-NOTHING, GEOM, BODY, SUBTREE = (
-    int(getattr(mujoco.mjtObj, f"mjOBJ_{name}")) for name in ("UNKNOWN", "GEOM", "BODY", "XBODY")
-)
+_KINDS = {"nothing": "UNKNOWN", "geom": "GEOM", "body": "BODY", "subtree": "XBODY"}
+MATCHED = {name: int(getattr(mujoco.mjtObj, f"mjOBJ_{theirs}")) for name, theirs in _KINDS.items()}
 
 
-def read_by_us(mj_model: mujoco.MjModel) -> list[int]:
-    """Return the contact sensors that the kernel reads: the kinds of `ContactSensor`, without delay and cutoff."""
-    return [
-        sensor
-        for sensor in range(mj_model.nsensor)
-        if mj_model.sensor_type[sensor] == mujoco.mjtSensor.mjSENS_CONTACT
-        and tuple(mj_model.sensor_intprm[sensor, :3].tolist()) in (NET, STRONGEST)
-        and mj_model.sensor_objtype[sensor] in (GEOM, BODY, SUBTREE)
-        and mj_model.sensor_reftype[sensor] in (NOTHING, GEOM, BODY, SUBTREE)
-        and not mj_model.sensor_history[sensor].any()
-        and not mj_model.sensor_cutoff[sensor]
-    ]
-
-
-def accelerometers(mj_model: mujoco.MjModel) -> list[int]:
-    """Return the accelerometers that the kernel reads: those without delay and cutoff."""
-    plain = ~mj_model.sensor_history.any(-1) & (mj_model.sensor_cutoff == 0.0)
-    return np.flatnonzero(plain & (mj_model.sensor_type == mujoco.mjtSensor.mjSENS_ACCELEROMETER)).tolist()
+def read_by_us(mj_model: mujoco.MjModel) -> tuple[list[int], list[int]]:
+    """Return the sensors that the kernel reads, without delay and cutoff: kinds of `ContactSensor`, accelerometers."""
+    m, kinds, objects = mj_model, mujoco.mjtSensor, list(MATCHED.values())
+    plain = ~m.sensor_history.any(-1) & (m.sensor_cutoff == 0.0)
+    known = (m.sensor_intprm[:, None, :3] == (NET, STRONGEST)).all(-1).any(-1)
+    known &= np.isin(m.sensor_objtype, objects[1:]) & np.isin(m.sensor_reftype, objects)
+    of_contacts = plain & known & (m.sensor_type == kinds.mjSENS_CONTACT)
+    accelerometers = plain & (m.sensor_type == kinds.mjSENS_ACCELEROMETER)
+    return np.flatnonzero(of_contacts).tolist(), np.flatnonzero(accelerometers).tolist()
 
 
 class ContactReadings:
@@ -56,8 +46,8 @@ class ContactReadings:
         self, mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data, lists: ContactLists
     ) -> None:
         m, d = warp_model, warp_data_E
-        of_contacts, of_accelerations = read_by_us(mj_model), accelerometers(mj_model)
-        self.sensors = of_contacts + of_accelerations
+        of_contacts, accelerometers = read_by_us(mj_model)
+        self.sensors = of_contacts + accelerometers
         own = {
             **vars(lists),
             "sensors": wp.array(self.sensors, dtype=int, device=d.qpos.device),
@@ -67,18 +57,15 @@ class ContactReadings:
         self._without_pool = dataclasses.replace(d, xfrc_applied=own["forces"], naconmax=0)
         self._lists = lists
         constants = {
-            **lists.constants,
+            **(lists.constants | MATCHED),
             "njmax": d.njmax,
             "elliptic": m.opt.cone == mjw.ConeType.ELLIPTIC,
             "bodies": m.nbody,
             "sensors": len(of_contacts),
-            "accelerometers": len(of_accelerations),
+            "accelerometers": len(accelerometers),
             "num_dofs": m.nv,
             "gravity": not m.opt.disableflags & mjw.DisableBit.GRAVITY,
             "sum": NET[1],
-            "nothing": NOTHING,
-            "geom": GEOM,
-            "subtree": SUBTREE,
         }
         parts = ("sensors", "accelerometers"), ("bodies",)
         sources = [native.source_of("rows", ("layout", "wrench", *own_parts)) for own_parts in parts]

@@ -86,9 +86,8 @@ class Substeps:
             self.contact_lists = ContactLists(warp_model, warp_data_E)
             self._make_rows = constraint_rows(warp_model, warp_data_E, self.contact_lists)
             self._contacts = ContactReadings(mj_model, warp_model, warp_data_E, self.contact_lists)
-            self._models = {
-                which: upstream.without(self._contacts.sensors, m) for which, m in self._models.items()
-            }
+            without = partial(upstream.without, self._contacts.sensors)
+            self._models = {which: without(m) for which, m in self._models.items()}
             if own_broad_phase:
                 self._collide = collisions(warp_model, warp_data_E, self.contact_lists)
         if one_kernel_integration:
@@ -132,18 +131,9 @@ class Substeps:
         if dynamics is not None:
             empties_pool = self._collide is not None and m.opt.run_collision_detection
             dynamics = partial(dynamics, is_read=is_read, empties_pool=empties_pool)
-        newton.step(
-            m,
-            self.warp_data_E,
-            self._solve,
-            dynamics,
-            self._make_rows,
-            self._contacts,
-            self._integrate,
-            self._aside,
-            self._collide,
-            sensors=sensors != "none" or self._always_senses,
-        )
+        stages = self._solve, dynamics, self._make_rows, self._contacts, self._integrate
+        senses = sensors != "none" or self._always_senses
+        newton.step(m, self.warp_data_E, *stages, self._aside, self._collide, sensors=senses)
 
     def refresh(self, *, masked: bool = False) -> None:
         """Launch what recomputes position- and velocity-stage quantities from the present qpos and qvel.

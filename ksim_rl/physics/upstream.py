@@ -39,11 +39,8 @@ GEOM_TYPES = {kind.name: int(kind) for kind in mjw.GeomType}
 FIXED = int(mjw.SetConstGroup.FIXED)
 # The two columns of `nxn_pairid` for a pair that never makes a contact, and for one that no sensor measures.
 NO_CONTACT, NO_SENSOR = -2, -1
-# Those for which it computes accelerations and forces of all bodies.
-FORCE_SENSORS = [
-    getattr(mujoco.mjtSensor, f"mjSENS_{name}")
-    for name in ("ACCELEROMETER", "FORCE", "TORQUE", "FRAMELINACC", "FRAMEANGACC")
-]
+# Of what is in `sensor_acc_adr`, those that read no accelerations and forces of bodies.
+FORCELESS = mujoco.mjtSensor.mjSENS_ACTUATORFRC, mujoco.mjtSensor.mjSENS_JOINTACTFRC
 
 
 def per_world_fields() -> tuple[str, ...]:
@@ -116,17 +113,17 @@ def sensors_by_refresh(
     )
     lists = ("limitpos", "limitvel", "contact_pos", "contact_vel", "stage_pos", "stage_vel")
     keeps_rays = bool(np.any(skip & (sensor_type == mujoco.mjtSensor.mjSENS_RANGEFINDER)))
-    rays, no_rays = {"nrangefinder": warp_model.nrangefinder}, {"nrangefinder": 0}
+    rays = warp_model.nrangefinder
     of_refresh = dataclasses.replace(
         warp_model,
         **{f"sensor_{name}_adr": none for name in lists},
         **refreshed,
-        **no_rays if keeps_rays else rays,
+        nrangefinder=0 if keeps_rays else rays,
         nsensorcollision=0,
         nsensortaxel=0,
     )
     sums = dict.fromkeys(("sensor_subtree_vel", "sensor_e_potential", "sensor_e_kinetic"), False)
-    of_substep = dataclasses.replace(warp_model, **kept, **sums, **rays if keeps_rays else no_rays)
+    of_substep = dataclasses.replace(warp_model, **kept, **sums, nrangefinder=rays if keeps_rays else 0)
     return of_refresh, of_substep
 
 
@@ -145,13 +142,13 @@ def without(sensors: Sequence[int], warp_model: mjw.Model) -> mjw.Model:
 
     It computes forces of all bodies only if a sensor that is left reads them.
     """
-    lists = {name: getattr(warp_model, name).numpy() for name in ("sensor_contact_acc_adr", "sensor_acc_adr")}
-    left = {name: ids[~np.isin(ids, sensors)] for name, ids in lists.items()}
-    reads_forces = np.isin(warp_model.sensor_type.numpy()[left["sensor_acc_adr"]], FORCE_SENSORS).any()
+    m, lists = warp_model, (warp_model.sensor_contact_acc_adr.numpy(), warp_model.sensor_acc_adr.numpy())
+    of_contacts, others = (ids[~np.isin(ids, sensors)] for ids in lists)
     return dataclasses.replace(
-        warp_model,
-        **{name: wp.array(ids, dtype=int) for name, ids in left.items()},
-        sensor_rne_postconstraint=bool(warp_model.sensor_rne_postconstraint and reads_forces),
+        m,
+        sensor_contact_acc_adr=wp.array(of_contacts, dtype=int),
+        sensor_acc_adr=wp.array(others, dtype=int),
+        sensor_rne_postconstraint=not np.isin(m.sensor_type.numpy()[others], FORCELESS).all(),
     )
 
 

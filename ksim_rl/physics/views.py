@@ -27,10 +27,8 @@ _REFRESHED = (
 CAMERAS_AND_LIGHTS = frozenset(("cam_xpos", "cam_xmat", "light_xpos", "light_xdir"))
 SUBTREE_VELOCITIES = frozenset(("subtree_linvel", "subtree_angmom"))
 FORCES_OF_BODIES = frozenset(("cacc", "cfrc_int", "cfrc_ext"))
-ON_DEMAND_TOGETHER = (
-    *(CAMERAS_AND_LIGHTS, SUBTREE_VELOCITIES, FORCES_OF_BODIES),
-    *({"ten_velocity"}, {"M"}, {"qfrc_bias"}),
-)
+_ALONE = tuple({name} for name in ("ten_velocity", "M", "qfrc_bias"))
+ON_DEMAND_TOGETHER = (CAMERAS_AND_LIGHTS, SUBTREE_VELOCITIES, FORCES_OF_BODIES, *_ALONE)
 ON_DEMAND = frozenset().union(*ON_DEMAND_TOGETHER)
 ACCELERATION_STAGE, SUBSTEP_INPUTS = tuple(_ACCELERATION_STAGE.split()), tuple(_INPUTS.split())
 STATE = (*SUBSTEP_INPUTS, *_KEPT.split(), *ACCELERATION_STAGE)

@@ -61,7 +61,7 @@ def place(world: World) -> None:
 
 def columns(mj_model: mujoco.MjModel, *, ours: bool) -> np.ndarray:
     read, (contact,) = (
-        read_by_us(mj_model),
+        read_by_us(mj_model)[0],
         (mj_model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT).nonzero(),
     )
     spans = zip(mj_model.sensor_adr[contact], mj_model.sensor_dim[contact], strict=True)
@@ -87,7 +87,7 @@ def share_that_agrees(
     The others read another contact that is as strong: rounding decides, or the order of what exerts no force.
     """
     agreeing, scale = [], max(1.0, float(np.abs(expected[columns(mj_model, ours=True)]).max()))
-    for sensor in read_by_us(mj_model):
+    for sensor in read_by_us(mj_model)[0]:
         at, dim = mj_model.sensor_adr[sensor], mj_model.sensor_dim[sensor]
         own, other = read[at : at + dim], expected[at : at + dim]
         assert own[0] == other[0]
@@ -100,7 +100,7 @@ def share_that_agrees(
 
 def test_values_are_those_of_mujoco_warp_which_reads_the_other_kinds(world: World):
     ours, theirs = (columns(world.mj_model, ours=ours) for ours in (True, False))
-    assert len(read_by_us(world.mj_model)) == 40
+    assert len(read_by_us(world.mj_model)[0]) == 40
     read = world.sensordata_EL.numpy().copy()
     assert (read[:-1, ours] != 0.0).mean() > 0.2 and (read[:-1, theirs] != 0.0).mean() > 0.2
     with wp.ScopedDevice("cpu"):

@@ -142,9 +142,8 @@ def step(
     The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
     not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel; `make_rows`,
     which needs it, the constraint rows as one, with the lists of contacts that `contacts` reads; and `integrate` what
-    advances the state. `collide` is a collision pass other than MuJoCo Warp's. On a stream `aside`, dynamics are
-    computed beside what places geoms, that pass, and the solver's order of the worlds, by the last substep. Then it
-    solves beside the sensors of positions and velocities.
+    advances the state. `collide` is a collision pass other than MuJoCo Warp's. On a stream `aside`, dynamics go on
+    beside that pass and the solver's order of the worlds, by the last substep; then it solves beside some sensors.
     """
     m, d = warp_model, warp_data_E
     if dynamics is None or m.callback.sensor:
