@@ -7,11 +7,13 @@ each(ACCELEROMETERS, [&](int place) {
     wp::vec_t<6, float> rising(0.0f);
     for (int axis = 0; axis < 3; ++axis)
         rising[3 + axis] = GRAVITY ? -problem.gravity.data[problem.gravity.shape[0] > 1 ? world : 0][axis] : 0.0f;
-    for (int dof = 0; dof < NUM_DOFS; ++dof)
-        if (moves[dof]) {
-            rising += row_of(problem.cdof_dot)[dof] * row_of(problem.qvel)[dof];
-            rising += row_of(problem.cdof)[dof] * row_of(problem.qacc)[dof];
-        }
+    // All are read, also those that do not move it, so that several are on their way at once.
+#pragma unroll 5
+    for (int dof = 0; dof < NUM_DOFS; ++dof) {
+        const auto carried = rising + row_of(problem.cdof_dot)[dof] * row_of(problem.qvel)[dof];
+        const auto moved = carried + row_of(problem.cdof)[dof] * row_of(problem.qacc)[dof];
+        rising = moves[dof] ? moved : rising;
+    }
     const auto& moving = row_of(problem.cvel)[body];
     const wp::mat33 back = wp::transpose(row_of(problem.site_xmat)[site]);
     const vec3 arm = row_of(problem.site_xpos)[site] - row_of(problem.subtree_com)[problem.body_rootid.data[body]];
