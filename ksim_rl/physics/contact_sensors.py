@@ -1,13 +1,15 @@
 """This module reads contact sensors, and the forces that contacts exert on bodies, from each world's list of contacts.
 
 MuJoCo Warp sums and chooses in the order in which its threads come, which on a GPU is another one in each run. The
-kernels are rows/wrench.cpp with rows/sensors.cpp, and with rows/bodies.cpp.
+kernels are rows/wrench.cpp with rows/sensors.cpp, and with rows/bodies.cpp. The first reads accelerometers as well, for
+which MuJoCo Warp computes accelerations and forces of all bodies.
 """
 
 import dataclasses
 
 import mujoco
 import mujoco_warp as mjw
+import numpy as np
 import warp as wp
 
 from ksim_rl.physics import native
@@ -18,27 +20,23 @@ _FOUND, _FORCE, _POSITION, _NORMAL, _TANGENT = 1 << 0, 1 << 1, 1 << 4, 1 << 5, 1
 NET = (_FOUND | _FORCE | _POSITION, 3, 1)
 # A single contact's force is in the axes of that contact, which are needed to turn it.
 STRONGEST = (NET[0] | _NORMAL | _TANGENT, 2, 1)
-NOTHING, GEOM, BODY, SUBTREE = (
-    int(getattr(mujoco.mjtObj, f"mjOBJ_{name}")) for name in ("UNKNOWN", "GEOM", "BODY", "XBODY")
-)
+_KINDS = {"nothing": "UNKNOWN", "geom": "GEOM", "body": "BODY", "subtree": "XBODY"}
+MATCHED = {name: int(getattr(mujoco.mjtObj, f"mjOBJ_{theirs}")) for name, theirs in _KINDS.items()}
 
 
-def read_by_us(mj_model: mujoco.MjModel) -> list[int]:
-    """Return the contact sensors that the kernel reads: the kinds of `ContactSensor`, without delay and cutoff."""
-    return [
-        sensor
-        for sensor in range(mj_model.nsensor)
-        if mj_model.sensor_type[sensor] == mujoco.mjtSensor.mjSENS_CONTACT
-        and tuple(mj_model.sensor_intprm[sensor, :3].tolist()) in (NET, STRONGEST)
-        and mj_model.sensor_objtype[sensor] in (GEOM, BODY, SUBTREE)
-        and mj_model.sensor_reftype[sensor] in (NOTHING, GEOM, BODY, SUBTREE)
-        and not mj_model.sensor_history[sensor].any()
-        and not mj_model.sensor_cutoff[sensor]
-    ]
+def read_by_us(mj_model: mujoco.MjModel) -> tuple[list[int], list[int]]:
+    """Return the sensors that the kernel reads, without delay and cutoff: kinds of `ContactSensor`, accelerometers."""
+    m, kinds, objects = mj_model, mujoco.mjtSensor, list(MATCHED.values())
+    plain = ~m.sensor_history.any(-1) & (m.sensor_cutoff == 0.0)
+    known = (m.sensor_intprm[:, None, :3] == (NET, STRONGEST)).all(-1).any(-1)
+    known &= np.isin(m.sensor_objtype, objects[1:]) & np.isin(m.sensor_reftype, objects)
+    of_contacts = plain & known & (m.sensor_type == kinds.mjSENS_CONTACT)
+    accelerometers = plain & (m.sensor_type == kinds.mjSENS_ACCELEROMETER)
+    return np.flatnonzero(of_contacts).tolist(), np.flatnonzero(accelerometers).tolist()
 
 
 class ContactReadings:
-    """What a substep reads of its contacts once their forces are known.
+    """What a substep reads of its contacts, and of accelerations, once their forces are known.
 
     Attributes:
         sensors: the ids of the sensors that `read_sensors` reads, and MuJoCo Warp need not.
@@ -48,7 +46,8 @@ class ContactReadings:
         self, mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data, lists: ContactLists
     ) -> None:
         m, d = warp_model, warp_data_E
-        self.sensors = read_by_us(mj_model)
+        of_contacts, accelerometers = read_by_us(mj_model)
+        self.sensors = of_contacts + accelerometers
         own = {
             **vars(lists),
             "sensors": wp.array(self.sensors, dtype=int, device=d.qpos.device),
@@ -58,17 +57,18 @@ class ContactReadings:
         self._without_pool = dataclasses.replace(d, xfrc_applied=own["forces"], naconmax=0)
         self._lists = lists
         constants = {
-            **lists.constants,
+            **(lists.constants | MATCHED),
             "njmax": d.njmax,
             "elliptic": m.opt.cone == mjw.ConeType.ELLIPTIC,
             "bodies": m.nbody,
-            "sensors": len(self.sensors),
+            "sensors": len(of_contacts),
+            "accelerometers": len(accelerometers),
+            "num_dofs": m.nv,
+            "gravity": not m.opt.disableflags & mjw.DisableBit.GRAVITY,
             "sum": NET[1],
-            "nothing": NOTHING,
-            "geom": GEOM,
-            "subtree": SUBTREE,
         }
-        sources = [native.source_of("rows", ("layout", "wrench", part)) for part in ("sensors", "bodies")]
+        parts = ("sensors", "accelerometers"), ("bodies",)
+        sources = [native.source_of("rows", ("layout", "wrench", *own_parts)) for own_parts in parts]
         self._read_sensors, self._sum_forces = (
             native.launcher(source, constants, own, m, d, lanes=lists.lanes, threads=lists.threads)
             for source in sources
@@ -81,7 +81,7 @@ class ContactReadings:
         self._lists.order()
 
     def read_sensors(self) -> None:
-        """Write the sensors that contacts match; the others have to be zero before."""
+        """Write accelerometers and the sensors that contacts match; the others have to be zero before."""
         if self.sensors:
             self._read_sensors()
 

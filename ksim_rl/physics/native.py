@@ -81,6 +81,7 @@ def _kernel(
     Problem.__annotations__ = dict(types)
     struct = wp.struct(Problem)
     named = "".join(f"constexpr int {name} = {value};\n" for name, value in constants)
+    named += "__builtin_assume(lane >= 0 && lane < LANES);\n"  # or else loops over nothing are compiled
 
     @wp.func_native(named + source)
     def body(world: int, lane: int, problem: struct) -> None: ...

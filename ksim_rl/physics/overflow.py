@@ -73,9 +73,8 @@ class OverflowRecord:
 
     def clear(self) -> None:
         """Start the next period."""
-        self.sticky_E.zero_()
-        self.most_nefc_E.zero_()
-        self.most_pool.zero_()
+        for tensor in (self.sticky_E, self.most_nefc_E, self.most_pool):
+            tensor.zero_()
 
     def counts(self) -> Int[Tensor, " N"]:
         """Return the period in whole numbers on the device: worlds by bit, most rows, most contacts and pairs."""

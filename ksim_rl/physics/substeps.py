@@ -17,7 +17,7 @@ from ksim_rl.physics.newton import solver as newton
 from ksim_rl.physics.rows.constraint_rows import constraint_rows
 from ksim_rl.physics.rows.contact_lists import ContactLists
 from ksim_rl.physics.smooth.stages import calls_back, integration, smooth_dynamics
-from ksim_rl.physics.views import CAMERAS_AND_LIGHTS, SUBTREE_VELOCITIES
+from ksim_rl.physics.views import CAMERAS_AND_LIGHTS, FORCES_OF_BODIES, SUBTREE_VELOCITIES
 
 # These read the contacts of the last substep's collision pass, which a reset empties.
 COLLISION_SENSORS = (
@@ -86,9 +86,8 @@ class Substeps:
             self.contact_lists = ContactLists(warp_model, warp_data_E)
             self._make_rows = constraint_rows(warp_model, warp_data_E, self.contact_lists)
             self._contacts = ContactReadings(mj_model, warp_model, warp_data_E, self.contact_lists)
-            self._alter(
-                sensor_contact_acc_adr=upstream.contact_sensors_but(warp_model, self._contacts.sensors)
-            )
+            without = partial(upstream.without, self._contacts.sensors)
+            self._models = {which: without(m) for which, m in self._models.items()}
             if own_broad_phase:
                 self._collide = collisions(warp_model, warp_data_E, self.contact_lists)
         if one_kernel_integration:
@@ -100,6 +99,8 @@ class Substeps:
             self.refreshed_on_demand.add("ten_velocity")
         if warp_model.sensor_subtree_vel:
             self.refreshed_on_demand |= SUBTREE_VELOCITIES
+        if warp_model.opt.run_rne_postconstraint or self._models["kept"].sensor_rne_postconstraint:
+            self.refreshed_on_demand |= FORCES_OF_BODIES
         if mujoco.mjtObj.mjOBJ_CAMERA in (*mj_model.sensor_objtype, *mj_model.sensor_reftype):
             self.refreshed_on_demand |= CAMERAS_AND_LIGHTS
         else:
@@ -123,23 +124,16 @@ class Substeps:
             mjw.step(m, self.warp_data_E)
             return
         m.opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
+        if sensors in ("kept", "all"):
+            m.sensor_rne_postconstraint |= self.refreshed_on_demand >= FORCES_OF_BODIES
         is_read = is_last or sensors != "none" or self._always_senses or m.opt.run_rne_postconstraint
         is_read |= self._make_rows is None or self._integrate is None
         if dynamics is not None:
             empties_pool = self._collide is not None and m.opt.run_collision_detection
             dynamics = partial(dynamics, is_read=is_read, empties_pool=empties_pool)
-        newton.step(
-            m,
-            self.warp_data_E,
-            self._solve,
-            dynamics,
-            self._make_rows,
-            self._contacts,
-            self._integrate,
-            self._aside,
-            self._collide,
-            sensors=sensors != "none" or self._always_senses,
-        )
+        stages = self._solve, dynamics, self._make_rows, self._contacts, self._integrate
+        senses = sensors != "none" or self._always_senses
+        newton.step(m, self.warp_data_E, *stages, self._aside, self._collide, sensors=senses)
 
     def refresh(self, *, masked: bool = False) -> None:
         """Launch what recomputes position- and velocity-stage quantities from the present qpos and qvel.

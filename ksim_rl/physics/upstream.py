@@ -39,6 +39,8 @@ GEOM_TYPES = {kind.name: int(kind) for kind in mjw.GeomType}
 FIXED = int(mjw.SetConstGroup.FIXED)
 # The two columns of `nxn_pairid` for a pair that never makes a contact, and for one that no sensor measures.
 NO_CONTACT, NO_SENSOR = -2, -1
+# Of what is in `sensor_acc_adr`, those that read no accelerations and forces of bodies.
+FORCELESS = mujoco.mjtSensor.mjSENS_ACTUATORFRC, mujoco.mjtSensor.mjSENS_JOINTACTFRC
 
 
 def per_world_fields() -> tuple[str, ...]:
@@ -111,17 +113,17 @@ def sensors_by_refresh(
     )
     lists = ("limitpos", "limitvel", "contact_pos", "contact_vel", "stage_pos", "stage_vel")
     keeps_rays = bool(np.any(skip & (sensor_type == mujoco.mjtSensor.mjSENS_RANGEFINDER)))
-    rays, no_rays = {"nrangefinder": warp_model.nrangefinder}, {"nrangefinder": 0}
+    rays = warp_model.nrangefinder
     of_refresh = dataclasses.replace(
         warp_model,
         **{f"sensor_{name}_adr": none for name in lists},
         **refreshed,
-        **no_rays if keeps_rays else rays,
+        nrangefinder=0 if keeps_rays else rays,
         nsensorcollision=0,
         nsensortaxel=0,
     )
     sums = dict.fromkeys(("sensor_subtree_vel", "sensor_e_potential", "sensor_e_kinetic"), False)
-    of_substep = dataclasses.replace(warp_model, **kept, **sums, **rays if keeps_rays else no_rays)
+    of_substep = dataclasses.replace(warp_model, **kept, **sums, nrangefinder=rays if keeps_rays else 0)
     return of_refresh, of_substep
 
 
@@ -135,10 +137,19 @@ def with_contact_sensors_only(warp_model: mjw.Model) -> mjw.Model:
     return dataclasses.replace(warp_model, **own, **counts)
 
 
-def contact_sensors_but(warp_model: mjw.Model, sensors: Sequence[int]) -> wp.array:
-    """Return the contact sensors with forces that MuJoCo Warp computes itself, if it leaves some out."""
-    left = [sensor for sensor in warp_model.sensor_contact_acc_adr.numpy() if sensor not in sensors]
-    return wp.array(left, dtype=int)
+def without(sensors: Sequence[int], warp_model: mjw.Model) -> mjw.Model:
+    """Return a model on the same arrays that leaves out these sensors of contacts and accelerations.
+
+    It computes forces of all bodies only if a sensor that is left reads them.
+    """
+    m, lists = warp_model, (warp_model.sensor_contact_acc_adr.numpy(), warp_model.sensor_acc_adr.numpy())
+    of_contacts, others = (ids[~np.isin(ids, sensors)] for ids in lists)
+    return dataclasses.replace(
+        m,
+        sensor_contact_acc_adr=wp.array(of_contacts, dtype=int),
+        sensor_acc_adr=wp.array(others, dtype=int),
+        sensor_rne_postconstraint=not np.isin(m.sensor_type.numpy()[others], FORCELESS).all(),
+    )
 
 
 def collide_boxes_exactly(warp_model: mjw.Model) -> None:

@@ -19,14 +19,16 @@ _KEPT = (
     "history plastic eq_active userdata tree_asleep tree_awake body_awake body_awake_ind dof_awake_ind ntree_awake "
     "nbody_awake nv_awake overflow sensordata qacc act_dot actuator_length actuator_velocity"
 )
-# What `refresh` recomputes, and what it recomputes from when on it is read.
+# What `refresh` recomputes, and what it, or the last of the next substeps, computes from when on it is read.
 _REFRESHED = (
     "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat subtree_com cdof cinert cvel "
     "cdof_dot ten_J ten_length ten_wrapadr ten_wrapnum wrap_obj wrap_xpos flexvert_xpos flexedge_J flexedge_length"
 )
 CAMERAS_AND_LIGHTS = frozenset(("cam_xpos", "cam_xmat", "light_xpos", "light_xdir"))
 SUBTREE_VELOCITIES = frozenset(("subtree_linvel", "subtree_angmom"))
-ON_DEMAND_TOGETHER = (CAMERAS_AND_LIGHTS, SUBTREE_VELOCITIES, {"ten_velocity"}, {"M"}, {"qfrc_bias"})
+FORCES_OF_BODIES = frozenset(("cacc", "cfrc_int", "cfrc_ext"))
+_ALONE = tuple({name} for name in ("ten_velocity", "M", "qfrc_bias"))
+ON_DEMAND_TOGETHER = (CAMERAS_AND_LIGHTS, SUBTREE_VELOCITIES, FORCES_OF_BODIES, *_ALONE)
 ON_DEMAND = frozenset().union(*ON_DEMAND_TOGETHER)
 ACCELERATION_STAGE, SUBSTEP_INPUTS = tuple(_ACCELERATION_STAGE.split()), tuple(_INPUTS.split())
 STATE = (*SUBSTEP_INPUTS, *_KEPT.split(), *ACCELERATION_STAGE)

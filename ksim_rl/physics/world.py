@@ -29,10 +29,7 @@ from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
 from ksim_rl.physics.resets import resets
 from ksim_rl.physics.rows.constraint_rows import one_kernel_rows_unavailable
 from ksim_rl.physics.sim_cfg import SimCfg
-from ksim_rl.physics.smooth.stages import (
-    one_kernel_dynamics_unavailable,
-    one_kernel_integration_unavailable,
-)
+from ksim_rl.physics.smooth import stages
 from ksim_rl.physics.substeps import Sensors, Substeps
 
 
@@ -106,27 +103,23 @@ class World(views.DataViews):
             self._overflow = OverflowRecord(self.warp_model, self.warp_data_E)
             self._reset_mask = wp.zeros(num_envs, dtype=bool)
             self._launch_reset = resets(self.warp_model, self.warp_data_E, self._reset_mask)
-            models = self.mj_model, self.warp_model, self.warp_data_E
-            self.one_kernel_dynamics_unavailable = one_kernel_dynamics_unavailable(
-                self.warp_model, self.sim, solver_unavailable=self.one_kernel_unavailable
-            )
-            self.one_kernel_rows_unavailable = one_kernel_rows_unavailable(
-                self.warp_model, dynamics_unavailable=self.one_kernel_dynamics_unavailable
-            )
-            no_pairs = broad_phase_unavailable(*models[1:], rows_unavailable=self.one_kernel_rows_unavailable)
-            self.one_kernel_collisions_unavailable = no_pairs or pairs_left(self.warp_model)
-            self.one_kernel_integration_unavailable = one_kernel_integration_unavailable(
-                self.warp_model, dynamics_unavailable=self.one_kernel_dynamics_unavailable
-            )
+            m, d, no_solver = self.warp_model, self.warp_data_E, self.one_kernel_unavailable
+            no_dynamics = stages.one_kernel_dynamics_unavailable(m, self.sim, solver_unavailable=no_solver)
+            no_rows = one_kernel_rows_unavailable(m, dynamics_unavailable=no_dynamics)
+            no_pairs = broad_phase_unavailable(m, d, rows_unavailable=no_rows)
+            no_integration = stages.one_kernel_integration_unavailable(m, dynamics_unavailable=no_dynamics)
+            self.one_kernel_dynamics_unavailable, self.one_kernel_rows_unavailable = no_dynamics, no_rows
+            self.one_kernel_collisions_unavailable = no_pairs or pairs_left(m)
+            self.one_kernel_integration_unavailable = no_integration
             # One of torch's, since Warp's own wait for the default stream, which no capture allows.
             aside = None if self.device.type == "cpu" else warp_stream(torch.cuda.Stream(self.device))
             self._substeps = Substeps(
-                *models,
-                one_kernel_solver=self.has_one_kernel_solver,
-                one_kernel_dynamics=self.one_kernel_dynamics_unavailable is None,
-                one_kernel_rows=self.one_kernel_rows_unavailable is None,
+                *(self.mj_model, m, d),
+                one_kernel_solver=no_solver is None,
+                one_kernel_dynamics=no_dynamics is None,
+                one_kernel_rows=no_rows is None,
                 own_broad_phase=no_pairs is None,
-                one_kernel_integration=self.one_kernel_integration_unavailable is None,
+                one_kernel_integration=no_integration is None,
                 aside=aside,
                 mask=self._reset_mask,
                 record=self._overflow.arrays,
@@ -205,16 +198,16 @@ class World(views.DataViews):
     def view(self, name: str) -> Shaped[Tensor, "*shape"]:
         """Return the view of an array that is current after `refresh`, and let `refresh` compute it from now on.
 
-        A RuntimeError once the world is frozen, if nothing has read that array before.
+        Forces of bodies (`cfrc_ext` and the like) are those of the last substep, from the next one on. A RuntimeError
+        once the world is frozen, if nothing has read that array before.
         """
         if name in views.ON_DEMAND - self._substeps.refreshed_on_demand:
             if self.is_frozen:
                 raise RuntimeError(
                     f"{name} is not computed: let a term of the config read it during construction"
                 )
-            self._substeps.refreshed_on_demand |= next(
-                names for names in views.ON_DEMAND_TOGETHER if name in names
-            )
+            together = next(names for names in views.ON_DEMAND_TOGETHER if name in names)
+            self._substeps.refreshed_on_demand |= together
             self._graphs.clear()
             self._record_resets()
         return super().view(name)
@@ -395,12 +388,8 @@ class World(views.DataViews):
     def _state_tensors(self) -> dict[str, Tensor]:
         tensors = views.state_tensors(self.warp_data_E)
         tensors |= {f"field/{name}": tensor for name, tensor in self._fields.items()}
-        tensors |= {
-            "overflow/sticky": self._overflow.sticky_E,
-            "overflow/most_nefc": self._overflow.most_nefc_E,
-            "overflow/most_pool": self._overflow.most_pool,
-        }
-        return tensors
+        overflow = self._overflow.arrays
+        return tensors | {f"overflow/{name}": wp.to_torch(array) for name, array in overflow.items()}
 
     def _launch_substeps(self, n: int, sensors: str) -> None:
         for substep in range(n):
@@ -408,10 +397,8 @@ class World(views.DataViews):
 
     @staticmethod
     def _sensors_of(substep: int, n: int, sensors: str) -> Sensors:
-        if sensors == "every":
-            return "all"
-        amid = "contacts" if sensors == "contacts" else "none"
-        return "kept" if substep == n - 1 else amid
+        last, amid = ("all", "all") if sensors == "every" else ("kept", "none")
+        return last if substep == n - 1 else "contacts" if sensors == "contacts" else amid
 
     def _launch_substep(self, sensors: Sensors, *, is_last: bool = True) -> None:
         if self._nan_guard is not None:

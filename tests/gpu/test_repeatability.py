@@ -23,6 +23,10 @@ def walk(task: str, *, device: str, num_envs: int, steps: int = STEPS) -> list[d
         conf.compose([f"task={task}", f"device={device}", f"num_envs={num_envs}"]), num_envs=num_envs, seed=1
     )
     root_E, world = env.reset(), env.base_env.world
+    # Forces of bodies are computed from when on they are read, which the env's terms did not.
+    world.is_frozen = False
+    for name in LOOKS:
+        world.view(name)
     generator = torch.Generator(device).manual_seed(0)
     action = torch.zeros_like(env.action_spec.rand())
 

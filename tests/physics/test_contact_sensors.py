@@ -1,5 +1,6 @@
 """The kernel of contact sensors, against MuJoCo Warp's own and the C engine, on the same contacts and forces."""
 
+import dataclasses
 import itertools
 
 import mujoco
@@ -60,7 +61,7 @@ def place(world: World) -> None:
 
 def columns(mj_model: mujoco.MjModel, *, ours: bool) -> np.ndarray:
     read, (contact,) = (
-        read_by_us(mj_model),
+        read_by_us(mj_model)[0],
         (mj_model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT).nonzero(),
     )
     spans = zip(mj_model.sensor_adr[contact], mj_model.sensor_dim[contact], strict=True)
@@ -86,7 +87,7 @@ def share_that_agrees(
     The others read another contact that is as strong: rounding decides, or the order of what exerts no force.
     """
     agreeing, scale = [], max(1.0, float(np.abs(expected[columns(mj_model, ours=True)]).max()))
-    for sensor in read_by_us(mj_model):
+    for sensor in read_by_us(mj_model)[0]:
         at, dim = mj_model.sensor_adr[sensor], mj_model.sensor_dim[sensor]
         own, other = read[at : at + dim], expected[at : at + dim]
         assert own[0] == other[0]
@@ -99,7 +100,7 @@ def share_that_agrees(
 
 def test_values_are_those_of_mujoco_warp_which_reads_the_other_kinds(world: World):
     ours, theirs = (columns(world.mj_model, ours=ours) for ours in (True, False))
-    assert len(read_by_us(world.mj_model)) == 40
+    assert len(read_by_us(world.mj_model)[0]) == 40
     read = world.sensordata_EL.numpy().copy()
     assert (read[:-1, ours] != 0.0).mean() > 0.2 and (read[:-1, theirs] != 0.0).mean() > 0.2
     with wp.ScopedDevice("cpu"):
@@ -132,7 +133,7 @@ def test_bits_do_not_depend_on_places_in_the_pool(world: World):
     read = world.sensordata_EL.numpy().copy()
     with wp.ScopedDevice("cpu"):
         contacts.rne_postconstraint(world.warp_model)
-    forces = world.view("cfrc_ext").numpy().copy()
+    forces = world.last_substep("cfrc_ext").numpy().copy()
     for seed in range(3):
         row_models.permute_pool(world, seed)
         world.sensordata_EL.zero_()
@@ -140,7 +141,7 @@ def test_bits_do_not_depend_on_places_in_the_pool(world: World):
             contacts.list()
             contacts.read_sensors()
             contacts.rne_postconstraint(world.warp_model)
-        np.testing.assert_array_equal(world.view("cfrc_ext").numpy(), forces)
+        np.testing.assert_array_equal(world.last_substep("cfrc_ext").numpy(), forces)
         ours = columns(world.mj_model, ours=True)
         np.testing.assert_array_equal(world.sensordata_EL.numpy()[:, ours], read[:, ours])
 
@@ -176,7 +177,9 @@ def test_forces_on_bodies_are_those_of_mujoco_warp(world: World):
     with wp.ScopedDevice("cpu"):
         for name, launch in (("ours", contacts.rne_postconstraint), ("theirs", theirs_of(world))):
             launch(world.warp_model)
-            found[name] = {part: world.view(part).numpy().copy() for part in ("cfrc_ext", "cfrc_int", "cacc")}
+            found[name] = {
+                part: world.last_substep(part).numpy().copy() for part in ("cfrc_ext", "cfrc_int", "cacc")
+            }
     for part, expected in found["theirs"].items():
         scale = max(1.0, np.abs(expected).max())
         np.testing.assert_allclose(found["ours"][part], expected, rtol=1e-5, atol=2e-6 * scale)
@@ -185,6 +188,44 @@ def test_forces_on_bodies_are_those_of_mujoco_warp(world: World):
 
 def theirs_of(world: World):
     return lambda warp_model: mjw.rne_postconstraint(warp_model, world.warp_data_E)
+
+
+@pytest.mark.parametrize("others", [(), (OBJECT.mjOBJ_BODY,)])
+def test_accelerometers_are_those_of_mujoco_warp_which_computes_forces_of_bodies_for_other_sensors_only(
+    others,
+):
+    spec = mujoco.MjSpec.from_string(row_models.XML)
+    for body in ("trunk", "arm", "hand"):
+        site = spec.body(body).add_site(
+            name=f"{body}_imu", pos=[0.03, -0.02, 0.1], quat=[0.5, -0.5, 0.1, 0.7]
+        )
+        kind = mujoco.mjtSensor.mjSENS_ACCELEROMETER
+        spec.add_sensor(type=kind, objtype=OBJECT.mjOBJ_SITE, objname=site.name)
+    for kind in others:
+        spec.add_sensor(type=mujoco.mjtSensor.mjSENS_FRAMELINACC, objtype=kind, objname="trunk")
+    prepare_spec(spec, ())
+    model, found = spec.compile(), []
+    for theirs in (False, True):
+        world = World(model, num_envs=ENVS, sim=SimCfg(njmax=120, nconmax=40, one_kernel_dynamics=True))
+        place(world)
+        world.qvel_EL.mul_(4.0)
+        models, all_of_them = world._substeps._models, world.warp_model.sensor_acc_adr
+        assert models["kept"].sensor_rne_postconstraint == bool(others)
+        if theirs:
+            whole = {"sensor_acc_adr": all_of_them, "sensor_rne_postconstraint": True}
+            models["kept"] = dataclasses.replace(models["kept"], **whole)
+        world.step()
+        found.append(world.sensordata_EL.clone())
+    assert found[0].abs().amax() > 20.0
+    assert torch.equal(*found)
+
+
+def test_forces_on_bodies_are_computed_from_when_on_they_are_read():
+    world = stepped("elliptic")
+    assert not world.last_substep("cfrc_ext").any()
+    forces = world.view("cfrc_ext")
+    world.step()
+    assert forces.abs().amax() > 10.0
 
 
 def test_without_the_kernel_of_the_dynamics_mujoco_warp_reads_all():

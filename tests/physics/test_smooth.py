@@ -283,6 +283,16 @@ def test_models_out_of_its_range_are_told_why(word):
         assert word in str(stages.unsuited(mjw.put_model(model)))
 
 
+def test_few_worlds_have_more_lanes_each():
+    with wp.ScopedDevice("cpu"):
+        sizes = stages._sizes(mjw.put_model(quadruped()))
+    lanes = {
+        worlds: [stages._lanes(parts, sizes, worlds) for parts in (stages.SMOOTH, stages.INTEGRATION)]
+        for worlds in (4096, 32768)
+    }
+    assert lanes == {4096: [16, 32], 32768: [8, 8]}
+
+
 def test_settings_that_leave_it_out_are_told():
     with wp.ScopedDevice("cpu"):
         warp_model = mjw.put_model(quadruped())

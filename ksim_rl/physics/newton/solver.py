@@ -143,8 +143,7 @@ def step(
     not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel; `make_rows`,
     which needs it, the constraint rows as one, with the lists of contacts that `contacts` reads; and `integrate` what
     advances the state. `collide` is a collision pass other than MuJoCo Warp's. On a stream `aside`, dynamics go on
-    beside that pass, which reads where geoms are, and the solver orders the worlds, by the last substep. Then it solves
-    beside the sensors of positions and velocities.
+    beside that pass and the solver's order of the worlds, by the last substep; then it solves beside some sensors.
     """
     m, d = warp_model, warp_data_E
     if dynamics is None or m.callback.sensor:
@@ -155,10 +154,11 @@ def step(
         if contacts is not None:
             contacts.list()
     else:
-        dynamics(goes_on=False)
-        with beside(aside, partial(dynamics, places_geoms=False), partial(solve, solves=False)):
+        with beside(aside, partial(dynamics, places_geoms=False)):
+            dynamics(goes_on=False)
             if m.opt.run_collision_detection:
                 collide() if collide is not None else mjw.collision(m, d)
+            solve(solves=False)
         if make_rows is None:
             mjw.make_constraint(m, d)
         else:

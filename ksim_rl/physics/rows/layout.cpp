@@ -16,7 +16,7 @@ auto sync = [=] {
     __syncwarp(own_lanes);
 #endif
 };
-auto of_lane = [=](int value, int source) {
+auto of_lane = [=](auto value, int source) {
 #if defined(__CUDA_ARCH__)
     value = __shfl_sync(own_lanes, value, source, LANES);
 #endif

@@ -68,9 +68,11 @@ auto law_of = [=](const auto& solref, const auto& solimp, float position) {
     else if (power == 1.0f)
         law.impedance = least + part * (most - least);
     else {
-        const float rise = part <= middle
-            ? (1.0f / wp::pow(middle, power - 1.0f)) * wp::pow(part, power)
-            : 1.0f - (1.0f / wp::pow(1.0f - middle, power - 1.0f)) * wp::pow(1.0f - part, power);
+        const bool is_upper = part > middle;
+        const float x = is_upper ? 1.0f - part : part, at = is_upper ? 1.0f - middle : middle;
+        // As in C; a power of two, the usual one, needs no logarithms.
+        const float curved = power == 2.0f ? x * x / at : wp::pow(x, power) / wp::pow(at, power - 1.0f);
+        const float rise = is_upper ? 1.0f - curved : curved;
         law.impedance = wp::clamp(least + rise * (most - least), least, most);
     }
     return law;

@@ -47,9 +47,9 @@ each(NUM_ACTUATORS, [&](int actuator) {
 });
 // Forces that the user applies to bodies are rare: whether this lane sees one, and then whether any does.
 bool sees_push = false;
-each(6 * NUM_BODIES, [&](int place) {
+#pragma unroll 8
+for (int place = lane; place < 6 * NUM_BODIES; place += LANES)
     sees_push |= !(((const float*)row_of(problem.xfrc_applied))[place] == 0.0f);
-});
 sync();
 #if defined(__CUDA_ARCH__)
 const unsigned own_lanes = (LANES == 32 ? 0xffffffffu : (1u << LANES) - 1u) << (threadIdx.x % 32 / LANES * LANES);

@@ -1,7 +1,8 @@
 // Part 3 of the integration: its solution by L' D L = M - h dF/dv (computation chapter, "Inertia factorization"), whose
 // L has entries where M has some. Degrees of freedom are eliminated from the last to the first: each takes from the
-// rows of its ancestors, among which that of the n-th has the columns of the first n. A lane has some of the columns,
-// so that an entry is summed by one lane, in the order of elimination.
+// rows of its ancestors, among which that of the n-th has the columns of the first n. In each of these turns another lane
+// has each entry that changes, so that an entry is summed in the order of elimination. A table says which entry of the
+// system, in its upper bits, takes the product of which two of the row; the right side stands in it as one more row.
 
 if (SOLVES) {
 #pragma unroll 1
@@ -9,13 +10,12 @@ if (SOLVES) {
         const int dof = look_up(problem.eliminated, i), ancestors = num_ancestors(dof);
         const float* const row = system + row_start(dof);
         const float inverse = 1.0f / row[ancestors];
-        each(ancestors, [&](int column) {
-            const float factor = row[column] * inverse;
-            right[look_up(problem.M_colind, row_start(dof) + column)] -= factor * right[dof];
-#pragma unroll 4
-            for (int other = column; other < ancestors; ++other)
-                system[row_start(look_up(problem.M_colind, row_start(dof) + other)) + column] -= factor * row[other];
-        });
+#pragma unroll 2
+        for (int item = look_up(problem.first_change, i) + lane; item < look_up(problem.first_change, i + 1); item += LANES) {
+            const int change = look_up(problem.changes, item), other = change & 127;
+            const float factor = row[change >> 7 & 127] * inverse;
+            system[change >> 14] -= factor * (other < ancestors ? row[other] : right[dof]);
+        }
         sync();
     }
     // From the roots to the leaves; lanes whose chains share a degree of freedom find and write the same.

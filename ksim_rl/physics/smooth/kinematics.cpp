@@ -11,6 +11,21 @@ if (lane == 0) {
     position(0) = vec3();
     turn(0) = quat(1.0f, 0.0f, 0.0f, 0.0f);
 }
+// By how much a joint turns, or a slide shifts, is found by a lane for each joint, before chains wait for one another.
+auto turned_by = [&](int joint) -> quat& { return *(quat*)(staged + 4 * joint); };
+each(NUM_JOINTS, [&](int joint) {
+    const int type = look_up(problem.jnt_type, joint), address = look_up(problem.jnt_qposadr, joint);
+    if (type == BALL || type == FREE) {
+        turned_by(joint) = unit_quat(qpos + address + (type == FREE ? 3 : 0));
+        return;
+    }
+    const float shift = qpos[address] - qpos0[address], half = 0.5f * shift, sine = wp::sin(half);
+    const vec3 own_axis = model_row(problem.jnt_axis)[joint];
+    turned_by(joint) = type == SLIDE
+        ? quat(shift, 0.0f, 0.0f, 0.0f)
+        : quat(wp::cos(half), sine * own_axis[0], sine * own_axis[1], sine * own_axis[2]);
+});
+sync();
 each(NUM_CHAINS, [&](int chain) {
     vec3 pos;
     quat rot(1.0f, 0.0f, 0.0f, 0.0f);
@@ -21,7 +36,7 @@ each(NUM_CHAINS, [&](int chain) {
         if (count == 1 && look_up(problem.jnt_type, first) == FREE) {
             const float* const q = qpos + look_up(problem.jnt_qposadr, first);
             pos = vec3(q[0], q[1], q[2]);
-            rot = unit_quat(q + 3);
+            rot = turned_by(first);
             anchor(first) = pos;
             axis(first) = model_row(problem.jnt_axis)[first];
         } else {
@@ -36,23 +51,14 @@ each(NUM_CHAINS, [&](int chain) {
             rot = product(rot, turn_of_parent);
 #pragma unroll 1
             for (int joint = first; joint < first + count; ++joint) {
-                const int type = look_up(problem.jnt_type, joint), address = look_up(problem.jnt_qposadr, joint);
-                const vec3 own_axis = model_row(problem.jnt_axis)[joint];
                 const vec3 own_anchor = model_row(problem.jnt_pos)[joint];
                 anchor(joint) = pos + rotate(own_anchor, rot);
-                axis(joint) = rotate(own_axis, rot);
-                if (type == SLIDE) {
-                    pos = pos + axis(joint) * (qpos[address] - qpos0[address]);
+                axis(joint) = rotate(model_row(problem.jnt_axis)[joint], rot);
+                if (look_up(problem.jnt_type, joint) == SLIDE) {
+                    pos = pos + axis(joint) * turned_by(joint).x;
                     continue;
                 }
-                if (type == BALL) {
-                    rot = product(rot, unit_quat(qpos + address));
-                } else {
-                    const float half = 0.5f * (qpos[address] - qpos0[address]), sine = wp::sin(half);
-                    rot = product(
-                        rot, quat(wp::cos(half), sine * own_axis[0], sine * own_axis[1], sine * own_axis[2])
-                    );
-                }
+                rot = product(rot, turned_by(joint));
                 // The anchor stays in its place.
                 pos = anchor(joint) - rotate(own_anchor, rot);
             }

@@ -85,14 +85,15 @@ sync();
 #pragma unroll 4
 for (int entry = lane; entry < problem.M_hinit_i.shape[0]; entry += LANES) {
     const int row = look_up(problem.M_hinit_i, entry), column = look_up(problem.M_colind, entry);
-    float found = wp::dot(motion(column), momentum(row));
-    if (row == column) {
-        float armature = model_row(problem.dof_armature)[row];
-        each_actuator_of(look_up(problem.dof_jntid, row), [&](int actuator) {
-            const float gear = model_row(problem.actuator_gear)[actuator][0];
-            armature += model_row(problem.actuator_armature)[actuator] * gear * gear;
-        });
-        found += armature;
-    }
-    row_of(problem.M)[entry] = found;
+    if (row != column)
+        row_of(problem.M)[entry] = wp::dot(motion(column), momentum(row));
 }
+each(NUM_DOFS, [&](int dof) {
+    float armature = model_row(problem.dof_armature)[dof];
+    each_actuator_of(look_up(problem.dof_jntid, dof), [&](int actuator) {
+        const float gear = model_row(problem.actuator_gear)[actuator][0];
+        armature += model_row(problem.actuator_armature)[actuator] * gear * gear;
+    });
+    const int entry = look_up(problem.M_rowadr, dof) + look_up(problem.M_rownnz, dof) - 1;
+    row_of(problem.M)[entry] = wp::dot(motion(dof), momentum(dof)) + armature;
+});
