@@ -129,10 +129,10 @@ def test_iterations_and_overflow_are_those_of_mujoco_warp(cone, iterations):
             names = ("qacc", "qfrc_constraint", "efc.Ma", "efc.state", "solver_niter", "overflow")
             found.append({name: world.last_substep(name).clone() for name in names})
     theirs, ours = found
-    # In its last steps an iteration is decided by rounding, and a step that is exact saves those that only mend it.
-    more = ours["solver_niter"] - theirs["solver_niter"]
-    assert more.max() <= 2 if iterations == 100 else not more.any()
+    # In its last steps an iteration is decided by rounding; fewer may do.
+    assert (ours["solver_niter"] - theirs["solver_niter"]).max() <= (2 if iterations == 100 else 0)
     if iterations == 2:
+        # Its line searches are shorter, so that it is elsewhere halfway; a world may have arrived all the same.
         assert not (ours["overflow"] & ~theirs["overflow"]).any() and ours["overflow"].any()
         return
     for name in ("qacc", "qfrc_constraint", "efc.Ma"):
@@ -222,16 +222,18 @@ def test_limbs_with_and_without_contacts_between_them_move_as_in_the_c_engine(co
     assert any(touched) == (spacing < 0.1)
 
 
+@pytest.mark.parametrize("num_worlds", [4096, 32768])
 @pytest.mark.parametrize("floats", [300, 1760, 2400, 3000, 4576, 5536, 12_000])
-def test_registers_are_bounded_so_that_as_many_worlds_run_at_once_as_shared_memory_lets(floats):
+def test_registers_are_bounded_so_that_as_many_worlds_run_at_once_as_shared_memory_lets(floats, num_worlds):
     by_memory = (228 * 1024) // (4 * floats + 1024)
-    registers = newton.most_registers(floats)
+    registers = newton.most_registers(floats, num_worlds)
     if registers is None:
         assert by_memory <= 16
         return
     warps_of_a_quarter = 65_536 // 4 // (32 * registers)
-    assert registers % 8 == 0 and newton.LEAST_REGISTERS <= registers <= 128
-    assert 4 * warps_of_a_quarter >= by_memory or registers == newton.LEAST_REGISTERS
+    least = newton.LEAST_REGISTERS[num_worlds > 8192]
+    assert registers % 8 == 0 and least <= registers <= 128
+    assert 4 * warps_of_a_quarter >= by_memory or registers == least
 
 
 def broken_invariants(world: World, substeps: int) -> Invariant:

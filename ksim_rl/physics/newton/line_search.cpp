@@ -1,23 +1,22 @@
 // Part 7: the line search along qacc + alpha search (computation chapter, "Algorithms"), to a slope that is a share of
-// that at the start, where mujoco_warp's (solver.py, _linesearch_iterative_kernel) goes on to the last bits. Along it a row's residual is r + alpha rate, and the cost a sum of
-// functions of alpha, of each of which its value relative to alpha = 0, its slope and its curvature are needed.
+// that at the start, where mujoco_warp's (solver.py, _linesearch_iterative_kernel) goes on to the last bits. Along it a
+// row's residual is r + alpha rate, and the cost a sum of functions of alpha, of each of which its value relative to
+// alpha = 0, its slope and its curvature are needed.
 
 struct Point {
     float cost, slope, curvature;  // the cost is relative to that at the start of the direction
-    float bends;  // 0 where it is quadratic from there on
 };
 // 1/2 D (r + alpha rate)^2 where that residual is negative.
 auto one_sided = [](float at_start, float rate, float efc_D, float alpha) {
     const float slope = efc_D * rate * at_start, curvature = efc_D * rate * rate;
     const float start = at_start < 0.0f ? 0.5f * efc_D * at_start * at_start : 0.0f;
     if (at_start + alpha * rate >= 0.0f)
-        return Point {-start, 0.0f, 0.0f, at_start < 0.0f ? 1.0f : 0.0f};
+        return Point {-start, 0.0f, 0.0f};
     const float change = alpha * (slope + 0.5f * alpha * curvature);
     return Point {
         at_start < 0.0f ? change : change + 0.5f * efc_D * at_start * at_start,
         slope + alpha * curvature,
-        curvature,
-        at_start < 0.0f ? 0.0f : 1.0f
+        curvature
     };
 };
 // Quadratic up to the bound on the force, and linear from there on.
@@ -29,8 +28,7 @@ auto dry_friction = [&](float at_start, float rate, float efc_D, float most, flo
     const float there = at_start + alpha * rate;
     const bool linear = there <= -reach || there >= reach;
     const float slope = there <= -reach ? -most * rate : there >= reach ? most * rate : efc_D * rate * there;
-    const bool bends = (there <= -reach) != (at_start <= -reach) || (there >= reach) != (at_start >= reach);
-    return Point {cost(there) - cost(at_start), slope, linear ? 0.0f : efc_D * rate * rate, bends ? 1.0f : 0.0f};
+    return Point {cost(there) - cost(at_start), slope, linear ? 0.0f : efc_D * rate * rate};
 };
 // A cone along the direction: N + alpha N_rate, and a slip whose part along its own rate is `along` + alpha
 // `speed`, while the square of its part across is `aside2` throughout. So T^2 = (along + alpha speed)^2 + aside2.
@@ -80,9 +78,8 @@ auto cone_point = [&](const Cone& cone, float alpha) {
     const float N = cone.N + alpha * cone.N_rate, ahead = cone.along + alpha * cone.speed;
     const float T2 = ahead * ahead + cone.aside2, T = sqrtf(T2);
     const int state = cone_zone(N, T, cone.mu);
-    const float bends = state != state_0 || state == CURVED ? 1.0f : 0.0f;
     if (state == SATISFIED)
-        return Point {-start, 0.0f, 0.0f, bends};
+        return Point {-start, 0.0f, 0.0f};
     // The quadratic cost of all rows exceeds that of the cone at the same point by Dm / 2 (mu N + T)^2.
     const float half = alpha * cone.half_curvature, quadratic = alpha * (half + cone.slope);
     if (state == QUADRATIC) {
@@ -90,7 +87,7 @@ auto cone_point = [&](const Cone& cone, float alpha) {
         const float change = state_0 == CURVED ? quadratic + 0.5f * cone.Dm * excess * excess
             : state_0 == SATISFIED ? 0.5f * cone.Dm * (1.0f + cone.mu * cone.mu) * (N * N + T2)
             : quadratic;
-        return Point {change, 2.0f * half + cone.slope, 2.0f * cone.half_curvature, bends};
+        return Point {change, 2.0f * half + cone.slope, 2.0f * cone.half_curvature};
     }
     // Of 1/2 Dm (N - mu T)^2; T' = ahead speed / T, and T'' = aside2 speed^2 / T^3.
     const float gap = N - cone.mu * T;
@@ -105,8 +102,7 @@ auto cone_point = [&](const Cone& cone, float alpha) {
         const float excess = cone.mu * N + T;
         change = quadratic - 0.5f * cone.Dm * excess * excess;
     }
-    const float curvature = cone.Dm * (gap_rate * gap_rate - cone.mu * gap * bend);
-    return Point {change, cone.Dm * gap * gap_rate, curvature, bends};
+    return Point {change, cone.Dm * gap * gap_rate, cone.Dm * (gap_rate * gap_rate - cone.mu * gap * bend)};
 };
 // What a unit costs at a point of the search direction.
 auto unit_point = [&](int row, float alpha) {
@@ -117,12 +113,10 @@ auto unit_point = [&](int row, float alpha) {
         return dry_friction(residual[row], rate[row], efc_D[row], bound[row], alpha);
     return one_sided(residual[row], rate[row], efc_D[row], alpha);
 };
-// The step to take, by how much it lowers the cost, and whether the cost is quadratic up to there, which makes of the
-// Newton step the minimum itself. `slope` and `half_curvature` are those of the terms that are quadratic everywhere:
-// the Gauss cost of M and the equalities; `slope_0` is that of all terms at the start.
+// The step to take, and by how much it lowers the cost. `slope` and `half_curvature` are those of the terms that are
+// quadratic everywhere: the Gauss cost of M and the equalities; `slope_0` is that of all terms at the start.
 struct Step {
     float alpha, improvement;
-    bool exact;
 };
 // The search keeps the points before and beyond the minimum that are flattest. Its trials measure four points each, on
 // CUDA by a team of eight lanes each, and take of those that are flat enough the cheapest. To ask more than ten times
@@ -130,7 +124,7 @@ struct Step {
 // itself, 1.5 with ten times that).
 auto search_line = [&](float slope, float half_curvature, float slope_0, float noise) {
     constexpr int TEAM = LANES > 1 ? 8 : 1, POINTS = 4;
-    Step step {rows == 0 ? 1.0f : 0.0f, 0.0f, false};
+    Step step {rows == 0 ? 1.0f : 0.0f, 0.0f};
     require(rows == 0 || slope_0 <= noise, SEARCH_DESCENDS);
     if (rows == 0 || !(slope_0 < -noise))
         return step;
@@ -142,34 +136,32 @@ auto search_line = [&](float slope, float half_curvature, float slope_0, float n
         sync();
     }
     auto measure = [&](float there) {
-        Point sum {0.0f, 0.0f, 0.0f, 0.0f};
+        Point sum {0.0f, 0.0f, 0.0f};
 #pragma unroll 1
         for (int unit = lane % TEAM; unit < num_units; unit += TEAM) {
             const Point point = unit_point(units[unit], there);
             sum.cost += point.cost;
             sum.slope += point.slope;
             sum.curvature += point.curvature;
-            sum.bends += point.bends;
         }
         return sum;
     };
     const float flat = wp::max(noise, 10.0f * ls_tolerance * -slope_0);
     float alphas[POINTS] = {1.0f, 0.5f, 0.25f, 0.1f}, low_alpha = 0.0f, high_alpha = 0.0f;
-    Point low {0.0f, slope_0, 0.0f, 0.0f}, high {0.0f, LARGEST, 0.0f, 0.0f};
+    Point low {0.0f, slope_0, 0.0f}, high {0.0f, LARGEST, 0.0f};
 #pragma unroll 1
     for (int trial = 0;; ++trial) {
 #if defined(__CUDA_ARCH__)
         const int team = lane / TEAM;
         const Point sum = measure(team == 0 ? alphas[0] : team == 1 ? alphas[1] : team == 2 ? alphas[2] : alphas[3]);
-        const float pool = pooled(sum.cost, sum.slope, sum.curvature, sum.bends, TEAM);
+        const float pool = pooled(sum.cost, sum.slope, sum.curvature, 0.0f, TEAM);
 #endif
         bool found = false, moved = false;
 UNROLL
         for (int i = 0; i < POINTS; ++i) {
             const float alpha = alphas[i];
 #if defined(__CUDA_ARCH__)
-            const float bends = i == 0 ? of_lane(pool, 3) : 0.0f;
-            Point point {of_lane(pool, TEAM * i), of_lane(pool, TEAM * i + 1), of_lane(pool, TEAM * i + 2), bends};
+            Point point {of_lane(pool, TEAM * i), of_lane(pool, TEAM * i + 1), of_lane(pool, TEAM * i + 2)};
 #else
             Point point = measure(alpha);
 #endif
@@ -178,7 +170,7 @@ UNROLL
             point.curvature += 2.0f * half_curvature;
             if (fabsf(point.slope) < flat && point.cost < -step.improvement) {
                 found = true;
-                step = Step {alpha, -point.cost, i == 0 && trial == 0 && point.bends == 0.0f};
+                step = Step {alpha, -point.cost};
             }
             if (point.slope < 0.0f && point.slope > low.slope) {
                 moved = true;
@@ -197,7 +189,7 @@ UNROLL
             if (moved && lane == 0)
                 wp::atomic_or(problem.overflow.data + world, OUT_OF_LS_ITERATIONS);
             const float cost = wp::min(low.cost, high.cost);
-            return cost < 0.0f ? Step {low.cost < high.cost ? low_alpha : high_alpha, -cost, false} : step;
+            return cost < 0.0f ? Step {low.cost < high.cost ? low_alpha : high_alpha, -cost} : step;
         }
         // Where nothing rises yet, up to four times as far as the lower point's Newton step.
         const float ahead = -ratio(low.slope, low.curvature), back = ratio(high.slope, high.curvature);

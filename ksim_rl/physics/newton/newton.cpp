@@ -40,21 +40,17 @@ for (int block = 0; block < BLOCKS; ++block)
 const float scale = 1.0f / wp::max(TINY, total(trace));
 
 int iteration = 0;
-bool last = false, exact = false;
-// Whether the gradient, which it sets, is below the tolerance; that at the start never counts.
-auto is_flat = [&] {
+bool last = false;
+// Sets the gradient, then the search direction, or returns that the accelerations are good enough or the last.
+auto find_search = [&](auto sum, auto eliminate, auto substitute) {
+    sum();
     float gradient2 = 0.0f;
 UNROLL
     for (int block = 0; block < BLOCKS; ++block) {
         gradient[block] = M_qacc[block] - qfrc_smooth[block] - qfrc_constraint[block];
         gradient2 += is_dof(block) ? gradient[block] * gradient[block] : 0.0f;
     }
-    return iteration > 0 && scale * sqrtf(total(gradient2)) < tolerance;
-};
-// Sets the gradient, then the search direction, or returns that the accelerations are good enough or the last.
-auto find_search = [&](auto sum, auto eliminate, auto substitute) {
-    sum();
-    if (is_flat())
+    if (iteration > 0 && scale * sqrtf(total(gradient2)) < tolerance)
         return true;
     const float decrement = eliminate();
     if (iteration > 0 && 0.5f * scale * decrement < tolerance)
@@ -79,11 +75,9 @@ while (true) {
     for (int row = lane; row < rows; row += LANES)
         update_row(row);
     sync();
-    // After an exact step only rounding is left, and most often too little of it for another Hessian.
-    if (last || exact) {
+    if (last) {
         pull_back();
-        if (last || is_flat())
-            break;
+        break;
     }
     if (by_limbs ? find_search(sum_by_limbs, factorize_limbs, search_along_limbs)
                  : find_search(sum_densely, factorize, back_substitute))
@@ -142,7 +136,6 @@ UNROLL
         residual[row] += step.alpha * rate[row];
     sync();
     ++iteration;
-    exact = step.exact;
     last = rows == 0 || step.alpha == 0.0f || (step.improvement > 0.0f && scale * step.improvement < tolerance);
 }
 
