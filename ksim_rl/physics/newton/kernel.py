@@ -1,14 +1,14 @@
 """This module makes the one kernel of MuJoCo's Newton solver, in which a warp solves one world until it has converged.
 
 MuJoCo Warp launches about ten kernels per iteration, over all worlds, until the last of them has converged; here no
-world waits for another, and what an iteration computes stays on the chip. The algorithm is the same: exact line search
-by bracketed Newton steps, and the same tests of convergence, so that the results agree up to rounding. It is written in
-C++, since its matrix lies in registers, which needs loops that are unrolled, shuffles and shared memory; the CPU
-compiles the same source, for a warp of one lane. Read its parts in their order: layout.cpp, constraints.cpp, cost.cpp,
-limbs.cpp, tiles.cpp, hessian.cpp, line_search.cpp, newton.cpp.
+world waits for another, and what an iteration computes stays on the chip. The algorithm is the same, with the same
+tests of convergence, but for a line search that is no more exact than iterations need; costs agree within the
+tolerance. It is written in C++, since its matrix lies in registers, which needs loops that are unrolled, shuffles and
+shared memory; the CPU compiles the same source, for a warp of one lane. Read its parts in their order: layout.cpp,
+constraints.cpp, cost.cpp, limbs.cpp, tiles.cpp, hessian.cpp, line_search.cpp, newton.cpp.
 
-Source of the algorithm: https://mujoco.readthedocs.io/en/stable/computation/index.html; of its bounds, line
-search and tests of convergence: mujoco_warp/_src/solver.py.
+Source of the algorithm: https://mujoco.readthedocs.io/en/stable/computation/index.html; of its bounds and
+tests of convergence: mujoco_warp/_src/solver.py.
 """
 
 # pyright: reportInvalidTypeForm=false

@@ -85,11 +85,10 @@ while (true) {
 
     // Along the search direction: M search, J search, and the terms of the cost that are quadratic everywhere.
     times_mass(M_search, search);
-    float search2 = 0.0f, slope = 0.0f, half_curvature = 0.0f, noise = 0.0f;
+    float slope_0 = 0.0f, slope = 0.0f, half_curvature = 0.0f, noise = 0.0f;
 UNROLL
     for (int block = 0; block < BLOCKS; ++block)
         if (is_dof(block)) {
-            search2 += search[block] * search[block];
             slope += search[block] * (M_qacc[block] - qfrc_smooth[block]);
             half_curvature += 0.5f * search[block] * M_search[block];
         }
@@ -110,6 +109,7 @@ UNROLL
         }
         rate[row] = product;
         noise += fabsf(force[row] * product);
+        slope_0 -= row < equalities ? 0.0f : force[row] * product;
         if (row < equalities) {
             slope += efc_D[row] * product * residual[row];
             half_curvature += 0.5f * efc_D[row] * product * product;
@@ -117,15 +117,14 @@ UNROLL
     });
     sync();
     if (LANES > 1) {
-        const float pool = pooled(search2, slope, half_curvature, noise, LANES);
-        search2 = of_lane(pool, 0);
+        const float pool = pooled(slope_0, slope, half_curvature, noise, LANES);
+        slope_0 = of_lane(pool, 0);
         slope = of_lane(pool, 1);
         half_curvature = of_lane(pool, 2);
         noise = of_lane(pool, 3);
     }
     noise = NOISE * (noise + fabsf(slope));
-    const float enough = wp::max(tolerance * ls_tolerance * sqrtf(search2) / scale, 1e-6f);
-    const Step step = search_line(slope, half_curvature, enough, noise);
+    const Step step = search_line(slope, half_curvature, slope + slope_0, noise);
     require(step.alpha >= 0.0f && step.improvement >= 0.0f, COST_FALLS);
 UNROLL
     for (int block = 0; block < BLOCKS; ++block) {

@@ -19,10 +19,10 @@ SHARED_FLOATS = 48 * 1024 // 4
 # took 212 us for 4096 worlds of G1; with 5600 floats (nine worlds) 217, with room for twelve 222 and for thirteen 237.
 FLOATS_PER_WORLD = 5536
 # A multiprocessor has 228 KiB of shared memory, of which each block takes another KiB, and in each quarter, where
-# warps stay, 512 registers for a lane. With 72 of them as many worlds of Go1 run at once as the memory lets, 28, and
-# with 80 only 24 do, which is faster all the same (H200, 4096 worlds: 104 us, and 109 with 72): fewer values lie in
-# memory meanwhile. Where more than 128 are left, there is no need of a bound.
-SHARED_BYTES, LEAST_REGISTERS, MOST_REGISTERS = 228 * 1024, 80, 128
+# warps stay, 512 registers for a lane. With 72 of them as many worlds of Go1 run at once as the memory lets, 28. With
+# 96 only 20 do, and fewer values lie in memory meanwhile, which is faster where most worlds run at once anyway (H200,
+# 4096 worlds: 119 us, 125 with 72; 32768: 776 and 722). Where more than 128 are left, there is no need of a bound.
+SHARED_BYTES, LEAST_REGISTERS, MOST_REGISTERS, FEW_WORLDS = 228 * 1024, (96, 72), 128, 8192
 MOST_DOFS = 64
 # MuJoCo Warp's solver ends its loop by a conditional node, which costs more than the few iterations that it saves
 # (H200, 4096 worlds, at most 10 iterations: Go1 8.22 ms without and 8.46 with it, G1 9.88 and 10.17).
@@ -69,10 +69,13 @@ def takes_conditional_nodes(warp_model: mjw.Model, *, supported: bool) -> bool:
     return supported and int(warp_model.opt.iterations) > MOST_UNCONDITIONAL_ITERATIONS
 
 
-def most_registers(floats: int) -> int | None:
-    """Return how many registers let as many worlds run at once as shared memory does, at least 80, or None for any."""
-    worlds = SHARED_BYTES // (4 * floats + 1024)
-    most = max(LEAST_REGISTERS, 512 // -(-worlds // 4) // 8 * 8)
+def most_registers(floats: int, num_worlds: int) -> int | None:
+    """Return how many registers let as many worlds run at once as shared memory does, or None for any number.
+
+    Few worlds have at least 96 of them, many 72.
+    """
+    at_once = SHARED_BYTES // (4 * floats + 1024)
+    most = max(LEAST_REGISTERS[num_worlds > FEW_WORLDS], 512 // -(-at_once // 4) // 8 * 8)
     return most if most <= MOST_REGISTERS else None
 
 
@@ -112,7 +115,7 @@ def solver(
         "order": wp.array(list(range(d.nworld)), dtype=int, device=device),
         "broken": wp.empty(0, dtype=int, device=device) if broken is None else broken,
     }
-    lanes, registers = (CUDA_LANES, most_registers(sizes["FLOATS"])) if on_cuda else (1, None)
+    lanes, registers = (CUDA_LANES, most_registers(sizes["FLOATS"], d.nworld)) if on_cuda else (1, None)
     solve = launcher(m, d, own, sizes, lanes=lanes, max_registers=registers, checked=broken is not None)
 
     def launch(*, orders: bool = True, solves: bool = True) -> None:
