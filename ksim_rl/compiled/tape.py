@@ -135,7 +135,7 @@ class Tape:
         self._own = self._find_own(returned)
         self._kept = [tensor for place, tensor in self._memory.made.items() if place not in self._own]
         modules = [self._compiled(part) for part in self.parts if isinstance(part, Kernel)]
-        kernel_loading.load([module for module in modules if module], self._device, BLOCK)
+        kernel_loading.load([(module, BLOCK) for module in modules if module], self._device)
 
     def __call__(self) -> None:
         """Run all parts in order."""

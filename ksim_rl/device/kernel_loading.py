@@ -13,7 +13,9 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import torch
@@ -106,12 +108,13 @@ def loaded_together(device: torch.device) -> Iterator[None]:
 
     with upstream.launches_diverted(note):
         yield
-    for block_dim, found in modules.items():
-        load(found, device, block_dim)
+    load([(module, block_dim) for block_dim, found in modules.items() for module in found], device)
 
 
-def load(modules: Iterable[wp.Module], device: torch.device, block_dim: int | None) -> None:
-    """Compile and load modules, side by side, for launches of this block size; of any on the CPU."""
-    workers = min(os.cpu_count() or 1, MOST_WORKERS)
-    size = None if device.type == "cpu" else block_dim
-    wp.force_load(warp_device(device), modules=list(modules), block_dim=size, max_workers=workers)
+def load(modules: Iterable[tuple[wp.Module, int | None]], device: torch.device) -> None:
+    """Compile and load modules, side by side, for launches of the block sizes beside them; of any on the CPU."""
+    of_cpu, load_one = device.type == "cpu", partial(wp.force_load, warp_device(device), max_workers=0)
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_WORKERS)) as pool:
+        jobs = [pool.submit(load_one, [module], None if of_cpu else size) for module, size in modules]
+    for job in jobs:
+        job.result()
