@@ -207,12 +207,15 @@ def make_rollout(
         return torch.randn(STEPS, num_envs, *shape, device=device, generator=generator)
 
     terminated, truncated = draw(1) > 2.33, draw(1) > 2.33
+    critic, following = draw(obs), draw(obs)
+    # A step begins with what followed the one before, but for the first step of an episode.
+    critic[1:] = critic[1:].where((terminated | truncated)[:-1], following[:-1])
     rollout_TE = TensorDict(
         {
             "actor": draw(obs),
-            "critic": draw(obs),
+            "critic": critic,
             "next": {
-                "critic": draw(obs),
+                "critic": following,
                 "reward": draw(1),
                 "terminated": terminated,
                 "truncated": truncated & ~terminated,

@@ -19,9 +19,9 @@ _STREAM = random.stream_id("data.epoch_sampler")
 class EpochSampler(Sampler):
     """Yields every stored env state once per epoch, in a new random order each epoch, or as stored without `shuffle`.
 
-    A drop-in for TorchRL's `SamplerWithoutReplacement` in any replay buffer. The order is the rank of counter-based
-    random keys, so it needs no generator, makes no host sync, can be captured in a CUDA graph (the epoch counter is a
-    device tensor; capture whole epochs), and resumes from four integers.
+    A drop-in for TorchRL's `SamplerWithoutReplacement` in any replay buffer. The order is a counter-based draw, so it
+    needs no generator, makes no host sync, can be captured in a CUDA graph (the epoch counter is a device tensor;
+    capture whole epochs), and resumes from four integers.
 
     With `shards`, it draws as so many ranks would: what is stored is so many equal parts, one after the other, and each
     of the `num_minibatches` of an epoch has as many elements of each.
@@ -105,8 +105,12 @@ class EpochSampler(Sampler):
 
     def _order(self, epoch: Tensor, size: int) -> Tensor:
         """Return the order of an epoch: a random one unless `shuffle` is off, minibatch by minibatch."""
-        whole = torch.arange(size, device=epoch.device)
-        order_D = permutation(self.seed, epoch, size, shards=self.shards) if self.shuffle else whole
+        order_D = torch.arange(size, device=epoch.device)
+        if self.shuffle:
+            if size % self.shards:
+                raise ValueError(f"{size} elements are no whole number for each of {self.shards} shards")
+            keys = random.row_keys(torch.full_like(epoch, self.seed), _STREAM, epoch, self.shards)
+            order_D = random.permutations(keys, size // self.shards).flatten()
         if self.shards == 1:
             return order_D
         return order_D.view(self.shards, self.num_minibatches, -1).transpose(0, 1).reshape(-1)
@@ -151,19 +155,6 @@ def stored(storage: Storage) -> int:
     if size == 0:
         raise RuntimeError("the replay buffer is empty: extend it before sampling")
     return size
-
-
-def permutation(seed: int, epoch: Int64[Tensor, ""], size: int, *, shards: int = 1) -> Int64[Tensor, " D"]:
-    """Return a random permutation of `range(size)` on the epoch's device, of each rank or shard its own."""
-    seed_tensor = torch.full((), seed, dtype=torch.int64, device=epoch.device)
-    keys = random.row_keys(seed_tensor, _STREAM, epoch, size)
-    keys_D = random.integers(keys, 1, 0, 2**31 - 1).squeeze(1).to(torch.int32)
-    # Of 100 000 keys of 31 bits about two pairs are equal. They keep their order, so it is still a permutation, and the
-    # sort takes half the passes that it takes for 64 bits.
-    if shards == 1:
-        return torch.argsort(keys_D, stable=True)
-    begin_S1 = torch.arange(0, size, size // shards, device=epoch.device)[:, None]
-    return (begin_S1 + torch.argsort(keys_D.view(shards, -1), stable=True)).flatten()
 
 
 BURN_IN_KEY = "burn_in"

@@ -10,6 +10,8 @@ Draws made at every step are keyed by a step counter; draws made at a reset by a
 one Warp kernel, which is also a torch operator: it can be captured and compiled. A normal is the inverse of the normal
 distribution's cumulative function at a uniform (Giles, "Approximating the erfinv function", 2010): one hash per number
 and no branch, so that the CPU's compiler turns loops into vector instructions.
+A permutation takes no sort: each element is what a Feistel network makes of its place (Luby and Rackoff, "How to
+construct pseudorandom permutations from pseudorandom functions", 1988).
 """
 
 import zlib
@@ -71,7 +73,7 @@ DRAWS = r"""
 """
 """C++ of all kernels that draw: `key_of` once per row, `bits_of` per number, `unit` or `normal` of these bits."""
 
-_UNIFORM, _NORMAL, _INTEGER = range(3)
+_UNIFORM, _NORMAL, _INTEGER, _ORDER = range(4)
 
 
 class RowKeys(NamedTuple):
@@ -136,17 +138,23 @@ def integers(
     return low + ((_drawn(*keys, n, _INTEGER, 0.0, 1.0, 0, 1 << 32) * (high - low + 1)) >> 32)
 
 
-_ARGUMENTS = arguments_of(
-    (int, "rows columns n kind"),
-    (float, "low high"),
-    (wp.int64, "start span"),
-    (wp.uint32, "stream"),
-    (int, "counter_stride first_row"),
-    (wp.uint64, "seed counter out"),
-)
+def permutations(keys: RowKeys, n: int) -> Int64[Tensor, "E L"]:
+    """Draw an order of `n` numbers for each row: of 0 to n - 1 for the first, of the next n for the second, ..."""
+    # Short halves need more rounds until all orders of few numbers are about equally likely.
+    bits = max((n - 1).bit_length(), 2)
+    return _drawn(*keys, n, _ORDER, 0.0, 1.0, bits, 8 if bits > 6 else 24)
+
+
 # On the CPU one thread fills all rows, in loops of vector instructions.
 _launch = QuickLaunch(
-    _ARGUMENTS,
+    arguments_of(
+        (int, "rows columns n kind"),
+        (float, "low high"),
+        (wp.int64, "start span"),
+        (wp.uint32, "stream"),
+        (int, "counter_stride first_row"),
+        (wp.uint64, "seed counter out"),
+    ),
     DRAWS
     + r"""
     const long long seed = *(const long long*)a.seed;
@@ -172,7 +180,27 @@ _launch = QuickLaunch(
     const unsigned long long span = (unsigned long long)a.span;
     if (a.kind == 0) run([=](long long at, unsigned b) { reals[at] = low + unit(b) * (high - low); });
     else if (a.kind == 1) run([=](long long at, unsigned b) { reals[at] = normal(b); });
-    else run([=](long long at, unsigned b) { integers[at] = start + (long long)((b * span) >> 32); });
+    else if (a.kind == 2) run([=](long long at, unsigned b) { integers[at] = start + (long long)((b * span) >> 32); });
+    else for (int row = begin_row; row < end_row; ++row) {
+        // A bijection of the next power of two; what it takes past the last number goes through it again (Black and
+        // Rogaway, "Ciphers with arbitrary finite domains", 2002).
+        const RowKey key = key_of(seed, stream, counter[row * stride], first + row);
+        unsigned low_bits = start / 2, low_mask = (1u << low_bits) - 1u, high_mask = (1u << (start - low_bits)) - 1u;
+        unsigned round_keys[24];
+        for (int round = 0; round < (int)span; ++round) round_keys[round] = bits_of(key, (unsigned)round);
+        for (int i = begin; i < end; ++i) {
+            unsigned number = i;
+            do {
+                unsigned low = number & low_mask, high = number >> low_bits;
+                for (int round = 0; round < (int)span; round += 2) {
+                    low ^= mix(high ^ round_keys[round]) & low_mask;
+                    high ^= mix(low ^ round_keys[round + 1]) & high_mask;
+                }
+                number = (high << low_bits) | low;
+            } while (number >= (unsigned)n);
+            integers[(long long)row * n + i] = (long long)row * n + number;
+        }
+    }
 """,
     indices=("part", "chunk"),
 )
@@ -196,20 +224,16 @@ def _draw_now(
             f"seed is {seed.dtype}, counter is {counter.dtype} of shape {tuple(counter.shape)}: expected torch.int64, "
             f"and a counter of shape () or ({num_rows},)"
         )
-    dtype = torch.int64 if kind == _INTEGER else torch.float32
-    out_EL = torch.empty((num_rows, n), dtype=dtype, device=seed.device)
-    counter = counter.contiguous()
+    out_EL, counter = _empty(seed, num_rows, n, kind), counter.contiguous()
     rows, columns = (num_rows, n) if seed.device.type == "cpu" else (1, 1)
     dim = (num_rows // max(rows, 1), n // max(columns, 1))
-    addresses = seed.data_ptr(), counter.data_ptr(), out_EL.data_ptr()
     layout = rows, columns, n, kind, low, high, start, span, stream, counter.ndim, first_row
-    _launch(seed.device, dim, *layout, *addresses)
+    _launch(seed.device, dim, *layout, seed.data_ptr(), counter.data_ptr(), out_EL.data_ptr())
     return out_EL
 
 
-def _draw_empty(seed: Tensor, stream: int, counter: Tensor, num_rows: int, *others: float) -> Tensor:
-    _, n, kind, *_ = others
-    return seed.new_empty((num_rows, int(n)), dtype=torch.int64 if kind == _INTEGER else torch.float32)
+def _empty(seed: Tensor, num_rows: int, n: int, kind: int) -> Tensor:
+    return seed.new_empty((num_rows, n), dtype=torch.int64 if kind >= _INTEGER else torch.float32)
 
 
-_drawn = as_operator("draw", _draw_now, _draw_empty)
+_drawn = as_operator("draw", _draw_now, lambda *given: _empty(given[0], given[3], *given[5:7]))

@@ -8,7 +8,6 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import SamplerWithoutReplacement
 
 from ksim_rl.data import EpochSampler
-from ksim_rl.device import random
 from ksim_rl.testing import count_syncs
 
 
@@ -77,12 +76,9 @@ def test_seed_fixes_the_orders():
     assert torch.equal(second, _epoch(one))
 
 
-@pytest.mark.parametrize("distinct", [1, 2, 5])
-def test_equal_keys_still_give_a_permutation(monkeypatch, distinct):
-    keys = torch.randint(distinct, (50, 1))
-    monkeypatch.setattr(random, "integers", lambda *_: keys)
-    order = _epoch(_buffer(size=50, batch_size=10))
-    assert torch.equal(order.sort().values, torch.arange(50))
+def test_shards_of_different_sizes_are_refused():
+    with pytest.raises(ValueError, match="7 elements.*2 shards"):
+        _buffer(size=7, batch_size=7, shards=2).sample()
 
 
 @pytest.mark.parametrize("shuffle", [True, False])

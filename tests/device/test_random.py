@@ -162,3 +162,62 @@ def test_counters_that_would_be_misread_are_refused(counter_E):
 def test_ranges_of_integers_are_checked(low, high):
     with pytest.raises(ValueError, match=f"low={low}, high={high}"):
         random.integers(keys(), 3, low, high)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 5, 7, 64, 65, 1000, 2**16, 98304])
+def test_a_permutation_has_each_number_once(n):
+    drawn = random.permutations(keys(rows=3), n)
+    assert torch.equal(drawn.sort().values, torch.arange(3 * n).view(3, n))
+    again, other = (random.permutations(keys(rows=3, counter=counter), n) for counter in (0, 1))
+    assert torch.equal(drawn, again)
+    if n > 60:
+        assert (drawn == other).sum() < 20, (
+            "as many numbers are where they were as in orders drawn apart: 3 in the mean"
+        )
+        assert (drawn[0] == drawn[1] - n).sum() < 20, "each row has an order of its own"
+
+
+def exact_permutation(row: int, n: int, bits: int, rounds: int) -> list[int]:
+    """Repeat the definition with Python's integers, from the bits that uniform draws show 24 of."""
+    low_bits = bits // 2
+    masks = (1 << low_bits) - 1, (1 << (bits - low_bits)) - 1
+    golden, stream, seed = 0x9E3779B9, 1, 5
+    base = mix(seed ^ stream)
+    first = mix(base) ^ mix(row + 1)
+    second = mix((first + row * golden + golden) & MASK) ^ mix(stream)
+    round_keys = [mix(mix(mix(first) ^ ((i + 1) * golden & MASK)) ^ mix(second)) for i in range(rounds)]
+
+    def through(number: int) -> int:
+        low, high = number & masks[0], number >> low_bits
+        for i in range(0, rounds, 2):
+            low ^= mix(high ^ round_keys[i]) & masks[0]
+            high ^= mix(low ^ round_keys[i + 1]) & masks[1]
+        return high << low_bits | low
+
+    numbers = []
+    for i in range(n):
+        number = through(i)
+        while number >= n:
+            number = through(number)
+        numbers.append(row * n + number)
+    return numbers
+
+
+@pytest.mark.parametrize(("n", "bits", "rounds"), [(3, 2, 24), (50, 6, 24), (100, 7, 8), (1000, 10, 8)])
+def test_a_permutation_is_the_network_that_it_says_it_is(n, bits, rounds):
+    assert random.permutations(keys(), n).tolist() == [
+        exact_permutation(row, n, bits, rounds) for row in range(4)
+    ]
+
+
+@pytest.mark.parametrize("n", [5, 12, 40, 100])
+def test_pairs_of_a_permutation_are_equally_likely(n):
+    rows = 20_000
+    drawn = random.permutations(keys(rows=rows), n) % n
+    expected = rows / (n * (n - 1))
+    for first, second in ((0, 1), (0, n - 1), (n // 2, n // 2 + 1)):
+        counts = torch.bincount(drawn[:, first] * n + drawn[:, second], minlength=n * n).view(n, n)
+        assert not counts.diagonal().any()
+        freedom = n * (n - 1) - 1
+        chi_square = float(((counts - expected) ** 2).sum() / expected) - n * expected
+        assert abs(chi_square - freedom) < 4.5 * math.sqrt(2 * freedom), (first, second)

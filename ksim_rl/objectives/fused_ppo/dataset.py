@@ -18,7 +18,6 @@ from ksim_rl.objectives.symmetry import SymmetricAugmentation
 
 # Envs per program.
 ENVS = 32
-Evaluate = Callable[[Float[Tensor, "D L"], Float[Tensor, " D"]], None]
 
 
 class FusedDataset:
@@ -54,6 +53,9 @@ class FusedDataset:
             "records": self.records,
             "num_obs": rows,
             "size": size,
+            "known": self.obs[1],
+            "places": torch.zeros(size, dtype=torch.int32, device=device),
+            "count": torch.zeros(1, dtype=torch.int32, device=device),
             "gamma": cfg.gamma,
             "decay": cfg.gamma * cfg.lmbda,
             "LANES": power_of_two(layout.stored),
@@ -64,7 +66,7 @@ class FusedDataset:
         }
 
     @torch.no_grad()
-    def read(self, rollout_ET: TensorDictBase, *, evaluate: Evaluate) -> Int64[Tensor, ""]:
+    def read(self, rollout_ET: TensorDictBase, *, evaluate: Callable[..., None]) -> Int64[Tensor, ""]:
         """Take over a rollout `["E","T"]`, whose advantages are estimated here with the values that `evaluate` writes.
 
         An env state with an element that is not finite takes no part, as in `DatasetStorage`; returned is how many.
@@ -73,11 +75,13 @@ class FusedDataset:
             for network, obs_DL in enumerate(self.obs):
                 self._take_observations(network, part_ET, obs_DL[first:])
         following = rollout_ET.get("next")
-        next_obs = torch.empty_like(self.obs[1, : self.size])
-        self._take_observations(1, following, next_obs)
-        evaluate(self.obs[1, : self.size], self._signals[0])
-        evaluate(next_obs, self._signals[1])
         num_envs, length = rollout_ET.batch_size
+        next_obs = torch.empty_like(self.obs[1, : self.size])
+        evaluate(self.obs[1, : self.size], self._signals[0])
+        listed = {name: self._arguments[name] for name in ("places", "count") if self.layout.chained}
+        self._arguments["count"].zero_()
+        self._take_observations(1, following, next_obs, num_envs=num_envs, LISTED=bool(listed))
+        evaluate(next_obs, self._signals[1], **listed)
         programs = parts(num_envs, ENVS)
         moments = self.records.new_empty(programs, 3)
         signals = {key: _time_major(following.get(key)) for key in ("reward", "done", "terminated")}
@@ -108,22 +112,16 @@ class FusedDataset:
         launch(write_records, (len(left_out),), given, MOMENTS=power_of_two(len(moments)))
         return left_out
 
-    def _take_observations(self, network: int, part_ET: TensorDictBase, obs: Tensor) -> None:
+    def _take_observations(self, network: int, part_ET: TensorDictBase, obs: Tensor, **changes: Any) -> None:
         observer = self._observers[network]
         source, block = _time_major(observer.read(part_ET)), _block(self._arguments["LANES"])
+        moments = observer.moments
         # Not read where there are none.
-        mean, var = (
-            (source, source) if observer.moments is None else (observer.moments.mean, observer.moments.var)
-        )
-        given = self._arguments | {
-            "source": source,
-            "mean": mean,
-            "var": var,
-            "obs": obs,
-            "eps": observer.eps,
-        }
-        sizes = {"num_rows": len(source), "DIM": source.shape[1], "NORMALIZED": observer.moments is not None}
-        launch(read_observations, (parts(len(source), block),), given, BLOCK=block, **sizes)
+        mean, var = (source, source) if moments is None else (moments.mean, moments.var)
+        own = {"source": source, "mean": mean, "var": var, "obs": obs, "eps": observer.eps}
+        sizes = {"num_rows": len(source), "DIM": source.shape[1], "NORMALIZED": moments is not None}
+        given = self._arguments | own | sizes | {"num_envs": 0, "LISTED": False} | changes
+        launch(read_observations, (parts(len(source), block),), given, BLOCK=block)
 
 
 def as_tf32(values: Float[Tensor, "*?shape"]) -> Float[Tensor, "*?shape"]:

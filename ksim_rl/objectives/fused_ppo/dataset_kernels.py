@@ -9,20 +9,34 @@ from ksim_rl.objectives.fused_ppo.mlp_kernels import operand
 
 @triton.jit
 def read_observations(
-    source, mean, var, obs, num_rows, eps,
+    source, mean, var, obs, known, values, next_values, places, count, num_rows, num_envs, eps,
     DIM: tl.constexpr, STORED: tl.constexpr, LANES: tl.constexpr, NORMALIZED: tl.constexpr, TF32: tl.constexpr,
-    BLOCK: tl.constexpr,
+    LISTED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write `source` [D, DIM], normalized or not, to `obs` [D, STORED], as products take it; padding is zero."""
-    row = (tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK))[:, None]
+    """Write `source` [D, DIM], normalized or not, to `obs` [D, STORED], as products take it; padding is zero.
+
+    LISTED, it is what follows env states, and only what the next step does not begin with is written, in any order, the
+    rows to `places` and their number to `count`. The value of others is that of `known` a step later.
+    """
+    row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     column = tl.arange(0, LANES)[None, :]
-    used = column < DIM
-    value = tl.load(source + row * DIM + column, mask=(row < num_rows) & used, other=0.0).to(tl.float32)
+    used, keep, at = column < DIM, row < num_rows, row
+    value = tl.load(source + row[:, None] * DIM + column, mask=keep[:, None] & used, other=0.0).to(tl.float32)
     if NORMALIZED:
         shift = tl.load(mean + column, mask=used, other=0.0)
         value = (value - shift) / tl.sqrt(tl.load(var + column, mask=used, other=1.0) + eps)
     value = operand(value, obs.dtype.element_ty, TF32)
-    tl.store(obs + row * STORED + column, value, mask=(row < num_rows) & (column < STORED))
+    if LISTED:
+        later = row + num_envs
+        follows = (later < num_rows)[:, None] & (column < STORED)
+        begun = tl.load(known + later[:, None] * STORED + column, mask=follows, other=0.0)
+        same = (later < num_rows) & (tl.sum(tl.where(value == begun, 0, 1), 1) == 0)
+        tl.store(next_values + row, tl.load(values + later, mask=same, other=0.0), mask=same)
+        keep = keep & (same == 0)
+        ones = tl.where(keep, 1, 0)
+        at = (tl.atomic_add(count, tl.sum(ones)) + tl.cumsum(ones, 0) - 1).to(tl.int64)
+        tl.store(places + at, row.to(tl.int32), mask=keep)
+    tl.store(obs + at[:, None] * STORED + column, value, mask=keep[:, None] & (column < STORED))
 
 
 @triton.jit

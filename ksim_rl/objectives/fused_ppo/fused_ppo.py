@@ -72,7 +72,7 @@ class FusedParameters:
         # Parameters, and the optimizer's means and variances, each [N].
         self.flat = [torch.zeros(layout.num_flat, device=device) for _ in range(3)]
         sizes, shapes = zip(*((own.numel(), own.shape) for own in self._parameters), strict=True)
-        self._views = [list(map(Tensor.view, flat.split(sizes), shapes)) for flat in self.flat]
+        self._views = [view for flat in self.flat for view in map(Tensor.view, flat.split(sizes), shapes)]
         self.places = layout.padded_index(networks).to(device)
         # The parameters in padded form, in float32 and in the dtype of the products.
         self.exact = torch.zeros(2, layout.num_padded, device=device)
@@ -83,17 +83,13 @@ class FusedParameters:
         self.steps = torch.zeros(num_steps + 1, device=device)
         for parameter in self._parameters:
             if parameter not in optimizer.state:
-                optimizer.state[parameter] = {
-                    "step": torch.zeros((), device=device),
-                    "exp_avg": torch.zeros_like(parameter),
-                    "exp_avg_sq": torch.zeros_like(parameter),
-                }
+                moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
+                optimizer.state[parameter] = {"step": torch.zeros((), device=device), **moments}
 
     @torch.no_grad()
     def load(self) -> None:
         """Take over what modules and optimizer hold."""
-        for views, tensors in zip(self._views, self._held(), strict=True):
-            torch._foreach_copy_(views, tensors)
+        torch._foreach_copy_(self._views, self._held())
         self.steps[0].copy_(self._optimizer.state[self._parameters[0]]["step"])
         self.exact.view(-1)[self.places] = self.flat[0]
         self.weights.copy_(as_tf32(self.exact) if self._tf32 else self.exact)
@@ -101,16 +97,13 @@ class FusedParameters:
     @torch.no_grad()
     def store(self) -> None:
         """Hand it back, with the number of steps after the last gradient step."""
-        for views, tensors in zip(self._views, self._held(), strict=True):
-            torch._foreach_copy_(tensors, views)
         counts = [self._optimizer.state[parameter]["step"] for parameter in self._parameters]
-        torch._foreach_copy_(counts, [self.steps[-1]] * len(counts))
+        torch._foreach_copy_([*self._held(), *counts], [*self._views, *[self.steps[-1]] * len(counts)])
 
-    def _held(self) -> list[list[Tensor]]:
+    def _held(self) -> list[Tensor]:
         # Looked up each time: loading a checkpoint gives the optimizer other tensors.
         states = [self._optimizer.state[parameter] for parameter in self._parameters]
-        moments = [[state[name] for state in states] for name in ("exp_avg", "exp_avg_sq")]
-        return [self._parameters, *moments]
+        return [*self._parameters, *(state[name] for name in ("exp_avg", "exp_avg_sq") for state in states)]
 
 
 class FusedPPO:
@@ -239,34 +232,29 @@ class FusedPPO:
         """Make all gradient steps of an update.
 
         `rollout_ET`, `["E","T"]`, may be time-major in memory, as that of a collector. `orders` has for each epoch the
-        env states in the order of the minibatches, counted env by env; a GPU draws one while it reads the rollout or
-        makes the steps of the epoch before, and does what is `aside` beside the first steps, which do not. Returned are
-        what each gradient step measured, by the names of `SUMMARY`, and how many env states took no part because an
-        element was not finite.
+        env states in the order of the minibatches, counted env by env; a GPU draws them while it reads the rollout, and
+        does what is `aside` beside the steps. Returned are what each gradient step measured, by the names of `SUMMARY`,
+        and how many env states took no part because an element was not finite.
         """
         num_envs, length = rollout_ET.batch_size
-        upcoming, epochs = iter(orders), []
+        # What was placed must stay until all is done, as another stream allocated it.
+        indices: list[Tensor] = []
 
         def place() -> None:
-            for order_D in itertools.islice(upcoming, 1):
-                order_D = order_D.to(torch.int32)
-                # From env by env to step by step.
-                epochs.append(((order_D % length) * num_envs + order_D // length).split(self.batch))
+            order_N = torch.cat([*orders]).to(torch.int32)
+            # From env by env to step by step.
+            indices.extend(((order_N % length) * num_envs + order_N // length).split(self.batch))
 
         with warp_scope(self._summary.device):
             with beside(self._side, place):
                 self.parameters.load()
                 left_out = self.dataset.read(rollout_ET, evaluate=self._evaluate)
-            step = itertools.count()
-            # Grows beside the steps; what was placed must stay until all is done, as another stream allocated it.
-            for indices in epochs:
-                with beside(self._side, place, *aside):
-                    for index_B in indices:
-                        if len(self.dataset.records) > self.dataset.size:
-                            index_B = torch.cat([index_B, index_B + self.dataset.size])
-                        self._multiply(index_B)
-                        self._improve(next(step))
-                aside = ()
+            with beside(self._side, *aside):
+                for step, index_B in enumerate(indices):
+                    if len(self.dataset.records) > self.dataset.size:
+                        index_B = torch.cat([index_B, index_B + self.dataset.size])
+                    self._multiply(index_B)
+                    self._improve(step)
             self.parameters.store()
         names = SUMMARY if self._mirrored else SUMMARY[:-1]
         return dict(zip(names, self._summary.unbind(1), strict=False)), left_out
@@ -348,10 +336,12 @@ class FusedPPO:
         grid = (parts(self.layout.num_flat, self.tuning.size),)
         launch(adam_step, grid, given, summary=summary, steps=self.parameters.steps[step:], **sizes)
 
-    def _evaluate(self, obs_DL: Tensor, values_D: Tensor) -> None:
+    def _evaluate(self, obs_DL: Tensor, values_D: Tensor, **listed: Tensor) -> None:
+        """Write the values of observations; `listed`, those of some rows to some places (see `state_values`)."""
         if self.layout.chained:
             given = self._arguments | {"obs": obs_DL, "values": values_D, "num_rows": len(values_D)}
             own = {"weights": self.parameters.weights[1], "biases": self.parameters.biases_2N[1]}
+            own |= {"LISTED": bool(listed), "count": None, **listed}
             grid = (parts(len(values_D), self.tuning.block),)
             launch(state_values, grid, given, num_warps=self.tuning.warps, **own)
             return

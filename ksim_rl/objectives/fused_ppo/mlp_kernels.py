@@ -53,33 +53,45 @@ def slope_of(value, ACTIVATION: tl.constexpr):
 
 @triton.jit
 def _outputs(
-    observed, weights, biases, inputs, input_rows, keep,
+    seen, rows, keep, weights, biases, inputs, input_rows,
+    STORED: tl.constexpr, OBS: tl.constexpr, HEAD: tl.constexpr, REST: tl.constexpr,
     H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr, OUT: tl.constexpr,
-    CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr, TF32: tl.constexpr,
-    STORE: tl.constexpr,
+    CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr, TF32: tl.constexpr, STORE: tl.constexpr,
 ):  # fmt: skip
-    """Return the outputs [BLOCK, OUT] for `observed` [BLOCK, OBS]; STORE keeps all but the first hidden layer."""
-    BLOCK: tl.constexpr = observed.shape[0]
-    OBS: tl.constexpr = observed.shape[1]
+    """Return the outputs [BLOCK, OUT] for `rows` of `seen` [D, STORED]; STORE keeps all but the first hidden layer."""
+    BLOCK: tl.constexpr = rows.shape[0]
     SECOND_AT: tl.constexpr = H1 * OBS
     THIRD_AT: tl.constexpr = SECOND_AT + H2 * H1
     OUT_AT: tl.constexpr = THIRD_AT + H3 * H2
-    obs_column = tl.arange(0, OBS)
+    dtype = weights.dtype.element_ty
+    head_column = tl.arange(0, HEAD)
     column = tl.arange(0, CHUNK)
     column2 = tl.arange(0, H2)
     output = tl.arange(0, OUT)
+    at = rows[:, None] * STORED
+    observed = tl.load(seen + (at + head_column), mask=keep & (head_column < STORED), other=0.0)
+    if STORE:
+        tl.store(inputs + (input_rows + head_column), observed, mask=keep)
+    if REST:
+        rest_column = HEAD + tl.arange(0, REST)
+        rest = tl.load(seen + (at + rest_column), mask=keep & (rest_column < STORED), other=0.0)
+        if STORE:
+            tl.store(inputs + (input_rows + rest_column), rest, mask=keep)
     acc = tl.zeros((BLOCK, H2), dtype=tl.float32)
     # Biases are loaded a chunk ahead: those of the same chunk each thread would copy to shared memory, like weights.
     bias = tl.load(biases + column)
     for first in tl.range(0, H1, CHUNK, num_stages=STAGES):
-        weight1 = tl.load(weights + ((first + column)[None, :] * OBS + obs_column[:, None]))
+        row = (first + column)[None, :] * OBS
+        hidden = tl.dot(observed, tl.load(weights + (row + head_column[:, None])))
+        if REST:
+            hidden = tl.dot(rest, tl.load(weights + (row + rest_column[:, None])), hidden)
         weight2 = tl.load(weights + (SECOND_AT + column2[None, :] * H1 + (first + column)[:, None]))
-        hidden = tl.dot(observed, weight1) + bias[None, :]
+        hidden += bias[None, :]
         bias = tl.load(biases + (first + CHUNK) % H1 + column)
-        hidden = operand(activate(hidden, ACTIVATION), observed.dtype, TF32)
+        hidden = operand(activate(hidden, ACTIVATION), dtype, TF32)
         acc = tl.dot(hidden, weight2, acc)
     second = activate(acc + tl.load(biases + H1 + column2)[None, :], ACTIVATION)
-    second = operand(second, observed.dtype, TF32)
+    second = operand(second, dtype, TF32)
     if STORE:
         tl.store(inputs + (input_rows + (OBS + column2[None, :])), second, mask=keep)
     out = tl.zeros((BLOCK, OUT), dtype=tl.float32)
@@ -89,7 +101,7 @@ def _outputs(
         weight4 = tl.load(weights + (OUT_AT + output[None, :] * H3 + (first + column)[:, None]))
         hidden = tl.dot(second, weight3) + bias[None, :]
         bias = tl.load(biases + H1 + H2 + (first + CHUNK) % H3 + column)
-        hidden = operand(activate(hidden, ACTIVATION), observed.dtype, TF32)
+        hidden = operand(activate(hidden, ACTIVATION), dtype, TF32)
         if STORE:
             tl.store(inputs + (input_rows + (OBS + H2 + first + column[None, :])), hidden, mask=keep)
         out = tl.dot(hidden, weight4, out)
@@ -97,27 +109,25 @@ def _outputs(
 
 
 @triton.jit
-def _observed(obs, rows, keep, STORED: tl.constexpr, OBS: tl.constexpr):
-    """Return those rows of `obs` [D, STORED], padded to OBS columns."""
-    column = tl.arange(0, OBS)[None, :]
-    return tl.load(obs + (rows[:, None] * STORED + column), mask=keep & (column < STORED), other=0.0)
-
-
-@triton.jit
 def state_values(
-    obs, weights, biases, values, num_rows,
-    STORED: tl.constexpr, OBS: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr,
-    OUT: tl.constexpr, BLOCK: tl.constexpr, CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr,
-    TF32: tl.constexpr,
+    obs, places, count, weights, biases, values, num_rows,
+    LISTED: tl.constexpr, STORED: tl.constexpr, OBS: tl.constexpr, HEAD: tl.constexpr, REST: tl.constexpr,
+    H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr, OUT: tl.constexpr, BLOCK: tl.constexpr,
+    CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr, TF32: tl.constexpr,
 ):  # fmt: skip
-    """Write the first output of a network for each row of `obs` [D, STORED] to `values` [D]."""
+    """Write the first output for rows of `obs` [D, STORED] to `values` [D]; LISTED, for `count` rows to `places`."""
     rows = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    if LISTED:
+        num_rows = tl.load(count)
+    if tl.program_id(0) * BLOCK >= num_rows:
+        return
     valid = rows < num_rows
-    keep = valid[:, None]
-    observed = _observed(obs, rows, keep, STORED, OBS)
     out = _outputs(
-        observed, weights, biases, values, rows, keep, H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, TF32, False
-    )
+        obs, rows, valid[:, None], weights, biases, values, rows, STORED, OBS, HEAD, REST,
+        H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, TF32, False
+    )  # fmt: skip
+    if LISTED:
+        rows = tl.load(places + rows, mask=valid, other=0)
     tl.store(values + rows, tl.sum(tl.where(tl.arange(0, OUT)[None, :] == 0, out, 0.0), 1), mask=valid)
 
 
@@ -125,12 +135,11 @@ def state_values(
 def minibatch_gradients(
     obs, records, order, weights, biases, inputs, slopes, block_partials, num_rows, num_obs,
     log_ratio_low, log_ratio_high, clip_value, entropy_coeff, critic_coeff,
-    NUM_PADDED: tl.constexpr, NUM_STATISTICS: tl.constexpr,
-    RECORD: tl.constexpr, INPUTS: tl.constexpr, GRADIENTS: tl.constexpr,
-    STORED: tl.constexpr, OBS: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr,
-    ACTIONS: tl.constexpr, OUT: tl.constexpr, LOG_STD: tl.constexpr, MIN_STD: tl.constexpr, CLIP_VALUE: tl.constexpr,
-    BLOCK: tl.constexpr, CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr,
-    TF32: tl.constexpr,
+    NUM_PADDED: tl.constexpr, NUM_STATISTICS: tl.constexpr, RECORD: tl.constexpr, INPUTS: tl.constexpr,
+    GRADIENTS: tl.constexpr, STORED: tl.constexpr, OBS: tl.constexpr, HEAD: tl.constexpr, REST: tl.constexpr,
+    H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr, ACTIONS: tl.constexpr, OUT: tl.constexpr,
+    LOG_STD: tl.constexpr, MIN_STD: tl.constexpr, CLIP_VALUE: tl.constexpr, BLOCK: tl.constexpr,
+    CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr, TF32: tl.constexpr,
 ):  # fmt: skip
     """Run a block of a minibatch through one network, its loss, and back: all but the products for the weights.
 
@@ -146,7 +155,6 @@ def minibatch_gradients(
     SECOND_AT: tl.constexpr = H1 * OBS
     THIRD_AT: tl.constexpr = SECOND_AT + H2 * H1
     OUT_AT: tl.constexpr = THIRD_AT + H3 * H2
-    obs_column = tl.arange(0, OBS)
     column = tl.arange(0, CHUNK)
     column2 = tl.arange(0, H2)
     output = tl.arange(0, OUT)
@@ -165,10 +173,10 @@ def minibatch_gradients(
     input_rows = rows[:, None] * INPUTS
     gradient_rows = rows[:, None] * GRADIENTS
 
-    observed = _observed(obs, index, keep, STORED, OBS)
-    tl.store(inputs + (input_rows + obs_column[None, :]), observed, mask=keep)
+    dtype = slopes.dtype.element_ty
     out = _outputs(
-        observed, weights, biases, inputs, input_rows, keep, H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, TF32, True
+        obs, index, keep, weights, biases, inputs, input_rows, STORED, OBS, HEAD, REST,
+        H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, TF32, True
     )  # fmt: skip
 
     record = records + index.to(tl.int64) * RECORD
@@ -182,7 +190,7 @@ def minibatch_gradients(
         )  # fmt: skip
     else:
         d_out = value_gradient(out, record, valid, statistics, clip_value, critic_coeff, OUT, CLIP_VALUE)
-    d_out = operand(d_out, observed.dtype, TF32)
+    d_out = operand(d_out, dtype, TF32)
     tl.store(slopes + (gradient_rows + (H2 + H3 + output[None, :])), d_out, mask=keep)
     # From here on threads read hidden layers that others of the block have written.
     tl.debug_barrier()
@@ -192,12 +200,12 @@ def minibatch_gradients(
         weight3 = tl.load(weights + (THIRD_AT + (first + column)[:, None] * H2 + column2[None, :]))
         hidden = tl.load(inputs + (input_rows + (OBS + H2 + first + column[None, :])), mask=keep, other=0.0)
         slope = tl.dot(d_out, weight4) * slope_of(hidden.to(tl.float32), ACTIVATION)
-        slope = operand(slope, observed.dtype, TF32)
+        slope = operand(slope, dtype, TF32)
         tl.store(slopes + (gradient_rows + (H2 + first + column[None, :])), slope, mask=keep)
         acc = tl.dot(slope, weight3, acc)
     middle = tl.load(inputs + (input_rows + (OBS + column2[None, :])), mask=keep, other=0.0)
     second = acc * slope_of(middle.to(tl.float32), ACTIVATION)
-    second = operand(second, observed.dtype, TF32)
+    second = operand(second, dtype, TF32)
     tl.store(slopes + (gradient_rows + column2[None, :]), second, mask=keep)
 
 
@@ -246,9 +254,10 @@ def lower_gradients(
             rest = tl.load(inputs + (rows * INPUTS + rest_column), mask=rows < num_rows, other=0.0)
             hidden = tl.dot(weight_rest, tl.trans(rest), hidden)
         hidden = operand(activate(hidden + bias, ACTIVATION), observed.dtype, TF32)
+        slope = tl.dot(weight2, tl.trans(above))
+        # Beside which a GPU takes the slopes of the activation: a product that adds up is not waited for.
         d_weight2 = tl.dot(hidden, above, d_weight2)
-        slope = tl.dot(weight2, tl.trans(above)) * slope_of(hidden.to(tl.float32), ACTIVATION)
-        slope = operand(slope, observed.dtype, TF32)
+        slope = operand(slope * slope_of(hidden.to(tl.float32), ACTIVATION), observed.dtype, TF32)
         d_weight1 = tl.dot(slope, observed, d_weight1)
         if REST:
             d_weight_rest = tl.dot(slope, rest, d_weight_rest)
