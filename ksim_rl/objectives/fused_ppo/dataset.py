@@ -64,6 +64,7 @@ class FusedDataset:
             "TF32": tf32,
             "STANDARDIZED": cfg.normalize_advantage == "dataset",
         }
+        self.listed = {name: self._arguments[name] for name in ("places", "count") if layout.chained}
 
     @torch.no_grad()
     def read(self, rollout_ET: TensorDictBase, *, evaluate: Callable[..., None]) -> Int64[Tensor, ""]:
@@ -78,10 +79,9 @@ class FusedDataset:
         num_envs, length = rollout_ET.batch_size
         next_obs = torch.empty_like(self.obs[1, : self.size])
         evaluate(self.obs[1, : self.size], self._signals[0])
-        listed = {name: self._arguments[name] for name in ("places", "count") if self.layout.chained}
         self._arguments["count"].zero_()
-        self._take_observations(1, following, next_obs, num_envs=num_envs, LISTED=bool(listed))
-        evaluate(next_obs, self._signals[1], **listed)
+        self._take_observations(1, following, next_obs, num_envs=num_envs, LISTED=bool(self.listed))
+        evaluate(next_obs, self._signals[1], **self.listed)
         programs = parts(num_envs, ENVS)
         moments = self.records.new_empty(programs, 3)
         signals = {key: _time_major(following.get(key)) for key in ("reward", "done", "terminated")}

@@ -32,6 +32,7 @@ from ksim_rl.objectives.fused_ppo.layout import (
     FusedNetworks,
     LayerPlace,
     Tuning,
+    compiled_together,
     launch,
     parts,
     power_of_two,
@@ -157,6 +158,12 @@ class FusedPPO:
         # chained kernels leave out half of its columns.
         self._splits = tuning.splits if self._mirrored or layout.chained else parts(tuning.splits, 2)
         self._arguments = self._all_arguments(rows, mirror)
+        if device.type == "cuda" and layout.chained:
+            with compiled_together():
+                self._multiply(torch.zeros(rows, dtype=torch.int32, device=device))
+                self._improve(0)
+                for listed in ({}, self.dataset.listed):
+                    self._evaluate(self.dataset.obs[1], self.dataset.records[:, 0].contiguous(), **listed)
 
     def _all_arguments(self, rows: int, mirror: SymmetricAugmentation | None) -> dict[str, Any]:
         """Return what kernels get in every step, by the names of their parameters; `rows` are those of a minibatch."""

@@ -2,8 +2,12 @@
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -26,6 +30,7 @@ MAX_WIDTH = 1024
 MAX_TF32_WIDTH = 256
 MAX_ACTIONS = 64
 MAX_PLACES = 2**31
+_only_compiles = ContextVar("only_compiles", default=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,7 +261,21 @@ def launch(
     It gets those of the `arguments`, and of their `changes`, that are named as its parameters.
     """
     given = {**arguments, **changes}
-    kernel[grid](**{name: given[name] for name in kernel.arg_names}, num_warps=num_warps)
+    run = partial(kernel.warmup, grid=grid) if _only_compiles.get() else kernel[grid]
+    run(**{name: given[name] for name in kernel.arg_names}, num_warps=num_warps)
+
+
+@contextmanager
+def compiled_together() -> Iterator[None]:
+    """Run none of the launches in this block, but compile their kernels side by side: in turn that takes seconds."""
+    import triton  # only where CUDA is
+
+    token = _only_compiles.set(True)
+    try:
+        with ThreadPoolExecutor() as pool, triton.AsyncCompileMode(pool):
+            yield
+    finally:
+        _only_compiles.reset(token)
 
 
 def parts(total: int, size: int) -> int:
