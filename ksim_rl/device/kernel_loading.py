@@ -115,6 +115,4 @@ def load(modules: Iterable[tuple[wp.Module, int | None]], device: torch.device) 
     """Compile and load modules, side by side, for launches of the block sizes beside them; of any on the CPU."""
     of_cpu, load_one = device.type == "cpu", partial(wp.force_load, warp_device(device), max_workers=0)
     with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_WORKERS)) as pool:
-        jobs = [pool.submit(load_one, [module], None if of_cpu else size) for module, size in modules]
-    for job in jobs:
-        job.result()
+        list(pool.map(lambda found: load_one([found[0]], None if of_cpu else found[1]), modules))

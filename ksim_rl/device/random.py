@@ -9,9 +9,8 @@ a resumed run needs only the integers. The mixing function is Wellons' two-round
 Draws made at every step are keyed by a step counter; draws made at a reset by a per-env counter of resets. A draw is
 one Warp kernel, which is also a torch operator: it can be captured and compiled. A normal is the inverse of the normal
 distribution's cumulative function at a uniform (Giles, "Approximating the erfinv function", 2010): one hash per number
-and no branch, so that the CPU's compiler turns loops into vector instructions.
-A permutation takes no sort: each element is what a Feistel network makes of its place (Luby and Rackoff, "How to
-construct pseudorandom permutations from pseudorandom functions", 1988).
+and no branch, so that the CPU's compiler turns loops into vector instructions. A permutation takes no sort, but a
+Feistel network of places (Luby and Rackoff, "How to construct pseudorandom permutations", 1988).
 """
 
 import zlib

@@ -102,8 +102,7 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         if (mask_B := self._mask(tensordict, log_weight_B)) is not None:
             # The ratio of a row that is left out may be infinite, and zero times that is a gradient of NaN.
             log_weight_B = torch.where(mask_B, log_weight_B, 0.0)
-        # The clipping acts on the ratio to the proximal policy; the gain is weighted by that to the
-        # collecting one.
+        # The clipping acts on the ratio to the proximal policy; the gain is weighted by that to the collecting one.
         log_behavior_weight_B = log_weight_B if log_is_weight_B is None else log_weight_B + log_is_weight_B
         log_clipped_B = log_weight_B.clamp(*self._clip_bounds)
         clipped_B = log_clipped_B != log_weight_B

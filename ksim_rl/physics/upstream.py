@@ -138,10 +138,7 @@ def with_contact_sensors_only(warp_model: mjw.Model) -> mjw.Model:
 
 
 def without(sensors: Sequence[int], warp_model: mjw.Model) -> mjw.Model:
-    """Return a model on the same arrays that leaves out these sensors of contacts and accelerations.
-
-    It computes forces of all bodies only if a sensor that is left reads them.
-    """
+    """Return a model on the same arrays without these sensors, nor forces of all bodies if no other reads them."""
     m, lists = warp_model, (warp_model.sensor_contact_acc_adr.numpy(), warp_model.sensor_acc_adr.numpy())
     of_contacts, others = (ids[~np.isin(ids, sensors)] for ids in lists)
     return dataclasses.replace(

@@ -1,10 +1,9 @@
 """All velocity tasks share this module: a legged robot follows a planar velocity command.
 
-A task's module holds the figures of its robot and puts the parts together. Weights, noise and pushes are those of
-mjlab 1.6.0's velocity tasks, so that both can be compared on the same work, and so are the training settings but for
-two (see `training`). Two more things are ours: the actor's joint positions are a term of their own
-(`joint_pos_biased`), because groups share terms by name; and the encoders' bias reaches that observation only, not the
-servo targets.
+A task's module holds the figures of its robot and puts the parts together. Weights, noise and pushes are those of mjlab
+1.6.0's velocity tasks, so that both can be compared on the same work, and so are the training settings but for two (see
+`training`). Two more things are ours: the actor's joint positions are a term of their own (`joint_pos_biased`), because
+groups share terms by name; and the encoders' bias reaches that observation only, not the servo targets.
 """
 
 import dataclasses

@@ -24,8 +24,7 @@ class ObservationNormalization(RowTransform):
 
     `env.eval()` freezes the statistics and `env.train()` goes on, `enable_` does the same for one transform; both write
     a device flag, so a captured or compiled step follows. With `torch.distributed`, the ranks merge their statistics in
-    each step (one collective, none while frozen), so they have to step alike; states of resets join in the next
-    step's.
+    each step (one collective, none while frozen), so they have to step alike; states of resets join in the next step's.
 
     Prefer `obs_normalization` of actor and critic where they fit: those go into the checkpoint by themselves.
 

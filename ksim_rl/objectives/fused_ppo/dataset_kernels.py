@@ -15,8 +15,8 @@ def read_observations(
 ):  # fmt: skip
     """Write `source` [D, DIM], normalized or not, to `obs` [D, STORED], as products take it; padding is zero.
 
-    LISTED, it is what follows env states, and only what the next step does not begin with is written, in any order, the
-    rows to `places` and their number to `count`. The value of others is that of `known` a step later.
+    LISTED, of what follows env states only what the next step does not begin with is written, in any order, the rows to
+    `places`, their number to `count`. The value of others is that of `known` a step later.
     """
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     column = tl.arange(0, LANES)[None, :]

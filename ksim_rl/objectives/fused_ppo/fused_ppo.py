@@ -11,10 +11,12 @@ moves it by 0.05 to 0.5.
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
 import torch
+import triton
 from jaxtyping import Float, Int64
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -32,7 +34,6 @@ from ksim_rl.objectives.fused_ppo.layout import (
     FusedNetworks,
     LayerPlace,
     Tuning,
-    compiled_together,
     launch,
     parts,
     power_of_two,
@@ -159,11 +160,14 @@ class FusedPPO:
         self._splits = tuning.splits if self._mirrored or layout.chained else parts(tuning.splits, 2)
         self._arguments = self._all_arguments(rows, mirror)
         if device.type == "cuda" and layout.chained:
-            with compiled_together():
+            # Side by side: one after another took seven of a cold start's seconds.
+            self._arguments["compiles"] = True
+            with ThreadPoolExecutor() as pool, triton.AsyncCompileMode(pool):
                 self._multiply(torch.zeros(rows, dtype=torch.int32, device=device))
                 self._improve(0)
                 for listed in ({}, self.dataset.listed):
                     self._evaluate(self.dataset.obs[1], self.dataset.records[:, 0].contiguous(), **listed)
+            self._arguments["compiles"] = False
 
     def _all_arguments(self, rows: int, mirror: SymmetricAugmentation | None) -> dict[str, Any]:
         """Return what kernels get in every step, by the names of their parameters; `rows` are those of a minibatch."""
@@ -244,18 +248,18 @@ class FusedPPO:
         and how many env states took no part because an element was not finite.
         """
         num_envs, length = rollout_ET.batch_size
-        # What was placed must stay until all is done, as another stream allocated it.
-        indices: list[Tensor] = []
+        left_out: list[Tensor] = []
 
-        def place() -> None:
-            order_N = torch.cat([*orders]).to(torch.int32)
-            # From env by env to step by step.
-            indices.extend(((order_N % length) * num_envs + order_N // length).split(self.batch))
+        def read() -> None:
+            self.parameters.load()
+            left_out.append(self.dataset.read(rollout_ET, evaluate=self._evaluate))
 
         with warp_scope(self._summary.device):
-            with beside(self._side, place):
-                self.parameters.load()
-                left_out = self.dataset.read(rollout_ET, evaluate=self._evaluate)
+            # A graph begins with what is aside, and reading takes longer than drawing.
+            with beside(self._side, read):
+                order_N = torch.cat([*orders]).to(torch.int32)
+                # From env by env to step by step.
+                indices = ((order_N % length) * num_envs + order_N // length).split(self.batch)
             with beside(self._side, *aside):
                 for step, index_B in enumerate(indices):
                     if len(self.dataset.records) > self.dataset.size:
@@ -264,7 +268,7 @@ class FusedPPO:
                     self._improve(step)
             self.parameters.store()
         names = SUMMARY if self._mirrored else SUMMARY[:-1]
-        return dict(zip(names, self._summary.unbind(1), strict=False)), left_out
+        return dict(zip(names, self._summary.unbind(1), strict=False)), left_out[0]
 
     def _split(self, rows: int) -> int:
         """Return how many rows of a minibatch are a split: whole blocks, and whole steps of `weight_gradients`."""

@@ -2,10 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -30,7 +27,6 @@ MAX_WIDTH = 1024
 MAX_TF32_WIDTH = 256
 MAX_ACTIONS = 64
 MAX_PLACES = 2**31
-_only_compiles = ContextVar("only_compiles", default=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,10 +113,9 @@ class FusedLayout:
         self.stored = _multiple(max(*self.obs_dims, MIN_WIDTH))
         self.obs = power_of_two(self.stored) if self.chained else self.stored
         # What is stored as two powers of two, where these are less than `obs`.
-        self.head = 1 << (self.stored.bit_length() - 1)
-        self.rest = power_of_two(self.stored - self.head) if self.stored > self.head else 0
-        if self.head + self.rest >= self.obs:
-            self.head, self.rest = self.obs, 0
+        head = 1 << (self.stored.bit_length() - 1)
+        rest = power_of_two(self.stored - head) if self.stored > head else 0
+        self.head, self.rest = (head, rest) if head + rest < self.obs else (self.obs, 0)
         self.out = power_of_two(max(self.actions, MIN_WIDTH))
         outputs = self.out if networks.std_layer is None else 2 * self.out
         widths = (self.obs, *self.hidden, outputs)
@@ -152,8 +147,7 @@ class FusedLayout:
                 index.append(row[self.num_weights + at.bias :][: layer.out_features])
             if layers is networks.actor:
                 if networks.std_layer is not None:
-                    rows = block[self.out : self.out + actions, : layer.in_features]
-                    index.append(rows)
+                    index.append(block[self.out : self.out + actions, : layer.in_features])
                 index.append(row[std_at : std_at + actions])
         return torch.cat([places.reshape(-1) for places in index])
 
@@ -258,24 +252,11 @@ def launch(
 ) -> None:
     """Run `grid` programs of a Triton kernel, whose signature type checkers cannot read, on the current stream.
 
-    It gets those of the `arguments`, and of their `changes`, that are named as its parameters.
+    It gets those of `arguments` and `changes` that are its parameters; with `compiles=True` it is only compiled.
     """
     given = {**arguments, **changes}
-    run = partial(kernel.warmup, grid=grid) if _only_compiles.get() else kernel[grid]
+    run = partial(kernel.warmup, grid=grid) if given.get("compiles") else kernel[grid]
     run(**{name: given[name] for name in kernel.arg_names}, num_warps=num_warps)
-
-
-@contextmanager
-def compiled_together() -> Iterator[None]:
-    """Run none of the launches in this block, but compile their kernels side by side: in turn that takes seconds."""
-    import triton  # only where CUDA is
-
-    token = _only_compiles.set(True)
-    try:
-        with ThreadPoolExecutor() as pool, triton.AsyncCompileMode(pool):
-            yield
-    finally:
-        _only_compiles.reset(token)
 
 
 def parts(total: int, size: int) -> int:

@@ -207,11 +207,7 @@ def _num_free_bodies(warp_model: mjw.Model) -> int:
 
 
 def _elimination(warp_model: mjw.Model) -> dict[str, Sequence[int] | np.ndarray]:
-    """Return tables of degrees of freedom, but for those of bodies solved for on their own, from the last to the first.
-
-    These are all of them, those in no other's row of the inertia matrix, which entries change as each is eliminated,
-    and where those of each begin.
-    """
+    """Return the degrees of freedom to eliminate, the last first, those in no other's row, and what each changes."""
     m, changes, first = warp_model, [], [0]
     alone = m.body_freeadr.numpy()[: _num_free_bodies(m)]
     order = np.flatnonzero(~np.isin(m.dof_bodyid.numpy(), alone))[::-1]
