@@ -53,11 +53,15 @@ def moments(made):
 
 
 def errors(made, exact):
-    """Return by layer how far its gradient, weights and biases together, is from the exact one, relative to that."""
+    """Return by layer how far its gradient, weights and biases together, is from the exact one, relative to that.
+
+    A standard deviation counts with its head: of one action it is one number, in which nearly all can cancel.
+    """
     names = [name for module in (made.actor, made.critic) for name, _ in module.named_parameters()]
     layers = {}
     for name, ours, theirs in zip(names, moments(made), moments(exact), strict=True):
-        layers.setdefault(name.rpartition(".")[0], []).append(torch.stack((ours, theirs)).flatten(1))
+        layer = name.rpartition(".")[0].removesuffix(".loc")
+        layers.setdefault(layer, []).append(torch.stack((ours, theirs)).flatten(1))
     joined = {layer: torch.cat(parts, dim=1) for layer, parts in layers.items()}
     return {layer: float((ours - theirs).norm() / theirs.norm()) for layer, (ours, theirs) in joined.items()}
 
