@@ -15,6 +15,7 @@ from ksim_rl.physics.newton import kernel
 from ksim_rl.physics.newton import solver as newton
 from ksim_rl.physics.newton.kernel import Invariant
 from ksim_rl.physics.newton.limbs import limbs_of
+from tests.physics.solver_problem import problems
 
 NUM_ENVS = 6
 ROWS_OF_ALL_KINDS = """
@@ -120,7 +121,7 @@ def test_accelerations_and_forces_are_those_of_the_c_engine(cone):
 def test_iterations_and_overflow_are_those_of_mujoco_warp(cone, iterations):
     world = worlds(cone, iterations=iterations)
     rows_of(world)
-    found = []
+    todo, found = problems(world), []
     with wp.ScopedDevice("cpu"):
         model, data = world.warp_model, world.warp_data_E
         for solve in (partial(mjw.solve, model, data), newton.solver(model, data)):
@@ -134,6 +135,12 @@ def test_iterations_and_overflow_are_those_of_mujoco_warp(cone, iterations):
     if iterations == 2:
         # Its line searches are shorter, so that it is elsewhere halfway; a world may have arrived all the same.
         assert not (ours["overflow"] & ~theirs["overflow"]).any() and ours["overflow"].any()
+        start, there, here = (
+            np.array([problem.cost(each) for problem, each in zip(todo, qacc.double().numpy(), strict=True)])
+            for qacc in (torch.zeros_like(ours["qacc"]), theirs["qacc"], ours["qacc"])
+        )
+        # Of what MuJoCo Warp has saved by then, 0.5 % was the most that ours had not.
+        assert (start > there).all() and (here - there <= 0.01 * (start - there)).all()
         return
     for name in ("qacc", "qfrc_constraint", "efc.Ma"):
         scale = 1.0 + theirs[name].abs().amax(-1, keepdim=True)
