@@ -200,20 +200,19 @@ class DatasetUpdate(RolloutUpdate):
 
 
 def optimizer_state(optimizer: torch.optim.Optimizer) -> state_tree.State:
-    """Return learning rate and moments; a parameter that no loss has reached has an empty entry."""
+    """Return learning rates and moments; a parameter that no loss has reached has an empty entry."""
     group = optimizer.param_groups[0]
     moments = {index: dict(optimizer.state.get(own, {})) for index, own in enumerate(group["params"])}
-    return {"learning_rate": group["lr"], "moments": moments}
+    rates = {"learning_rate": group["lr"], "initial_learning_rate": group.get("initial_lr")}
+    return rates | {"moments": moments}
 
 
 def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, Any], *, what: str) -> None:
     """Continue where `optimizer_state` was taken, at the same addresses; a ValueError names what does not fit."""
-    parameters = optimizer.param_groups[0]["params"]
+    group, parameters = optimizer.param_groups[0], optimizer.param_groups[0]["params"]
     moments = {int(index): entry for index, entry in state["moments"].items()}
     if set(moments) != set(range(len(parameters))):
-        raise ValueError(
-            f"{what}: {len(moments)} parameters in the checkpoint, {len(parameters)} in this run"
-        )
+        raise ValueError(f"{what}: {len(moments)} parameters in the checkpoint, {len(parameters)} in the run")
     for index, parameter in enumerate(parameters):
         for name in ("exp_avg", "exp_avg_sq") if moments[index] else ():
             if moments[index][name].shape != parameter.shape:
@@ -221,7 +220,9 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, A
                     f"{what}: {name} of parameter {index} has shape {list(moments[index][name].shape)} in the "
                     f"checkpoint and {list(parameter.shape)} in this run"
                 )
-    optimizer.param_groups[0]["lr"].copy_(torch.as_tensor(state["learning_rate"]))
+    # A rate that a resumed run is given anew stays.
+    if state.get("initial_learning_rate") in (None, group.get("initial_lr")):
+        group["lr"].copy_(torch.as_tensor(state["learning_rate"]))
     for index, parameter in enumerate(parameters):
         own = optimizer.state[parameter]
         for name, tensor in moments[index].items():

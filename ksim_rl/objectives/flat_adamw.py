@@ -32,7 +32,8 @@ class FlatAdamW(torch.optim.Optimizer):
     ) -> None:
         learning = [parameter for parameter in parameters if parameter.requires_grad]
         device = learning[0].device
-        super().__init__(learning, {"lr": torch.tensor(learning_rate, device=device)})
+        rates = {"lr": torch.tensor(learning_rate, device=device), "initial_lr": learning_rate}
+        super().__init__(learning, rates)
         self._cfg, self._learning = cfg, learning
         self._gaps = [own.new_zeros(-own.numel() % ALIGNMENT) for own in learning]
         self._flat, self._target = self._end_to_end(learning), self._end_to_end(list(target))

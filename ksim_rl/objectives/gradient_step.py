@@ -111,7 +111,7 @@ def make_optimizer(cfg: OnPolicyCfg, *modules: nn.Module) -> torch.optim.Adam:
     parameters = list(dict.fromkeys(parameter for module in modules for parameter in module.parameters()))
     device = parameters[0].device
     return torch.optim.Adam(
-        parameters,
+        [{"params": parameters, "initial_lr": cfg.learning_rate}],
         lr=torch.tensor(cfg.learning_rate, dtype=torch.float32, device=device),
         betas=cfg.betas,
         eps=cfg.adam_eps,

@@ -67,7 +67,8 @@ def test_a_loaded_state_continues():
     for step in range(3):
         flat.step(_descend(network, flat, seed=step))
     twin = copy.deepcopy(network)
-    other = FlatAdamW(CFG, twin.parameters(), learning_rate=0.5)
+    other = FlatAdamW(CFG, twin.parameters(), learning_rate=1e-2)
+    other.param_groups[0]["lr"].fill_(0.5)
     load_optimizer_state(other, optimizer_state(flat), what="optimizer")
     for made, optimizer in ((network, flat), (twin, other)):
         optimizer.step(_descend(made, optimizer, seed=9))

@@ -143,13 +143,22 @@ def test_shared_parameters_are_optimized_once():
     assert len(parameters) == len(set(parameters)) == len({*actor.parameters(), *critic.parameters()})
 
 
+def test_a_learning_rate_that_is_given_anew_stays():
+    cfg = PPOCfg()
+    actor, critic, _, optimizer = _parts(cfg)
+    optimizer.param_groups[0]["lr"].fill_(9e-3)
+    resumed = make_optimizer(dataclasses.replace(cfg, learning_rate=2e-4), actor, critic)
+    load_optimizer_state(resumed, optimizer_state(optimizer), what="optimizer")
+    assert resumed.param_groups[0]["lr"].item() == pytest.approx(2e-4)
+
+
 def test_optimizer_state_continues_exactly():
     cfg = PPOCfg()
     actor, critic, loss, optimizer = _parts(cfg)
     first, second = minibatch(actor, critic), minibatch(actor, critic)
     ppo_step(loss, optimizer, first, cfg=cfg)
-    resumed = make_optimizer(dataclasses.replace(cfg, learning_rate=9e-3), actor, critic)
-    rate = resumed.param_groups[0]["lr"]
+    resumed = make_optimizer(cfg, actor, critic)
+    rate = resumed.param_groups[0]["lr"].fill_(9e-3)
     load_optimizer_state(resumed, optimizer_state(optimizer), what="optimizer")
     assert resumed.param_groups[0]["lr"] is rate
     assert rate == optimizer.param_groups[0]["lr"]
