@@ -51,7 +51,6 @@ def _training(
 
 
 # -- a pole on a cart --------------------------------------------------------------------------------------------
-
 # A 1 kg cart on a 3.6 m rail carries a 0.1 kg pole of 1 m; the force is at most 10 N; control runs at 100 Hz for 10 s.
 
 
@@ -174,7 +173,6 @@ CARTPOLE_SWINGUP = Task(
 
 
 # -- a pendulum --------------------------------------------------------------------------------------------------
-
 # Its torque cannot lift it. dm_control's reward is 1 within 8 degrees of upright and 0 elsewhere; ours also the way.
 UPRIGHT = math.cos(math.radians(8.0))
 
@@ -221,13 +219,15 @@ PENDULUM_SWINGUP = Task(
     name="pendulum_swingup",
     description="swing a pendulum up with little torque and hold it there",
     cfg=pendulum_swingup,
-    # Few envs, short rollouts and small minibatches, for a CPU: solved after 200 to 300 thousand env states.
+    # Few envs, short rollouts and small minibatches, for a CPU: solved after 200 to 500 thousand env states, with each
+    # of seeds 1 to 8. With a rate that stays one of eight ended unsolved, its last steps as large as the first.
     training=_training(
         num_envs=64,
         data=DatasetCfg(num_env_states_per_minibatch=512, num_minibatches=4),
         num_iterations=300,
         eval_interval=50,
         learning_rate=2e-3,
+        anneal_learning_rate=True,
         num_epochs=6,
         gamma=0.98,
         lmbda=0.9,
@@ -267,7 +267,6 @@ PENDULUM_SWINGUP = Task(
 
 
 # -- an arm with two joints --------------------------------------------------------------------------------------
-
 # dm_control's reward is 1 inside the target and 0 elsewhere; ours rates the way there too.
 TARGET_RADIUS = 0.015
 
