@@ -212,7 +212,9 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, A
     group, parameters = optimizer.param_groups[0], optimizer.param_groups[0]["params"]
     moments = {int(index): entry for index, entry in state["moments"].items()}
     if set(moments) != set(range(len(parameters))):
-        raise ValueError(f"{what}: {len(moments)} parameters in the checkpoint, {len(parameters)} in the run")
+        raise ValueError(
+            f"{what}: {len(moments)} parameters in the checkpoint, {len(parameters)} in this run"
+        )
     for index, parameter in enumerate(parameters):
         for name in ("exp_avg", "exp_avg_sq") if moments[index] else ():
             if moments[index][name].shape != parameter.shape:
@@ -220,8 +222,7 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, A
                     f"{what}: {name} of parameter {index} has shape {list(moments[index][name].shape)} in the "
                     f"checkpoint and {list(parameter.shape)} in this run"
                 )
-    # A rate that a resumed run is given anew stays.
-    if state.get("initial_learning_rate") in (None, group.get("initial_lr")):
+    if state.get("initial_learning_rate") in (None, group.get("initial_lr")):  # or else it is given anew
         group["lr"].copy_(torch.as_tensor(state["learning_rate"]))
     for index, parameter in enumerate(parameters):
         own = optimizer.state[parameter]

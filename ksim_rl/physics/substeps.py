@@ -86,8 +86,8 @@ class Substeps:
             self.contact_lists = ContactLists(warp_model, warp_data_E)
             self._make_rows = constraint_rows(warp_model, warp_data_E, self.contact_lists)
             self._contacts = ContactReadings(mj_model, warp_model, warp_data_E, self.contact_lists)
-            without = partial(upstream.without, self._contacts.sensors)
-            self._models = {which: without(m) for which, m in self._models.items()}
+            ours = self._contacts.sensors
+            self._models = {which: upstream.without(ours, m) for which, m in self._models.items()}
             if own_broad_phase:
                 self._collide = collisions(warp_model, warp_data_E, self.contact_lists)
         if one_kernel_integration:

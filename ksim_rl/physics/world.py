@@ -397,8 +397,8 @@ class World(views.DataViews):
 
     @staticmethod
     def _sensors_of(substep: int, n: int, sensors: str) -> Sensors:
-        last, amid = ("all", "all") if sensors == "every" else ("kept", "none")
-        return last if substep == n - 1 else "contacts" if sensors == "contacts" else amid
+        amid: dict[str, Sensors] = {"last": "none", "contacts": "contacts", "every": "all"}
+        return "kept" if substep == n - 1 and sensors != "every" else amid[sensors]
 
     def _launch_substep(self, sensors: Sensors, *, is_last: bool = True) -> None:
         if self._nan_guard is not None:

@@ -84,7 +84,7 @@ def test_an_optimizer_of_another_size_is_refused(trainer):
     trainer.update(trainer.collector.collect())
     state = trainer.update.state_dict()
     state["optimizer"]["moments"].popitem()
-    with pytest.raises(ValueError, match=r"optimizer: \d+ parameters in the checkpoint, \d+ in the run"):
+    with pytest.raises(ValueError, match=r"optimizer: \d+ parameters in the checkpoint, \d+ in this run"):
         trainer.update.load_state_dict(state)
 
 
