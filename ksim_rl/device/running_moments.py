@@ -34,13 +34,17 @@ _quick = QuickLaunch(
     } else if (a.stage == 1) {
         const size_t begin = (size_t)row * a.rows, end = begin + a.rows < a.num_rows ? begin + a.rows : a.num_rows;
         double weight = 0.0, sum = 0.0, square = 0.0;
+        // All rows are read, counted or not, so that many reads are under way at once.
+        #pragma unroll 8
         for (size_t i = begin; i < end; ++i) {
+            const double value = values[i * dim + lane];
             weight += counts[i];
-            sum += counts[i] ? (double)values[i * dim + lane] : 0.0;
+            sum += counts[i] ? value : 0.0;
         }
         const double mean = weight > 0.0 ? sum / weight : 0.0;
+        #pragma unroll 8
         for (size_t i = begin; i < end; ++i) {
-            const double error = counts[i] ? (double)values[i * dim + lane] - mean : 0.0;
+            const double value = values[i * dim + lane], error = counts[i] ? value - mean : 0.0;
             square += error * error;
         }
         means[row * dim + lane] = mean;
@@ -48,11 +52,13 @@ _quick = QuickLaunch(
         if (lane == 0) weights[row] = weight;
     } else {
         double added = 0.0, sum = 0.0, square = 0.0;
+        #pragma unroll 16
         for (int part = 0; part < a.parts; ++part) {
             added += weights[part];
             sum += weights[part] * means[part * dim + lane];
         }
         const double mean = sum / (added > 1.0 ? added : 1.0);
+        #pragma unroll 16
         for (int part = 0; part < a.parts; ++part) {
             const double error = means[part * dim + lane] - mean;
             square += squares[part * dim + lane] + weights[part] * error * error;

@@ -248,18 +248,18 @@ class FusedPPO:
         and how many env states took no part because an element was not finite.
         """
         num_envs, length = rollout_ET.batch_size
-        left_out: list[Tensor] = []
+        indices: list[Tensor] = []
 
-        def read() -> None:
-            self.parameters.load()
-            left_out.append(self.dataset.read(rollout_ET, evaluate=self._evaluate))
+        def draw() -> None:
+            order_N = torch.cat([*orders]).to(torch.int32)
+            # From env by env to step by step.
+            indices.extend(((order_N % length) * num_envs + order_N // length).split(self.batch))
 
         with warp_scope(self._summary.device):
-            # A graph begins with what is aside, and reading takes longer than drawing.
-            with beside(self._side, read):
-                order_N = torch.cat([*orders]).to(torch.int32)
-                # From env by env to step by step.
-                indices = ((order_N % length) * num_envs + order_N // length).split(self.batch)
+            # What is aside starts late: a graph's launch sends the main stream's steps first, all hundred of them.
+            with beside(self._side, draw):
+                self.parameters.load()
+                left_out = self.dataset.read(rollout_ET, evaluate=self._evaluate)
             with beside(self._side, *aside):
                 for step, index_B in enumerate(indices):
                     if len(self.dataset.records) > self.dataset.size:
@@ -268,7 +268,7 @@ class FusedPPO:
                     self._improve(step)
             self.parameters.store()
         names = SUMMARY if self._mirrored else SUMMARY[:-1]
-        return dict(zip(names, self._summary.unbind(1), strict=False)), left_out[0]
+        return dict(zip(names, self._summary.unbind(1), strict=False)), left_out
 
     def _split(self, rows: int) -> int:
         """Return how many rows of a minibatch are a split: whole blocks, and whole steps of `weight_gradients`."""
