@@ -44,6 +44,7 @@ class ActorCfg(OnPolicyNetworkCfg):
             bounds; None refuses such a spec.
         init_std: standard deviation of each action at the start, in units of the action; of the bounded distributions
             in units of half the range, before the tanh or the truncation.
+        min_std: what no standard deviation falls below, in units of `init_std`: how broadly it always explores.
         std_type: "scalar" learns the standard deviation itself, "log" its logarithm.
         state_dependent_std: predict the standard deviation from the state instead of learning one per action.
         output_gain: scale of the last layer's weights. Small, so that the first policy acts around zero (the default
@@ -53,6 +54,7 @@ class ActorCfg(OnPolicyNetworkCfg):
     distribution: Literal["gaussian", "tanh_gaussian", "truncated_gaussian", "categorical"] = "gaussian"
     action_bound: Positive | None = None
     init_std: Positive = 1.0
+    min_std: Positive = MIN_STD
     std_type: Literal["scalar", "log"] = "scalar"
     state_dependent_std: bool = False
     output_gain: NonNegative = 0.01
@@ -64,6 +66,8 @@ class ActorCfg(OnPolicyNetworkCfg):
                 f"action_bound={self.action_bound!r} does nothing with distribution={self.distribution!r}: "
                 "use 'tanh_gaussian' or 'truncated_gaussian', or leave it out"
             )
+        if self.min_std > self.init_std:
+            raise ValueError(f"min_std={self.min_std!r}: init_std={self.init_std!r} must not lie below")
 
 
 class GaussianHead(nn.Module):
@@ -79,7 +83,7 @@ class GaussianHead(nn.Module):
 
     def __init__(self, cfg: ActorCfg, feature_dim: int, action_dim: int, *, device: Device = None) -> None:
         super().__init__()
-        self.std_type, init_std = cfg.std_type, cfg.init_std
+        self.std_type, self.min_std, init_std = cfg.std_type, cfg.min_std, cfg.init_std
         self.loc = linear(feature_dim, action_dim, gain=cfg.output_gain, device=device)
         self.std_layer: nn.Linear | None = None
         self.std: nn.Parameter | None = None
@@ -95,7 +99,7 @@ class GaussianHead(nn.Module):
     def forward(
         self, features: Float[Tensor, "*batch L"]
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
-        """Return `(loc, scale)`; `scale` is at least `MIN_STD`."""
+        """Return `(loc, scale)`; `scale` is at least `cfg.min_std`."""
         loc = self.loc(features)
         if self.std_layer is None:
             assert self.std is not None
@@ -105,7 +109,7 @@ class GaussianHead(nn.Module):
             scale = raw.exp() if self.std_type == "log" else functional.softplus(raw)
         # A std that the optimizer pushes to zero or below would give NaN log-probabilities. The gradient
         # passes the bound (a plain clamp stops it), so that a std below it can come back.
-        bounded = scale + (scale.clamp_min(MIN_STD) - scale).detach()
+        bounded = scale + (scale.clamp_min(self.min_std) - scale).detach()
         return loc, bounded.expand_as(loc)
 
     def distribution(self, loc: Float[Tensor, "*batch L"], scale: Float[Tensor, "*batch L"]) -> Distribution:

@@ -59,7 +59,8 @@ class RolloutEstimator(ValueEstimatorBase):
     A step whose reward or values are not finite gets a NaN advantage, so that `DatasetBuffer` removes it, and the
     recursion starts anew before it: the steps that led there keep finite advantages, which bootstrap from the value at
     that step. A non-finite value after a termination does not matter. `normalize_advantage` shifts and scales the
-    finite ones to mean 0 and standard deviation 1 over all env states. Time is the batch dim `time_dim`, whatever the
+    finite ones to mean 0 and standard deviation 1 over all env states, or divides by `min_advantage_std` where that is
+    more (the default is TorchRL's). Time is the batch dim `time_dim`, whatever the
     names say.
     """
 
@@ -71,6 +72,7 @@ class RolloutEstimator(ValueEstimatorBase):
         gamma: float,
         critic: TensorDictModule | None = None,
         normalize_advantage: bool = False,
+        min_advantage_std: float = 1e-4,
         time_dim: int = -1,
         device: torch.device | str | None = None,
         value_network: TensorDictModule | None = None,
@@ -86,7 +88,7 @@ class RolloutEstimator(ValueEstimatorBase):
             device=None if device is None else torch.device(device),
             **options,
         )
-        self.normalize_advantage = normalize_advantage
+        self.normalize_advantage, self.min_advantage_std = normalize_advantage, min_advantage_std
 
     @abstractmethod
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
@@ -111,8 +113,7 @@ class RolloutEstimator(ValueEstimatorBase):
         signals = self._signals(tensordict, params, target_params, self._resolved(time_dim, tensordict))
         adv_ET, target_ET, finite_ET = self._estimate(signals, tensordict)
         if self.normalize_advantage:
-            # The bound is that of TorchRL.
-            adv_ET = standardized(adv_ET, finite_ET, lowest_std=1e-4)
+            adv_ET = standardized(adv_ET, finite_ET, lowest_std=self.min_advantage_std)
         nan_ET = torch.full_like(adv_ET, torch.nan)
         tensordict.set(self.tensor_keys.advantage, torch.where(finite_ET, adv_ET, nan_ET))
         tensordict.set(self.tensor_keys.value_target, target_ET)

@@ -95,6 +95,9 @@ class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
             whose weights follow the policy from epoch to epoch, within `rho_thresh` and `c_thresh`; see `VTrace`.
         estimate_each_epoch: estimate advantages and value targets anew before each epoch, with the present networks,
             instead of once (Andrychowicz et al., arXiv 2006.05990, section 3.5). "vtrace" always does.
+        min_advantage_std: with `normalize_advantage="dataset"` advantages are divided by their standard deviation, at
+            least this. Where no reward is seen they are errors of the critic, and soon shrink below any bound that
+            fits the rewards: the policy stays as it is, where otherwise it would follow them and cease to explore.
         symmetry: "augment" adds the mirror image of each env state to its minibatch, "loss" adds `symmetry_coeff` times
             the mirror loss, which is zero for a policy that acts in the mirror as its mirror image.
         precision: of what layers multiply in the gradient steps: "float32" (on CUDA as `trainer.matmul_precision`
@@ -115,6 +118,7 @@ class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
     entropy_coeff: NonNegative = 0.01
     critic_coeff: NonNegative = 1.0
     normalize_advantage: Literal["dataset", "minibatch", "none"] = "dataset"
+    min_advantage_std: Positive = 1e-4
     symmetry: Literal["none", "augment", "loss"] = "none"
     symmetry_coeff: NonNegative = 1.0
     precision: Literal["float32", "bfloat16", "auto"] = "float32"

@@ -53,6 +53,7 @@ def make_advantage(
         "lmbda": cfg.lmbda,
         "critic": critic,
         "normalize_advantage": cfg.normalize_advantage == "dataset",
+        "min_advantage_std": cfg.min_advantage_std,
     }
     if cfg.advantage == "vtrace":
         return VTrace(actor=actor, rho_thresh=cfg.rho_thresh, c_thresh=cfg.c_thresh, **options)

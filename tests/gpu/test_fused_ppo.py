@@ -135,11 +135,14 @@ def test_float32_is_rounded_as_by_torch(network_options):
     assert fused.metrics()["update/kl"] < 1e-3
 
 
-def test_the_fused_kernels_equal_torch_in_bfloat16():
-    actor, critic = networks()
+@pytest.mark.parametrize(
+    ("network_options", "options"), [({}, {}), ({"min_std": 1.0}, {"min_advantage_std": 2.0})], ids=str
+)
+def test_the_fused_kernels_equal_torch_in_bfloat16(network_options, options):
+    actor, critic = networks(**network_options)
     rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE)
-    fused = update(actor, critic, schedule="fixed")
-    plain = update(actor, critic, schedule="fixed", kernels="torch")
+    fused = update(actor, critic, schedule="fixed", **options)
+    plain = update(actor, critic, schedule="fixed", kernels="torch", **options)
     assert plain.metrics()["update/fused"] == 0.0
     before = [parameter.clone() for parameter in parameters(fused)]
     for made in (fused, plain):

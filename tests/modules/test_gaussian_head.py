@@ -36,11 +36,17 @@ def test_state_dependent_std_depends_on_the_state_once_trained():
     assert head(torch.randn(8, 6))[1].std(0).min() > 0
 
 
-def test_std_is_bounded_below_and_comes_back():
-    head = _head()
+@pytest.mark.parametrize("options", [{}, {"min_std": 0.2}], ids=str)
+def test_std_is_bounded_below_and_comes_back(options):
+    head = _head(**options)
     with torch.no_grad():
         head.std.fill_(-0.5)
     scale = head(torch.randn(4, 6))[1]
-    torch.testing.assert_close(scale, torch.full((4, 3), MIN_STD))
+    torch.testing.assert_close(scale, torch.full((4, 3), options.get("min_std", MIN_STD)))
     scale.sum().backward()
     assert (head.std.grad > 0).all(), "a std below the bound must still get a gradient"
+
+
+def test_refuses_a_bound_above_the_start():
+    with pytest.raises(ValueError, match=r"min_std=0\.8: init_std=0\.7"):
+        ActorCfg(init_std=0.7, min_std=0.8)

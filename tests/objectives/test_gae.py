@@ -159,6 +159,15 @@ def test_normalization_is_over_the_finite_advantages_of_the_dataset():
     torch.testing.assert_close(out["value_target"][1:], raw["value_target"][1:])
 
 
+def test_advantages_below_the_least_standard_deviation_are_divided_by_it():
+    actor, critic = networks()
+    data = rollout(actor, num_envs=16, length=12)
+    raw = GAE(gamma=GAMMA, lmbda=LMBDA, critic=critic)(data.clone())["advantage"]
+    options = {"normalize_advantage": True, "min_advantage_std": 2.0 * raw.std().item()}
+    scaled = GAE(gamma=GAMMA, lmbda=LMBDA, critic=critic, **options)(data)["advantage"]
+    torch.testing.assert_close(scaled, (raw - raw.mean()) / (2.0 * raw.std()))
+
+
 def test_advantages_that_are_all_alike_stay_finite():
     data = _known([1.0], [0.0], [0.0], terminated=[0])
     out = GAE(gamma=0.5, lmbda=1.0, critic=_critic(), normalize_advantage=True)(data)

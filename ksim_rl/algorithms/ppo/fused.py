@@ -10,7 +10,7 @@ from torch import nn
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate
 from ksim_rl.data import EpochSampler
 from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, ValueNetwork
-from ksim_rl.modules.actor import MIN_STD, GaussianHead
+from ksim_rl.modules.actor import GaussianHead
 from ksim_rl.objectives import SymmetricAugmentation
 from ksim_rl.objectives.fused_ppo import ACTIVATIONS, FusedNetworks, why_not_fused
 from ksim_rl.objectives.fused_ppo.layout import Observer
@@ -71,7 +71,12 @@ def fused_networks(
     std: Any = {"std_A": head.std, "std_layer": head.std_layer, "log_std": head.std_type == "log"}
     observers = _observer(actor[0]), _observer(critic)
     return FusedNetworks(
-        actor=layers[0], critic=layers[1], observers=observers, activation=activation, min_std=MIN_STD, **std
+        actor=layers[0],
+        critic=layers[1],
+        observers=observers,
+        activation=activation,
+        min_std=head.min_std,
+        **std,
     )
 
 

@@ -58,6 +58,7 @@ class FusedDataset:
             "count": torch.zeros(1, dtype=torch.int32, device=device),
             "gamma": cfg.gamma,
             "decay": cfg.gamma * cfg.lmbda,
+            "min_advantage_std": cfg.min_advantage_std,
             "LANES": power_of_two(layout.stored),
             "RECORD": self.records.shape[1],
             "RECORD_LANES": power_of_two(self.records.shape[1]),

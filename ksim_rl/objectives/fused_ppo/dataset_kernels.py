@@ -48,7 +48,7 @@ def _counted_odd(value):
 @triton.jit
 def write_records(
     action, loc, scale, action_log_prob, advantages, values, targets, moments, obs, records, left_out,
-    num_rows, num_obs, first, size, num_moments,
+    num_rows, num_obs, first, size, num_moments, min_advantage_std,
     RECORD: tl.constexpr, RECORD_LANES: tl.constexpr, ACTIONS: tl.constexpr, OUT: tl.constexpr, STORED: tl.constexpr,
     LANES: tl.constexpr, MOMENTS: tl.constexpr, STANDARDIZED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -72,7 +72,7 @@ def write_records(
         gap = means - mean
         squares = tl.sum(tl.load(moments + 3 * part + 2, mask=known, other=0.0) + counts * gap * gap)
         std = tl.sqrt(squares / tl.maximum(count - 1.0, 1.0))
-        advantage = (advantage - mean) / tl.maximum(std, 1e-4)
+        advantage = (advantage - mean) / tl.maximum(std, min_advantage_std)
     row, column = rows[:, None], tl.arange(0, RECORD_LANES)[None, :]
     kind, output = column // OUT, column % OUT
     own, used = row * ACTIONS + output, valid[:, None] & (output < ACTIONS)
