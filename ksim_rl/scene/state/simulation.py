@@ -58,8 +58,6 @@ class Simulation:
         self._scope, self._draw_scope, self._draws = "", "", 0
         self._lasting: set[int] = set()
 
-    # -- state and what derives from it ----------------------------------------------------------------------------
-
     def new_cache(self) -> dict[str, Shaped[Tensor, "*?shape"]]:
         """Return a dict for quantities that is emptied whenever the state changes."""
         self._caches.append({})
@@ -107,8 +105,6 @@ class Simulation:
         cvel_EN6 = world.cvel_EL[:, body]
         lever_EN3 = point_EN3 - world.subtree_com_EL[:, self._body_root[body]]
         return cvel_EN6[..., 3:] + torch.linalg.cross(cvel_EN6[..., :3], lever_EN3)
-
-    # -- terms -------------------------------------------------------------------------------------------------------
 
     @contextmanager
     def scope(
