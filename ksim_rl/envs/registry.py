@@ -14,7 +14,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
-from ksim_rl.checks import unknown_name
+from ksim_rl.checks import check_known
 from ksim_rl.config import plugins, upstream
 from ksim_rl.config.config_tree import from_tree, to_tree
 from ksim_rl.config.overrides import check_overrides
@@ -63,8 +63,7 @@ def names() -> list[str]:
 def task(name: str) -> Task:
     """Return a task by name; a ValueError gives the near names."""
     tasks = _tasks()
-    if name not in tasks:
-        raise unknown_name("task", name, tasks)
+    check_known("task", name, tasks)
     return tasks[name]
 
 

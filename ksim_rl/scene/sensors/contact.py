@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ksim_rl.checks import naming
 from ksim_rl.physics.contact_sensors import NET, STRONGEST
 from ksim_rl.scene.names import as_index, match_names
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
@@ -83,10 +84,8 @@ class ContactSensor(Sensor):
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
         """Add one MJCF contact sensor `<name>_<element>` per element."""
         parts = {"geom": spec.geoms, "body": spec.bodies}
-        try:
+        with naming(f"scene.sensors.{name}"):
             elements = self.elements([part.name for part in parts[_TABLES[self.kind]]])
-        except ValueError as error:
-            raise ValueError(f"scene.sensors.{name}: {error}") from None
         other = {}
         if self.against is not None:
             table = _TABLES[self.against_kind]
