@@ -11,19 +11,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import naming
-from ksim_rl.physics.contact_sensors import NET, STRONGEST
+from ksim_rl.physics.contact_sensors import MATCHED, NET, STRONGEST
 from ksim_rl.scene.names import as_index, match_names
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.sensor import Sensor, SensorTracker, check_present
 from ksim_rl.scene.small_matrices import product
 from ksim_rl.scene.state.world_view import WorldView
 
-_OBJECTS = {
-    "geom": mujoco.mjtObj.mjOBJ_GEOM,
-    "body": mujoco.mjtObj.mjOBJ_BODY,
-    # MuJoCo's contact sensor reads this type as the body with all its descendants.
-    "subtree": mujoco.mjtObj.mjOBJ_XBODY,
-}
 _TABLES = {"geom": "geom", "body": "body", "subtree": "body"}
 _RGBA = (1.0, 0.55, 0.1, 1.0)
 
@@ -90,12 +84,12 @@ class ContactSensor(Sensor):
         if self.against is not None:
             table = _TABLES[self.against_kind]
             check_present(name, table, self.against, parts[table])
-            other = {"reftype": _OBJECTS[self.against_kind], "refname": self.against}
+            other = {"reftype": MATCHED[self.against_kind], "refname": self.against}
         for element in elements:
             spec.add_sensor(
                 name=f"{name}_{element}",
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
-                objtype=_OBJECTS[self.kind],
+                objtype=MATCHED[self.kind],
                 objname=element,
                 intprm=[*(NET if self.reduce == "net" else STRONGEST)],
                 **other,
