@@ -157,18 +157,17 @@ class ContactTracker(SensorTracker):
     @property
     def state(self) -> ContactState:
         """The contacts of the last env step."""
-        cache, history_ESN3 = self._view.cache, self._history_ESN3
-        force_EN3, position_EN3 = cache.get(f"{self._key}.force"), cache.get(f"{self._key}.position")
-        if force_EN3 is None or position_EN3 is None:
+        cache = self._view.cache
+        if self._key not in cache:
             readings = self._readings()
-            force_EN3 = cache[f"{self._key}.force"] = self._force(readings)
-            position_EN3 = cache[f"{self._key}.position"] = readings[..., 4:7]
-        return ContactState(
-            force_EN3=force_EN3,
-            position_EN3=position_EN3,
-            force_history_ESN3=force_EN3[:, None] if history_ESN3 is None else history_ESN3,
-            **{f"{clock}_EN": value_EN for clock, value_EN in self._clocks.items()},
-        )
+            force_EN3 = self._force(readings)
+            cache[self._key] = ContactState(
+                force_EN3=force_EN3,
+                position_EN3=readings[..., 4:7],
+                force_history_ESN3=force_EN3[:, None] if self._history_ESN3 is None else self._history_ESN3,
+                **{f"{clock}_EN": value_EN for clock, value_EN in self._clocks.items()},
+            )
+        return cache[self._key]
 
     def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw an arrow for each contact: the force on the element, from the point of contact."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int64, Shaped
@@ -58,8 +58,8 @@ class Simulation:
         self._scope, self._draw_scope, self._draws = "", "", 0
         self._lasting: set[int] = set()
 
-    def new_cache(self) -> dict[str, Shaped[Tensor, "*?shape"]]:
-        """Return a dict for quantities that is emptied whenever the state changes."""
+    def new_cache(self) -> dict[str, Any]:
+        """Return a dict for quantities, tensors or tuples of them, that is emptied whenever the state changes."""
         self._caches.append({})
         return self._caches[-1]
 
