@@ -61,8 +61,7 @@ Name = Annotated[str, Filled("expected a name")]
 class Checked:
     """A base of dataclasses whose fields are checked against their annotations when one is built.
 
-    Raises:
-        ValueError: naming the field, the value and what would be valid.
+    A ValueError names the field, the value and what would be valid.
     """
 
     def __init_subclass__(cls, **given: Any) -> None:

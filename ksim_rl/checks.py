@@ -2,7 +2,8 @@
 
 import argparse
 import difflib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 from numbers import Real
 from typing import NoReturn
 
@@ -23,6 +24,22 @@ def near(name: str, choices: Iterable[str]) -> str:
 def unknown_name(kind: str, name: str, choices: Iterable[str]) -> ValueError:
     """Build the error for a name that matches nothing, with the near names."""
     return ValueError(f"unknown {kind} {name!r}: {near(name, choices)}")
+
+
+def check_known(kind: str, name: str, choices: Collection[str]) -> None:
+    """Refuse a name that is none of `choices`, by the error of `unknown_name`."""
+    if name not in choices:
+        raise unknown_name(kind, name, choices)
+
+
+@contextmanager
+def naming(where: str, *errors: type[Exception]) -> Iterator[None]:
+    """Put `where` before a ValueError of this block; given other `errors`, make one of these, and of these alone."""
+    kinds = errors or (ValueError,)
+    try:
+        yield
+    except kinds as error:
+        raise ValueError(f"{where}: {error}") from error
 
 
 def check_in_range(

@@ -19,10 +19,8 @@ AnyTensorDict = TypeVar("AnyTensorDict", bound=TensorDictBase)
 def name(td: AnyTensorDict, *dims: str) -> AnyTensorDict:
     """Label the batch dims of `td`, in place, and return it.
 
-    Nested tensordicts take the same labels for the batch dims that they share.
-
-    Raises:
-        ValueError: if the number of labels differs from the number of batch dims.
+    Nested tensordicts take the same labels for the batch dims that they share. A ValueError if the number of labels
+    differs from the number of batch dims.
     """
     if len(dims) != td.batch_dims:
         raise ValueError(

@@ -1,8 +1,8 @@
-"""Numbers are compared as they are."""
+"""Numbers are compared as they are, and errors say of what they are."""
 
 import pytest
 
-from ksim_rl.checks import check_count, check_in_range
+from ksim_rl.checks import check_count, check_in_range, check_known, naming
 
 
 def test_bounds_of_large_ints_are_exact():
@@ -33,3 +33,20 @@ def test_a_count_may_start_at_zero():
     check_count("burn_in", 0, low=0)
     with pytest.raises(ValueError, match=r"burn_in=-1: expected a whole number >= 0"):
         check_count("burn_in", -1, low=0)
+
+
+def test_an_unknown_name_is_refused_with_the_near_ones():
+    check_known("body", "arm", {"arm": 1})
+    with pytest.raises(ValueError, match=r"unknown body 'amr': did you mean 'arm'\?"):
+        check_known("body", "amr", {"arm": 1})
+
+
+def test_errors_are_named_by_what_they_are_of():
+    with pytest.raises(ValueError, match=r"^scene.robots.go1: no file$"), naming("scene.robots.go1"):
+        raise ValueError("no file")
+    with pytest.raises(ValueError, match=r"^go1: no file$"), naming("go1", OSError):
+        raise OSError("no file")
+    with pytest.raises(ValueError, match=r"^too large$"), naming("go1", OSError):
+        raise ValueError("too large")
+    with pytest.raises(OSError, match=r"^no file$"), naming("go1"):
+        raise OSError("no file")

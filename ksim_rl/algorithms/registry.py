@@ -3,7 +3,7 @@
 import importlib
 import pkgutil
 
-from ksim_rl.checks import unknown_name
+from ksim_rl.checks import check_known
 from ksim_rl.config import plugins
 from ksim_rl.objectives import AlgorithmCfg
 from ksim_rl.trainers.algorithm import Algorithm
@@ -30,8 +30,7 @@ def names() -> list[str]:
 def algorithm(name: str) -> Algorithm:
     """Return an algorithm by name."""
     found = _algorithms()
-    if name not in found:
-        raise unknown_name("algorithm", name, found)
+    check_known("algorithm", name, found)
     return found[name][1]
 
 

@@ -15,7 +15,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ksim_rl.checks import unknown_name
+from ksim_rl.checks import check_known
 from ksim_rl.conf import spelling
 from ksim_rl.conf.registration import CHOSEN_BY_TASK, MODULE, NAME, RUN_AGAIN, register, store_run
 from ksim_rl.config.overrides import check_parsed
@@ -122,8 +122,7 @@ def _check_names(overrides: Sequence[Override], loader: ConfigLoader, name: str)
                     f"{override.key_or_group}=name: {', '.join(options)}"
                 )
             for choice in _values(override):
-                if choice not in options:
-                    raise unknown_name(override.key_or_group, choice, options)
+                check_known(override.key_or_group, choice, options)
             # A group that is not in the defaults list, such as another package's, is added with "+".
             added = "+" if override.is_add() else ""
             choices.append(f"{added}{override.key_or_group}={_values(override)[0]}")

@@ -85,7 +85,10 @@ class EpochSampler(Sampler):
         if size != self._size:
             self._size, self._position = size, 0
         if self._position == 0:
-            self._order_D = self._next_order(size, device)
+            if self._epoch is None or self._epoch.device != device:
+                self._epoch = torch.full((), self._first_epoch, dtype=torch.int64, device=device)
+            self._order_D = self._order(self._epoch, size)
+            self._epoch.add_(self.shuffle)
         assert self._order_D is not None
         index = self._order_D[self._position : self._position + batch_size]
         self._position += batch_size
@@ -95,13 +98,6 @@ class EpochSampler(Sampler):
             self._position = 0
         self._remaining_batches = left // batch_size if self.drop_last else -(-left // batch_size)
         return index
-
-    def _next_order(self, size: int, device: torch.device) -> Tensor:
-        if self._epoch is None or self._epoch.device != device:
-            self._epoch = torch.full((), self._first_epoch, dtype=torch.int64, device=device)
-        order_D = self._order(self._epoch, size)
-        self._epoch.add_(self.shuffle)
-        return order_D
 
     def _order(self, epoch: Tensor, size: int) -> Tensor:
         """Return the order of an epoch: a random one unless `shuffle` is off, minibatch by minibatch."""

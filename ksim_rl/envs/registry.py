@@ -3,9 +3,8 @@
 import dataclasses
 import importlib
 import pkgutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache, partial
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -14,7 +13,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
-from ksim_rl.checks import unknown_name
+from ksim_rl.checks import check_known
 from ksim_rl.config import plugins, upstream
 from ksim_rl.config.config_tree import from_tree, to_tree
 from ksim_rl.config.overrides import check_overrides
@@ -38,7 +37,10 @@ def _tasks() -> dict[str, Task]:
 def _tasks_with(_named: tuple[str, ...]) -> dict[str, Task]:
     """Import all task modules once, ours and those of other packages, and collect their `Task`s."""
     found: dict[str, tuple[str, Task]] = {}
-    for origin, module in (*_own_modules(), *plugins.modules(plugins.TASKS)):
+    packages = map(importlib.import_module, OWN_TASKS)
+    inside = (info for own in packages for info in pkgutil.iter_modules(own.__path__, f"{own.__name__}."))
+    ours = ((info.name, importlib.import_module(info.name)) for info in inside)
+    for origin, module in (*ours, *plugins.modules(plugins.TASKS)):
         held = [value for value in vars(module).values() if isinstance(value, Task)]
         for value in (*held, *vars(module).get("TASKS", ())):
             first, known = found.setdefault(value.name, (origin, value))
@@ -49,12 +51,6 @@ def _tasks_with(_named: tuple[str, ...]) -> dict[str, Task]:
     return {name: task for name, (_, task) in sorted(found.items())}
 
 
-def _own_modules() -> Iterator[tuple[str, ModuleType]]:
-    for package in map(importlib.import_module, OWN_TASKS):
-        for module_info in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
-            yield module_info.name, importlib.import_module(module_info.name)
-
-
 def names() -> list[str]:
     """Return the names of the registered tasks."""
     return list(_tasks())
@@ -63,8 +59,7 @@ def names() -> list[str]:
 def task(name: str) -> Task:
     """Return a task by name; a ValueError gives the near names."""
     tasks = _tasks()
-    if name not in tasks:
-        raise unknown_name("task", name, tasks)
+    check_known("task", name, tasks)
     return tasks[name]
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ksim_rl import ranks
 from ksim_rl.checked import Count, Filled, NonNegative, Range, Share, WholeNumber, Within
-from ksim_rl.checks import check_in_range, unknown_name
+from ksim_rl.checks import check_in_range, check_known
 from ksim_rl.envs.term import CurriculumTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
@@ -124,8 +124,7 @@ class SaturationLevel(SteppedLevel):
     reward: str
 
     def score(self, view: EnvView) -> Float[Tensor, " E"]:
-        if self.reward not in view.episode_rewards:
-            raise unknown_name("reward", self.reward, view.episode_rewards)
+        check_known("reward", self.reward, view.episode_rewards)
         sum_E = view.episode_rewards[self.reward]
         return sum_E if view.max_episode_length == 0 else sum_E / (_longest_E(view) * view.step_dt)
 
@@ -259,10 +258,8 @@ class CommandRangesByLevel(OfCommand, CurriculumTerm):
 
 def _ranges_of(view: EnvView, command: str, fields: Iterable[str]) -> dict[str, Tensor]:
     """Return the present ranges of some fields of a command, (low, high) [2] each."""
-    if command not in view.command_ranges:
-        raise unknown_name("command with ranges", command, view.command_ranges)
+    check_known("command with ranges", command, view.command_ranges)
     present = view.command_ranges[command]
     for field in fields:
-        if field not in present:
-            raise unknown_name(f"range of the command {command!r}", field, present)
+        check_known(f"range of the command {command!r}", field, present)
     return {field: present[field] for field in present if field in set(fields)}

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checked import Filled, Positive
-from ksim_rl.checks import unknown_name
+from ksim_rl.checks import check_known
 from ksim_rl.envs.term import MetricTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.commands import OfTarget
@@ -121,8 +121,7 @@ class Success(MetricTerm, reduce="last"):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         for name in self.terminations:
-            if name not in view.terminations:
-                raise unknown_name("termination", name, view.terminations)
+            check_known("termination", name, view.terminations)
         wanted = [flag_E for name, flag_E in view.terminations.items() if name in self.terminations]
         others = [flag_E for name, flag_E in view.terminations.items() if name not in self.terminations]
         succeeds_E = torch.stack(wanted).any(0)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl import mdp
-from ksim_rl.checks import near
+from ksim_rl.checks import naming, near
 from ksim_rl.envs.contract import part
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.mdp.actions import JointAction, per_joint
@@ -71,10 +71,8 @@ def mirror_maps(
 
 
 def _named(where: str, term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
-    try:
+    with naming(where):
         return term_mirror(term, env)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
 
 
 @functools.singledispatch

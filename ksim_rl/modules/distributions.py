@@ -46,11 +46,6 @@ class VectorDistribution(Distribution):
         shape = torch.Size(batch_shape) + self.event_shape
         return type(self)(self.loc.expand(shape), self.scale.expand(shape), *self._bounds)
 
-    def sample(self, sample_shape: Any = ()) -> Float[Tensor, "*shape L"]:
-        """Draw [*sample_shape, ..., L] without gradients."""
-        with torch.no_grad():
-            return self.rsample(sample_shape)
-
 
 class BoundedDistribution(VectorDistribution, ABC):
     """The base of those whose components lie in [low, high], both numbers or both tensors [L]."""

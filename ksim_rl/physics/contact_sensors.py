@@ -20,6 +20,7 @@ _FOUND, _FORCE, _POSITION, _NORMAL, _TANGENT = 1 << 0, 1 << 1, 1 << 4, 1 << 5, 1
 NET = (_FOUND | _FORCE | _POSITION, 3, 1)
 # A single contact's force is in the axes of that contact, which are needed to turn it.
 STRONGEST = (NET[0] | _NORMAL | _TANGENT, 2, 1)
+# MuJoCo's contact sensor reads the type XBODY as the body with all its descendants.
 _KINDS = {"nothing": "UNKNOWN", "geom": "GEOM", "body": "BODY", "subtree": "XBODY"}
 MATCHED = {name: int(getattr(mujoco.mjtObj, f"mjOBJ_{theirs}")) for name, theirs in _KINDS.items()}
 

@@ -6,7 +6,7 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 
-from ksim_rl.checks import unknown_name
+from ksim_rl.checks import check_known
 from ksim_rl.physics.upstream import per_world_fields
 
 FIXED, KIN0, INERT0 = (int(mjw.SetConstGroup[name]) for name in ("FIXED", "KIN0", "INERT0"))
@@ -49,8 +49,7 @@ def fields_to_expand(fields: Sequence[str]) -> tuple[str, ...]:
         raise ValueError(f"per_world_fields={fields!r}: expected a sequence of names, such as ({fields!r},)")
     valid = per_world_fields()
     for field in fields:
-        if field != GRAVITY and field not in valid:
-            raise unknown_name("per-world model field", field, (*valid, GRAVITY))
+        check_known("per-world model field", field, (*valid, GRAVITY))
     derived = derived_fields(const_groups(fields))
     return tuple(dict.fromkeys([*(field for field in fields if field != GRAVITY), *derived]))
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import mujoco
 import warp as wp
 
-from ksim_rl.checks import near
+from ksim_rl.checks import naming, near
 from ksim_rl.device.streams import start_warp
 from ksim_rl.physics.model_checks import check_finite, check_meant, warp_model_of
 from ksim_rl.physics.model_size import check_text
@@ -61,11 +61,8 @@ def load_model(source: Source, sim: SimCfg | None = None) -> mujoco.MjModel:
     check_meant(mj_model, label)
     _pass_on(caught + caught_later, label)
     start_warp()
-    with wp.ScopedDevice("cpu"):
-        try:
-            warp_model_of(mj_model)
-        except ValueError as error:
-            raise ValueError(f"{label}: {error}") from error
+    with wp.ScopedDevice("cpu"), naming(label):
+        warp_model_of(mj_model)
     return mj_model
 
 

@@ -24,27 +24,15 @@ ENUM_FIELDS = {
 }
 MOST_TIMESTEP = 0.1
 # What nobody means with a sign.
-NOT_NEGATIVE_OPTIONS = (
-    "iterations",
-    "ls_iterations",
-    "ccd_iterations",
-    "noslip_iterations",
-    "sdf_iterations",
-    "sdf_initpoints",
-    "density",
-    "viscosity",
-    "impratio",
+_OPTIONS = (
+    "iterations ls_iterations ccd_iterations noslip_iterations sdf_iterations sdf_initpoints density viscosity "
+    "impratio"
 )
-NOT_NEGATIVE_FIELDS = (
-    "dof_damping",
-    "dof_frictionloss",
-    "dof_armature",
-    "tendon_damping",
-    "tendon_frictionloss",
-    "geom_friction",
-    "pair_friction",
-    "actuator_damping",
+_FIELDS = (
+    "dof_damping dof_frictionloss dof_armature tendon_damping tendon_frictionloss geom_friction pair_friction "
+    "actuator_damping"
 )
+NOT_NEGATIVE_OPTIONS, NOT_NEGATIVE_FIELDS = tuple(_OPTIONS.split()), tuple(_FIELDS.split())
 CALLBACKS = {field: getattr(mujoco, f"get_mjcb_act_{field}") for field in ("dyn", "gain", "bias")}
 
 

@@ -24,7 +24,7 @@ class OverflowReport:
 
     `worlds` counts those that raised each overflow bit. Of all substeps, `nefc` is the most constraint rows of any
     world, which has `njmax`, and `ncon` the most contacts or candidate pairs in the pool of all worlds, which has
-    `naconmax` places. There is a message for each kind of loss, naming the needed and the present value.
+    `naconmax` places.
     """
 
     worlds: dict[str, int]
@@ -33,7 +33,6 @@ class OverflowReport:
     ncon: int
     naconmax: int
     num_envs: int
-    messages: tuple[str, ...]
 
     @property
     def ok(self) -> bool:
@@ -44,6 +43,35 @@ class OverflowReport:
     def nconmax(self) -> int:
         """Places in the pool of contacts, per world."""
         return self.naconmax // self.num_envs
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """One for each kind of loss, naming the needed and the present value."""
+        needed_nconmax = math.ceil(self.ncon / self.num_envs)
+        pool = (
+            f"the pool of contacts and candidate pairs needed {self.ncon} places but has {self.naconmax}: "
+            f"set sim.nconmax >= {needed_nconmax} (now {self.nconmax} per world, {self.num_envs} worlds)"
+        )
+        known = {
+            "NEFC": f"constraint rows needed {self.nefc} per world but has {self.njmax}: "
+            f"set sim.njmax >= {self.nefc}",
+            "NJMAX_NNZ": f"the constraint Jacobian is full; it grows with njmax: raise sim.njmax above {self.njmax}",
+            "BROADPHASE": pool,
+            "NARROWPHASE": pool,
+            "CCD": f"too many convex pairs: raise sim.nconmax above {self.nconmax}",
+            "HFIELD": "too many height-field cells under one geom: use smaller geoms or a coarser height field",
+            "CONTACT_MATCH": "a contact sensor matched more contacts than it keeps: "
+            'raise <custom><numeric name="contact_sensor_maxmatch" data="64"/></custom> in the model',
+            "EPA_HORIZON": "convex collision ran out of faces: simplify the meshes or raise sim.ccd_iterations",
+            "TACTILE": "a tactile sensor saw more geoms than it keeps",
+            "NVMAX": "too many degrees of freedom are awake",
+        }
+        lines: dict[str, list[str]] = {}
+        for name, count in self.worlds.items():
+            if count and name not in METRIC_BITS:
+                text = known.get(name, "the physics dropped something")
+                lines.setdefault(text, []).append(f"{name} in {count} worlds")
+        return tuple(f"{text} ({', '.join(bits)})" for text, bits in lines.items())
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -88,42 +116,5 @@ class OverflowRecord:
         worlds = dict(zip(BIT_NAMES, numbers, strict=False))
         nefc, ncon = numbers[len(BIT_NAMES)], max(numbers[len(BIT_NAMES) + 1 :])
         return OverflowReport(
-            worlds=worlds,
-            nefc=nefc,
-            njmax=d.njmax,
-            ncon=ncon,
-            naconmax=d.naconmax,
-            num_envs=d.nworld,
-            messages=_messages(worlds, nefc=nefc, ncon=ncon, warp_data_E=d),
+            worlds=worlds, nefc=nefc, njmax=d.njmax, ncon=ncon, naconmax=d.naconmax, num_envs=d.nworld
         )
-
-
-def _messages(worlds: dict[str, int], *, nefc: int, ncon: int, warp_data_E: mjw.Data) -> tuple[str, ...]:
-    num_envs = warp_data_E.nworld
-    nconmax = warp_data_E.naconmax // num_envs
-    needed_nconmax = math.ceil(ncon / num_envs)
-    pool = (
-        f"the pool of contacts and candidate pairs needed {ncon} places but has {warp_data_E.naconmax}: "
-        f"set sim.nconmax >= {needed_nconmax} (now {nconmax} per world, {num_envs} worlds)"
-    )
-    rows = f"constraint rows needed {nefc} per world but has {warp_data_E.njmax}: set sim.njmax >= {nefc}"
-    known = {
-        "NEFC": rows,
-        "NJMAX_NNZ": f"the constraint Jacobian is full; it grows with njmax: raise sim.njmax above {warp_data_E.njmax}",
-        "BROADPHASE": pool,
-        "NARROWPHASE": pool,
-        "CCD": f"too many convex pairs: raise sim.nconmax above {nconmax}",
-        "HFIELD": "too many height-field cells under one geom: use smaller geoms or a coarser height field",
-        "CONTACT_MATCH": "a contact sensor matched more contacts than it keeps: "
-        'raise <custom><numeric name="contact_sensor_maxmatch" data="64"/></custom> in the model',
-        "EPA_HORIZON": "convex collision ran out of faces: simplify the meshes or raise sim.ccd_iterations",
-        "TACTILE": "a tactile sensor saw more geoms than it keeps",
-        "NVMAX": "too many degrees of freedom are awake",
-    }
-    lines: dict[str, list[str]] = {}
-    for name, count in worlds.items():
-        if count and name not in METRIC_BITS:
-            lines.setdefault(known.get(name, "the physics dropped something"), []).append(
-                f"{name} in {count} worlds"
-            )
-    return tuple(f"{text} ({', '.join(bits)})" for text, bits in lines.items())

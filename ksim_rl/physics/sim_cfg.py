@@ -44,9 +44,6 @@ class SimCfg(Checked):
         nan_guard: where to save what led to a non-finite state; `None` keeps nothing and costs nothing.
 
     See https://mujoco.readthedocs.io/en/stable/XMLreference.html#option
-
-    Raises:
-        ValueError: naming the field, the value and what is valid.
     """
 
     timestep: Positive | None = None

@@ -7,7 +7,7 @@ import warp as wp
 from jaxtyping import Shaped
 from torch import Tensor
 
-from ksim_rl.checks import unknown_name
+from ksim_rl.checks import check_known
 
 # Left as they were by mujoco_warp.reset_data, though they belong to the episode that ended.
 _ACCELERATION_STAGE = "actuator_force qfrc_actuator qfrc_constraint qfrc_passive cacc cfrc_int cfrc_ext"
@@ -118,8 +118,7 @@ class DataViews:
         Rows of `efc` beyond `nefc`, and all of `contact` after a reset, hold leftovers.
         """
         if name not in self._views:
-            if name not in self._arrays:
-                raise unknown_name("data array", name, self._arrays)
+            check_known("data array", name, self._arrays)
             self._views[name] = wp.to_torch(self._arrays[name])
         return self._views[name]
 

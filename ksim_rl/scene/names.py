@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from ksim_rl.checks import near
+from ksim_rl.checks import naming, near
 
 Patterns = str | Sequence[str]
 Index = Int64[Tensor, " N"] | slice
@@ -94,10 +94,8 @@ def match_names(kind: str, patterns: Sequence[str], table: Sequence[str]) -> tup
     """Return the places in `table` that the patterns match in full: each pattern's matches in the table's order."""
     found: list[int] = []
     for pattern in patterns:
-        try:
+        with naming(f"{kind} pattern {pattern!r} is no regular expression", re.error):
             expression = re.compile(pattern)
-        except re.error as error:
-            raise ValueError(f"{kind} pattern {pattern!r} is no regular expression: {error}") from None
         matches = [i for i, name in enumerate(table) if name and expression.fullmatch(name)]
         if not matches:
             raise ValueError(

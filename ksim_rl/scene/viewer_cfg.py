@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from ksim_rl.checked import Checked, Count, Positive, WholeNumber, Within
+from ksim_rl.checks import naming
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +29,5 @@ class ViewerCfg(Checked):
 
     def _check_fields(self) -> None:
         for index, pattern in enumerate(self.draw):
-            try:
+            with naming(f"draw[{index}]={pattern!r}: no regular expression", re.error):
                 re.compile(pattern)
-            except re.error as error:
-                raise ValueError(f"draw[{index}]={pattern!r}: no regular expression: {error}") from None

@@ -60,9 +60,8 @@ class OfAlignedBodies(OfAnchor, OfMotionBodies):
             pos_EN3, quat_EN4 = motion_bodies(view, self.file, self.bodies)
             place_E3 = torch.cat((own.pos_EL[:, :2], pos_E3[:, 2:]), dim=-1)
             placed_EN3 = place_E3[:, None] + quaternion.rotate(turn_EN4, pos_EN3 - pos_E3[:, None])
-            turned_EN4 = quaternion.multiply(turn_EN4, quat_EN4)
-            view.cache[key] = torch.cat((placed_EN3, turned_EN4), dim=-1)
-        return Poses(view.cache[key][..., :3], view.cache[key][..., 3:])
+            view.cache[key] = Poses(placed_EN3, quaternion.multiply(turn_EN4, quat_EN4))
+        return view.cache[key]
 
 
 def motion_velocities(

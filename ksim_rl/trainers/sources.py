@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
 
-from ksim_rl.checks import near
+from ksim_rl.checks import naming, near
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.evaluation import Evaluation
 from ksim_rl.trainers.loggers import check_installed
@@ -26,16 +26,12 @@ def check_sources(cfg: RunCfg, *, resumes: bool = False) -> None:
     named |= {f"objective.{name}": getattr(cfg.objective, name) for name in cfg.objective.checkpoint_fields}
     for field, path in named.items():
         if path is not None and not resumes:
-            try:
+            with naming(f"{field}={path}", checkpoint.CheckpointError):
                 checkpoint.load_latest(Path(path))
-            except checkpoint.CheckpointError as error:
-                raise ValueError(f"{field}={path}: {error}") from error
     for kind, entities in (("robots", cfg.task.scene.robots), ("objects", cfg.task.scene.objects)):
         for name, entity in entities.items():
-            try:
+            with naming(f"task.scene.{kind}.{name}", ValueError, OSError):
                 entity.spec()
-            except (ValueError, OSError) as error:
-                raise ValueError(f"task.scene.{kind}.{name}: {error}") from error
     check_targets(cfg)
 
 

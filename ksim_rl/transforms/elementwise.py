@@ -66,7 +66,7 @@ class RewardMap(_Outward):
 
 
 class ActionMap(_Map):
-    """Base of those that replace the action on its way to the env; the tensordict keeps what the policy chose."""
+    """Base of those that replace the action on its way to the env; what the policy chose stays, in samples too."""
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
         self._replace_leaves(action_spec, self.new_spec, is_inverse=True, is_floating=True)
@@ -77,10 +77,6 @@ class ActionMap(_Map):
             return tensordict
         for index, (key, out_key) in enumerate(zip(self.in_keys_inv, self.out_keys_inv, strict=True)):
             tensordict.set(key, self.new_value(index, tensordict.get(out_key)))
-        return tensordict
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Leave a batch of samples as it is: they hold the actions that the policy chose."""
         return tensordict
 
 

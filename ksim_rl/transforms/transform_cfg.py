@@ -12,7 +12,7 @@ from typing import Any, Literal, Self
 from tensordict import NestedKey
 from torchrl.envs.transforms import Transform
 
-from ksim_rl.checks import near
+from ksim_rl.checks import naming, near
 from ksim_rl.config import class_paths
 from ksim_rl.config.class_paths import TARGET
 from ksim_rl.config.config_tree import OwnTree, build_value, to_tree
@@ -60,10 +60,8 @@ class TransformCfg(OwnTree):
         arguments = self.arguments
         if name is not None and "stream" in arguments and arguments["stream"] is None:
             arguments = {**arguments, "stream": f"transforms.{name}"}
-        try:
+        with naming(self.transform.__name__, TypeError, KeyError, RuntimeError, ImportError):
             return self.transform(**arguments)
-        except (TypeError, KeyError, RuntimeError, ImportError) as error:
-            raise ValueError(f"{self.transform.__name__}: {error}") from error
 
     def to_tree(self) -> dict[str, Any]:
         """Return the plain tree: the path of the class, and all arguments."""
@@ -81,19 +79,15 @@ class TransformCfg(OwnTree):
         transform = class_paths.find(
             tree[TARGET], path, kind="transform", accepts=_is_transform, besides=frozenset({stock.PACKAGE})
         )
-        try:
+        with naming(f"{path}.{TARGET}"):
             stock.check(transform)
-        except ValueError as error:
-            raise ValueError(f"{path}.{TARGET}: {error}") from None
         arguments = {}
         for name, value in tree.items():
             if name != TARGET:
                 where = f"{path}.{name}"
                 arguments[name] = build_value(_annotation(transform, name, where), value, where)
-        try:
+        with naming(path):
             return cls(transform, **arguments)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
 
     def given(self) -> dict[str, Any]:
         """Return the arguments that differ from their defaults."""

@@ -9,6 +9,7 @@ from typing import Any
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
+from ksim_rl.checks import naming
 from ksim_rl.device import state_tree
 from ksim_rl.modules import recurrent_modules
 from ksim_rl.trainers import checkpoint
@@ -39,7 +40,7 @@ def load_teacher(path: Path, env: EnvBase, *, cfg: RunCfg) -> Teacher:
 
     A ValueError says what is absent or damaged, or which observation or tensor this env has not, or has otherwise.
     """
-    try:
+    with naming(f"objective.teacher={str(path)!r}"):
         saved = checkpoint.load_latest(path)
         state = {
             "actor": saved.state["update"]["actor"],
@@ -47,8 +48,6 @@ def load_teacher(path: Path, env: EnvBase, *, cfg: RunCfg) -> Teacher:
             "columns": json.dumps(saved.state["observation_columns"]),
         }
         return restored_teacher(state, env, cfg=cfg)
-    except ValueError as error:
-        raise ValueError(f"objective.teacher={str(path)!r}: {error}") from error
 
 
 def restored_teacher(state: Mapping[str, Any], env: EnvBase, *, cfg: RunCfg) -> Teacher:

@@ -121,15 +121,12 @@ class PPOUpdate(DatasetUpdate):
         steps: list[dict[str, Tensor]] = []
         for epoch in range(self.cfg.num_epochs):
             if epoch > 0 and self.cfg.estimates_each_epoch:
-                self._estimate_anew(rollout_ET)
+                # The rows that are not finite were counted with the first estimate.
+                count = self.dataset.non_finite_count.clone()
+                self.dataset.extend(self.advantage(rollout_ET))
+                self.dataset.non_finite_count.copy_(count)
             steps += self._epoch(self._losses)
         return in_columns(steps)
-
-    def _estimate_anew(self, rollout_ET: TensorDictBase) -> None:
-        # The rows that are not finite were counted with the first estimate.
-        count = self.dataset.non_finite_count.clone()
-        self.dataset.extend(self.advantage(rollout_ET))
-        self.dataset.non_finite_count.copy_(count)
 
     def state_dict(self) -> state_tree.State:
         """Return networks, optimizer, sampler and counters."""

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from ksim_rl.checks import unknown_name
+from ksim_rl.checks import check_known
 from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.masked_reset import mask_from_env_ids
 from ksim_rl.envs.term import CommandTerm
@@ -63,8 +63,7 @@ class CommandManager:
         captured step sees them too. A ValueError for an unknown name, a command that is drawn, values that do not fit,
         or envs that do not exist.
         """
-        if name not in self._terms:
-            raise unknown_name("command", name, self._terms)
+        check_known("command", name, self._terms)
         view = self._view
         rows = range(view.num_envs) if env_ids is None else env_ids
         mask_E = mask_from_env_ids(rows, torch.Size([view.num_envs]), view.device)

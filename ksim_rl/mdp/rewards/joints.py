@@ -1,8 +1,4 @@
-"""These rewards rate what joints, actuators and actions do, left-right symmetry, and whether an episode goes on.
-
-Positions and velocities are of the current state; accelerations, efforts and forces belong to the last physics substep
-(acceleration stage).
-"""
+"""These rewards rate what joints, actuators and actions do, left-right symmetry, and whether an episode goes on."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -7,7 +7,7 @@ from typing import Any
 
 import mujoco
 
-from ksim_rl.checks import unknown_name
+from ksim_rl.checks import check_known
 from ksim_rl.physics.load import caught_warnings
 from ksim_rl.scene.names import SCALAR_JOINTS, match_names
 from ksim_rl.scene.state.joint_targets import control_kind
@@ -146,8 +146,7 @@ def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom])
     """Delete all geoms that can collide and add `geoms`; visual geoms, masses and inertias of all bodies stay."""
     bodies = {body.name: body for body in spec.bodies}
     for geom in geoms:
-        if geom.body not in bodies:
-            raise unknown_name("body", geom.body, bodies)
+        check_known("body", geom.body, bodies)
     deleted = [geom for geom in spec.geoms if geom.contype or geom.conaffinity]
     _keep_inertia(spec, [geom.parent for geom in deleted])
     for geom in deleted:
@@ -198,8 +197,7 @@ def set_sites(spec: mujoco.MjSpec, sites: Iterable[Site]) -> None:
     present = {site.name: site for site in spec.sites}
     bodies = {body.name: body for body in spec.bodies}
     for site in sites:
-        if site.body not in bodies:
-            raise unknown_name("body", site.body, bodies)
+        check_known("body", site.body, bodies)
         placed = present.get(site.name)
         if placed is not None and placed.parent != bodies[site.body]:
             spec.delete(placed)

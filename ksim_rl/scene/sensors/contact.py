@@ -10,19 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.physics.contact_sensors import NET, STRONGEST
+from ksim_rl.checks import naming
+from ksim_rl.physics.contact_sensors import MATCHED, NET, STRONGEST
 from ksim_rl.scene.names import as_index, match_names
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.sensor import Sensor, SensorTracker, check_present
 from ksim_rl.scene.small_matrices import product
 from ksim_rl.scene.state.world_view import WorldView
 
-_OBJECTS = {
-    "geom": mujoco.mjtObj.mjOBJ_GEOM,
-    "body": mujoco.mjtObj.mjOBJ_BODY,
-    # MuJoCo's contact sensor reads this type as the body with all its descendants.
-    "subtree": mujoco.mjtObj.mjOBJ_XBODY,
-}
 _TABLES = {"geom": "geom", "body": "body", "subtree": "body"}
 _RGBA = (1.0, 0.55, 0.1, 1.0)
 
@@ -83,20 +78,18 @@ class ContactSensor(Sensor):
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
         """Add one MJCF contact sensor `<name>_<element>` per element."""
         parts = {"geom": spec.geoms, "body": spec.bodies}
-        try:
+        with naming(f"scene.sensors.{name}"):
             elements = self.elements([part.name for part in parts[_TABLES[self.kind]]])
-        except ValueError as error:
-            raise ValueError(f"scene.sensors.{name}: {error}") from None
         other = {}
         if self.against is not None:
             table = _TABLES[self.against_kind]
             check_present(name, table, self.against, parts[table])
-            other = {"reftype": _OBJECTS[self.against_kind], "refname": self.against}
+            other = {"reftype": MATCHED[self.against_kind], "refname": self.against}
         for element in elements:
             spec.add_sensor(
                 name=f"{name}_{element}",
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
-                objtype=_OBJECTS[self.kind],
+                objtype=MATCHED[self.kind],
                 objname=element,
                 intprm=[*(NET if self.reduce == "net" else STRONGEST)],
                 **other,
@@ -164,18 +157,17 @@ class ContactTracker(SensorTracker):
     @property
     def state(self) -> ContactState:
         """The contacts of the last env step."""
-        cache, history_ESN3 = self._view.cache, self._history_ESN3
-        force_EN3, position_EN3 = cache.get(f"{self._key}.force"), cache.get(f"{self._key}.position")
-        if force_EN3 is None or position_EN3 is None:
+        cache = self._view.cache
+        if self._key not in cache:
             readings = self._readings()
-            force_EN3 = cache[f"{self._key}.force"] = self._force(readings)
-            position_EN3 = cache[f"{self._key}.position"] = readings[..., 4:7]
-        return ContactState(
-            force_EN3=force_EN3,
-            position_EN3=position_EN3,
-            force_history_ESN3=force_EN3[:, None] if history_ESN3 is None else history_ESN3,
-            **{f"{clock}_EN": value_EN for clock, value_EN in self._clocks.items()},
-        )
+            force_EN3 = self._force(readings)
+            cache[self._key] = ContactState(
+                force_EN3=force_EN3,
+                position_EN3=readings[..., 4:7],
+                force_history_ESN3=force_EN3[:, None] if self._history_ESN3 is None else self._history_ESN3,
+                **{f"{clock}_EN": value_EN for clock, value_EN in self._clocks.items()},
+            )
+        return cache[self._key]
 
     def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw an arrow for each contact: the force on the element, from the point of contact."""

@@ -148,7 +148,7 @@ class RayTracker(SensorTracker):
     """Casts the rays of one sensor, at most once per state, and only if something reads them."""
 
     def __init__(self, name: str, sensor: RayCaster, view: WorldView) -> None:
-        self._sensor, self._view, self._key = sensor, view, f"rays/{name}."
+        self._sensor, self._view, self._key = sensor, view, f"rays/{name}"
         site = view.world.mj_model.site(sensor.mounting_site(name))
         self._site = int(site.id)
         start_N3, direction_N3 = (
@@ -166,9 +166,9 @@ class RayTracker(SensorTracker):
     def state(self) -> RayState:
         """What the rays hit in the current state."""
         cache = self._view.cache
-        if self._key + RayState._fields[0] not in cache:
-            cache.update({self._key + name: value for name, value in self._cast()._asdict().items()})
-        return RayState(*(cache[self._key + name] for name in RayState._fields))
+        if self._key not in cache:
+            cache[self._key] = self._cast()
+        return cache[self._key]
 
     @property
     def origin_E3(self) -> Float[Tensor, "E 3"]:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from ksim_rl.checks import unknown_name
+from ksim_rl.checks import check_known
 from ksim_rl.device import recording
 
 # Numbers per env that an arena has room for; a wider buffer has one of its own.
@@ -199,8 +199,7 @@ class ActuatorParams:
         return frozenset(joint for joint, value in owners.items() if not finite or math.isfinite(value))
 
     def _check(self, name: str, joints: Collection[int]) -> None:
-        if name not in self._buffers:
-            raise unknown_name("parameter of explicit actuators", name, self._buffers)
+        check_known("parameter of explicit actuators", name, self._buffers)
         for joint in joints:
             if joint not in self._owners[name]:
                 raise ValueError(

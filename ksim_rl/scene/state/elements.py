@@ -63,8 +63,6 @@ class Joints(_Elements):
         assert self is self._every_joint
         return Joints(self._state, ids, [self.names[i] for i in ids], self._tables, self)
 
-    # -- state ---------------------------------------------------------------------------------------------------
-
     @quantity
     def pos_EL(self) -> Float[Tensor, "E L"]:
         """Positions, rad or m; position stage."""
@@ -92,8 +90,6 @@ class Joints(_Elements):
             return self.pos_EL - self._tables.default_pos_EL
         return self._every_joint.pos_rel_EL[:, self.index]
 
-    # -- what is known of them -------------------------------------------------------------------------------------
-
     @property
     def default_pos_EL(self) -> Float[Tensor, "E L"]:
         """Positions in the default pose, which events may move."""
@@ -108,8 +104,6 @@ class Joints(_Elements):
     def encoder_bias_EL(self) -> Float[Tensor, "E L"]:
         """What the encoders read beyond the position, rad or m."""
         return self._tables.encoder_bias_EL[:, self.index]
-
-    # -- writes --------------------------------------------------------------------------------------------------
 
     def write_pos(self, mask_E: Bool[Tensor, " E"], pos_EL: Float[Tensor, "E L"]) -> None:
         """Set the positions in the rows of `mask_E`."""

@@ -52,8 +52,6 @@ class Entity:
         self._down = torch.tensor([0.0, 0.0, -1.0], device=device)
         self.joints = every_joint.some([i for i, j in enumerate(scalar_joint_ids(model)) if j in joints])
 
-    # -- pose ----------------------------------------------------------------------------------------------------
-
     @quantity
     def root_pos_EL(self) -> Float[Tensor, "E 3"]:
         """Position of the root body's frame in the world, m."""
@@ -73,8 +71,6 @@ class Entity:
     def heading_E(self) -> Float[Tensor, " E"]:
         """Yaw of the root body, rad in [-pi, pi]."""
         return quaternion.yaw(self.root_quat_EL)
-
-    # -- velocity ------------------------------------------------------------------------------------------------
 
     @quantity
     def root_lin_vel_w_EL(self) -> Float[Tensor, "E 3"]:
@@ -99,8 +95,6 @@ class Entity:
         if self.free_root:  # MuJoCo keeps a free joint's angular velocity in the body frame
             return self._free_qvel_EL[:, 3:]
         return quaternion.rotate_inverse(self.root_quat_EL, self.root_ang_vel_w_EL)
-
-    # -- writes --------------------------------------------------------------------------------------------------
 
     def write_root_pose(
         self, mask_E: Bool[Tensor, " E"], pos_EL: Float[Tensor, "E 3"], quat_EL: Float[Tensor, "E 4"]

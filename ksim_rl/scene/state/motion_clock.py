@@ -21,26 +21,23 @@ def motion_joints(
     view: WorldView, file: str, joints: Patterns
 ) -> tuple[Float[Tensor, "E L"], Float[Tensor, "E L"]]:
     """Return positions and velocities that joints have in the motion now; computed once per state."""
-    keys = [f"motion/{file}.{part} of {joints}" for part in ("joint_pos", "joint_vel")]
-    if keys[0] not in view.cache:
-        sampled = view.motion(file).sample_joints(motion_time(view, file), view.joints(joints).index)
-        view.cache.update(zip(keys, sampled, strict=True))
-    return view.cache[keys[0]], view.cache[keys[1]]
+    key = f"motion/{file}.joints {joints}"
+    if key not in view.cache:
+        index = view.joints(joints).index
+        view.cache[key] = view.motion(file).sample_joints(motion_time(view, file), index)
+    return view.cache[key]
 
 
 def motion_bodies(
     view: WorldView, file: str, bodies: Patterns
 ) -> tuple[Float[Tensor, "E N 3"], Float[Tensor, "E N 4"]]:
     """Return the poses that bodies have in the motion now, world frame, moved by `motion_shift`; once per state."""
-    keys = [f"motion/{file}.{part} of {bodies}" for part in ("body_pos", "body_quat")]
-    if keys[0] not in view.cache:
-        pos_EN3, quat_EN4 = view.motion(file).sample_bodies(
-            motion_time(view, file), view.bodies(bodies).index
-        )
-        shift_E3 = motion_shift(view)
-        pos_EN3 = pos_EN3 if shift_E3 is None else pos_EN3 + shift_E3[:, None]
-        view.cache.update(zip(keys, (pos_EN3, quat_EN4), strict=True))
-    return view.cache[keys[0]], view.cache[keys[1]]
+    key = f"motion/{file}.bodies {bodies}"
+    if key not in view.cache:
+        index, shift_E3 = view.bodies(bodies).index, motion_shift(view)
+        pos_EN3, quat_EN4 = view.motion(file).sample_bodies(motion_time(view, file), index)
+        view.cache[key] = (pos_EN3 if shift_E3 is None else pos_EN3 + shift_E3[:, None]), quat_EN4
+    return view.cache[key]
 
 
 def motion_shift(view: WorldView) -> Float[Tensor, "E 3"] | None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int64, Shaped
@@ -58,10 +58,8 @@ class Simulation:
         self._scope, self._draw_scope, self._draws = "", "", 0
         self._lasting: set[int] = set()
 
-    # -- state and what derives from it ----------------------------------------------------------------------------
-
-    def new_cache(self) -> dict[str, Shaped[Tensor, "*?shape"]]:
-        """Return a dict for quantities that is emptied whenever the state changes."""
+    def new_cache(self) -> dict[str, Any]:
+        """Return a dict for quantities, tensors or tuples of them, that is emptied whenever the state changes."""
         self._caches.append({})
         return self._caches[-1]
 
@@ -107,8 +105,6 @@ class Simulation:
         cvel_EN6 = world.cvel_EL[:, body]
         lever_EN3 = point_EN3 - world.subtree_com_EL[:, self._body_root[body]]
         return cvel_EN6[..., 3:] + torch.linalg.cross(cvel_EN6[..., :3], lever_EN3)
-
-    # -- terms -------------------------------------------------------------------------------------------------------
 
     @contextmanager
     def scope(

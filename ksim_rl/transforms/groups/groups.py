@@ -144,9 +144,6 @@ class ObservationGroups(CheckedKeys):
             drop_leaf(next_tensordict, key)
         return next_tensordict
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._call(next_tensordict)
-
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Do the same to a batch of samples."""
         self._check_samples(tensordict, is_floating=False)

@@ -82,8 +82,7 @@ def mirror_joints(mj_model: mujoco.MjModel, joints: Sequence[str] | None = None)
     valid = {mj_model.joint(i).name: i for i in range(mj_model.njnt) if mj_model.jnt_type[i] in scalar}
     names = list(valid) if joints is None else list(joints)
     for name in names:
-        if name not in valid:
-            raise checks.unknown_name("hinge or slide", name, valid)
+        checks.check_known("hinge or slide", name, valid)
     source, signs = [], []
     for name in names:
         other = mirror_name(name, names)

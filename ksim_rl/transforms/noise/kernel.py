@@ -90,19 +90,14 @@ _COLUMNS = r"""
         }
         out[i] = x;
     };
-    switch (features) {
-        case 0:
-            for (int i = lane; i < n; i += LANES) column(i, 0);
-            break;
-        case 16:
-            for (int i = lane; i < n; i += LANES) column(i, 16);
-            break;
-        case 17:
-            for (int i = lane; i < n; i += LANES) column(i, 17);
-            break;
-        default:
-            for (int i = lane; i < n; i += LANES) column(i, features);
-    }
+    if (features == 0)
+        for (int i = lane; i < n; i += LANES) column(i, 0);
+    else if (features == 16)
+        for (int i = lane; i < n; i += LANES) column(i, 16);
+    else if (features == 17)
+        for (int i = lane; i < n; i += LANES) column(i, 17);
+    else
+        for (int i = lane; i < n; i += LANES) column(i, features);
 """
 
 _LANES = 32

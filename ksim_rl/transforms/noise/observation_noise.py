@@ -9,6 +9,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 
+from ksim_rl.checks import naming
 from ksim_rl.transforms import upstream
 from ksim_rl.transforms.columns import side_by_side, split
 from ksim_rl.transforms.noise import kernel as noise_kernel
@@ -201,12 +202,10 @@ class NoiseColumns(nn.Module):
 
 def _parameters(cfg: NoiseCfg, key: NestedKey, size: int) -> list[list[float]]:
     """Return the parameters of one observation, in the order of the rows of `noise_kernel`'s table."""
-    try:
+    with naming(f"{type(cfg).__name__} of {key!r}"):
         bias = cfg.bias.affine(size) if cfg.bias is not None else ([0.0] * size, [0.0] * size)
         walk, grain = (per_dim(name, getattr(cfg, name), size) for name in ("walk_std", "resolution"))
         return [*cfg.affine(size), *bias, walk, grain, [cfg.dropout] * size]
-    except ValueError as error:
-        raise ValueError(f"{type(cfg).__name__} of {key!r}: {error}") from None
 
 
 def _flags(cfg: NoiseCfg) -> int:
