@@ -101,10 +101,11 @@ class EpochSampler(Sampler):
 
     def _order(self, epoch: Tensor, size: int) -> Tensor:
         """Return the order of an epoch: a random one unless `shuffle` is off, minibatch by minibatch."""
-        order_D = torch.arange(size, device=epoch.device)
-        if self.shuffle:
-            if size % self.shards:
-                raise ValueError(f"{size} elements are no whole number for each of {self.shards} shards")
+        if not self.shuffle:
+            order_D = torch.arange(size, device=epoch.device)
+        elif size % self.shards:
+            raise ValueError(f"{size} elements are no whole number for each of {self.shards} shards")
+        else:
             keys = random.row_keys(torch.full_like(epoch, self.seed), _STREAM, epoch, self.shards)
             order_D = random.permutations(keys, size // self.shards).flatten()
         if self.shards == 1:

@@ -11,21 +11,42 @@ from ksim_rl import ranks
 from ksim_rl.checks import check_in_range
 from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator
 
-# Parts of a batch whose moments are taken side by side: at most so many, of at least so many rows.
-MOST_PARTS, LEAST_ROWS = 512, 16
-# Stages 0 to 2 are of a row (which rows count), of a column of a part, and of a column of the batch.
+# Parts of a batch whose moments are taken side by side: at most so many, of at least so many rows. Short ones hold up
+# little of what else a GPU does. Then those of so many parts are merged, and at last those of all these groups.
+MOST_PARTS, LEAST_ROWS, GROUP = 2048, 16, 32
+# Stages 0 to 3 are of a row (which rows count), of a column of a part, of a group, and of the batch.
 _quick = QuickLaunch(
     arguments_of(
-        (int, "stage num_rows dim rows parts ranks"),
+        (int, "stage num_rows dim rows parts groups ranks"),
         (wp.int64, "until"),
         (wp.uint64, "values valid counts moments count mean squares"),
     ),
     r"""
-    const size_t dim = a.dim, size = a.parts * dim;
+    const size_t dim = a.dim, slots = a.parts + a.groups, size = slots * dim;
     const float* values = (const float*)a.values;
     unsigned char* counts = (unsigned char*)a.counts;
     double *means = (double*)a.moments, *squares = means + size, *weights = squares + size;
     const long long before = *(const long long*)a.count;
+    double weight = 0.0, mean = 0.0, square = 0.0;
+    auto merge = [&](int begin, int end) {
+        double sum = 0.0;
+        #pragma unroll 16
+        for (int slot = begin; slot < end; ++slot) {
+            weight += weights[slot];
+            sum += weights[slot] * means[slot * dim + lane];
+        }
+        mean = sum / (weight > 1.0 ? weight : 1.0);
+        #pragma unroll 16
+        for (int slot = begin; slot < end; ++slot) {
+            const double error = means[slot * dim + lane] - mean;
+            square += squares[slot * dim + lane] + weights[slot] * error * error;
+        }
+    };
+    auto store = [&](int slot) {
+        means[slot * dim + lane] = mean;
+        squares[slot * dim + lane] = square;
+        if (lane == 0) weights[slot] = weight;
+    };
     if (a.stage == 0) {
         bool is_counted = a.until < 0 || before * a.ranks < a.until;
         if (a.valid) is_counted &= ((const unsigned char*)a.valid)[row] != 0;
@@ -33,7 +54,7 @@ _quick = QuickLaunch(
         counts[row] = is_counted;
     } else if (a.stage == 1) {
         const size_t begin = (size_t)row * a.rows, end = begin + a.rows < a.num_rows ? begin + a.rows : a.num_rows;
-        double weight = 0.0, sum = 0.0, square = 0.0;
+        double sum = 0.0;
         // All rows are read, counted or not, so that many reads are under way at once.
         #pragma unroll 8
         for (size_t i = begin; i < end; ++i) {
@@ -41,37 +62,28 @@ _quick = QuickLaunch(
             weight += counts[i];
             sum += counts[i] ? value : 0.0;
         }
-        const double mean = weight > 0.0 ? sum / weight : 0.0;
+        mean = weight > 0.0 ? sum / weight : 0.0;
         #pragma unroll 8
         for (size_t i = begin; i < end; ++i) {
             const double value = values[i * dim + lane], error = counts[i] ? value - mean : 0.0;
             square += error * error;
         }
-        means[row * dim + lane] = mean;
-        squares[row * dim + lane] = square;
-        if (lane == 0) weights[row] = weight;
+        store(row);
+    } else if (a.stage == 2) {
+        const int begin = row * GROUP, end = begin + GROUP;
+        merge(begin, end < a.parts ? end : a.parts);
+        store(a.parts + row);
     } else {
-        double added = 0.0, sum = 0.0, square = 0.0;
-        #pragma unroll 16
-        for (int part = 0; part < a.parts; ++part) {
-            added += weights[part];
-            sum += weights[part] * means[part * dim + lane];
-        }
-        const double mean = sum / (added > 1.0 ? added : 1.0);
-        #pragma unroll 16
-        for (int part = 0; part < a.parts; ++part) {
-            const double error = means[part * dim + lane] - mean;
-            square += squares[part * dim + lane] + weights[part] * error * error;
-        }
+        merge(a.parts, (int)slots);
         // The union of both, as of those of ranks in `ranks.merged`.
-        const double total = before + added, share = added / (total > 1.0 ? total : 1.0);
+        const double total = before + weight, share = weight / (total > 1.0 ? total : 1.0);
         double* exact_mean = (double*)a.mean + lane;
         const double delta = mean - *exact_mean;
         *exact_mean += delta * share;
         ((double*)a.squares)[lane] += square + delta * delta * share * before;
-        if (lane == 0) weights[a.parts] = total;
+        if (lane == 0) weights[slots] = total;
     }
-""",
+""".replace("GROUP", str(GROUP)),
 )
 
 
@@ -82,12 +94,13 @@ def _count(
     num_rows, dim = values_NL.shape
     rows = max(LEAST_ROWS, -(-num_rows // MOST_PARTS))
     parts = -(-num_rows // rows)
+    groups = -(-parts // GROUP)
     counts_N = torch.empty(num_rows, dtype=torch.uint8, device=count.device)
-    moments = torch.empty((2 * dim + 1) * parts + 1, dtype=torch.float64, device=count.device)
+    moments = torch.empty((2 * dim + 1) * (parts + groups) + 1, dtype=torch.float64, device=count.device)
     held = (counts_N, moments, count, mean_L, squares_L)
     given = values_NL.data_ptr(), address(valid_N), *(own.data_ptr() for own in held)
-    for stage, size in enumerate(((num_rows, 1), (parts, dim), (1, dim))):
-        _quick(count.device, size, stage, num_rows, dim, rows, parts, ranks.size(), until, *given)
+    for stage, size in enumerate(((num_rows, 1), (parts, dim), (groups, dim), (1, dim))):
+        _quick(count.device, size, stage, num_rows, dim, rows, parts, groups, ranks.size(), until, *given)
     count.copy_(moments[-1])
 
 
