@@ -24,7 +24,9 @@ def ppo(*, gamma: float = 0.995, env_states: float = PPO_STATES) -> TrainingCfg:
     of values to 0.2, or gradients to 1, would stop the critic from learning. Standard deviations fall to some
     hundredths, where actions of a network in bfloat16 are too coarse: WalkerRun came to 267 after 20 M env states,
     in float32 to 676. Many actions have a large divergence in sum, which would hold the adaptive learning rate at
-    its usual floor of 1e-5.
+    its usual floor of 1e-5. No deviation falls below 0.2, and advantages of nearly nothing stay small: without these
+    two bounds exploration ended where rewards are rare. Of an actor as deep as the critic fused kernels make the
+    steps, and with one of 256 and 128 FingerTurnHard came to 682 in place of 920.
     """
     return TrainingCfg(
         num_envs=NUM_ENVS,
@@ -32,6 +34,8 @@ def ppo(*, gamma: float = 0.995, env_states: float = PPO_STATES) -> TrainingCfg:
             gamma=gamma,
             num_epochs=8,
             clip_value=False,
+            desired_kl=0.02,
+            min_advantage_std=0.02,
             entropy_coeff=0.001,
             learning_rate_min=1e-4,
             learning_rate_max=1e-3,
@@ -40,7 +44,8 @@ def ppo(*, gamma: float = 0.995, env_states: float = PPO_STATES) -> TrainingCfg:
         ),
         data=DatasetCfg(num_env_states_per_minibatch=8192, num_minibatches=16),
         modules=ModulesCfg(
-            actor=ActorCfg(hidden_dims=(256, 128)), critic=CriticCfg(hidden_dims=(256, 256, 128))
+            actor=ActorCfg(hidden_dims=(256, 256, 128), init_std=0.7, min_std=0.2),
+            critic=CriticCfg(hidden_dims=(256, 256, 128)),
         ),
         trainer=TrainerCfg(
             num_iterations=math.ceil(env_states / (8192 * 16)), eval_interval=50, stop_when_solved=False
