@@ -11,7 +11,6 @@ first line of a burst to stderr; a program with its own display sets another:
 import os
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -99,16 +98,17 @@ def loaded_together(device: torch.device) -> Iterator[None]:
     One after another, a new model takes half a minute. Loops of Warp (`wp.capture_while`) go through their body once.
     Kernels that take their types from a launch are left to that launch.
     """
-    modules: dict[int | None, dict[wp.Module, None]] = defaultdict(dict)
+    found: dict[tuple[wp.Kernel, int | None], None] = {}
 
     def note(kernel: wp.Kernel, dim: Any, block_dim: int | None) -> None:
         size = dim if isinstance(dim, (tuple, list)) else (dim,)
         if all(size) and not kernel.is_generic:
-            modules[None if device.type == "cpu" else block_dim][kernel.module] = None
+            found[kernel, None if device.type == "cpu" else block_dim] = None
 
     with upstream.launches_diverted(note):
         yield
-    load([(module, block_dim) for block_dim, found in modules.items() for module in found], device)
+    upstream.put_apart(kernel for kernel, _ in found)
+    load(dict.fromkeys((kernel.module, block_dim) for kernel, block_dim in found), device)
 
 
 def load(modules: Iterable[tuple[wp.Module, int | None]], device: torch.device) -> None:

@@ -28,6 +28,33 @@ def test_launches_of_the_block_are_loaded_and_not_run():
         assert values.numpy().tolist() == [1.0] * 3
 
 
+@wp.kernel(enable_backward=False)
+def double(values: wp.array[float]):
+    values[wp.tid()] *= 2.0
+
+
+@wp.kernel(enable_backward=False)
+def negate(values: wp.array[float]):
+    values[wp.tid()] *= -1.0
+
+
+def test_what_is_launched_of_a_module_is_compiled_without_the_rest_of_it():
+    with warp_scope(CPU):
+        values, whole = wp.ones(3, dtype=float, device="cpu"), negate.module
+        with loaded_together(CPU):
+            wp.launch(double, dim=3, inputs=[values], device="cpu")
+        assert [*double.module.kernels] == ["double"] and double.module.execs
+        assert double.module is not whole is negate.module and not whole.execs
+        for kernel in (double, negate):
+            wp.launch(kernel, dim=3, inputs=[values], device="cpu")
+        assert values.numpy().tolist() == [-2.0] * 3
+        apart = double.module
+        with loaded_together(CPU):
+            for kernel in (double, negate):
+                wp.launch(kernel, dim=3, inputs=[values], device="cpu")
+        assert double.module is apart and negate.module is whole
+
+
 def test_compiled_modules_call_the_hook_and_cached_ones_do_not():
     lines: list[str] = []
     with compile_notice(lines.append):
