@@ -21,6 +21,7 @@ import torch
 import warp as wp
 
 from ksim_rl.device import upstream
+from ksim_rl.device.quick_launch import QuickLaunch
 from ksim_rl.device.streams import warp_device
 
 CompileHook = Callable[[str], None]
@@ -96,7 +97,7 @@ def loaded_together(device: torch.device) -> Iterator[None]:
     """Run none of the launches that this thread issues in this block, but load their kernels, side by side, at its end.
 
     One after another, a new model takes half a minute. Loops of Warp (`wp.capture_while`) go through their body once.
-    Kernels that take their types from a launch are left to that launch.
+    Kernels that take their types from a launch are left to that launch. Each `QuickLaunch` that exists is loaded, too.
     """
     found: dict[tuple[wp.Kernel, int | None], None] = {}
 
@@ -108,7 +109,8 @@ def loaded_together(device: torch.device) -> Iterator[None]:
     with upstream.launches_diverted(note):
         yield
     upstream.put_apart(kernel for kernel, _ in found)
-    load(dict.fromkeys((kernel.module, block_dim) for kernel, block_dim in found), device)
+    modules = dict.fromkeys((kernel.module, block_dim) for kernel, block_dim in found)
+    load([*modules, *(quick.loadable for quick in QuickLaunch.existing)], device)
 
 
 def load(modules: Iterable[tuple[wp.Module, int | None]], device: torch.device) -> None:

@@ -8,7 +8,8 @@ import ctypes
 import struct
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
+from weakref import WeakSet
 
 import torch
 import warp as wp
@@ -35,6 +36,8 @@ class QuickLaunch:
     `indices` within the launch's dim. The kernel has no gradients.
     """
 
+    existing: ClassVar[WeakSet["QuickLaunch"]] = WeakSet()
+
     def __init__(
         self,
         arguments: type,
@@ -56,11 +59,12 @@ class QuickLaunch:
         self._packer = struct.Struct("")
         # The bytes are shared by all launches until the driver, or the kernel on the CPU, has read them.
         self._lock = threading.Lock()
+        QuickLaunch.existing.add(self)
 
     @property
-    def module(self) -> wp.Module:
-        """What is compiled."""
-        return self._kernel.module
+    def loadable(self) -> tuple[wp.Module, int]:
+        """What is compiled, and for blocks of which size."""
+        return self._kernel.module, self._block_dim
 
     def __call__(self, device: torch.device, dim: tuple[int, int], *values: float) -> None:
         """Launch with one value per field of the struct, in their order; do nothing for a dim of 0."""
