@@ -11,12 +11,10 @@ moves it by 0.05 to 0.5.
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
 import torch
-import triton
 from jaxtyping import Float, Int64
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -26,6 +24,7 @@ from ksim_rl import ranks
 from ksim_rl.device.memory import ROLLOUT_PARTS
 from ksim_rl.device.streams import beside, warp_scope, warp_stream
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
+from ksim_rl.objectives.fused_ppo.ahead import Ahead
 from ksim_rl.objectives.fused_ppo.dataset import FusedDataset, as_tf32
 from ksim_rl.objectives.fused_ppo.layer_kernels import layer, output_gradients
 from ksim_rl.objectives.fused_ppo.layout import (
@@ -159,15 +158,18 @@ class FusedPPO:
         # chained kernels leave out half of its columns.
         self._splits = tuning.splits if self._mirrored or layout.chained else parts(tuning.splits, 2)
         self._arguments = self._all_arguments(rows, mirror)
-        if device.type == "cuda" and layout.chained:
-            # Side by side: one after another took seven of a cold start's seconds.
-            self._arguments["compiles"] = True
-            with ThreadPoolExecutor() as pool, triton.AsyncCompileMode(pool):
-                self._multiply(torch.zeros(rows, dtype=torch.int32, device=device))
-                self._improve(0)
-                for listed in ({}, self.dataset.listed):
-                    self._evaluate(self.dataset.obs[1], self.dataset.records[:, 0].contiguous(), **listed)
-            self._arguments["compiles"] = False
+        # Until the first update.
+        self._ahead = Ahead() if device.type == "cuda" and layout.chained else None
+        if self._ahead is not None:
+            self._ahead.add(self._launch_all)
+
+    def _launch_all(self) -> None:
+        """Launch what an update does after its rollout has been read, each kernel once."""
+        rows, records = self._arguments["num_rows"], self.dataset.records
+        self._multiply(torch.zeros(rows, dtype=torch.int32, device=records.device))
+        self._improve(0)
+        for listed in ({}, self.dataset.listed):
+            self._evaluate(self.dataset.obs[1], records[:, 0].contiguous(), **listed)
 
     def _all_arguments(self, rows: int, mirror: SymmetricAugmentation | None) -> dict[str, Any]:
         """Return what kernels get in every step, by the names of their parameters; `rows` are those of a minibatch."""
@@ -247,6 +249,10 @@ class FusedPPO:
         does what is `aside` beside the steps. Returned are what each gradient step measured, by the names of `SUMMARY`,
         and how many env states took no part because an element was not finite.
         """
+        if self._ahead is not None:
+            self._ahead.add(lambda: self.dataset.read(rollout_ET, evaluate=self._evaluate))
+            self._ahead.wait()
+            self._ahead = None
         num_envs, length = rollout_ET.batch_size
         indices: list[Tensor] = []
 
