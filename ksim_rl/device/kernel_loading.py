@@ -108,9 +108,10 @@ def loaded_together(device: torch.device) -> Iterator[None]:
 
     with upstream.launches_diverted(note):
         yield
-    upstream.put_apart(kernel for kernel, _ in found)
-    modules = dict.fromkeys((kernel.module, block_dim) for kernel, block_dim in found)
-    load([*modules, *(quick.loadable for quick in QuickLaunch.existing)], device)
+        # Before another thread comes here: it would put apart again what is not loaded yet.
+        upstream.put_apart([kernel for kernel, _ in found])
+        modules = dict.fromkeys((kernel.module, block_dim) for kernel, block_dim in found)
+        load([*modules, *(quick.loadable for quick in QuickLaunch.existing)], device)
 
 
 def load(modules: Iterable[tuple[wp.Module, int | None]], device: torch.device) -> None:

@@ -55,16 +55,12 @@ class QuickLaunch:
             run(index_0, index_1, a)
 
         self._kernel, self._arguments, self._block_dim = kernel, arguments, block_dim
+        self.loadable: tuple[wp.Module, int] = kernel.module, block_dim  # what is compiled, for which blocks
         self._recorded: dict[tuple[torch.device, tuple[int, int]], tuple[wp.Launch, ctypes.Structure]] = {}
         self._packer = struct.Struct("")
         # The bytes are shared by all launches until the driver, or the kernel on the CPU, has read them.
         self._lock = threading.Lock()
-        QuickLaunch.existing.add(self)
-
-    @property
-    def loadable(self) -> tuple[wp.Module, int]:
-        """What is compiled, and for blocks of which size."""
-        return self._kernel.module, self._block_dim
+        QuickLaunch.existing = WeakSet([*QuickLaunch.existing, self])  # a thread may go through the old one
 
     def __call__(self, device: torch.device, dim: tuple[int, int], *values: float) -> None:
         """Launch with one value per field of the struct, in their order; do nothing for a dim of 0."""

@@ -1,5 +1,7 @@
 """Triton kernels that are compiled ahead: they are not launched, and what goes wrong is raised."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 
 from ksim_rl.objectives.fused_ppo.layout import launch
@@ -31,14 +33,14 @@ class Kernel:
 
 @pytest.fixture
 def ahead(monkeypatch):
-    from ksim_rl.objectives.fused_ppo.ahead import Ahead
+    from ksim_rl.objectives.fused_ppo.fused_ppo import Ahead
 
     class Driver:
         launchers: list = []
         launcher_cls = staticmethod(lambda src, metadata: Driver.launchers.append(src))
 
     monkeypatch.setattr(triton.runtime.driver, "_active", Driver())
-    return Ahead()
+    return Ahead(ThreadPoolExecutor())
 
 
 def test_what_is_added_is_compiled_and_not_launched(ahead):

@@ -11,10 +11,13 @@ moves it by 0.05 to 0.5.
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from functools import partial
 from typing import Any
 
 import torch
+import triton
 from jaxtyping import Float, Int64
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -24,7 +27,6 @@ from ksim_rl import ranks
 from ksim_rl.device.memory import ROLLOUT_PARTS
 from ksim_rl.device.streams import beside, warp_scope, warp_stream
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
-from ksim_rl.objectives.fused_ppo.ahead import Ahead
 from ksim_rl.objectives.fused_ppo.dataset import FusedDataset, as_tf32
 from ksim_rl.objectives.fused_ppo.layer_kernels import layer, output_gradients
 from ksim_rl.objectives.fused_ppo.layout import (
@@ -34,6 +36,7 @@ from ksim_rl.objectives.fused_ppo.layout import (
     LayerPlace,
     Tuning,
     launch,
+    only_compiles,
     parts,
     power_of_two,
 )
@@ -107,6 +110,32 @@ class FusedParameters:
         return [*self._parameters, *(state[name] for name in ("exp_avg", "exp_avg_sq") for state in states)]
 
 
+class Ahead(triton.AsyncCompileMode):
+    """Threads compile what `launch` is given in some work; loading it, too, would break the capture of a graph."""
+
+    def add(self, work: Callable[[], object]) -> None:
+        """Do `work`, and begin to compile what it would launch."""
+        context = copy_context()
+        context.run(only_compiles.set, True)
+        context.run(self.__enter__)  # whose exit waits
+        context.run(work)
+
+    def submit(self, key: str, compile_fn: Callable[[], Any], finalize_fn: Callable[[Any], None]) -> Any:
+        """Compile a kernel, and what launches it, for which some versions of Triton start gcc."""
+        driver: Any = triton.runtime.driver.active
+
+        def compiled() -> Any:
+            kernel = compile_fn()
+            driver.launcher_cls(kernel.src, kernel.metadata)
+            return kernel
+
+        return super().submit(key, compiled, finalize_fn)
+
+    def wait(self) -> None:
+        """Wait for all that was added, and raise what went wrong."""
+        self.__exit__(None, None, None)
+
+
 class FusedPPO:
     """Makes the gradient steps of one update after another; all memory is allocated once, and nothing syncs.
 
@@ -158,18 +187,17 @@ class FusedPPO:
         # chained kernels leave out half of its columns.
         self._splits = tuning.splits if self._mirrored or layout.chained else parts(tuning.splits, 2)
         self._arguments = self._all_arguments(rows, mirror)
-        # Until the first update.
-        self._ahead = Ahead() if device.type == "cuda" and layout.chained else None
-        if self._ahead is not None:
-            self._ahead.add(self._launch_all)
 
-    def _launch_all(self) -> None:
-        """Launch what an update does after its rollout has been read, each kernel once."""
-        rows, records = self._arguments["num_rows"], self.dataset.records
-        self._multiply(torch.zeros(rows, dtype=torch.int32, device=records.device))
-        self._improve(0)
-        for listed in ({}, self.dataset.listed):
-            self._evaluate(self.dataset.obs[1], records[:, 0].contiguous(), **listed)
+        def launch_all() -> None:
+            self._multiply(torch.zeros(rows, dtype=torch.int32, device=device))
+            self._improve(0)
+            for listed in ({}, self.dataset.listed):
+                self._evaluate(self.dataset.obs[1], self.dataset.records[:, 0].contiguous(), **listed)
+
+        # Until the first update. One after another, kernels took ten of a cold start's seconds.
+        self._ahead = Ahead(ThreadPoolExecutor()) if device.type == "cuda" and layout.chained else None
+        if self._ahead is not None:
+            self._ahead.add(launch_all)
 
     def _all_arguments(self, rows: int, mirror: SymmetricAugmentation | None) -> dict[str, Any]:
         """Return what kernels get in every step, by the names of their parameters; `rows` are those of a minibatch."""
@@ -249,10 +277,6 @@ class FusedPPO:
         does what is `aside` beside the steps. Returned are what each gradient step measured, by the names of `SUMMARY`,
         and how many env states took no part because an element was not finite.
         """
-        if self._ahead is not None:
-            self._ahead.add(lambda: self.dataset.read(rollout_ET, evaluate=self._evaluate))
-            self._ahead.wait()
-            self._ahead = None
         num_envs, length = rollout_ET.batch_size
         indices: list[Tensor] = []
 
@@ -262,6 +286,10 @@ class FusedPPO:
             indices.extend(((order_N % length) * num_envs + order_N // length).split(self.batch))
 
         with warp_scope(self._summary.device):
+            if self._ahead is not None:
+                self._ahead.add(lambda: self.dataset.read(rollout_ET, evaluate=self._evaluate))
+                self._ahead.wait()
+                self._ahead = None
             # What is aside starts late: a graph's launch sends the main stream's steps first, all hundred of them.
             with beside(self._side, draw):
                 self.parameters.load()

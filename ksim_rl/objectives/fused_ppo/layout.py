@@ -28,7 +28,6 @@ MAX_WIDTH = 1024
 MAX_TF32_WIDTH = 256
 MAX_ACTIONS = 64
 MAX_PLACES = 2**31
-# Whether `launch` compiles kernels and launches none.
 only_compiles = ContextVar("only_compiles", default=False)
 
 
@@ -255,7 +254,7 @@ def launch(
 ) -> None:
     """Run `grid` programs of a Triton kernel, whose signature type checkers cannot read, on the current stream.
 
-    It gets those of `arguments` and `changes` that are its parameters; where `only_compiles` is set it is not run.
+    It gets those of `arguments` and `changes` that are its parameters; where `only_compiles` is set it only compiles.
     """
     given = {**arguments, **changes}
     run = partial(kernel.warmup, grid=grid) if only_compiles.get() else kernel[grid]
