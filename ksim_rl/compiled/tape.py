@@ -135,7 +135,7 @@ class Tape:
         self._own = self._find_own(returned)
         self._kept = [tensor for place, tensor in self._memory.made.items() if place not in self._own]
         modules = [self._compiled(part) for part in self.parts if isinstance(part, Kernel)]
-        kernel_loading.load([(module, BLOCK) for module in modules if module], self._device)
+        kernel_loading.load([module for module in modules if module], self._device)
 
     def __call__(self) -> None:
         """Run all parts in order."""
@@ -214,7 +214,7 @@ class Tape:
         width, rest = divmod(width, self._num_rows)
         return width if distances == {width} and not rest else 0
 
-    def _compiled(self, kernel: Kernel) -> wp.Module | None:
+    def _compiled(self, kernel: Kernel) -> tuple[wp.Module, int] | None:
         """Give a kernel its launch, and return what is to be compiled; None where nobody sees what it computes."""
         names: dict[int, str] = {}
         given: list[int] = []
@@ -277,4 +277,4 @@ class Tape:
             tensor for one, _ in kernel.operations for tensor in one.read() if _storage(tensor) in given
         ]
         kernel.operations.clear()
-        return launch.module
+        return launch.loadable

@@ -11,7 +11,6 @@ first line of a burst to stderr; a program with its own display sets another:
 import os
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -22,6 +21,7 @@ import torch
 import warp as wp
 
 from ksim_rl.device import upstream
+from ksim_rl.device.quick_launch import QuickLaunch
 from ksim_rl.device.streams import warp_device
 
 CompileHook = Callable[[str], None]
@@ -97,18 +97,21 @@ def loaded_together(device: torch.device) -> Iterator[None]:
     """Run none of the launches that this thread issues in this block, but load their kernels, side by side, at its end.
 
     One after another, a new model takes half a minute. Loops of Warp (`wp.capture_while`) go through their body once.
-    Kernels that take their types from a launch are left to that launch.
+    Kernels that take their types from a launch are left to that launch. Each `QuickLaunch` that exists is loaded, too.
     """
-    modules: dict[int | None, dict[wp.Module, None]] = defaultdict(dict)
+    found: dict[tuple[wp.Kernel, int | None], None] = {}
 
     def note(kernel: wp.Kernel, dim: Any, block_dim: int | None) -> None:
         size = dim if isinstance(dim, (tuple, list)) else (dim,)
         if all(size) and not kernel.is_generic:
-            modules[None if device.type == "cpu" else block_dim][kernel.module] = None
+            found[kernel, None if device.type == "cpu" else block_dim] = None
 
     with upstream.launches_diverted(note):
         yield
-    load([(module, block_dim) for block_dim, found in modules.items() for module in found], device)
+        # Before another thread comes here: it would put apart again what is not loaded yet.
+        upstream.put_apart([kernel for kernel, _ in found])
+        modules = dict.fromkeys((kernel.module, block_dim) for kernel, block_dim in found)
+        load([*modules, *(quick.loadable for quick in QuickLaunch.existing)], device)
 
 
 def load(modules: Iterable[tuple[wp.Module, int | None]], device: torch.device) -> None:

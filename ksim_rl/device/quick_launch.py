@@ -8,7 +8,8 @@ import ctypes
 import struct
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
+from weakref import WeakSet
 
 import torch
 import warp as wp
@@ -35,6 +36,8 @@ class QuickLaunch:
     `indices` within the launch's dim. The kernel has no gradients.
     """
 
+    existing: ClassVar[WeakSet["QuickLaunch"]] = WeakSet()
+
     def __init__(
         self,
         arguments: type,
@@ -52,15 +55,12 @@ class QuickLaunch:
             run(index_0, index_1, a)
 
         self._kernel, self._arguments, self._block_dim = kernel, arguments, block_dim
+        self.loadable: tuple[wp.Module, int] = kernel.module, block_dim  # what is compiled, for which blocks
         self._recorded: dict[tuple[torch.device, tuple[int, int]], tuple[wp.Launch, ctypes.Structure]] = {}
         self._packer = struct.Struct("")
         # The bytes are shared by all launches until the driver, or the kernel on the CPU, has read them.
         self._lock = threading.Lock()
-
-    @property
-    def module(self) -> wp.Module:
-        """What is compiled."""
-        return self._kernel.module
+        QuickLaunch.existing = WeakSet([*QuickLaunch.existing, self])  # a thread may go through the old one
 
     def __call__(self, device: torch.device, dim: tuple[int, int], *values: float) -> None:
         """Launch with one value per field of the struct, in their order; do nothing for a dim of 0."""

@@ -21,7 +21,9 @@ def take_pair(pair: Pair):
     wp.tid()
 
 
-@pytest.mark.parametrize("name", ["launch", "launch_tiled", "capture_while", "force_load", "from_torch"])
+@pytest.mark.parametrize(
+    "name", ["launch", "launch_tiled", "capture_while", "force_load", "from_torch", "get_module"]
+)
 def test_warp_has_the_functions_that_are_diverted_or_called(name: str) -> None:
     assert callable(getattr(wp, name, None)), f"warp.{name} is gone"
 
@@ -37,6 +39,15 @@ def test_launches_begin_with_kernel_and_dim() -> None:
 def test_kernels_tell_their_module_and_whether_they_are_generic() -> None:
     assert take_pair.is_generic is False, "warp.Kernel.is_generic means something else"
     assert isinstance(take_pair.module, wp.Module), "warp.Kernel.module is something else"
+
+
+def test_modules_list_their_kernels_and_what_is_loaded_and_take_others() -> None:
+    module = wp.get_module("some_module")
+    assert wp.get_module("some_module") is module and module.name == "some_module"
+    assert module.execs == {} and isinstance(module.options, dict), "warp.Module.execs or options are others"
+    assert module.has_unresolved_static_expressions is False, "warp.Module resolves wp.static otherwise"
+    module.register_kernel(take_pair)
+    assert module.kernels == {take_pair.key: take_pair}, "warp.Module.kernels is something else"
 
 
 def test_diversion_ends_with_its_block() -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import pytest
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
 from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.term import EventTerm
@@ -17,12 +18,15 @@ from tests.mdp.every_term_env import actions, every_term_env
 STEPS = 16
 
 
+def spoiled(value: Tensor) -> Tensor:
+    """Return something useless of the same kind; not in place, as a quantity may be a view of the state."""
+    return ~value if value.dtype == torch.bool else torch.full_like(value, 77)
+
+
 def spoil_caches(env: ManagerBasedRlEnv) -> None:
     """Make all quantities that were computed so far useless."""
     for cache in env.driver._caches:
-        for name, value in cache.items():
-            # Not in place: a quantity may be a view of the state.
-            cache[name] = ~value if value.dtype == torch.bool else torch.full_like(value, 77)
+        cache.update({name: tree_map(spoiled, value) for name, value in cache.items()})
 
 
 def roots(env: ManagerBasedRlEnv, chosen: Tensor, spoil: Callable[[], None]) -> list[dict[str, Tensor]]:

@@ -12,6 +12,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from functools import partial
 from typing import Any
 
@@ -35,6 +36,7 @@ from ksim_rl.objectives.fused_ppo.layout import (
     LayerPlace,
     Tuning,
     launch,
+    only_compiles,
     parts,
     power_of_two,
 )
@@ -108,6 +110,32 @@ class FusedParameters:
         return [*self._parameters, *(state[name] for name in ("exp_avg", "exp_avg_sq") for state in states)]
 
 
+class Ahead(triton.AsyncCompileMode):
+    """Threads compile what `launch` is given in some work; loading it, too, would break the capture of a graph."""
+
+    def add(self, work: Callable[[], object]) -> None:
+        """Do `work`, and begin to compile what it would launch."""
+        context = copy_context()
+        context.run(only_compiles.set, True)
+        context.run(self.__enter__)  # whose exit waits
+        context.run(work)
+
+    def submit(self, key: str, compile_fn: Callable[[], Any], finalize_fn: Callable[[Any], None]) -> Any:
+        """Compile a kernel, and what launches it, for which some versions of Triton start gcc."""
+        driver: Any = triton.runtime.driver.active
+
+        def compiled() -> Any:
+            kernel = compile_fn()
+            driver.launcher_cls(kernel.src, kernel.metadata)
+            return kernel
+
+        return super().submit(key, compiled, finalize_fn)
+
+    def wait(self) -> None:
+        """Wait for all that was added, and raise what went wrong."""
+        self.__exit__(None, None, None)
+
+
 class FusedPPO:
     """Makes the gradient steps of one update after another; all memory is allocated once, and nothing syncs.
 
@@ -159,15 +187,17 @@ class FusedPPO:
         # chained kernels leave out half of its columns.
         self._splits = tuning.splits if self._mirrored or layout.chained else parts(tuning.splits, 2)
         self._arguments = self._all_arguments(rows, mirror)
-        if device.type == "cuda" and layout.chained:
-            # Side by side: one after another took seven of a cold start's seconds.
-            self._arguments["compiles"] = True
-            with ThreadPoolExecutor() as pool, triton.AsyncCompileMode(pool):
-                self._multiply(torch.zeros(rows, dtype=torch.int32, device=device))
-                self._improve(0)
-                for listed in ({}, self.dataset.listed):
-                    self._evaluate(self.dataset.obs[1], self.dataset.records[:, 0].contiguous(), **listed)
-            self._arguments["compiles"] = False
+
+        def launch_all() -> None:
+            self._multiply(torch.zeros(rows, dtype=torch.int32, device=device))
+            self._improve(0)
+            for listed in ({}, self.dataset.listed):
+                self._evaluate(self.dataset.obs[1], self.dataset.records[:, 0].contiguous(), **listed)
+
+        # Until the first update. One after another, kernels took ten of a cold start's seconds.
+        self._ahead = Ahead(ThreadPoolExecutor()) if device.type == "cuda" and layout.chained else None
+        if self._ahead is not None:
+            self._ahead.add(launch_all)
 
     def _all_arguments(self, rows: int, mirror: SymmetricAugmentation | None) -> dict[str, Any]:
         """Return what kernels get in every step, by the names of their parameters; `rows` are those of a minibatch."""
@@ -249,6 +279,10 @@ class FusedPPO:
         """
         num_envs, length = rollout_ET.batch_size
         with warp_scope(self._summary.device):
+            if self._ahead is not None:
+                self._ahead.add(lambda: self.dataset.read(rollout_ET, evaluate=self._evaluate))
+                self._ahead.wait()
+                self._ahead = None
             # One after the other: of two branches, a graph sends the longer one first, with all its steps, and the
             # other starts 0.17 ms later. Drawing takes a third of that.
             order_N = torch.cat([*orders]).to(torch.int32)

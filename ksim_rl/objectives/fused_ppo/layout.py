@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -27,6 +28,7 @@ MAX_WIDTH = 1024
 MAX_TF32_WIDTH = 256
 MAX_ACTIONS = 64
 MAX_PLACES = 2**31
+only_compiles = ContextVar("only_compiles", default=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,10 +254,10 @@ def launch(
 ) -> None:
     """Run `grid` programs of a Triton kernel, whose signature type checkers cannot read, on the current stream.
 
-    It gets those of `arguments` and `changes` that are its parameters; with `compiles=True` it is only compiled.
+    It gets those of `arguments` and `changes` that are its parameters; where `only_compiles` is set it only compiles.
     """
     given = {**arguments, **changes}
-    run = partial(kernel.warmup, grid=grid) if given.get("compiles") else kernel[grid]
+    run = partial(kernel.warmup, grid=grid) if only_compiles.get() else kernel[grid]
     run(**{name: given[name] for name in kernel.arg_names}, num_warps=num_warps)
 
 
