@@ -21,12 +21,9 @@ def ppo(*, gamma: float = 0.995, env_states: float = PPO_STATES) -> TrainingCfg:
     """Return the settings of PPO: 64 steps of each env and 128 gradient steps in turn.
 
     Rewards lie in [0, 1] per step, so that values reach 1 / (1 - gamma) and gradients hundreds: clipping the change
-    of values to 0.2, or gradients to 1, would stop the critic from learning. Standard deviations fall to some
-    hundredths, where actions of a network in bfloat16 are too coarse: WalkerRun came to 267 after 20 M env states,
-    in float32 to 676. Many actions have a large divergence in sum, which would hold the adaptive learning rate at
-    its usual floor of 1e-5. No deviation falls below 0.2, and advantages of nearly nothing stay small: without these
-    two bounds exploration ended where rewards are rare. Of an actor as deep as the critic fused kernels make the
-    steps, and with one of 256 and 128 FingerTurnHard came to 682 in place of 920.
+    of values to 0.2, or gradients to 1, would stop the critic from learning. In bfloat16 WalkerRun came to 267 after
+    20 M env states, in float32 to 676. Many actions have a large divergence in sum, which would hold the adaptive
+    learning rate at its usual floor of 1e-5. Without least deviations, exploration ends where rewards are rare.
     """
     return TrainingCfg(
         num_envs=NUM_ENVS,
