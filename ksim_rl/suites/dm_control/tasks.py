@@ -54,7 +54,7 @@ class SuiteTask:
     damping: Mapping[str, float] = field(default_factory=dict)
     gamma: float = 0.995
     ppo_states: float = training.PPO_STATES
-    fast_sac_states: float = training.FAST_SAC_STATES
+    fast_sac_states: float = 5e6
 
 
 def _product(weight: float = 1.0, /, **factors: Factor) -> ToleranceProduct:

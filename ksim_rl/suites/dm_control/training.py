@@ -4,7 +4,6 @@ import dataclasses
 import math
 
 from ksim_rl.algorithms import fast_sac
-from ksim_rl.algorithms.fast_sac import FastSACCfg
 from ksim_rl.algorithms.off_policy import MANY_ENVS
 from ksim_rl.data import DatasetCfg
 from ksim_rl.modules import ActorCfg, CriticCfg
@@ -14,7 +13,6 @@ from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg
 NUM_ENVS = 2048
 # Env states that MuJoCo Playground gives PPO.
 PPO_STATES = 60e6
-FAST_SAC_STATES = 5e6
 
 
 def ppo(*, gamma: float = 0.995, env_states: float = PPO_STATES) -> TrainingCfg:
@@ -50,7 +48,7 @@ def ppo(*, gamma: float = 0.995, env_states: float = PPO_STATES) -> TrainingCfg:
     )
 
 
-def fast_sac_training(*, env_states: float = FAST_SAC_STATES) -> TrainingCfg:
+def fast_sac_training(*, env_states: float) -> TrainingCfg:
     """Return the settings of FastSAC: 4 steps of each env and 16 gradient steps in turn.
 
     Returns lie in [0, 100]. Values of a new critic are in the middle of its range: with [-5, 105] they began near 50,
@@ -62,7 +60,7 @@ def fast_sac_training(*, env_states: float = FAST_SAC_STATES) -> TrainingCfg:
     )
     return TrainingCfg(
         num_envs=num_envs,
-        objective=FastSACCfg(
+        objective=fast_sac.FastSACCfg(
             gamma=0.99, target_entropy_per_action=-0.5, policy_delay=2, autocast=True, compile=True
         ),
         data=data,
