@@ -67,7 +67,9 @@ class ActorCfg(OnPolicyNetworkCfg):
                 "use 'tanh_gaussian' or 'truncated_gaussian', or leave it out"
             )
         if self.min_std > self.init_std:
-            raise ValueError(f"min_std={self.min_std!r}: init_std={self.init_std!r} must not lie below")
+            raise ValueError(
+                f"min_std={self.min_std!r} exceeds init_std={self.init_std!r}: lower it, or begin there"
+            )
 
 
 class GaussianHead(nn.Module):

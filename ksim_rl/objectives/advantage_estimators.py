@@ -60,8 +60,7 @@ class RolloutEstimator(ValueEstimatorBase):
     recursion starts anew before it: the steps that led there keep finite advantages, which bootstrap from the value at
     that step. A non-finite value after a termination does not matter. `normalize_advantage` shifts and scales the
     finite ones to mean 0 and standard deviation 1 over all env states, or divides by `min_advantage_std` where that is
-    more (the default is TorchRL's). Time is the batch dim `time_dim`, whatever the
-    names say.
+    more (the default is TorchRL's). Time is the batch dim `time_dim`, whatever the names say.
     """
 
     time_dim: int | None

@@ -124,6 +124,13 @@ class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
     precision: Literal["float32", "bfloat16", "auto"] = "float32"
     kernels: Literal["auto", "torch"] = "auto"
 
+    def _check_fields(self) -> None:
+        if self.min_advantage_std != PPOCfg.min_advantage_std and self.normalize_advantage != "dataset":
+            raise ValueError(
+                f"min_advantage_std={self.min_advantage_std!r} does nothing with normalize_advantage="
+                f"{self.normalize_advantage!r}: use 'dataset', or leave it out"
+            )
+
     @property
     def estimates_each_epoch(self) -> bool:
         """Whether advantages are estimated anew before each epoch."""

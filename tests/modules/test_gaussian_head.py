@@ -48,5 +48,5 @@ def test_std_is_bounded_below_and_comes_back(options):
 
 
 def test_refuses_a_bound_above_the_start():
-    with pytest.raises(ValueError, match=r"min_std=0\.8: init_std=0\.7"):
+    with pytest.raises(ValueError, match=r"min_std=0\.8 exceeds init_std=0\.7"):
         ActorCfg(init_std=0.7, min_std=0.8)

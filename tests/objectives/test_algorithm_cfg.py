@@ -28,6 +28,7 @@ def test_defaults_are_valid_and_frozen():
         ("entropy_coeff", -1.0),
         ("critic_coeff", float("nan")),
         ("normalize_advantage", "data_set"),
+        ("min_advantage_std", 0.0),
         ("learning_rate", 0.0),
         ("learning_rate", 1e-6),
         ("learning_rate", 0.02),
@@ -46,6 +47,13 @@ def test_refusals_name_the_field_and_the_value(field, value):
         PPOCfg(**{field: value})
     shown = value[-1] if isinstance(value, tuple) and len(value) == 2 else value
     assert str(shown) in str(error.value)
+
+
+def test_a_bound_of_advantages_that_are_not_scaled_is_refused():
+    with pytest.raises(
+        ValueError, match=r"min_advantage_std=0\.02 does nothing with normalize_advantage='none'"
+    ):
+        PPOCfg(min_advantage_std=0.02, normalize_advantage="none")
 
 
 def test_a_fixed_learning_rate_has_no_bounds():
