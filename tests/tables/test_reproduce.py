@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from benchmarks.report import RESULTS
 from ksim_rl.cli.main import main
 from ksim_rl.config import plugins
 from ksim_rl.tables import measure as measuring
@@ -179,6 +180,14 @@ def test_settings_differ_by_everything_but_the_seed():
     first = settings(row, run_cfg(row, 1, device="cpu"))
     assert first == settings(row, run_cfg(row, 2, device="cpu"))
     assert first != settings(row, run_cfg(row, 1, device="cpu", smoke=True))
+
+
+@pytest.mark.parametrize("table", ["dm_control", "humanoids", "tracking", "velocity"])
+def test_committed_results_are_of_the_settings_that_rows_have_now(table):
+    for name, row in load(table).rows.items():
+        expected = settings(row, run_cfg(row, 1, device="cpu"))
+        for path in (RESULTS / "tables" / table / name).glob("seed_*.json"):
+            assert json.loads(path.read_text())["settings"] == expected, path
 
 
 def test_a_seed_is_trained_and_its_final_policy_judged(tmp_path):
