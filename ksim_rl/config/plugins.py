@@ -5,7 +5,8 @@ An installed package declares what it has in its pyproject.toml, and is then kno
     [project.entry-points."ksim_rl.tasks"]
     my_robots = "my_robots.tasks"      # a module, or a package whose modules are all read
 
-    [project.entry-points."ksim_rl.algorithms"] my_robots = "my_robots.learning"
+    [project.entry-points."ksim_rl.algorithms"]
+    my_robots = "my_robots.learning"
 
     [project.entry-points."ksim_rl.conf"]
     my_robots = "my_robots.conf"       # a package of YAML files, laid out like ksim_rl/conf

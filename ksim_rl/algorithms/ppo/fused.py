@@ -69,11 +69,10 @@ def fused_networks(
         return f"the activations are {names[0]}, and not all one of {names[1]}"
     (activation,) = activations
     std: Any = {"std_A": head.std, "std_layer": head.std_layer, "log_std": head.std_type == "log"}
-    observers = _observer(actor[0]), _observer(critic)
     return FusedNetworks(
         actor=layers[0],
         critic=layers[1],
-        observers=observers,
+        observers=(_observer(actor[0]), _observer(critic)),
         activation=activation,
         min_std=head.min_std,
         **std,

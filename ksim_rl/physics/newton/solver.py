@@ -70,7 +70,7 @@ def takes_conditional_nodes(warp_model: mjw.Model, *, supported: bool) -> bool:
 
 
 def most_registers(floats: int, num_worlds: int) -> int | None:
-    """Return how many registers let as many worlds run at once as shared memory (few: at least 96), or None for any."""
+    """Return how many registers let as many worlds run at once as shared memory does, or None for any number."""
     at_once = SHARED_BYTES // (4 * floats + 1024)
     most = max(LEAST_REGISTERS[num_worlds > FEW_WORLDS], 512 // -(-at_once // 4) // 8 * 8)
     return most if most <= MOST_REGISTERS else None
