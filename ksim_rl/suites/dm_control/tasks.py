@@ -151,20 +151,21 @@ def _reach(radius: float) -> SuiteTask:
         description=f"a planar arm reaches a ball of {100 * radius:g} cm",
         rewards=_reward(inside=Factor(of=distance, high=radius + 0.01)),
         target=RingTarget(center=(0.0, 0.0, 0.01), radius=(0.05, 0.2), size=radius),
+        # Easy and hard came to 983 and 977 after 60 M env states; with 0.995 to 980 and 972 after 88 M.
+        gamma=0.97,
     )
 
 
-def _walker(*moves: Factor) -> dict[str, ToleranceProduct]:
+def _walker(*speeds: float) -> dict[str, ToleranceProduct]:
     standing = Factor(of=Offset(ends=("body:torso",), axes="z"), low=1.2, margin=0.6)
-    factors = {f"move_{number}": move for number, move in enumerate(moves)}
+    factors = {
+        f"move_{number}": _speed(low, margin=low / 2.0, value_at_margin=0.5, floor=1.0 / 6.0)
+        for number, low in enumerate(speeds)
+    }
     return {
         "standing": _product(0.75, standing=standing, **factors),
         "upright": _product(0.25, upright=_upright("torso"), **factors),
     }
-
-
-def _walker_speed(low: float) -> Factor:
-    return _speed(low, margin=low / 2.0, value_at_margin=0.5, floor=1.0 / 6.0)
 
 
 _BALL_OFFSET = {axis: Offset(ends=("site:target",), start="body:ball", axes=axis) for axis in "xz"}
@@ -282,11 +283,9 @@ SUITE_TASKS: Mapping[str, SuiteTask] = {
         ppo_states=LONG,
     ),
     "walker_stand": SuiteTask(description="a planar walker stands", rewards=_walker()),
-    "walker_walk": SuiteTask(
-        description="a planar walker walks at 1 m/s", rewards=_walker(_walker_speed(1.0))
-    ),
+    "walker_walk": SuiteTask(description="a planar walker walks at 1 m/s", rewards=_walker(1.0)),
     "walker_run": SuiteTask(
-        description="a planar walker runs at 8 m/s", rewards=_walker(_walker_speed(8.0)), ppo_states=LONG
+        description="a planar walker runs at 8 m/s", rewards=_walker(8.0), ppo_states=LONG
     ),
 }
 """The tasks by `<domain>_<task>`."""
