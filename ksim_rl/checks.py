@@ -43,12 +43,7 @@ def naming(where: str, *errors: type[Exception]) -> Iterator[None]:
 
 
 def check_in_range(
-    field: str,
-    value: object,
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    low_open: bool = False,
+    field: str, value: object, *, low: float | None = None, high: float | None = None, low_open: bool = False
 ) -> None:
     """Refuse a number that is not finite or lies outside `[low, high]` (`(low, high]` with `low_open`)."""
     bounds = f"{'(' if low_open or low is None else '['}{'-inf' if low is None else low}, "

@@ -6,6 +6,7 @@ rewards in [0, 1], 1000 steps per episode, no early end. Unlike there, episodes 
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -114,21 +115,21 @@ def training(*, num_iterations: int = 500, objective: PPOCfg | None = None) -> T
         objective=objective or PPOCfg(**OBJECTIVE),
         data=DatasetCfg(num_env_states_per_minibatch=16384, num_minibatches=4),
         modules=ModulesCfg(
-            actor=ActorCfg(hidden_dims=(256, 128), init_std=0.6),
-            critic=CriticCfg(hidden_dims=(256, 128)),
+            actor=ActorCfg(hidden_dims=(256, 128), init_std=0.6), critic=CriticCfg(hidden_dims=(256, 128))
         ),
         trainer=TrainerCfg(num_iterations=num_iterations, eval_interval=50),
     )
 
 
 def _task(
+    name: str,
     cfg: Callable[[], ManagerBasedRlEnvCfg],
     what: str,
     num_iterations: int = 500,
     solved_at: float | None = None,
 ) -> Task:
     settings = training(num_iterations=num_iterations)
-    return Task(name=cfg.__name__, description=what, cfg=cfg, training=settings, solved_at=solved_at)
+    return Task(name=name, description=what, cfg=cfg, training=settings, solved_at=solved_at)
 
 
 # -- a hind and a fore leg ---------------------------------------------------------------------------------------
@@ -150,7 +151,7 @@ def cheetah_run() -> ManagerBasedRlEnvCfg:
 
 
 # 5.9 m/s from 1 s on (5.9 / 8 in 900 of 1000 steps), after a start that is uniformly faster (half of that in 100).
-CHEETAH_RUN = _task(cheetah_run, "a planar quadruped runs at 8 m/s", solved_at=700.0)
+CHEETAH_RUN = _task("cheetah_run", cheetah_run, "a planar quadruped runs at 8 m/s", solved_at=700.0)
 
 # -- one leg -----------------------------------------------------------------------------------------------------
 
@@ -177,24 +178,19 @@ class HopperReward(RewardTerm):
         return stand_E * _fast(view, self.speed, margin=self.speed)
 
 
-def _hopper_cfg(speed: float) -> ManagerBasedRlEnvCfg:
+def hopper(speed: float) -> ManagerBasedRlEnvCfg:
+    """Return the config of hopping forward at `speed`, m/s, or faster; at 0, of balancing on one leg."""
     reward = HopperReward(speed=speed)
     return planar_cfg(Hopper(), reward=reward, decimation=4, step_dt=0.02, distance=3.5)
 
 
-def hopper_stand() -> ManagerBasedRlEnvCfg:
-    """Return the config of balancing on one leg."""
-    return _hopper_cfg(0.0)
-
-
-def hopper_hop() -> ManagerBasedRlEnvCfg:
-    """Return the config of hopping forward at 1.5 m/s or faster."""
-    return _hopper_cfg(1.5)
-
-
 # Tall and upright in all 1000 steps, with half of the effort saved: (4 + 0.5) / 5 each.
-HOPPER_STAND = _task(hopper_stand, "a one-legged planar robot balances", solved_at=900.0)
-HOPPER_HOP = _task(hopper_hop, "a one-legged planar robot hops forward at 1.5 m/s", 1000)
+HOPPER_STAND = _task(
+    "hopper_stand", partial(hopper, 0.0), "a one-legged planar robot balances", solved_at=900.0
+)
+HOPPER_HOP = _task(
+    "hopper_hop", partial(hopper, 1.5), "a one-legged planar robot hops forward at 1.5 m/s", 1000
+)
 
 # -- two legs ----------------------------------------------------------------------------------------------------
 
@@ -221,31 +217,17 @@ class WalkerReward(RewardTerm):
         return stand_E * (5.0 * fast_E + 1.0) / 6.0
 
 
-def _walker_cfg(speed: float) -> ManagerBasedRlEnvCfg:
+def walker(speed: float) -> ManagerBasedRlEnvCfg:
+    """Return the config of walking at `speed`, m/s, or faster; at 0, of standing upright."""
     reward = WalkerReward(speed=speed)
     return planar_cfg(Walker(), reward=reward, decimation=5, step_dt=0.025, distance=4.0)
 
 
-def walker_stand() -> ManagerBasedRlEnvCfg:
-    """Return the config of standing upright."""
-    return _walker_cfg(0.0)
-
-
-def walker_walk() -> ManagerBasedRlEnvCfg:
-    """Return the config of walking at 1 m/s or faster."""
-    return _walker_cfg(1.0)
-
-
-def walker_run() -> ManagerBasedRlEnvCfg:
-    """Return the config of running at 5 m/s or faster."""
-    return _walker_cfg(5.0)
-
-
 # Upright from 1.25 s on (950 of 1000 steps), with nothing before that.
-WALKER_STAND = _task(walker_stand, "a planar biped stands upright", solved_at=950.0)
+WALKER_STAND = _task("walker_stand", partial(walker, 0.0), "a planar biped stands upright", solved_at=950.0)
 # At full speed from 3 s on (880 of 1000 steps), and standing before that (1 / 6 in 120).
-WALKER_WALK = _task(walker_walk, "a planar biped walks at 1 m/s", solved_at=900.0)
-WALKER_RUN = _task(walker_run, "a planar biped runs at 5 m/s", 1000)
+WALKER_WALK = _task("walker_walk", partial(walker, 1.0), "a planar biped walks at 1 m/s", solved_at=900.0)
+WALKER_RUN = _task("walker_run", partial(walker, 5.0), "a planar biped runs at 5 m/s", 1000)
 
 # -- a recorded walk ---------------------------------------------------------------------------------------------
 
@@ -351,4 +333,4 @@ AMP = Task(
     training=training(num_iterations=400),
     other_trainings=(training(num_iterations=400, objective=AS_RECORDED),),
 )
-TRACK = _task(walker_track, "a planar biped follows a walk", 400)
+TRACK = _task("walker_track", walker_track, "a planar biped follows a walk", 400)
