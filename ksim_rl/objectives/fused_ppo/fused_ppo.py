@@ -206,7 +206,7 @@ class FusedPPO:
         zeros = partial(torch.zeros, device=dataset.records.device)
         blocks, dtype = parts(rows, tuning.block), dataset.obs.dtype
         held = min(rows, self._splits * self._split(rows))
-        programs = 2 * parts(layout.num_padded, tuning.size) + 1
+        programs = 2 * parts(layout.num_padded, tuning.size) + 2
         # Where the image of each action comes from, counted from 1, times its sign; see `output_gradients`.
         image_of = torch.arange(1, layout.out + 1, device=dataset.records.device, dtype=torch.int32)
         if mirror is not None:
@@ -235,9 +235,8 @@ class FusedPPO:
             "num_obs": len(dataset.records),
             "num_rows": rows,
             "tiles": layout.weight_tiles(tuning.tile).to(dataset.records.device),
-            # Tiles at the edge read past the last row.
-            "inputs": zeros(2 * held * layout.inputs + tuning.tile, dtype=dtype),
-            "slopes": zeros(2 * held * layout.gradients + tuning.tile, dtype=dtype),
+            "inputs": zeros(2 * held * layout.inputs, dtype=dtype),
+            "slopes": zeros(2 * held * layout.gradients, dtype=dtype),
             "weight_partials": zeros(tuning.splits, 2, layout.num_padded),
             "block_partials": zeros(blocks, 2, layout.out + NUM_STATISTICS),
             # Of both networks; ranks add them up together with the summary behind them.
