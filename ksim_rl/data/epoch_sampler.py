@@ -75,20 +75,28 @@ class EpochSampler(Sampler):
             index = torch.unravel_index(index, storage.shape)
         return index, {}
 
-    def epoch_order(self, size: int, *, device: torch.device) -> Int64[Tensor, " D"]:
-        """Begin an epoch and return its order of `range(size)`, as `sample` would give it in parts."""
+    def epoch_orders(self, count: int, size: int, *, device: torch.device) -> Int64[Tensor, "K D"]:
+        """Begin `count` epochs and return their orders of `range(size)`, as `sample` would give them in parts."""
         self.restart()
-        return self._next_part(size, size, device)
+        self._size, begun = size, self._begun(device)
+        orders_KD = self._orders(begun + torch.arange(count, device=device), size)
+        begun.add_(count * self.shuffle)
+        return orders_KD
+
+    def _begun(self, device: torch.device) -> Tensor:
+        """Return how many epochs began so far, on the device."""
+        if self._epoch is None or self._epoch.device != device:
+            self._epoch = torch.full((), self._first_epoch, dtype=torch.int64, device=device)
+        return self._epoch
 
     def _next_part(self, size: int, batch_size: int, device: torch.device) -> Tensor:
         """Return the next `batch_size` elements of the epoch's order of `range(size)`, on the device."""
         if size != self._size:
             self._size, self._position = size, 0
         if self._position == 0:
-            if self._epoch is None or self._epoch.device != device:
-                self._epoch = torch.full((), self._first_epoch, dtype=torch.int64, device=device)
-            self._order_D = self._order(self._epoch, size)
-            self._epoch.add_(self.shuffle)
+            begun = self._begun(device)
+            self._order_D = self._orders(begun, size)[0]
+            begun.add_(self.shuffle)
         assert self._order_D is not None
         index = self._order_D[self._position : self._position + batch_size]
         self._position += batch_size
@@ -99,18 +107,20 @@ class EpochSampler(Sampler):
         self._remaining_batches = left // batch_size if self.drop_last else -(-left // batch_size)
         return index
 
-    def _order(self, epoch: Tensor, size: int) -> Tensor:
-        """Return the order of an epoch: a random one unless `shuffle` is off, minibatch by minibatch."""
+    def _orders(self, epochs: Tensor, size: int) -> Tensor:
+        """Return the orders of epochs: random ones unless `shuffle` is off, minibatch by minibatch."""
+        count = epochs.numel()
         if not self.shuffle:
-            order_D = torch.arange(size, device=epoch.device)
+            orders_KD = torch.arange(size, device=epochs.device).expand(count, size)
         elif size % self.shards:
             raise ValueError(f"{size} elements are no whole number for each of {self.shards} shards")
         else:
-            keys = random.row_keys(torch.full_like(epoch, self.seed), _STREAM, epoch, self.shards)
-            order_D = random.permutations(keys, size // self.shards).flatten()
+            seed = torch.full((), self.seed, dtype=torch.int64, device=epochs.device)
+            keys = random.row_keys(seed, _STREAM, epochs, self.shards)
+            orders_KD = random.permutations(keys, size // self.shards).view(count, size)
         if self.shards == 1:
-            return order_D
-        return order_D.view(self.shards, self.num_minibatches, -1).transpose(0, 1).reshape(-1)
+            return orders_KD
+        return orders_KD.reshape(count, self.shards, self.num_minibatches, -1).transpose(1, 2).reshape(count, -1)
 
     def state_dict(self) -> dict[str, int]:
         """Return the integers from which the orders continue exactly (reads the epoch counter on the host)."""
@@ -128,7 +138,7 @@ class EpochSampler(Sampler):
             self._epoch.fill_(self._first_epoch)
         if self._position > 0:
             previous = torch.full((), self._first_epoch - 1, dtype=torch.int64, device=device)
-            self._order_D = self._order(previous, self._size)
+            self._order_D = self._orders(previous, self._size)[0]
 
     def dumps(self, path: str | Path) -> None:
         """Write the state as JSON into the folder `path`."""

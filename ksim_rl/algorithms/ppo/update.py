@@ -100,8 +100,8 @@ class PPOUpdate(DatasetUpdate):
             steps = self._torch_steps(rollout_ET)
             self._count()
         else:
-            orders = (self.dataset.epoch_order() for _ in range(self.cfg.num_epochs))
-            steps, left_out = self.fused(rollout_ET, orders, self._count)
+            orders_KD = self.dataset.epoch_orders(self.cfg.num_epochs)
+            steps, left_out = self.fused(rollout_ET, orders_KD, self._count)
             self.dataset.non_finite_count.add_(left_out)
         self._measure_(steps)
 

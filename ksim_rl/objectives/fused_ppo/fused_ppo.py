@@ -10,7 +10,7 @@ moves it by 0.05 to 0.5.
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from functools import partial
@@ -70,14 +70,19 @@ class FusedParameters:
         dtype: torch.dtype,
         tf32: bool,
         num_steps: int,
+        size: int,
     ) -> None:
         self._parameters, self._optimizer, self._tf32 = networks.parameters, optimizer, tf32
         device = self._parameters[0].device
-        # Parameters, and the optimizer's means and variances, each [N].
-        self.flat = [torch.zeros(layout.num_flat, device=device) for _ in range(3)]
+        # Parameters, and the optimizer's means and variances, each [N], then zeros up to a whole number of `size`.
+        self._padding = torch.zeros(-layout.num_flat % size, device=device)
+        self._flat = torch.zeros(3, layout.num_flat + len(self._padding), device=device)
+        self.flat = self._flat.unbind()
         sizes, shapes = zip(*((own.numel(), own.shape) for own in self._parameters), strict=True)
-        self._views = [view for flat in self.flat for view in map(Tensor.view, flat.split(sizes), shapes)]
-        self.places = layout.padded_index(networks).to(device)
+        parts_of = [flat[: layout.num_flat].split(sizes) for flat in self.flat]
+        self._views = [view for own in parts_of for view in map(Tensor.view, own, shapes)]
+        self._index = layout.padded_index(networks).to(device, torch.int64)  # as torch takes it
+        self.places = torch.cat([self._index, self._padding]).to(torch.int32)
         # The parameters in padded form, in float32 and in the dtype of the products.
         self.exact = torch.zeros(2, layout.num_padded, device=device)
         self.weights = torch.zeros(2, layout.num_padded, dtype=dtype, device=device)
@@ -93,9 +98,12 @@ class FusedParameters:
     @torch.no_grad()
     def load(self) -> None:
         """Take over what modules and optimizer hold."""
-        torch._foreach_copy_(self._views, self._held())
+        held, count = [own.reshape(-1) for own in self._held()], len(self._parameters)
+        rows = (held[first : first + count] for first in range(0, 3 * count, count))
+        # One kernel; `_foreach_copy_` gives a large tensor to few blocks.
+        torch.cat([own for row in rows for own in (*row, self._padding)], out=self._flat.view(-1))
         self.steps[0].copy_(self._optimizer.state[self._parameters[0]]["step"])
-        self.exact.view(-1)[self.places] = self.flat[0]
+        self.exact.view(-1)[self._index] = self.flat[0][: len(self._index)]
         self.weights.copy_(as_tf32(self.exact) if self._tf32 else self.exact)
 
     @torch.no_grad()
@@ -169,7 +177,7 @@ class FusedPPO:
         num_steps = cfg.num_epochs * num_minibatches
         self._side = warp_stream(torch.cuda.Stream(device)) if device.type == "cuda" else None
         self.parameters = FusedParameters(
-            networks, layout, optimizer=optimizer, dtype=dtype, tf32=tf32, num_steps=num_steps
+            networks, layout, optimizer=optimizer, dtype=dtype, tf32=tf32, num_steps=num_steps, size=tuning.size
         )
         self.dataset = FusedDataset(
             cfg,
@@ -267,11 +275,11 @@ class FusedPPO:
         }
 
     def __call__(
-        self, rollout_ET: TensorDictBase, orders: Iterable[Int64[Tensor, " D"]], *aside: Callable[[], None]
+        self, rollout_ET: TensorDictBase, orders_KD: Int64[Tensor, "K D"], *aside: Callable[[], None]
     ) -> tuple[dict[str, Float[Tensor, " steps"]], Int64[Tensor, ""]]:
         """Make all gradient steps of an update.
 
-        `rollout_ET`, `["E","T"]`, may be time-major in memory, as that of a collector. `orders` has for each epoch the
+        `rollout_ET`, `["E","T"]`, may be time-major in memory, as that of a collector. `orders_KD` has for each epoch the
         env states in the order of the minibatches, counted env by env; a GPU does what is `aside` beside the steps.
         Returned are what each gradient step measured, by the names of `SUMMARY`, and how many env states took no part
         because an element was not finite.
@@ -284,7 +292,7 @@ class FusedPPO:
                 self._ahead = None
             # One after the other: of two branches, a graph sends the longer one first, with all its steps, and the
             # other starts 0.17 ms later. Drawing takes a third of that.
-            order_N = torch.cat([*orders]).to(torch.int32)
+            order_N = orders_KD.flatten().to(torch.int32)
             # From env by env to step by step.
             indices = ((order_N % length) * num_envs + order_N // length).split(self.batch)
             self.parameters.load()

@@ -194,7 +194,7 @@ def adam_step(
     """Make one step of Adam (Kingma and Ba, arXiv 1412.6980), as torch's, on the clipped gradient.
 
     Gradients, and the NUM_SQUARES partial `squares`, are of a SHARE of the rows: divided by it they are means. If their
-    norm or the loss is not finite, nothing changes but the counters of skipped steps. Parameters, means and variances are in flat form, [SIZE]; `places` leads from it to
+    norm or the loss is not finite, nothing changes but the counters of skipped steps. Parameters, means and variances are in flat form, [SIZE] and zeros that fill the last program; `places` leads from it to
     the padded form of gradients and of the weights, in the dtype of the products and exact, which follow the
     parameters. The loss, the norm and whether the step was skipped are added to the `summary` of this step, and the
     number of steps made after it is written behind that before it.
@@ -202,10 +202,10 @@ def adam_step(
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = at < SIZE
     # What is far away is asked for before threads wait for each other.
-    place = tl.load(places + at, mask=inside, other=0)
-    parameter = tl.load(parameters + at, mask=inside, other=0.0)
-    mean = tl.load(means + at, mask=inside, other=0.0)
-    variance = tl.load(variances + at, mask=inside, other=0.0)
+    place = tl.load(places + at)
+    parameter = tl.load(parameters + at)
+    mean = tl.load(means + at)
+    variance = tl.load(variances + at)
     gradient = tl.load(gradients + place, mask=inside, other=0.0)
     square_at = tl.arange(0, SQUARES)
     share = tl.maximum(tl.load(summary + SHARE), 1e-30)  # all gradients are zero where no env state takes part
@@ -228,9 +228,9 @@ def adam_step(
     new_variance = beta2 * variance + (1.0 - beta2) * gradient * gradient
     change = (rate / correction1) * new_mean / (tl.sqrt(new_variance) / tl.sqrt(correction2) + adam_eps)
     parameter = tl.where(made, parameter - change, parameter)
-    tl.store(parameters + at, parameter, mask=inside)
-    tl.store(means + at, tl.where(made, new_mean, mean), mask=inside)
-    tl.store(variances + at, tl.where(made, new_variance, variance), mask=inside)
+    tl.store(parameters + at, parameter)
+    tl.store(means + at, tl.where(made, new_mean, mean))
+    tl.store(variances + at, tl.where(made, new_variance, variance))
     tl.store(weights + place, operand(parameter, weights.dtype.element_ty, TF32), mask=inside)
     tl.store(exact_weights + place, parameter, mask=inside)
     if tl.program_id(0) == 0:
