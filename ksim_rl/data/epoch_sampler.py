@@ -78,25 +78,17 @@ class EpochSampler(Sampler):
     def epoch_orders(self, count: int, size: int, *, device: torch.device) -> Int64[Tensor, "K D"]:
         """Begin `count` epochs and return their orders of `range(size)`, as `sample` would give them in parts."""
         self.restart()
-        self._size, begun = size, self._begun(device)
-        orders_KD = self._orders(begun + torch.arange(count, device=device), size)
-        begun.add_(count * self.shuffle)
-        return orders_KD
-
-    def _begun(self, device: torch.device) -> Tensor:
-        """Return how many epochs began so far, on the device."""
+        self._size = size
         if self._epoch is None or self._epoch.device != device:
             self._epoch = torch.full((), self._first_epoch, dtype=torch.int64, device=device)
-        return self._epoch
+        orders_KD = self._orders(self._epoch + torch.arange(count, device=device), size)
+        self._epoch.add_(count * self.shuffle)
+        return orders_KD
 
     def _next_part(self, size: int, batch_size: int, device: torch.device) -> Tensor:
         """Return the next `batch_size` elements of the epoch's order of `range(size)`, on the device."""
-        if size != self._size:
-            self._size, self._position = size, 0
-        if self._position == 0:
-            begun = self._begun(device)
-            self._order_D = self._orders(begun, size)[0]
-            begun.add_(self.shuffle)
+        if size != self._size or self._position == 0:
+            self._order_D = self.epoch_orders(1, size, device=device)[0]
         assert self._order_D is not None
         index = self._order_D[self._position : self._position + batch_size]
         self._position += batch_size
@@ -109,18 +101,16 @@ class EpochSampler(Sampler):
 
     def _orders(self, epochs: Tensor, size: int) -> Tensor:
         """Return the orders of epochs: random ones unless `shuffle` is off, minibatch by minibatch."""
-        count = epochs.numel()
         if not self.shuffle:
-            orders_KD = torch.arange(size, device=epochs.device).expand(count, size)
+            orders_KD = torch.arange(size, device=epochs.device).expand(len(epochs), size)
         elif size % self.shards:
             raise ValueError(f"{size} elements are no whole number for each of {self.shards} shards")
         else:
-            seed = torch.full((), self.seed, dtype=torch.int64, device=epochs.device)
-            keys = random.row_keys(seed, _STREAM, epochs, self.shards)
-            orders_KD = random.permutations(keys, size // self.shards).view(count, size)
+            keys = random.row_keys(epochs.new_full((), self.seed), _STREAM, epochs, self.shards)
+            orders_KD = random.permutations(keys, size // self.shards).view(-1, size)
         if self.shards == 1:
             return orders_KD
-        return orders_KD.reshape(count, self.shards, self.num_minibatches, -1).transpose(1, 2).reshape(count, -1)
+        return orders_KD.unflatten(1, (self.shards, self.num_minibatches, -1)).transpose(1, 2).flatten(1)
 
     def state_dict(self) -> dict[str, int]:
         """Return the integers from which the orders continue exactly (reads the epoch counter on the host)."""
@@ -137,7 +127,7 @@ class EpochSampler(Sampler):
         if self._epoch is not None:
             self._epoch.fill_(self._first_epoch)
         if self._position > 0:
-            previous = torch.full((), self._first_epoch - 1, dtype=torch.int64, device=device)
+            previous = torch.full((1,), self._first_epoch - 1, dtype=torch.int64, device=device)
             self._order_D = self._orders(previous, self._size)[0]
 
     def dumps(self, path: str | Path) -> None:

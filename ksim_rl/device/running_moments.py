@@ -17,7 +17,7 @@ MOST_PARTS, LEAST_ROWS, GROUP = 2048, 16, 32
 # Stages 0 to 3 are of an element (which rows count), of a column of a part, of a group, and of the batch.
 _quick = QuickLaunch(
     arguments_of(
-        (int, "stage num_rows dim rows parts groups ranks columns"),
+        (int, "stage num_rows dim rows parts groups ranks span"),
         (wp.int64, "until"),
         (wp.uint64, "values valid counts moments count mean squares"),
     ),
@@ -51,8 +51,7 @@ _quick = QuickLaunch(
         // Threads of a GPU read neighbours, and whoever finds a fault writes the same.
         bool is_counted = a.until < 0 || before * a.ranks < a.until;
         if (a.valid) is_counted &= ((const unsigned char*)a.valid)[row] != 0;
-        const size_t first = row * dim + lane;
-        for (size_t i = first; i < first + a.columns; ++i) is_counted &= fabsf(values[i]) <= 3.402823466e38f;
+        for (int i = 0; i < a.span; ++i) is_counted &= fabsf(values[row * dim + lane + i]) <= 3.402823466e38f;
         if (!is_counted) counts[row] = 0;
     } else if (a.stage == 1) {
         const size_t begin = (size_t)row * a.rows, end = begin + a.rows < a.num_rows ? begin + a.rows : a.num_rows;
@@ -97,14 +96,12 @@ def _count(
     rows = max(LEAST_ROWS, -(-num_rows // MOST_PARTS))
     parts = -(-num_rows // rows)
     groups = -(-parts // GROUP)
-    columns = dim if count.device.type == "cpu" else 1  # of a row, for a thread that looks for faults
+    span = dim if count.device.type == "cpu" else 1  # of a row, for a thread that looks for faults
     counts_N = torch.ones(num_rows, dtype=torch.uint8, device=count.device)
     moments = torch.empty((2 * dim + 1) * (parts + groups) + 1, dtype=torch.float64, device=count.device)
-    held = (counts_N, moments, count, mean_L, squares_L)
-    given = values_NL.data_ptr(), address(valid_N), *(own.data_ptr() for own in held)
-    sizes = num_rows, dim, rows, parts, groups, ranks.size(), columns, until
-    for stage, size in enumerate(((num_rows, dim // columns), (parts, dim), (groups, dim), (1, dim))):
-        _quick(count.device, size, stage, *sizes, *given)
+    at = [address(own) for own in (values_NL, valid_N, counts_N, moments, count, mean_L, squares_L)]
+    for stage, size in enumerate(((num_rows, dim // span), (parts, dim), (groups, dim), (1, dim))):
+        _quick(count.device, size, stage, num_rows, dim, rows, parts, groups, ranks.size(), span, until, *at)
     count.copy_(moments[-1])
 
 
