@@ -45,8 +45,6 @@ class FusedDataset:
         self.obs = torch.zeros(2, rows, layout.stored, dtype=dtype, device=device)
         self.records = torch.zeros(rows, 3 * layout.out + 8, device=device)
         self._signals = torch.zeros(4, size, device=device)
-        # Whether an observation of actor or critic has elements that are not finite.
-        self._faults = torch.zeros(2, rows, dtype=torch.int8, device=device)
         # What kernels get, by the names of their parameters.
         self._arguments: dict[str, Any] = {
             **dict(zip(("values", "next_values", "advantages", "targets"), self._signals, strict=True)),
@@ -55,6 +53,7 @@ class FusedDataset:
             "records": self.records,
             "num_obs": rows,
             "size": size,
+            "faults": torch.zeros(2, rows, dtype=torch.int8, device=device),
             "known": self.obs[1],
             "places": torch.zeros(size, dtype=torch.int32, device=device),
             "count": torch.zeros(1, dtype=torch.int32, device=device),
@@ -76,8 +75,8 @@ class FusedDataset:
         An env state with an element that is not finite takes no part, as in `DatasetStorage`; returned is how many.
         """
         for part_ET, first in self._parts(rollout_ET):
-            for network, (obs_DL, faults_D) in enumerate(zip(self.obs, self._faults, strict=True)):
-                self._take_observations(network, part_ET, obs_DL[first:], faults=faults_D[first:])
+            for network, faults_D in enumerate(self._arguments["faults"]):
+                self._take_observations(network, part_ET, self.obs[network, first:], faults=faults_D[first:])
         following = rollout_ET.get("next")
         num_envs, length = rollout_ET.batch_size
         next_obs = torch.empty_like(self.obs[1, : self.size])
@@ -109,7 +108,7 @@ class FusedDataset:
         rows, block = part_ET.numel(), _block(self._arguments["RECORD_LANES"])
         left_out = torch.empty(parts(rows, block), dtype=torch.int32, device=self.records.device)
         own = {"obs": self.obs[0, first:], "records": self.records[first:], "first": first, "num_rows": rows}
-        own |= {"faults": self._faults[0, first:], "moments": moments, "num_moments": len(moments), "left_out": left_out, "BLOCK": block}
+        own |= {"moments": moments, "num_moments": len(moments), "left_out": left_out, "BLOCK": block}
         keys = ("action", "loc", "scale", "action_log_prob")
         given = self._arguments | {key: _time_major(part_ET.get(key)) for key in keys} | own
         launch(write_records, (len(left_out),), given, MOMENTS=power_of_two(len(moments)))

@@ -21,8 +21,9 @@ def read_observations(
 ):  # fmt: skip
     """Write `source` [D, DIM], normalized or not, to `obs` [D, STORED], as products take it; padding is zero.
 
-    Whether an element of a row is not finite is written to `faults` [D], where given. LISTED, of what follows env states only what the next step does not begin with is written, in any order, the rows to
-    `places`, their number to `count`. The value of others is that of `known` a step later.
+    Whether an element of a row is not finite is written to `faults` [D], where given. LISTED, of what follows env
+    states only what the next step does not begin with is written, in any order, the rows to `places`, their number to
+    `count`. The value of others is that of `known` a step later.
     """
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     column = tl.arange(0, LANES)[None, :]
@@ -97,16 +98,12 @@ def write_records(
     of_actor = obs + row * STORED + lane
     of_critic = of_actor + num_obs.to(tl.int64) * STORED
     odd = _counted_odd(record)
-    odd += tl.load(faults + rows, mask=valid, other=0)
-    odd += tl.load(faults + num_obs + rows, mask=valid, other=0)
+    odd += tl.load(faults + first + rows, mask=valid, other=0)
+    odd += tl.load(faults + num_obs + first + rows, mask=valid, other=0)
     is_odd = (odd > 0)[:, None]
-    tl.store(
-        records + row * RECORD + column,
-        tl.where(is_odd, neutral, record),
-        mask=valid[:, None] & (column < RECORD),
-    )
+    record = tl.where(is_odd, neutral, record)
+    tl.store(records + row * RECORD + column, record, mask=valid[:, None] & (column < RECORD))
     if tl.sum(odd) > 0:
-        none = tl.zeros((BLOCK, LANES), dtype=obs.dtype.element_ty)
-        tl.store(of_actor, none, mask=inside & is_odd)
-        tl.store(of_critic, none, mask=inside & is_odd)
+        tl.store(of_actor, 0.0, mask=inside & is_odd)
+        tl.store(of_critic, 0.0, mask=inside & is_odd)
     tl.store(left_out + tl.program_id(0), tl.sum(tl.where(valid & (odd > 0) & (first + rows < size), 1, 0)))

@@ -74,15 +74,15 @@ class FusedParameters:
     ) -> None:
         self._parameters, self._optimizer, self._tf32 = networks.parameters, optimizer, tf32
         device = self._parameters[0].device
-        # Parameters, and the optimizer's means and variances, each [N], then zeros up to a whole number of `size`.
+        # Parameters, and the optimizer's means and variances, each [N] and zeros up to a whole number of `size`.
         self._padding = torch.zeros(-layout.num_flat % size, device=device)
-        self._flat = torch.zeros(3, layout.num_flat + len(self._padding), device=device)
-        self.flat = self._flat.unbind()
-        sizes, shapes = zip(*((own.numel(), own.shape) for own in self._parameters), strict=True)
-        parts_of = [flat[: layout.num_flat].split(sizes) for flat in self.flat]
-        self._views = [view for own in parts_of for view in map(Tensor.view, own, shapes)]
+        self.flat = torch.zeros(3, layout.num_flat + len(self._padding), device=device)
+        sizes, shapes = zip(
+            *((own.numel(), own.shape) for own in (*self._parameters, self._padding)), strict=True
+        )
+        self._views = [view for flat in self.flat for view in map(Tensor.view, flat.split(sizes), shapes)]
         self._index = layout.padded_index(networks).to(device, torch.int64)  # as torch takes it
-        self.places = torch.cat([self._index, self._padding]).to(torch.int32)
+        self.places = functional.pad(self._index, (0, len(self._padding))).to(torch.int32)
         # The parameters in padded form, in float32 and in the dtype of the products.
         self.exact = torch.zeros(2, layout.num_padded, device=device)
         self.weights = torch.zeros(2, layout.num_padded, dtype=dtype, device=device)
@@ -98,10 +98,8 @@ class FusedParameters:
     @torch.no_grad()
     def load(self) -> None:
         """Take over what modules and optimizer hold."""
-        held, count = [own.reshape(-1) for own in self._held()], len(self._parameters)
-        rows = (held[first : first + count] for first in range(0, 3 * count, count))
         # One kernel; `_foreach_copy_` gives a large tensor to few blocks.
-        torch.cat([own for row in rows for own in (*row, self._padding)], out=self._flat.view(-1))
+        torch.cat([own.reshape(-1) for own in self._held()], out=self.flat.view(-1))
         self.steps[0].copy_(self._optimizer.state[self._parameters[0]]["step"])
         self.exact.view(-1)[self._index] = self.flat[0][: len(self._index)]
         self.weights.copy_(as_tf32(self.exact) if self._tf32 else self.exact)
@@ -115,7 +113,8 @@ class FusedParameters:
     def _held(self) -> list[Tensor]:
         # Looked up each time: loading a checkpoint gives the optimizer other tensors.
         states = [self._optimizer.state[parameter] for parameter in self._parameters]
-        return [*self._parameters, *(state[name] for name in ("exp_avg", "exp_avg_sq") for state in states)]
+        moments = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq"))
+        return [own for row in (self._parameters, *moments) for own in (*row, self._padding)]
 
 
 class Ahead(triton.AsyncCompileMode):
@@ -174,10 +173,10 @@ class FusedPPO:
         self.batch = num_env_states_per_minibatch
         # With the mirror images behind.
         rows = self.batch if mirror is None else 2 * self.batch
-        num_steps = cfg.num_epochs * num_minibatches
+        steps = cfg.num_epochs * num_minibatches
         self._side = warp_stream(torch.cuda.Stream(device)) if device.type == "cuda" else None
         self.parameters = FusedParameters(
-            networks, layout, optimizer=optimizer, dtype=dtype, tf32=tf32, num_steps=num_steps, size=tuning.size
+            networks, layout, optimizer=optimizer, dtype=dtype, tf32=tf32, num_steps=steps, size=tuning.size
         )
         self.dataset = FusedDataset(
             cfg,
@@ -190,7 +189,7 @@ class FusedPPO:
             mirror=mirror,
         )
 
-        self._summary = torch.zeros(num_steps, power_of_two(len(SUMMARY) + 1), device=device)
+        self._summary = torch.zeros(steps, power_of_two(len(SUMMARY) + 1), device=device)
         # Splits whose layer inputs and gradients exist at a time. The loss of a mirror image reads the whole minibatch;
         # chained kernels leave out half of its columns.
         self._splits = tuning.splits if self._mirrored or layout.chained else parts(tuning.splits, 2)
@@ -279,7 +278,7 @@ class FusedPPO:
     ) -> tuple[dict[str, Float[Tensor, " steps"]], Int64[Tensor, ""]]:
         """Make all gradient steps of an update.
 
-        `rollout_ET`, `["E","T"]`, may be time-major in memory, as that of a collector. `orders_KD` has for each epoch the
+        `rollout_ET`, `["E","T"]`, may be time-major in memory, as a collector's. `orders_KD` has for each epoch the
         env states in the order of the minibatches, counted env by env; a GPU does what is `aside` beside the steps.
         Returned are what each gradient step measured, by the names of `SUMMARY`, and how many env states took no part
         because an element was not finite.
@@ -308,7 +307,7 @@ class FusedPPO:
         return dict(zip(names, self._summary.unbind(1), strict=False)), left_out
 
     def _split(self, rows: int) -> int:
-        """Return how many rows of a minibatch are a split: whole blocks, and whole steps of `weight_gradients`."""
+        """Return how many rows of a minibatch are a split: a whole number of steps of `weight_gradients`."""
         tuning = self.tuning
         return parts(rows, tuning.splits * tuning.depth) * tuning.depth
 

@@ -290,8 +290,8 @@ def weight_gradients(
     input_columns = tl.multiple_of(tl.load(tile + 5), 16)
     gradient_columns = tl.multiple_of(tl.load(tile + 6), 16)
     bias = tl.load(tile + 7)
-    row = tl.arange(0, DEPTH)
-    lane = tl.arange(0, TILE)
+    row, lane = tl.arange(0, DEPTH), tl.arange(0, TILE)
+    column = lane[None, :]
     # What is past the tile's own columns is not read: of a network's last tiles that is most.
     reads, inside = lane < input_columns, lane < gradient_columns
     inputs += network.to(tl.int64) * num_rows * INPUTS + first_input
@@ -303,11 +303,11 @@ def weight_gradients(
     for first in tl.range(0, ROWS, DEPTH, num_stages=TILE_STAGES):
         rows = (split * ROWS + first + row)[:, None]
         valid = rows < num_rows
-        layer_input = tl.load(inputs + (rows * INPUTS + lane[None, :]), mask=valid & reads[None, :], other=0.0)
-        gradient = tl.load(slopes + (rows * GRADIENTS + lane[None, :]), mask=valid & inside[None, :], other=0.0)
+        layer_input = tl.load(inputs + (rows * INPUTS + column), mask=valid & reads[None, :], other=0.0)
+        gradient = tl.load(slopes + (rows * GRADIENTS + column), mask=valid & inside[None, :], other=0.0)
         acc = tl.dot(tl.trans(gradient), layer_input, acc)
         sums = tl.dot(tl.trans(gradient), one, sums)
     weight_partials += (split * 2 + network).to(tl.int64) * NUM_PADDED
     keep = inside[:, None] & reads[None, :]
-    tl.store(weight_partials + place + (lane[:, None] * stride + lane[None, :]), acc, mask=keep)
+    tl.store(weight_partials + place + (lane[:, None] * stride + column), acc, mask=keep)
     tl.store(weight_partials + bias + lane, tl.sum(sums, 1), mask=inside & (bias >= 0))

@@ -27,7 +27,7 @@ LOSS = tl.constexpr(SUMMARY.index("loss"))
 LEARNING_RATE = tl.constexpr(SUMMARY.index("learning_rate"))
 GRAD_NORM = tl.constexpr(SUMMARY.index("grad_norm"))
 LOSS_MIRROR = tl.constexpr(SUMMARY.index("loss_mirror"))
-# Behind it stands which share of the rows of all ranks took part, of several on this one, then on all.
+# Behind it stands which share of all ranks' rows took part: those of this rank, and once these are added up, all.
 SHARE = tl.constexpr(len(SUMMARY))
 # As in TorchRL's explained variance: the resolution of float32.
 EPS = tl.constexpr(1.1920929e-07)
@@ -111,34 +111,31 @@ def sum_gradients(
         tl.store(squares + program, tl.sum(total * total))
     elif program == 2 * PROGRAMS:
         output = tl.arange(0, OUT)
-        statistic = tl.arange(0, NUM_STATISTICS)
-        used = statistic < (6 if STATE_STD or MIRROR else 4)
-        sums = _block_sums(block_partials, OUT + statistic, used, WIDTH, BLOCKS, ROWS, NUM_STATISTICS)
+        column = tl.arange(0, NUM_STATISTICS)
+        sums = _block_sums(block_partials, OUT + column, column < 6, WIDTH, BLOCKS, ROWS, NUM_STATISTICS)
         if not STATE_STD:
             d_std = _block_sums(block_partials, output, output >= 0, WIDTH, BLOCKS, ROWS, OUT) / divisor
             tl.store(gradients + STD_AT + output, d_std)
             tl.store(squares + program, tl.sum(d_std * d_std))
         # How many env states take part. It may be none.
         counted = _column(sums, 0, NUM_STATISTICS)
-        policy = sums / tl.maximum(counted, 1.0)
+        number = tl.maximum(counted, 1.0) if RANKS == 1 else divisor
+        policy = sums / number
         kl = _column(policy, 2, NUM_STATISTICS)
         if STATE_STD:
             entropy = _column(policy, 4, NUM_STATISTICS)
         else:
-            raw = tl.load(
-                biases + (NUM_BIASES - OUT + output), mask=output < ACTIONS, other=0.0 if LOG_STD else 1.0
-            )
+            acts = output < ACTIONS
+            raw = tl.load(biases + (NUM_BIASES - OUT + output), mask=acts, other=0.0 if LOG_STD else 1.0)
             std = tl.maximum(tl.exp(raw) if LOG_STD else raw, MIN_STD)
-            entropy = tl.sum(tl.where(output < ACTIONS, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0))
-        share = counted / divisor
-        part = tl.minimum(counted, 1.0) if RANKS == 1 else share
-        tl.store(summary + SHARE, share)
-        tl.store(summary, _column(policy, 1, NUM_STATISTICS) * part)
-        tl.store(summary + 2, entropy * part)
-        tl.store(summary + 3, kl * part)
-        tl.store(summary + 4, _column(policy, 3, NUM_STATISTICS) * part)
+            entropy = tl.sum(tl.where(acts, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0)) * (counted / number)
+        tl.store(summary + SHARE, counted / divisor)
+        tl.store(summary, _column(policy, 1, NUM_STATISTICS))
+        tl.store(summary + 2, entropy)
+        tl.store(summary + 3, kl)
+        tl.store(summary + 4, _column(policy, 3, NUM_STATISTICS))
         if MIRROR:
-            tl.store(summary + LOSS_MIRROR, _column(policy, 5, NUM_STATISTICS) * part)
+            tl.store(summary + LOSS_MIRROR, _column(policy, 5, NUM_STATISTICS))
         alone: tl.constexpr = ADAPTIVE and RANKS == 1
         tl.store(summary + LEARNING_RATE, _adapt(learning_rate, kl, desired_kl, rate_bounds, alone))
     else:
@@ -151,15 +148,15 @@ def sum_gradients(
             size = tl.load(row, mask=keep, other=0.0)
             loss += tl.load(row + 1, mask=keep, other=0.0)
             total, own = tl.load(row + 2, mask=keep, other=0.0), tl.load(row + 3, mask=keep, other=0.0)
-            error_total, error_own = tl.load(row + 4, mask=keep, other=0.0), tl.load(row + 5, mask=keep, other=0.0)
             target, target_squares = _merged(count, target, target_squares, size, total, own)
-            error, error_squares = _merged(count, error, error_squares, size, error_total, error_own)
+            total, own = tl.load(row + 4, mask=keep, other=0.0), tl.load(row + 5, mask=keep, other=0.0)
+            error, error_squares = _merged(count, error, error_squares, size, total, own)
             count += size
         counted = tl.sum(count)
-        part = tl.minimum(counted, 1.0) if RANKS == 1 else counted / divisor
+        number = tl.maximum(counted, 1.0) if RANKS == 1 else divisor
         left = _variance(count, error, error_squares) / (_variance(count, target, target_squares) + EPS)
-        tl.store(summary + 1, critic_coeff * tl.sum(loss) / tl.maximum(counted, 1.0) * part)
-        tl.store(summary + 5, (1.0 - left) * part)
+        tl.store(summary + 1, critic_coeff * tl.sum(loss) / number)
+        tl.store(summary + 5, (1.0 - left) * (counted / number))
 
 
 @triton.jit
@@ -167,7 +164,7 @@ def take_means(
     gradients, squares, learning_rate, summary, desired_kl, rate_bounds,
     NUM_GRADIENTS: tl.constexpr, ADAPTIVE: tl.constexpr, SIZE: tl.constexpr,
 ):  # fmt: skip
-    """Take sums of squares of what `sum_gradients` left, added up over ranks, and the means; adapt the learning rate."""
+    """Take squares and means of what `sum_gradients` left, added up over ranks, and adapt the learning rate."""
     sums = gradients + NUM_GRADIENTS
     at = tl.program_id(0) * SIZE + tl.arange(0, SIZE)
     gradient = tl.load(gradients + at, mask=at < NUM_GRADIENTS, other=0.0)
@@ -193,11 +190,11 @@ def adam_step(
 ):  # fmt: skip
     """Make one step of Adam (Kingma and Ba, arXiv 1412.6980), as torch's, on the clipped gradient.
 
-    Gradients, and the NUM_SQUARES partial `squares`, are of a SHARE of the rows: divided by it they are means. If their
-    norm or the loss is not finite, nothing changes but the counters of skipped steps. Parameters, means and variances are in flat form, [SIZE] and zeros that fill the last program; `places` leads from it to
-    the padded form of gradients and of the weights, in the dtype of the products and exact, which follow the
-    parameters. The loss, the norm and whether the step was skipped are added to the `summary` of this step, and the
-    number of steps made after it is written behind that before it.
+    Gradients and NUM_SQUARES partial `squares`, divided by the SHARE of the rows, are means. If the norm or the loss is
+    not finite, nothing changes but the counters of skipped steps. Parameters, means and variances are in flat form,
+    [SIZE] and zeros that fill the last program; `places` leads from it to the padded form of gradients and of the
+    weights, in the dtype of the products and exact, which follow the parameters. Loss, norm and whether the step was
+    skipped go to the `summary` of this step, and the number of steps made after it behind that before it.
     """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = at < SIZE
@@ -208,7 +205,7 @@ def adam_step(
     variance = tl.load(variances + at)
     gradient = tl.load(gradients + place, mask=inside, other=0.0)
     square_at = tl.arange(0, SQUARES)
-    share = tl.maximum(tl.load(summary + SHARE), 1e-30)  # all gradients are zero where no env state takes part
+    share = tl.maximum(tl.load(summary + SHARE), 1e-30)  # all is zero where no env state takes part
     norm = tl.sqrt(tl.sum(tl.load(squares + square_at, mask=square_at < NUM_SQUARES, other=0.0))) / share
     loss = tl.load(summary) + tl.load(summary + 1) + tl.load(summary + LOSS_MIRROR)
     loss -= entropy_coeff * tl.load(summary + 2)
@@ -220,9 +217,7 @@ def adam_step(
     correction1 = (1.0 - tl.exp(steps_made * log_beta1)).to(tl.float32)
     correction2 = (1.0 - tl.exp(steps_made * log_beta2)).to(tl.float32)
 
-    gradient = gradient / share
-    if CLIP:
-        gradient = gradient * tl.minimum(max_grad_norm / (norm + 1e-6), 1.0)
+    gradient = gradient / share * (tl.minimum(max_grad_norm / (norm + 1e-6), 1.0) if CLIP else 1.0)
     gradient += weight_decay * parameter
     new_mean = mean + (gradient - mean) * (1.0 - beta1)
     new_variance = beta2 * variance + (1.0 - beta2) * gradient * gradient
