@@ -147,8 +147,8 @@ class PPO:
         assert rollout_ET is not None
         if self.fused is not None:
             # The same numbers in a few Triton kernels: docs/fused_ppo.md.
-            orders = [self.dataset.epoch_order() for _ in range(self.cfg.num_epochs)]
-            steps, _ = self.fused(rollout_ET, orders)
+            orders_KD = self.dataset.epoch_orders(self.cfg.num_epochs)
+            steps, _ = self.fused(rollout_ET, orders_KD)
             self.kl.copy_(steps["kl"][-1])
         else:
             # Writes "advantage" and "value_target"; values after a step are those of the true next observation.

@@ -176,11 +176,11 @@ class DatasetBuffer(ReplayBuffer):
         data = _labelled(data, info)
         yield from data.split(data.batch_size[0] // self.cfg.num_minibatches)
 
-    def epoch_order(self) -> Int64[Tensor, " D"]:
-        """Begin an epoch of an `EpochSampler`, and return its whole order instead of its minibatches, on the device."""
+    def epoch_orders(self, count: int) -> Int64[Tensor, "K D"]:
+        """Begin `count` epochs of an `EpochSampler`; return their orders instead of minibatches, on the device."""
         if type(self.sampler) is not EpochSampler:
             raise TypeError(f"a {type(self.sampler).__name__} has no order of single env states: use epoch()")
-        return self.sampler.epoch_order(self.cfg.num_env_states, device=self.non_finite_count.device)
+        return self.sampler.epoch_orders(count, self.cfg.num_env_states, device=self.non_finite_count.device)
 
     def all(self) -> TensorDictBase:
         """Return the dataset `["D"]`: views of the storage, which the next `extend` overwrites."""

@@ -75,20 +75,20 @@ class EpochSampler(Sampler):
             index = torch.unravel_index(index, storage.shape)
         return index, {}
 
-    def epoch_order(self, size: int, *, device: torch.device) -> Int64[Tensor, " D"]:
-        """Begin an epoch and return its order of `range(size)`, as `sample` would give it in parts."""
+    def epoch_orders(self, count: int, size: int, *, device: torch.device) -> Int64[Tensor, "K D"]:
+        """Begin `count` epochs and return their orders of `range(size)`, as `sample` would give them in parts."""
         self.restart()
-        return self._next_part(size, size, device)
+        self._size = size
+        if self._epoch is None or self._epoch.device != device:
+            self._epoch = torch.full((), self._first_epoch, dtype=torch.int64, device=device)
+        orders_KD = self._orders(self._epoch + torch.arange(count, device=device), size)
+        self._epoch.add_(count * self.shuffle)
+        return orders_KD
 
     def _next_part(self, size: int, batch_size: int, device: torch.device) -> Tensor:
         """Return the next `batch_size` elements of the epoch's order of `range(size)`, on the device."""
-        if size != self._size:
-            self._size, self._position = size, 0
-        if self._position == 0:
-            if self._epoch is None or self._epoch.device != device:
-                self._epoch = torch.full((), self._first_epoch, dtype=torch.int64, device=device)
-            self._order_D = self._order(self._epoch, size)
-            self._epoch.add_(self.shuffle)
+        if size != self._size or self._position == 0:
+            self._order_D = self.epoch_orders(1, size, device=device)[0]
         assert self._order_D is not None
         index = self._order_D[self._position : self._position + batch_size]
         self._position += batch_size
@@ -99,18 +99,18 @@ class EpochSampler(Sampler):
         self._remaining_batches = left // batch_size if self.drop_last else -(-left // batch_size)
         return index
 
-    def _order(self, epoch: Tensor, size: int) -> Tensor:
-        """Return the order of an epoch: a random one unless `shuffle` is off, minibatch by minibatch."""
+    def _orders(self, epochs: Tensor, size: int) -> Tensor:
+        """Return the orders of epochs: random ones unless `shuffle` is off, minibatch by minibatch."""
         if not self.shuffle:
-            order_D = torch.arange(size, device=epoch.device)
+            orders_KD = torch.arange(size, device=epochs.device).expand(len(epochs), size)
         elif size % self.shards:
             raise ValueError(f"{size} elements are no whole number for each of {self.shards} shards")
         else:
-            keys = random.row_keys(torch.full_like(epoch, self.seed), _STREAM, epoch, self.shards)
-            order_D = random.permutations(keys, size // self.shards).flatten()
+            keys = random.row_keys(epochs.new_full((), self.seed), _STREAM, epochs, self.shards)
+            orders_KD = random.permutations(keys, size // self.shards).view(-1, size)
         if self.shards == 1:
-            return order_D
-        return order_D.view(self.shards, self.num_minibatches, -1).transpose(0, 1).reshape(-1)
+            return orders_KD
+        return orders_KD.unflatten(1, (self.shards, self.num_minibatches, -1)).transpose(1, 2).flatten(1)
 
     def state_dict(self) -> dict[str, int]:
         """Return the integers from which the orders continue exactly (reads the epoch counter on the host)."""
@@ -127,8 +127,8 @@ class EpochSampler(Sampler):
         if self._epoch is not None:
             self._epoch.fill_(self._first_epoch)
         if self._position > 0:
-            previous = torch.full((), self._first_epoch - 1, dtype=torch.int64, device=device)
-            self._order_D = self._order(previous, self._size)
+            previous = torch.full((1,), self._first_epoch - 1, dtype=torch.int64, device=device)
+            self._order_D = self._orders(previous, self._size)[0]
 
     def dumps(self, path: str | Path) -> None:
         """Write the state as JSON into the folder `path`."""

@@ -138,9 +138,10 @@ def integers(
 
 
 def permutations(keys: RowKeys, n: int) -> Int64[Tensor, "E L"]:
-    """Draw an order of `n` numbers for each row: of 0 to n - 1 for the first, of the next n for the second, ..."""
+    """Draw for each count an order of `n` numbers per row: row 0 has 0 to n - 1, row 1 the next n, and so on."""
     # Short halves need more rounds until all orders of few numbers are about equally likely.
     bits = max((n - 1).bit_length(), 2)
+    keys = keys._replace(num_rows=keys.counter.numel() * keys.num_rows)
     return _drawn(*keys, n, _ORDER, 0.0, 1.0, bits, 8 if bits > 6 else 24)
 
 
@@ -183,7 +184,7 @@ _launch = QuickLaunch(
     else for (int row = begin_row; row < end_row; ++row) {
         // A bijection of the next power of two; what it takes past the last number goes through it again (Black and
         // Rogaway, "Ciphers with arbitrary finite domains", 2002).
-        const RowKey key = key_of(seed, stream, counter[row * stride], first + row);
+        const RowKey key = key_of(seed, stream, counter[row / stride], first + row % stride);
         unsigned low_bits = start / 2, low_mask = (1u << low_bits) - 1u, high_mask = (1u << (start - low_bits)) - 1u;
         unsigned round_keys[24];
         for (int round = 0; round < (int)span; ++round) round_keys[round] = bits_of(key, (unsigned)round);
@@ -197,7 +198,7 @@ _launch = QuickLaunch(
                 }
                 number = (high << low_bits) | low;
             } while (number >= (unsigned)n);
-            integers[(long long)row * n + i] = (long long)row * n + number;
+            integers[(long long)row * n + i] = (long long)(row % stride) * n + number;
         }
     }
 """,
@@ -218,15 +219,17 @@ def _draw_now(
     start: int,
     span: int,
 ) -> Tensor:
-    if seed.dtype != torch.int64 or counter.dtype != torch.int64 or counter.shape not in ((), (num_rows,)):
+    counts = counter.numel() if kind == _ORDER else num_rows
+    stride = num_rows // counts if kind == _ORDER else counter.ndim
+    if seed.dtype != torch.int64 or counter.dtype != torch.int64 or counter.shape not in ((), (counts,)):
         raise ValueError(
             f"seed is {seed.dtype}, counter is {counter.dtype} of shape {tuple(counter.shape)}: expected torch.int64, "
-            f"and a counter of shape () or ({num_rows},)"
+            f"and a counter of shape () or ({counts},)"
         )
     out_EL, counter = _empty(seed, num_rows, n, kind), counter.contiguous()
     rows, columns = (num_rows, n) if seed.device.type == "cpu" else (1, 1)
     dim = (num_rows // max(rows, 1), n // max(columns, 1))
-    layout = rows, columns, n, kind, low, high, start, span, stream, counter.ndim, first_row
+    layout = rows, columns, n, kind, low, high, start, span, stream, stride, first_row
     _launch(seed.device, dim, *layout, seed.data_ptr(), counter.data_ptr(), out_EL.data_ptr())
     return out_EL
 

@@ -14,10 +14,10 @@ from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_o
 # Parts of a batch whose moments are taken side by side: at most so many, of at least so many rows. Short ones hold up
 # little of what else a GPU does. Then those of so many parts are merged, and at last those of all these groups.
 MOST_PARTS, LEAST_ROWS, GROUP = 2048, 16, 32
-# Stages 0 to 3 are of a row (which rows count), of a column of a part, of a group, and of the batch.
+# Stages 0 to 3 are of an element (which rows count), of a column of a part, of a group, and of the batch.
 _quick = QuickLaunch(
     arguments_of(
-        (int, "stage num_rows dim rows parts groups ranks"),
+        (int, "stage num_rows dim rows parts groups ranks span"),
         (wp.int64, "until"),
         (wp.uint64, "values valid counts moments count mean squares"),
     ),
@@ -48,10 +48,11 @@ _quick = QuickLaunch(
         if (lane == 0) weights[slot] = weight;
     };
     if (a.stage == 0) {
+        // Threads of a GPU read neighbours, and whoever finds a fault writes the same.
         bool is_counted = a.until < 0 || before * a.ranks < a.until;
         if (a.valid) is_counted &= ((const unsigned char*)a.valid)[row] != 0;
-        for (size_t i = row * dim; i < (row + 1) * dim; ++i) is_counted &= fabsf(values[i]) <= 3.402823466e38f;
-        counts[row] = is_counted;
+        for (int i = 0; i < a.span; ++i) is_counted &= fabsf(values[row * dim + lane + i]) <= 3.402823466e38f;
+        if (!is_counted) counts[row] = 0;
     } else if (a.stage == 1) {
         const size_t begin = (size_t)row * a.rows, end = begin + a.rows < a.num_rows ? begin + a.rows : a.num_rows;
         double sum = 0.0;
@@ -95,12 +96,12 @@ def _count(
     rows = max(LEAST_ROWS, -(-num_rows // MOST_PARTS))
     parts = -(-num_rows // rows)
     groups = -(-parts // GROUP)
-    counts_N = torch.empty(num_rows, dtype=torch.uint8, device=count.device)
+    span = dim if count.device.type == "cpu" else 1  # of a row, for a thread that looks for faults
+    counts_N = torch.ones(num_rows, dtype=torch.uint8, device=count.device)
     moments = torch.empty((2 * dim + 1) * (parts + groups) + 1, dtype=torch.float64, device=count.device)
-    held = (counts_N, moments, count, mean_L, squares_L)
-    given = values_NL.data_ptr(), address(valid_N), *(own.data_ptr() for own in held)
-    for stage, size in enumerate(((num_rows, 1), (parts, dim), (groups, dim), (1, dim))):
-        _quick(count.device, size, stage, num_rows, dim, rows, parts, groups, ranks.size(), until, *given)
+    at = [address(own) for own in (values_NL, valid_N, counts_N, moments, count, mean_L, squares_L)]
+    for stage, size in enumerate(((num_rows, dim // span), (parts, dim), (groups, dim), (1, dim))):
+        _quick(count.device, size, stage, num_rows, dim, rows, parts, groups, ranks.size(), span, until, *at)
     count.copy_(moments[-1])
 
 

@@ -129,3 +129,20 @@ def test_an_empty_buffer_is_refused():
     buffer = ReplayBuffer(storage=LazyTensorStorage(12), sampler=EpochSampler(), batch_size=4)
     with pytest.raises(RuntimeError, match="empty"):
         buffer.sample()
+
+
+@pytest.mark.parametrize("shards", [1, 3])
+@pytest.mark.parametrize("shuffle", [True, False])
+def test_orders_of_several_epochs_are_those_of_one_after_the_other(shards, shuffle):
+    together, apart = (
+        EpochSampler(seed=3, shards=shards, num_minibatches=4, shuffle=shuffle) for _ in range(2)
+    )
+    for count in (2, 3):
+        orders_KD = together.epoch_orders(count, 24, device=torch.device("cpu"))
+        singles = [apart.epoch_orders(1, 24, device=torch.device("cpu"))[0] for _ in range(count)]
+        assert torch.equal(orders_KD, torch.stack(singles))
+        assert together.state_dict() == apart.state_dict()
+    buffer = _buffer(size=24, batch_size=6, seed=3, shards=shards, num_minibatches=4, shuffle=shuffle)
+    drawn = [_epoch(buffer) for _ in range(2)]
+    apart.set_seed(3)
+    assert torch.equal(torch.stack(drawn), apart.epoch_orders(2, 24, device=torch.device("cpu")))

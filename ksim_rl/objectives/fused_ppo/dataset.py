@@ -53,6 +53,7 @@ class FusedDataset:
             "records": self.records,
             "num_obs": rows,
             "size": size,
+            "faults": torch.zeros(2, rows, dtype=torch.int8, device=device),
             "known": self.obs[1],
             "places": torch.zeros(size, dtype=torch.int32, device=device),
             "count": torch.zeros(1, dtype=torch.int32, device=device),
@@ -74,8 +75,8 @@ class FusedDataset:
         An env state with an element that is not finite takes no part, as in `DatasetStorage`; returned is how many.
         """
         for part_ET, first in self._parts(rollout_ET):
-            for network, obs_DL in enumerate(self.obs):
-                self._take_observations(network, part_ET, obs_DL[first:])
+            for network, faults_D in enumerate(self._arguments["faults"]):
+                self._take_observations(network, part_ET, self.obs[network, first:], faults=faults_D[first:])
         following = rollout_ET.get("next")
         num_envs, length = rollout_ET.batch_size
         next_obs = torch.empty_like(self.obs[1, : self.size])
@@ -104,7 +105,7 @@ class FusedDataset:
 
     def _take_records(self, part_ET: TensorDictBase, first: int, moments: Tensor) -> Tensor:
         """Write records, and return of each program how many env states it left out."""
-        rows, block = part_ET.numel(), _block(max(self._arguments["LANES"], self._arguments["RECORD_LANES"]))
+        rows, block = part_ET.numel(), _block(self._arguments["RECORD_LANES"])
         left_out = torch.empty(parts(rows, block), dtype=torch.int32, device=self.records.device)
         own = {"obs": self.obs[0, first:], "records": self.records[first:], "first": first, "num_rows": rows}
         own |= {"moments": moments, "num_moments": len(moments), "left_out": left_out, "BLOCK": block}
@@ -121,7 +122,7 @@ class FusedDataset:
         mean, var = (source, source) if moments is None else (moments.mean, moments.var)
         own = {"source": source, "mean": mean, "var": var, "obs": obs, "eps": observer.eps}
         sizes = {"num_rows": len(source), "DIM": source.shape[1], "NORMALIZED": moments is not None}
-        given = self._arguments | own | sizes | {"num_envs": 0, "LISTED": False} | changes
+        given = self._arguments | own | sizes | {"num_envs": 0, "LISTED": False, "faults": None} | changes
         launch(read_observations, (parts(len(source), block),), given, BLOCK=block)
 
 

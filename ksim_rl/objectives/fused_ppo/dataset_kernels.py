@@ -8,15 +8,22 @@ from ksim_rl.objectives.fused_ppo.mlp_kernels import operand
 
 
 @triton.jit
+def _counted_odd(value):
+    # How many elements of each row are not finite.
+    return tl.sum(tl.where(tl.abs(value.to(tl.float32)) < float("inf"), 0, 1), 1)
+
+
+@triton.jit
 def read_observations(
-    source, mean, var, obs, known, values, next_values, places, count, num_rows, num_envs, eps,
+    source, mean, var, obs, faults, known, values, next_values, places, count, num_rows, num_envs, eps,
     DIM: tl.constexpr, STORED: tl.constexpr, LANES: tl.constexpr, NORMALIZED: tl.constexpr, TF32: tl.constexpr,
     LISTED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write `source` [D, DIM], normalized or not, to `obs` [D, STORED], as products take it; padding is zero.
 
-    LISTED, of what follows env states only what the next step does not begin with is written, in any order, the rows to
-    `places`, their number to `count`. The value of others is that of `known` a step later.
+    Whether an element of a row is not finite is written to `faults` [D], where given. LISTED, of what follows env
+    states only what the next step does not begin with is written, in any order, the rows to `places`, their number to
+    `count`. The value of others is that of `known` a step later.
     """
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     column = tl.arange(0, LANES)[None, :]
@@ -36,18 +43,14 @@ def read_observations(
         ones = tl.where(keep, 1, 0)
         at = (tl.atomic_add(count, tl.sum(ones)) + tl.cumsum(ones, 0) - 1).to(tl.int64)
         tl.store(places + at, row.to(tl.int32), mask=keep)
+    elif faults is not None:
+        tl.store(faults + row, (_counted_odd(value) > 0).to(tl.int8), mask=keep)
     tl.store(obs + at[:, None] * STORED + column, value, mask=keep[:, None] & (column < STORED))
 
 
 @triton.jit
-def _counted_odd(value):
-    # How many elements of each row are not finite.
-    return tl.sum(tl.where(tl.abs(value.to(tl.float32)) < float("inf"), 0, 1), 1)
-
-
-@triton.jit
 def write_records(
-    action, loc, scale, action_log_prob, advantages, values, targets, moments, obs, records, left_out,
+    action, loc, scale, action_log_prob, advantages, values, targets, moments, obs, faults, records, left_out,
     num_rows, num_obs, first, size, num_moments, min_advantage_std,
     RECORD: tl.constexpr, RECORD_LANES: tl.constexpr, ACTIONS: tl.constexpr, OUT: tl.constexpr, STORED: tl.constexpr,
     LANES: tl.constexpr, MOMENTS: tl.constexpr, STANDARDIZED: tl.constexpr, BLOCK: tl.constexpr,
@@ -95,15 +98,12 @@ def write_records(
     of_actor = obs + row * STORED + lane
     of_critic = of_actor + num_obs.to(tl.int64) * STORED
     odd = _counted_odd(record)
-    odd += _counted_odd(tl.load(of_actor, mask=inside, other=0.0))
-    odd += _counted_odd(tl.load(of_critic, mask=inside, other=0.0))
+    odd += tl.load(faults + first + rows, mask=valid, other=0)
+    odd += tl.load(faults + num_obs + first + rows, mask=valid, other=0)
     is_odd = (odd > 0)[:, None]
-    tl.store(
-        records + row * RECORD + column,
-        tl.where(is_odd, neutral, record),
-        mask=valid[:, None] & (column < RECORD),
-    )
-    none = tl.zeros((BLOCK, LANES), dtype=obs.dtype.element_ty)
-    tl.store(of_actor, none, mask=inside & is_odd)
-    tl.store(of_critic, none, mask=inside & is_odd)
+    record = tl.where(is_odd, neutral, record)
+    tl.store(records + row * RECORD + column, record, mask=valid[:, None] & (column < RECORD))
+    if tl.sum(odd) > 0:
+        tl.store(of_actor, 0.0, mask=inside & is_odd)
+        tl.store(of_critic, 0.0, mask=inside & is_odd)
     tl.store(left_out + tl.program_id(0), tl.sum(tl.where(valid & (odd > 0) & (first + rows < size), 1, 0)))

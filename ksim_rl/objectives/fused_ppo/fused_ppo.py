@@ -10,7 +10,7 @@ moves it by 0.05 to 0.5.
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from functools import partial
@@ -70,14 +70,19 @@ class FusedParameters:
         dtype: torch.dtype,
         tf32: bool,
         num_steps: int,
+        size: int,
     ) -> None:
         self._parameters, self._optimizer, self._tf32 = networks.parameters, optimizer, tf32
         device = self._parameters[0].device
-        # Parameters, and the optimizer's means and variances, each [N].
-        self.flat = [torch.zeros(layout.num_flat, device=device) for _ in range(3)]
-        sizes, shapes = zip(*((own.numel(), own.shape) for own in self._parameters), strict=True)
+        # Parameters, and the optimizer's means and variances, each [N] and zeros up to a whole number of `size`.
+        self._padding = torch.zeros(-layout.num_flat % size, device=device)
+        self.flat = torch.zeros(3, layout.num_flat + len(self._padding), device=device)
+        sizes, shapes = zip(
+            *((own.numel(), own.shape) for own in (*self._parameters, self._padding)), strict=True
+        )
         self._views = [view for flat in self.flat for view in map(Tensor.view, flat.split(sizes), shapes)]
-        self.places = layout.padded_index(networks).to(device)
+        self._index = layout.padded_index(networks).to(device, torch.int64)  # as torch takes it
+        self.places = functional.pad(self._index, (0, len(self._padding))).to(torch.int32)
         # The parameters in padded form, in float32 and in the dtype of the products.
         self.exact = torch.zeros(2, layout.num_padded, device=device)
         self.weights = torch.zeros(2, layout.num_padded, dtype=dtype, device=device)
@@ -93,9 +98,10 @@ class FusedParameters:
     @torch.no_grad()
     def load(self) -> None:
         """Take over what modules and optimizer hold."""
-        torch._foreach_copy_(self._views, self._held())
+        # One kernel; `_foreach_copy_` gives a large tensor to few blocks.
+        torch.cat([own.reshape(-1) for own in self._held()], out=self.flat.view(-1))
         self.steps[0].copy_(self._optimizer.state[self._parameters[0]]["step"])
-        self.exact.view(-1)[self.places] = self.flat[0]
+        self.exact.view(-1)[self._index] = self.flat[0][: len(self._index)]
         self.weights.copy_(as_tf32(self.exact) if self._tf32 else self.exact)
 
     @torch.no_grad()
@@ -107,7 +113,8 @@ class FusedParameters:
     def _held(self) -> list[Tensor]:
         # Looked up each time: loading a checkpoint gives the optimizer other tensors.
         states = [self._optimizer.state[parameter] for parameter in self._parameters]
-        return [*self._parameters, *(state[name] for name in ("exp_avg", "exp_avg_sq") for state in states)]
+        moments = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq"))
+        return [own for row in (self._parameters, *moments) for own in (*row, self._padding)]
 
 
 class Ahead(triton.AsyncCompileMode):
@@ -166,10 +173,10 @@ class FusedPPO:
         self.batch = num_env_states_per_minibatch
         # With the mirror images behind.
         rows = self.batch if mirror is None else 2 * self.batch
-        num_steps = cfg.num_epochs * num_minibatches
+        steps = cfg.num_epochs * num_minibatches
         self._side = warp_stream(torch.cuda.Stream(device)) if device.type == "cuda" else None
         self.parameters = FusedParameters(
-            networks, layout, optimizer=optimizer, dtype=dtype, tf32=tf32, num_steps=num_steps
+            networks, layout, optimizer=optimizer, dtype=dtype, tf32=tf32, num_steps=steps, size=tuning.size
         )
         self.dataset = FusedDataset(
             cfg,
@@ -182,7 +189,7 @@ class FusedPPO:
             mirror=mirror,
         )
 
-        self._summary = torch.zeros(num_steps, power_of_two(len(SUMMARY) + 1), device=device)
+        self._summary = torch.zeros(steps, power_of_two(len(SUMMARY) + 1), device=device)
         # Splits whose layer inputs and gradients exist at a time. The loss of a mirror image reads the whole minibatch;
         # chained kernels leave out half of its columns.
         self._splits = tuning.splits if self._mirrored or layout.chained else parts(tuning.splits, 2)
@@ -206,7 +213,7 @@ class FusedPPO:
         zeros = partial(torch.zeros, device=dataset.records.device)
         blocks, dtype = parts(rows, tuning.block), dataset.obs.dtype
         held = min(rows, self._splits * self._split(rows))
-        programs = 2 * parts(layout.num_padded, tuning.size) + 1
+        programs = 2 * parts(layout.num_padded, tuning.size) + 2
         # Where the image of each action comes from, counted from 1, times its sign; see `output_gradients`.
         image_of = torch.arange(1, layout.out + 1, device=dataset.records.device, dtype=torch.int32)
         if mirror is not None:
@@ -235,9 +242,8 @@ class FusedPPO:
             "num_obs": len(dataset.records),
             "num_rows": rows,
             "tiles": layout.weight_tiles(tuning.tile).to(dataset.records.device),
-            # Tiles at the edge read past the last row.
-            "inputs": zeros(2 * held * layout.inputs + tuning.tile, dtype=dtype),
-            "slopes": zeros(2 * held * layout.gradients + tuning.tile, dtype=dtype),
+            "inputs": zeros(2 * held * layout.inputs, dtype=dtype),
+            "slopes": zeros(2 * held * layout.gradients, dtype=dtype),
             "weight_partials": zeros(tuning.splits, 2, layout.num_padded),
             "block_partials": zeros(blocks, 2, layout.out + NUM_STATISTICS),
             # Of both networks; ranks add them up together with the summary behind them.
@@ -268,11 +274,11 @@ class FusedPPO:
         }
 
     def __call__(
-        self, rollout_ET: TensorDictBase, orders: Iterable[Int64[Tensor, " D"]], *aside: Callable[[], None]
+        self, rollout_ET: TensorDictBase, orders_KD: Int64[Tensor, "K D"], *aside: Callable[[], None]
     ) -> tuple[dict[str, Float[Tensor, " steps"]], Int64[Tensor, ""]]:
         """Make all gradient steps of an update.
 
-        `rollout_ET`, `["E","T"]`, may be time-major in memory, as that of a collector. `orders` has for each epoch the
+        `rollout_ET`, `["E","T"]`, may be time-major in memory, as a collector's. `orders_KD` has for each epoch the
         env states in the order of the minibatches, counted env by env; a GPU does what is `aside` beside the steps.
         Returned are what each gradient step measured, by the names of `SUMMARY`, and how many env states took no part
         because an element was not finite.
@@ -285,7 +291,7 @@ class FusedPPO:
                 self._ahead = None
             # One after the other: of two branches, a graph sends the longer one first, with all its steps, and the
             # other starts 0.17 ms later. Drawing takes a third of that.
-            order_N = torch.cat([*orders]).to(torch.int32)
+            order_N = orders_KD.flatten().to(torch.int32)
             # From env by env to step by step.
             indices = ((order_N % length) * num_envs + order_N // length).split(self.batch)
             self.parameters.load()
@@ -301,7 +307,7 @@ class FusedPPO:
         return dict(zip(names, self._summary.unbind(1), strict=False)), left_out
 
     def _split(self, rows: int) -> int:
-        """Return how many rows of a minibatch are a split: whole blocks, and whole steps of `weight_gradients`."""
+        """Return how many rows of a minibatch are a split: a whole number of steps of `weight_gradients`."""
         tuning = self.tuning
         return parts(rows, tuning.splits * tuning.depth) * tuning.depth
 

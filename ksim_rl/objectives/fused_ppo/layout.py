@@ -185,7 +185,7 @@ def power_of_two(number: int) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class Tuning:
-    """How the work is cut. The defaults were the fastest on an H200 for layers of 512, 256 and 128, but for `lower`."""
+    """How work is cut. What `of` gives was the fastest on an H200 for layers of 512, 256 and 128, but for `lower`."""
 
     block: int = 64  # rows of a minibatch that one program takes through a network, or through one layer
     chunk: int = 32  # columns of the widest layer that exist at a time
@@ -213,8 +213,8 @@ class Tuning:
         chunk = math.gcd(cls.chunk, layout.hidden[0], layout.hidden[2])
         lower, read = math.gcd(32 if wide else cls.lower, layout.hidden[0]), layout.head + layout.rest
         # Two programs of `lower_gradients` share a multiprocessor, where their sums fit into registers.
-        wide |= {"block": 32, "lower_depth": 16} if wide else {}
         stages, warps = 3 if not wide and read <= 96 else 2, 4 if not wide and read <= 128 else 8
+        wide |= {"block": 32, "lower_depth": 16} if wide else {"depth": 32, "tile_stages": 6}
         return cls(chunk=chunk, lower=lower, lower_stages=stages, lower_warps=warps, splits=16, **wide)
 
 

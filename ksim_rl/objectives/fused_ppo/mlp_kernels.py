@@ -287,12 +287,13 @@ def weight_gradients(
     first_gradient = tl.multiple_of(tl.load(tile + 2), 16)
     place = tl.load(tile + 3)
     stride = tl.load(tile + 4)
-    input_columns = tl.load(tile + 5)
-    gradient_columns = tl.load(tile + 6)
+    input_columns = tl.multiple_of(tl.load(tile + 5), 16)
+    gradient_columns = tl.multiple_of(tl.load(tile + 6), 16)
     bias = tl.load(tile + 7)
-    row = tl.arange(0, DEPTH)
-    lane = tl.arange(0, TILE)
-    # Columns past the tile's own belong to the next layer or row: they are multiplied, and not stored.
+    row, lane = tl.arange(0, DEPTH), tl.arange(0, TILE)
+    column = lane[None, :]
+    # What is past the tile's own columns is not read: of a network's last tiles that is most.
+    reads, inside = lane < input_columns, lane < gradient_columns
     inputs += network.to(tl.int64) * num_rows * INPUTS + first_input
     slopes += network.to(tl.int64) * num_rows * GRADIENTS + first_gradient
     acc = tl.zeros((TILE, TILE), dtype=tl.float32)
@@ -301,12 +302,12 @@ def weight_gradients(
     one = (tl.arange(0, 16)[None, :] == row[:, None] * 0).to(inputs.dtype.element_ty)
     for first in tl.range(0, ROWS, DEPTH, num_stages=TILE_STAGES):
         rows = (split * ROWS + first + row)[:, None]
-        layer_input = tl.load(inputs + (rows * INPUTS + lane[None, :]), mask=rows < num_rows, other=0.0)
-        gradient = tl.load(slopes + (rows * GRADIENTS + lane[None, :]), mask=rows < num_rows, other=0.0)
+        valid = rows < num_rows
+        layer_input = tl.load(inputs + (rows * INPUTS + column), mask=valid & reads[None, :], other=0.0)
+        gradient = tl.load(slopes + (rows * GRADIENTS + column), mask=valid & inside[None, :], other=0.0)
         acc = tl.dot(tl.trans(gradient), layer_input, acc)
         sums = tl.dot(tl.trans(gradient), one, sums)
     weight_partials += (split * 2 + network).to(tl.int64) * NUM_PADDED
-    inside = lane < gradient_columns
-    keep = inside[:, None] & (lane[None, :] < input_columns)
-    tl.store(weight_partials + place + (lane[:, None] * stride + lane[None, :]), acc, mask=keep)
+    keep = inside[:, None] & reads[None, :]
+    tl.store(weight_partials + place + (lane[:, None] * stride + column), acc, mask=keep)
     tl.store(weight_partials + bias + lane, tl.sum(sums, 1), mask=inside & (bias >= 0))

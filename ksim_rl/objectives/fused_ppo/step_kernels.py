@@ -27,7 +27,7 @@ LOSS = tl.constexpr(SUMMARY.index("loss"))
 LEARNING_RATE = tl.constexpr(SUMMARY.index("learning_rate"))
 GRAD_NORM = tl.constexpr(SUMMARY.index("grad_norm"))
 LOSS_MIRROR = tl.constexpr(SUMMARY.index("loss_mirror"))
-# Behind it stands which share of the rows of all ranks took part on this one.
+# Behind it stands which share of all ranks' rows took part: those of this rank, and once these are added up, all.
 SHARE = tl.constexpr(len(SUMMARY))
 # As in TorchRL's explained variance: the resolution of float32.
 EPS = tl.constexpr(1.1920929e-07)
@@ -46,19 +46,18 @@ def _block_sums(
 
 
 @triton.jit
-def _variance(
-    partials, sum_at, count_at, mean, count, WIDTH: tl.constexpr, BLOCKS: tl.constexpr, ROWS: tl.constexpr
-):
-    # Of each block: how many, their sum, and their sum of squares about its own mean (Chan et al., 1979).
-    squares = tl.zeros((ROWS,), dtype=tl.float32)
-    for first in range(0, BLOCKS, ROWS):
-        block = first + tl.arange(0, ROWS)
-        keep = block < BLOCKS
-        row = partials + block * 2 * WIDTH
-        size = tl.load(row + count_at, mask=keep, other=0.0)
-        gap = tl.load(row + sum_at, mask=keep, other=0.0) / tl.maximum(size, 1.0) - mean
-        squares += tl.load(row + (sum_at + 1), mask=keep, other=0.0) + size * gap * gap
-    return tl.sum(squares) / count
+def _merged(count, mean, squares, size, total, own):
+    # With `size` more numbers, of which there are the sum and that of squares about their mean (Chan et al., 1979).
+    share = size / tl.maximum(count + size, 1.0)
+    gap = total / tl.maximum(size, 1.0) - mean
+    return mean + gap * share, squares + own + gap * gap * count * share
+
+
+@triton.jit
+def _variance(count, mean, squares):
+    number = tl.maximum(tl.sum(count), 1.0)
+    gap = mean - tl.sum(count * mean) / number
+    return tl.sum(squares + count * gap * gap) / number
 
 
 @triton.jit
@@ -81,29 +80,24 @@ def _adapt(learning_rate, kl, desired_kl, bounds, ADAPTIVE: tl.constexpr):
 @triton.jit
 def sum_gradients(
     weight_partials, block_partials, gradients, squares, biases, learning_rate, summary, num_rows,
-    entropy_coeff, critic_coeff, desired_kl, rate_bounds,
+    critic_coeff, desired_kl, rate_bounds,
     RANKS: tl.constexpr, SPLITS: tl.constexpr, BLOCKS: tl.constexpr,
     NUM_PADDED: tl.constexpr, NUM_BIASES: tl.constexpr, NUM_STATISTICS: tl.constexpr,
     ACTIONS: tl.constexpr, OUT: tl.constexpr, LOG_STD: tl.constexpr, MIN_STD: tl.constexpr,
     STATE_STD: tl.constexpr, MIRROR: tl.constexpr, ADAPTIVE: tl.constexpr,
     SIZE: tl.constexpr, ROWS: tl.constexpr,
 ):  # fmt: skip
-    """Add up what splits and blocks left, divide by the number of env states, and adapt the learning rate.
+    """Add up what splits and blocks left, divide by the number of rows of all ranks, and adapt the learning rate.
 
-    The first programs take SIZE weights and biases each, and leave mean gradients [2, NUM_PADDED] and the sum of their
-    squares; the last takes the std and the loss's statistics. Ranks multiply all by their SHARE.
+    The first programs take SIZE weights and biases each, and leave their gradients [2, NUM_PADDED] and the sum of their
+    squares; two more take the std and the statistics of the policy's loss, and those of the value's. That gradients are
+    means of only a SHARE of the rows is left to who reads them, so that no program waits for the count.
     """
     PROGRAMS: tl.constexpr = (NUM_PADDED + SIZE - 1) // SIZE
     STD_AT: tl.constexpr = NUM_PADDED - OUT
     WIDTH: tl.constexpr = OUT + NUM_STATISTICS
     program = tl.program_id(0)
-    statistic = tl.arange(0, NUM_STATISTICS)
-    # The first statistic of both networks is the number of env states that take part. It may be none.
-    of_policy = statistic < (6 if STATE_STD or MIRROR else 4)
-    sums = _block_sums(block_partials, OUT + statistic, of_policy, WIDTH, BLOCKS, ROWS, NUM_STATISTICS)
-    counted = _column(sums, 0, NUM_STATISTICS)
-    count = tl.maximum(counted, 1.0)
-    divisor = count if RANKS == 1 else num_rows * (1.0 * RANKS)
+    divisor = num_rows * (1.0 * RANKS)
     if program < 2 * PROGRAMS:
         network = program // PROGRAMS
         at = (program % PROGRAMS) * SIZE + tl.arange(0, SIZE)
@@ -115,51 +109,54 @@ def sum_gradients(
         total = total / divisor
         tl.store(gradients + (network * NUM_PADDED + at), total, mask=kept)
         tl.store(squares + program, tl.sum(total * total))
-    else:
+    elif program == 2 * PROGRAMS:
         output = tl.arange(0, OUT)
+        column = tl.arange(0, NUM_STATISTICS)
+        sums = _block_sums(block_partials, OUT + column, column < 6, WIDTH, BLOCKS, ROWS, NUM_STATISTICS)
         if not STATE_STD:
             d_std = _block_sums(block_partials, output, output >= 0, WIDTH, BLOCKS, ROWS, OUT) / divisor
             tl.store(gradients + STD_AT + output, d_std)
             tl.store(squares + program, tl.sum(d_std * d_std))
-        policy = sums / count
-        of_value = statistic < 6
-        value_sums = _block_sums(
-            block_partials + WIDTH, OUT + statistic, of_value, WIDTH, BLOCKS, ROWS, NUM_STATISTICS
-        )
-        value = value_sums / count
-        objective = _column(policy, 1, NUM_STATISTICS)
+        # How many env states take part. It may be none.
+        counted = _column(sums, 0, NUM_STATISTICS)
+        number = tl.maximum(counted, 1.0) if RANKS == 1 else divisor
+        policy = sums / number
         kl = _column(policy, 2, NUM_STATISTICS)
-        critic = critic_coeff * _column(value, 1, NUM_STATISTICS)
-        target = _column(value, 2, NUM_STATISTICS)
-        error = _column(value, 4, NUM_STATISTICS)
-        of_values = block_partials + WIDTH
-        target_variance = _variance(of_values, OUT + 2, OUT, target, count, WIDTH, BLOCKS, ROWS)
-        error_variance = _variance(of_values, OUT + 4, OUT, error, count, WIDTH, BLOCKS, ROWS)
         if STATE_STD:
             entropy = _column(policy, 4, NUM_STATISTICS)
         else:
-            raw = tl.load(
-                biases + (NUM_BIASES - OUT + output), mask=output < ACTIONS, other=0.0 if LOG_STD else 1.0
-            )
+            acts = output < ACTIONS
+            raw = tl.load(biases + (NUM_BIASES - OUT + output), mask=acts, other=0.0 if LOG_STD else 1.0)
             std = tl.maximum(tl.exp(raw) if LOG_STD else raw, MIN_STD)
-            entropy = tl.sum(tl.where(output < ACTIONS, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0))
-        alone: tl.constexpr = ADAPTIVE and RANKS == 1
-        rate = _adapt(learning_rate, kl, desired_kl, rate_bounds, alone)
-        share = counted / divisor  # zero, as all means, where no env state takes part
-        tl.store(summary + SHARE, share)
-        tl.store(summary, objective * share)
-        tl.store(summary + 1, critic * share)
-        tl.store(summary + 2, entropy * share)
-        tl.store(summary + 3, kl * share)
-        tl.store(summary + 4, _column(policy, 3, NUM_STATISTICS) * share)
-        tl.store(summary + 5, (1.0 - error_variance / (target_variance + EPS)) * share)
-        loss = objective + critic - entropy_coeff * entropy
+            entropy = tl.sum(tl.where(acts, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0)) * (counted / number)
+        tl.store(summary + SHARE, counted / divisor)
+        tl.store(summary, _column(policy, 1, NUM_STATISTICS))
+        tl.store(summary + 2, entropy)
+        tl.store(summary + 3, kl)
+        tl.store(summary + 4, _column(policy, 3, NUM_STATISTICS))
         if MIRROR:
-            mirror = _column(policy, 5, NUM_STATISTICS)
-            tl.store(summary + LOSS_MIRROR, mirror * share)
-            loss += mirror
-        tl.store(summary + LOSS, loss * share)
-        tl.store(summary + LEARNING_RATE, rate)
+            tl.store(summary + LOSS_MIRROR, _column(policy, 5, NUM_STATISTICS))
+        alone: tl.constexpr = ADAPTIVE and RANKS == 1
+        tl.store(summary + LEARNING_RATE, _adapt(learning_rate, kl, desired_kl, rate_bounds, alone))
+    else:
+        count = tl.zeros((ROWS,), dtype=tl.float32)
+        loss, target, error, target_squares, error_squares = count, count, count, count, count
+        for first in range(0, BLOCKS, ROWS):
+            block = first + tl.arange(0, ROWS)
+            keep = block < BLOCKS
+            row = block_partials + (block * 2 * WIDTH + WIDTH + OUT)
+            size = tl.load(row, mask=keep, other=0.0)
+            loss += tl.load(row + 1, mask=keep, other=0.0)
+            total, own = tl.load(row + 2, mask=keep, other=0.0), tl.load(row + 3, mask=keep, other=0.0)
+            target, target_squares = _merged(count, target, target_squares, size, total, own)
+            total, own = tl.load(row + 4, mask=keep, other=0.0), tl.load(row + 5, mask=keep, other=0.0)
+            error, error_squares = _merged(count, error, error_squares, size, total, own)
+            count += size
+        counted = tl.sum(count)
+        number = tl.maximum(counted, 1.0) if RANKS == 1 else divisor
+        left = _variance(count, error, error_squares) / (_variance(count, target, target_squares) + EPS)
+        tl.store(summary + 1, critic_coeff * tl.sum(loss) / number)
+        tl.store(summary + 5, (1.0 - left) * (counted / number))
 
 
 @triton.jit
@@ -167,19 +164,19 @@ def take_means(
     gradients, squares, learning_rate, summary, desired_kl, rate_bounds,
     NUM_GRADIENTS: tl.constexpr, ADAPTIVE: tl.constexpr, SIZE: tl.constexpr,
 ):  # fmt: skip
-    """Make means, and sums of squares, of what `sum_gradients` left, added up over ranks; adapt the learning rate."""
+    """Take squares and means of what `sum_gradients` left, added up over ranks, and adapt the learning rate."""
     sums = gradients + NUM_GRADIENTS
-    share = tl.maximum(tl.load(sums + SHARE), 1e-30)  # all sums are zero where no env state takes part
     at = tl.program_id(0) * SIZE + tl.arange(0, SIZE)
-    mean = tl.load(gradients + at, mask=at < NUM_GRADIENTS, other=0.0) / share
-    tl.store(gradients + at, mean, mask=at < NUM_GRADIENTS)
-    tl.store(squares + tl.program_id(0), tl.sum(mean * mean))
+    gradient = tl.load(gradients + at, mask=at < NUM_GRADIENTS, other=0.0)
+    tl.store(squares + tl.program_id(0), tl.sum(gradient * gradient))
     if tl.program_id(0) == 0:
-        kl = tl.load(sums + 3) / share
-        rate = _adapt(learning_rate, kl, desired_kl, rate_bounds, ADAPTIVE)
+        share = tl.load(sums + SHARE)
+        scale = 1.0 / tl.maximum(share, 1e-30)  # all sums are zero where no env state takes part
+        rate = _adapt(learning_rate, tl.load(sums + 3) * scale, desired_kl, rate_bounds, ADAPTIVE)
         column = tl.arange(0, SIZE)
-        means = tl.load(sums + column, mask=column < SHARE) / share
+        means = tl.load(sums + column, mask=column < SHARE) * scale
         tl.store(summary + column, tl.where(column == LEARNING_RATE, rate, means), mask=column < SHARE)
+        tl.store(summary + SHARE, share)
 
 
 # One kernel for all steps, whose places are not all whole numbers of 16 bytes.
@@ -187,23 +184,31 @@ def take_means(
 def adam_step(
     parameters, means, variances, places, gradients, weights, exact_weights, squares, summary,
     steps, skipped, skipped_in_a_row,
-    beta1, beta2, log_beta1, log_beta2, adam_eps, weight_decay, max_grad_norm,
+    beta1, beta2, log_beta1, log_beta2, adam_eps, weight_decay, max_grad_norm, entropy_coeff,
     SIZE: tl.constexpr, NUM_SQUARES: tl.constexpr, SQUARES: tl.constexpr, CLIP: tl.constexpr,
     TF32: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Make one step of Adam (Kingma and Ba, arXiv 1412.6980), as torch's, on the clipped gradient.
 
-    If the norm of the gradient, from its NUM_SQUARES partial `squares`, or the loss is not finite, nothing changes but
-    the counters of skipped steps. Parameters, means and variances are in flat form, [SIZE]; `places` leads from it to
-    the padded form of gradients and of the weights, in the dtype of the products and exact, which follow the
-    parameters. The norm and whether the step was skipped are added to the `summary` of this step, and the number of
-    steps made after it is written behind that before it.
+    Gradients and NUM_SQUARES partial `squares`, divided by the SHARE of the rows, are means. If the norm or the loss is
+    not finite, nothing changes but the counters of skipped steps. Parameters, means and variances are in flat form,
+    [SIZE] and zeros that fill the last program; `places` leads from it to the padded form of gradients and of the
+    weights, in the dtype of the products and exact, which follow the parameters. Loss, norm and whether the step was
+    skipped go to the `summary` of this step, and the number of steps made after it behind that before it.
     """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = at < SIZE
+    # What is far away is asked for before threads wait for each other.
+    place = tl.load(places + at)
+    parameter = tl.load(parameters + at)
+    mean = tl.load(means + at)
+    variance = tl.load(variances + at)
+    gradient = tl.load(gradients + place, mask=inside, other=0.0)
     square_at = tl.arange(0, SQUARES)
-    norm = tl.sqrt(tl.sum(tl.load(squares + square_at, mask=square_at < NUM_SQUARES, other=0.0)))
-    loss = tl.load(summary + LOSS)
+    share = tl.maximum(tl.load(summary + SHARE), 1e-30)  # all is zero where no env state takes part
+    norm = tl.sqrt(tl.sum(tl.load(squares + square_at, mask=square_at < NUM_SQUARES, other=0.0))) / share
+    loss = tl.load(summary) + tl.load(summary + 1) + tl.load(summary + LOSS_MIRROR)
+    loss -= entropy_coeff * tl.load(summary + 2)
     rate = tl.load(summary + LEARNING_RATE)
     step = tl.load(steps)
     made = (norm < float("inf")) & (tl.abs(loss) < float("inf"))
@@ -212,21 +217,15 @@ def adam_step(
     correction1 = (1.0 - tl.exp(steps_made * log_beta1)).to(tl.float32)
     correction2 = (1.0 - tl.exp(steps_made * log_beta2)).to(tl.float32)
 
-    place = tl.load(places + at, mask=inside, other=0)
-    parameter = tl.load(parameters + at, mask=inside, other=0.0)
-    mean = tl.load(means + at, mask=inside, other=0.0)
-    variance = tl.load(variances + at, mask=inside, other=0.0)
-    gradient = tl.load(gradients + place, mask=inside, other=0.0)
-    if CLIP:
-        gradient = gradient * tl.minimum(max_grad_norm / (norm + 1e-6), 1.0)
+    gradient = gradient / share * (tl.minimum(max_grad_norm / (norm + 1e-6), 1.0) if CLIP else 1.0)
     gradient += weight_decay * parameter
     new_mean = mean + (gradient - mean) * (1.0 - beta1)
     new_variance = beta2 * variance + (1.0 - beta2) * gradient * gradient
     change = (rate / correction1) * new_mean / (tl.sqrt(new_variance) / tl.sqrt(correction2) + adam_eps)
     parameter = tl.where(made, parameter - change, parameter)
-    tl.store(parameters + at, parameter, mask=inside)
-    tl.store(means + at, tl.where(made, new_mean, mean), mask=inside)
-    tl.store(variances + at, tl.where(made, new_variance, variance), mask=inside)
+    tl.store(parameters + at, parameter)
+    tl.store(means + at, tl.where(made, new_mean, mean))
+    tl.store(variances + at, tl.where(made, new_variance, variance))
     tl.store(weights + place, operand(parameter, weights.dtype.element_ty, TF32), mask=inside)
     tl.store(exact_weights + place, parameter, mask=inside)
     if tl.program_id(0) == 0:
@@ -235,6 +234,7 @@ def adam_step(
         tl.store(skipped, tl.load(skipped) + miss)
         tl.store(skipped_in_a_row, in_a_row)
         tl.store(steps + 1, tl.where(made, step + 1.0, step))
+        tl.store(summary + LOSS, loss)
         tl.store(summary + GRAD_NORM, norm)
         tl.store(summary + GRAD_NORM + 1, miss.to(tl.float32))
         tl.store(summary + GRAD_NORM + 2, in_a_row.to(tl.float32))
