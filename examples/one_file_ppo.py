@@ -21,9 +21,9 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
-from torch import nn
 
 from ksim_rl import envs
+from ksim_rl.algorithms.ppo.fused import fused_networks
 from ksim_rl.collectors import CollectorCfg, RolloutCollector
 from ksim_rl.data import DatasetBuffer, DatasetCfg
 from ksim_rl.device.capture import Captured
@@ -36,7 +36,6 @@ from ksim_rl.modules import (
     observation_dim,
     update_normalizers,
 )
-from ksim_rl.modules.actor import MIN_STD
 from ksim_rl.objectives import (
     PPOCfg,
     StepGuard,
@@ -47,7 +46,7 @@ from ksim_rl.objectives import (
     ppo_step,
     with_precision_of,
 )
-from ksim_rl.objectives.fused_ppo import FusedNetworks, why_not_fused
+from ksim_rl.objectives.fused_ppo import why_not_fused
 
 # ---- settings ------------------------------------------------------------------------------------------------------
 
@@ -168,41 +167,16 @@ def make_fused(settings: Settings, ppo: PPO) -> Any:
     """Return the fused kernels for the gradient steps, or None where they do not fit the networks."""
     if importlib.util.find_spec("triton") is None:
         return None
-    policy: Any = ppo.actor[0].module
-    value: Any = ppo.critic.module
-    plain = settings.actor.distribution == "gaussian" and not settings.actor.state_dependent_std
-    if not plain or {settings.actor.activation, settings.critic.activation} != {"elu"}:
-        return None
-    networks = FusedNetworks(
-        actor=[*linear_layers(policy.trunk), policy.head.loc],
-        critic=linear_layers(value.layers),
-        std_A=policy.head.std,
-        log_std=settings.actor.std_type == "log",
-        min_std=MIN_STD,
-    )
-    data = settings.data
+    networks, data = fused_networks(ppo.actor, ppo.critic), settings.data
     sizes: Any = {
         "num_env_states_per_minibatch": data.num_env_states_per_minibatch,
         "num_minibatches": data.num_minibatches,
     }
-    if why_not_fused(settings.objective, networks, **sizes) is not None:
+    if isinstance(networks, str) or why_not_fused(settings.objective, networks, **sizes) is not None:
         return None
     from ksim_rl.objectives.fused_ppo.fused_ppo import FusedPPO
 
-    return FusedPPO(
-        settings.objective,
-        networks,
-        observe_actor=lambda td: policy.observe(*(td.get(key) for key in settings.actor.in_keys)),
-        observe_critic=lambda td: value.observe(*(td.get(key) for key in settings.critic.in_keys)),
-        optimizer=ppo.optimizer,
-        guard=ppo.guard,
-        **sizes,
-    )
-
-
-def linear_layers(network: nn.Sequential) -> list[nn.Linear]:
-    """Return the linear layers of an MLP."""
-    return [layer for layer in network if isinstance(layer, nn.Linear)]
+    return FusedPPO(settings.objective, networks, optimizer=ppo.optimizer, guard=ppo.guard, **sizes)
 
 
 # ---- the loop ------------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 import importlib.util
 from pathlib import Path
 
+import pytest
 import torch
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "one_file_ppo.py"
@@ -41,6 +42,16 @@ def test_settings_are_the_tasks_but_for_what_is_given():
     assert (settings.num_envs, settings.data.num_env_states, settings.objective.num_epochs) == (16, 256, 2)
     assert settings.actor.hidden_dims == (16, 16) and settings.critic.hidden_dims == (64, 64)
     assert settings.objective.clip_value is False
+
+
+def test_its_networks_fit_the_fused_kernels():
+    pytest.importorskip("triton")
+    from ksim_rl import envs
+
+    example = _example()
+    settings = example.read_settings([*SMALL, "objective.precision='bfloat16'"])
+    env = envs.make(settings.task, num_envs=settings.num_envs, seed=settings.seed)
+    assert example.make_fused(settings, example.PPO(settings, env)) is not None
 
 
 def test_an_update_changes_the_networks_as_the_trainers_update_does():
