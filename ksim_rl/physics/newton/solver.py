@@ -142,8 +142,9 @@ def step(
     The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
     not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel; `make_rows`,
     which needs it, the constraint rows as one, with the lists of contacts that `contacts` reads; and `integrate` what
-    advances the state. `collide` is a collision pass other than MuJoCo Warp's. On a stream `aside`, dynamics go on
-    beside that pass and the solver's order of the worlds, by the last substep; then it solves beside some sensors.
+    advances the state. `collide` is a collision pass other than MuJoCo Warp's. On a stream `aside`, the solver orders
+    the worlds, by the last substep, and dynamics of few worlds go on beside that pass; then it solves beside some
+    sensors.
     """
     m, d = warp_model, warp_data_E
     if dynamics is None or m.callback.sensor:
@@ -154,11 +155,13 @@ def step(
         if contacts is not None:
             contacts.list()
     else:
-        with beside(aside, partial(dynamics, places_geoms=False)):
-            dynamics(goes_on=False)
+        # Where dynamics alone fill a GPU, placing bodies twice, for collisions first, takes longer than it saves.
+        at_once = aside is not None and d.nworld <= FEW_WORLDS
+        rest = [partial(dynamics, places_geoms=False)] if at_once else []
+        with beside(aside, partial(solve, solves=False), *rest):
+            dynamics(goes_on=not at_once)
             if m.opt.run_collision_detection:
                 collide() if collide is not None else mjw.collision(m, d)
-            solve(solves=False)
         if make_rows is None:
             mjw.make_constraint(m, d)
         else:

@@ -29,7 +29,7 @@ LANES, CUDA_THREADS = (8, 16, 32), 32
 FEW_WORLDS, LANES_OF_FEW = 8192, {SMOOTH: 16, INTEGRATION: 32}
 # Whether it writes where geoms are, goes on after that, and after the velocities to the inertia matrix and the forces,
 # and whether others than a substep read what it writes. Or else it sums momenta of subtrees there, takes the worlds of
-# a mask alone, or empties the pool of contacts where it does not go on.
+# a mask alone, or empties the pool of contacts where it places geoms.
 WHOLE = {
     **dict.fromkeys(("places_geoms", "goes_on", "forces_too", "is_read"), True),
     **dict.fromkeys(("sums_momenta", "masked", "empties_pool"), False),
