@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Callable, Hashable, Sequence
+from functools import partial
 from typing import Literal, get_args
 
 import mujoco
@@ -164,7 +165,7 @@ class World(views.DataViews):
         those of contacts on every one; or all on every one.
         Hooks are called, in order, before each substep (such as a motor model that writes `ctrl`) and after it, when
         `refresh` has not run: `qpos` and `qvel` are those of the state reached, poses and sensors those that the
-        substep computed on its way. With hooks the substeps are launches of their own, with the hooks' torch work in
+        substep computed on its way, or with "contacts" nothing else but contact sensors until the last. With hooks the substeps are launches of their own, with the hooks' torch work in
         between; without, all of them are one. Inside an outer capture both become part of its graph.
         """
         if n < 1:
@@ -177,7 +178,8 @@ class World(views.DataViews):
                 for hook in before:
                     hook()
                 which = self._sensors_of(substep, n, sensors)
-                self._graphs.run(("substep", which), lambda which=which: self._launch_substep(which))
+                launch = partial(self._launch_substep, which, is_last=which != "contacts")
+                self._graphs.run(("substep", which), launch)
                 for hook in after:
                     hook()
         if self._nan_guard is not None:
