@@ -134,8 +134,9 @@ class Substeps:
             empties_pool = self._collide is not None and m.opt.run_collision_detection
             dynamics = partial(dynamics, is_read=is_read, empties_pool=empties_pool)
         stages = self._solve, dynamics, self._make_rows, self._contacts, self._integrate
-        senses = sensors != "none" or self._always_senses
-        newton.step(m, self.warp_data_E, *stages, self._aside, self._collide, sensors=senses, is_read=is_read)
+        wanted = {"sensors": sensors != "none", "accelerometers": sensors != "contacts"}
+        wanted = {name: holds or self._always_senses for name, holds in wanted.items()}
+        newton.step(m, self.warp_data_E, *stages, self._aside, self._collide, **wanted)
 
     def refresh(self, *, masked: bool = False) -> None:
         """Launch what recomputes position- and velocity-stage quantities from the present qpos and qvel.

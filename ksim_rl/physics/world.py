@@ -165,8 +165,9 @@ class World(views.DataViews):
         those of contacts on every one; or all on every one.
         Hooks are called, in order, before each substep (such as a motor model that writes `ctrl`) and after it, when
         `refresh` has not run: `qpos` and `qvel` are those of the state reached, poses and sensors those that the
-        substep computed on its way, or with "contacts" nothing else but contact sensors until the last. With hooks the substeps are launches of their own, with the hooks' torch work in
-        between; without, all of them are one. Inside an outer capture both become part of its graph.
+        substep computed on its way; until the last, "contacts" leaves out all but contact sensors. With hooks the
+        substeps are launches of their own, with the hooks' torch work in between; without, all of them are one. Inside
+        an outer capture both become part of its graph.
         """
         if n < 1:
             raise ValueError(f"n={n}: expected at least 1 substep")

@@ -136,7 +136,7 @@ def step(
     collide: Callable[[], None] | None = None,
     *,
     sensors: bool,
-    is_read: bool = True,
+    accelerometers: bool = True,
 ) -> None:
     """Launch a physics step: that of MuJoCo Warp, with this solver.
 
@@ -145,7 +145,7 @@ def step(
     which needs it, the constraint rows as one, with the lists of contacts that `contacts` reads; and `integrate` what
     advances the state. `collide` is a collision pass other than MuJoCo Warp's. On a stream `aside`, the solver orders
     the worlds, by the last substep, and dynamics of few worlds go on beside that pass; then it solves beside some
-    sensors. Without `is_read` dynamics leave out what accelerometers read, which are not read then.
+    sensors, of which `contacts` leaves out `accelerometers` where they are not wanted.
     """
     m, d = warp_model, warp_data_E
     if dynamics is None or m.callback.sensor:
@@ -190,7 +190,7 @@ def step(
         mjw.rne_postconstraint(m, d)
     if sensors:
         if contacts is not None:
-            contacts.read_sensors(accelerometers=is_read)
+            contacts.read_sensors(accelerometers=accelerometers)
         mjw.sensor_acc(m, d, skip_rne_postconstraint=True)
     if integrate is not None:
         integrate()
