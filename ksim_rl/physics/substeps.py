@@ -126,10 +126,10 @@ class Substeps:
         m.opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
         if sensors in ("kept", "all"):
             m.sensor_rne_postconstraint |= self.refreshed_on_demand >= FORCES_OF_BODIES
-        is_read = is_last or sensors in ("kept", "all") or self._always_senses or m.opt.run_rne_postconstraint
+        # Contact sensors that we do not read may be of sites.
+        is_read = m.sensor_contact_acc_adr.size > 0 if sensors == "contacts" else is_last or sensors != "none"
+        is_read |= self._always_senses or m.opt.run_rne_postconstraint
         is_read |= self._make_rows is None or self._integrate is None
-        # Those that we do not read may be of sites.
-        is_read |= sensors == "contacts" and m.sensor_contact_acc_adr.size > 0
         if dynamics is not None:
             empties_pool = self._collide is not None and m.opt.run_collision_detection
             dynamics = partial(dynamics, is_read=is_read, empties_pool=empties_pool)

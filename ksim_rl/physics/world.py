@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Callable, Hashable, Sequence
-from functools import partial
 from typing import Literal, get_args
 
 import mujoco
@@ -162,12 +161,11 @@ class World(views.DataViews):
         """Advance all worlds by `n` substeps under the present `ctrl`.
 
         Sensors are computed on the last one, but for those that `refresh` computes, which read zero until then; with
-        those of contacts on every one; or all on every one.
-        Hooks are called, in order, before each substep (such as a motor model that writes `ctrl`) and after it, when
-        `refresh` has not run: `qpos` and `qvel` are those of the state reached, poses and sensors those that the
-        substep computed on its way; until the last, "contacts" leaves out all but contact sensors. With hooks the
-        substeps are launches of their own, with the hooks' torch work in between; without, all of them are one. Inside
-        an outer capture both become part of its graph.
+        those of contacts on every one, which until the last computes nothing else; or all on every one. Hooks are
+        called, in order, before each substep (such as a motor model that writes `ctrl`) and after it, when `refresh`
+        has not run: `qpos` and `qvel` are those of the state reached, poses and sensors those that the substep computed
+        on its way. With hooks the substeps are launches of their own, with the hooks' torch work in between; without,
+        all of them are one. Inside an outer capture both become part of its graph.
         """
         if n < 1:
             raise ValueError(f"n={n}: expected at least 1 substep")
@@ -179,8 +177,7 @@ class World(views.DataViews):
                 for hook in before:
                     hook()
                 which = self._sensors_of(substep, n, sensors)
-                launch = partial(self._launch_substep, which, is_last=which != "contacts")
-                self._graphs.run(("substep", which), launch)
+                self._graphs.run(("substep", which), lambda which=which: self._launch_substep(which))
                 for hook in after:
                     hook()
         if self._nan_guard is not None:

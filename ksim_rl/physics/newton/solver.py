@@ -9,6 +9,7 @@ import warp as wp
 
 from ksim_rl.device.streams import beside
 from ksim_rl.physics.contact_sensors import ContactReadings
+from ksim_rl.physics.native import FEW_WORLDS
 from ksim_rl.physics.newton.kernel import CUDA_LANES, launcher, layout, put_longest_first
 from ksim_rl.physics.newton.limbs import limbs_of
 from ksim_rl.physics.sim_cfg import SimCfg
@@ -17,12 +18,13 @@ from ksim_rl.physics.sim_cfg import SimCfg
 SHARED_FLOATS = 48 * 1024 // 4
 # What a world may have of a multiprocessor's shared memory: ten such worlds live there at once. On an H200 a prototype
 # took 212 us for 4096 worlds of G1; with 5600 floats (nine worlds) 217, with room for twelve 222 and for thirteen 237.
-FLOATS_PER_WORLD = 5536
+# Of many worlds twelve do, if an eighth of the rows fit: 1850 us instead of 1901 for 32768.
+FLOATS_PER_WORLD, FLOATS_OF_MANY = 5536, 4400
 # A multiprocessor has 228 KiB of shared memory, of which each block takes another KiB, and in each quarter, where
 # warps stay, 512 registers for a lane. With 72 of them as many worlds of Go1 run at once as the memory lets, 28. With
 # 96 only 20 do, and fewer values lie in memory meanwhile, which is faster where most worlds run at once anyway (H200,
 # 4096 worlds: 119 us, 125 with 72; 32768: 776 and 722). Where more than 128 are left, there is no need of a bound.
-SHARED_BYTES, LEAST_REGISTERS, MOST_REGISTERS, FEW_WORLDS = 228 * 1024, (96, 72), 128, 8192
+SHARED_BYTES, LEAST_REGISTERS, MOST_REGISTERS = 228 * 1024, (96, 72), 128
 MOST_DOFS = 64
 # MuJoCo Warp's solver ends its loop by a conditional node, which costs more than the few iterations that it saves
 # (H200, 4096 worlds, at most 10 iterations: Go1 8.22 ms without and 8.46 with it, G1 9.88 and 10.17).
@@ -99,7 +101,8 @@ def solver(
     sizes = layout(m.nv, d.njmax, limbs, elliptic=elliptic, rows_on_chip=0)
     stride, narrow = sizes["STRIDE"], sizes["NARROW"]
     if rows_on_chip is None:
-        room = FLOATS_PER_WORLD - sizes["FLOATS"]
+        is_tight = d.nworld > FEW_WORLDS and sizes["FLOATS"] + d.njmax // 8 * narrow <= FLOATS_OF_MANY
+        room = (FLOATS_OF_MANY if is_tight else FLOATS_PER_WORLD) - sizes["FLOATS"]
         rows_on_chip = min(-(-d.njmax // 2), max(0, room // narrow)) if on_cuda else d.njmax
     sizes = layout(m.nv, d.njmax, limbs, elliptic=elliptic, rows_on_chip=rows_on_chip)
     far_floats = (d.njmax - rows_on_chip * narrow // stride) * stride
