@@ -24,9 +24,8 @@ def follow_the_c_engine(warp_model: mjw.Model) -> None:
         hooks.append(align_steep_capsules)
     if hooks:
         # MuJoCo Warp calls it after its own collision pass.
-        warp_model.callback.contactfilter = (
-            hooks[0] if len(hooks) == 1 else lambda m, d: [f(m, d) for f in hooks]
-        )
+        every = hooks[0] if len(hooks) == 1 else lambda m, d: [hook(m, d) for hook in hooks]
+        warp_model.callback.contactfilter = every
 
 
 def align_steep_capsules(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:

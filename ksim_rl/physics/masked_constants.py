@@ -90,12 +90,8 @@ class MaskedConstants:
             return
         if self._moves:
             wp.launch(kernels.frames, dim=self._num_envs, inputs=[self._constants])
-        wp.launch(
-            self._kernel,
-            dim=(self._num_envs, self._lanes),
-            inputs=[self._constants, groups],
-            block_dim=self._lanes,
-        )
+        dim, inputs = (self._num_envs, self._lanes), [self._constants, groups]
+        wp.launch(self._kernel, dim=dim, inputs=inputs, block_dim=self._lanes)
 
 
 def _drives_scalar_joints(mj_model: mujoco.MjModel) -> bool:

@@ -14,6 +14,7 @@ import warp as wp
 
 from ksim_rl.physics.structs import filled, values_of
 
+FEW_WORLDS = 8192  # more fill a GPU with fewer lanes each
 _ARRAYS = {1: wp.array, 2: wp.array2d, 3: wp.array3d}
 
 

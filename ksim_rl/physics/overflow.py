@@ -94,10 +94,8 @@ class OverflowRecord:
         sizes = {"sticky": warp_data_E.nworld, "most_nefc": warp_data_E.nworld, "most_pool": 2}
         self.arrays = {name: wp.zeros(size, dtype=int) for name, size in sizes.items()}
         self.sticky_E, self.most_nefc_E, self.most_pool = map(wp.to_torch, self.arrays.values())
-        source = native.source_of("smooth", ("record",))
-        self.record = native.launcher(
-            source, {}, self.arrays, warp_model, warp_data_E, lanes=1, threads=threads
-        )
+        given = native.source_of("smooth", ("record",)), {}, self.arrays, warp_model, warp_data_E
+        self.record = native.launcher(*given, lanes=1, threads=threads)
 
     def clear(self) -> None:
         """Start the next period."""

@@ -126,14 +126,17 @@ class Substeps:
         m.opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
         if sensors in ("kept", "all"):
             m.sensor_rne_postconstraint |= self.refreshed_on_demand >= FORCES_OF_BODIES
-        is_read = is_last or sensors != "none" or self._always_senses or m.opt.run_rne_postconstraint
+        # Contact sensors that we do not read may be of sites.
+        is_read = m.sensor_contact_acc_adr.size > 0 if sensors == "contacts" else is_last or sensors != "none"
+        is_read |= self._always_senses or m.opt.run_rne_postconstraint
         is_read |= self._make_rows is None or self._integrate is None
         if dynamics is not None:
             empties_pool = self._collide is not None and m.opt.run_collision_detection
             dynamics = partial(dynamics, is_read=is_read, empties_pool=empties_pool)
         stages = self._solve, dynamics, self._make_rows, self._contacts, self._integrate
-        senses = sensors != "none" or self._always_senses
-        newton.step(m, self.warp_data_E, *stages, self._aside, self._collide, sensors=senses)
+        wanted = {"sensors": sensors != "none", "accelerometers": sensors != "contacts"}
+        wanted = {name: holds or self._always_senses for name, holds in wanted.items()}
+        newton.step(m, self.warp_data_E, *stages, self._aside, self._collide, **wanted)
 
     def refresh(self, *, masked: bool = False) -> None:
         """Launch what recomputes position- and velocity-stage quantities from the present qpos and qvel.

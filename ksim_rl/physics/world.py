@@ -161,11 +161,11 @@ class World(views.DataViews):
         """Advance all worlds by `n` substeps under the present `ctrl`.
 
         Sensors are computed on the last one, but for those that `refresh` computes, which read zero until then; with
-        those of contacts on every one; or all on every one.
-        Hooks are called, in order, before each substep (such as a motor model that writes `ctrl`) and after it, when
-        `refresh` has not run: `qpos` and `qvel` are those of the state reached, poses and sensors those that the
-        substep computed on its way. With hooks the substeps are launches of their own, with the hooks' torch work in
-        between; without, all of them are one. Inside an outer capture both become part of its graph.
+        those of contacts on every one, which until the last computes nothing else; or all on every one. Hooks are
+        called, in order, before each substep (such as a motor model that writes `ctrl`) and after it, when `refresh`
+        has not run: `qpos` and `qvel` are those of the state reached, poses and sensors those that the substep computed
+        on its way. With hooks the substeps are launches of their own, with the hooks' torch work in between; without,
+        all of them are one. Inside an outer capture both become part of its graph.
         """
         if n < 1:
             raise ValueError(f"n={n}: expected at least 1 substep")

@@ -5,10 +5,11 @@ import pytest
 import torch
 import warp as wp
 
-from ksim_rl.physics import World
+from ksim_rl.physics import SimCfg, World, native
 from ksim_rl.physics.rows import constraint_rows as rows
 from ksim_rl.physics.rows.contact_lists import ContactLists
 from tests.physics.row_models import touching
+from tests.physics.test_contact_sensors import model
 
 # Not a multiple of the worlds of a block.
 NUM_ENVS = 301
@@ -77,3 +78,21 @@ def test_captured_steps_from_one_state_reach_the_same_bits():
         reached.append((world.qpos_EL.clone(), world.qvel_EL.clone()))
     for ours, again in zip(*reached, strict=True):
         assert torch.equal(ours, again)
+
+
+@pytest.mark.gpu
+def test_blocks_of_many_worlds_reach_the_same_bits(monkeypatch):
+    reached = []
+    for few_worlds in (native.FEW_WORLDS, 0):
+        monkeypatch.setattr(native, "FEW_WORLDS", few_worlds)
+        sim = SimCfg(njmax=120, nconmax=40, one_kernel_dynamics=True)
+        world = World(model("elliptic", ()), num_envs=NUM_ENVS, sim=sim, device="cuda")
+        generator = torch.Generator(device="cuda").manual_seed(0)
+        world.qpos_EL[:, 2] -= 0.03
+        for state, scale in ((world.qpos_EL, 0.05), (world.qvel_EL, 0.5)):
+            state.add_(scale * torch.randn(state.shape, generator=generator, device="cuda"))
+        world.step(4)
+        reached.append([state.clone() for state in (world.qpos_EL, world.qvel_EL, world.sensordata_EL)])
+    assert reached[0][2].any()
+    for few, many in zip(*reached, strict=True):
+        assert torch.equal(few, many)

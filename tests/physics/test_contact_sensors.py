@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from typing import Literal
 
 import mujoco
 import mujoco_warp as mjw
@@ -28,11 +29,11 @@ FOREIGN = (
 ENVS = 4
 
 
-def model(cone: str) -> mujoco.MjModel:
+def model(cone: str, foreign: tuple[tuple[int, ...], ...] = FOREIGN) -> mujoco.MjModel:
     spec = mujoco.MjSpec.from_string(row_models.XML)
     spec.option.cone = getattr(mujoco.mjtCone, f"mjCONE_{cone.upper()}")
     prepare_spec(spec, ())
-    for own, other, layout in itertools.product((*ELEMENTS, *TREES), OTHERS, (NET, STRONGEST, *FOREIGN)):
+    for own, other, layout in itertools.product((*ELEMENTS, *TREES), OTHERS, (NET, STRONGEST, *foreign)):
         sensor = spec.add_sensor(
             type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=own[0], objname=own[1], intprm=[*layout]
         )
@@ -72,6 +73,26 @@ def columns(mj_model: mujoco.MjModel, *, ours: bool) -> np.ndarray:
             if (sensor in read) == ours
         ]
     )
+
+
+def test_substeps_of_which_nothing_else_is_read_write_no_poses():
+    seen: dict[Literal["contacts", "every"], list[tuple[torch.Tensor, ...]]] = {"contacts": [], "every": []}
+    sim = SimCfg(njmax=120, nconmax=40, one_kernel_dynamics=True)
+    for which, moments in seen.items():
+        world = World(model("pyramidal", ()), num_envs=ENVS, sim=sim)
+        place(world)
+        world.last_substep("xmat").fill_(7.0)
+
+        def note(world: World = world, moments: list[tuple[torch.Tensor, ...]] = moments) -> None:
+            moments.append(tuple(world.last_substep(name).clone() for name in ("xmat", "qpos", "sensordata")))
+
+        world.step(3, after=[note], sensors=which)
+    own = columns(world.mj_model, ours=True)
+    for contacts, every in zip(seen["contacts"], seen["every"], strict=True):
+        assert torch.equal(contacts[1], every[1])
+        assert torch.equal(contacts[2][:, own], every[2][:, own]) and contacts[2][:, own].any()
+    unwritten = [bool((moment[0] == 7.0).all()) for moment in seen["contacts"]]
+    assert unwritten == [True, True, False] and torch.equal(seen["contacts"][2][0], seen["every"][2][0])
 
 
 @pytest.fixture(scope="module", params=["pyramidal", "elliptic"])

@@ -230,7 +230,7 @@ def test_limbs_with_and_without_contacts_between_them_move_as_in_the_c_engine(co
 
 
 @pytest.mark.parametrize("num_worlds", [4096, 32768])
-@pytest.mark.parametrize("floats", [300, 1760, 2400, 3000, 4576, 5536, 12_000])
+@pytest.mark.parametrize("floats", [300, 1760, 2400, 3000, 4400, 4576, 5536, 12_000])
 def test_registers_are_bounded_so_that_as_many_worlds_run_at_once_as_shared_memory_lets(floats, num_worlds):
     by_memory = (228 * 1024) // (4 * floats + 1024)
     registers = newton.most_registers(floats, num_worlds)

@@ -283,14 +283,22 @@ def test_models_out_of_its_range_are_told_why(word):
         assert word in str(stages.unsuited(mjw.put_model(model)))
 
 
-def test_few_worlds_have_more_lanes_each():
+@pytest.mark.parametrize(
+    ("num_bodies", "worlds", "expected"),
+    [
+        (10, 4096, [(16, 32), (32, 32)]),
+        (10, 32768, [(8, 64), (8, 64)]),
+        (20, 32768, [(16, 64), (8, 64)]),
+        (50, 32768, [(16, 64), (16, 64)]),
+        (300, 32768, [(32, 64), (32, 64)]),
+        (400, 32768, [(32, 32), (32, 32)]),
+    ],
+)
+def test_few_or_large_worlds_have_more_lanes_each(num_bodies, worlds, expected):
     with wp.ScopedDevice("cpu"):
         sizes = stages._sizes(mjw.put_model(quadruped()))
-    lanes = {
-        worlds: [stages._lanes(parts, sizes, worlds) for parts in (stages.SMOOTH, stages.INTEGRATION)]
-        for worlds in (4096, 32768)
-    }
-    assert lanes == {4096: [16, 32], 32768: [8, 8]}
+    sizes |= {"num_bodies": num_bodies, "poses": 10 * num_bodies, "num_entries": 16 * num_bodies}
+    assert [stages._block(parts, sizes, worlds) for parts in (stages.SMOOTH, stages.INTEGRATION)] == expected
 
 
 def test_settings_that_leave_it_out_are_told():

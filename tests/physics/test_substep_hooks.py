@@ -86,10 +86,11 @@ def test_sensors_are_read_on_every_substep_only_if_asked():
     assert not torch.equal(readings["every"][0], readings["every"][1])
 
 
-def test_of_contacts_alone_are_those_that_all_on_every_substep_have():
-    readings = {}
+@pytest.mark.parametrize("ours", (False, True))
+def test_of_contacts_alone_are_those_that_all_on_every_substep_have(ours):
+    readings, sim = {}, SimCfg(njmax=80, nconmax=40, one_kernel_dynamics=ours)
     for which in ("contacts", "every"):
-        world, seen = standing_quadrupeds(), readings.setdefault(which, [])
+        world, seen = standing_quadrupeds(sim=sim), readings.setdefault(which, [])
         world.step(
             3,
             after=[lambda seen=seen, world=world: seen.append(world.sensordata_EL.clone())],

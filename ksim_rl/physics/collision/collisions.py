@@ -82,7 +82,7 @@ def collisions(
     }
     source = native.source_of("rows", ("layout",))
     source += native.source_of("collision", ("broad_phase", "shapes", "narrow_phase"))
-    lanes, threads, registers = (lanes or LANES, CUDA_THREADS, REGISTERS) if device.is_cuda else (1, 1, None)
+    lanes, threads, most = (lanes or LANES, CUDA_THREADS, REGISTERS) if device.is_cuda else (1, 1, None)
     margins = m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap
     constants = {
         **upstream.GEOM_TYPES,
@@ -93,9 +93,7 @@ def collisions(
         "others": others.size > 0,
         "has_rows": HAS_ROWS,
     }
-    collide = native.launcher(
-        source, constants, own, m, d, lanes=lanes, threads=threads, max_registers=registers
-    )
+    collide = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, max_registers=most)
     theirs = dataclasses.replace(m, geom_pair_type_count=upstream.pair_type_counts(m, others))
 
     def launch() -> None:

@@ -116,17 +116,8 @@ def launcher(
         "CHECKED": checked,
         **{str(invariant.name): invariant for invariant in Invariant},
     }
-    return native.launcher(
-        _SOURCE,
-        constants,
-        own,
-        warp_model,
-        warp_data_E,
-        lanes=lanes,
-        threads=lanes,
-        fast_math=True,
-        max_registers=max_registers,
-    )
+    given = _SOURCE, constants, own, warp_model, warp_data_E
+    return native.launcher(*given, lanes=lanes, threads=lanes, fast_math=True, max_registers=max_registers)
 
 
 @wp.func_native("""

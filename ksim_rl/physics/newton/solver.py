@@ -9,6 +9,7 @@ import warp as wp
 
 from ksim_rl.device.streams import beside
 from ksim_rl.physics.contact_sensors import ContactReadings
+from ksim_rl.physics.native import FEW_WORLDS
 from ksim_rl.physics.newton.kernel import CUDA_LANES, launcher, layout, put_longest_first
 from ksim_rl.physics.newton.limbs import limbs_of
 from ksim_rl.physics.sim_cfg import SimCfg
@@ -17,12 +18,13 @@ from ksim_rl.physics.sim_cfg import SimCfg
 SHARED_FLOATS = 48 * 1024 // 4
 # What a world may have of a multiprocessor's shared memory: ten such worlds live there at once. On an H200 a prototype
 # took 212 us for 4096 worlds of G1; with 5600 floats (nine worlds) 217, with room for twelve 222 and for thirteen 237.
-FLOATS_PER_WORLD = 5536
+# Of many worlds twelve do, if an eighth of the rows fit: 1850 us instead of 1901 for 32768.
+FLOATS_PER_WORLD, FLOATS_OF_MANY = 5536, 4400
 # A multiprocessor has 228 KiB of shared memory, of which each block takes another KiB, and in each quarter, where
 # warps stay, 512 registers for a lane. With 72 of them as many worlds of Go1 run at once as the memory lets, 28. With
 # 96 only 20 do, and fewer values lie in memory meanwhile, which is faster where most worlds run at once anyway (H200,
 # 4096 worlds: 119 us, 125 with 72; 32768: 776 and 722). Where more than 128 are left, there is no need of a bound.
-SHARED_BYTES, LEAST_REGISTERS, MOST_REGISTERS, FEW_WORLDS = 228 * 1024, (96, 72), 128, 8192
+SHARED_BYTES, LEAST_REGISTERS, MOST_REGISTERS = 228 * 1024, (96, 72), 128
 MOST_DOFS = 64
 # MuJoCo Warp's solver ends its loop by a conditional node, which costs more than the few iterations that it saves
 # (H200, 4096 worlds, at most 10 iterations: Go1 8.22 ms without and 8.46 with it, G1 9.88 and 10.17).
@@ -99,7 +101,8 @@ def solver(
     sizes = layout(m.nv, d.njmax, limbs, elliptic=elliptic, rows_on_chip=0)
     stride, narrow = sizes["STRIDE"], sizes["NARROW"]
     if rows_on_chip is None:
-        room = FLOATS_PER_WORLD - sizes["FLOATS"]
+        is_tight = d.nworld > FEW_WORLDS and sizes["FLOATS"] + d.njmax // 8 * narrow <= FLOATS_OF_MANY
+        room = (FLOATS_OF_MANY if is_tight else FLOATS_PER_WORLD) - sizes["FLOATS"]
         rows_on_chip = min(-(-d.njmax // 2), max(0, room // narrow)) if on_cuda else d.njmax
     sizes = layout(m.nv, d.njmax, limbs, elliptic=elliptic, rows_on_chip=rows_on_chip)
     far_floats = (d.njmax - rows_on_chip * narrow // stride) * stride
@@ -136,14 +139,16 @@ def step(
     collide: Callable[[], None] | None = None,
     *,
     sensors: bool,
+    accelerometers: bool = True,
 ) -> None:
     """Launch a physics step: that of MuJoCo Warp, with this solver.
 
     The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
     not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel; `make_rows`,
     which needs it, the constraint rows as one, with the lists of contacts that `contacts` reads; and `integrate` what
-    advances the state. `collide` is a collision pass other than MuJoCo Warp's. On a stream `aside`, dynamics go on
-    beside that pass and the solver's order of the worlds, by the last substep; then it solves beside some sensors.
+    advances the state. `collide` is a collision pass other than MuJoCo Warp's. On a stream `aside`, the solver orders
+    the worlds, by the last substep, and dynamics of few worlds go on beside that pass; then it solves beside some
+    sensors, of which `contacts` leaves out `accelerometers` where they are not wanted.
     """
     m, d = warp_model, warp_data_E
     if dynamics is None or m.callback.sensor:
@@ -154,11 +159,13 @@ def step(
         if contacts is not None:
             contacts.list()
     else:
-        with beside(aside, partial(dynamics, places_geoms=False)):
-            dynamics(goes_on=False)
+        # Where dynamics alone fill a GPU, placing bodies twice, for collisions first, takes longer than it saves.
+        at_once = aside is not None and d.nworld <= FEW_WORLDS
+        rest = [partial(dynamics, places_geoms=False)] if at_once else []
+        with beside(aside, partial(solve, solves=False), *rest):
+            dynamics(goes_on=not at_once)
             if m.opt.run_collision_detection:
                 collide() if collide is not None else mjw.collision(m, d)
-            solve(solves=False)
         if make_rows is None:
             mjw.make_constraint(m, d)
         else:
@@ -186,7 +193,7 @@ def step(
         mjw.rne_postconstraint(m, d)
     if sensors:
         if contacts is not None:
-            contacts.read_sensors()
+            contacts.read_sensors(accelerometers=accelerometers)
         mjw.sensor_acc(m, d, skip_rne_postconstraint=True)
     if integrate is not None:
         integrate()

@@ -1,6 +1,6 @@
 // What accelerometers read: the acceleration of their body (mj_rnePostConstraint), summed from its root on, at their place.
 
-each(ACCELEROMETERS, [&](int place) {
+each(problem.accelerates ? ACCELEROMETERS : 0, [&](int place) {
     const int sensor = problem.sensors.data[SENSORS + place], site = problem.sensor_objid.data[sensor];
     const int body = problem.site_bodyid.data[site];
     const int* const moves = problem.body_isdofancestor.data + (size_t)body * problem.body_isdofancestor.shape[1];

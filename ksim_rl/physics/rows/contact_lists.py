@@ -9,7 +9,7 @@ import warp as wp
 from ksim_rl.physics import native, upstream
 
 # Lanes of a world on CUDA, and threads of a block, which shares nothing.
-LANES, CUDA_THREADS = 16, 128
+LANES, CUDA_THREADS = 16, 64
 HAS_ROWS = int(upstream.ContactType.CONSTRAINT)
 
 

@@ -80,12 +80,11 @@ if (problem.places_geoms) {
         const int geom = geom_of(item), body = look_up(problem.geom_bodyid, geom);
         return matrix(product(turn(body), model_row(problem.geom_quat)[geom]));
     });
-}
-if (!problem.goes_on) {
     if (problem.empties_pool && world == 0 && lane == 0)
         *problem.nacon.data = 0;
-    return;
 }
+if (!problem.goes_on)
+    return;
 each(NUM_BODIES, [&](int body) {
     center(body) = position(body) + rotate(model_row(problem.body_ipos)[body], turn(body));
 });

@@ -8,6 +8,7 @@ SMOOTH and INTEGRATION name them.
 Source of the algorithms: https://mujoco.readthedocs.io/en/stable/computation/index.html
 """
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
@@ -23,13 +24,13 @@ SMOOTH = ("world", "layout", "kinematics", "inertia", "velocities", "passive", "
 INTEGRATION = ("world", "derivative", "factorization", "free_bodies", "advance")
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
-LANES, CUDA_THREADS = (8, 16, 32), 32
-# So many worlds do not fill a GPU with 8 lanes each: of a control step of 4096 worlds of G1 on an H200 the kernels take
-# 0.67 ms instead of 0.91. But one of 32768 worlds of Go1 takes 4.71 ms with 16 lanes and 4.58 with 8.
-FEW_WORLDS, LANES_OF_FEW = 8192, {SMOOTH: 16, INTEGRATION: 32}
+# Few worlds do not fill a GPU with 8 lanes each. Many have 8 where a block of two warps is small, so that shared memory
+# does not limit how many run (32768 of Go1 on an H200 are integrated in 65 us, in 87 with 16; of G1 in 267 and 234). In
+# small blocks dynamics take 56 registers, not the 72 that the compiler likes (Go1, 16 lanes: 154 us instead of 164).
+LANES, LANES_OF_FEW, SMALL_BLOCK_FLOATS, REGISTERS = (8, 16, 32), {SMOOTH: 16, INTEGRATION: 32}, 3072, 56
 # Whether it writes where geoms are, goes on after that, and after the velocities to the inertia matrix and the forces,
 # and whether others than a substep read what it writes. Or else it sums momenta of subtrees there, takes the worlds of
-# a mask alone, or empties the pool of contacts where it does not go on.
+# a mask alone, or empties the pool of contacts where it places geoms.
 WHOLE = {
     **dict.fromkeys(("places_geoms", "goes_on", "forces_too", "is_read"), True),
     **dict.fromkeys(("sums_momenta", "masked", "empties_pool"), False),
@@ -64,7 +65,7 @@ def unsuited(warp_model: mjw.Model) -> str | None:
         "joints yield": bool(m.nplastic),
         "an actuator is delayed": m.nhistory > 0,
         "an actuator is not affine or drives no hinge or slide": not _has_affine_actuators(m),
-        "its bodies do not fit shared memory": _lanes(SMOOTH, _sizes(m), 1) is None,
+        "its bodies do not fit shared memory": _block(SMOOTH, _sizes(m), 1) is None,
     }
     return next((reason for reason, holds in reasons.items() if holds), None)
 
@@ -138,8 +139,8 @@ def _launcher(
 ) -> Callable[..., None]:
     m, d = warp_model, warp_data_E
     sizes, device = _sizes(m), d.qpos.device
-    threads = CUDA_THREADS if device.is_cuda else 1
-    lanes = (lanes or _lanes(parts, sizes, d.nworld) or CUDA_THREADS) if device.is_cuda else 1
+    asked = (lanes, 64) if lanes else _block(parts, sizes, d.nworld)
+    lanes, threads = asked if asked and device.is_cuda else (1, 1)
     driven = m.jnt_dofadr.numpy()[m.actuator_trnid.numpy()[:, 0]]
     tables = {
         "moving_geoms": _moving_geoms(m),
@@ -150,10 +151,12 @@ def _launcher(
     arrays = {name: wp.array(table, dtype=int, device=device) for name, table in tables.items()}
     own = {**WHOLE, **given, **arrays}
     constants = {**_ENUMS, **sizes, "floats": _floats(parts, sizes, lanes)}
+    is_small = parts == SMOOTH and threads == 64 and constants["floats"] * (64 // lanes) <= SMALL_BLOCK_FLOATS
     parents = ", ".join(map(str, m.body_parentid.numpy()))
     parts += ("record",) if "sticky" in given else ()
     source = f"constexpr int PARENTS[] = {{{parents}}};\n" + native.source_of("smooth", parts)
-    return native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads)
+    most = REGISTERS if is_small else None
+    return native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, max_registers=most)
 
 
 def _sizes(warp_model: mjw.Model) -> dict[str, int]:
@@ -231,12 +234,14 @@ def _has_affine_actuators(warp_model: mjw.Model) -> bool:
     return bool(np.isin(m.jnt_type.numpy()[m.actuator_trnid.numpy()[:, 0]], HINGES).all())
 
 
-def _lanes(parts: tuple[str, ...], sizes: Mapping[str, int], worlds: int) -> int | None:
-    """Return the fewest lanes that suit so many worlds, and with which those of a warp fit shared memory together."""
-    least = LANES_OF_FEW[parts] if worlds <= FEW_WORLDS else 0
-    for lanes in LANES:
-        if lanes >= least and _floats(parts, sizes, lanes) * (CUDA_THREADS // lanes) <= SHARED_FLOATS:
-            return lanes
+def _block(parts: tuple[str, ...], sizes: Mapping[str, int], worlds: int) -> tuple[int, int] | None:
+    """Return the fewest lanes that suit so many worlds, and threads of a block, whose worlds fit shared memory."""
+    is_few = worlds <= native.FEW_WORLDS
+    least = LANES_OF_FEW[parts] if is_few else 0
+    for threads, lanes in itertools.product((32,) if is_few else (64, 32), LANES):
+        most = SMALL_BLOCK_FLOATS if lanes == 8 else SHARED_FLOATS
+        if lanes >= least and _floats(parts, sizes, lanes) * (threads // lanes) <= most:
+            return lanes, threads
     return None
 
 
