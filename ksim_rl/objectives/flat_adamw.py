@@ -48,12 +48,12 @@ class FlatAdamW(torch.optim.Optimizer):
         parts = zip(flat.split(sizes), self._learning, strict=True)
         return [part[: own.numel()].view_as(own) for part, own in parts]
 
-    def _joined(self, tensors: list[Tensor]) -> Tensor:
+    def _pieces(self, tensors: list[Tensor]) -> list[Tensor]:
         pairs = zip(tensors, self._gaps, strict=True)
-        return torch.cat([part for own, gap in pairs for part in (own.reshape(-1), gap)])
+        return [part for own, gap in pairs for part in (own.reshape(-1), gap)]
 
     def _end_to_end(self, parameters: list[nn.Parameter]) -> Tensor:
-        flat = self._joined([own.detach() for own in parameters]) if parameters else torch.empty(0)
+        flat = torch.cat(self._pieces([own.detach() for own in parameters])) if parameters else torch.empty(0)
         for parameter, part in zip(parameters, self._parts(flat) if parameters else (), strict=True):
             parameter.data = part
         return flat
@@ -66,14 +66,16 @@ class FlatAdamW(torch.optim.Optimizer):
         """
         gradients = [torch.zeros_like(own) if own.grad is None else own.grad for own in self._learning]
         changed = self._flat, *self._moments, self._steps, self._target
-        given = self._joined(gradients), loss.detach(), self.param_groups[0]["lr"]
+        given = self._pieces(gradients), loss.detach(), self.param_groups[0]["lr"]
         return self._change_(changed, *given, self._cfg)
 
 
 def _change_(
-    changed: tuple[Tensor, ...], gradient: Tensor, loss: Tensor, rate: Tensor, cfg: OffPolicyCfg
+    changed: tuple[Tensor, ...], pieces: list[Tensor], loss: Tensor, rate: Tensor, cfg: OffPolicyCfg
 ) -> tuple[Tensor, Tensor]:
     flat, mean, variance, steps, target = changed
+    # Here, where the compiler makes a kernel of it: torch's takes as long as all the rest.
+    gradient = torch.cat(pieces)
     norm = torch.linalg.vector_norm(gradient)
     made = norm.isfinite() & loss.isfinite()
     if cfg.max_grad_norm is not None:
