@@ -325,14 +325,9 @@ class VTrace(RolloutEstimator, value.VTrace):
     def in_keys(self) -> list[NestedKey]:
         """What the data must have, or the arguments of a call without a TensorDict."""
         # Written out: the compiler cannot follow TorchRL's, which asks its base class for a property.
-        keys, critic = self.tensor_keys, self.value_network
+        keys, actor, critic = self.tensor_keys, self.actor_network, self.value_network
         observed = [keys.value] if critic is None else list(critic.in_keys)
-        read = [
-            *observed,
-            *self.actor_network.in_keys,
-            *self.actor_network.dist_sample_keys,
-            keys.sample_log_prob,
-        ]
+        read = [*observed, *actor.in_keys, *actor.dist_sample_keys, keys.sample_log_prob]
         flags = [keys.reward, keys.done, keys.terminated]
         return list(dict.fromkeys([*read, *(("next", key) for key in [*observed, *flags])]))
 

@@ -85,9 +85,7 @@ class OffPolicyLoss(LossModule):
         check_value("value_reduction", value_reduction, ValueReduction)
         self.actor_network, self.critic_network = actor_network, critic_network
         # Running statistics are shared: both networks see observations on the same scale at any time.
-        shared: Any = {
-            id(part): part for part in critic_network.modules() if isinstance(part, RunningMoments)
-        }
+        shared: Any = {id(own): own for own in critic_network.modules() if isinstance(own, RunningMoments)}
         # Under a name that `parameters()` leaves out.
         self._target_critic = copy.deepcopy(critic_network, memo=shared).requires_grad_(False)
         self.support_A, self.gamma, self.value_reduction = support_A, gamma, value_reduction

@@ -20,15 +20,8 @@ def project_by_kernel(
     moves = [move.expand(*batch, 1).reshape(-1).contiguous() for move in (reward, discount)]
     projected = torch.empty(probs.shape, dtype=probs.dtype, device=probs.device)
     launch: Any = _project_row[(batch.numel(),)]
-    launch(
-        probs.contiguous(),
-        *moves,
-        support_A,
-        projected,
-        count,
-        LANES=triton.next_power_of_2(count),
-        num_warps=1,
-    )
+    given = probs.contiguous(), *moves, support_A, projected, count
+    launch(*given, LANES=triton.next_power_of_2(count), num_warps=1)
     return projected
 
 

@@ -74,7 +74,7 @@ def observations(robot: LeggedRobot) -> dict[str, ObservationGroupCfg]:
         "actions": ObservationTermCfg(term=mdp.LastAction()),
         "command": ObservationTermCfg(term=mdp.Command(command=COMMAND)),
     }
-    actor_terms = {
+    actor = {
         "base_lin_vel": noisy(lin_vel, 0.5),
         "base_ang_vel": noisy(ang_vel, 0.2),
         "projected_gravity": noisy(gravity, 0.05),
@@ -82,7 +82,7 @@ def observations(robot: LeggedRobot) -> dict[str, ObservationGroupCfg]:
         "joint_vel": noisy(joint_vel, 1.5),
         **seen_by_both,
     }
-    critic_terms = {
+    critic = {
         "base_lin_vel": ObservationTermCfg(term=lin_vel),
         "base_ang_vel": ObservationTermCfg(term=ang_vel),
         "projected_gravity": ObservationTermCfg(term=gravity),
@@ -94,10 +94,7 @@ def observations(robot: LeggedRobot) -> dict[str, ObservationGroupCfg]:
         "foot_contact": ObservationTermCfg(term=mdp.FootContact(sensor=FEET)),
         "foot_contact_forces": ObservationTermCfg(term=mdp.FootContactForces(sensor=FEET)),
     }
-    return {
-        "actor": ObservationGroupCfg(terms=actor_terms),
-        "critic": ObservationGroupCfg(terms=critic_terms),
-    }
+    return {"actor": ObservationGroupCfg(terms=actor), "critic": ObservationGroupCfg(terms=critic)}
 
 
 def rewards(

@@ -236,9 +236,7 @@ class KeyedTransform(RowTransform):
         self._register_rows("reset_count_E")
         every = (self.in_keys, self.out_keys, self.in_keys_inv, self.out_keys_inv)
         self.stream = type(self).__name__ + "".join(map(str, every)) if stream is None else stream
-        self._stream_ids = {
-            purpose: random.stream_id(f"{self.stream}/{purpose}") for purpose in self.purposes
-        }
+        self._stream_ids = {name: random.stream_id(f"{self.stream}/{name}") for name in self.purposes}
         self._is_seeded = seed is not None
         self.register_buffer("seed_value", torch.tensor(_NO_SEED if seed is None else seed))
         self.register_buffer("step_count", torch.zeros((), dtype=torch.int64))

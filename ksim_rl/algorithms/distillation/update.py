@@ -113,10 +113,8 @@ class DistillationUpdate(DatasetUpdate):
 
     def state_dict(self) -> state_tree.State:
         """Return student, teacher, optimizer, sampler and counters."""
-        return super().state_dict() | {
-            "teacher": self.teacher.state_dict(),
-            "teacher_share": self.teacher_share,
-        }
+        own = {"teacher": self.teacher.state_dict(), "teacher_share": self.teacher_share}
+        return super().state_dict() | own
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue where `state_dict` was taken; see `RolloutUpdate`."""

@@ -239,9 +239,7 @@ def read(path: Path) -> Failure:
         raise ValueError(f"{path}: written with MuJoCo {about.get('mujoco')}; this is {mujoco.__version__}")
 
     def under(prefix: str) -> dict[str, np.ndarray]:
-        return {
-            name.removeprefix(prefix): array for name, array in tensors.items() if name.startswith(prefix)
-        }
+        return {name.removeprefix(prefix): own for name, own in tensors.items() if name.startswith(prefix)}
 
     try:
         mj_model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": tensors[_MODEL].tobytes()})

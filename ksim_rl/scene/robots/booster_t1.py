@@ -25,10 +25,8 @@ JOINTS = (
 )
 
 
-def _servo(joints: tuple[str, ...], effort_limit: float, *, kp: float, kd: float) -> PositionActuator:
-    return PositionActuator(
-        joints=joints, effort_limit=effort_limit, armature=0.005, stiffness=kp, damping=kd
-    )
+def _servo(joints: tuple[str, ...], limit: float, *, kp: float, kd: float) -> PositionActuator:
+    return PositionActuator(joints=joints, effort_limit=limit, armature=0.005, stiffness=kp, damping=kd)
 
 
 SERVOS = (

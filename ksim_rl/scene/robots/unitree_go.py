@@ -47,12 +47,7 @@ GO1_SERVOS = (
 )
 # A unit action moves the target by a quarter of the deflection at which the servo saturates (effort_limit / kp).
 GO1_ACTION_SCALE = {".*_(hip|thigh)_joint": 0.37275, ".*_calf_joint": 0.2485}
-_GO1_FOOT: dict[str, Any] = {
-    "condim": 6,
-    "solref": (0.01, 1.0),
-    "priority": 1,
-    "friction": (1.0, 0.005, 0.0005),
-}
+_GO1_FOOT: Any = {"condim": 6, "solref": (0.01, 1.0), "priority": 1, "friction": (1.0, 0.005, 0.0005)}
 
 
 def _go1_leg_geoms(leg: str) -> tuple[CollisionGeom, ...]:
