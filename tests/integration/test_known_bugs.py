@@ -201,12 +201,12 @@ def check_epochs_have_orders_of_their_own():
 def test_epochs_that_reuse_an_order(bug, monkeypatch):
     check_epochs_have_orders_of_their_own()
     if bug == "one order for all epochs":
-        order_of = lambda self, epoch, size: torch.randperm(  # noqa: E731
+        orders_of = lambda self, epochs, size: torch.randperm(  # noqa: E731
             size, generator=torch.Generator().manual_seed(0)
-        )
+        ).expand(len(epochs), size)
     else:
-        order_of = lambda self, epoch, size: torch.randint(size, (size,))  # noqa: E731
-    monkeypatch.setattr(EpochSampler, "_order", order_of)
+        orders_of = lambda self, epochs, size: torch.randint(size, (len(epochs), size))  # noqa: E731
+    monkeypatch.setattr(EpochSampler, "_orders", orders_of)
     with pytest.raises(AssertionError):
         check_epochs_have_orders_of_their_own()
 
