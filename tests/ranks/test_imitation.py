@@ -47,8 +47,10 @@ def compared(name, size, folder, *, dtype=torch.float32):
 )
 def test_ranks_learn_what_one_process_learns(name, size, tmp_path):
     tensors, worst = compared(name, size, tmp_path)
-    print(f"{name}, {size} ranks: {tensors} tensors, largest difference {worst:.2g}")
-    assert worst <= 1e-6
+    places = worst / torch.finfo(torch.float32).eps
+    print(f"{name}, {size} ranks: {tensors} tensors, largest difference {places:.1f} last places")
+    # That of AMP with 4 ranks is 14 in float32, and 8 of its own in float64: rounding, which grows as learning goes on.
+    assert places <= (16 if name == "amp" else 8)
 
 
 @pytest.mark.parametrize("size", [2, pytest.param(4, marks=pytest.mark.full)])
