@@ -1,8 +1,8 @@
 """This module has the Triton kernels that add a bias, normalize rows, and apply an activation, forward and back.
 
-A program takes some rows of one of N networks, a tile at a time, in float32. It is one warp, which waits for no other;
-a row is two or three chunks of a power of two, as layers are that wide. Sums of columns are left in parts, one of each
-program, and added up in one order: the same numbers each time.
+A program takes some rows of one of N networks, a tile at a time, in float32. To 768 columns it is one warp, which waits
+for no other. A row is two or three chunks of a power of two, as layers are that wide. Sums of columns are left in
+parts, one of each program, and added up in one order: the same numbers each time.
 """
 
 from typing import Any
@@ -137,10 +137,11 @@ def normalize_rows_back(
             slope = (slopes[chunk] - mean_slope - units[chunk] * mean_along) * scale
             tl.store(d_features + at, slope.to(d_features.dtype.element_ty), mask=keep)
             of_bias = of_bias + (slope,)
-        added, found = of_bias + of_gain + of_offset, ()
-        for part in tl.static_range(3 * CHUNKS):
-            found = found + (sums[part] + added[part],)
-        sums = found
+        if WEIGHTS:
+            added, found = of_bias + of_gain + of_offset, ()
+            for part in tl.static_range(3 * CHUNKS):
+                found = found + (sums[part] + added[part],)
+            sums = found
     if WEIGHTS:
         for part in tl.static_range(3 * CHUNKS):
             column = part % CHUNKS * LANES + tl.arange(0, LANES)
