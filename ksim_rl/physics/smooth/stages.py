@@ -139,8 +139,9 @@ def _launcher(
 ) -> Callable[..., None]:
     m, d = warp_model, warp_data_E
     sizes, device = _sizes(m), d.qpos.device
-    asked = (lanes, 64) if lanes else _block(parts, sizes, d.nworld)
-    lanes, threads = asked if asked and device.is_cuda else (1, 1)
+    block = ((lanes, 64) if lanes else _block(parts, sizes, d.nworld)) if device.is_cuda else (1, 1)
+    assert block is not None, "the model is unsuited"
+    lanes, threads = block
     driven = m.jnt_dofadr.numpy()[m.actuator_trnid.numpy()[:, 0]]
     tables = {
         "moving_geoms": _moving_geoms(m),
