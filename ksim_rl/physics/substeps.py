@@ -134,8 +134,8 @@ class Substeps:
             empties_pool = self._collide is not None and m.opt.run_collision_detection
             dynamics = partial(dynamics, is_read=is_read, empties_pool=empties_pool)
         stages = self._solve, dynamics, self._make_rows, self._contacts, self._integrate
-        wanted = {"sensors": sensors != "none", "accelerometers": sensors != "contacts"}
-        wanted = {name: holds or self._always_senses for name, holds in wanted.items()}
+        always = self._always_senses
+        wanted = {"sensors": always or sensors != "none", "accelerometers": always or sensors != "contacts"}
         newton.step(m, self.warp_data_E, *stages, self._aside, self._collide, **wanted)
 
     def refresh(self, *, masked: bool = False) -> None:
