@@ -8,6 +8,7 @@ import ctypes
 import struct
 import threading
 from collections.abc import Callable, Sequence
+from importlib.resources import files
 from typing import Any, ClassVar
 from weakref import WeakSet
 
@@ -27,6 +28,11 @@ def arguments_of(*fields: tuple[type, str]) -> Any:
     """Return the struct of a `QuickLaunch` with these fields in order: types, each with names and blanks between."""
     types = {name: kind for kind, names in fields for name in names.split()}
     return wp.struct(type("Arguments", (), {"__annotations__": types}))
+
+
+def source_of(package: str, *parts: str) -> str:
+    """Return the C++ of a kernel, whose parts lie in files of a package."""
+    return "".join((files(package) / f"{part}.cpp").read_text() for part in parts)
 
 
 class QuickLaunch:

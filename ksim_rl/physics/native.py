@@ -6,12 +6,12 @@
 import functools
 import re
 from collections.abc import Callable, Mapping
-from importlib.resources import files
 from typing import Any
 
 import mujoco_warp as mjw
 import warp as wp
 
+from ksim_rl.device import quick_launch
 from ksim_rl.physics.structs import filled, values_of
 
 FEW_WORLDS = 8192  # more fill a GPU with fewer lanes each
@@ -20,7 +20,7 @@ _ARRAYS = {1: wp.array, 2: wp.array2d, 3: wp.array3d}
 
 def source_of(folder: str, parts: tuple[str, ...]) -> str:
     """Return the C++ of a kernel, whose parts lie in a folder of this room."""
-    return "".join((files("ksim_rl.physics") / folder / f"{part}.cpp").read_text() for part in parts)
+    return quick_launch.source_of(f"ksim_rl.physics.{folder}", *parts)
 
 
 def names_of(*enums: Any) -> dict[str, int]:
