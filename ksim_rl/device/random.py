@@ -22,54 +22,9 @@ from jaxtyping import Float32, Int, Int64
 from torch import Tensor
 
 from ksim_rl import ranks
-from ksim_rl.device.quick_launch import QuickLaunch, arguments_of, as_operator
+from ksim_rl.device.quick_launch import QuickLaunch, arguments_of, as_operator, source_of
 
-DRAWS = r"""
-    const unsigned golden = 0x9E3779B9u;
-    auto mix = [](unsigned x) {
-        x = (x ^ (x >> 16)) * 0x21F0AAADu;
-        x = (x ^ (x >> 15)) * 0xD35A2D97u;
-        return x ^ (x >> 15);
-    };
-    struct RowKey { unsigned first, second; };
-    auto key_of = [=](long long seed, unsigned stream, long long count, int row) {
-        const unsigned low = (unsigned)count, high = (unsigned)((unsigned long long)count >> 32);
-        const unsigned base = mix((unsigned)(seed ^ (seed >> 32)) ^ stream);
-        const unsigned first = mix(base + low * golden) ^ mix((unsigned)row + high + 1u);
-        const unsigned second = mix(first + (unsigned)row * golden + golden) ^ mix(low + stream);
-        return RowKey{mix(first), mix(second)};
-    };
-    auto bits_of = [=](RowKey key, unsigned index) {
-        return mix(mix(key.first ^ ((index + 1u) * golden)) ^ key.second);
-    };
-    auto unit = [](unsigned b) { return (float)(b >> 8) * 5.9604644775390625e-08f; };
-    auto horner = [](float x, float sum, auto... coefficients) {
-        ((sum = sum * x + coefficients), ...);
-        return sum;
-    };
-    auto normal = [=](unsigned b) {
-        const float x = ((float)((int)(b >> 8) - 8388608) + 0.5f) * 1.1920928955078125e-07f;
-        const float t = (1.0f - x) * (1.0f + x);
-        unsigned word;
-        memcpy(&word, &t, 4);
-        int exponent = (int)(word >> 23) - 127;
-        word = (word & 0x7FFFFFu) | 0x3F800000u;
-        float mantissa;
-        memcpy(&mantissa, &word, 4);
-        const bool is_large = mantissa > 1.41421356f;
-        exponent += is_large;
-        const float f = (is_large ? 0.5f * mantissa : mantissa) - 1.0f;
-        const float s = horner(f, 7.0376836292e-2f, -1.1514610310e-1f, 1.1676998740e-1f, -1.2420140846e-1f,
-            1.4249322787e-1f, -1.6668057665e-1f, 2.0000714765e-1f, -2.4999993993e-1f, 3.3333331174e-1f);
-        const float w = -(f + f * f * (s * f - 0.5f) + (float)exponent * 0.693147180559945f);
-        const float p = horner(w - 2.5f, 2.81022636e-08f, 3.43273939e-07f, -3.5233877e-06f, -4.39150654e-06f,
-            2.1858087e-04f, -1.25372503e-03f, -4.17768164e-03f, 2.46640727e-01f, 1.50140941f);
-        const float d = sqrtf(w < 5.0f ? 5.0f : w) - 3.0f;
-        const float q = horner(d, -2.00214257e-04f, 1.00950558e-04f, 1.34934322e-03f, -3.67342844e-03f,
-            5.73950773e-03f, -7.6224613e-03f, 9.43887047e-03f, 1.00167406f, 2.83297682f);
-        return 1.41421356237f * x * (w < 5.0f ? p : q);
-    };
-"""
+DRAWS = source_of("ksim_rl.device", "draws")
 """C++ of all kernels that draw: `key_of` once per row, `bits_of` per number, `unit` or `normal` of these bits."""
 
 _UNIFORM, _NORMAL, _INTEGER, _ORDER = range(4)
@@ -155,53 +110,7 @@ _launch = QuickLaunch(
         (int, "counter_stride first_row"),
         (wp.uint64, "seed counter out"),
     ),
-    DRAWS
-    + r"""
-    const long long seed = *(const long long*)a.seed;
-    const long long* __restrict__ counter = (const long long*)a.counter;
-    const int begin_row = part * a.rows, begin = chunk * a.columns, n = a.n, stride = a.counter_stride;
-    const int first = a.first_row, end_row = begin_row + a.rows, end = begin + a.columns;
-    const unsigned stream = a.stream;
-    auto fill = [&](auto write) {
-        for (int row = begin_row; row < end_row; ++row) {
-            const RowKey key = key_of(seed, stream, counter[row * stride], first + row);
-            for (int i = begin; i < end; ++i) write((long long)row * n + i, bits_of(key, (unsigned)i));
-        }
-    };
-    auto fill_one_each = [&](auto write) {
-        for (int row = begin_row; row < end_row; ++row)
-            write(row, bits_of(key_of(seed, stream, counter[row * stride], first + row), 0u));
-    };
-    auto run = [&](auto write) { n == 1 ? fill_one_each(write) : fill(write); };
-    float* __restrict__ reals = (float*)a.out;
-    long long* __restrict__ integers = (long long*)a.out;
-    const float low = a.low, high = a.high;
-    const long long start = a.start;
-    const unsigned long long span = (unsigned long long)a.span;
-    if (a.kind == 0) run([=](long long at, unsigned b) { reals[at] = low + unit(b) * (high - low); });
-    else if (a.kind == 1) run([=](long long at, unsigned b) { reals[at] = normal(b); });
-    else if (a.kind == 2) run([=](long long at, unsigned b) { integers[at] = start + (long long)((b * span) >> 32); });
-    else for (int row = begin_row; row < end_row; ++row) {
-        // A bijection of the next power of two; what it takes past the last number goes through it again (Black and
-        // Rogaway, "Ciphers with arbitrary finite domains", 2002).
-        const RowKey key = key_of(seed, stream, counter[row / stride], first + row % stride);
-        unsigned low_bits = start / 2, low_mask = (1u << low_bits) - 1u, high_mask = (1u << (start - low_bits)) - 1u;
-        unsigned round_keys[24];
-        for (int round = 0; round < (int)span; ++round) round_keys[round] = bits_of(key, (unsigned)round);
-        for (int i = begin; i < end; ++i) {
-            unsigned number = i;
-            do {
-                unsigned low = number & low_mask, high = number >> low_bits;
-                for (int round = 0; round < (int)span; round += 2) {
-                    low ^= mix(high ^ round_keys[round]) & low_mask;
-                    high ^= mix(low ^ round_keys[round + 1]) & high_mask;
-                }
-                number = (high << low_bits) | low;
-            } while (number >= (unsigned)n);
-            integers[(long long)row * n + i] = (long long)(row % stride) * n + number;
-        }
-    }
-""",
+    DRAWS + source_of("ksim_rl.device", "draw"),
     indices=("part", "chunk"),
 )
 
