@@ -91,7 +91,7 @@ _NOTHING = (0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizePseudoInertia(Randomize):
+class RandomizePseudoInertia(Randomize, drawn=("alpha", "stretch", "shear", "shift")):
     """Mass, centre of mass and inertia of bodies, drawn together, each body one that can exist.
 
     The body's mass distribution is deformed: J = U J0 U^T for its pseudo-inertia matrix J0 [4, 4] in the frame of
@@ -107,10 +107,6 @@ class RandomizePseudoInertia(Randomize):
     shift: Pair = _NOTHING  # t1, t2, t3: m that the centre of mass moves along each principal axis
     operation: Literal["add"] = "add"
     distribution: Literal["uniform", "gaussian"] = "uniform"
-
-    def _check_fields(self) -> None:
-        for name in ("alpha", "stretch", "shear", "shift"):
-            self.check_range(name, getattr(self, name))
 
     per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
 

@@ -166,7 +166,7 @@ class RandomizeActuator(OfJoints, Randomize, operation="scale"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeActuatorGains(RandomizeActuator):
+class RandomizeActuatorGains(RandomizeActuator, drawn=("stiffness", "damping")):
     """Gains of the servos that drive joints: stiffness, N m / rad or N / m; damping, N m s / rad or N s / m.
 
     MuJoCo's position servo keeps one stiffness in its gain and its bias, and its velocity servo one damping; both
@@ -178,13 +178,8 @@ class RandomizeActuatorGains(RandomizeActuator):
     damping: Pair | None = None
     per_world_fields: ClassVar[tuple[str, ...]] = ("actuator_gainprm", "actuator_biasprm")
 
-    def _check_fields(self) -> None:
-        for name in ("stiffness", "damping"):
-            if getattr(self, name) is not None:
-                self.check_range(name, getattr(self, name))
-
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        for name in ("stiffness", "damping"):
+        for name in self.drawn:
             if getattr(self, name) is not None:
                 self._write(view, mask_E, name, getattr(self, name))
 

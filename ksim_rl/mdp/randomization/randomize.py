@@ -48,6 +48,13 @@ class Randomize(EventTerm, mode="startup"):
     distribution: Distribution = "uniform"
     shared: bool = False
 
+    drawn: ClassVar[tuple[str, ...]] = ()  # the fields with one range each, or None
+
+    def _check_fields(self) -> None:
+        for name in self.drawn:
+            if getattr(self, name) is not None:
+                self.check_range(name, getattr(self, name))
+
     def check_range(self, name: str, pair: object) -> None:
         """Raise a ValueError for a range that the distribution cannot draw from."""
         check_value(f"{name} ({self.distribution})", pair, _RANGES[self.distribution])
@@ -93,13 +100,10 @@ class Randomize(EventTerm, mode="startup"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeNumber(Randomize):
+class RandomizeNumber(Randomize, drawn=("ranges",)):
     """Draw one number per element and world from `ranges`."""
 
     ranges: Pair
-
-    def _check_fields(self) -> None:
-        self.check_range("ranges", self.ranges)
 
 
 @dataclass(frozen=True, kw_only=True)

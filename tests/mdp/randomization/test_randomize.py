@@ -248,6 +248,25 @@ def test_bad_figures_are_refused():
 
 
 @pytest.mark.parametrize(
+    ("kind", "field", "others"),
+    [
+        (mdp.RandomizeEncoderBias, "ranges", {"joints": "a"}),
+        (mdp.RandomizeEffortLimit, "ranges", {"joints": "a"}),
+        (mdp.RandomizeActuatorGains, "stiffness", {"joints": "a"}),
+        (mdp.RandomizeActuatorGains, "damping", {"joints": "a"}),
+        *(
+            (mdp.RandomizePseudoInertia, name, {"bodies": "a"})
+            for name in ("alpha", "stretch", "shear", "shift")
+        ),
+    ],
+)
+def test_ranges_that_cannot_be_drawn_from_are_refused_by_name(kind, field, others):
+    assert getattr(kind(**{field: (0.5, 2.0)}, **others), field) == (0.5, 2.0)
+    with pytest.raises(ValueError, match=rf"{field} \(uniform\)=\(2.0, 0.5\): low exceeds high"):
+        kind(**{field: (2.0, 0.5)}, **others)
+
+
+@pytest.mark.parametrize(
     ("event", "message"),
     [
         (mdp.RandomizeBodyMass(bodies="trunkk", ranges=(0.5, 2.0)), "no body matches 'trunkk'.*'trunk'"),
