@@ -3,7 +3,7 @@
 A transform is public once it is imported here.
 """
 
-from types import ModuleType
+import inspect
 
 from ksim_rl.transforms.delay import ActionDelay, DelayCfg, ObservationDelay
 from ksim_rl.transforms.elementwise import (
@@ -35,8 +35,4 @@ from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, follo
 from ksim_rl.transforms.trackers import EpisodeTracker, SuccessTracker, TimeAwareObservation
 from ksim_rl.transforms.transform_cfg import TransformCfg
 
-__all__ = sorted(
-    name
-    for name, value in globals().items()
-    if name[0] != "_" and value is not ModuleType and not isinstance(value, ModuleType)
-)  # pyright: ignore
+__all__ = sorted(name for name, value in globals().items() if name[0] != "_" and not inspect.ismodule(value))  # pyright: ignore
