@@ -28,7 +28,6 @@ from rich.table import Table
 from benchmarks import command_line, report
 from benchmarks.learning_picture import draw
 from ksim_rl.runs.csv_table import read_table
-from ksim_rl.tables.levels import thinned
 from ksim_rl.trainers import RunCfg, RunProgress, run
 
 KEPT_POINTS = 60
@@ -91,7 +90,9 @@ def train_and_keep(seeds: list[int], *, cfg: RunCfg, overrides: list[str]) -> di
             figures=figures,
             device=device,
             module="benchmarks.learning_curve",
-            curves={f"{label}/seed_{seed}": thinned(points, KEPT_POINTS) for seed, points in curves.items()},
+            curves={
+                f"{label}/seed_{seed}": report.thinned(points, KEPT_POINTS) for seed, points in curves.items()
+            },
         )
 
     for seed, points in train_all(seeds):
@@ -206,7 +207,7 @@ def _table(title: str, curves: dict[int, list[Point]]) -> Table:
     for name in ("seed", *names):
         table.add_column(name.removeprefix("reward/"))
     for seed, points in curves.items():
-        for point in thinned(points, 6):
+        for point in report.thinned(points, 6):
             table.add_row(str(seed), *(f"{point.get(name, float('nan')):.4g}" for name in names))
     return table
 

@@ -2,36 +2,31 @@
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from ksim_rl.tables.table import Row
 
 HELD_STATES = 1e6
 Point = Mapping[str, float]
-T = TypeVar("T")
+
+
+def means_of(points: Sequence[Point], names: Iterable[str]) -> dict[str, float]:
+    """Return the means of metrics; one that a point lacks, as no episode ended then, counts in no mean."""
+    logged = {name: [point[name] for point in points if name in point] for name in names}
+    return {name: statistics.fmean(values) for name, values in logged.items() if values}
 
 
 def reached(points: Sequence[Point], levels: Mapping[str, float]) -> Point | None:
-    """Return the end of the first `HELD_STATES` env states over which all levels hold in the mean; None: never.
-
-    Points have "env_states" and metrics by name. One that a point lacks, as no episode ended then, counts in no mean; a
-    level of a metric that none of these points has does not hold.
-    """
+    """Return the end of the first `HELD_STATES` env states over which all levels hold in the mean; None: never."""
     for index, point in enumerate(points):
-        end = point["env_states"] + HELD_STATES
-        held = [other for other in points[index:] if other["env_states"] <= end]
-        if points[-1]["env_states"] < end:
+        if points[-1]["env_states"] < point["env_states"] + HELD_STATES:
             return None
-        logged = {name: [other[name] for other in held if name in other] for name in levels}
-        if all(values and statistics.fmean(values) >= levels[name] for name, values in logged.items()):
+        held = [other for other in points[index:] if other["env_states"] <= point["env_states"] + HELD_STATES]
+        means = means_of(held, levels)
+        if all(means.get(name, -math.inf) >= level for name, level in levels.items()):
             return held[-1]
     return None
-
-
-def thinned(points: Sequence[T], count: int) -> list[T]:
-    """Return about so many of the points, the last one among them."""
-    return [*points[: -1 : max(1, len(points) // count)], points[-1]]
 
 
 def value_of(row: Row, results: Sequence[Mapping[str, Any]]) -> float | None:
@@ -51,6 +46,8 @@ def is_reached(row: Row, results: Sequence[Mapping[str, Any]]) -> bool | None:
     if row.goal is not None:
         is_good = value is not None and (value <= row.goal if row.measure == "seconds" else value >= row.goal)
         found.append(is_good)
+    for name, level in row.levels.items() if row.measure != "seconds" else ():
+        found += [result["means"].get(name, -math.inf) >= level for result in results]
     if row.most_falls is not None:
         found.append(max(result["falls"] for result in results) < row.most_falls)
     return all(found) if found else None

@@ -18,11 +18,12 @@ from typing import Any
 from ksim_rl import conf
 from ksim_rl.config import plugins
 from ksim_rl.device.kernel_loading import compile_notice
+from ksim_rl.envs.contract import EpisodeSums, part
 from ksim_rl.runs import record
 from ksim_rl.runs.csv_table import read_table
 from ksim_rl.runs.listing import METRICS
 from ksim_rl.runs.whole_file import write_whole
-from ksim_rl.tables.levels import reached, thinned
+from ksim_rl.tables.levels import HELD_STATES, means_of, reached
 from ksim_rl.tables.table import Row, load
 from ksim_rl.tracking.trials import run_trials
 from ksim_rl.trainers import Hook, RunCfg, RunProgress, Trainer, run
@@ -64,16 +65,19 @@ class _Judge(Hook):
 
     def __init__(self, cfg: RunCfg, row: Row, *, trials: int) -> None:
         self._cfg, self._trials = cfg, trials if row.measure == "success" else 0
-        self.trials: dict[str, Any] | None = None
-        self.falls, self.seconds_in_all, self.ended = 0.0, 0.0, 0.0
+        self.found: dict[str, Any] = {"trials": None, "means": {}}
+        self.seconds_in_all, self.ended = 0.0, 0.0
 
     def at_end(self, trainer: Trainer) -> None:
         self.ended, self.seconds_in_all = time.monotonic(), trainer.clock.total
-        if trainer.evaluator is not None:
-            too_early_E = trainer.evaluator.length_E < trainer.evaluator.max_steps
-            self.falls = float(too_early_E.double().mean())
+        assert (evaluator := trainer.evaluator) is not None
+        too_early_E = evaluator.length_E < evaluator.max_steps
+        self.found["falls"] = round(float(too_early_E.double().mean()), 5)
+        sums = episodes.episode_log() if (episodes := part(evaluator.env, EpisodeSums)) else {}
+        metrics = {name: float(sums[name] / sums["episodes"]) for name in sums if name.startswith("metric/")}
+        self.found["means"] = {f"evaluation/{name}": round(mean, 4) for name, mean in metrics.items()}
         if self._trials:
-            self.trials = asdict(run_trials(self._cfg, trainer.update.actor, trials=self._trials))
+            self.found["trials"] = asdict(run_trials(self._cfg, trainer.update.actor, trials=self._trials))
 
 
 def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) -> dict[str, Any]:
@@ -89,6 +93,7 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
     _, lines = read_table(run_folder / METRICS)
     points = [{n: float(line[n]) for n in names if line.get(n)} for line in lines if line.get("seconds")]
     end = reached(points, row.levels) if row.levels else None
+    last = [point for point in points if point["env_states"] >= points[-1]["env_states"] - HELD_STATES]
     session = record.read(run_folder)[-1]
     code = session.code.get("ksim_rl", {"commit": os.environ.get("GIT_COMMIT", "unknown")})
     return {
@@ -102,11 +107,11 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
         "seconds": round(points[-1]["seconds"], 2),
         "seconds_before": round(judge.ended - began - judge.seconds_in_all, 2),
         "evaluation": asdict(outcome.evaluation),
-        "falls": round(judge.falls, 5),
-        "trials": judge.trials,
+        **judge.found,
+        "means": means_of(last, row.levels) | judge.found["means"],
         "seconds_to_levels": None if end is None else round(end["seconds"], 2),
         "env_states_to_levels": None if end is None else end["env_states"],
-        "curve": thinned(points, KEPT_POINTS),
+        "curve": [*points[: -1 : max(1, len(points) // KEPT_POINTS)], points[-1]],
     }
 
 

@@ -29,9 +29,7 @@ def figures_of(table: Table, rows: Mapping[str, Results]) -> dict[str, float]:
         value, key = value_of(table.rows[name], results), f"{table.name}/{name}"
         if table.rows[name].measure == "seconds":
             figures[f"{key}/falls"] = max(result["falls"] for result in results)
-            key += "/seconds"
-        elif table.rows[name].measure == "success":
-            key += "/success"
+        key += {"return": ""}.get(table.rows[name].measure, f"/{table.rows[name].measure}")
         if value is not None:
             figures[key] = round(value, 4 if key.endswith("/success") else 2)
     for mean_name, mean in table.means.items():
@@ -106,13 +104,15 @@ def _cells(row: Row, results: Results) -> list[str]:
     value, returns = value_of(row, results), [r["evaluation"]["return_mean"] for r in results]
     spread = f" ± {statistics.stdev(returns):.0f}" if len(returns) > 1 else ""
     ours = "" if value is None else f"{value:.0f}{spread}"
+    for level in row.levels if row.measure == "return" else ():
+        worst = min(r["means"].get(level, float("-inf")) for r in results)
+        ours += f", {level.rpartition('/')[2]} {worst:.2f}"
     if row.measure == "seconds":
         falls = f"falls {100 * max(result['falls'] for result in results):.1f} %"
         ours = f"{'not reached' if value is None else f'{value:.1f} s'}, {falls}"
     elif row.measure == "success" and value is not None:
         ours = f"{100 * value:.1f} % of trials succeed"
-    states, seconds, before = (
-        statistics.fmean(r[key] for r in results) for key in ("env_states", "seconds", "seconds_before")
-    )
+    keys = "env_states", "seconds", "seconds_before"
+    states, seconds, before = (statistics.fmean(r[key] for r in results) for key in keys)
     verdict = {True: "yes", False: "no", None: ""}[is_reached(row, results)]
     return [ours, str(len(results)), f"{states / 1e6:.1f} M", f"{seconds:.0f} + {before:.0f}", verdict]

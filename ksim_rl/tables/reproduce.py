@@ -71,9 +71,7 @@ def _parser() -> OneLineParser:
     parser.add_argument("--rows", default=".*", help="regular expression of rows, such as 'ppo/Walker.*'")
     parser.add_argument("--seeds", default="", help="some of the table's, such as 1,2")
     parser.add_argument("--device", default="cuda", help="cpu, or cuda where there is a GPU")
-    parser.add_argument(
-        "--per-gpu", type=int, default=1, help="runs that share a GPU, where no row measures seconds"
-    )
+    parser.add_argument("--per-gpu", type=int, default=1, help="runs that share a GPU, if none is timed")
     parser.add_argument("--output", type=Path, help="default: benchmarks/results/tables, or tables elsewhere")
     parser.add_argument("--runs", type=Path, default=Path("runs/tables"), help="where the runs lie")
     parser.add_argument("--minutes", type=float, default=math.inf, help="end then; 0 writes what is there")

@@ -30,6 +30,8 @@ class Row(Checked):
             training metrics hold, the median over the seeds, one that does not get there counting as infinite; or
             "success" of the final policy in `episodes` trials of a tracking task, the lowest over the seeds.
         episodes: of the final evaluation: deterministic actions, fresh envs.
+        levels: of training metrics, which seconds wait for; with another measure each seed should have them in the mean
+            of its last million env states. There `evaluation/metric/<name>` is of the final evaluation's episodes.
         within_s: seconds in which the levels should be reached.
         at_least: share of trials that should succeed.
         most_falls: share of these episodes that may end before their time; the worst seed counts.
@@ -53,8 +55,8 @@ class Row(Checked):
     def _check_fields(self) -> None:
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds={self.seeds!r}: expected at least one, and each once")
-        if (self.measure == "seconds") != bool(self.levels):
-            raise ValueError(f"levels={dict(self.levels)!r}: give them with measure=seconds, and only then")
+        if self.measure == "seconds" and not self.levels:
+            raise ValueError("levels={}: measure=seconds waits until metrics reach some; give one at least")
         for word in self.overrides:
             if word.partition("=")[0] in ("task", "objective", "seed", "trainer.num_iterations"):
                 raise ValueError(f"overrides: {word!r} has a field of its own in the row")
@@ -62,9 +64,8 @@ class Row(Checked):
     @property
     def goal(self) -> float | None:
         """What the measure should reach: a return or share at least, seconds at most; None where nothing is asked."""
-        if self.measure == "success":
-            return self.at_least
-        return self.within_s if self.measure == "seconds" else self.published.get(self.against)
+        goals = {"success": self.at_least, "seconds": self.within_s}
+        return goals.get(self.measure, self.published.get(self.against))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,11 +106,10 @@ def load(name: str) -> Table:
         raise unknown_name("table", name, shipped())
     tree = plain_data.read_yaml(path)
     groups, rows = tree.pop("groups", None) if isinstance(tree, dict) else None, {}
-    if not isinstance(groups, dict) or not all(
-        isinstance((g or {}).get("rows"), dict) for g in groups.values()
-    ):
+    found = groups if isinstance(groups, dict) else {"": {}}
+    if not all(isinstance((fields or {}).get("rows"), dict) for fields in found.values()):
         raise ValueError(f"{path}: expected a mapping with a title, and groups that have rows")
-    for group, fields in groups.items():
+    for group, fields in found.items():
         shared = {key: value for key, value in fields.items() if key != "rows"}
         for row, own in fields["rows"].items():
             rows[f"{group}/{row}" if group else row] = {**shared, **(own or {})}

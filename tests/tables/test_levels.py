@@ -62,6 +62,16 @@ def test_the_seed_with_the_fewest_successes_counts():
     assert figures_of(table, {"walk": results}) == {"tracking/walk/success": 0.95}
 
 
+def test_beside_a_return_each_seed_should_end_with_its_levels():
+    row = Row(**COMMON, levels=LEVELS, published={"PPO": 500.0}, against="PPO")
+    good = {"evaluation": {"return_mean": 600.0}, "means": {"linear": 1.4, "angular": 1.0}}
+    assert is_reached(row, [good, good]) is True
+    assert is_reached(row, [good, good | {"means": {"linear": 1.5, "angular": 0.99}}]) is False
+    assert is_reached(row, [good, good | {"means": {"linear": 1.5}}]) is False, "no episode ended"
+    assert is_reached(row, [good | {"evaluation": {"return_mean": 400.0}}]) is False
+    assert is_reached(Row(**COMMON, levels=LEVELS), [good]) is True
+
+
 def test_returns_are_compared_with_what_one_of_the_others_reports():
     results = [{"evaluation": {"return_mean": value}, "falls": 1.0} for value in (400.0, 500.0, 601.0)]
     assert value_of(RETURN, results) == pytest.approx(500.333, abs=1e-3)

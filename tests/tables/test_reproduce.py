@@ -3,12 +3,15 @@
 import json
 import subprocess
 import sys
+from dataclasses import dataclass, replace
 
 import pytest
+import torch
 
 from benchmarks.report import RESULTS
 from ksim_rl.cli.main import main
 from ksim_rl.config import plugins
+from ksim_rl.envs import MetricTerm
 from ksim_rl.tables import measure as measuring
 from ksim_rl.tables import reproduce as reproduce_command
 from ksim_rl.tables import runner
@@ -48,6 +51,7 @@ def reproduce(monkeypatch, tmp_path):
             "versions": {},
             "evaluation": {"return_mean": RETURNS[job[0]] + job[1]},
             "falls": 0.0,
+            "means": {"episode/length": 0.5 + job[1]},
             "seconds_to_levels": None,
             "env_states": 1e6,
             "seconds": 5.0,
@@ -168,6 +172,13 @@ def test_a_row_whose_levels_no_seed_reaches_is_in_the_table(reproduce):
     assert "not reached, falls 0.0 %" in (reproduce.folder / "poles.md").read_text()
 
 
+def test_what_training_ended_with_stands_beside_the_return_for_the_worst_seed(reproduce):
+    text = TABLE.replace("Other: {task: reacher}", "Other: {task: reacher, levels: {episode/length: 2}}")
+    assert reproduce("--rows", "ppo/Other", text=text)[0] == 1
+    assert "| 8 ± 1, length 1.50 | 2 | 1.0 M | 5 + 1 | no |" in (reproduce.folder / "poles.md").read_text()
+    assert reproduce("--rows", "ppo/Other", text=text.replace("length: 2", "length: 1"))[0] == 0
+
+
 def test_unknown_rows_and_seeds_are_refused(reproduce, capsys):
     assert reproduce("--rows", "ppo/Balanc")[:2] == (2, [])
     assert "'ppo/Balance'" in capsys.readouterr().err
@@ -182,7 +193,7 @@ def test_settings_differ_by_everything_but_the_seed():
     assert first != settings(row, run_cfg(row, 1, device="cpu", smoke=True))
 
 
-@pytest.mark.parametrize("table", ["dm_control", "humanoids", "tracking", "velocity"])
+@pytest.mark.parametrize("table", ["dm_control", "humanoids", "tasks", "tracking", "velocity"])
 def test_committed_results_are_of_the_settings_that_rows_have_now(table):
     for name, row in load(table).rows.items():
         expected = settings(row, run_cfg(row, 1, device="cpu"))
@@ -201,6 +212,31 @@ def test_a_seed_is_trained_and_its_final_policy_judged(tmp_path):
     assert 0.0 <= found["falls"] <= 1.0
     assert found["seconds"] == pytest.approx(found["curve"][-1]["seconds"], abs=0.01)
     assert found["seconds_before"] > 0.0 and len(found["commit"]) >= 7
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steps(MetricTerm, reduce="last"):
+    """How many steps the episode has made."""
+
+    def __call__(self, view):
+        return view.episode_step_E.to(torch.float32)
+
+
+def test_means_are_of_the_end_of_training_and_of_the_episodes_of_the_evaluation(monkeypatch, tmp_path):
+    def with_steps(row, seed, **options):
+        cfg = run_cfg(row, seed, **options)
+        return replace(cfg, task=replace(cfg.task, metrics={"steps": Steps()}))
+
+    monkeypatch.setattr(measuring, "run_cfg", with_steps)
+    path = tmp_path / "one.yaml"
+    path.write_text(TABLE.replace("Swingup: {", "Swingup: {levels: {rollout/reward: 0, episode/none: 0}, "))
+    row = load(str(path)).rows["ppo/Swingup"]
+    found = measure(row, 1, tmp_path / "run", device="cpu", smoke=True)
+    logged = [point["rollout/reward"] for point in found["curve"]]
+    assert len(logged) == 2 and found["means"] == {
+        "rollout/reward": pytest.approx(sum(logged) / 2),
+        "evaluation/metric/steps": found["evaluation"]["length_mean"],
+    }
 
 
 def test_a_row_may_name_the_task_of_a_plug_in(monkeypatch, tmp_path):

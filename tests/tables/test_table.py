@@ -60,7 +60,7 @@ def test_a_table_that_does_not_exist_gives_the_near_names():
 
 
 def test_the_shipped_tables_name_tasks_that_exist():
-    assert shipped() == ["dm_control", "humanoids", "manipulation", "tracking", "velocity"]
+    assert shipped() == ["dm_control", "humanoids", "manipulation", "tasks", "tracking", "velocity"]
     for name in shipped():
         assert {row.task for row in load(name).rows.values()} <= set(envs.names())
 
@@ -92,6 +92,7 @@ def test_the_other_algorithm_stays_within_its_env_states():
         "manipulation:panda_pick_cube",
         "manipulation:leap_cube_reorient",
         *(f"tracking:{clip}" for clip in ("walk", "squat", "turn", "kick")),
+        *(f"tasks:{row}" for row in load("tasks").rows),
         *(pytest.param(f"dm_control:{row}", marks=pytest.mark.full) for row in load("dm_control").rows),
     ],
 )
@@ -103,6 +104,28 @@ def test_a_row_composes_with_one_evaluation_at_its_end_and_at_most_its_env_state
     assert 0.95 * row.env_states < states <= row.env_states
     assert (cfg.seed, cfg.trainer.eval_interval, cfg.trainer.eval_episodes) == (2, 0, row.episodes)
     assert not cfg.trainer.stop_when_solved and cfg.trainer.stop_at is None
+
+
+def test_the_table_of_tasks_has_every_task_once_and_asks_of_it_what_the_task_does():
+    rows = load("tasks").rows
+    tracked = [row.task for row in load("tracking").rows.values()]
+    own = [name for name in envs.names() if not envs.task(name).suite]
+    assert sorted([*(row.task for row in rows.values()), *tracked]) == own
+    for name, row in rows.items():
+        task = envs.task(row.task)
+        assert name.rpartition("/")[2] == row.task and row.goal == task.solved_at
+        if name.startswith("control/"):
+            assert run_cfg(row, 1).trainer.num_iterations == task.training.trainer.num_iterations
+
+
+@pytest.mark.parametrize("table", ["humanoids", "tasks", "velocity"])
+def test_levels_are_of_metrics_that_the_task_has(table):
+    for row in load(table).rows.values():
+        cfg = envs.task(row.task).cfg()
+        known = {f"reward/{name}" for name in cfg.rewards} | {
+            f"evaluation/metric/{name}" for name in cfg.metrics
+        }
+        assert set(row.levels) <= known, row.task
 
 
 PAGE = Path(__file__).parents[2] / "docs" / "tables.md"
