@@ -45,6 +45,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "tasks": (*STEP, *LEARN, *TASK),
     "terrain": STEP,
     "throughput": (*STEP, *LEARN, *TASK),
+    "tracking": (*STEP, *LEARN, "ksim_rl/tracking"),
     "transforms": ("ksim_rl/transforms", "ksim_rl/device"),
     "unseen_robots": (*STEP, *LEARN, *TASK),
     "update": (*LEARN, "ksim_rl/device"),

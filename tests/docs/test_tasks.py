@@ -7,7 +7,7 @@ import json
 import os
 import statistics
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -17,9 +17,11 @@ import pytest
 from benchmarks import report, tasks
 from ksim_rl import envs
 from ksim_rl.scene.scene import SceneCfg
+from ksim_rl.tables.table import Row, load
 
 PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
 RESULTS = report.RESULTS / "tasks.json"
+TABLES = {name: report.RESULTS / "tables" / f"{name}.json" for name in ("tasks", "tracking")}
 NUM_ENVS = 4096
 COLUMNS = (
     "task",
@@ -55,20 +57,25 @@ All tasks that come with the package: `ksim-rl train task=<task>`, or `envs.make
 * **syncs**: times that the host waits for the device in a step with its reset. **`check_env`**: the result of
   `ksim_rl.testing.check_env`.
 """
-TAIL = f"""The last four columns are measured on an H200: `python -m benchmarks.tasks device=cuda num_envs={NUM_ENVS}`.
-Rows whose ratio is below 1 were measured before this package had a constraint solver of its own: they are slower than
-what you will see."""
-
-
+OLDER = (
+    "Rows whose ratio is below 1 were measured before this package had a constraint solver of its own: they are\n"
+    "slower than what you will see."
+)
 LEARNED = """## What was learned
 
-By training runs on one H200 that are committed in `benchmarks/results/learning_*.json`: the env states of a run, its
-seconds with the first iteration, the mean return of the training episodes at its end (medians over the seeds), and the
-commit that it was made of. Each row is of its own commit, and most tasks have no committed run of this kind yet.
+By `ksim-rl reproduce tasks`, and for `g1_track_*` `ksim-rl reproduce tracking`, with
+[one protocol](tables.md#the-protocol).
 
-| task | objective | env states | seconds | return | seeds | commit |
-|---|---|---|---|---|---|---|
+* **env states**, **seconds**: of a run's training, its first iteration included. Two runs of `g1_track_*` at a time
+  shared a GPU.
+* **return**: the mean over the final policy's episodes and over the seeds, with the standard deviation between seeds.
+* **asked for**: what came out, and in brackets what should: *solved at* of the mean return; for the worst seed the
+  rewards for following a velocity command (2 each at most, over the last million env states of training), the share of
+  1000 robots that stand 6 s after they were dropped, or of 1024 trials in which a motion is followed to its end.
+
+[Learning](learning.md#how-well-they-learn) compares algorithms.
 """
+LEARNED_COLUMNS = ("task", "objective", "env states", "seconds", "return", "asked for", "reached", "seeds")
 
 
 def robots(scene: SceneCfg) -> str:
@@ -95,21 +102,36 @@ def episode(cfg: envs.ManagerBasedRlEnvCfg) -> str:
     return f"{cfg.episode_length_s:g} s"
 
 
-def measured(name: str, saved: Mapping[str, Any]) -> tuple[str, ...]:
-    """The GPU's figures of a task, of the last run if there are several."""
+def last_run(name: str, saved: Mapping[str, Any]) -> str | None:
+    """The prefix of a task's last run on a GPU."""
     runs = {
         prefix: run
         for prefix, run in saved.get("runs", {}).items()
         if prefix.split("/")[1:] == [name, str(NUM_ENVS)] and not prefix.startswith("cpu/")
     }
-    if not runs:
+    return max(runs, key=lambda prefix: runs[prefix]["date"], default=None)
+
+
+def measured(name: str, saved: Mapping[str, Any]) -> tuple[str, ...]:
+    """The GPU's figures of a task, of the last run if there are several."""
+    if (prefix := last_run(name, saved)) is None:
         return (NOTHING,) * (len(MEASURED) + 1)
-    prefix = max(runs, key=lambda prefix: runs[prefix]["date"])
     values = (
         form.format(saved["figures"][f"{prefix}/{key}"]) if f"{prefix}/{key}" in saved["figures"] else NOTHING
         for key, form in MEASURED
     )
     return (*values, saved["outcomes"][prefix]["check_env"])
+
+
+def tail(saved: Mapping[str, Any]) -> str:
+    """Where and at which commit the figures were measured, and that some are old while they are of several."""
+    prefixes = [prefix for name in own_tasks() if (prefix := last_run(name, saved))]
+    devices = sorted({saved["runs"][prefix]["device"] for prefix in prefixes})
+    commits = sorted({saved["runs"][prefix]["commit"] for prefix in prefixes})
+    said = f"commit{'s' * (len(commits) > 1)} {' and '.join(commit[:7] for commit in commits)}"
+    text = f"The last four columns are of {' and '.join(devices)}, at {said}:\n"
+    command = f"`python -m benchmarks.tasks device=cuda num_envs={NUM_ENVS}`."
+    return text + command + ("\n" + OLDER if len(commits) > 1 else "")
 
 
 def row(name: str, size: Mapping[str, str], saved: Mapping[str, Any]) -> str:
@@ -137,25 +159,59 @@ def own_tasks() -> list[str]:
 def page(sizes: Mapping[str, Mapping[str, str]], saved: Mapping[str, Any]) -> str:
     head = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
     rows = [row(name, sizes[name], saved) for name in own_tasks()]
-    after = "\n".join(line for name in own_tasks() for line in learned(name))
-    return f"{HEAD}\n" + "\n".join([*head, *rows]) + f"\n\n{TAIL}\n\n{LEARNED}{after}\n"
+    tables = {name: json.loads(path.read_text()) for name, path in TABLES.items() if path.exists()}
+    return f"{HEAD}\n" + "\n".join([*head, *rows]) + f"\n\n{tail(saved)}\n\n{LEARNED}\n{learned(tables)}\n"
 
 
-def learned(name: str) -> list[str]:
-    """The rows of a task: for each kind of GPU run the medians over its seeds of the last points of the curves."""
-    rows = []
-    for path in sorted(report.RESULTS.glob(f"learning_{name}*.json")):
-        saved = json.loads(path.read_text())
-        objective = path.stem.removeprefix(f"learning_{name}").lstrip("_") or "ppo"
-        curves = saved.get("curves", {}).items()
-        if ends := [points[-1] for label, points in curves if label.startswith(f"h200/{name}/")]:
-            states, seconds, reward = (
-                statistics.median(end[key] for end in ends)
-                for key in ("env_states", "seconds", "episode/return")
-            )
-            cells = f"{states / 1e6:.1f} million", f"{seconds:.0f}", f"{reward:.1f}", f"{len(ends)}"
-            rows.append(" | ".join((f"| `{name}`", objective, *cells, f"{saved['commit']} |")))
-    return rows or [f"| `{name}` | {NOTHING} | not measured" + f" | {NOTHING}" * 4 + " |"]
+def learned(tables: Mapping[str, Mapping[str, Any]]) -> str:
+    """What a table of results has for each task, and of which commit it is."""
+    lines, runs_of = {}, {}
+    for table in TABLES:
+        for name, of_table in load(table).rows.items():
+            saved = tables.get(table, {}).get("rows", {}).get(name)
+            lines[of_table.task] = learned_row(of_table, saved)
+            runs_of[of_table.task] = saved["runs"] if saved else []
+    head = ["| " + " | ".join(LEARNED_COLUMNS) + " |", "|" + "---|" * len(LEARNED_COLUMNS)]
+    return "\n".join([*where(runs_of), *head, *(lines[name] for name in own_tasks())])
+
+
+def learned_row(of_table: Row, saved: Mapping[str, Any] | None) -> str:
+    """The cells of a task, whose result may not be there yet."""
+    cells = [f"`{of_table.task}`", of_table.objective]
+    if saved is None:
+        cells += ["not measured", *(NOTHING,) * 5]
+        return f"| {' | '.join(cells)} |"
+    runs = saved["runs"]
+    returns = [run["evaluation"]["return_mean"] for run in runs]
+    spread = f" ± {statistics.stdev(returns):.1f}" if len(runs) > 1 else ""
+    states, seconds = (statistics.fmean(run[key] for run in runs) for key in ("env_states", "seconds"))
+    asked = []
+    if of_table.measure == "success":
+        asked.append(f"followed {saved['value']:.3f} ({saved['goal']:g})")
+    elif saved["goal"] is not None:
+        asked.append(f"return {saved['value']:.0f} ({saved['goal']:g})")
+    for name, level in of_table.levels.items():
+        values = [run["means"].get(name) for run in runs]
+        worst = "not logged" if None in values else f"{min(values):.2f}"
+        asked.append(f"{name.rpartition('/')[2]} {worst} ({level:g})")
+    cells += [f"{states / 1e6:.1f} million", f"{seconds:.0f}", f"{statistics.fmean(returns):.1f}{spread}"]
+    verdict = {True: "yes", False: "no", None: NOTHING}[saved["reached"]]
+    return f"| {' | '.join([*cells, ', '.join(asked) or NOTHING, verdict, str(len(runs))])} |"
+
+
+def where(runs_of: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
+    """A sentence on GPUs and commits of the runs, where there are some; most share one, and others are named."""
+    by_commit: dict[str, list[str]] = {}
+    for task, runs in sorted(runs_of.items()):
+        for commit in dict.fromkeys(run["commit"] for run in runs):
+            by_commit.setdefault(commit, []).append(task)
+    if not by_commit:
+        return []
+    most, *others = sorted(by_commit, key=lambda commit: -len(by_commit[commit]))
+    devices = sorted({run["device"] for runs in runs_of.values() for run in runs})
+    names = (f"{', '.join(f'`{task}`' for task in by_commit[commit])} at {commit[:7]}" for commit in others)
+    but = "".join(f", but {text}" for text in names)
+    return [f"Runs are of {' and '.join(devices)}, at commit {most[:7]}{but}.", ""]
 
 
 def built_sizes() -> dict[str, dict[str, str]]:
@@ -210,6 +266,59 @@ def test_the_figures_are_those_of_the_last_run_on_a_gpu():
     }
     assert measured("reacher", saved) == ("1,234,568", NOTHING, "0", "passed h200/reacher/4096")
     assert measured("walker_run", saved) == (NOTHING,) * 4
+
+
+def result(commit="abcdef012", **fields):
+    return {"commit": commit, "device": "NVIDIA H200", "env_states": 6e7, "seconds": 40.0} | fields
+
+
+def test_what_was_learned_is_what_the_tables_have():
+    means = {"reward/track_linear_velocity": 1.5, "reward/track_angular_velocity": 1.2}
+    go2 = [
+        result(evaluation={"return_mean": 80.0}, means=dict(means)),
+        result(
+            evaluation={"return_mean": 84.0},
+            means=means | {"reward/track_angular_velocity": 0.94},
+            seconds=50.0,
+        ),
+    ]
+    tables = {
+        "tasks": {
+            "rows": {
+                "velocity/go2_velocity_flat": {"reached": False, "value": 82.0, "goal": None, "runs": go2},
+                "control/reacher": {
+                    "reached": True,
+                    "value": 941.6,
+                    "goal": 930.0,
+                    "runs": [result(evaluation={"return_mean": 941.6}, means={})],
+                },
+            }
+        },
+        "tracking": {
+            "rows": {
+                "kick": {
+                    "reached": True,
+                    "value": 0.999,
+                    "goal": 0.95,
+                    "runs": [result("0123456789", evaluation={"return_mean": 21.04})],
+                }
+            }
+        },
+    }
+    text = learned(tables)
+    for line in (
+        "Runs are of NVIDIA H200, at commit abcdef0, but `g1_track_kick` at 0123456.",
+        "| `go2_velocity_flat` | ppo | 60.0 million | 45 | 82.0 ± 2.8 | "
+        "track_linear_velocity 1.50 (1.3), track_angular_velocity 0.94 (1) | no | 2 |",
+        "| `reacher` | ppo | 60.0 million | 40 | 941.6 | return 942 (930) | yes | 1 |",
+        "| `g1_track_kick` | ppo | 60.0 million | 40 | 21.0 | followed 0.999 (0.95) | yes | 1 |",
+        "| `walker_amp` | amp | not measured | – | – | – | – | – |",
+    ):
+        assert line in text.splitlines(), text
+    assert "commit abcdef0." in learned({"tasks": tables["tasks"]})
+    del go2[0]["means"]["reward/track_linear_velocity"]
+    assert "track_linear_velocity not logged (1.3)" in learned(tables)
+    assert "Runs are" not in learned({}) and learned({}).count("not measured") == len(own_tasks())
 
 
 @pytest.mark.full

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from ksim_rl import envs
+from ksim_rl.conf import compose
 from ksim_rl.suites.dm_control.domains import DOMAINS
 from ksim_rl.tables.measure import run_cfg
 from ksim_rl.tables.table import load, shipped
@@ -115,7 +116,9 @@ def test_the_table_of_tasks_has_every_task_once_and_asks_of_it_what_the_task_doe
         task = envs.task(row.task)
         assert name.rpartition("/")[2] == row.task and row.goal == task.solved_at
         if name.startswith("control/"):
-            assert run_cfg(row, 1).trainer.num_iterations == task.training.trainer.num_iterations
+            assert (
+                run_cfg(row, 1).trainer.num_iterations == compose([f"task={row.task}"]).trainer.num_iterations
+            )
 
 
 @pytest.mark.parametrize("table", ["humanoids", "tasks", "velocity"])
