@@ -264,6 +264,7 @@ def test_a_row_may_name_the_task_of_a_plug_in(monkeypatch, tmp_path):
         ("velocity", ".*"),
         ("humanoids", ".*"),
         ("manipulation", ".*"),
+        ("tasks", "(arm|motion|get_up)/.*"),
     ],
 )
 def test_the_shipped_tables_run_for_two_iterations(table, rows, tmp_path, capsys):
