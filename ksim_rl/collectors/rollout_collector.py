@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -57,8 +58,9 @@ class RolloutCollector:
 
     The rollout is the same as that of `EnvBase.rollout(T, policy, break_when_any_done=False, auto_reset=False)`. On
     CUDA the env's `step_and_maybe_reset` must not synchronize (`ManagerBasedRlEnv`, `MaskedTransformedEnv`); on CPU any
-    TorchRL env of batch size [E] will do. The policy writes the action, and what training needs. Stored are the leaves
-    at `keys`, None for all: fewer cost fewer bytes and less time.
+    TorchRL env of batch size [E] will do. The policy writes the action, and what training needs; one that has a context
+    `steady()` acts within it, where its weights stay. Stored are the leaves at `keys`, None for all: fewer cost fewer
+    bytes and less time.
     """
 
     def __init__(
@@ -175,7 +177,7 @@ class RolloutCollector:
         assert self._root is not None
         root_keys = list(self._root.keys(True, True))
         root_E = self._root.copy()
-        with _exploring():
+        with _exploring(), getattr(self.policy, "steady", nullcontext)():
             if self.compiled_step is not None:
                 for t in range(self.rollout_length):
                     env_state_E = self.policy(self._root.copy())

@@ -103,6 +103,10 @@ class GaussianHead(nn.Module):
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
         """Return `(loc, scale)`; `scale` is at least `cfg.min_std`."""
         loc = self.loc(features)
+        return loc, self.scale(features).expand_as(loc)
+
+    def scale(self, features: Float[Tensor, "*batch L"] | None = None) -> Float[Tensor, "*own action_dim"]:
+        """Return the `scale`, [action_dim] where it does not depend on the state, whose features are not read then."""
         if self.std_layer is None:
             assert self.std is not None
             scale = self.std.exp() if self.std_type == "log" else self.std
@@ -111,8 +115,7 @@ class GaussianHead(nn.Module):
             scale = raw.exp() if self.std_type == "log" else functional.softplus(raw)
         # A std that the optimizer pushes to zero or below would give NaN log-probabilities. The gradient
         # passes the bound (a plain clamp stops it), so that a std below it can come back.
-        bounded = scale + (scale.clamp_min(self.min_std) - scale).detach()
-        return loc, bounded.expand_as(loc)
+        return scale + (scale.clamp_min(self.min_std) - scale).detach()
 
     def distribution(self, loc: Float[Tensor, "*batch L"], scale: Float[Tensor, "*batch L"]) -> Distribution:
         """Return the distribution of the action."""

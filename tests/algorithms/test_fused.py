@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl.algorithms.ppo.fused import fused_networks, make_fused_ppo
 from ksim_rl.algorithms.ppo.update import PPOUpdate
@@ -102,6 +103,14 @@ def update(cfg, actor, critic, fused_ppo=None, *, data=DATA):
         )
         assert made.fused.layout.chained == chained
     return made
+
+
+def finite(leaf):
+    return leaf if leaf.dtype == torch.bool else leaf.nan_to_num(0.0, 0.0, 0.0)
+
+
+def column(name):
+    return importlib.import_module("ksim_rl.objectives.fused_ppo.step_kernels").SUMMARY.index(name)
 
 
 def flat(state, path=""):
@@ -231,17 +240,14 @@ def test_what_takes_no_part_may_be_anything_and_no_part_at_all_is_a_loss_of_zero
     assert metrics["update/non_finite_env_states"] == 2 + ENVS * STEPS
     for name in ("loss/policy", "loss/value", "loss/entropy", "update/kl", "update/grad_norm"):
         assert metrics[name] == 0.0, name
-    summary = importlib.import_module("ksim_rl.objectives.fused_ppo.step_kernels").SUMMARY
-    assert (fused.fused._summary[:, summary.index("loss")] == 0.0).all()
+    assert (fused.fused._summary[:, column("loss")] == 0.0).all()
 
 
 @needs_interpreter
 def test_explained_variance_of_targets_far_from_zero(fused_ppo):
     actor, critic = networks()
     cfg = PPOCfg(num_epochs=1, learning_rate=1e-9, schedule="fixed", normalize_advantage="none")
-    data = rollout(actor).apply(
-        lambda leaf: leaf if leaf.dtype == torch.bool else leaf.nan_to_num(0.0, 0.0, 0.0)
-    )
+    data = rollout(actor).apply(finite)
     data["next", "done"].fill_(True)
     data["next", "terminated"].fill_(True)
     data["next", "reward"].add_(1e4)
@@ -251,6 +257,81 @@ def test_explained_variance_of_targets_far_from_zero(fused_ppo):
     name = "update/explained_variance"
     torch.testing.assert_close(fused.metrics()[name], torch_s.metrics()[name], atol=1e-3, rtol=0.0)
     assert fused.metrics()[name].abs() < 1.0
+
+
+def to_eleven_bits(values):
+    mantissa, exponent = torch.frexp(values)
+    # Halves go away from zero, as in the instruction that converts.
+    return torch.ldexp((mantissa.abs() * 2**11 + 0.5).floor().copysign(mantissa) / 2**11, exponent)
+
+
+def by_hand(network, obs, rounded):
+    """Return the means of an MLP that has what it multiplies `rounded`."""
+    hidden = network.observe(obs)
+    for layer in network.trunk[::2]:
+        hidden = torch.nn.functional.elu(rounded(hidden) @ rounded(layer.weight).mT + layer.bias)
+    return rounded(hidden) @ rounded(network.head.loc.weight).mT + network.head.loc.bias
+
+
+@needs_interpreter
+@pytest.mark.parametrize(("precision", "normalized"), [("high", True), ("highest", False)])
+def test_who_collects_is_the_policy_of_the_first_gradient_step(fused_ppo, precision, normalized):
+    torch.set_float32_matmul_precision(precision)
+    rounded = to_eleven_bits if precision == "high" else torch.clone
+    actor, critic = networks(actor_obs=40, obs_normalization=normalized)
+    # Outside of the clip interval is a ratio that is not one to rounding.
+    cfg = PPOCfg(num_epochs=1, schedule="fixed", learning_rate=1e-2, clip_epsilon=1e-5)
+    made, clipped = update(cfg, actor, critic, fused_ppo), []
+    network = made.actor[0].module
+    # Before the first update, after it, and as torch acts.
+    for acting in (made.behavior, made.behavior, made.actor):
+        data = rollout(made.actor, seed=len(clipped)).apply(finite)
+        with torch.no_grad():
+            acted = acting(data.select("actor"))
+            near = by_hand(network, data["actor"], rounded)
+            torch.testing.assert_close(acted["loc"], network(data["actor"])[0], atol=5e-3, rtol=0.0)
+        if acting is not made.actor:
+            # Not of each: what lies between two numbers may be rounded to the other one.
+            assert (acted["loc"] - near).abs().median() < 1e-5
+            scored = made.actor.build_dist_from_params(acted).log_prob(acted["action"])
+            torch.testing.assert_close(acted["action_log_prob"], scored)
+            assert torch.equal(acted["scale"], network(data["actor"])[1])
+        made(data.update(acted))
+        clipped.append(made.fused._summary[0, column("clip_fraction")].item())
+    assert clipped[:2] == [0.0, 0.0]
+    assert (clipped[2] > 0.5) == (precision == "high")
+
+
+@needs_interpreter
+def test_who_collects_has_the_weights_of_the_modules_at_each_call_or_where_a_steady_begins(fused_ppo):
+    actor, critic = networks()
+    made = update(PPOCfg(), actor, critic, fused_ppo)
+    behavior, data = made.behavior, rollout(actor).select("actor").apply(finite)
+    kept = copy.deepcopy(made.state_dict())
+
+    def means():
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            acted = behavior(data.clone())
+        assert torch.equal(acted["action"], acted["loc"])
+        return acted["loc"]
+
+    first = means()
+    with torch.no_grad():
+        made.actor[0].module.head.loc.bias += 0.5
+    changed = means()
+    torch.testing.assert_close(changed, first + 0.5)
+    with behavior.steady():
+        made.load_state_dict(kept)
+        assert torch.equal(means(), changed)
+    assert torch.equal(means(), first)
+
+
+def test_without_chained_kernels_the_actor_itself_collects(fused_ppo):
+    actor, critic = networks(hidden=(48, 16))
+    made = update(PPOCfg(), actor, critic)
+    assert made.behavior is made.actor
+    made = update(PPOCfg(), actor, critic, fused_ppo)
+    assert made.behavior is made.actor
 
 
 @needs_interpreter
@@ -341,10 +422,7 @@ def test_what_tensor_cores_would_cut_off_is_rounded(fused_ppo, hidden):
     for one in (made, exact):
         one(data.clone())
     parameters = made.fused.parameters
-    mantissa, exponent = torch.frexp(parameters.exact)
-    # Halves go away from zero, as in the instruction that converts.
-    rounded = (mantissa.abs() * 2**11 + 0.5).floor().copysign(mantissa)
-    torch.testing.assert_close(parameters.weights, torch.ldexp(rounded / 2**11, exponent), rtol=0.0, atol=0.0)
+    torch.testing.assert_close(parameters.weights, to_eleven_bits(parameters.exact), rtol=0.0, atol=0.0)
     arguments = made.fused._arguments
     for operands in (made.fused.dataset.obs, parameters.weights, arguments["inputs"], arguments["slopes"]):
         assert operands.count_nonzero() and not (operands.view(torch.int32) & 0x1FFF).any()

@@ -4,6 +4,8 @@ import copy
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from benchmarks.update import make_rollout
 from ksim_rl.algorithms.ppo.update import PPOUpdate
@@ -225,6 +227,50 @@ def test_no_host_sync(hidden_dims):
     with no_syncs():
         made._update()
         made.metrics()
+
+
+@pytest.mark.parametrize("network_options", [{}, {"obs": 45, "action_dim": 29, "std_type": "log"}])
+def test_the_ratio_at_the_first_step_is_one(network_options):
+    actor, critic = networks(output_gain=1.0, **network_options)
+    obs = network_options.get("obs", OBS)
+    # Of 1e-3 off one a ratio counts as clipped.
+    one = {"minibatches": 1, "num_epochs": 1, "clip_epsilon": 1e-3}
+    clipped = {}
+    for name in ("behavior", "actor"):
+        made = update(actor, critic, **one)
+        assert made.metrics()["update/fused"] == 1.0
+        # The second rollout is of the policy that the first update has left, with other statistics.
+        for _ in range(2):
+            acting = getattr(made, name)
+            rollout_ET = make_rollout(acting, num_envs=ENVS, device=DEVICE, obs=obs)
+            with torch.no_grad():
+                plain = made.actor(rollout_ET.select("actor"))["loc"]
+            torch.testing.assert_close(rollout_ET["loc"], plain, atol=0.1, rtol=0.05)
+            made(rollout_ET)
+            clipped.setdefault(name, []).append(float(made.metrics()["update/clip_fraction"]))
+    assert clipped["behavior"] == [0.0, 0.0]
+    assert min(clipped["actor"]) > 0.1
+
+
+def test_what_a_graph_of_a_rollout_replays_follows_the_modules():
+    made = update(*networks())
+    behavior, seen = made.behavior, TensorDict({"actor": torch.randn(ENVS, OBS, device=DEVICE)}, [ENVS])
+    means = torch.empty(ENVS, 12, device=DEVICE)
+
+    def act():
+        with torch.no_grad(), behavior.steady(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            means.copy_(behavior(seen.copy())["action"])
+
+    graph = Captured(act, device=DEVICE, require_graphs=True)
+    for _ in range(4):
+        graph()
+    assert graph.ready
+    before = means.clone()
+    with torch.no_grad():
+        made.actor[0].module.head.loc.bias += 0.5
+    graph()
+    torch.testing.assert_close(means, before + 0.5)
+    assert torch.equal(means, behavior(seen.copy())["loc"])
 
 
 def test_steps_that_are_not_finite_are_skipped():

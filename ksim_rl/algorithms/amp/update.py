@@ -59,7 +59,7 @@ class AMPUpdate(RolloutUpdate):
                 f"motions={cfg.motions!r}: group {cfg.style_group!r} is not finite in their states"
             )
         self.cfg, self.ppo, self.notes = cfg, ppo, ppo.notes
-        self.actor = self.behavior = ppo.actor
+        self.actor, self.behavior = ppo.actor, ppo.behavior
         self.set_progress = ppo.set_progress  # the discriminator's learning rate stays
         self.num_env_states = ppo.num_env_states
         self.reference_N2L = reference_N2L.to(ppo.device)

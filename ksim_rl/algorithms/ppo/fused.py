@@ -1,11 +1,12 @@
 """This module says whether the gradient steps of a PPO run can be fused kernels, and builds these for it."""
 
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
-from torch import nn
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
 
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate
 from ksim_rl.data import EpochSampler
@@ -50,6 +51,37 @@ def make_fused_ppo(update: DatasetUpdate, mirror: Mapping[Any, MirrorMap] | None
         guard=update.guard,
         **sizes,
     )
+
+
+class FusedBehavior(ProbabilisticTensorDictSequential):
+    """Acts as `actor`, with means that are bit for bit those of the first gradient step, by its chained kernels.
+
+    The weights are those that the actor has at each call, or where `steady` began.
+    """
+
+    def __init__(self, actor: ProbabilisticTensorDictSequential, fused: "FusedPPO") -> None:
+        parts: list[Any] = [*cast(Any, actor).module]
+        network, keys = parts[0].module, {"in_keys": parts[0].in_keys, "out_keys": parts[0].out_keys}
+
+        def parameters_of(*observations: Tensor) -> tuple[Tensor, Tensor]:
+            if not self._is_steady:
+                self._fused.parameters.load()
+            loc = self._fused.means(network.joined(*observations))
+            return loc, network.head.scale().expand_as(loc)
+
+        parts[0] = TensorDictModule(parameters_of, **keys)
+        super().__init__(*parts)
+        self._fused, self._is_steady = fused, False
+
+    @contextmanager
+    def steady(self) -> Iterator[None]:
+        """Take over the weights for all calls within, between which they stay."""
+        self._fused.parameters.load()
+        self._is_steady = True
+        try:
+            yield
+        finally:
+            self._is_steady = False
 
 
 def fused_networks(

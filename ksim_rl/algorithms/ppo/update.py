@@ -11,7 +11,7 @@ from tensordict.utils import unravel_key
 from torch import Tensor
 
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate, in_columns
-from ksim_rl.algorithms.ppo.fused import make_fused_ppo
+from ksim_rl.algorithms.ppo.fused import FusedBehavior, make_fused_ppo
 from ksim_rl.device import state_tree
 from ksim_rl.modules import CarriedState, update_normalizers
 from ksim_rl.objectives import (
@@ -58,8 +58,7 @@ class PPOUpdate(DatasetUpdate):
         **shared: Any,
     ) -> None:
         cfg = with_precision_of(cfg, device)
-        self.actor = self.behavior = actor
-        self.critic = critic
+        self.actor, self.critic = actor, critic
         self.advantage = make_advantage(cfg, actor, critic)
         loss = make_loss(cfg, actor, critic)
         networks = {"actor": actor, "critic": critic}
@@ -73,6 +72,13 @@ class PPOUpdate(DatasetUpdate):
         self._is_fused = torch.tensor(float(not isinstance(self.fused, str)), device=self.device)
         self._std = torch.zeros((), device=self.device)
         self._scale_keys = [key for key in distribution_keys(actor) if key == "scale" or key[-1] == "scale"]
+
+    @property
+    def behavior(self) -> ProbabilisticTensorDictSequential:
+        """The policy that collects: the actor, with means as chained kernels compute them where they make the steps."""
+        if isinstance(self.fused, str) or not self.fused.layout.chained:
+            return self.actor
+        return FusedBehavior(self.actor, self.fused)
 
     @property
     def rollout_keys(self) -> list[Any]:

@@ -117,12 +117,8 @@ class FusedDataset:
     def _take_observations(self, network: int, part_ET: TensorDictBase, obs: Tensor, **changes: Any) -> None:
         observer = self._observers[network]
         source, block = _time_major(observer.read(part_ET)), _block(self._arguments["LANES"])
-        moments = observer.moments
-        # Not read where there are none.
-        mean, var = (source, source) if moments is None else (moments.mean, moments.var)
-        own = {"source": source, "mean": mean, "var": var, "obs": obs, "eps": observer.eps}
-        sizes = {"num_rows": len(source), "DIM": source.shape[1], "NORMALIZED": moments is not None}
-        given = self._arguments | own | sizes | {"num_envs": 0, "LISTED": False, "faults": None} | changes
+        own = {"source": source, "obs": obs, "num_rows": len(source), "WIDTH": source.shape[1], "num_envs": 0}
+        given = self._arguments | observer.moments_given | own | {"LISTED": False, "faults": None} | changes
         launch(read_observations, (parts(len(source), block),), given, BLOCK=block)
 
 

@@ -4,7 +4,7 @@ import triton
 import triton.language as tl
 
 from ksim_rl.objectives.fused_ppo.loss_kernels import ADVANTAGE, LOG_PROB, MASK, TARGET, VALUE
-from ksim_rl.objectives.fused_ppo.mlp_kernels import operand
+from ksim_rl.objectives.fused_ppo.mlp_kernels import read_rows
 
 
 @triton.jit
@@ -16,10 +16,10 @@ def _counted_odd(value):
 @triton.jit
 def read_observations(
     source, mean, var, obs, faults, known, values, next_values, places, count, num_rows, num_envs, eps,
-    DIM: tl.constexpr, STORED: tl.constexpr, LANES: tl.constexpr, NORMALIZED: tl.constexpr, TF32: tl.constexpr,
+    WIDTH: tl.constexpr, STORED: tl.constexpr, LANES: tl.constexpr, NORMALIZED: tl.constexpr, TF32: tl.constexpr,
     LISTED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write `source` [D, DIM], normalized or not, to `obs` [D, STORED], as products take it; padding is zero.
+    """Write `source` [D, WIDTH], normalized or not, to `obs` [D, STORED], as products take it; padding is zero.
 
     Whether an element of a row is not finite is written to `faults` [D], where given. LISTED, of what follows env
     states only what the next step does not begin with is written, in any order, the rows to `places`, their number to
@@ -27,12 +27,10 @@ def read_observations(
     """
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     column = tl.arange(0, LANES)[None, :]
-    used, keep, at = column < DIM, row < num_rows, row
-    value = tl.load(source + row[:, None] * DIM + column, mask=keep[:, None] & used, other=0.0).to(tl.float32)
-    if NORMALIZED:
-        shift = tl.load(mean + column, mask=used, other=0.0)
-        value = (value - shift) / tl.sqrt(tl.load(var + column, mask=used, other=1.0) + eps)
-    value = operand(value, obs.dtype.element_ty, TF32)
+    keep, at = row < num_rows, row
+    value = read_rows(
+        source, row[:, None], column, keep[:, None], mean, var, eps, obs, WIDTH, NORMALIZED, TF32
+    )
     if LISTED:
         later = row + num_envs
         follows = (later < num_rows)[:, None] & (column < STORED)

@@ -43,7 +43,7 @@ from ksim_rl.objectives.fused_ppo.layout import (
 from ksim_rl.objectives.fused_ppo.mlp_kernels import (
     lower_gradients,
     minibatch_gradients,
-    state_values,
+    network_outputs,
     weight_gradients,
 )
 from ksim_rl.objectives.fused_ppo.step_kernels import SUMMARY, adam_step, sum_gradients, take_means
@@ -200,6 +200,7 @@ class FusedPPO:
             self._improve(0)
             for listed in ({}, self.dataset.listed):
                 self._evaluate(self.dataset.obs[1], self.dataset.records[:, 0].contiguous(), **listed)
+            self.means(torch.zeros(rows, layout.obs_dims[0], device=device))
 
         # Until the first update. One after another, kernels took ten of a cold start's seconds.
         self._ahead = Ahead(ThreadPoolExecutor()) if device.type == "cuda" and layout.chained else None
@@ -306,6 +307,23 @@ class FusedPPO:
         names = SUMMARY if self._mirrored else SUMMARY[:-1]
         return dict(zip(names, self._summary.unbind(1), strict=False)), left_out
 
+    @torch.no_grad()
+    def means(self, obs_EL: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch A"]:
+        """Return mean actions for raw observations, as chained kernels have them, with the weights loaded last."""
+        means_EA = obs_EL.new_empty(*obs_EL.shape[:-1], self.layout.actions)
+        rows_EL = obs_EL.flatten(0, -2).contiguous()
+        self._answer(0, rows_EL, means_EA.flatten(0, -2), **self.networks.observers[0].moments_given)
+        return means_EA
+
+    def _answer(self, network: int, obs: Tensor, outputs: Tensor, **given: Any) -> None:
+        """Write the outputs of a network of chained kernels for `obs` [D, L], as many columns as `outputs` has."""
+        own = {"obs": obs, "outputs": outputs, "num_rows": len(obs), "LISTED": "count" in given}
+        own |= {"WIDTH": obs.shape[1], "COLUMNS": outputs.stride(0), "NORMALIZED": False, "eps": 0.0}
+        own |= {"weights": self.parameters.weights[network], "biases": self.parameters.biases_2N[network]}
+        own |= {"mean": None, "var": None, "count": None, **given}
+        grid = (parts(len(obs), self.tuning.block),)
+        launch(network_outputs, grid, self._arguments, num_warps=self.tuning.warps, **own)
+
     def _split(self, rows: int) -> int:
         """Return how many rows of a minibatch are a split: a whole number of steps of `weight_gradients`."""
         tuning = self.tuning
@@ -384,14 +402,9 @@ class FusedPPO:
         launch(adam_step, grid, given, summary=summary, steps=self.parameters.steps[step:], **sizes)
 
     def _evaluate(self, obs_DL: Tensor, values_D: Tensor, **listed: Tensor) -> None:
-        """Write the values of observations; `listed`, those of some rows to some places (see `state_values`)."""
+        """Write the values of observations; `listed`, those of some rows to some places (see `network_outputs`)."""
         if self.layout.chained:
-            given = self._arguments | {"obs": obs_DL, "values": values_D, "num_rows": len(values_D)}
-            own = {"weights": self.parameters.weights[1], "biases": self.parameters.biases_2N[1]}
-            own |= {"LISTED": bool(listed), "count": None, **listed}
-            grid = (parts(len(values_D), self.tuning.block),)
-            launch(state_values, grid, given, num_warps=self.tuning.warps, **own)
-            return
+            return self._answer(1, obs_DL, values_D, **listed)
         *layers, last = self.networks.critic
         activation = self.networks.activation()
         # The hidden layers of some env states at a time: they take several times the memory of these.

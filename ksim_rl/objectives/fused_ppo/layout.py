@@ -39,6 +39,12 @@ class Observer:
     moments: RunningMoments | None = None
     eps: float = 0.0
 
+    @property
+    def moments_given(self) -> dict[str, Any]:
+        """What kernels get to normalize with, by the names of their parameters."""
+        mean, var = (None, None) if self.moments is None else (self.moments.mean, self.moments.var)
+        return {"mean": mean, "var": var, "eps": self.eps, "NORMALIZED": self.moments is not None}
+
 
 @dataclass(frozen=True, kw_only=True)
 class FusedNetworks:

@@ -52,13 +52,26 @@ def slope_of(value, ACTIVATION: tl.constexpr):
 
 
 @triton.jit
+def read_rows(
+    source, row, column, keep, mean, var, eps, like, WIDTH: tl.constexpr, NORMALIZED: tl.constexpr, TF32: tl.constexpr
+):  # fmt: skip
+    """Return columns of rows of `source` [D, WIDTH], normalized or not, as products with what is `like` take them."""
+    used = column < WIDTH
+    value = tl.load(source + (row * WIDTH + column), mask=keep & used, other=0.0)
+    if NORMALIZED:
+        shift = tl.load(mean + column, mask=used, other=0.0)
+        value = (value - shift) / tl.sqrt(tl.load(var + column, mask=used, other=1.0) + eps)
+    return operand(value, like.dtype.element_ty, TF32)
+
+
+@triton.jit
 def _outputs(
-    seen, rows, keep, weights, biases, inputs, input_rows,
-    STORED: tl.constexpr, OBS: tl.constexpr, HEAD: tl.constexpr, REST: tl.constexpr,
+    seen, rows, keep, mean, var, eps, weights, biases, inputs, input_rows,
+    WIDTH: tl.constexpr, NORMALIZED: tl.constexpr, OBS: tl.constexpr, HEAD: tl.constexpr, REST: tl.constexpr,
     H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr, OUT: tl.constexpr,
     CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr, TF32: tl.constexpr, STORE: tl.constexpr,
 ):  # fmt: skip
-    """Return the outputs [BLOCK, OUT] for `rows` of `seen` [D, STORED]; STORE keeps all but the first hidden layer."""
+    """Return the outputs [BLOCK, OUT] for `rows` of `seen` [D, WIDTH]; STORE keeps all but the first hidden layer."""
     BLOCK: tl.constexpr = rows.shape[0]
     SECOND_AT: tl.constexpr = H1 * OBS
     THIRD_AT: tl.constexpr = SECOND_AT + H2 * H1
@@ -68,13 +81,13 @@ def _outputs(
     column = tl.arange(0, CHUNK)
     column2 = tl.arange(0, H2)
     output = tl.arange(0, OUT)
-    at = rows[:, None] * STORED
-    observed = tl.load(seen + (at + head_column), mask=keep & (head_column < STORED), other=0.0)
+    at = rows[:, None]
+    observed = read_rows(seen, at, head_column, keep, mean, var, eps, weights, WIDTH, NORMALIZED, TF32)
     if STORE:
         tl.store(inputs + (input_rows + head_column), observed, mask=keep)
     if REST:
         rest_column = HEAD + tl.arange(0, REST)
-        rest = tl.load(seen + (at + rest_column), mask=keep & (rest_column < STORED), other=0.0)
+        rest = read_rows(seen, at, rest_column, keep, mean, var, eps, weights, WIDTH, NORMALIZED, TF32)
         if STORE:
             tl.store(inputs + (input_rows + rest_column), rest, mask=keep)
     acc = tl.zeros((BLOCK, H2), dtype=tl.float32)
@@ -109,13 +122,14 @@ def _outputs(
 
 
 @triton.jit
-def state_values(
-    obs, places, count, weights, biases, values, num_rows,
-    LISTED: tl.constexpr, STORED: tl.constexpr, OBS: tl.constexpr, HEAD: tl.constexpr, REST: tl.constexpr,
+def network_outputs(
+    obs, places, count, mean, var, eps, weights, biases, outputs, num_rows,
+    LISTED: tl.constexpr, WIDTH: tl.constexpr, NORMALIZED: tl.constexpr, COLUMNS: tl.constexpr,
+    OBS: tl.constexpr, HEAD: tl.constexpr, REST: tl.constexpr,
     H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr, OUT: tl.constexpr, BLOCK: tl.constexpr,
     CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr, TF32: tl.constexpr,
 ):  # fmt: skip
-    """Write the first output for rows of `obs` [D, STORED] to `values` [D]; LISTED, for `count` rows to `places`."""
+    """Write what a network makes of rows of `obs` [D, WIDTH] to `outputs` [D, COLUMNS]; LISTED, `count` to `places`."""
     rows = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     if LISTED:
         num_rows = tl.load(count)
@@ -123,12 +137,13 @@ def state_values(
         return
     valid = rows < num_rows
     out = _outputs(
-        obs, rows, valid[:, None], weights, biases, values, rows, STORED, OBS, HEAD, REST,
+        obs, rows, valid[:, None], mean, var, eps, weights, biases, outputs, rows, WIDTH, NORMALIZED, OBS, HEAD, REST,
         H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, TF32, False
     )  # fmt: skip
     if LISTED:
         rows = tl.load(places + rows, mask=valid, other=0)
-    tl.store(values + rows, tl.sum(tl.where(tl.arange(0, OUT)[None, :] == 0, out, 0.0), 1), mask=valid)
+    column = tl.arange(0, OUT)[None, :]
+    tl.store(outputs + (rows[:, None] * COLUMNS + column), out, mask=valid[:, None] & (column < COLUMNS))
 
 
 @triton.jit
@@ -175,7 +190,7 @@ def minibatch_gradients(
 
     dtype = slopes.dtype.element_ty
     out = _outputs(
-        obs, index, keep, weights, biases, inputs, input_rows, STORED, OBS, HEAD, REST,
+        obs, index, keep, None, None, 0.0, weights, biases, inputs, input_rows, STORED, False, OBS, HEAD, REST,
         H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, TF32, True
     )  # fmt: skip
 
