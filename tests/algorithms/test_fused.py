@@ -182,13 +182,16 @@ def test_updates_equal_those_of_torch(fused_ppo, options, actor_options):
     actor, critic = networks(**actor_options)
     torch_s, fused = update(cfg, actor, critic), update(cfg, actor, critic, fused_ppo)
     for seed in range(2):
-        data = rollout(actor, seed=seed)
+        data = rollout(actor, seed=seed).clone()
+        # Of an env state that is left out, as its reward is no number.
+        data["scale"][3, 2, 0] = float("nan")
         torch_s(data.clone())
         fused(data)
     assert_equal_states(torch_s, fused, atol=1e-5)
     ours, theirs = fused.metrics(), torch_s.metrics()
     assert ours.keys() == theirs.keys()
     assert ours["update/non_finite_env_states"] == 4
+    torch.testing.assert_close(ours["policy/std"], data["scale"].nanmean())
     assert 0.0 <= ours["update/clip_fraction"] < 1.0
     assert ("loss/mirror" in ours) == (cfg.symmetry == "loss")
     # Torch's has other numbers in the place of the env states that are left out, and takes their variance too.
