@@ -1,6 +1,7 @@
 """`RolloutCollector` against TorchRL's own rollout and collector."""
 
 import dataclasses
+from contextlib import contextmanager
 
 import pytest
 import torch
@@ -44,6 +45,24 @@ class RandomPolicy(torch.nn.Module):
         return td.set("action_log_prob", noise[..., 0].square())
 
 
+class SteadyPolicy(RandomPolicy):
+    """Notes of each call how many `steady` have begun, or None outside of them."""
+
+    def __init__(self):
+        super().__init__()
+        self.begun, self.within, self.calls = 0, False, []
+
+    @contextmanager
+    def steady(self):
+        self.begun, self.within = self.begun + 1, True
+        yield
+        self.within = False
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        self.calls.append(self.begun if self.within else None)
+        return super().forward(td)
+
+
 def assert_same(actual: TensorDictBase, expected: TensorDictBase, ignore=()):
     keys = {
         key for key in expected.keys(True, True) if (key if isinstance(key, str) else key[0]) not in ignore
@@ -83,6 +102,14 @@ def test_equals_the_stock_collector():
     stock.shutdown(close_env=False)
     assert_same(first, batches[0], ignore=("collector",))
     assert_same(second, batches[1], ignore=("collector",))
+
+
+def test_a_policy_is_steady_once_for_all_steps_of_a_rollout():
+    policy = SteadyPolicy()
+    collector = RolloutCollector(noisy_env(), policy, rollout_length=STEPS, cfg=CollectorCfg(compile=False))
+    collector.collect()
+    collector.collect()
+    assert policy.calls == [1] * STEPS + [2] * STEPS
 
 
 def test_dims_are_named_and_memory_is_reused():
