@@ -13,7 +13,7 @@ from ksim_rl.objectives.algorithm_cfg import (
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.discriminator_loss import discriminator_loss, style_reward
 from ksim_rl.objectives.distillation_loss import DistillationLoss
-from ksim_rl.objectives.distributional import cross_entropy, mean_of, project_distribution
+from ksim_rl.objectives.distributional import compare, mean_of, project_distribution
 from ksim_rl.objectives.flat_adamw import FlatAdamW
 from ksim_rl.objectives.gradient_step import (
     NonFiniteStepsError,

@@ -1,8 +1,59 @@
 """This module projects the targets of critics that predict a distribution of returns, and compares them."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
+
+from ksim_rl.objectives.algorithm_cfg import ValueReduction
+
+
+def compare(
+    logits_BNA: Float[Tensor, "B N A"],
+    support_A: Float[Tensor, " A"],
+    following_BNA: Float[Tensor, "B N A"],
+    reward_B1: Float[Tensor, "B 1"],
+    discount_B1: Float[Tensor, "B 1"],
+    reduction: ValueReduction,
+) -> tuple[Float[Tensor, "B N"], Float[Tensor, "B N"]]:
+    """Return the cross entropies of N critics to their targets, and the means that they predict, without gradients.
+
+    Targets are the projected distributions of the logits that follow: each critic has its own, or with "min" that of
+    the lowest mean. On CUDA it is one kernel, gradients included, and the same bits each time.
+    """
+    if logits_BNA.is_cuda:
+        given = following_BNA, reward_B1, discount_B1, reduction == "min"
+        loss_BN, mean_BN = _by_kernel(logits_BNA, support_A, *given)
+        return loss_BN, mean_BN.detach()
+    logits_BNA = _exact(logits_BNA)
+    with torch.no_grad():
+        probs_BNA, moves = _exact(following_BNA).softmax(-1), (reward_B1[:, None], discount_B1[:, None])
+        target_BNA = project_distribution(probs_BNA, *moves, support_A)
+        if reduction == "min":
+            lowest_B11 = mean_of(target_BNA, support_A).argmin(-1)[:, None, None]
+            target_BNA = target_BNA.take_along_dim(lowest_B11, dim=1).expand_as(logits_BNA)
+    losses_BN = functional.cross_entropy(logits_BNA.mT, target_BNA.mT, reduction="none")
+    return losses_BN, mean_of(logits_BNA.detach().softmax(-1), support_A)
+
+
+def mean_returns(logits_BNA: Float[Tensor, "B N A"], support_A: Float[Tensor, " A"]) -> Float[Tensor, "B N"]:
+    """Return the means of the distributions with these logits, by one kernel on CUDA."""
+    if logits_BNA.is_cuda:
+        return _by_kernel(logits_BNA, support_A)[0]
+    return mean_of(_exact(logits_BNA).softmax(-1), support_A)
+
+
+def _by_kernel(*given: Any) -> Any:
+    # Not above: Triton comes with torch for CUDA only.
+    from ksim_rl.objectives.distribution_kernel import Compared
+
+    return Compared.apply(*given)
+
+
+def _exact(logits: Tensor) -> Tensor:
+    return logits.to(torch.promote_types(logits.dtype, torch.float32))
 
 
 def project_distribution(
@@ -15,13 +66,8 @@ def project_distribution(
 
     The mass of each moved atom goes to the two atoms that it falls between, in proportion to how near they are; beyond
     the ends it goes to the last atom (algorithm 1 of Bellemare et al., arXiv 1707.06887). `support_A` has the values of
-    the atoms, evenly spaced, rising. On CUDA the sums have one order, and so the same bits each time.
+    the atoms, evenly spaced, rising.
     """
-    if probs.is_cuda:
-        # Not above: Triton comes with torch for CUDA only.
-        from ksim_rl.objectives.projection_kernel import project_by_kernel
-
-        return project_by_kernel(probs, reward, discount, support_A)
     low, high, count = support_A[0], support_A[-1], support_A.shape[0]
     spacing = (high - low) / (count - 1)
     position = ((reward + discount * support_A).clamp(low, high) - low) / spacing
@@ -39,10 +85,3 @@ def mean_of(probs: Float[Tensor, "*batch A"], support_A: Float[Tensor, " A"]) ->
     """Return the means of distributions."""
     # No product of matrices: autocast would round it to bfloat16.
     return (probs * support_A).sum(-1)
-
-
-def cross_entropy(
-    logits: Float[Tensor, "*batch A"], probs: Float[Tensor, "*batch A"]
-) -> Float[Tensor, "*batch"]:
-    """Return -sum(probs * log softmax(logits)), in nats."""
-    return -(probs * logits.log_softmax(-1)).sum(-1)

@@ -22,7 +22,7 @@ from ksim_rl.checked import Share, check_value
 from ksim_rl.checks import check_in_range
 from ksim_rl.device.running_moments import RunningMoments
 from ksim_rl.objectives.algorithm_cfg import ValueReduction
-from ksim_rl.objectives.distributional import cross_entropy, mean_of, project_distribution
+from ksim_rl.objectives.distributional import compare, mean_returns
 
 
 @contextmanager
@@ -88,7 +88,8 @@ class OffPolicyLoss(LossModule):
         shared: Any = {id(own): own for own in critic_network.modules() if isinstance(own, RunningMoments)}
         # Under a name that `parameters()` leaves out.
         self._target_critic = copy.deepcopy(critic_network, memo=shared).requires_grad_(False)
-        self.support_A, self.gamma, self.value_reduction = support_A, gamma, value_reduction
+        self.support_A, self.gamma = support_A, gamma
+        self.value_reduction: ValueReduction = value_reduction
         self.reduction, self._selected = "mean", list[Any](self._written)
 
     @property
@@ -158,17 +159,17 @@ class OffPolicyLoss(LossModule):
         """There is no value estimator."""
 
     def _predict(self, critic: TensorDictModule, observed: TensorDictBase, action: Tensor) -> Tensor:
-        """Return what the N critics say of an action: values [B, N], or logits [B, N, A]."""
+        """Return what the N critics say of an action: values [B, N], or logits [B, N, A] in the precision of layers."""
         keys = [key for key in critic.in_keys if key != self.tensor_keys.action]
         inputs = observed.select(*keys).set(self.tensor_keys.action, action)
         out = critic(inputs).get(critic.out_keys[0])
-        return out.to(torch.promote_types(out.dtype, torch.float32))
+        return out.to(torch.promote_types(out.dtype, torch.float32)) if self.support_A is None else out
 
     def _value(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         """Return the value of an action [B], which the actor climbs; no gradients reach the critics."""
         with frozen(self.critic_network):
             predicted = self._predict(self.critic_network, tensordict, action)
-        values_BN = predicted if self.support_A is None else mean_of(predicted.softmax(-1), self.support_A)
+        values_BN = predicted if self.support_A is None else mean_returns(predicted, self.support_A)
         return values_BN.amin(-1) if self.value_reduction == "min" else values_BN.mean(-1)
 
     def critic_loss(self, tensordict: TensorDictBase) -> tuple[Scalar, dict[str, Scalar]]:
@@ -194,15 +195,8 @@ class OffPolicyLoss(LossModule):
             values_BN, loss_B = predicted, error_BN.square().sum(-1)
             td_error_B = error_BN.detach().abs().amax(-1)
         else:
-            with torch.no_grad():
-                target_BNA = project_distribution(
-                    next_predicted.softmax(-1), reward_B1[:, None], discount_B1[:, None], self.support_A
-                )
-                if self.value_reduction == "min":
-                    lowest_B11 = mean_of(target_BNA, self.support_A).argmin(-1)[:, None, None]
-                    target_BNA = target_BNA.take_along_dim(lowest_B11, dim=1).expand_as(predicted)
-                values_BN = mean_of(predicted.softmax(-1), self.support_A)
-            loss_BN = cross_entropy(predicted, target_BNA)
+            given = next_predicted, reward_B1, discount_B1, self.value_reduction
+            loss_BN, values_BN = compare(predicted, self.support_A, *given)
             loss_B = loss_BN.sum(-1)
             # As in Rainbow (Hessel et al., arXiv 1710.02298), what is minimized is the priority.
             td_error_B = loss_BN.detach().amax(-1)

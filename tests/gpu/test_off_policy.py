@@ -3,6 +3,8 @@
 import copy
 import dataclasses
 from contextlib import nullcontext
+from functools import partial
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +14,8 @@ from torchrl.data import Unbounded
 
 from ksim_rl.device import state_tree
 from ksim_rl.modules.mlp import mlp
-from ksim_rl.objectives import FlatAdamW, SACCfg, TD3Cfg, frozen, project_distribution
+from ksim_rl.objectives import FlatAdamW, SACCfg, TD3Cfg, compare, frozen
+from ksim_rl.objectives.distributional import mean_returns
 from tests.algorithms.off_policy_problem import make_update
 from tests.gpu.no_syncs import no_syncs
 
@@ -151,15 +154,34 @@ def test_compiled_losses_are_those_of_eager_ones():
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_projected_distributions_are_those_of_the_cpu_and_the_same_each_time():
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("reduction", ["min", "mean"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_distributions_are_compared_as_on_the_cpu_with_the_same_bits_each_time(dtype, reduction, compiled):
+    torch.manual_seed(0)
     support = torch.linspace(-2.0, 6.0, 101)
-    probs = torch.randn(512, 2, 101).softmax(-1)
-    reward, discount = torch.randn(512, 1, 1) * 3, torch.where(torch.rand(512, 1, 1) < 0.1, 0.0, 0.97)
-    expected = project_distribution(probs, reward, discount, support)
-    moved = [tensor.cuda() for tensor in (probs, reward, discount, support)]
-    found = project_distribution(*moved)
-    torch.testing.assert_close(found.cpu(), expected, rtol=1e-4, atol=1e-5)
-    assert torch.equal(found, project_distribution(*moved))
+    logits, following = (3.0 * torch.randn(513, 2, 101).to(dtype) for _ in range(2))
+    reward, discount = torch.randn(513, 1) * 3, torch.where(torch.rand(513, 1) < 0.1, 0.0, 0.97)
+    given = support, following, reward, discount
+    forward: Any = partial(compare, reduction=reduction)
+    fast = torch.compile(forward, fullgraph=True, dynamic=False) if compiled else forward
+
+    def run(work, logits, *given):
+        logits = logits.detach().requires_grad_()
+        losses, means = work(logits, *given)
+        values = mean_returns(logits, given[0])
+        return losses, means, values, *torch.autograd.grad((losses.square() + values).sum(), logits)
+
+    moved = [own.cuda() for own in (logits, *given)]
+    found, expected = (
+        run(fast, *moved),
+        run(forward, logits.float(), support, following.float(), reward, discount),
+    )
+    for one, other in zip(found, expected, strict=True):
+        # bfloat16 rounds gradients twice, and their sum.
+        tolerance = 0.01 if one.dtype == torch.bfloat16 else 1e-5
+        assert (one.float().cpu() - other).norm() < tolerance * other.norm()
+    assert all(map(torch.equal, found, run(fast, *moved)))
 
 
 @pytest.mark.parametrize("compiled", [False, True])

@@ -15,7 +15,7 @@ from torchrl.data import Unbounded
 
 from ksim_rl.data import MASK_KEY
 from ksim_rl.modules import QNetworkCfg, SquashedActorCfg, make_q_network, make_squashed_actor
-from ksim_rl.objectives import SACLoss, TD3Loss, frozen, off_policy_loss
+from ksim_rl.objectives import SACLoss, TD3Loss, distributional, frozen
 from ksim_rl.testing import count_syncs
 
 BATCH, OBS, ACTION = 64, 5, 3
@@ -216,7 +216,7 @@ def test_keys_can_be_renamed():
 @pytest.mark.parametrize("layer_norm", [False, True])
 def test_no_sum_of_a_compiled_step_is_without_an_order(layer_norm, monkeypatch):
     # On CUDA a kernel projects, in one order.
-    monkeypatch.setattr(off_policy_loss, "project_distribution", lambda probs, *_: probs)
+    monkeypatch.setattr(distributional, "project_distribution", lambda probs, *_: probs)
     actor, critic = networks(11, layer_norm=layer_norm)
     loss = SACLoss(actor, critic, target_entropy=-3.0, support_A=critic.module.support)
     found = []
