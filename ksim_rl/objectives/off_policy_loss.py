@@ -216,7 +216,10 @@ class OffPolicyLoss(LossModule):
                 weight_B = weight_B * self._expand_loss_mask(mask, column_B)
         # A where instead of a product: what is left out may be anything, and zero times infinity is NaN.
         column_B = torch.where(weight_B > 0.0, column_B * weight_B, 0.0)
-        return column_B.sum() / weight_B.sum().clamp_min(torch.finfo(torch.float32).tiny)
+        # In two steps: the compiler makes one block of a sum to 8192 numbers, which takes three times as long.
+        parts = math.gcd(len(column_B), 64)
+        column_sum, weight_sum = (own.reshape(parts, -1).sum(-1).sum() for own in (column_B, weight_B))
+        return column_sum / weight_sum.clamp_min(torch.finfo(torch.float32).tiny)
 
 
 class SACLoss(OffPolicyLoss):
