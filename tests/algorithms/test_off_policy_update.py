@@ -102,6 +102,14 @@ def test_steps_that_are_not_finite_change_nothing_and_end_the_run():
     assert all(torch.equal(a, b) for a, b in zip(before, update.actor.parameters(), strict=True))
 
 
+def test_a_step_is_skipped_where_the_actors_part_is():
+    update = make_trainer("fast_sac").update
+    of_critic, of_actor = torch.tensor([1.0, 0, 0, 0, 1, 1, 0, 0]), torch.tensor([0.0, 1, 0, 1])
+    assert update.cfg.policy_delay == 2 and int(update._counted_(of_critic, of_actor)) == 3
+    # 1, 0, 0, 1, 1, 1, 0, 1
+    assert (int(update.guard.skipped), int(update.guard.skipped_in_a_row)) == (5, 1)
+
+
 def test_rollouts_that_are_not_finite_reach_no_gradient():
     trainer = make_trainer("fast_sac")
     for _ in range(2):

@@ -135,21 +135,25 @@ class OffPolicyUpdate(RolloutUpdate):
     def _update(self) -> None:
         self._store()
         minibatches = self.replay.minibatches(self.data.num_minibatches, read=self._read)
-        of_critic, of_actor, in_a_row = [], [], []
+        of_critic, of_actor = [], []
         for step, minibatch_B in enumerate(minibatches, start=1):
             of_critic.append(self._improve_critic(minibatch_B))
-            skipped = [of_critic[-1]["skipped"]]
             if step % self.cfg.policy_delay == 0:
                 of_actor.append(self._improve_actor(minibatch_B))
-                skipped.append(of_actor[-1]["skipped"])
-            in_a_row.append(self._count_(skipped))
-        self._measure_(in_columns(of_critic) | {"skipped_in_a_row": torch.stack(in_a_row)})
-        self._means.take_(in_columns(of_actor))
+        columns = in_columns(of_critic), in_columns(of_actor)
+        longest = self._count_(*(own["skipped"] for own in columns))
+        self._measure_(columns[0] | {"skipped_in_a_row": longest.expand_as(columns[0]["skipped"])})
+        self._means.take_(columns[1])
 
-    def _counted_(self, skipped: list[Tensor]) -> Tensor:
-        """Count a gradient step, skipped if one of its parts was; return how many in a row were."""
-        self.guard.count_(torch.stack(skipped).amax())
-        return self.guard.skipped_in_a_row.clone()
+    def _counted_(self, of_critic_S: Tensor, of_actor: Tensor) -> Tensor:
+        """Count S gradient steps, skipped if one of their parts was; return how many in a row were at most."""
+        longest, delay = torch.zeros_like(self.guard.skipped), self.cfg.policy_delay
+        for step, skipped in enumerate(of_critic_S.unbind(), start=1):
+            if step % delay == 0:
+                skipped = torch.maximum(skipped, of_actor[step // delay - 1])
+            self.guard.count_(skipped)
+            longest = torch.maximum(longest, self.guard.skipped_in_a_row)
+        return longest
 
     def _stored(self, index_B: Int64[Tensor, " B"]) -> TensorDictBase:
         """Return env states of the replay for their indices, every second one in the mirror with a symmetry."""
