@@ -82,8 +82,7 @@ class QNetwork(ObservingNetwork):
         """Return action values [..., N], or with atoms the logits of their probabilities [..., N, A]."""
         features = torch.cat((self.observe(obs), action), dim=-1)
         batch = features.shape[:-1]
-        features_NBL = features.reshape(1, -1, features.shape[-1]).expand(self.cfg.num_networks, -1, -1)
-        out = self.layers(features_NBL).transpose(0, 1).unflatten(0, batch)
+        out = self.layers(features.reshape(1, -1, features.shape[-1])).transpose(0, 1).unflatten(0, batch)
         return out.squeeze(-1) if self.support is None else out
 
 

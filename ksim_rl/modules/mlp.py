@@ -77,7 +77,7 @@ def linear(input_dim: int, output_dim: int, *, gain: float, device: Device = Non
 
 
 class EnsembleLinear(nn.Module):
-    """N linear layers as one batched product: [N, B, input_dim] to [N, B, output_dim].
+    """N linear layers as one batched product: [N, B, input_dim], or [1, B, input_dim] for all, to [N, B, output_dim].
 
     Weights are orthogonal with scale `gain`, drawn on the CPU network by network, and biases zero.
     """
@@ -98,9 +98,9 @@ class EnsembleLinear(nn.Module):
             network.copy_(nn.init.orthogonal_(torch.empty(network.shape[::-1]), self.gain).t())
         self.bias.zero_()
 
-    def forward(self, features_NBL: Float[Tensor, "N B L"]) -> Float[Tensor, "N B M"]:
+    def forward(self, features_NBL: Float[Tensor, "#N B L"]) -> Float[Tensor, "N B M"]:
         """Return what each layer gives for its own input."""
-        return torch.baddbmm(self.bias, features_NBL, self.weight)
+        return torch.baddbmm(self.bias, features_NBL.expand(len(self.weight), -1, -1), self.weight)
 
 
 class EnsembleLayerNorm(nn.Module):
@@ -129,7 +129,7 @@ class Layers(nn.Sequential):
     kernel. An activation that the kernel does not have follows it.
     """
 
-    def forward(self, features: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch M"]:
+    def forward(self, features: Float[Tensor, "#*batch L"]) -> Float[Tensor, "*batch M"]:
         """Return what the last layer gives."""
         if not rounds(features):
             return super().forward(features)
@@ -167,16 +167,20 @@ def rounds(features: Float[Tensor, "*batch L"]) -> bool:
 class _Product(Function):
     """The products [N, B, M] of features [N, B, K] and weights [N, K, M], which are there `rounded` as well.
 
-    Those of one network are [M, K], as torch has them. The gradient of the weights is a sum over env states in SPLITS
-    parts: its outputs alone, which are few, would occupy a part of the GPU. It lies in memory as the weights do, since
-    autograd copies what does not.
+    Features [1, B, K] are those of all networks. Weights of one network are [M, K], as torch has them. The gradient of
+    the weights is a sum over env states in SPLITS parts: its outputs alone, which are few, would occupy a part of the
+    GPU. It lies in memory as the weights do, since autograd copies what does not.
     """
 
     @staticmethod
     def forward(ctx: Any, features_NBK: Tensor, weight: Tensor, rounded: Tensor) -> Tensor:
         ctx.alone = weight.dim() == 2
         fan_in, fan_out = ctx.sizes = weight.mT.shape if ctx.alone else weight.shape[1:]
-        features = _padded(features_NBK, -fan_in % 8)
+        networks = len(rounded)
+        ctx.is_shared = len(features_NBK) < networks
+        # What all networks read is cast once, unless weights learn by it: their gradient would copy it again.
+        features = features_NBK.expand(networks if ctx.needs_input_grad[1] else -1, -1, -1)
+        features = _padded(features, -fan_in % 8).expand(networks, -1, -1)
         ctx.save_for_backward(features, rounded)
         ctx.dtype = features_NBK.dtype
         return torch.bmm(features, rounded)[..., :fan_out]
@@ -189,6 +193,7 @@ class _Product(Function):
         d_features = d_weight = None
         if ctx.needs_input_grad[0]:
             d_features = torch.bmm(d_out, rounded.mT)[..., :fan_in].to(ctx.dtype)
+            d_features = d_features.sum(0, keepdim=True) if ctx.is_shared else d_features
         if ctx.needs_input_grad[1]:
             networks, rows = features.shape[:2]
             splits = math.gcd(SPLITS, rows)

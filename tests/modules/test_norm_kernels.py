@@ -86,3 +86,22 @@ def test_layers_without_a_norm_are_products(monkeypatch):
     monkeypatch.setattr(sys.modules[Layers.__module__], "rounds", lambda features: True)
     assert (layers(inputs) - expected).norm() < 0.02 * expected.norm()
     assert isinstance(layers[:2], Layers) and isinstance(mlp(7, (9,), 3), nn.Sequential)
+
+
+@pytest.mark.parametrize("learns", [False, True])
+def test_networks_that_read_the_same_give_what_they_give_for_copies(learns, monkeypatch):
+    layers = mlp(61, (24,), 13, num_networks=2, layer_norm=True).requires_grad_(learns)
+    inputs = torch.randn(8, 61, requires_grad=True)
+    module, cast = sys.modules[Layers.__module__], []
+    padded = vars(module)["_padded"]
+    monkeypatch.setattr(module, "rounds", lambda features: True)
+    monkeypatch.setattr(module, "_padded", lambda own, *given: cast.append(own) or padded(own, *given))
+
+    def run(features):
+        out = layers(features).float().square().sum()
+        return out, *torch.autograd.grad(out, [inputs, *(layers.parameters() if learns else ())])
+
+    found = run(inputs[None])
+    assert len(cast[0]) == (2 if learns else 1)
+    for one, other in zip(found, run(inputs.expand(2, -1, -1).contiguous()), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
