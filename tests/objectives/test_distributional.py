@@ -112,6 +112,7 @@ def test_one_kernel_takes_means_and_logits_of_half_precision(kernel):
         torch.testing.assert_close(own.float(), true, rtol=1.2e-2, atol=1e-5)
 
 
+@pytest.mark.filterwarnings("ignore:invalid value encountered in cast")
 def test_one_kernel_hides_nothing_that_is_not_finite(kernel):
     # The discount of row 7 is 0.
     for which, row in itertools.product(range(4), (7, 12)):
