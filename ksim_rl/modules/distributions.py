@@ -103,8 +103,12 @@ class DiagonalGaussian(VectorDistribution):
 
     def log_prob(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*shape"]:
         """Return the log density of `value` in nats."""
+        return self.log_densities(value).sum(-1)
+
+    def log_densities(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*shape L"]:
+        """Return the log density of each component, in nats."""
         error = (value - self.loc) / self.scale
-        return (-0.5 * error.square() - self.scale.log() - _HALF_LOG_2_PI).sum(-1)
+        return -0.5 * error.square() - self.scale.log() - _HALF_LOG_2_PI
 
     def entropy(self) -> Float[Tensor, "*batch"]:
         """Return the differential entropy in nats."""
@@ -175,7 +179,12 @@ class TanhGaussian(BoundedDistribution):
         log_slope = 2.0 * (math.log(2.0) - latent - functional.softplus(-2.0 * latent))
         half_range = self._half_range
         log_half_range = half_range.log() if isinstance(half_range, Tensor) else math.log(half_range)
-        return self.base.log_prob(latent) - (log_slope + log_half_range).sum(-1)
+        terms = self.base.log_densities(latent) - log_slope - log_half_range
+        if torch.compiler.is_compiling():
+            # The compiler would compute what a sum adds up by few, long threads. No product rounds float64.
+            ones = torch.ones(terms.shape[-1], 1, dtype=torch.float64, device=terms.device)
+            return (terms.to(torch.float64) @ ones).squeeze(-1).to(terms.dtype)
+        return terms.sum(-1)
 
 
 @register_kl(TanhGaussian, TanhGaussian)

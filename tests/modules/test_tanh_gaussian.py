@@ -2,6 +2,8 @@ import math
 
 import pytest
 import torch
+from torch._dynamo.backends.common import aot_autograd
+from torch._functorch.aot_autograd import make_boxed_func
 from torch.distributions import (
     AffineTransform,
     Independent,
@@ -153,3 +155,25 @@ def test_no_host_sync_and_compiles_without_a_break():
     assert syncs.total == 0, syncs.report()
     compiled = torch.compile(use, fullgraph=True, backend="aot_eager")(loc, scale, value)
     torch.testing.assert_close(compiled[:2], eager[:2])
+
+
+def test_compiled_densities_are_summed_by_a_product_and_equal_with_their_gradients():
+    loc, raw = torch.randn(6, 5, requires_grad=True), torch.randn(6, 5, requires_grad=True)
+
+    def work(loc, raw):
+        return TanhGaussian(loc, raw.exp(), -2.0, 2.0).rsample_and_log_prob()
+
+    kept = []
+
+    def note(graph, _):
+        kept.extend(str(node.target) for node in graph.graph.nodes)
+        return make_boxed_func(graph.forward)
+
+    compiled = torch.compile(work, backend=aot_autograd(fw_compiler=note), fullgraph=True, dynamic=False)
+    results = []
+    for draw in (compiled, work):
+        torch.manual_seed(0)
+        out = draw(loc, raw)
+        results.append([*out, *torch.autograd.grad(out[0].sum() + out[1].square().sum(), [loc, raw])])
+    torch.testing.assert_close(*results)
+    assert "aten.mm.default" in kept and not any("aten.sum" in name for name in kept)
