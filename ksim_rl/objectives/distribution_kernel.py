@@ -107,7 +107,7 @@ class Compared(Function):
             following_BNA, *moves, lowest = targets
             given = following_BNA.transpose(0, 1), *(move.expand(rows, 1) for move in moves)
         given = logits, *(own.contiguous() for own in given), support_A, loss_NB, mean_NB, slope
-        sizes = rows, bool(targets), lowest, networks, count, ROWS, triton.next_power_of_2(count)
+        sizes = rows, len(targets) > 0, lowest, networks, count, ROWS, triton.next_power_of_2(count)
         launch: Any = compare_rows[-(-rows // ROWS), networks]
         launch(*given, *sizes, num_warps=max(sizes[-1] // 256, 1))
         ctx.save_for_backward(slope)
