@@ -200,8 +200,8 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             after=driver.after_substep,
             sensors=driver.substep_sensors,
         )
-        # Also false for NaN, and in fewer kernels than `torch.isfinite`.
-        finite_E = finite_E & ((world.qpos_EL.sum(-1) + world.qvel_EL.sum(-1)).abs() < torch.inf)
+        # Also false for NaN. Beyond this bound MuJoCo's C engine, too, calls a state bad and resets it.
+        finite_E = finite_E & ((world.qpos_EL.sum(-1) + world.qvel_EL.sum(-1)).abs() < mujoco.mjMAXVAL)
         # Clearing failed worlds at once keeps everything that is computed from here on finite.
         world.reset(~finite_E)
         world.refresh()

@@ -2,6 +2,7 @@
 
 import math
 
+import mujoco
 import pytest
 import torch
 from tensordict import TensorDict
@@ -140,10 +141,12 @@ def test_a_non_finite_action_ends_that_env_only():
     assert next_E["reward"][1] == 0 and env.episode_log()["termination/non_finite"] == 1
 
 
-def test_non_finite_physics_ends_that_env_and_is_gone_after_the_reset():
+@pytest.mark.parametrize("speed", [math.inf, 2.0 * mujoco.mjMAXVAL])
+def test_physics_gone_bad_ends_that_env_and_is_gone_after_the_reset(speed):
+    """MuJoCo's C engine resets a state beyond `mjMAXVAL` as it does one that is not finite."""
     env, twin = puck_env(limit=None), puck_env(limit=None)
     root_E, twin_root_E = env.reset(), twin.reset()
-    env.world.qvel_EL[2] = torch.inf
+    env.world.qvel_EL[2] = speed
     env_state_E, root_E = env.step_and_maybe_reset(root_E.set("action", torch.zeros(3, 1)))
     assert env_state_E["next", "terminated"][:, 0].tolist() == [False, False, True]
     assert all(torch.isfinite(leaf).all() for leaf in env_state_E.values(True, True))
