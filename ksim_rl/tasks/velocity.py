@@ -377,7 +377,10 @@ def on_rough_ground(
     )
 
 
-def training(*, num_iterations: int, entropy_coeff: float = 0.01) -> TrainingCfg:
+ACTOR = ActorCfg(output_gain=1.0)
+
+
+def training(*, num_iterations: int, entropy_coeff: float = 0.01, actor: ActorCfg = ACTOR) -> TrainingCfg:
     """Return the training settings: 24 steps of 4096 envs per update.
 
     They are mjlab's but for two: with a discount of 0.98 (it has 0.99) and an output layer of ordinary scale Go1
@@ -388,7 +391,7 @@ def training(*, num_iterations: int, entropy_coeff: float = 0.01) -> TrainingCfg
         seed=42,
         objective=PPOCfg(gamma=0.98, entropy_coeff=entropy_coeff, precision="auto"),
         data=DatasetCfg(num_env_states_per_minibatch=24 * 4096 // 4, num_minibatches=4),
-        modules=ModulesCfg(actor=ActorCfg(output_gain=1.0)),
+        modules=ModulesCfg(actor=actor),
         trainer=TrainerCfg(num_iterations=num_iterations),
     )
 
