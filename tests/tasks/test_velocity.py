@@ -1,5 +1,7 @@
 """Velocity and get-up tasks: a stance that holds without a policy, sizes, and rewards that rank states rightly."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -156,6 +158,7 @@ def test_a_humanoid_that_gets_up_is_not_thrown_about_by_its_first_policy():
     )
     trainer = build(conf.compose(["task=humanoid_get_up", *words.split()]))
     joints = trainer.collector.env.action_spec.shape[-1]
-    speeds = trainer.collector.collect()["actor"][..., -2 * joints : -joints].abs()
+    rollout_ET: Any = trainer.collector.collect()
+    speeds = rollout_ET["actor"][..., -2 * joints : -joints].abs()
     trainer.collector.env.close()
     assert 10.0 < speeds.flatten().quantile(0.99) < 36.0
