@@ -130,15 +130,19 @@ def _training(num_iterations: int) -> TrainingCfg:
     )
 
 
+# At its point in 6 of 8 s, in which both rewards are 1: a new one comes every 3 to 5 s, and a second is for the way.
 REACH = Task(
     name="arm_reach",
     description="an arm brings its tip to points in space",
     cfg=arm_reach,
     training=_training(300),
+    solved_at=12.0,
 )
+# The cube in its place, and the tip at the cube, in 6 of 8 s: rewards of 1, 2 and 0.5.
 PUSH = Task(
     name="arm_push",
     description="an arm pushes a cube to a place on the table",
     cfg=arm_push,
     training=_training(1000),
+    solved_at=21.0,
 )

@@ -326,11 +326,14 @@ def walker_track() -> ManagerBasedRlEnvCfg:
 
 
 AS_RECORDED = AMPCfg(motions=(MOTION,), **OBJECTIVE)
+# At its speed from 1 s on, in 350 of 400 steps.
 AMP = Task(
     name="walker_amp",
     description="a planar biped walks at 0.8 m/s, with objective=amp as a recorded walk does",
     cfg=walker_amp,
     training=training(num_iterations=400),
     other_trainings=(training(num_iterations=400, objective=AS_RECORDED),),
+    solved_at=350.0,
 )
-TRACK = _task("walker_track", walker_track, "a planar biped follows a walk", 400)
+# Nine tenths of the rewards, which are 1 together, in the 4.4 s that are left of the walk where an episode starts.
+TRACK = _task("walker_track", walker_track, "a planar biped follows a walk", 400, 3.9)
