@@ -3,6 +3,7 @@
 To write it anew: python -m tests.docs.test_tasks. It builds every task once, for the sizes, and needs all robots.
 """
 
+import itertools
 import json
 import os
 import statistics
@@ -21,7 +22,10 @@ from ksim_rl.tables.table import Row, load
 
 PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
 RESULTS = report.RESULTS / "tasks.json"
-TABLES = {name: report.RESULTS / "tables" / f"{name}.json" for name in ("tasks", "tracking")}
+TABLES = {
+    name: report.RESULTS / "tables" / f"{name}.json"
+    for name in ("tasks", "velocity", "humanoids", "tracking")
+}
 NUM_ENVS = 4096
 COLUMNS = (
     "task",
@@ -63,15 +67,16 @@ OLDER = (
 )
 LEARNED = """## What was learned
 
-By `ksim-rl reproduce tasks`, and for `g1_track_*` `ksim-rl reproduce tracking`, with
-[one protocol](tables.md#the-protocol).
+By `ksim-rl reproduce tasks`, and for Go1, G1 and `g1_track_*` `ksim-rl reproduce velocity`, `humanoids` and `tracking`,
+with [one protocol](tables.md#the-protocol).
 
 * **env states**, **seconds**: of a run's training, its first iteration included. Two runs of `g1_track_*` at a time
   shared a GPU.
 * **return**: the mean over the final policy's episodes and over the seeds, with the standard deviation between seeds.
 * **asked for**: what came out, and in brackets what should: *solved at* of the mean return; for the worst seed the
   rewards for following a velocity command (2 each at most, over the last million env states of training), the share of
-  1000 robots that stand 6 s after they were dropped, or of 1024 trials in which a motion is followed to its end.
+  1000 robots that stand 6 s after they were dropped, or of 1024 trials in which a motion is followed to its end. Where
+  the two rewards have a time, it is the median of the seeds'.
 
 [Learning](learning.md#how-well-they-learn) compares algorithms.
 """
@@ -164,15 +169,20 @@ def page(sizes: Mapping[str, Mapping[str, str]], saved: Mapping[str, Any]) -> st
 
 
 def learned(tables: Mapping[str, Mapping[str, Any]]) -> str:
-    """What a table of results has for each task, and of which commit it is."""
-    lines, runs_of = {}, {}
-    for table in TABLES:
-        for name, of_table in load(table).rows.items():
-            saved = tables.get(table, {}).get("rows", {}).get(name)
-            lines[of_table.task] = learned_row(of_table, saved)
-            runs_of[of_table.task] = saved["runs"] if saved else []
+    """What the tables of results have for each task, and of which commit it is."""
+    rows = [(table, name, of_table) for table in TABLES for name, of_table in load(table).rows.items()]
+    lines: dict[str, list[str]] = {name: [] for name in own_tasks()}
+    runs_of: dict[str, list[Any]] = {name: [] for name in lines}
+    for table, name, of_table in rows:
+        saved = tables.get(table, {}).get("rows", {}).get(name)
+        if saved is not None:
+            lines[of_table.task].append(learned_row(of_table, saved))
+            runs_of[of_table.task] += saved["runs"]
+    for _, _, of_table in rows:
+        # Until one of its rows has a result.
+        lines[of_table.task] = lines[of_table.task] or [learned_row(of_table, None)]
     head = ["| " + " | ".join(LEARNED_COLUMNS) + " |", "|" + "---|" * len(LEARNED_COLUMNS)]
-    return "\n".join([*where(runs_of), *head, *(lines[name] for name in own_tasks())])
+    return "\n".join([*where(runs_of), *head, *itertools.chain(*lines.values())])
 
 
 def learned_row(of_table: Row, saved: Mapping[str, Any] | None) -> str:
@@ -188,9 +198,13 @@ def learned_row(of_table: Row, saved: Mapping[str, Any] | None) -> str:
     asked = []
     if of_table.measure == "success":
         asked.append(f"followed {saved['value']:.3f} ({saved['goal']:g})")
+    elif of_table.measure == "seconds":
+        rewards = " and ".join(f"{level:.2f}" for level in of_table.levels.values())
+        within = "" if saved["goal"] is None else f" ({saved['goal']:g})"
+        asked.append(f"rewards of {rewards} after {saved['value']:.1f} s{within}")
     elif saved["goal"] is not None:
         asked.append(f"return {saved['value']:.0f} ({saved['goal']:g})")
-    for name, level in of_table.levels.items():
+    for name, level in of_table.levels.items() if of_table.measure == "return" else ():
         values = [run["means"].get(name) for run in runs]
         worst = "not logged" if None in values else f"{min(values):.2f}"
         asked.append(f"{name.rpartition('/')[2]} {worst} ({level:g})")
@@ -210,7 +224,7 @@ def where(runs_of: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
     most, *others = sorted(by_commit, key=lambda commit: -len(by_commit[commit]))
     devices = sorted({run["device"] for runs in runs_of.values() for run in runs})
     names = (f"{', '.join(f'`{task}`' for task in by_commit[commit])} at {commit[:7]}" for commit in others)
-    but = "".join(f", but {text}" for text in names)
+    but = f", but {' and '.join(names)}" if others else ""
     return [f"Runs are of {' and '.join(devices)}, at commit {most[:7]}{but}.", ""]
 
 
@@ -315,6 +329,16 @@ def test_what_was_learned_is_what_the_tables_have():
         "| `walker_amp` | amp | not measured | – | – | – | – | – |",
     ):
         assert line in text.splitlines(), text
+    timed = {
+        "reached": True,
+        "value": 26.04,
+        "goal": 100.0,
+        "runs": [result(evaluation={"return_mean": 99.0})],
+    }
+    assert (
+        "| `g1_velocity_flat` | fast_sac | 60.0 million | 40 | 99.0 | "
+        "rewards of 1.40 and 1.00 after 26.0 s (100) | yes | 1 |"
+    ) in learned({"humanoids": {"rows": {"g1_flat": timed}}}).splitlines()
     assert "commit abcdef0." in learned({"tasks": tables["tasks"]})
     del go2[0]["means"]["reward/track_linear_velocity"]
     assert "track_linear_velocity not logged (1.3)" in learned(tables)
