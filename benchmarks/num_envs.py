@@ -16,8 +16,7 @@ two settings that are farthest apart, seed by seed.
 Equal in expectation are the sizes. What the first datasets hold is not quite the same: few envs fill them with few
 episodes, and where T is shorter than the horizon of the returns, 1 / (1 - gamma), most of what an untrained critic is
 asked for lies beyond the end of a rollout. So this setting has a short horizon, spread starts, and steps that a
-divergence bounds. With D = 16384 (T = 16 with 1024 envs) the 1024 envs were the last to learn, with D = 65536 they are
-the first; in both the means of the scores lie within about one standard deviation of the seeds.
+divergence bounds. Seeds 1 to 5 alone, on a CPU, once had p = 0.02; of 24 seeds it is 0.31.
 """
 
 from __future__ import annotations
