@@ -1,5 +1,6 @@
 """Metrics are read from env and physics on the device, come to the host in one copy, and are explained there."""
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -39,11 +40,15 @@ def start_copy(metrics: Mapping[str, Shaped[Tensor, ""]], *, device: torch.devic
     On CUDA the copy goes to pinned memory and does not wait for the device: work that is queued after it may start
     before the host reads.
     """
-    names = tuple(metrics)
-    if not names:
-        return PendingMetrics(names, torch.zeros(0, dtype=torch.float64))
-    # float64 holds every count of env states exactly.
-    values_M = torch.stack([value.detach().to(torch.float64).reshape(()) for value in metrics.values()])
+    if not metrics:
+        return PendingMetrics((), torch.zeros(0, dtype=torch.float64))
+    of_kind: dict[torch.dtype, dict[str, Tensor]] = {}
+    for name, value in metrics.items():
+        of_kind.setdefault(value.dtype, {})[name] = value.detach().reshape(())
+    names = tuple(itertools.chain(*of_kind.values()))
+    # float64 holds every count of env states exactly. One by one, a conversion each, took a kernel each.
+    kinds = (torch.stack([*own.values()]).to(torch.float64) for own in of_kind.values())
+    values_M = torch.cat([*kinds])
     if device.type != "cuda":
         return PendingMetrics(names, values_M)
     on_host_M = torch.empty(values_M.shape, dtype=values_M.dtype, pin_memory=True)
@@ -61,8 +66,10 @@ def read_episode_sums(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Num
     """
     sums = {"rollout/reward": rollout_ET.get(unravel_key(("next", signal_keys(env).reward))).mean()}
     if (episodes := part(env, EpisodeSums)) is not None:
-        # Copies, because the sums are cleared before they are read on the host.
-        sums |= {f"sum/{name}": total.clone() for name, total in episodes.episode_log().items()}
+        # A copy, because the sums are cleared before they are read on the host.
+        log = episodes.episode_log()
+        totals = torch.stack([*log.values()]).unbind()
+        sums |= {f"sum/{name}": total for name, total in zip(log, totals, strict=True)}
         episodes.episode_log_reset_()
     if (levels := part(env, DifficultyLevels)) is not None:
         sums |= {f"curriculum/{name}": level for name, level in levels.curriculum_levels().items()}
