@@ -71,7 +71,7 @@ By `ksim-rl reproduce tasks`, and for Go1, G1 and `g1_track_*` `ksim-rl reproduc
 with [one protocol](tables.md#the-protocol).
 
 * **env states**, **seconds**: of a run's training, its first iteration included. Two runs of `g1_track_*` at a time
-  shared a GPU.
+  shared a GPU; on a CPU each had one core of two, and other work beside it.
 * **return**: the mean over the final policy's episodes and over the seeds, with the standard deviation between seeds.
 * **asked for**: what came out, and in brackets what should: *solved at* of the mean return; for the worst seed the
   rewards for following a velocity command (2 each at most, over the last million env states of training), the share of
@@ -195,6 +195,7 @@ def learned_row(of_table: Row, saved: Mapping[str, Any] | None) -> str:
     returns = [run["evaluation"]["return_mean"] for run in runs]
     spread = f" ± {statistics.stdev(returns):.1f}" if len(runs) > 1 else ""
     states, seconds = (statistics.fmean(run[key] for run in runs) for key in ("env_states", "seconds"))
+    took = f"{seconds:.0f}" + (" on a CPU" if {run["device"] for run in runs} == {"CPU"} else "")
     asked = []
     if of_table.measure == "success":
         asked.append(f"followed {saved['value']:.3f} ({saved['goal']:g})")
@@ -203,12 +204,12 @@ def learned_row(of_table: Row, saved: Mapping[str, Any] | None) -> str:
         within = "" if saved["goal"] is None else f" ({saved['goal']:g})"
         asked.append(f"rewards of {rewards} after {saved['value']:.1f} s{within}")
     elif saved["goal"] is not None:
-        asked.append(f"return {saved['value']:.0f} ({saved['goal']:g})")
+        asked.append(f"return {saved['value']:.4g} ({saved['goal']:g})")
     for name, level in of_table.levels.items() if of_table.measure == "return" else ():
         values = [run["means"].get(name) for run in runs]
         worst = "not logged" if None in values else f"{min(values):.2f}"
         asked.append(f"{name.rpartition('/')[2]} {worst} ({level:g})")
-    cells += [f"{states / 1e6:.1f} million", f"{seconds:.0f}", f"{statistics.fmean(returns):.1f}{spread}"]
+    cells += [f"{states / 1e6:.1f} million", took, f"{statistics.fmean(returns):.1f}{spread}"]
     verdict = {True: "yes", False: "no", None: NOTHING}[saved["reached"]]
     return f"| {' | '.join([*cells, ', '.join(asked) or NOTHING, verdict, str(len(runs))])} |"
 
@@ -224,7 +225,7 @@ def where(runs_of: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
     most, *others = sorted(by_commit, key=lambda commit: -len(by_commit[commit]))
     devices = sorted({run["device"] for runs in runs_of.values() for run in runs})
     names = (f"{', '.join(f'`{task}`' for task in by_commit[commit])} at {commit[:7]}" for commit in others)
-    but = f", but {' and '.join(names)}" if others else ""
+    but = f", but {'; '.join(names)}" if others else ""
     return [f"Runs are of {' and '.join(devices)}, at commit {most[:7]}{but}.", ""]
 
 
@@ -304,7 +305,7 @@ def test_what_was_learned_is_what_the_tables_have():
                     "reached": True,
                     "value": 941.6,
                     "goal": 930.0,
-                    "runs": [result(evaluation={"return_mean": 941.6}, means={})],
+                    "runs": [result(evaluation={"return_mean": 941.6}, means={}, device="CPU")],
                 },
             }
         },
@@ -321,10 +322,10 @@ def test_what_was_learned_is_what_the_tables_have():
     }
     text = learned(tables)
     for line in (
-        "Runs are of NVIDIA H200, at commit abcdef0, but `g1_track_kick` at 0123456.",
+        "Runs are of CPU and NVIDIA H200, at commit abcdef0, but `g1_track_kick` at 0123456.",
         "| `go2_velocity_flat` | ppo | 60.0 million | 45 | 82.0 ± 2.8 | "
         "track_linear_velocity 1.50 (1.3), track_angular_velocity 0.94 (1) | no | 2 |",
-        "| `reacher` | ppo | 60.0 million | 40 | 941.6 | return 942 (930) | yes | 1 |",
+        "| `reacher` | ppo | 60.0 million | 40 on a CPU | 941.6 | return 941.6 (930) | yes | 1 |",
         "| `g1_track_kick` | ppo | 60.0 million | 40 | 21.0 | followed 0.999 (0.95) | yes | 1 |",
         "| `walker_amp` | amp | not measured | – | – | – | – | – |",
     ):
