@@ -19,7 +19,7 @@ import torch
 
 from benchmarks import command_line, report
 from ksim_rl.modules import ObservationNormalizer
-from ksim_rl.runs.csv_table import read_table
+from ksim_rl.runs.csv_table import read_table, thinned
 from ksim_rl.trainers import Hook, RunProgress, Trainer, build
 
 KEPT_ROWS = 30
@@ -240,7 +240,7 @@ def train(overrides: tuple[str, ...], hooks: tuple[Hook, ...], sabotage: Sabotag
 
 def kept_metrics(rows: list[dict[str, str]]) -> dict[str, str]:
     """Return about `KEPT_ROWS` rows, the last one among them, each metric in one text; "-" where a row has none."""
-    rows = report.thinned(rows, KEPT_ROWS)
+    rows = thinned(rows, KEPT_ROWS)
     names = [name for name in rows[-1] if name.startswith(KEPT)]
     return {
         name: " ".join(f"{float(row[name]):.4g}" if row.get(name) else "-" for row in rows) for name in names

@@ -27,7 +27,7 @@ from rich.table import Table
 
 from benchmarks import command_line, report
 from benchmarks.learning_picture import draw
-from ksim_rl.runs.csv_table import read_table
+from ksim_rl.runs.csv_table import read_table, thinned
 from ksim_rl.trainers import RunCfg, RunProgress, run
 
 KEPT_POINTS = 60
@@ -90,9 +90,7 @@ def train_and_keep(seeds: list[int], *, cfg: RunCfg, overrides: list[str]) -> di
             figures=figures,
             device=device,
             module="benchmarks.learning_curve",
-            curves={
-                f"{label}/seed_{seed}": report.thinned(points, KEPT_POINTS) for seed, points in curves.items()
-            },
+            curves={f"{label}/seed_{seed}": thinned(points, KEPT_POINTS) for seed, points in curves.items()},
         )
 
     for seed, points in train_all(seeds):
@@ -207,7 +205,7 @@ def _table(title: str, curves: dict[int, list[Point]]) -> Table:
     for name in ("seed", *names):
         table.add_column(name.removeprefix("reward/"))
     for seed, points in curves.items():
-        for point in report.thinned(points, 6):
+        for point in thinned(points, 6):
             table.add_row(str(seed), *(f"{point.get(name, float('nan')):.4g}" for name in names))
     return table
 

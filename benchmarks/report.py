@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 
@@ -18,12 +18,6 @@ import torch
 RESULTS = Path(os.environ.get("BENCHMARK_RESULTS") or Path(__file__).parent / "results")
 WRITTEN = ("benchmarks/results", "docs")
 PACKAGES = ("ksim_rl", "torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
-T = TypeVar("T")
-
-
-def thinned(points: Sequence[T], count: int) -> list[T]:
-    """Return about so many of the points, the last one among them."""
-    return [*points[: -1 : max(1, len(points) // count)], points[-1]]
 
 
 def device_label(device: torch.device) -> str:

@@ -2,14 +2,16 @@
 
 import csv
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 from ksim_rl.config.plain_data import MOST_DATA_BYTES, open_regular
 from ksim_rl.runs.whole_file import whole_file
 
 STEP = "env_states"
+T = TypeVar("T")
 
 
 class CsvTable:
@@ -84,3 +86,8 @@ def _opened(path: Path) -> Iterator[tuple[list[str], Iterator[dict[str, str]]]]:
         reader = csv.DictReader(line for line in file if line.endswith("\n"))
         rows = (row for row in reader if row.get(STEP) and None not in row.values())
         yield list(reader.fieldnames or [STEP]), rows
+
+
+def thinned(rows: Sequence[T], count: int) -> list[T]:
+    """Return about so many of the rows, the last one among them."""
+    return [*rows[: -1 : max(1, len(rows) // count)], rows[-1]]

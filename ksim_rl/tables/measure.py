@@ -20,7 +20,7 @@ from ksim_rl.config import plugins
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.envs.contract import EpisodeSums, part
 from ksim_rl.runs import record
-from ksim_rl.runs.csv_table import read_table
+from ksim_rl.runs.csv_table import read_table, thinned
 from ksim_rl.runs.listing import METRICS
 from ksim_rl.runs.whole_file import write_whole
 from ksim_rl.tables.levels import HELD_STATES, means_of, reached
@@ -111,7 +111,7 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
         "means": means_of(last, row.levels) | judge.found["means"],
         "seconds_to_levels": None if end is None else round(end["seconds"], 2),
         "env_states_to_levels": None if end is None else end["env_states"],
-        "curve": [*points[: -1 : max(1, len(points) // KEPT_POINTS)], points[-1]],
+        "curve": thinned(points, KEPT_POINTS),
     }
 
 
