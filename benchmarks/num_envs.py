@@ -4,8 +4,8 @@
 
 trains a cartpole with 64, 256 and 1024 envs and D = 65536 env states per update (so T = 1024, 256 and 64), five seeds
 each (`num_envs=64,256,1024 seeds=1,2,3,4,5`), `at_once=1` of them, and compares the curves of deterministic evaluation
-over env states. Other words are overrides of `ksim-rl train`; `label=other` keeps what they give under another name.
-Figures go to benchmarks/results/num_envs.json, the picture beside it.
+over env states. Other words are overrides of `ksim-rl train`. Figures go to benchmarks/results/num_envs.json, the
+picture beside it.
 
 A run's score is its mean evaluation return over all evaluations (the area under its curve). If num_envs did not
 matter, the three scores of one seed, which begin with the same networks, could change places. So the test counts in
@@ -42,7 +42,7 @@ from ksim_rl.data import DatasetCfg
 from ksim_rl.runs.csv_table import read_table
 from ksim_rl.trainers import RunCfg, RunProgress, run
 
-OWN_OPTIONS = {"num_envs": "64,256,1024", "seeds": "1,2,3,4,5", "at_once": "1", "label": "as_is"}
+OWN_OPTIONS = {"num_envs": "64,256,1024", "seeds": "1,2,3,4,5", "at_once": "1"}
 # Where there are more exchanges than this, so many are drawn.
 EXCHANGES = 20_000
 SETTING = (
@@ -93,17 +93,16 @@ def main() -> None:
     scores = {num_envs: [score(curve) for curve in found] for num_envs, found in curves.items()}
     figures = compare(scores)
     device = cfg.resolved_device()
-    label = f"{report.device_label(device)}/{cfg.task_name}/{own['label']}"
+    label = f"{report.device_label(device)}/{cfg.task_name}"
     Console(width=160).print(_table(label, scores, figures))
     path = report.write(
         "num_envs",
         figures={f"{label}/{name}": value for name, value in figures.items()},
         device=device,
         module="benchmarks.num_envs",
-        scores={own["label"]: {str(n): [round(value, 3) for value in found] for n, found in scores.items()}},
+        scores={str(num_envs): [round(value, 3) for value in found] for num_envs, found in scores.items()},
     )
-    ending = ".png" if own["label"] == OWN_OPTIONS["label"] else f"_{own['label']}.png"
-    draw(curves, path.with_name(path.stem + ending), title=_title(cfg, len(seeds), figures))
+    draw(curves, path.with_suffix(".png"), title=_title(cfg, len(seeds), figures))
     print(f"written to {path}")
 
 
