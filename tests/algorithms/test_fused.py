@@ -6,130 +6,30 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tensordict import TensorDict
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl.algorithms.ppo.fused import fused_networks, make_fused_ppo
-from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.data import DatasetCfg
-from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
-from ksim_rl.objectives import PPOCfg, StepGuard, SymmetricAugmentation
-from ksim_rl.objectives.fused_ppo import FusedLayout, Tuning, why_not_fused
+from ksim_rl.modules import ActorCfg, make_actor, make_critic
+from ksim_rl.objectives import PPOCfg, StepGuard
+from ksim_rl.objectives.fused_ppo import FusedLayout, why_not_fused
 from ksim_rl.suites.dm_control import training
-from ksim_rl.transforms import MirrorMap
-
-ENVS, STEPS, ACTIONS, ACTOR_OBS, CRITIC_OBS = 8, 6, 3, 20, 24
-SIZES = {"num_env_states_per_minibatch": 24, "num_minibatches": 2}
-DATA = DatasetCfg(**SIZES)
-HIDDEN = (32, 32, 16)
-# Blocks that do not divide the 24 rows of a minibatch or the layers; few, since the interpreter is slow.
-LOWER = {"lower": 16, "lower_depth": 16, "lower_stages": 1}
-TUNING = Tuning(block=16, chunk=16, stages=1, depth=16, tile=32, tile_stages=1, splits=2, size=1024, **LOWER)
-# A layer is a grid of programs; few of them are still more than one in each direction.
-LAYERED = Tuning(block=32, stages=1, depth=32, tile=32, tile_stages=1, splits=2, size=4096)
-MIRROR = {
-    "actor": MirrorMap(source=(1, 0, *range(2, ACTOR_OBS)), signs=(1, 1, -1, *[1] * (ACTOR_OBS - 3))),
-    "critic": MirrorMap(source=(*range(CRITIC_OBS - 2), CRITIC_OBS - 1, CRITIC_OBS - 2)),
-    "action": MirrorMap(source=(1, 0, 2), signs=(-1, -1, -1)),
-}
-
-needs_interpreter = pytest.mark.skipif(
-    torch.cuda.is_available(), reason="tests/gpu runs the kernels themselves"
+from tests.algorithms.fused_problem import (
+    ACTIONS,
+    ACTOR_OBS,
+    ENVS,
+    HIDDEN,
+    SIZES,
+    STEPS,
+    assert_equal_states,
+    column,
+    finite,
+    flat,
+    needs_interpreter,
+    networks,
+    rollout,
+    to_eleven_bits,
+    update,
 )
-
-
-@pytest.fixture(scope="module")
-def fused_ppo():
-    # tests/conftest.py turns the interpreter on where there is no CUDA.
-    pytest.importorskip("triton", reason="Triton is not installed")
-    from ksim_rl.objectives.fused_ppo.fused_ppo import FusedPPO
-
-    return FusedPPO
-
-
-def networks(*, action_dim=ACTIONS, hidden=HIDDEN, critic=None, actor_obs=ACTOR_OBS, **actor_options):
-    torch.manual_seed(3)
-    activation = actor_options.pop("activation", "elu")
-    cfg = ActorCfg(hidden_dims=hidden, activation=activation, output_gain=0.5, **actor_options)
-    actor = make_actor(cfg, obs_dim=actor_obs, action_dim=action_dim)
-    return actor, make_critic(
-        CriticCfg(hidden_dims=critic or hidden, activation=activation), obs_dim=CRITIC_OBS
-    )
-
-
-def rollout(actor, *, seed=0):
-    """Return a rollout `["E","T"]` in time-major memory, with ends of both kinds and two env states to leave out."""
-    torch.manual_seed(seed)
-    shape = STEPS, ENVS
-    terminated, truncated = torch.rand(*shape, 1) < 0.1, torch.rand(*shape, 1) < 0.1
-    data = TensorDict(
-        {
-            "actor": torch.randn(*shape, actor[0].module.trunk[0].in_features) * 2.0 + 1.0,
-            "critic": torch.randn(*shape, CRITIC_OBS),
-            "next": {
-                "critic": torch.randn(*shape, CRITIC_OBS),
-                "reward": torch.randn(*shape, 1),
-                "terminated": terminated,
-                "done": terminated | truncated,
-            },
-        },
-        shape,
-    )
-    with torch.no_grad():
-        actor(data)
-    # What follows is what the next step begins with, where it does not begin another episode.
-    goes_on = ~data["next", "done"][:-1]
-    data["next", "critic"][:-1] = data["critic"][1:].where(goes_on, data["next", "critic"][:-1])
-    data["next", "reward"][2, 3] = float("nan")
-    data["actor"][1, 5, 2] = float("inf")
-    return data.transpose(0, 1)
-
-
-def update(cfg, actor, critic, fused_ppo=None, *, data=DATA):
-    copies = {"actor": copy.deepcopy(actor), "critic": copy.deepcopy(critic)}
-    made = PPOUpdate(cfg, **copies, data=data, seed=5, mirror=MIRROR)
-    if fused_ppo is not None:
-        description = fused_networks(made.actor, made.critic)
-        chained = description.chained and cfg.symmetry != "loss"
-        made.fused = fused_ppo(
-            cfg,
-            description,
-            mirror=None if cfg.symmetry == "none" else SymmetricAugmentation(MIRROR),
-            optimizer=made.optimizer,
-            guard=made.guard,
-            num_env_states_per_minibatch=DATA.num_env_states_per_minibatch,
-            num_minibatches=DATA.num_minibatches,
-            tuning=TUNING if chained else LAYERED,
-        )
-        assert made.fused.layout.chained == chained
-    return made
-
-
-def finite(leaf):
-    return leaf if leaf.dtype == torch.bool else leaf.nan_to_num(0.0, 0.0, 0.0)
-
-
-def column(name):
-    return importlib.import_module("ksim_rl.objectives.fused_ppo.step_kernels").SUMMARY.index(name)
-
-
-def flat(state, path=""):
-    if isinstance(state, dict):
-        return {k: v for name, entry in state.items() for k, v in flat(entry, f"{path}/{name}").items()}
-    return {path: torch.as_tensor(state)}
-
-
-def assert_equal_states(one, other, *, atol=1e-4):
-    one, other = flat(one.state_dict()), flat(other.state_dict())
-    assert one.keys() == other.keys()
-    for name, value in one.items():
-        torch.testing.assert_close(
-            value.float(),
-            other[name].float(),
-            atol=atol,
-            rtol=1e-4,
-            msg=lambda text, name=name: f"{name}: {text}",
-        )
 
 
 def full(*values):
@@ -260,81 +160,6 @@ def test_explained_variance_of_targets_far_from_zero(fused_ppo):
     name = "update/explained_variance"
     torch.testing.assert_close(fused.metrics()[name], torch_s.metrics()[name], atol=1e-3, rtol=0.0)
     assert fused.metrics()[name].abs() < 1.0
-
-
-def to_eleven_bits(values):
-    mantissa, exponent = torch.frexp(values)
-    # Halves go away from zero, as in the instruction that converts.
-    return torch.ldexp((mantissa.abs() * 2**11 + 0.5).floor().copysign(mantissa) / 2**11, exponent)
-
-
-def by_hand(network, obs, rounded):
-    """Return the means of an MLP that has what it multiplies `rounded`."""
-    hidden = network.observe(obs)
-    for layer in network.trunk[::2]:
-        hidden = torch.nn.functional.elu(rounded(hidden) @ rounded(layer.weight).mT + layer.bias)
-    return rounded(hidden) @ rounded(network.head.loc.weight).mT + network.head.loc.bias
-
-
-@needs_interpreter
-@pytest.mark.parametrize(("precision", "normalized"), [("high", True), ("highest", False)])
-def test_who_collects_is_the_policy_of_the_first_gradient_step(fused_ppo, precision, normalized):
-    torch.set_float32_matmul_precision(precision)
-    rounded = to_eleven_bits if precision == "high" else torch.clone
-    actor, critic = networks(actor_obs=40, obs_normalization=normalized)
-    # Outside of the clip interval is a ratio that is not one to rounding.
-    cfg = PPOCfg(num_epochs=1, schedule="fixed", learning_rate=1e-2, clip_epsilon=1e-5)
-    made, clipped = update(cfg, actor, critic, fused_ppo), []
-    network = made.actor[0].module
-    # Before the first update, after it, and as torch acts.
-    for acting in (made.behavior, made.behavior, made.actor):
-        data = rollout(made.actor, seed=len(clipped)).apply(finite)
-        with torch.no_grad():
-            acted = acting(data.select("actor"))
-            near = by_hand(network, data["actor"], rounded)
-            torch.testing.assert_close(acted["loc"], network(data["actor"])[0], atol=5e-3, rtol=0.0)
-        if acting is not made.actor:
-            # Not of each: what lies between two numbers may be rounded to the other one.
-            assert (acted["loc"] - near).abs().median() < 1e-5
-            scored = made.actor.build_dist_from_params(acted).log_prob(acted["action"])
-            torch.testing.assert_close(acted["action_log_prob"], scored)
-            assert torch.equal(acted["scale"], network(data["actor"])[1])
-        made(data.update(acted))
-        clipped.append(made.fused._summary[0, column("clip_fraction")].item())
-    assert clipped[:2] == [0.0, 0.0]
-    assert (clipped[2] > 0.5) == (precision == "high")
-
-
-@needs_interpreter
-def test_who_collects_has_the_weights_of_the_modules_at_each_call_or_where_a_steady_begins(fused_ppo):
-    actor, critic = networks()
-    made = update(PPOCfg(), actor, critic, fused_ppo)
-    behavior, data = made.behavior, rollout(actor).select("actor").apply(finite)
-    kept = copy.deepcopy(made.state_dict())
-
-    def means():
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            acted = behavior(data.clone())
-        assert torch.equal(acted["action"], acted["loc"])
-        return acted["loc"]
-
-    first = means()
-    with torch.no_grad():
-        made.actor[0].module.head.loc.bias += 0.5
-    changed = means()
-    torch.testing.assert_close(changed, first + 0.5)
-    with behavior.steady():
-        made.load_state_dict(kept)
-        assert torch.equal(means(), changed)
-    assert torch.equal(means(), first)
-
-
-def test_without_chained_kernels_the_actor_itself_collects(fused_ppo):
-    actor, critic = networks(hidden=(48, 16))
-    made = update(PPOCfg(), actor, critic)
-    assert made.behavior is made.actor
-    made = update(PPOCfg(), actor, critic, fused_ppo)
-    assert made.behavior is made.actor
 
 
 @needs_interpreter

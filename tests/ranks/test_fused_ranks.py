@@ -5,7 +5,7 @@ import torch
 
 from ksim_rl import ranks
 from ksim_rl.objectives import PPOCfg
-from tests.algorithms.test_fused import assert_equal_states, networks, rollout, update
+from tests.algorithms.fused_problem import assert_equal_states, networks, rollout, update
 from tests.ranks.gloo import results
 
 pytestmark = [
