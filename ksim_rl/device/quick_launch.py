@@ -9,6 +9,7 @@ import struct
 import threading
 from collections.abc import Callable, Sequence
 from importlib.resources import files
+from inspect import signature
 from typing import Any, ClassVar
 from weakref import WeakSet
 
@@ -108,6 +109,9 @@ def as_operator(
     Eager code goes past torch's dispatcher, which takes longer than the launch. `fake` returns an empty result for the
     arguments, of which those named in `mutates` are changed.
     """
+    # torch 2.11 looks for each of these among the arguments that were given, without those that equal their defaults.
+    defaults = {name for name, own in signature(launch).parameters.items() if own.default is not own.empty}
+    assert not defaults & set(mutates), f"{name}: arguments that are changed have no default"
     operator = torch.library.custom_op(f"ksim_rl::{name}", launch, mutates_args=mutates)
     operator.register_fake(fake)
 

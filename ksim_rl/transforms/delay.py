@@ -10,6 +10,7 @@ from torchrl.data import Composite
 
 from ksim_rl.checked import Checked, Share, WholeNumber
 from ksim_rl.device import random
+from ksim_rl.transforms import ring
 from ksim_rl.transforms.history import RingTransform
 from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, Keys, RowTransform, checked_action
 
@@ -125,7 +126,7 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
 
     def _draws(self, index: int) -> tuple[Any, ...]:
         if index > 0 or not self._draws_in_ring:
-            return ()
+            return ring.NO_DRAWS
         state = self._buffers["seed_value"], self._buffers["reset_count_E"], self._stream_ids["reset/lag"]
         return *state, self.delay.min_lag, self.delay.max_lag
 

@@ -24,6 +24,8 @@ _ARGUMENTS = arguments_of(
 _quick = QuickLaunch(_ARGUMENTS, DRAWS + source_of("ksim_rl.transforms", "ring"))
 _LANES, _MANY_LANES = 32, 256
 """Threads that share a row on the GPU: a warp, or a block for large rows."""
+NO_DRAWS = None, None, 0, 0, 0
+"""The last arguments of `turn`, from `seed` on, where no row draws a lag."""
 
 
 def _launch(
@@ -36,11 +38,11 @@ def _launch(
     stride: int,
     parts: Tensor | None,
     counts: bool,
-    seed: Tensor | None = None,
-    draw_count_E: Tensor | None = None,
-    stream: int = 0,
-    lowest: int = 0,
-    highest: int = 0,
+    seed: Tensor | None,
+    draw_count_E: Tensor | None,
+    stream: int,
+    lowest: int,
+    highest: int,
 ) -> Tensor:
     """Go on by one step: write its values, and return those of some steps ago, N frames of L elements per env.
 

@@ -7,7 +7,7 @@ import torch
 import warp as wp
 
 from ksim_rl.device import quick_launch
-from ksim_rl.device.quick_launch import QuickLaunch, address
+from ksim_rl.device.quick_launch import QuickLaunch, address, as_operator
 
 CPU = torch.device("cpu")
 
@@ -73,3 +73,11 @@ def test_numbers_of_two_threads_do_not_mix(launch):
 
 def test_none_lies_nowhere():
     assert address(None) == 0
+
+
+def test_arguments_that_an_operator_changes_have_no_default():
+    def fill(out_N: torch.Tensor, count_N: torch.Tensor | None = None) -> None:
+        out_N.fill_(1.0)
+
+    with pytest.raises(AssertionError, match="fill_counted: arguments that are changed have no default"):
+        as_operator("fill_counted", fill, lambda *_: None, mutates=("out_N", "count_N"))

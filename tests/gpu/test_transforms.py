@@ -66,14 +66,14 @@ def test_steps_and_resets_do_not_synchronize_and_replay_as_they_ran(kind):
             check(step)
 
 
-def begin(ring_EM, age_E, value_E, mask_E, *, num_frames=1, parts=None, lag_E=None, draws=()):
+def begin(ring_EM, age_E, value_E, mask_E, *, num_frames=1, parts=None, lag_E=None, draws=ring.NO_DRAWS):
     """Let the masked rows begin."""
     return ring.turn(ring_EM, age_E, value_E, lag_E, mask_E, num_frames, 0, parts, True, *draws)
 
 
 def push(ring_EM, age_E, value_E, *, num_frames, stride, parts=None):
     """Make a step."""
-    return ring.turn(ring_EM, age_E, value_E, None, None, num_frames, stride, parts, True)
+    return ring.turn(ring_EM, age_E, value_E, None, None, num_frames, stride, parts, True, *ring.NO_DRAWS)
 
 
 @pytest.mark.gpu
