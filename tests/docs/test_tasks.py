@@ -71,7 +71,8 @@ By `ksim-rl reproduce tasks`, and for Go1, G1 and `g1_track_*` `ksim-rl reproduc
 with [one protocol](tables.md#the-protocol).
 
 * **env states**, **seconds**: of a run's training, its first iteration included. Two runs of `g1_track_*` at a time
-  shared a GPU; on a CPU each had one core of two, and other work beside it.
+  shared a GPU, and of the others, but for G1's and Go1's on flat ground, ten or eleven; on a CPU each had one core of
+  two, and other work beside it.
 * **return**: the mean over the final policy's episodes and over the seeds, with the standard deviation between seeds.
 * **asked for**: what came out, and in brackets what should: *solved at* of the mean return; for the worst seed the
   rewards for following a velocity command (2 each at most, over the last million env states of training), the share of
