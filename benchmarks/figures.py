@@ -34,6 +34,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "nan_names": ("ksim_rl/envs/non_finite.py", "ksim_rl/device/quick_launch.py"),
     "num_envs": (*STEP, *LEARN),
     "off_policy_update": (*LEARN, "ksim_rl/device"),
+    "peer_settings": (*STEP, *LEARN, *TASK),
     "peers": (*STEP, *LEARN, *TASK),
     "profile": (*STEP, *LEARN),
     "randomization": STEP,
