@@ -177,8 +177,10 @@ class OffPolicyLoss(LossModule):
         return self.compare(tensordict, self.predict(tensordict), *self.following(tensordict))
 
     def predict(self, tensordict: TensorDictBase) -> Tensor:
-        """Return what the critics say of the actions that were taken: values [B, N], or logits [B, N, A]."""
-        return self._predict(self.critic_network, tensordict, tensordict.get(self.tensor_keys.action))
+        """Return what the critics say of the actions that were taken: values [N, B], or logits [N, B, A]."""
+        # As they lie in memory: between compiled functions the compiler copies what does not.
+        action = tensordict.get(self.tensor_keys.action)
+        return self._predict(self.critic_network, tensordict, action).transpose(0, 1)
 
     @torch.no_grad()
     def following(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
@@ -191,7 +193,8 @@ class OffPolicyLoss(LossModule):
         discount_B1 = self.gamma * going_B1 if steps_B1 is None else self.gamma**steps_B1 * going_B1
         if next_bonus_B is not None:
             reward_B1 = reward_B1 + discount_B1 * next_bonus_B[:, None]
-        return self._predict(self._target_critic, following, next_action), reward_B1, discount_B1
+        next_predicted = self._predict(self._target_critic, following, next_action)
+        return next_predicted.transpose(0, 1), reward_B1, discount_B1
 
     def compare(
         self,
@@ -202,6 +205,7 @@ class OffPolicyLoss(LossModule):
         discount_B1: Tensor,
     ) -> tuple[Scalar, dict[str, Scalar]]:
         """Return what `critic_loss` does, given what `predict` and `following` do."""
+        predicted, next_predicted = predicted.transpose(0, 1), next_predicted.transpose(0, 1)
         if self.support_A is None:
             with torch.no_grad():
                 target_BN = reward_B1 + discount_B1 * next_predicted
