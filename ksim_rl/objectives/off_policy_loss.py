@@ -174,38 +174,18 @@ class OffPolicyLoss(LossModule):
 
     def critic_loss(self, tensordict: TensorDictBase) -> tuple[Scalar, dict[str, Scalar]]:
         """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
-        return self.compare(tensordict, self.predict(tensordict), *self.following(tensordict))
-
-    def predict(self, tensordict: TensorDictBase) -> Tensor:
-        """Return what the critics say of the actions that were taken: values [N, B], or logits [N, B, A]."""
-        # As they lie in memory: between compiled functions the compiler copies what does not.
-        action = tensordict.get(self.tensor_keys.action)
-        return self._predict(self.critic_network, tensordict, action).transpose(0, 1)
-
-    @torch.no_grad()
-    def following(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what the target critics say of the next actions, the rewards until then [B, 1], and the discounts."""
-        keys, following = self.tensor_keys, tensordict.get("next")
-        next_action, next_bonus_B = self._next_action(following.select(*self.actor_network.in_keys))
-        reward_B1 = following.get(keys.reward)
-        going_B1 = 1.0 - following.get(keys.terminated).to(reward_B1.dtype)
-        steps_B1 = tensordict.get(keys.steps_to_next_obs, None)
-        discount_B1 = self.gamma * going_B1 if steps_B1 is None else self.gamma**steps_B1 * going_B1
-        if next_bonus_B is not None:
-            reward_B1 = reward_B1 + discount_B1 * next_bonus_B[:, None]
-        next_predicted = self._predict(self._target_critic, following, next_action)
-        return next_predicted.transpose(0, 1), reward_B1, discount_B1
-
-    def compare(
-        self,
-        tensordict: TensorDictBase,
-        predicted: Tensor,
-        next_predicted: Tensor,
-        reward_B1: Tensor,
-        discount_B1: Tensor,
-    ) -> tuple[Scalar, dict[str, Scalar]]:
-        """Return what `critic_loss` does, given what `predict` and `following` do."""
-        predicted, next_predicted = predicted.transpose(0, 1), next_predicted.transpose(0, 1)
+        keys = self.tensor_keys
+        following = tensordict.get("next")
+        with torch.no_grad():
+            next_action, next_bonus_B = self._next_action(following.select(*self.actor_network.in_keys))
+            reward_B1 = following.get(keys.reward)
+            going_B1 = 1.0 - following.get(keys.terminated).to(reward_B1.dtype)
+            steps_B1 = tensordict.get(keys.steps_to_next_obs, None)
+            discount_B1 = self.gamma * going_B1 if steps_B1 is None else self.gamma**steps_B1 * going_B1
+            if next_bonus_B is not None:
+                reward_B1 = reward_B1 + discount_B1 * next_bonus_B[:, None]
+            next_predicted = self._predict(self._target_critic, following, next_action)
+        predicted = self._predict(self.critic_network, tensordict, tensordict.get(keys.action))
         if self.support_A is None:
             with torch.no_grad():
                 target_BN = reward_B1 + discount_B1 * next_predicted
@@ -220,7 +200,7 @@ class OffPolicyLoss(LossModule):
             loss_B = loss_BN.sum(-1)
             # As in Rainbow (Hessel et al., arXiv 1710.02298), what is minimized is the priority.
             td_error_B = loss_BN.detach().amax(-1)
-        tensordict.set(self.tensor_keys.priority, td_error_B)
+        tensordict.set(keys.priority, td_error_B)
         return self._mean(loss_B, tensordict), {
             "value": self._mean(values_BN.detach().mean(-1), tensordict),
             "td_error": self._mean(td_error_B, tensordict),

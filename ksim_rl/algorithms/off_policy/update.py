@@ -18,7 +18,6 @@ from ksim_rl.data import MASK_KEY, ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.compiling import compiled
-from ksim_rl.device.streams import beside, warp_scope, warp_stream
 from ksim_rl.modules import ExploringPolicy, update_normalizers
 from ksim_rl.objectives import (
     FlatAdamW,
@@ -87,9 +86,7 @@ class OffPolicyUpdate(RolloutUpdate):
         if cfg.symmetry == "augment":
             self._images = SymmetricAugmentation(mirror, read=self._observations, device=self.device)
         self._read, self._count_ = fast(self._stored), fast(self._counted_)
-        self._predict, self._following = fast(loss.predict), fast(loss.following)
-        self._compare, self._actor_losses = fast(loss.compare), fast(loss.actor_losses)
-        self._aside = warp_stream(torch.cuda.Stream(self.device)) if self.device.type == "cuda" else None
+        self._critic_loss, self._actor_losses = fast(loss.critic_loss), fast(loss.actor_losses)
         self.replay = ReplayRing(
             data, num_envs=num_envs, observations=self._observations, gamma=cfg.gamma, device=self.device
         )
@@ -138,32 +135,15 @@ class OffPolicyUpdate(RolloutUpdate):
     def _update(self) -> None:
         self._store()
         minibatches = self.replay.minibatches(self.data.num_minibatches, read=self._read)
-        of_critic, of_actor, waiting = [], [], []
+        of_critic, of_actor = [], []
         for step, minibatch_B in enumerate(minibatches, start=1):
-            targets: list[Tensor] = []
-            # Neither the actor's step nor the targets need what the critics say, and most of their kernels are small.
-            meanwhile = partial(self._catch_up, waiting, of_actor, minibatch_B, targets)
-            with warp_scope(self.device), beside(self._aside, meanwhile), self._precision():
-                predicted = self._predict(minibatch_B)
-            of_critic.append(self._improve_critic(minibatch_B, predicted, *targets))
-            waiting = [] if step % self.cfg.policy_delay else [minibatch_B]
-        of_actor.extend(map(self._improve_actor, waiting))
+            of_critic.append(self._improve_critic(minibatch_B))
+            if step % self.cfg.policy_delay == 0:
+                of_actor.append(self._improve_actor(minibatch_B))
         columns = in_columns(of_critic), in_columns(of_actor)
         longest = self._count_(*(own["skipped"] for own in columns))
         self._measure_(columns[0] | {"skipped_in_a_row": longest.expand_as(columns[0]["skipped"])})
         self._means.take_(columns[1])
-
-    def _catch_up(
-        self,
-        waiting: list[TensorDictBase],
-        of_actor: list[Any],
-        minibatch_B: TensorDictBase,
-        targets: list[Tensor],
-    ) -> None:
-        """Make the step of the actor that waits, if one does, and then compute the targets that it acts in."""
-        of_actor.extend(map(self._improve_actor, waiting))
-        with self._precision():
-            targets.extend(self._following(minibatch_B))
 
     def _counted_(self, of_critic_S: Tensor, of_actor: Tensor) -> Tensor:
         """Count S gradient steps, skipped if one of their parts was; return how many in a row were at most."""
@@ -182,10 +162,10 @@ class OffPolicyUpdate(RolloutUpdate):
             self._images.reflect_every_second_(env_states_B)
         return env_states_B
 
-    def _improve_critic(self, minibatch_B: TensorDictBase, *predicted: Tensor) -> dict[str, Tensor]:
+    def _improve_critic(self, minibatch_B: TensorDictBase) -> dict[str, Tensor]:
         """Make one gradient step of critics and targets; return what it measured, and `skipped`, 0 or 1."""
         with self._precision():
-            loss, logged = self._compare(minibatch_B, *predicted)
+            loss, logged = self._critic_loss(minibatch_B)
         norm, skipped = self._descend({"critic": loss}, minibatch_B)["critic"]
         if self.data.prioritized:
             self.replay.update_priority(minibatch_B.get("index"), minibatch_B.get("td_error"))
