@@ -172,18 +172,17 @@ def humanoid_get_up() -> ManagerBasedRlEnvCfg:
     )
 
 
-# An output layer of ordinary scale acts the more, the faster joints move, until statistics of observations are known:
-# the humanoid then throws itself about so hard that no engine simulates it, MuJoCo's own included.
-ACTOR = ActorCfg(init_std=0.5)
 QUADRUPED = Task(
     name="quadruped_get_up",
     description="our quadruped gets up from any pose",
     cfg=quadruped_get_up,
-    training=velocity.training(num_iterations=1_000, entropy_coeff=0.005, actor=ACTOR),
+    training=velocity.training(num_iterations=1_000, entropy_coeff=0.005),
 )
 HUMANOID = Task(
     name="humanoid_get_up",
     description="our humanoid gets up from any pose",
     cfg=humanoid_get_up,
-    training=velocity.training(num_iterations=3_000, entropy_coeff=0.005, actor=ACTOR),
+    # An output layer of ordinary scale acts the more, the faster joints move, until statistics of observations are
+    # known: the humanoid then throws itself about so hard that no engine simulates it, MuJoCo's own included.
+    training=velocity.training(num_iterations=3_000, entropy_coeff=0.005, actor=ActorCfg(init_std=0.5)),
 )
