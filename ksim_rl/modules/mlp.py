@@ -8,12 +8,14 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd import Function
 from torch.nn import functional
 
 from ksim_rl.checked import Count, check_value
 from ksim_rl.checks import check_choice, check_in_range
 
 Device = torch.device | str | None
+SPLITS = 4  # see `_Product`
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "elu": nn.ELU,
     "gelu": nn.GELU,
@@ -124,7 +126,7 @@ class Layers(nn.Sequential):
     """Linear layers, norms and activations in a row, which take [..., input_dim], or those of ensembles in a row.
 
     With autocast on CUDA products are in bfloat16, and a norm, the bias before it and the activation after it are one
-    kernel, or a part of the product's. An activation that the kernels do not have follows them.
+    kernel. An activation that the kernel does not have follows it.
     """
 
     def forward(self, features: Float[Tensor, "#*batch L"]) -> Float[Tensor, "*batch M"]:
@@ -132,27 +134,27 @@ class Layers(nn.Sequential):
         if not rounds(features):
             return super().forward(features)
         # Not above: Triton comes with torch for CUDA only.
-        from ksim_rl.modules.layer_kernels import FUSED, Layer, rounded_weights
+        from ksim_rl.modules.norm_kernels import FUSED, Normalized
 
         alone = not isinstance(self[0], EnsembleLinear)
         out = features.reshape(1, -1, features.shape[-1]) if alone else features
         parts: list[Any] = list(self)
         linears = [part for part in parts if isinstance(part, nn.Linear | EnsembleLinear)]
         weights = [layer.weight for layer in linears]
-        rounded = rounded_weights([own.mT[None] if alone else own for own in weights])
+        rounded = _rounded([own.mT[None] if alone else own for own in weights])
         while parts:
             layer = parts.pop(0)
             if not isinstance(layer, nn.Linear | EnsembleLinear):
                 out = layer(out)
                 continue
-            given = out, weights.pop(0), rounded.pop(0), torch.is_grad_enabled()
+            out = _Product.apply(out, weights.pop(0), rounded.pop(0))
             if not parts or not isinstance(parts[0], nn.LayerNorm | EnsembleLayerNorm):
-                out = Layer.apply(*given) + layer.bias.to(torch.bfloat16)
+                out = out + layer.bias.to(out.dtype)
                 continue
             norm = parts.pop(0)
             kind = type(parts[0]) if parts else None
             known = FUSED.index(kind) + 1 if kind in FUSED else 0
-            out = Layer.apply(*given, layer.bias, norm.weight, norm.bias, known)
+            out = Normalized.apply(out, layer.bias, norm.weight, norm.bias, known)
             del parts[: bool(known)]
         return out.reshape(*features.shape[:-1], -1) if alone else out
 
@@ -160,3 +162,62 @@ class Layers(nn.Sequential):
 def rounds(features: Float[Tensor, "*batch L"]) -> bool:
     """Whether products of these are to be in bfloat16, on a device with kernels for what follows."""
     return features.is_cuda and torch.is_autocast_enabled("cuda")
+
+
+class _Product(Function):
+    """The products [N, B, M] of features [N, B, K] and weights [N, K, M], which are there `rounded` as well.
+
+    Features [1, B, K] are those of all networks. Weights of one network are [M, K], as torch has them. The gradient of
+    the weights is a sum over env states in SPLITS parts: its outputs alone, which are few, would occupy a part of the
+    GPU. It lies in memory as the weights do, since autograd copies what does not.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, features_NBK: Tensor, weight: Tensor, rounded: Tensor) -> Tensor:
+        ctx.alone = weight.dim() == 2
+        fan_in, fan_out = ctx.sizes = weight.mT.shape if ctx.alone else weight.shape[1:]
+        networks = len(rounded)
+        ctx.is_shared = len(features_NBK) < networks
+        # What all networks read is cast once, unless weights learn by it: their gradient would copy it again.
+        features = features_NBK.expand(networks if ctx.needs_input_grad[1] else -1, -1, -1)
+        features = _padded(features, -fan_in % 8).expand(networks, -1, -1)
+        ctx.save_for_backward(features, rounded)
+        ctx.dtype = features_NBK.dtype
+        return torch.bmm(features, rounded)[..., :fan_out]
+
+    @staticmethod
+    def backward(ctx: Any, d_out: Tensor) -> tuple[Tensor | None, ...]:
+        features, rounded = ctx.saved_tensors
+        fan_in, fan_out = ctx.sizes
+        d_out = _padded(d_out, -fan_out % 8)
+        d_features = d_weight = None
+        if ctx.needs_input_grad[0]:
+            d_features = torch.bmm(d_out, rounded.mT)[..., :fan_in].to(ctx.dtype)
+            d_features = d_features.sum(0, keepdim=True) if ctx.is_shared else d_features
+        if ctx.needs_input_grad[1]:
+            networks, rows = features.shape[:2]
+            splits = math.gcd(SPLITS, rows)
+            parts = [part.reshape(networks * splits, rows // splits, -1) for part in (features, d_out)]
+            if ctx.alone:
+                parts, fan_in, fan_out = parts[::-1], fan_out, fan_in
+            sums = torch.bmm(parts[0].mT, parts[1]).unflatten(0, (networks, splits))
+            d_weight = sums[..., :fan_in, :fan_out].sum(1, dtype=torch.float32)
+            d_weight = d_weight[0] if ctx.alone else d_weight
+        return d_features, d_weight, None
+
+
+@torch.no_grad()
+def _rounded(weights: list[Tensor]) -> list[Tensor]:
+    """Return weights in bfloat16, padded to whole 16 bytes in each dim, all by one kernel of compiled code.
+
+    Tensor cores are fast with such rows: 315 inputs take three times as long as 320.
+    """
+    padded = [functional.pad(own, (0, -own.shape[-1] % 8, 0, -own.shape[-2] % 8)) for own in weights]
+    flat = torch.cat([own.reshape(-1) for own in padded]).to(torch.bfloat16)
+    parts = zip(flat.split([own.numel() for own in padded]), padded, strict=True)
+    return [part.view_as(own) for part, own in parts]
+
+
+def _padded(features: Tensor, columns: int) -> Tensor:
+    features = features.to(torch.bfloat16)
+    return functional.pad(features, (0, columns)) if columns else features

@@ -9,7 +9,6 @@ from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, OneH
 
 from ksim_rl.device.capture import Captured
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
-from ksim_rl.modules.mlp import mlp
 from ksim_rl.objectives import PPOCfg, make_loss, make_optimizer, ppo_step
 from tests.gpu.no_syncs import no_syncs
 
@@ -113,36 +112,3 @@ def test_captured_gradient_steps_equal_eager_ones_where_nothing_is_drawn(name):
     for eager, replayed in zip(*results, strict=True):
         assert replayed.isfinite().all()
         torch.testing.assert_close(replayed, eager, atol=1e-4, rtol=1e-3)
-
-
-@pytest.mark.parametrize("rows", [8192, 1001])
-@pytest.mark.parametrize(
-    ("num_networks", "hidden_dims", "inputs"),
-    [(2, (768, 384, 192), 140), (None, (512, 256, 128), 99), (3, (72, 36), 48)],
-)
-def test_a_layer_and_its_norm_by_one_kernel_are_those_of_two(
-    num_networks, hidden_dims, inputs, rows, monkeypatch
-):
-    from ksim_rl.modules import layer_kernels
-
-    torch.manual_seed(0)
-    options = {"activation": "silu", "layer_norm": True, "num_networks": num_networks, "device": "cuda"}
-    layers = mlp(inputs, hidden_dims, 29, **options)
-    for parameter in layers.parameters():
-        parameter.data.add_(0.1 * torch.randn_like(parameter))
-    obs = torch.randn(*([1] if num_networks else []), rows, inputs, device="cuda", requires_grad=True)
-    weights = torch.randn(rows, 29, device="cuda")
-    results = []
-    # Twice, since equal runs have equal bits.
-    for joined in (False, True, True):
-        monkeypatch.setattr(layer_kernels, "JOINS", joined)
-        with torch.autocast("cuda", torch.bfloat16):
-            out = layers(obs)
-            with torch.no_grad():
-                assert torch.equal(layers(obs), out)
-        gradients = torch.autograd.grad((out.float() * weights).sum(), [obs, *layers.parameters()])
-        results.append([out.detach(), *gradients])
-    for two, one in zip(*results[:2], strict=True):
-        assert (one.float() - two.float()).norm() < 0.02 * two.float().norm()
-    assert all(map(torch.equal, *results[1:]))
-    assert not all(map(torch.equal, *results[:2]))
