@@ -63,16 +63,8 @@ def said() -> dict[str, tuple[str, str]]:
             f"{scaling['h100/go1_velocity_flat/32768/env_states_per_s'] / 1e6:.2f} million with 32768, and G1 at "
             f"{scaling['h100/g1_velocity_flat/32768/env_states_per_s'] / 1e6:.2f} million",
         ),
-        "kernels of a later commit": (
-            PAGE,
-            f"control step of Go1 is {speed['h100/go1_velocity_flat/4096/kernels_per_control_step']:.0f}",
-        ),
         "g1": (PAGE, f"trains at {round(speed[G1 + 'env_states_per_s'], -3):,.0f} with 4096"),
-        "kernels": (
-            PAGE,
-            f"is {speed[GO1 + 'kernels_per_control_step']:.0f} kernels, one of G1 "
-            f"{speed[G1 + 'kernels_per_control_step']:.0f}",
-        ),
+        "kernels": (PAGE, f"is {speed[GO1 + 'kernels_per_control_step']:.0f} kernels"),
         "g1 physics": (PAGE, f"{speed[G1 + 'iteration_over_physics']:.2f} times its raw physics"),
         "peers": (
             PAGE,
