@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import gc
 import hashlib
+import itertools
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -36,13 +37,22 @@ from ksim_rl.trainers.build import build
 
 NAME = "determinism"
 OWN_OPTIONS = {"tasks": "all", "runs": "2", "iterations": "200"}
+CLUTTER = tuple(
+    word
+    for index, (x, y) in enumerate(itertools.product((0.2, 0.3, 0.4), (-0.24, 0.24)))
+    for word in (
+        f"+task.scene.objects.cube_{index}={{_target_:ksim_rl.scene.objects.Box,size:[0.06,0.06,0.06],mass:0.15}}",
+        f"+task.scene.placements.cube_{index}={{pos:[{x},{y},0.0]}}",
+    )
+)
 TASKS: dict[str, tuple[str, ...]] = {
     "go1_velocity_flat": ("task=go1_velocity_flat",),
     "g1_velocity_flat": ("task=g1_velocity_flat",),
     "go1_velocity_flat_fast_sac": ("task=go1_velocity_flat", "objective=fast_sac"),
     # Of the tasks on our own robots the one with most contacts, 3.9 in a world under random actions (humanoid_get_up
-    # has 1.7, humanoid_velocity_flat 1.3). None has 20.
+    # has 1.7, humanoid_velocity_flat 1.3). None has 20, but with six more cubes about the arm.
     "arm_push": ("task=arm_push",),
+    "arm_clutter": ("task=arm_push", *CLUTTER),
 }
 QUIET = ("logger=none", "trainer.eval_episodes=0", "trainer.video=false", "trainer.checkpoint_interval=0")
 FIRST_LOOKS, LATER_LOOKS = (1, 2, 3, 5), 10

@@ -1,5 +1,8 @@
 """The determinism benchmark finds equal runs equal, and any bit that is planted."""
 
+import itertools
+import math
+
 import pytest
 import torch
 
@@ -41,6 +44,14 @@ def test_everything_is_looked_at():
     for path in ("/world/qpos", "/world/efc.force", "/world/contact.dist", "/env/base_env.world.qpos"):
         assert any(known.startswith(path) for known in look), path
     assert not any("seconds" in path for path in look)
+
+
+def test_each_run_is_composed_and_the_clutter_has_cubes_of_one_size_that_are_apart():
+    cfgs = {name: command_line.compose([*words, "device=cpu"]) for name, words in determinism.TASKS.items()}
+    scene = cfgs["arm_clutter"].task.scene
+    assert len(scene.objects) == 7 and {box.size for box in scene.objects.values()} == {(0.06, 0.06, 0.06)}
+    diagonal, places = 0.06 * math.sqrt(2.0), [place.pos[:2] for place in scene.placements.values()]
+    assert all(math.dist(*pair) > diagonal for pair in itertools.combinations(places, 2))
 
 
 def test_a_hash_sees_each_bit_and_its_place():
