@@ -71,7 +71,7 @@ By `ksim-rl reproduce tasks`, and for Go1, G1 and `g1_track_*` `ksim-rl reproduc
 with [one protocol](tables.md#the-protocol).
 
 * **env states**, **seconds**: of a run's training, its first iteration included. Two runs of `g1_track_*` at a time
-  shared a GPU, and of the others, but for G1's and Go1's on flat ground, ten or eleven; on a CPU each had one core of
+  shared a GPU, and of the others, but for G1's and Go1's on flat ground, up to eleven; on a CPU each had one core of
   two, and other work beside it.
 * **return**: the mean over the final policy's episodes and over the seeds, with the standard deviation between seeds.
 * **asked for**: what came out, and in brackets what should: *solved at* of the mean return; for the worst seed the
@@ -79,7 +79,8 @@ with [one protocol](tables.md#the-protocol).
   1000 robots that stand 6 s after they were dropped, or of 1024 trials in which a motion is followed to its end. Where
   the two rewards have a time, it is the median of the seeds'.
 
-[Learning](learning.md#how-well-they-learn) compares algorithms.
+[Learning](learning.md#how-well-they-learn) compares algorithms, and says how far Go1 gets on
+[each kind of rough ground](learning.md#rough-ground), whose levels rise as training goes on: there these rewards say little.
 """
 LEARNED_COLUMNS = ("task", "objective", "env states", "seconds", "return", "asked for", "reached", "seeds")
 
