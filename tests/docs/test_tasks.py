@@ -80,7 +80,7 @@ with [one protocol](tables.md#the-protocol).
   the two rewards have a time, it is the median of the seeds'.
 
 [Learning](learning.md#how-well-they-learn) compares algorithms, and says how far Go1 gets on
-[each kind of rough ground](learning.md#rough-ground), whose levels rise as training goes on: there these rewards say little.
+[each kind of rough ground](learning.md#rough-ground). Its levels rise as training goes on, so rewards say little there.
 """
 LEARNED_COLUMNS = ("task", "objective", "env states", "seconds", "return", "asked for", "reached", "seeds")
 
