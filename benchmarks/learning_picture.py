@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
@@ -45,19 +46,24 @@ def draw(
             for (seed, points), color in zip(curves.items(), _COLORS * len(curves), strict=False):
                 pairs = [(point[step], point[name]) for point in points if name in point]
                 axes.plot(*zip(*pairs, strict=True), color=color, linewidth=1.4, label=f"seed {seed}")
-            peer = PEER.get(task_name, {})
-            if name in peer:
-                axes.plot(
-                    peer[step], peer[name], color=_PEER_COLOR, marker="o", markersize=4, linestyle="--",
-                    label="mjlab 1.6.0 + rsl_rl (H200)",
-                )  # fmt: skip
+            finish_panel(axes, name, task_name=task_name, step=step)
             axes.set_xlabel(label, fontsize=9)
-            if step == "env_states":
-                axes.set_title(PANELS[name], fontsize=10.5)
-                axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axes.tick_params(labelsize=8)
-            axes.grid(alpha=0.25)
-            axes.spines[["top", "right"]].set_visible(False)
             if column == 1 and line == 0:
                 axes.legend(fontsize=8, frameon=False)
     figure.savefig(picture, dpi=100)
+
+
+def finish_panel(axes: Axes, name: str, *, task_name: str, step: str = "env_states") -> None:
+    """Add the peer's curve of a metric, where it was measured, and what all panels over this step look like."""
+    peer = PEER.get(task_name, {})
+    if name in peer:
+        axes.plot(
+            peer[step], peer[name], color=_PEER_COLOR, marker="o", markersize=4, linestyle="--",
+            label="mjlab 1.6.0 + rsl_rl (H200)",
+        )  # fmt: skip
+    if step == "env_states":
+        axes.set_title(PANELS[name], fontsize=10.5)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.tick_params(labelsize=8)
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)

@@ -1,4 +1,4 @@
-"""How much of Go1's learning with PPO comes from the three settings in which ours differ from mjlab's?
+"""This benchmark says how much of Go1's learning with PPO comes from three settings in which ours differ from mjlab's.
 
     python -m benchmarks.peer_settings device=cuda seeds=1,2,3 at_once=5
 
@@ -28,13 +28,12 @@ from typing import Any
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
 
 from benchmarks import command_line, learning_curve, report
-from benchmarks.learning_picture import PANELS, PEER
+from benchmarks.learning_picture import finish_panel
 from ksim_rl.algorithms import PPOUpdate
 from ksim_rl.checks import check_known
 from ksim_rl.runs.csv_table import thinned
@@ -76,7 +75,6 @@ VARIANTS = {
 }
 OWN_OPTIONS = {"seeds": "1,2,3", "env_states": "40e6", "variants": ",".join(VARIANTS), "at_once": "1"}
 _COLORS = ("#3465a4", "#4e9a06", "#75507b", "#c4a000", "#a40000", "#888a85")
-_PEER_COLOR = "#cc5500"
 
 
 def main() -> None:
@@ -303,7 +301,6 @@ def draw(runs: Mapping[str, Mapping[int, Run]], picture: Path, *, title: str) ->
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=12)
-    peer = PEER[TASK]
     for column, (reward, level) in enumerate(LEVELS.items(), 1):
         axes = figure.add_subplot(1, len(LEVELS), column)
         axes.axhline(level, color="black", linewidth=0.8, linestyle=":")
@@ -313,16 +310,8 @@ def draw(runs: Mapping[str, Mapping[int, Run]], picture: Path, *, title: str) ->
                 axes.plot(*_columns(median_curve([curve], reward)), color=color, linewidth=0.6, alpha=0.35)
             line = _columns(median_curve(curves, reward))
             axes.plot(*line, color=color, linewidth=1.8, label=VARIANTS[name].label)
-        axes.plot(
-            peer["env_states"], peer[reward], color=_PEER_COLOR, marker="o", markersize=4, linestyle="--",
-            label="mjlab 1.6.0 + rsl_rl (H200)",
-        )  # fmt: skip
-        axes.set_title(PANELS[reward], fontsize=10.5)
+        finish_panel(axes, reward, task_name=TASK)
         axes.set_xlabel("env states; rewards are means over the last million", fontsize=9)
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.tick_params(labelsize=8)
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
         if column == 1:
             axes.legend(fontsize=8, frameon=False, loc="lower right")
     figure.savefig(picture, dpi=110)
