@@ -119,6 +119,12 @@ def write(
     return path
 
 
+def filled(page: str, begin: str, end: str, part: str) -> str:
+    """Return a page with this part between two markers of it, in place of what is there."""
+    before, _, rest = page.partition(begin)
+    return f"{before}{begin}\n\n{part}\n\n{end}{rest.partition(end)[2]}"
+
+
 def merge(name: str, sources: Sequence[Path], *, folder: Path = RESULTS) -> Path:
     """Merge `<source>/<name>.json` of each source into `<folder>/<name>.json`; of two entries, the later run's stays.
 

@@ -91,6 +91,4 @@ def table(saved: Mapping[str, Any]) -> str:
 
 def with_table(text: str, saved: Mapping[str, Any]) -> str:
     """Return the page with its table made anew."""
-    before, _, rest = text.partition(BEGIN)
-    after = rest.partition(END)[2]
-    return f"{before}{BEGIN}\n\n{table(saved)}\n\n{END}{after}"
+    return report.filled(text, BEGIN, END, table(saved))

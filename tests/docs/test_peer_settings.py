@@ -3,7 +3,6 @@
 To write it anew: python -m tests.docs.test_peer_settings.
 """
 
-import json
 import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,34 +12,30 @@ import pytest
 from benchmarks import report
 from benchmarks.learning_picture import PEER
 from benchmarks.peer_settings import LEVELS, TASK, VARIANTS, median_of
+from tests.docs.committed import last_on_gpu, results
 from tests.docs.guide import DOCS
 
 PAGE = DOCS / "learning.md"
-RESULTS = report.RESULTS / "peer_settings.json"
-BEGIN = "<!-- peer settings: python -m tests.docs.test_peer_settings writes what follows -->\n\n"
-END = "\n<!-- end of peer settings -->"
-UNKNOWN = "How much of the difference in env states each of them makes was not measured.\n"
+BEGIN = "<!-- peer settings: python -m tests.docs.test_peer_settings writes what follows -->"
+END = "<!-- end of peer settings -->"
+UNKNOWN = "How much of the difference in env states each of them makes was not measured."
 COLUMNS = ("settings", "seeds", "env states", "seconds", "rewards")
 
 
 def text(saved: Mapping[str, Any]) -> str:
     """What the last run on a GPU has to say, or that there is none."""
-    runs = {
-        key.rpartition("/")[0]: run
-        for key, run in saved.get("runs", {}).items()
-        if not key.startswith("cpu/")
-    }
-    if not runs:
+    runs = saved.get("runs", {})
+    if (last := last_on_gpu(runs)) is None:
         return UNKNOWN
-    prefix = max(runs, key=lambda key: runs[key]["date"])
+    prefix = last.rpartition("/")[0]
     own = {name: saved["seeds"][key] for name in VARIANTS if (key := f"{prefix}/{name}") in saved["seeds"]}
-    made_by = {key: saved["runs"][f"{prefix}/{key}"] for key in own}
+    made_by = {key: runs[f"{prefix}/{key}"] for key in own}
     commits = " and ".join(dict.fromkeys(run["commit"][:7] for run in made_by.values()))
     at_once = max(found["at_once"] for found in own.values())
     of_how_many = f", {at_once} runs at a time, whose seconds these are" if at_once > 1 else ""
     head = (
         "With each of them as mjlab has it, and with all, medians of seeds until both levels hold, and rewards at the\n"
-        f"end ({runs[prefix]['device']}, commit {commits}{of_how_many}):\n"
+        f"end ({runs[last]['device']}, commit {commits}{of_how_many}):\n"
     )
     rows = [row(VARIANTS[name].label, [*found["runs"].values()]) for name, found in own.items()]
     command = next(iter(made_by.values()))["command"]
@@ -55,7 +50,6 @@ def text(saved: Mapping[str, Any]) -> str:
             f"`{command}`",
             "",
             "![Go1 with our settings and with mjlab's](../benchmarks/results/peer_settings.png)",
-            "",
         ]
     )
 
@@ -82,19 +76,13 @@ def peer_row() -> str:
     return f"| mjlab | one curve | {env_states} | {peer['seconds'][-1]} | {ends} after {env_states} |"
 
 
-def results() -> dict[str, Any]:
-    return json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-
-
-def written() -> tuple[str, str, str]:
-    """The page before, in and after the part that is written."""
-    before, _, rest = PAGE.read_text().partition(BEGIN)
-    part, _, after = rest.partition(END)
-    return before, part, after
+def page() -> str:
+    """The page with what was measured written anew."""
+    return report.filled(PAGE.read_text(), BEGIN, END, text(results("peer_settings")))
 
 
 def test_the_page_says_what_was_measured():
-    assert written()[1] == text(results()), "out of date: python -m tests.docs.test_peer_settings"
+    assert PAGE.read_text() == page(), "out of date: python -m tests.docs.test_peer_settings"
 
 
 def run(*, env_states_to_levels=None, seconds_to_levels=None, linear=1.6, angular=1.3):
@@ -133,5 +121,4 @@ def test_a_table_has_medians_and_says_where_a_level_was_not_reached(at_once):
 
 
 if __name__ == "__main__":
-    before, _, after = written()
-    PAGE.write_text(before + BEGIN + text(results()) + END + after)
+    PAGE.write_text(page())

@@ -19,9 +19,9 @@ from benchmarks import report, tasks
 from ksim_rl import envs
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.tables.table import Row, load
+from tests.docs.committed import last_run, results
 
 PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
-RESULTS = report.RESULTS / "tasks.json"
 TABLES = {
     name: report.RESULTS / "tables" / f"{name}.json"
     for name in ("tasks", "velocity", "humanoids", "tracking")
@@ -109,19 +109,9 @@ def episode(cfg: envs.ManagerBasedRlEnvCfg) -> str:
     return f"{cfg.episode_length_s:g} s"
 
 
-def last_run(name: str, saved: Mapping[str, Any]) -> str | None:
-    """The prefix of a task's last run on a GPU."""
-    runs = {
-        prefix: run
-        for prefix, run in saved.get("runs", {}).items()
-        if prefix.split("/")[1:] == [name, str(NUM_ENVS)] and not prefix.startswith("cpu/")
-    }
-    return max(runs, key=lambda prefix: runs[prefix]["date"], default=None)
-
-
 def measured(name: str, saved: Mapping[str, Any]) -> tuple[str, ...]:
     """The GPU's figures of a task, of the last run if there are several."""
-    if (prefix := last_run(name, saved)) is None:
+    if (prefix := last_run(saved, name, str(NUM_ENVS))) is None:
         return (NOTHING,) * (len(MEASURED) + 1)
     values = (
         form.format(saved["figures"][f"{prefix}/{key}"]) if f"{prefix}/{key}" in saved["figures"] else NOTHING
@@ -132,7 +122,7 @@ def measured(name: str, saved: Mapping[str, Any]) -> tuple[str, ...]:
 
 def tail(saved: Mapping[str, Any]) -> str:
     """Where and at which commit the figures were measured, and that some are old while they are of several."""
-    prefixes = [prefix for name in own_tasks() if (prefix := last_run(name, saved))]
+    prefixes = [prefix for name in own_tasks() if (prefix := last_run(saved, name, str(NUM_ENVS)))]
     devices = sorted({saved["runs"][prefix]["device"] for prefix in prefixes})
     commits = sorted({saved["runs"][prefix]["commit"] for prefix in prefixes})
     said = f"commit{'s' * (len(commits) > 1)} {' and '.join(commit[:7] for commit in commits)}"
@@ -251,10 +241,6 @@ def written_sizes() -> dict[str, dict[str, str]]:
     return found
 
 
-def results() -> dict[str, Any]:
-    return json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-
-
 OUT_OF_DATE = "docs/tasks.md is out of date: python -m tests.docs.test_tasks"
 
 
@@ -262,7 +248,7 @@ def test_the_table_of_tasks_lists_all_tasks_as_they_are():
     sizes = written_sizes()
     assert list(sizes) == own_tasks(), OUT_OF_DATE
     assert all(size.isdecimal() for task in sizes.values() for size in task.values())
-    assert PAGE.read_text().splitlines() == page(sizes, results()).splitlines(), OUT_OF_DATE
+    assert PAGE.read_text().splitlines() == page(sizes, results("tasks")).splitlines(), OUT_OF_DATE
 
 
 def test_the_figures_are_those_of_the_last_run_on_a_gpu():
@@ -360,4 +346,4 @@ def test_the_sizes_are_those_of_the_envs():
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(built_sizes(), results()))
+    PAGE.write_text(page(built_sizes(), results("tasks")))

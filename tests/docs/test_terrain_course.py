@@ -3,28 +3,17 @@
 To write it anew: python -m tests.docs.test_terrain_course.
 """
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
 from benchmarks import report
 from ksim_rl.tasks.velocity import PATCHES
+from tests.docs.committed import last_run, results
 from tests.docs.guide import DOCS
 
 PAGE = DOCS / "learning.md"
-RESULTS = report.RESULTS / "terrain_course.json"
 TASKS = ("go1_velocity_rough", "g1_velocity_rough")
 BEGIN, END = "<!-- table: python -m tests.docs.test_terrain_course -->", "<!-- end of the table -->"
-
-
-def last_run(task: str, saved: Mapping[str, Any]) -> str | None:
-    """The prefix of a task's last run on a GPU."""
-    runs = {
-        prefix: run
-        for prefix, run in saved.get("runs", {}).items()
-        if prefix.split("/")[1:] == [task] and not prefix.startswith("cpu/")
-    }
-    return max(runs, key=lambda prefix: runs[prefix]["date"], default=None)
 
 
 def cells(prefix: str | None, kind: str, saved: Mapping[str, Any]) -> list[str]:
@@ -51,7 +40,7 @@ def about(task: str, prefix: str | None, saved: Mapping[str, Any]) -> str:
 
 
 def table(saved: Mapping[str, Any]) -> str:
-    prefixes = {task: last_run(task, saved) for task in TASKS}
+    prefixes = {task: last_run(saved, task) for task in TASKS}
     head = ["ground", *(name for task in TASKS for name in (f"`{task}`", "fell", "levels"))]
     rows = [
         [title, *(cell for prefix in prefixes.values() for cell in cells(prefix, kind, saved))]
@@ -62,13 +51,13 @@ def table(saved: Mapping[str, Any]) -> str:
     return "\n".join([*lines, "", *(about(task, prefix, saved) for task, prefix in prefixes.items())])
 
 
-def results() -> dict[str, Any]:
-    return json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+def page() -> str:
+    """The page with its table made anew."""
+    return report.filled(PAGE.read_text(), BEGIN, END, table(results("terrain_course")))
 
 
 def test_the_table_is_that_of_the_results():
-    shown = PAGE.read_text().split(BEGIN)[1].split(END)[0].strip()
-    assert shown == table(results()), "write it anew: python -m tests.docs.test_terrain_course"
+    assert PAGE.read_text() == page(), "write it anew: python -m tests.docs.test_terrain_course"
 
 
 def test_a_row_shows_the_last_run_on_a_gpu_and_no_other():
@@ -98,5 +87,4 @@ def test_a_row_shows_the_last_run_on_a_gpu_and_no_other():
 
 
 if __name__ == "__main__":
-    before, rest = PAGE.read_text().split(BEGIN)
-    PAGE.write_text(f"{before}{BEGIN}\n\n{table(results())}\n\n{END}{rest.split(END)[1]}")
+    PAGE.write_text(page())
