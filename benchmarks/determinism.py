@@ -41,7 +41,7 @@ CLUTTER = tuple(
     word
     for index, (x, y) in enumerate(itertools.product((0.2, 0.3, 0.4), (-0.24, 0.24)))
     for word in (
-        f"+task.scene.objects.cube_{index}={{_target_:ksim_rl.scene.objects.Box,size:[0.06,0.06,0.06],mass:0.15}}",
+        f"+task.scene.objects.cube_{index}=${{task.scene.objects.cube}}",
         f"+task.scene.placements.cube_{index}={{pos:[{x},{y},0.0]}}",
     )
 )

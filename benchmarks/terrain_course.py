@@ -47,6 +47,7 @@ from ksim_rl.mdp.fields import distance_from_origin
 from ksim_rl.runs.csv_table import read_table
 from ksim_rl.runs.listing import METRICS
 from ksim_rl.scene.terrains import PatchedGround, TerrainGrid
+from ksim_rl.tables.levels import HELD_STATES
 from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.evaluation import Evaluator
 from ksim_rl.trainers.run_folder import Policy, load_policy, without_nan_guard
@@ -59,7 +60,6 @@ GROUND_SEED, ROBOT_SEED = 1_000, 2_000
 """Of the ground, and of starts and drawn models."""
 ENOUGH = 0.5
 """The share of robots that makes a level count."""
-AVERAGED_STATES = 1e6
 LEVEL = "curriculum/terrain_level"
 """The column of a run's metrics, as `on_rough_ground` names the term."""
 
@@ -267,7 +267,7 @@ def trained(path: Path, iteration: int) -> dict[str, float]:
     _, rows = read_table(table)
     rows = [row for row in rows if int(float(row["iteration"])) <= iteration]
     env_states = int(rows[-1]["env_states"])
-    last = [row for row in rows if int(row["env_states"]) > env_states - AVERAGED_STATES]
+    last = [row for row in rows if int(row["env_states"]) > env_states - HELD_STATES]
     levels = [float(row[LEVEL]) for row in last if row.get(LEVEL)]
     return {"env_states": env_states} | ({"trained_level": statistics.fmean(levels)} if levels else {})
 

@@ -18,12 +18,12 @@ def draw(table: Table, rows: Mapping[str, Sequence[Mapping[str, Any]]], path: Pa
     """Draw one panel per group; `rows` has the results of those rows that are complete."""
     groups = [(group, [n for n in names if n in rows]) for group, names in table.groups().items()]
     groups = [(group, names) for group, names in groups if names]
-    across, tall = min(len(groups), 3), 1.8 + 0.27 * max(len(names) for _, names in groups)
-    figure = Figure(figsize=(6.0 * across, -(-len(groups) // across) * tall), layout="constrained")
+    down, across, most = -(-len(groups) // 3), min(len(groups), 3), max(len(names) for _, names in groups)
+    figure = Figure(figsize=(6.0 * across, (1.8 + 0.27 * most) * down), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle("\n".join(wrap(table.title, 60 * across)), fontsize=12)
     for place, (group, names) in enumerate(groups):
-        axes = figure.add_subplot(-(-len(groups) // across), across, place + 1)
+        axes = figure.add_subplot(down, across, place + 1)
         for line, name in enumerate(names):
             for result in (*[[one] for one in rows[name]], rows[name]):
                 if (value := value_of(table.rows[name], result)) is not None:

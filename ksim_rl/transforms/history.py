@@ -81,11 +81,8 @@ class RingTransform(RowTransform):
         ring_EM, age_E = buffers[f"ring_{index}"], buffers["age_E"]
         value_E = value if value.ndim == ring_EM.ndim - 1 else value.reshape(-1, *ring_EM.shape[2:])
         begins = mask_E is not None
-        counts, draws = (
-            begins or index == self._num_rings - 1,
-            self._draws(index) if begins else ring.NO_DRAWS,
-        )
-        layout = self.num_frames, self.stride, buffers["part_bytes"], counts
+        draws = self._draws(index) if begins else ring.NO_DRAWS
+        layout = self.num_frames, self.stride, buffers["part_bytes"], begins or index == self._num_rings - 1
         return ring.turn(ring_EM, age_E, value_E, buffers.get("lag_E"), mask_E, *layout, *draws)
 
     def _draws(self, index: int) -> tuple[Any, ...]:
