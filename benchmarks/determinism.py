@@ -19,6 +19,8 @@ import gc
 import hashlib
 import itertools
 import json
+import os
+import statistics
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,13 +32,14 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from benchmarks import command_line, report
+from benchmarks.throughput import iteration_ms
 from ksim_rl.checks import check_choice
 from ksim_rl.physics import views
 from ksim_rl.trainers import RunCfg, Trainer
 from ksim_rl.trainers.build import build
 
 NAME = "determinism"
-OWN_OPTIONS = {"tasks": "all", "runs": "2", "iterations": "200"}
+OWN_OPTIONS = {"tasks": "all", "runs": "2", "iterations": "200", "switch": "go1_velocity_flat"}
 CLUTTER = tuple(
     word
     for index, (x, y) in enumerate(itertools.product((0.2, 0.3, 0.4), (-0.24, 0.24)))
@@ -156,11 +159,21 @@ def train(cfg: RunCfg, *, iterations: int, change: Callable[[Trainer], None] | N
     if world is not None:
         bits.contacts_per_world = float(world.last_substep("nacon").item()) / world.num_envs
     trainer.collector.env.close(raise_if_closed=False)
-    del trainer, world
-    gc.collect()
-    if torch.cuda.is_available():
-        torch.cuda.empty_cache()
     return bits
+
+
+def on_over_off(cfg: RunCfg) -> float:
+    """Return the speed of an iteration with torch's switch for equal runs, relative to that without it."""
+    times: dict[bool, list[float]] = {True: [], False: []}
+    try:
+        # In an order in which a GPU that gets slower harms both.
+        for on in (False, True, True, False):
+            torch.use_deterministic_algorithms(on)
+            times[on].append(iteration_ms(build(cfg)))
+            _free()
+    finally:
+        torch.use_deterministic_algorithms(False)
+    return statistics.mean(times[False]) / statistics.mean(times[True])
 
 
 def differing(runs: Sequence[Bits]) -> dict[int, list[str]]:
@@ -196,7 +209,10 @@ def explain(found: Mapping[int, Sequence[str]]) -> list[str]:
 
 def compare(cfg: RunCfg, *, runs: int, iterations: int) -> tuple[dict[str, float], list[str], list[str]]:
     """Train equal runs; return the figures of their end, the hash of each, and lines that say what differs."""
-    bits = [train(cfg, iterations=iterations) for _ in range(runs)]
+    bits = []
+    for _ in range(runs):
+        bits.append(train(cfg, iterations=iterations))
+        _free()
     found = differing(bits)
     figures = {
         "tensors": float(sum(map(counts, bits[0].looks[iterations]))),
@@ -217,13 +233,18 @@ def main() -> int:
     runs = command_line.whole_number("runs", own["runs"], least=2)
     iterations = command_line.whole_number("iterations", own["iterations"])
     wanted = list(TASKS) if own["tasks"] == "all" else own["tasks"].split(",")
-    for task in wanted:
+    switched = own["switch"].split(",")
+    for task in (*wanted, *switched):
         check_choice("task", task, TASKS)
+    # Read when cuBLAS starts; torch's switch asks for it.
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     failed = False
     for task in wanted:
         cfg = command_line.compose([*TASKS[task], *QUIET, *overrides])
         device = cfg.resolved_device()
         figures, hashes, lines = compare(cfg, runs=runs, iterations=iterations)
+        if task in switched:
+            figures["on_over_off"] = round(on_over_off(cfg), 3)
         prefix = f"{report.device_label(device)}/{task}"
         for line in lines:
             print(line)
@@ -246,6 +267,12 @@ def main() -> int:
 
 def _world(trainer: Trainer) -> Any:
     return getattr(getattr(trainer.collector.env, "base_env", None), "world", None)
+
+
+def _free() -> None:
+    gc.collect()
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
 
 
 def _names(paths: Sequence[str], *, most: int) -> str:

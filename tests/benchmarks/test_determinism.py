@@ -54,6 +54,18 @@ def test_each_run_is_composed_and_the_clutter_has_cubes_of_one_size_that_are_apa
     assert all(math.dist(*pair) > diagonal for pair in itertools.combinations(places, 2))
 
 
+def test_the_switch_is_on_while_half_of_the_runs_are_timed_and_off_afterwards(monkeypatch):
+    seen = []
+
+    def timed(trainer):
+        seen.append(torch.are_deterministic_algorithms_enabled())
+        return 5.0 if seen[-1] else 4.0
+
+    monkeypatch.setattr(determinism, "iteration_ms", timed)
+    assert determinism.on_over_off(command_line.compose(TINY)) == pytest.approx(0.8)
+    assert seen == [False, True, True, False] and not torch.are_deterministic_algorithms_enabled()
+
+
 def test_a_hash_sees_each_bit_and_its_place():
     numbers = torch.tensor([0.0, 1.0, torch.nan])
     changed = (
@@ -89,9 +101,12 @@ def test_the_command_writes_figures_and_hashes(monkeypatch, capsys):
     written = {}
     monkeypatch.setattr(report, "write", lambda name, **what: written.update(what))
     monkeypatch.setattr(determinism, "TASKS", {"tiny": TINY})
-    monkeypatch.setattr("sys.argv", ["determinism", "tasks=tiny", "iterations=1", "device=cpu"])
+    monkeypatch.setattr(
+        "sys.argv", ["determinism", "tasks=tiny", "switch=tiny", "iterations=1", "device=cpu"]
+    )
     assert determinism.main() == 0
     figures = written["figures"]
+    assert figures["cpu/tiny/on_over_off"] > 0.0
     assert figures["cpu/tiny/tensors_that_differ"] == 0 and figures["cpu/tiny/tensors"] > 100
     assert len(set(written["hashes"]["cpu/tiny"])) == 1 and written["first_differences"] == {"cpu/tiny": []}
     assert "0 of " in capsys.readouterr().out
