@@ -101,9 +101,15 @@ class GaussianHead(nn.Module):
     def forward(
         self, features: Float[Tensor, "*batch L"]
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
-        """Return `(loc, scale)`; `scale` is at least `cfg.min_std`."""
-        loc = self.loc(features)
-        return loc, self.scale(features).expand_as(loc)
+        """Return `(loc, scale)`; `scale` is at least `cfg.min_std`. Autocast does not round them.
+
+        With a small `scale` the 8 bits of bfloat16 would move `loc` by standard deviations, and with it the ratio of
+        probabilities that PPO learns from.
+        """
+        with torch.autocast(features.device.type, enabled=False):
+            features = features.to(self.loc.weight.dtype)
+            loc = self.loc(features)
+            return loc, self.scale(features).expand_as(loc)
 
     def scale(self, features: Float[Tensor, "*batch L"] | None = None) -> Float[Tensor, "*own action_dim"]:
         """Return the `scale`, [action_dim] where it does not depend on the state, whose features are not read then."""

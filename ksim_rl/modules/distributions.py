@@ -167,7 +167,8 @@ class TanhGaussian(BoundedDistribution):
 
     def log_prob(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*shape"]:
         """Return the log density in nats, of a value beyond the bounds that of the last value inside."""
-        inside = 1.0 - torch.finfo(self.loc.dtype).eps
+        # Of the value: parameters of fewer bits would take most actions near a bound for others.
+        inside = 1.0 - torch.finfo(value.dtype).eps
         unit = ((value - self._center) / self._half_range).clamp(-inside, inside)
         return self._log_density(torch.atanh(unit))
 

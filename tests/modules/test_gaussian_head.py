@@ -36,6 +36,14 @@ def test_state_dependent_std_depends_on_the_state_once_trained():
     assert head(torch.randn(8, 6))[1].std(0).min() > 0
 
 
+@pytest.mark.parametrize("state_dependent_std", [False, True])
+def test_autocast_rounds_what_it_reads_and_nothing_else(state_dependent_std):
+    head, features = _head(state_dependent_std=state_dependent_std), torch.randn(64, 6).bfloat16()
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded = head(features)
+    torch.testing.assert_close(rounded, head(features.float()), rtol=0.0, atol=0.0)
+
+
 @pytest.mark.parametrize("options", [{}, {"min_std": 0.2}], ids=str)
 def test_std_is_bounded_below_and_comes_back(options):
     head = _head(**options)

@@ -110,6 +110,13 @@ def test_both_ways_to_score_a_sample_agree():
         torch.testing.assert_close(log_prob, dist.log_prob(value))
 
 
+def test_rounded_parameters_leave_actions_near_a_bound_where_they_are():
+    loc, scale = torch.tensor([[4.0, -3.5, 0.0]]), torch.tensor([[0.5, 0.5, 1.0]])  # bfloat16 has them all
+    value = torch.tanh(torch.tensor([[4.25, -3.75, 0.5]]))
+    rounded = TanhGaussian(loc.bfloat16(), scale.bfloat16()).log_prob(value)
+    torch.testing.assert_close(rounded, TanhGaussian(loc, scale).log_prob(value), rtol=1e-2, atol=1e-2)
+
+
 def test_gradients_are_those_of_finite_differences():
     loc, scale = (parameter.requires_grad_() for parameter in _parameters(4, dtype=torch.float64))
     low, high = LOW.double(), HIGH.double()
