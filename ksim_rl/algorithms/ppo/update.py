@@ -105,11 +105,12 @@ class PPOUpdate(DatasetUpdate):
         if isinstance(self.fused, str):
             steps = self._torch_steps(rollout_ET)
             self._count()
+            self._measure_(steps)
         else:
             orders_KD = self.dataset.epoch_orders(self.cfg.num_epochs)
-            steps, left_out = self.fused(rollout_ET, orders_KD, self._count)
+            means, self._longest_skip, left_out = self.fused(rollout_ET, orders_KD, self._count)
+            self._means.update({LOGGED[name]: own for name, own in means.items() if name in LOGGED})
             self.dataset.non_finite_count.add_(left_out)
-        self._measure_(steps)
 
     def _count(self) -> None:
         if self._scale_keys:

@@ -1,10 +1,12 @@
 """This module lays out for the kernels what the gradient steps of an update read of a rollout."""
 
 from collections.abc import Callable, Iterator
+from functools import reduce
+from operator import add
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int32
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -69,7 +71,7 @@ class FusedDataset:
         self.listed = {name: self._arguments[name] for name in ("places", "count") if layout.chained}
 
     @torch.no_grad()
-    def read(self, rollout_ET: TensorDictBase, *, evaluate: Callable[..., None]) -> Int64[Tensor, ""]:
+    def read(self, rollout_ET: TensorDictBase, *, evaluate: Callable[..., None]) -> Int32[Tensor, ""]:
         """Take over a rollout `["E","T"]`, whose advantages are estimated here with the values that `evaluate` writes.
 
         An env state with an element that is not finite takes no part, as in `DatasetStorage`; returned is how many.
@@ -92,7 +94,7 @@ class FusedDataset:
         launch(estimate_advantages, (programs,), given, num_warps=1, moments=moments)
         moments = torch.cat(ranks.gather(moments))
         left_out = [self._take_records(part_ET, first, moments) for part_ET, first in self._parts(rollout_ET)]
-        return torch.cat(left_out).sum()
+        return reduce(add, (own.sum(dtype=torch.int32) for own in left_out))
 
     def _parts(self, rollout_ET: TensorDictBase) -> Iterator[tuple[TensorDictBase, int]]:
         """Yield the rollout, or some steps at a time and their mirror images, and at which row each begins."""

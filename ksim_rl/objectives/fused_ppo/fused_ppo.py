@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 import triton
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int32, Int64
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional
@@ -46,19 +46,26 @@ from ksim_rl.objectives.fused_ppo.mlp_kernels import (
     network_outputs,
     weight_gradients,
 )
-from ksim_rl.objectives.fused_ppo.step_kernels import SUMMARY, adam_step, sum_gradients, take_means
+from ksim_rl.objectives.fused_ppo.step_kernels import (
+    SUMMARY,
+    adam_step,
+    mean_steps,
+    sum_gradients,
+    take_means,
+)
 from ksim_rl.objectives.gradient_step import StepGuard, rate_bounds
 from ksim_rl.objectives.symmetry import SymmetricAugmentation
 
 # Sums that each block leaves beside its gradients.
 NUM_STATISTICS = 16
+MOMENTS = "exp_avg", "exp_avg_sq"
 
 
 class FusedParameters:
     """Flat and padded forms (see `FusedLayout`) of what an update changes.
 
-    Between updates the modules and the optimizer hold the state, so that checkpoints, evaluation and collection see
-    what they always see.
+    Parameters of the modules and moments of the optimizer are views of the flat form: checkpoints, evaluation and
+    collection see what they always see. `load` makes the padded form of it, and `store` tells how many steps were made.
     """
 
     def __init__(
@@ -74,15 +81,13 @@ class FusedParameters:
     ) -> None:
         self._parameters, self._optimizer, self._tf32 = networks.parameters, optimizer, tf32
         device = self._parameters[0].device
+        padding = -layout.num_flat % size
         # Parameters, and the optimizer's means and variances, each [N] and zeros up to a whole number of `size`.
-        self._padding = torch.zeros(-layout.num_flat % size, device=device)
-        self.flat = torch.zeros(3, layout.num_flat + len(self._padding), device=device)
-        sizes, shapes = zip(
-            *((own.numel(), own.shape) for own in (*self._parameters, self._padding)), strict=True
-        )
-        self._views = [view for flat in self.flat for view in map(Tensor.view, flat.split(sizes), shapes)]
+        self.flat = [torch.zeros(layout.num_flat + padding, device=device) for _ in range(3)]
+        sizes = [own.numel() for own in self._parameters]
+        self._views = [flat[: layout.num_flat].split(sizes) for flat in self.flat]
         self._index = layout.padded_index(networks).to(device, torch.int64)  # as torch takes it
-        self.places = functional.pad(self._index, (0, len(self._padding))).to(torch.int32)
+        self.places = functional.pad(self._index, (0, padding)).to(torch.int32)
         # The parameters in padded form, in float32 and in the dtype of the products.
         self.exact = torch.zeros(2, layout.num_padded, device=device)
         self.weights = torch.zeros(2, layout.num_padded, dtype=dtype, device=device)
@@ -92,29 +97,32 @@ class FusedParameters:
         self.steps = torch.zeros(num_steps + 1, device=device)
         for parameter in self._parameters:
             if parameter not in optimizer.state:
-                moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
+                moments = {name: torch.zeros_like(parameter) for name in MOMENTS}
                 optimizer.state[parameter] = {"step": torch.zeros((), device=device), **moments}
+        self.load()
 
     @torch.no_grad()
     def load(self) -> None:
         """Take over what modules and optimizer hold."""
-        # One kernel; `_foreach_copy_` gives a large tensor to few blocks.
-        torch.cat([own.reshape(-1) for own in self._held()], out=self.flat.view(-1))
+        for parameter, *views in zip(self._parameters, *self._views, strict=True):
+            state = self._optimizer.state[parameter]
+            held = [parameter, *(state[name] for name in MOMENTS)]
+            # Elsewhere at first, and where torch has loaded the optimizer's state.
+            if any(own.data_ptr() != view.data_ptr() for own, view in zip(held, views, strict=True)):
+                views = [
+                    view.copy_(own.flatten()).view_as(own) for own, view in zip(held, views, strict=True)
+                ]
+                parameter.data, *moments = views
+                state.update(zip(MOMENTS, moments, strict=True))
         self.steps[0].copy_(self._optimizer.state[self._parameters[0]]["step"])
         self.exact.view(-1)[self._index] = self.flat[0][: len(self._index)]
         self.weights.copy_(as_tf32(self.exact) if self._tf32 else self.exact)
 
     @torch.no_grad()
     def store(self) -> None:
-        """Hand it back, with the number of steps after the last gradient step."""
+        """Give the optimizer the number of steps after the last gradient step."""
         counts = [self._optimizer.state[parameter]["step"] for parameter in self._parameters]
-        torch._foreach_copy_([*self._held(), *counts], [*self._views, *[self.steps[-1]] * len(counts)])
-
-    def _held(self) -> list[Tensor]:
-        # Looked up each time: loading a checkpoint gives the optimizer other tensors.
-        states = [self._optimizer.state[parameter] for parameter in self._parameters]
-        moments = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq"))
-        return [own for row in (self._parameters, *moments) for own in (*row, self._padding)]
+        torch._foreach_copy_(counts, [self.steps[-1]] * len(counts))
 
 
 class Ahead(triton.AsyncCompileMode):
@@ -190,6 +198,9 @@ class FusedPPO:
         )
 
         self._summary = torch.zeros(steps, power_of_two(len(SUMMARY) + 1), device=device)
+        self._step_means = torch.zeros_like(self._summary[0])
+        self._longest_skip = torch.zeros((), dtype=torch.int64, device=device)
+        self._rows: Tensor | None = None
         # Splits whose layer inputs and gradients exist at a time. The loss of a mirror image reads the whole minibatch;
         # chained kernels leave out half of its columns.
         self._splits = tuning.splits if self._mirrored or layout.chained else parts(tuning.splits, 2)
@@ -198,6 +209,7 @@ class FusedPPO:
         def launch_all() -> None:
             self._multiply(torch.zeros(rows, dtype=torch.int32, device=device))
             self._improve(0)
+            self._take_step_means()
             for listed in ({}, self.dataset.listed):
                 self._evaluate(self.dataset.obs[1], self.dataset.records[:, 0].contiguous(), **listed)
             self.means(torch.zeros(rows, layout.obs_dims[0], device=device))
@@ -276,13 +288,14 @@ class FusedPPO:
 
     def __call__(
         self, rollout_ET: TensorDictBase, orders_KD: Int64[Tensor, "K D"], *aside: Callable[[], None]
-    ) -> tuple[dict[str, Float[Tensor, " steps"]], Int64[Tensor, ""]]:
+    ) -> tuple[dict[str, Float[Tensor, ""]], Int64[Tensor, ""], Int32[Tensor, ""]]:
         """Make all gradient steps of an update.
 
         `rollout_ET`, `["E","T"]`, may be time-major in memory, as a collector's. `orders_KD` has for each epoch the
         env states in the order of the minibatches, counted env by env; a GPU does what is `aside` beside the steps.
-        Returned are what each gradient step measured, by the names of `SUMMARY`, and how many env states took no part
-        because an element was not finite.
+        Returned are means of what the steps measured that were made, by the names of `SUMMARY`; how many in a row were
+        not, at most; and how many env states took no part because an element was not finite. The first two are the same
+        memory each time.
         """
         num_envs, length = rollout_ET.batch_size
         with warp_scope(self._summary.device):
@@ -292,9 +305,11 @@ class FusedPPO:
                 self._ahead = None
             # One after the other: of two branches, a graph sends the longer one first, with all its steps, and the
             # other starts 0.17 ms later. Drawing takes a third of that.
-            order_N = orders_KD.flatten().to(torch.int32)
-            # From env by env to step by step.
-            indices = ((order_N % length) * num_envs + order_N // length).split(self.batch)
+            if self._rows is None:
+                # From env by env to step by step.
+                rows = torch.arange(num_envs * length, dtype=torch.int32, device=orders_KD.device)
+                self._rows = rows.view(length, num_envs).t().flatten()
+            indices = self._rows[orders_KD.flatten()].split(self.batch)
             self.parameters.load()
             left_out = self.dataset.read(rollout_ET, evaluate=self._evaluate)
             with beside(self._side, *aside):
@@ -304,8 +319,9 @@ class FusedPPO:
                     self._multiply(index_B)
                     self._improve(step)
             self.parameters.store()
+            self._take_step_means()
         names = SUMMARY if self._mirrored else SUMMARY[:-1]
-        return dict(zip(names, self._summary.unbind(1), strict=False)), left_out
+        return dict(zip(names, self._step_means.unbind(), strict=False)), self._longest_skip, left_out
 
     @torch.no_grad()
     def means(self, obs_EL: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch A"]:
@@ -400,6 +416,12 @@ class FusedPPO:
         sizes = {"SIZE": self.layout.num_flat, "BLOCK": self.tuning.size}
         grid = (parts(self.layout.num_flat, self.tuning.size),)
         launch(adam_step, grid, given, summary=summary, steps=self.parameters.steps[step:], **sizes)
+
+    def _take_step_means(self) -> None:
+        steps, columns = self._summary.shape
+        own = {"summary": self._summary, "means": self._step_means, "longest": self._longest_skip}
+        sizes = {"STEPS": steps, "ROWS": power_of_two(steps), "COLUMNS": columns}
+        launch(mean_steps, (1,), own | sizes)
 
     def _evaluate(self, obs_DL: Tensor, values_D: Tensor, **listed: Tensor) -> None:
         """Write the values of observations; `listed`, those of some rows to some places (see `network_outputs`)."""

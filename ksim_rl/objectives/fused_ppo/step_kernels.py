@@ -26,6 +26,8 @@ SUMMARY = (
 LOSS = tl.constexpr(SUMMARY.index("loss"))
 LEARNING_RATE = tl.constexpr(SUMMARY.index("learning_rate"))
 GRAD_NORM = tl.constexpr(SUMMARY.index("grad_norm"))
+SKIPPED = tl.constexpr(SUMMARY.index("skipped"))
+SKIPPED_IN_A_ROW = tl.constexpr(SUMMARY.index("skipped_in_a_row"))
 LOSS_MIRROR = tl.constexpr(SUMMARY.index("loss_mirror"))
 # Behind it stands which share of all ranks' rows took part: those of this rank, and once these are added up, all.
 SHARE = tl.constexpr(len(SUMMARY))
@@ -236,5 +238,19 @@ def adam_step(
         tl.store(steps + 1, tl.where(made, step + 1.0, step))
         tl.store(summary + LOSS, loss)
         tl.store(summary + GRAD_NORM, norm)
-        tl.store(summary + GRAD_NORM + 1, miss.to(tl.float32))
-        tl.store(summary + GRAD_NORM + 2, in_a_row.to(tl.float32))
+        tl.store(summary + SKIPPED, miss.to(tl.float32))
+        tl.store(summary + SKIPPED_IN_A_ROW, in_a_row.to(tl.float32))
+
+
+@triton.jit
+def mean_steps(summary, means, longest, STEPS: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    """Write the means of all columns over the steps that were made, and how many in a row were skipped at most."""
+    row = tl.arange(0, ROWS)[:, None]
+    at, inside = summary + row * COLUMNS, row < STEPS
+    made = tl.load(at + SKIPPED, mask=inside, other=1.0) == 0.0
+    # What a skipped step measured would spoil the means.
+    column = tl.arange(0, COLUMNS)
+    total = tl.sum(tl.load(at + column[None, :], mask=made, other=0.0), 0)
+    tl.store(means + column, total / tl.maximum(tl.sum(made.to(tl.float32)), 1.0))
+    in_a_row = tl.load(at + SKIPPED_IN_A_ROW, mask=inside, other=0.0)
+    tl.store(longest, tl.max(in_a_row).to(tl.int64))
