@@ -15,6 +15,7 @@ from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import ObservationTerm, RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
+from ksim_rl.physics import SimCfg
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.suites.dm_control.quantities import (
@@ -111,6 +112,7 @@ def panda_pick_cube() -> ManagerBasedRlEnvCfg:
     return ManagerBasedRlEnvCfg(
         decimation=4,
         scene=SceneCfg(robots={"panda": PlaygroundModel(scene="panda_cube")}, num_envs=2048),
+        sim=SimCfg(njmax=128),
         observations={"actor": group, "critic": group},
         actions={"joints": MoveTargets(joints=DRIVEN, scale=0.04)},
         events={
