@@ -64,7 +64,7 @@ LEAP = Task(
         ),
         data=DatasetCfg(num_env_states_per_minibatch=65536, num_minibatches=4),
         modules=ModulesCfg(actor=ActorCfg(init_std=0.5), critic=CriticCfg(in_keys=("actor", "critic"))),
-        trainer=TrainerCfg(num_iterations=1984, eval_interval=100),
+        trainer=TrainerCfg(num_iterations=1831, eval_interval=100),
     ),
 )
 TASKS = (PANDA, LEAP)
