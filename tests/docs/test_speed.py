@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import report
+from benchmarks import determinism, report
 from tests.docs.guide import DOCS, REPOSITORY
 
 README = (REPOSITORY / "README.md").read_text()
@@ -36,6 +36,15 @@ def test_the_table_of_an_iteration(label: str) -> None:
     assert ms == pytest.approx(figures[GO1 + name], rel=5e-3)
     assert per_s == pytest.approx(1000 * ENV_STATES.get(name, 24 * 4096) / figures[GO1 + name], rel=1e-4)
     assert relative == pytest.approx(per_s * figures[GO1 + "physics_ms"] / 4096 / 1000, rel=5e-3)
+
+
+@pytest.mark.parametrize("task", determinism.TASKS)
+def test_the_table_of_equal_runs(task: str) -> None:
+    name = task.removesuffix("_fast_sac")
+    starts = f"| `{name}`, `objective=fast_sac` |" if name != task else (f"| `{name}` |", f"| `{name}` (")
+    (row,) = (line for line in PAGE.splitlines() if line.startswith(starts) and "." not in line)
+    found = [results("determinism")[f"h200/{task}/{key}"] for key in ("tensors", "tensors_that_differ")]
+    assert [float(cell) for cell in row.strip("| ").split(" | ")[1:]] == found
 
 
 def said() -> dict[str, tuple[str, str]]:
@@ -76,6 +85,10 @@ def said() -> dict[str, tuple[str, str]]:
             f"takes {speed[GO1 + 'first_iteration_warm_s']:.1f} s, or {speed[GO1 + 'first_iteration_cold_s']:.0f} s",
         ),
         "memory": (PAGE, " kB, ".join(map(str, memory)) + " kB"),
+        "switch": (
+            PAGE,
+            f"of Go1 is {results('determinism')['h200/go1_velocity_flat/on_over_off']:.3f} times as fast with it",
+        ),
         "guards": (PAGE, f"{100 * speed[GO1 + 'guards_share']:.1f} % of an iteration"),
         "chain": (PAGE, f"+ {100 * transforms['h200/4096/chain_share_of_go1_step']:.1f} % of a control step"),
         "randomization": (
