@@ -101,11 +101,8 @@ class GaussianHead(nn.Module):
     def forward(
         self, features: Float[Tensor, "*batch L"]
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
-        """Return `(loc, scale)`; `scale` is at least `cfg.min_std`. Autocast does not round them.
-
-        With a small `scale` the 8 bits of bfloat16 would move `loc` by standard deviations, and with it the ratio of
-        probabilities that PPO learns from.
-        """
+        """Return `(loc, scale)`; `scale` is at least `cfg.min_std`. Autocast does not round them."""
+        # The 8 bits of bfloat16 move `loc` by small standard deviations, and PPO's ratios with it.
         with torch.autocast(features.device.type, enabled=False):
             features = features.to(self.loc.weight.dtype)
             loc = self.loc(features)

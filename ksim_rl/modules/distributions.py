@@ -167,10 +167,13 @@ class TanhGaussian(BoundedDistribution):
 
     def log_prob(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*shape"]:
         """Return the log density in nats, of a value beyond the bounds that of the last value inside."""
+        return self._log_density(self.latent(value))
+
+    def latent(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*value L"]:
+        """Return the `u` of a value, of one beyond the bounds that of the last value inside."""
         # Of the value: parameters of fewer bits would take most actions near a bound for others.
         inside = 1.0 - torch.finfo(value.dtype).eps
-        unit = ((value - self._center) / self._half_range).clamp(-inside, inside)
-        return self._log_density(torch.atanh(unit))
+        return torch.atanh(((value - self._center) / self._half_range).clamp(-inside, inside))
 
     def _squash(self, latent: Tensor) -> Tensor:
         # Rounding can carry the sum past a bound, which specs would refuse.

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate
 from ksim_rl.data import EpochSampler
-from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, ValueNetwork
-from ksim_rl.modules.actor import GaussianHead
+from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, TanhGaussian, ValueNetwork
+from ksim_rl.modules.actor import GaussianHead, TanhGaussianHead
 from ksim_rl.objectives import SymmetricAugmentation
 from ksim_rl.objectives.fused_ppo import ACTIVATIONS, FusedNetworks, why_not_fused
 from ksim_rl.objectives.fused_ppo.layout import Observer
@@ -91,9 +91,9 @@ def fused_networks(
     policy, value = getattr(actor[0], "module", None), getattr(critic, "module", None)
     if type(policy) is not PolicyNetwork or type(value) is not ValueNetwork:
         return "the networks are not those of make_actor and make_critic"
-    head = policy.head
-    if type(head) is not GaussianHead:
-        return f"the policy is not a {DiagonalGaussian.__name__}"
+    head: Any = policy.head
+    if type(head) not in (GaussianHead, TanhGaussianHead):
+        return f"the policy is no {DiagonalGaussian.__name__} or {TanhGaussian.__name__}"
     layers = [*_layers(policy.trunk), head.loc], _layers(value.layers)
     activations = {type(part) for part in (*policy.trunk, *value.layers)} - {nn.Linear}
     if len(activations) != 1 or not activations <= {*ACTIVATIONS}:
@@ -107,6 +107,7 @@ def fused_networks(
         observers=(_observer(actor[0]), _observer(critic)),
         activation=activation,
         min_std=head.min_std,
+        squashed=head.distribution if type(head) is TanhGaussianHead else None,
         **std,
     )
 

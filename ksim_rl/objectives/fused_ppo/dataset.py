@@ -14,7 +14,7 @@ from ksim_rl import ranks
 from ksim_rl.device.memory import ROLLOUT_PARTS
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
 from ksim_rl.objectives.fused_ppo.dataset_kernels import read_observations, write_records
-from ksim_rl.objectives.fused_ppo.layout import FusedLayout, Observer, launch, parts, power_of_two
+from ksim_rl.objectives.fused_ppo.layout import FusedLayout, FusedNetworks, launch, parts, power_of_two
 from ksim_rl.objectives.fused_ppo.loss_kernels import estimate_advantages
 from ksim_rl.objectives.symmetry import SymmetricAugmentation
 
@@ -26,7 +26,7 @@ class FusedDataset:
     """Normalized observations, and one record for each env state, in the order of a collector's rollout: step by step.
 
     `obs` [2, D, L] is for actor and critic, padded with zeros, in the `dtype` of the products; `records` [D, columns]
-    are described in `loss_kernels`. The `observers` say what the first layers take.
+    are described in `loss_kernels`.
     With a `mirror`, rows D to 2 D of both are the mirror images of those before.
     """
 
@@ -35,14 +35,14 @@ class FusedDataset:
         cfg: PPOCfg,
         layout: FusedLayout,
         *,
-        observers: tuple[Observer, Observer],
+        networks: FusedNetworks,
         size: int,
         dtype: torch.dtype,
         tf32: bool,
         device: torch.device,
         mirror: SymmetricAugmentation | None = None,
     ) -> None:
-        self.layout, self.size, self._mirror, self._observers = layout, size, mirror, observers
+        self.layout, self.size, self._mirror, self._networks = layout, size, mirror, networks
         rows = size if mirror is None else 2 * size
         self.obs = torch.zeros(2, rows, layout.stored, dtype=dtype, device=device)
         self.records = torch.zeros(rows, 3 * layout.out + 8, device=device)
@@ -112,12 +112,17 @@ class FusedDataset:
         own = {"obs": self.obs[0, first:], "records": self.records[first:], "first": first, "num_rows": rows}
         own |= {"moments": moments, "num_moments": len(moments), "left_out": left_out, "BLOCK": block}
         keys = ("action", "loc", "scale", "action_log_prob")
-        given = self._arguments | {key: _time_major(part_ET.get(key)) for key in keys} | own
+        acted = {key: _time_major(part_ET.get(key)) for key in keys}
+        if self._networks.squashed is not None:
+            policy = self._networks.squashed(acted["loc"], acted["scale"])
+            acted["action"] = action = policy.latent(acted["action"])
+            acted["action_log_prob"] = policy.base.log_prob(action)
+        given = self._arguments | acted | own
         launch(write_records, (len(left_out),), given, MOMENTS=power_of_two(len(moments)))
         return left_out
 
     def _take_observations(self, network: int, part_ET: TensorDictBase, obs: Tensor, **changes: Any) -> None:
-        observer = self._observers[network]
+        observer = self._networks.observers[network]
         source, block = _time_major(observer.read(part_ET)), _block(self._arguments["LANES"])
         own = {"source": source, "obs": obs, "num_rows": len(source), "WIDTH": source.shape[1], "num_envs": 0}
         given = self._arguments | observer.moments_given | own | {"LISTED": False, "faults": None} | changes

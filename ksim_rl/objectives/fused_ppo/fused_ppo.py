@@ -3,9 +3,7 @@
 It computes what `GAE`, `ClipPPOLoss` and `ppo_step` compute for an actor and a critic of `FusedNetworks`, from the same
 config, in the same order of env states, and on the state of the same optimizer: a run can change from one to the other
 at any update. Where they are multiplied, weights, observations, hidden layers and their gradients are rounded to 8
-significant bits with bfloat16, with float32 to 11 (TF32); parameters, sums, losses and Adam stay float32. For networks
-of 512, 256 and 128 bfloat16 moved the gradient of each parameter by 0.2 to 0.6 percent of its norm, where torch's TF32
-moves it by 0.05 to 0.5.
+significant bits with bfloat16, with float32 to 11 (TF32); parameters, sums, losses and Adam stay float32.
 """
 
 import itertools
@@ -16,9 +14,11 @@ from contextvars import copy_context
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 import triton
 from jaxtyping import Float, Int32, Int64
+from numpy.polynomial.hermite_e import hermegauss
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional
@@ -59,6 +59,9 @@ from ksim_rl.objectives.symmetry import SymmetricAugmentation
 # Sums that each block leaves beside its gradients.
 NUM_STATISTICS = 16
 MOMENTS = "exp_avg", "exp_avg_sq"
+# Points of the quadrature for the entropy of squashed actions: it is good to 1e-3 nats for standard deviations to 1.5
+# before the tanh.
+NODES = 16
 
 
 class FusedParameters:
@@ -151,6 +154,17 @@ class Ahead(triton.AsyncCompileMode):
         self.__exit__(None, None, None)
 
 
+def _squashing(networks: FusedNetworks, zeros_A: Tensor) -> dict[str, Any]:
+    """Return what kernels get for the entropy of squashed actions."""
+    if networks.squashed is None:
+        return {"nodes": None, "log_range": 0.0, "NODES": 0}
+    policy, (points, weights) = networks.squashed(zeros_A, zeros_A + 1.0), hermegauss(NODES)
+    nodes = torch.tensor(np.stack((points, weights / math.sqrt(2.0 * math.pi)), 1), dtype=torch.float32)
+    # At the median only the range sets both densities apart.
+    log_range = policy.base.log_prob(zeros_A) - policy.log_prob(policy.median)
+    return {"nodes": nodes.to(zeros_A.device), "log_range": log_range.item(), "NODES": NODES}
+
+
 class FusedPPO:
     """Makes the gradient steps of one update after another; all memory is allocated once, and nothing syncs.
 
@@ -189,14 +203,13 @@ class FusedPPO:
         self.dataset = FusedDataset(
             cfg,
             layout,
-            observers=networks.observers,
+            networks=networks,
             size=num_env_states_per_minibatch * num_minibatches,
             dtype=dtype,
             tf32=tf32,
             device=device,
             mirror=mirror,
         )
-
         self._summary = torch.zeros(steps, power_of_two(len(SUMMARY) + 1), device=device)
         self._step_means = torch.zeros_like(self._summary[0])
         self._longest_skip = torch.zeros((), dtype=torch.int64, device=device)
@@ -209,7 +222,7 @@ class FusedPPO:
         def launch_all() -> None:
             self._multiply(torch.zeros(rows, dtype=torch.int32, device=device))
             self._improve(0)
-            self._take_step_means()
+            launch(mean_steps, (1,), self._arguments, summary=self._summary)
             for listed in ({}, self.dataset.listed):
                 self._evaluate(self.dataset.obs[1], self.dataset.records[:, 0].contiguous(), **listed)
             self.means(torch.zeros(rows, layout.obs_dims[0], device=device))
@@ -254,6 +267,8 @@ class FusedPPO:
             "records": dataset.records,
             "num_obs": len(dataset.records),
             "num_rows": rows,
+            "step_means": self._step_means,
+            "longest_skip": self._longest_skip,
             "tiles": layout.weight_tiles(tuning.tile).to(dataset.records.device),
             "inputs": zeros(2 * held * layout.inputs, dtype=dtype),
             "slopes": zeros(2 * held * layout.gradients, dtype=dtype),
@@ -272,8 +287,12 @@ class FusedPPO:
             "max_grad_norm": cfg.max_grad_norm or 0.0,
             "ACTIVATION": ACTIVATIONS.index(self.networks.activation),
             "STATE_STD": self.networks.std_layer is not None,
+            **_squashing(self.networks, zeros(layout.actions)),
             "RECORD": dataset.records.shape[1],
             "NUM_STATISTICS": NUM_STATISTICS,
+            "STEPS": len(self._summary),
+            "POWER_OF_STEPS": power_of_two(len(self._summary)),
+            "COLUMNS": self._summary.shape[1],
             "NUM_GRADIENTS": 2 * layout.num_padded,
             "NUM_SQUARES": programs,
             "SQUARES": power_of_two(programs),
@@ -293,9 +312,8 @@ class FusedPPO:
 
         `rollout_ET`, `["E","T"]`, may be time-major in memory, as a collector's. `orders_KD` has for each epoch the
         env states in the order of the minibatches, counted env by env; a GPU does what is `aside` beside the steps.
-        Returned are means of what the steps measured that were made, by the names of `SUMMARY`; how many in a row were
-        not, at most; and how many env states took no part because an element was not finite. The first two are the same
-        memory each time.
+        Returned are means over the steps that were made, by the names of `SUMMARY`, how many in a row were not at most,
+        both in the same memory each time, and how many env states took no part as an element was not finite.
         """
         num_envs, length = rollout_ET.batch_size
         with warp_scope(self._summary.device):
@@ -319,7 +337,7 @@ class FusedPPO:
                     self._multiply(index_B)
                     self._improve(step)
             self.parameters.store()
-            self._take_step_means()
+            launch(mean_steps, (1,), self._arguments, summary=self._summary)
         names = SUMMARY if self._mirrored else SUMMARY[:-1]
         return dict(zip(names, self._step_means.unbind(), strict=False)), self._longest_skip, left_out
 
@@ -416,12 +434,6 @@ class FusedPPO:
         sizes = {"SIZE": self.layout.num_flat, "BLOCK": self.tuning.size}
         grid = (parts(self.layout.num_flat, self.tuning.size),)
         launch(adam_step, grid, given, summary=summary, steps=self.parameters.steps[step:], **sizes)
-
-    def _take_step_means(self) -> None:
-        steps, columns = self._summary.shape
-        own = {"summary": self._summary, "means": self._step_means, "longest": self._longest_skip}
-        sizes = {"STEPS": steps, "ROWS": power_of_two(steps), "COLUMNS": columns}
-        launch(mean_steps, (1,), own | sizes)
 
     def _evaluate(self, obs_DL: Tensor, values_D: Tensor, **listed: Tensor) -> None:
         """Write the values of observations; `listed`, those of some rows to some places (see `network_outputs`)."""

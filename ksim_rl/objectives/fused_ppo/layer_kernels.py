@@ -83,12 +83,12 @@ def layer(
 
 @triton.jit
 def output_gradients(
-    records, order, inputs, slopes, weights, biases, block_partials, image_of,
-    num_rows, fan_in, input_at, slope_at,
+    records, order, inputs, slopes, weights, biases, block_partials, image_of, nodes,
+    num_rows, fan_in, input_at, slope_at, log_range,
     log_ratio_low, log_ratio_high, clip_value, entropy_coeff, critic_coeff, symmetry_coeff,
     NUM_PADDED: tl.constexpr, NUM_STATISTICS: tl.constexpr,
     RECORD: tl.constexpr, INPUTS: tl.constexpr, GRADIENTS: tl.constexpr, ACTIONS: tl.constexpr, OUT: tl.constexpr,
-    LOG_STD: tl.constexpr, MIN_STD: tl.constexpr, STATE_STD: tl.constexpr, MIRROR: tl.constexpr,
+    LOG_STD: tl.constexpr, MIN_STD: tl.constexpr, STATE_STD: tl.constexpr, NODES: tl.constexpr, MIRROR: tl.constexpr,
     CLIP_VALUE: tl.constexpr, TF32: tl.constexpr, BLOCK: tl.constexpr, DEPTH: tl.constexpr, TILE_STAGES: tl.constexpr,
 ):  # fmt: skip
     """Run BLOCK rows through the last layer and the loss: program (i, n) is of network n (0: actor, 1: critic).
@@ -129,7 +129,7 @@ def output_gradients(
             ]
         d_out, d_std = policy_gradient(
             out, raw_std, record, judged, d_std_at, statistics, log_ratio_low, log_ratio_high, entropy_coeff,
-            ACTIONS, OUT, LOG_STD, MIN_STD, STATE_STD
+            nodes, log_range, ACTIONS, OUT, LOG_STD, MIN_STD, STATE_STD, NODES
         )  # fmt: skip
         if STATE_STD:
             tl.store(slope_rows + (OUT + output[None, :]), operand(d_std, dtype, TF32), mask=keep)

@@ -52,7 +52,8 @@ class FusedNetworks:
 
     The activation follows each linear layer but the last. The standard deviations, or their logarithms, are a parameter
     `std_A`, or what a `std_layer` makes of the last hidden layer: logarithms, or what a softplus makes positive. The
-    gradient passes the bound `min_std`. What actor and critic read is what their `observers` say.
+    gradient passes the bound `min_std`. What actor and critic read is what their `observers` say. Where
+    actions are squashed, `squashed` makes a `TanhGaussian` of `loc` and `scale`.
     """
 
     actor: Sequence[nn.Linear]
@@ -63,6 +64,7 @@ class FusedNetworks:
     log_std: bool
     min_std: float
     activation: type[nn.Module] = nn.ELU
+    squashed: Callable[..., Any] | None = None
 
     @property
     def parameters(self) -> list[Float[Tensor, "*?shape"]]:
@@ -79,6 +81,7 @@ class FusedNetworks:
         hidden = [layer.out_features for layer in self.actor[:-1]]
         return (
             self.std_layer is None
+            and self.squashed is None
             and self.activation is not nn.SiLU
             and hidden == [layer.out_features for layer in self.critic[:-1]]
             and len(hidden) == 3
@@ -238,6 +241,8 @@ def why_not_fused(
     for field, is_set in refused.items():
         if is_set:
             return f"{field}={getattr(cfg, field)!r}"
+    if cfg.symmetry == "loss" and networks.squashed is not None:
+        return "symmetry='loss', and the policy is squashed"
     hidden = [[layer.out_features for layer in layers[:-1]] for layers in (networks.actor, networks.critic)]
     if len(hidden[0]) != len(hidden[1]) or not hidden[0]:
         return f"actor and critic have hidden layers of {hidden[0]} and {hidden[1]}, not one or more, and as many"

@@ -1,7 +1,7 @@
 """This module has generalized advantages, and the clipped losses of PPO with their gradients, as Triton functions.
 
-The losses are those of `ClipPPOLoss`, for a diagonal gaussian; the gradients are of the sum over the env states, not of
-the mean. `docs/fused_ppo.md` derives them.
+The losses are those of `ClipPPOLoss`, for a diagonal gaussian, or for one that a tanh squashes: actions are then those
+before the tanh. The gradients are of the sum over the env states, not of the mean. `docs/fused_ppo.md` derives them.
 
 What is known of an env state is one record: `OUT` columns each of the action, of the old mean and of the old standard
 deviation, then `LOG_PROB`, `ADVANTAGE`, `VALUE`, `TARGET` and `MASK`, counted from column 3 OUT.
@@ -16,19 +16,21 @@ VALUE = tl.constexpr(2)
 TARGET = tl.constexpr(3)
 MASK = tl.constexpr(4)
 HALF_LOG_2_PI = tl.constexpr(0.9189385332046727)
+LOG_2 = tl.constexpr(0.6931471805599453)
 
 
 @triton.jit
 def policy_gradient(
-    loc, raw_std, record, valid, d_std_at, statistics, log_ratio_low, log_ratio_high, entropy_coeff,
+    loc, raw_std, record, valid, d_std_at, statistics, log_ratio_low, log_ratio_high, entropy_coeff, nodes, log_range,
     ACTIONS: tl.constexpr, OUT: tl.constexpr,
-    LOG_STD: tl.constexpr, MIN_STD: tl.constexpr, STATE_STD: tl.constexpr,
+    LOG_STD: tl.constexpr, MIN_STD: tl.constexpr, STATE_STD: tl.constexpr, NODES: tl.constexpr,
 ):  # fmt: skip
     """Return the gradient of the policy loss and the entropy loss at `loc` and at `raw_std`, both [rows, OUT].
 
     Writes the sum of the latter to `d_std_at` [OUT], and to `statistics` the sums of mask, policy loss, divergence and
     clipped ratios. With STATE_STD `raw_std` has a row for each of `loc`, and the sum of entropies is written, too; else
-    it is [1, OUT].
+    it is [1, OUT]. With NODES, points [NODES, 2] of a quadrature and their weights, actions are squashed to a box with
+    a volume of exp(`log_range`) times that of [-1, 1], and the entropy is that of what comes out.
     """
     output = tl.arange(0, OUT)[None, :]
     action_dims = output < ACTIONS
@@ -62,7 +64,18 @@ def policy_gradient(
     slope = tl.where(inside | (gain < clipped_gain), -gain, 0.0) * mask
 
     error = tl.where(counts[:, None], error, 0.0)
+    d_loc = slope[:, None] * error * inverse
     d_std = (slope[:, None] * (error * error - 1.0) - entropy_coeff * mask[:, None]) * inverse
+    log_slope = tl.zeros_like(loc)
+    if NODES:  # the mean of log(1 - tanh(u)^2) over the gaussian
+        for node in range(NODES):
+            at, share = tl.load(nodes + 2 * node), tl.load(nodes + 2 * node + 1)
+            latent = loc + bounded * at
+            fold = tl.exp(-2.0 * tl.abs(latent))
+            log_slope += share * 2.0 * (LOG_2 - tl.abs(latent) - tl.log(1.0 + fold))
+            change = tl.where(latent < 0.0, 2.0, -2.0) * (1.0 - fold) / (1.0 + fold) * share
+            d_loc -= entropy_coeff * mask[:, None] * change
+            d_std -= entropy_coeff * mask[:, None] * change * at
     if LOG_STD:
         d_std = d_std * std
     elif STATE_STD:
@@ -77,10 +90,11 @@ def policy_gradient(
     tl.store(statistics + 1, -tl.sum(tl.minimum(gain, clipped_gain) * mask))
     tl.store(statistics + 2, tl.sum(tl.sum(tl.where(action_dims, divergence, 0.0), 1) * mask))
     tl.store(statistics + 3, tl.sum(tl.where(inside, 0.0, mask)))
-    if STATE_STD:
-        entropy = tl.sum(tl.where(action_dims, log_scale + (0.5 + HALF_LOG_2_PI), 0.0), 1)
+    if STATE_STD or NODES:
+        entropy = tl.where(action_dims, log_scale + log_slope + (0.5 + HALF_LOG_2_PI), 0.0)
+        entropy = tl.sum(entropy, 1) + log_range
         tl.store(statistics + 4, tl.sum(entropy * mask))
-    return tl.where(action_dims, slope[:, None] * error * inverse, 0.0), d_std
+    return tl.where(action_dims, d_loc, 0.0), d_std
 
 
 @triton.jit

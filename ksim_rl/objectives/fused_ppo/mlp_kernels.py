@@ -201,7 +201,7 @@ def minibatch_gradients(
         )[None, :]
         d_out, _ = policy_gradient(
             out, raw_std, record, valid, d_std_at, statistics, log_ratio_low, log_ratio_high, entropy_coeff,
-            ACTIONS, OUT, LOG_STD, MIN_STD, False
+            None, 0.0, ACTIONS, OUT, LOG_STD, MIN_STD, False, 0
         )  # fmt: skip
     else:
         d_out = value_gradient(out, record, valid, statistics, clip_value, critic_coeff, OUT, CLIP_VALUE)

@@ -86,7 +86,7 @@ def sum_gradients(
     RANKS: tl.constexpr, SPLITS: tl.constexpr, BLOCKS: tl.constexpr,
     NUM_PADDED: tl.constexpr, NUM_BIASES: tl.constexpr, NUM_STATISTICS: tl.constexpr,
     ACTIONS: tl.constexpr, OUT: tl.constexpr, LOG_STD: tl.constexpr, MIN_STD: tl.constexpr,
-    STATE_STD: tl.constexpr, MIRROR: tl.constexpr, ADAPTIVE: tl.constexpr,
+    STATE_STD: tl.constexpr, NODES: tl.constexpr, MIRROR: tl.constexpr, ADAPTIVE: tl.constexpr,
     SIZE: tl.constexpr, ROWS: tl.constexpr,
 ):  # fmt: skip
     """Add up what splits and blocks left, divide by the number of rows of all ranks, and adapt the learning rate.
@@ -124,7 +124,7 @@ def sum_gradients(
         number = tl.maximum(counted, 1.0) if RANKS == 1 else divisor
         policy = sums / number
         kl = _column(policy, 2, NUM_STATISTICS)
-        if STATE_STD:
+        if STATE_STD or NODES:
             entropy = _column(policy, 4, NUM_STATISTICS)
         else:
             acts = output < ACTIONS
@@ -243,14 +243,16 @@ def adam_step(
 
 
 @triton.jit
-def mean_steps(summary, means, longest, STEPS: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+def mean_steps(
+    summary, step_means, longest_skip, STEPS: tl.constexpr, POWER_OF_STEPS: tl.constexpr, COLUMNS: tl.constexpr
+):  # fmt: skip
     """Write the means of all columns over the steps that were made, and how many in a row were skipped at most."""
-    row = tl.arange(0, ROWS)[:, None]
+    row = tl.arange(0, POWER_OF_STEPS)[:, None]
     at, inside = summary + row * COLUMNS, row < STEPS
     made = tl.load(at + SKIPPED, mask=inside, other=1.0) == 0.0
     # What a skipped step measured would spoil the means.
     column = tl.arange(0, COLUMNS)
     total = tl.sum(tl.load(at + column[None, :], mask=made, other=0.0), 0)
-    tl.store(means + column, total / tl.maximum(tl.sum(made.to(tl.float32)), 1.0))
+    tl.store(step_means + column, total / tl.maximum(tl.sum(made.to(tl.float32)), 1.0))
     in_a_row = tl.load(at + SKIPPED_IN_A_ROW, mask=inside, other=0.0)
-    tl.store(longest, tl.max(in_a_row).to(tl.int64))
+    tl.store(longest_skip, tl.max(in_a_row).to(tl.int64))
