@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -101,9 +102,9 @@ class GaussianHead(nn.Module):
     def forward(
         self, features: Float[Tensor, "*batch L"]
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
-        """Return `(loc, scale)`; `scale` is at least `cfg.min_std`. Autocast does not round them."""
-        # The 8 bits of bfloat16 move `loc` by small standard deviations, and PPO's ratios with it.
-        with torch.autocast(features.device.type, enabled=False):
+        """Return `(loc, scale)`, the latter at least `cfg.min_std`, in full: 8 bits would move `loc` by deviations."""
+        kind = features.device.type
+        with torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext():
             features = features.to(self.loc.weight.dtype)
             loc = self.loc(features)
             return loc, self.scale(features).expand_as(loc)

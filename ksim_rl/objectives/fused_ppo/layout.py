@@ -52,8 +52,7 @@ class FusedNetworks:
 
     The activation follows each linear layer but the last. The standard deviations, or their logarithms, are a parameter
     `std_A`, or what a `std_layer` makes of the last hidden layer: logarithms, or what a softplus makes positive. The
-    gradient passes the bound `min_std`. What actor and critic read is what their `observers` say. Where
-    actions are squashed, `squashed` makes a `TanhGaussian` of `loc` and `scale`.
+    gradient passes the bound `min_std`. The `observers` say what is read; `squashed`, if any, makes a `TanhGaussian`.
     """
 
     actor: Sequence[nn.Linear]
