@@ -225,6 +225,7 @@ def test_captured_steps_are_the_eager_ones_bit_for_bit(hidden_dims):
     )
     assert all(parameter.isfinite().all() for parameter in parameters(eager))
     assert captured.metrics()["update/skipped_steps"] == 0
+    assert all(torch.equal(value, captured.metrics()[name]) for name, value in eager.metrics().items())
 
 
 @pytest.mark.parametrize("hidden_dims", [(512, 256, 128), (512, 256)])
