@@ -102,7 +102,7 @@ class GaussianHead(nn.Module):
     def forward(
         self, features: Float[Tensor, "*batch L"]
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
-        """Return `(loc, scale)`, the latter at least `cfg.min_std`, in full: 8 bits would move `loc` by deviations."""
+        """Return `loc`, and `scale` of at least `cfg.min_std`; autocast, which would move narrow policies, is off."""
         kind = features.device.type
         with torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext():
             features = features.to(self.loc.weight.dtype)

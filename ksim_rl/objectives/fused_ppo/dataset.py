@@ -26,8 +26,7 @@ class FusedDataset:
     """Normalized observations, and one record for each env state, in the order of a collector's rollout: step by step.
 
     `obs` [2, D, L] is for actor and critic, padded with zeros, in the `dtype` of the products; `records` [D, columns]
-    are described in `loss_kernels`.
-    With a `mirror`, rows D to 2 D of both are the mirror images of those before.
+    are described in `loss_kernels`. With a `mirror`, rows D to 2 D of both are the mirror images of those before.
     """
 
     def __init__(
