@@ -1,10 +1,11 @@
 """Is a run that is saved and resumed in a new process the run that never stopped? Compared tensor by tensor.
 
     python -m benchmarks.resume
+    python -m benchmarks.resume device=cuda mlp fast_sac
 
-trains each case twice with the command `ksim-rl`: N iterations at a stretch, and N/2, then `ksim-rl resume` in a new
-process. The final checkpoints hold all that a next iteration depends on; every tensor and value of them is compared
-bit for bit. Figures go to benchmarks/results/resume.json. Physics on the CPU is reproducible; see the README for GPUs.
+trains each case, or those named, twice with the command `ksim-rl`: N iterations at a stretch, and N/2, then `ksim-rl
+resume` in a new process. The final checkpoints hold all that a next iteration depends on; every tensor and value of
+them is compared bit for bit. Figures go to benchmarks/results/resume.json, as `<device>/<case>/<figure>`.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from torch import Tensor
 from benchmarks import command_line, report
 from ksim_rl.checks import check_choice
 from ksim_rl.device import state_tree
+from ksim_rl.device.streams import checked_device
 from ksim_rl.trainers import checkpoint
 
 TERM = "task.observations.actor.terms"
@@ -32,7 +34,6 @@ TERM = "task.observations.actor.terms"
 # at startup and at resets, pushes, commands, a level that rises, a reward weight and command ranges that follow it.
 TASK = (
     "task=quadruped_velocity_flat",
-    "device=cpu",
     "num_envs=6",
     "task.episode_length_s=0.5",
     "task.events.push_robot.interval_range_s=[0.1,0.3]",
@@ -65,6 +66,15 @@ CASES = {
     ),
     "sac": (
         "objective=sac",
+        "data.num_env_states_per_minibatch=24",
+        "data.num_minibatches=4",
+        "data.num_steps=16",
+        "data.capacity=80",
+        "data.learning_starts=16",
+    ),
+    "fast_sac": (
+        "objective=fast_sac",
+        "data.save_replay=true",
         "data.num_env_states_per_minibatch=24",
         "data.num_minibatches=4",
         "data.num_steps=16",
@@ -117,28 +127,33 @@ class Comparison:
 
 def main() -> None:
     """Run the cases that are named (or all), print the table and write it."""
-    wanted = sys.argv[1:] or list(CASES)
+    own, named = command_line.split(sys.argv[1:], {"device": "cpu"})
+    device, wanted = checked_device(own["device"]), named or list(CASES)
+    label = report.device_label(device)
     for name in wanted:
         check_choice("case", name, CASES)
     found = {}
     for name in wanted:
         with tempfile.TemporaryDirectory() as folder:
-            found[name] = compare_runs((*TASK, *CASES[name]), Path(folder), num_iterations=NUM_ITERATIONS)
+            overrides = (*TASK, *CASES[name])
+            found[name] = compare_runs(
+                overrides, Path(folder), num_iterations=NUM_ITERATIONS, device=device.type
+            )
     Console(width=140).print(_table(found))
     figures = {
-        f"cpu/{case}/{figure}": getattr(comparison, figure)
+        f"{label}/{case}/{figure}": getattr(comparison, figure)
         for case, comparison in found.items()
         for figure in ("tensors_compared", "tensors_that_differ")
     }
     path = report.write(
         "resume",
         figures=figures,
-        device=torch.device("cpu"),
+        device=device,
         module="benchmarks.resume",
         tensors_compared=sum(comparison.tensors_compared for comparison in found.values()),
         tensors_that_differ=sum(comparison.tensors_that_differ for comparison in found.values()),
         components={
-            f"cpu/{case}": {
+            f"{label}/{case}": {
                 component: {"tensors_compared": count, "that_differ": comparison.differing.get(component, [])}
                 for component, count in comparison.compared.items()
             }
@@ -162,13 +177,15 @@ def compare_runs(
     folder: Path,
     *,
     num_iterations: int,
+    device: str = "cpu",
     train: Callable[..., None] = run_command,
 ) -> Comparison:
     """Train at a stretch and in two processes, and compare the final checkpoints; `train` runs what is not resumed."""
     straight, halves = folder / "straight", folder / "halves"
+    overrides = (*overrides, f"device={device}")
     train("train", *overrides, f"trainer.num_iterations={num_iterations}", f"hydra.run.dir={straight}")
     train("train", *overrides, f"trainer.num_iterations={num_iterations // 2}", f"hydra.run.dir={halves}")
-    run_command("resume", str(halves), "--num-iterations", str(num_iterations), "--device", "cpu")
+    run_command("resume", str(halves), "--num-iterations", str(num_iterations), "--device", device)
     one, other = (checkpoint.load_latest(run) for run in (straight, halves))
     if one.iteration != num_iterations or other.iteration != num_iterations:
         raise RuntimeError(f"the runs ended after {one.iteration} and {other.iteration} iterations")
