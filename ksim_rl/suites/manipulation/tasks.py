@@ -1,7 +1,7 @@
 """This module has the manipulation tasks with the settings that they are trained with.
 
-MuJoCo Playground's are in `config/manipulation_params.py` of its commit d5e6b47. With its sizes of minibatches and its
-learning rate our Panda stays above its cube, and the hand turns the cube a fifth as often; see docs/tables.md.
+MuJoCo Playground's are in `config/manipulation_params.py` of its commit d5e6b47. With these a Panda lifts its first
+cubes later, and a hand turns its cube about half as often after the same seconds; see docs/tables.md.
 """
 
 from functools import partial
