@@ -56,6 +56,13 @@ TASK = (
     "logger=none",
 )
 ON_POLICY = ("data.num_env_states_per_minibatch=32", "data.num_minibatches=3")
+OFF_POLICY = (
+    "data.num_env_states_per_minibatch=24",
+    "data.num_minibatches=4",
+    "data.num_steps=16",
+    "data.capacity=80",
+    "data.learning_starts=16",
+)
 CASES = {
     "mlp": ON_POLICY,
     "lstm": (
@@ -64,23 +71,8 @@ CASES = {
         "modules.recurrent_actor.hidden_dim=8",
         "modules.recurrent_critic.hidden_dim=8",
     ),
-    "sac": (
-        "objective=sac",
-        "data.num_env_states_per_minibatch=24",
-        "data.num_minibatches=4",
-        "data.num_steps=16",
-        "data.capacity=80",
-        "data.learning_starts=16",
-    ),
-    "fast_sac": (
-        "objective=fast_sac",
-        "data.save_replay=true",
-        "data.num_env_states_per_minibatch=24",
-        "data.num_minibatches=4",
-        "data.num_steps=16",
-        "data.capacity=80",
-        "data.learning_starts=16",
-    ),
+    "sac": ("objective=sac", *OFF_POLICY),
+    "fast_sac": ("objective=fast_sac", "data.save_replay=true", *OFF_POLICY),
 }
 NUM_ITERATIONS = 6
 # The first of these that a tensor's path begins with names its component; else it is the path's first word.

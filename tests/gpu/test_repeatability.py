@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -121,15 +122,8 @@ def single(device: str) -> list[torch.Tensor]:
     rods.step()
     tendons.refresh()
     contact, count = rods.warp_data_E.contact, int(rods.warp_data_E.nacon.numpy()[0])
-    rows = [
-        (
-            *contact.geom.numpy()[i],
-            contact.worldid.numpy()[i],
-            *contact.pos.numpy()[i],
-            *contact.frame.numpy()[i].flat,
-        )
-        for i in range(count)
-    ]
+    fields = (getattr(contact, name).numpy()[:count] for name in ("geom", "worldid", "pos", "frame"))
+    rows = np.concatenate([field.reshape(count, -1) for field in fields], axis=1)
     return [torch.tensor(sorted(map(tuple, rows))), tendons.view("ten_velocity").cpu().clone()]
 
 
