@@ -30,7 +30,7 @@ PANDA = Task(
             num_epochs=8,
             learning_rate=7e-4,
             schedule="fixed",
-            entropy_coeff=0.02,
+            entropy_coeff=0.03,
             clip_epsilon=0.3,
         ),
         data=DatasetCfg(num_env_states_per_minibatch=10240, num_minibatches=16),
