@@ -15,7 +15,7 @@ from ksim_rl.checked import Count, check_value
 from ksim_rl.checks import check_choice, check_in_range
 
 Device = torch.device | str | None
-SPLITS = 4  # see `_Product`
+SPLITS, OUTPUTS = 4, 2**16  # see `_Product`
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "elu": nn.ELU,
     "gelu": nn.GELU,
@@ -141,7 +141,8 @@ class Layers(nn.Sequential):
         parts: list[Any] = list(self)
         linears = [part for part in parts if isinstance(part, nn.Linear | EnsembleLinear)]
         weights = [layer.weight for layer in linears]
-        rounded = _rounded([own.mT[None] if alone else own for own in weights])
+        rounded = _rounded([own[None] if alone else own for own in weights])
+        rounded = [own.mT if alone else own for own in rounded]
         while parts:
             layer = parts.pop(0)
             if not isinstance(layer, nn.Linear | EnsembleLinear):
@@ -168,8 +169,8 @@ class _Product(Function):
     """The products [N, B, M] of features [N, B, K] and weights [N, K, M], which are there `rounded` as well.
 
     Features [1, B, K] are those of all networks. Weights of one network are [M, K], as torch has them. The gradient of
-    the weights is a sum over env states in SPLITS parts: its outputs alone, which are few, would occupy a part of the
-    GPU. It lies in memory as the weights do, since autograd copies what does not.
+    the weights is a sum over env states in SPLITS parts, or as many as have OUTPUTS numbers: fewer would occupy a part
+    of the GPU. It lies in memory as the weights do, since autograd copies what does not.
     """
 
     @staticmethod
@@ -196,7 +197,7 @@ class _Product(Function):
             d_features = d_features.sum(0, keepdim=True) if ctx.is_shared else d_features
         if ctx.needs_input_grad[1]:
             networks, rows = features.shape[:2]
-            splits = math.gcd(SPLITS, rows)
+            splits = math.gcd(SPLITS * max(OUTPUTS // rounded.numel(), 1), rows)
             parts = [part.reshape(networks * splits, rows // splits, -1) for part in (features, d_out)]
             if ctx.alone:
                 parts, fan_in, fan_out = parts[::-1], fan_out, fan_in
