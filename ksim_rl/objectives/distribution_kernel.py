@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd import Function
 
-# Rows that a warp takes at once: what one waits for, the other computes.
-ROWS = 2
+# Lanes that a warp has at once, of two rows or more: what one waits for, another computes.
+LANES = 256
 # Powers of 2 are one instruction, those of e several.
 LOG2_E = tl.constexpr(1.4426950408889634)
 
@@ -107,9 +107,10 @@ class Compared(Function):
             following_BNA, *moves, lowest = targets
             given = following_BNA.transpose(0, 1), *(move.expand(rows, 1) for move in moves)
         given = logits, *(own.contiguous() for own in given), support_A, loss_NB, mean_NB, slope
-        sizes = rows, len(targets) > 0, lowest, networks, count, ROWS, triton.next_power_of_2(count)
-        launch: Any = compare_rows[-(-rows // ROWS), networks]
-        launch(*given, *sizes, num_warps=max(sizes[-1] // 256, 1))
+        lanes = triton.next_power_of_2(count)
+        sizes = rows, len(targets) > 0, lowest, networks, count, max(LANES // lanes, 2), lanes
+        launch: Any = compare_rows[-(-rows // sizes[-2]), networks]
+        launch(*given, *sizes, num_warps=max(lanes // 256, 1))
         ctx.save_for_backward(slope)
         ctx.others = (None,) * (1 + len(targets))
         return loss_NB.T, mean_NB.T
@@ -119,4 +120,5 @@ class Compared(Function):
         """Return the gradient at the logits."""
         (slope_NBA,) = ctx.saved_tensors
         d_logits_NBA = (slope_NBA * d_loss_BN.T[..., None]).to(slope_NBA.dtype)
-        return d_logits_NBA.transpose(0, 1), *ctx.others
+        # As the part before, compiled by itself, would copy it to lie.
+        return d_logits_NBA.transpose(0, 1).contiguous(), *ctx.others
