@@ -23,7 +23,14 @@ def _gradients(function, inputs, weights):
 
 @pytest.mark.parametrize(
     ("shape", "activation"),
-    [((2, 70, 24), 2), ((1, 33, 20), 1), ((3, 5, 48), 0), ((1, 3, 300), 2), ((2, 41, 520), 2)],
+    [
+        ((2, 70, 24), 2),
+        ((1, 33, 20), 1),
+        ((3, 5, 64), 0),
+        ((2, 19, 128), 2),
+        ((2, 41, 520), 2),
+        ((1, 9, 1000), 2),
+    ],
 )
 def test_values_and_gradients_are_those_of_torch(shape, activation):
     from ksim_rl.modules.norm_kernels import Normalized
