@@ -8,6 +8,7 @@ import pytest
 
 from ksim_rl.cli import main
 from ksim_rl.cli.new import copy_model
+from tests.absent_models import skipped_without_models
 from tests.docs import guide
 from tests.scene.robots.test_analysis import biped
 
@@ -83,10 +84,8 @@ def test_it_trains_at_once_and_its_own_test_passes(work, model, name):
     if "/" in model:
         from ksim_rl.physics import load_spec
 
-        try:
+        with skipped_without_models():
             load_spec(model)
-        except ValueError as error:
-            pytest.skip(str(error))
     assert run("new", "robot", model, "--name", name) == 0
     command = [
         "-m",

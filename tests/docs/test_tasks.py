@@ -19,6 +19,7 @@ from benchmarks import report, tasks
 from ksim_rl import envs
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.tables.table import Row, load
+from tests.absent_models import skipped_without_models
 from tests.docs.committed import last_run, results
 
 PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
@@ -336,12 +337,8 @@ def test_what_was_learned_is_what_the_tables_have():
 
 @pytest.mark.full
 def test_the_sizes_are_those_of_the_envs():
-    try:
+    with skipped_without_models():
         sizes = built_sizes()
-    except ValueError as error:
-        if "menagerie" not in str(error):
-            raise
-        pytest.skip(str(error))
     assert written_sizes() == sizes, OUT_OF_DATE
 
 

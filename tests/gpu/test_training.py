@@ -6,6 +6,7 @@ import torch
 from ksim_rl import conf, envs
 from ksim_rl.collectors import CollectorCfg, RolloutCollector
 from ksim_rl.trainers import build
+from tests.absent_models import skipped_without_models
 
 pytestmark = [
     pytest.mark.gpu,
@@ -16,12 +17,8 @@ TASKS = ("cartpole_balance", "cartpole_swingup", "go1_velocity_flat")
 
 
 def make(name, **kwargs):
-    try:
+    with skipped_without_models():
         return envs.make(name, num_envs=64, device="cuda", seed=1, **kwargs)
-    except (FileNotFoundError, ValueError) as error:
-        if "menagerie" in str(error).lower():
-            pytest.skip(f"no menagerie: {error}")
-        raise
 
 
 @pytest.fixture

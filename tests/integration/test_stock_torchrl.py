@@ -13,6 +13,7 @@ from ksim_rl.collectors import CollectorCfg, RolloutCollector
 from ksim_rl.modules import ActorCfg, make_actor
 from ksim_rl.scene.scene import build_spec
 from ksim_rl.testing import check_env, count_syncs
+from tests.absent_models import skipped_without_models
 
 E, T = 4, 16
 EPISODE_STEPS = 6  # short, so that each rollout holds several resets
@@ -33,14 +34,10 @@ def made(task: str) -> envs.MaskedTransformedEnv:
     cfg = envs.make_cfg(task)
     timestep = cfg.sim.timestep or build_spec(cfg.scene).option.timestep
     step_s = cfg.decimation * timestep
-    try:
+    with skipped_without_models():
         return envs.make(
             task, num_envs=E, seed=3, overrides=[f"task.episode_length_s={EPISODE_STEPS * step_s}"]
         )
-    except ValueError as error:
-        if "menagerie" not in str(error):
-            raise
-        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="module", params=TASKS)

@@ -24,6 +24,7 @@ from ksim_rl.transforms import (
     mirror_name,
     mirrored,
 )
+from tests.absent_models import skipped_without_models
 from tests.transforms.chains import VECTOR, actions, fixed_rollout
 
 ROBOTS = {
@@ -36,12 +37,8 @@ ROBOTS = {
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_mirrored_joints_put_the_bodies_where_the_mirror_shows_them(robot):
-    try:
+    with skipped_without_models():
         model = ROBOTS[robot]()
-    except ValueError as error:
-        if "menagerie" not in str(error):
-            raise
-        pytest.skip(str(error))
     joints = mirror_joints(model)
     generator = np.random.default_rng(0)
     data, image = mujoco.MjData(model), mujoco.MjData(model)

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.absent_models import skipped_without_models
+
 
 def reference_file(name: str) -> Path:
     """Return a file of the reference folder, or skip the test with the reason.
@@ -26,9 +28,5 @@ def reference_figures(robot: str) -> dict:
 
 def loaded_spec(robot):
     """Return the robot's spec, or skip if the menagerie is not at hand."""
-    try:
+    with skipped_without_models():
         return robot.spec()
-    except ValueError as error:
-        if "menagerie" not in str(error):
-            raise
-        pytest.skip(str(error))
