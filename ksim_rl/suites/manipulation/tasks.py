@@ -22,7 +22,7 @@ PANDA = Task(
     suite="manipulation",
     description="a Panda picks a cube up and carries it to a place in the air",
     cfg=panda_pick_cube,
-    # First cubes are lifted after 10 to 18 million env states, nearly all of them 5 million later.
+    # First cubes are lifted after 9 to 13 million env states, nearly all of them 5 million later.
     training=TrainingCfg(
         num_envs=2048,
         objective=_ppo(
