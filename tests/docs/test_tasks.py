@@ -79,6 +79,7 @@ with [one protocol](tables.md#the-protocol).
   rewards for following a velocity command (2 each at most, over the last million env states of training), the share of
   1000 robots that stand 6 s after they were dropped, or of 1024 trials in which a motion is followed to its end. Where
   the two rewards have a time, it is the median of the seeds'.
+* FastSAC of Go1, T1, our humanoid and G1 on rough ground had wider critics, the paper's, than these tasks have now.
 
 [Learning](learning.md#how-well-they-learn) compares algorithms, and says how far Go1 gets on
 [each kind of rough ground](learning.md#rough-ground). Its levels rise as training goes on, so rewards say little there.
