@@ -2,14 +2,12 @@
 
 from collections.abc import Mapping
 
-import mujoco
 import torch
 from torch import Tensor
 
-from ksim_rl.envs.driver import EnvDriver
-from ksim_rl.physics import World, load_model, prepare_spec
 from ksim_rl.scene.sensors import Sensor
 from ksim_rl.scene.state.ground import Ground
+from tests.scene.sensors.bench import SensorBench
 
 FREE_BODY = """
 <mujoco>
@@ -89,46 +87,13 @@ class Plateau(Ground):
         return torch.full_like(points_EN2[..., 0], 0.25)
 
 
-class Bench:
-    """Worlds and their view, with what the env does around terms."""
+class Bench(SensorBench):
+    """Worlds and their view, with what the env does around terms; a step takes 20 ms."""
 
     def __init__(self, source: str, num_envs: int, contacts: Mapping[str, Sensor], **view: float) -> None:
-        spec = mujoco.MjSpec.from_string(source)
-        for name, sensor in contacts.items():
-            sensor.add_to(spec, name)
         self.per_world = ("geom_friction", "body_ipos")
-        prepare_spec(spec, self.per_world)
-        self.world = World(load_model(spec), num_envs=num_envs, per_world_fields=self.per_world)
-        self.driver = EnvDriver(self.world, step_dt=0.02, **view)
-        self.view = self.driver.view
-        self.driver.add_sensors(contacts)
+        super().__init__(source, num_envs, contacts, step_dt=0.02, view=view, per_world_fields=self.per_world)
         self.everybody_E = torch.ones(num_envs, dtype=torch.bool)
-
-    def place(self, qpos=None, qvel=None) -> None:
-        """Write states [E, L] or [L], and refresh what derives from them."""
-        for target, value in ((self.world.qpos_EL, qpos), (self.world.qvel_EL, qvel)):
-            if value is not None:
-                target.copy_(torch.as_tensor(value, dtype=torch.float32).expand_as(target))
-        self.refresh()
-
-    def refresh(self) -> None:
-        self.world.refresh()
-        self.driver.refreshed()
-
-    def step(self, substeps: int = 10) -> None:
-        """Advance by one env step of 20 ms, contact clocks included."""
-        self.view.step_count.add_(1)
-        driver = self.driver
-        self.world.step(
-            substeps,
-            before=driver.before_substep,
-            after=driver.after_substep,
-            sensors=driver.substep_sensors,
-        )
-        self.refresh()
-        self.view.episode_step_E.add_(1)
-        for tracker in self.view.sensors.values():
-            tracker.update()
 
     def command(self, values) -> None:
         """Set the command "twist" [E, 3] or [3]."""

@@ -1,12 +1,13 @@
 """A bench for sensors: a few worlds of a small model, and their view."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import mujoco
 import torch
 
 from ksim_rl.envs.driver import EnvDriver
-from ksim_rl.physics import World, load_model
+from ksim_rl.physics import World, load_model, prepare_spec
 from ksim_rl.scene.sensors import Sensor
 
 SUBSTEPS = 10
@@ -16,13 +17,27 @@ class SensorBench:
     """Worlds and their view, with what the env does around sensors."""
 
     def __init__(
-        self, source: str, num_envs: int, sensors: Mapping[str, Sensor], *, device: str = "cpu", **world
+        self,
+        source: str,
+        num_envs: int,
+        sensors: Mapping[str, Sensor],
+        *,
+        step_dt: float | None = None,
+        view: Mapping[str, float] | None = None,
+        per_world_fields: tuple[str, ...] = (),
+        **world: Any,
     ) -> None:
         spec = mujoco.MjSpec.from_string(source)
         for name, sensor in sensors.items():
             sensor.add_to(spec, name)
-        self.world = World(load_model(spec), num_envs=num_envs, device=device, **world)
-        self.driver = EnvDriver(self.world, step_dt=SUBSTEPS * self.world.timestep)
+        prepare_spec(spec, per_world_fields)
+        self.world = World(
+            load_model(spec),
+            num_envs=num_envs,
+            per_world_fields=per_world_fields,
+            **{"device": "cpu", **world},
+        )
+        self.driver = EnvDriver(self.world, step_dt=step_dt or SUBSTEPS * self.world.timestep, **view or {})
         self.view = self.driver.view
         self.driver.add_sensors(sensors)
 
@@ -38,7 +53,8 @@ class SensorBench:
         self.driver.refreshed()
 
     def step(self, substeps: int = SUBSTEPS) -> None:
-        """Advance by one env step."""
+        """Advance by one env step, clocks of sensors included."""
+        self.view.step_count.add_(1)
         driver = self.driver
         self.world.step(
             substeps,
@@ -47,5 +63,6 @@ class SensorBench:
             sensors=driver.substep_sensors,
         )
         self.refresh()
+        self.view.episode_step_E.add_(1)
         for tracker in self.view.sensors.values():
             tracker.update()
