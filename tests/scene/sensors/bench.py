@@ -25,6 +25,7 @@ class SensorBench:
         step_dt: float | None = None,
         view: Mapping[str, float] | None = None,
         per_world_fields: tuple[str, ...] = (),
+        device: str = "cpu",
         **world: Any,
     ) -> None:
         spec = mujoco.MjSpec.from_string(source)
@@ -32,10 +33,7 @@ class SensorBench:
             sensor.add_to(spec, name)
         prepare_spec(spec, per_world_fields)
         self.world = World(
-            load_model(spec),
-            num_envs=num_envs,
-            per_world_fields=per_world_fields,
-            **{"device": "cpu", **world},
+            load_model(spec), num_envs=num_envs, per_world_fields=per_world_fields, device=device, **world
         )
         self.driver = EnvDriver(self.world, step_dt=step_dt or SUBSTEPS * self.world.timestep, **view or {})
         self.view = self.driver.view
