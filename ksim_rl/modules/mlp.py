@@ -139,16 +139,14 @@ class Layers(nn.Sequential):
         alone = not isinstance(self[0], EnsembleLinear)
         out = features.reshape(1, -1, features.shape[-1]) if alone else features
         parts: list[Any] = list(self)
-        linears = [part for part in parts if isinstance(part, nn.Linear | EnsembleLinear)]
-        weights = [layer.weight for layer in linears]
-        rounded = _rounded([own[None] if alone else own for own in weights])
-        rounded = [own.mT if alone else own for own in rounded]
+        weights = [part.weight for part in parts if isinstance(part, nn.Linear | EnsembleLinear)]
+        rounded = [own.mT[None] if alone else own for own in _rounded(weights)]
         while parts:
             layer = parts.pop(0)
             if not isinstance(layer, nn.Linear | EnsembleLinear):
                 out = layer(out)
                 continue
-            out = _Product.apply(out, weights.pop(0), rounded.pop(0))
+            out = _Product.apply(out, layer.weight, rounded.pop(0))
             if not parts or not isinstance(parts[0], nn.LayerNorm | EnsembleLayerNorm):
                 out = out + layer.bias.to(out.dtype)
                 continue

@@ -215,7 +215,7 @@ def _cut(networks: int, rows: int, width: int, most: int) -> tuple[int, dict[str
     """Return how many programs take the rows of a network, some `most` for all of them, and their tiles."""
     power = max(1 << (width - 1).bit_length(), 4)
     chunks, lanes = (3, power // 4) if 4 * width <= 3 * power else (2, power // 2)
-    tall, warps = max(32 * ELEMENTS[chunks] // lanes, 1), max(lanes // 256, 1)
+    tall, warps = max(32 * ELEMENTS[chunks] // lanes, 1), max(lanes // (32 * ELEMENTS[3]), 1)
     steps = -(-rows * networks // (tall * most))
     tile = {"STEPS": steps, "ROWS": tall, "WIDTH": width, "CHUNKS": chunks, "LANES": lanes}
     return -(-rows // (tall * steps)), {**tile, "num_warps": warps}

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd import Function
 
-# Lanes that a warp has at once, of two rows or more: what one waits for, another computes.
+# Lanes that a warp takes, of two rows or more at once: what one waits for, another computes.
 LANES = 256
 # Powers of 2 are one instruction, those of e several.
 LOG2_E = tl.constexpr(1.4426950408889634)
@@ -108,9 +108,9 @@ class Compared(Function):
             given = following_BNA.transpose(0, 1), *(move.expand(rows, 1) for move in moves)
         given = logits, *(own.contiguous() for own in given), support_A, loss_NB, mean_NB, slope
         lanes = triton.next_power_of_2(count)
-        sizes = rows, len(targets) > 0, lowest, networks, count, max(LANES // lanes, 2), lanes
-        launch: Any = compare_rows[-(-rows // sizes[-2]), networks]
-        launch(*given, *sizes, num_warps=max(lanes // 256, 1))
+        tall, warps = max(LANES // lanes, 2), max(lanes // LANES, 1)
+        launch: Any = compare_rows[-(-rows // tall), networks]
+        launch(*given, rows, len(targets) > 0, lowest, networks, count, tall, lanes, num_warps=warps)
         ctx.save_for_backward(slope)
         ctx.others = (None,) * (1 + len(targets))
         return loss_NB.T, mean_NB.T

@@ -69,8 +69,11 @@ class OffPolicyUpdate(RolloutUpdate):
                 f"data.num_minibatches={data.num_minibatches} is no multiple of objective.policy_delay="
                 f"{cfg.policy_delay}: each iteration makes the same gradient steps"
             )
-        networks = {"actor": loss.actor_network, "critic": loss.critic_network}
-        networks["target_critic"] = loss.target_critic_network
+        networks = {
+            "actor": loss.actor_network,
+            "critic": loss.critic_network,
+            "target_critic": loss.target_critic_network,
+        }
         logged = LOGGED | (OF_TEMPERATURE if isinstance(loss, SACLoss) else {})
         super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, logged=logged, **shared)
         self.cfg, self.loss, self.data = cfg, loss, data
