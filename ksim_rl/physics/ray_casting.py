@@ -25,8 +25,7 @@ class RayBatch:
 
     Attributes:
         distance_EN: m to the first geom that is hit, -1 for none, float32.
-        geom_EN: its id, -1 for none, int32.
-        normal_EN3: unit normal of its surface there, world frame, float32.
+        normal_EN3: unit normal of the surface there, world frame, float32.
     """
 
     def __init__(
@@ -41,8 +40,7 @@ class RayBatch:
             self._distance, self._geom = wp.zeros(shape, dtype=float), wp.zeros(shape, dtype=int)
             self._exclude = wp.array(np.full(num_rays, exclude_body, dtype=np.int32), dtype=int)
         self.start_EN3, self.direction_EN3 = wp.to_torch(self._start), wp.to_torch(self._direction)
-        self.distance_EN, self.geom_EN = wp.to_torch(self._distance), wp.to_torch(self._geom)
-        self.normal_EN3 = wp.to_torch(self._normal)
+        self.distance_EN, self.normal_EN3 = wp.to_torch(self._distance), wp.to_torch(self._normal)
 
     def cast(self) -> None:
         """Cast all rays against the present poses of the geoms."""
