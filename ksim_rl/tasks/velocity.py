@@ -45,6 +45,7 @@ SELF = "self_collision"
 """The contact sensor of a robot against itself, for tasks that have one."""
 MOVING = {"command": COMMAND, "command_threshold": 0.05}
 """Rewards of the feet count only while the command asks to move."""
+ACTOR = ActorCfg(output_gain=1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -377,11 +378,8 @@ def on_rough_ground(
     )
 
 
-ACTOR = ActorCfg(output_gain=1.0)
-
-
-def training(*, num_iterations: int, entropy_coeff: float = 0.01, actor: ActorCfg = ACTOR) -> TrainingCfg:
-    """Return the training settings: 24 steps of 4096 envs per update.
+def training(*, num_iterations: int, actor: ActorCfg = ACTOR, **ppo: Any) -> TrainingCfg:
+    """Return the training settings: 24 steps of 4096 envs per update; `ppo` are fields of `PPOCfg`.
 
     They are mjlab's but for two: with a discount of 0.98 (it has 0.99) and an output layer of ordinary scale Go1
     tracks both velocities better after 30 M env states (linear 1.64, angular 1.35, against 1.48 and 1.07).
@@ -389,7 +387,7 @@ def training(*, num_iterations: int, entropy_coeff: float = 0.01, actor: ActorCf
     return TrainingCfg(
         num_envs=4096,
         seed=42,
-        objective=PPOCfg(gamma=0.98, entropy_coeff=entropy_coeff, precision="auto"),
+        objective=PPOCfg(**({"gamma": 0.98, "entropy_coeff": 0.01, "precision": "auto"} | ppo)),
         data=DatasetCfg(num_env_states_per_minibatch=24 * 4096 // 4, num_minibatches=4),
         modules=ModulesCfg(actor=actor),
         trainer=TrainerCfg(num_iterations=num_iterations),

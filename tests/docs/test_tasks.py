@@ -71,15 +71,14 @@ LEARNED = """## What was learned
 By `ksim-rl reproduce tasks`, and for Go1, G1 and `g1_track_*` `ksim-rl reproduce velocity`, `humanoids` and `tracking`,
 with [one protocol](tables.md#the-protocol).
 
-* **env states**, **seconds**: of a run's training, its first iteration included. Two runs of `g1_track_*` at a time
-  shared a GPU, and of the others, but for G1's and Go1's on flat ground, up to eleven; on a CPU each had one core of
-  two, and other work beside it.
+* **env states**, **seconds**: of a run's training, its first iteration included. Runs of G1 and Go1 on flat ground and
+  of the squat and the turn had a GPU of their own, the walk and the kick shared one with another, and the rest with
+  up to eleven; on a CPU each had one core of two, and other work beside it.
 * **return**: the mean over the final policy's episodes and over the seeds, with the standard deviation between seeds.
 * **asked for**: what came out, and in brackets what should: *solved at* of the mean return; for the worst seed the
   rewards for following a velocity command (2 each at most, over the last million env states of training), the share of
   1000 robots that stand 6 s after they were dropped, or of 1024 trials in which a motion is followed to its end. Where
   the two rewards have a time, it is the median of the seeds'.
-* FastSAC of Go1, T1, our humanoid and G1 on rough ground had wider critics, the paper's, than these tasks have now.
 
 [Learning](learning.md#how-well-they-learn) compares algorithms, and says how far Go1 gets on
 [each kind of rough ground](learning.md#rough-ground). Its levels rise as training goes on, so rewards say little there.
