@@ -1,6 +1,8 @@
 """The figures in README and docs/speed.md are those of benchmarks/results."""
 
 import json
+import math
+import statistics
 from typing import Any
 
 import pytest
@@ -45,6 +47,33 @@ def test_the_table_of_equal_runs(task: str) -> None:
     (row,) = (line for line in PAGE.splitlines() if line.startswith(starts) and "." not in line)
     found = [results("determinism")[f"h200/{task}/{key}"] for key in ("tensors", "tensors_that_differ")]
     assert [float(cell) for cell in row.strip("| ").split(" | ")[1:]] == found
+
+
+TRAINED = {
+    "base": "| 4 steps of 5 ms |",
+    "large": "| 2 steps of 10 ms |",
+    "discrete": "| the same, `task.sim.integrator=discrete` |",
+}
+
+
+@pytest.mark.parametrize("trained", TRAINED)
+def test_the_table_of_larger_time_steps(trained: str) -> None:
+    figures = results("sim2sim")
+
+    def of_seeds(trained: str, figure: str) -> list[float]:
+        label = f"go1_velocity_flat/without_noise/{trained}_seed_"
+        return [figures[f"{label}{seed}/{figure}"] for seed in (1, 2, 3)]
+
+    (row,) = (line for line in PAGE.splitlines() if line.startswith(TRAINED[trained]))
+    returned, fell = row.strip("| ").split(" | ")[1:]
+    (base, base_error), (mean, error) = (
+        (statistics.fmean(values), statistics.stdev(values) / math.sqrt(3))
+        for values in (of_seeds(name, "return_c_engine") for name in ("base", trained))
+    )
+    ratio = mean / base
+    share = f", or {ratio:.3f} ± {ratio * math.hypot(error / mean, base_error / base):.3f} of it"
+    assert returned == f"{mean:.1f}" + share * (trained != "base")
+    assert fell == f"{100 * statistics.fmean(of_seeds(trained, 'fell')):.1f} %"
 
 
 def said() -> dict[str, tuple[str, str]]:
