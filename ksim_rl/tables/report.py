@@ -50,7 +50,7 @@ def write(table: Table, rows: Mapping[str, Results], folder: Path, *, seeds: Seq
     newest = max(counted, key=lambda result: result["date"], default={})
     tree = {
         **{key: newest.get(key, "") for key in ("commit", "date", "device", "versions")},
-        "command": f"ksim-rl reproduce {table.name}",
+        "command": f"ksim-rl reproduce {table.source}",
         "commits": sorted({result["commit"] for result in counted}),
         "seeds": sorted({s for row in table.rows.values() for s in row.seeds if not seeds or s in seeds}),
         "figures": figures_of(table, rows),

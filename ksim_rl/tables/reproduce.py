@@ -38,7 +38,7 @@ def reproduce(arguments: Sequence[str]) -> int:
     output = (options.output or Path(default)) / ("smoke" if smoke else "")
     run_folder = options.runs / ("smoke" if smoke else "") / table.name
     device = options.device if torch.cuda.is_available() else "cpu"
-    runs = Runs(table, output / table.name, run_folder, source=options.table, smoke=smoke)
+    runs = Runs(table, output / table.name, run_folder, smoke=smoke)
 
     def write(said: str) -> None:
         report.write(table, runs.complete(seeds), output, seeds=seeds)

@@ -22,8 +22,8 @@ Job = tuple[str, int]  # a row and a seed
 class Runs:
     """The runs of one table: results in `folder`/<row>/seed_<n>.json, run folders and logs below `run_folder`."""
 
-    def __init__(self, table: Table, folder: Path, run_folder: Path, *, source: str, smoke: bool) -> None:
-        self.table, self.folder, self.run_folder, self.source = table, folder, run_folder, source
+    def __init__(self, table: Table, folder: Path, run_folder: Path, *, smoke: bool) -> None:
+        self.table, self.folder, self.run_folder = table, folder, run_folder
         self.smoke, self._of = smoke, cache(lambda name: run_cfg(table.rows[name], 1, smoke=smoke))
 
     def results(self) -> dict[str, dict[int, dict[str, Any]]]:
@@ -81,9 +81,8 @@ class Runs:
     def _start(self, job: Job, gpu: str) -> subprocess.Popen[bytes]:
         (name, seed), log = job, self._log(job)
         result = self.folder / name / f"seed_{seed}.json"
-        words = [self.source, name, seed, result, log.with_suffix(""), "cuda" if gpu else "cpu"]
-        command = [sys.executable, "-m", "ksim_rl.tables.measure", *map(str, words)]
-        command.append("smoke" if self.smoke else "")
+        words = [self.table.source, name, seed, result, log.with_suffix(""), "cuda" if gpu else "cpu"]
+        command = [sys.executable, "-m", "ksim_rl.tables.measure", *map(str, words), "smoke" * self.smoke]
         log.parent.mkdir(parents=True, exist_ok=True)
         result.unlink(missing_ok=True)
         environment = os.environ | ({"CUDA_VISIBLE_DEVICES": gpu} if gpu else {})

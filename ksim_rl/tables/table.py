@@ -78,9 +78,10 @@ class Mean(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class Table(Checked):
-    """Rows by `<group>/<name>`, or by name in the group ""; `notes` is a paragraph below the table."""
+    """Rows by `<group>/<name>`, or by name in the group ""; `notes` is a paragraph below, `source` what `load` took."""
 
     name: str
+    source: str = ""
     title: str
     rows: Mapping[str, Row]
     means: Mapping[str, Mean] = field(default_factory=dict)
@@ -113,4 +114,4 @@ def load(name: str) -> Table:
         shared = {key: value for key, value in fields.items() if key != "rows"}
         for row, own in fields["rows"].items():
             rows[f"{group}/{row}" if group else row] = {**shared, **(own or {})}
-    return from_tree(Table, {"name": path.stem, **tree, "rows": rows}, str(path))
+    return from_tree(Table, {"name": path.stem, **tree, "source": name, "rows": rows}, str(path))

@@ -110,6 +110,7 @@ def test_what_is_missing_is_run_seed_by_seed_and_what_is_there_stays(reproduce):
         "poles/best/mean_all": 151.5,
     }
     assert table["seeds"] == [1, 2] and table["commit"] == "abc"
+    assert table["command"] == f"ksim-rl reproduce {reproduce.folder.parent / 'poles.yaml'}"
     assert {name: row["reached"] for name, row in table["rows"].items()} == {
         "ppo/Balance": True,
         "ppo/Swingup": False,
