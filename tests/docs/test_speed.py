@@ -60,8 +60,8 @@ TRAINED = {
 def test_the_table_of_larger_time_steps(trained: str) -> None:
     figures = results("sim2sim")
 
-    def of_seeds(trained: str, figure: str) -> list[float]:
-        label = f"go1_velocity_flat/without_noise/{trained}_seed_"
+    def of_seeds(name: str, figure: str) -> list[float]:
+        label = f"go1_velocity_flat/without_noise/{name}_seed_"
         return [figures[f"{label}{seed}/{figure}"] for seed in (1, 2, 3)]
 
     (row,) = (line for line in PAGE.splitlines() if line.startswith(TRAINED[trained]))

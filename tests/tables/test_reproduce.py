@@ -16,7 +16,7 @@ from ksim_rl.tables import measure as measuring
 from ksim_rl.tables import reproduce as reproduce_command
 from ksim_rl.tables import runner
 from ksim_rl.tables.measure import measure, run_cfg, settings
-from ksim_rl.tables.table import load
+from ksim_rl.tables.table import load, shipped
 
 TABLE = """
 title: Two poles
@@ -197,7 +197,7 @@ def test_settings_differ_by_everything_but_the_seed():
 TRIALS = sorted(map(str, (RESULTS.parent / "tables").glob("*.yaml")))
 
 
-@pytest.mark.parametrize("table", ["dm_control", "humanoids", "tasks", "tracking", "velocity", *TRIALS])
+@pytest.mark.parametrize("table", [*shipped(), *TRIALS])
 def test_committed_results_are_of_the_settings_that_rows_have_now(table):
     table = load(table)
     for name, row in table.rows.items():
