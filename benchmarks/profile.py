@@ -2,11 +2,12 @@
 
     python -m benchmarks.profile task=go1_velocity_flat num_envs=4096 device=cuda
 
-takes the overrides of `ksim-rl train`; steps are not compiled, as a kernel would belong to many rooms. On CUDA one
-iteration runs without graphs, so that each kernel can be laid to the room in which the host launched it: physics,
-policy, terms, transforms, resets, the storage of the rollout, GAE and update. The times are those of the kernels alone,
-since the graphs have no pauses for launches; what the measured iteration (with graphs) takes beyond their sum is the
-`gaps`. On the CPU the rooms are timed on the wall clock. Figures go to benchmarks/results/profile.json: `<room>_ms`,
+takes the overrides of `ksim-rl train`. On CUDA one iteration runs without graphs, so that each kernel can be laid to
+the room in which the host launched it: the substeps of physics, their refresh and resets, the terms (all that is
+compiled or left to torch between them: actions, events, commands, rewards, observations, transforms), policy, storage
+of the rollout, GAE and update. The times are those of the kernels alone, since the graphs have no pauses for launches;
+what the measured iteration (with graphs) takes beyond their sum is the `gaps`, less what runs side by side there. On
+the CPU the rooms are timed on the wall clock. Figures go to benchmarks/results/profile.json: `<room>_ms`,
 `<room>_share` and, on CUDA, `<room>_kernels`. `label=before` keeps them under another name beside the present ones.
 """
 
@@ -32,6 +33,8 @@ from ksim_rl.transforms.innermost import innermost
 
 ROOT = "iteration"
 PREFIX = "room:"
+LAUNCHES = {"refresh": "refresh", "refresh of rows": "refresh", "reset": "resets"}
+"""The rooms of what physics launches, beside its substeps."""
 
 
 class Clock:
@@ -55,46 +58,22 @@ class Clock:
                 self._inner[-1] += taken
 
 
-def rooms_of(trainer: Trainer) -> list[tuple[object, str, str]]:
-    """Return what to watch: (object, method, room)."""
-    env: Any = trainer.collector.env
-    base = innermost(env)
-    rooms: list[tuple[object, str, str]] = [
-        (base.world, "step", "physics"),
-        (base.world, "refresh", "refresh"),
-        (base.world, "reset", "resets"),
-        (base, "_reset", "resets"),
-        (env, "_merge", "resets"),
-        (base.command_manager, "step", "terms"),
-        (base.action_manager, "apply", "terms"),
-        (base.observation_manager, "read", "terms"),
-        (base.reward_manager, "step", "terms"),
-        (base.termination_manager, "step", "terms"),
-        (base.metric_manager, "step", "terms"),
-        (base.event_manager, "step", "terms"),
-        (trainer.collector, "policy", "policy"),
-        (trainer.collector, "_store", "storage"),
-        (trainer.collector, "collect", "rollout"),
-        (trainer, "_report", "log"),
-    ]
-    rooms += [(tracker, "update", "terms") for tracker in base.view.sensors.values()]
-    transforms = getattr(env, "transform", ())
-    for transform in transforms if hasattr(transforms, "__iter__") else (transforms,):
-        rooms += [
-            (transform, method, "transforms")
-            for method in ("_step", "_reset", "_call")
-            if hasattr(transform, method)
-        ]
-    return rooms
-
-
 def watch(trainer: Trainer, clock: Clock) -> None:
-    """Let every call of what `rooms_of` names be counted in its room; the rest of the update is "update"."""
-    for target, name, room in rooms_of(trainer):
+    """Let what an iteration calls be counted in its room; what no room has is "update"."""
+    collector: Any = trainer.collector
+    calls: list[tuple[Any, str, Callable[..., str]]] = [
+        # Launches of physics go through here in a compiled step, too.
+        (innermost(collector.env).world._graphs, "run", lambda key, _: LAUNCHES.get(key, "physics")),
+        (collector.policy, "forward", lambda *_: "policy"),
+        (collector, "_store", lambda *_: "storage"),
+        (collector, "collect", lambda *_: "terms"),
+        (trainer, "_report", lambda *_: "log"),
+    ]
+    for target, name, room_of in calls:
         method = getattr(target, name)
 
-        def watched(*args: Any, method: Any = method, room: str = room, **kwargs: Any) -> Any:
-            return clock.run(room, lambda: method(*args, **kwargs))
+        def watched(*args: Any, method: Any = method, room_of: Any = room_of, **kwargs: Any) -> Any:
+            return clock.run(room_of(*args), lambda: method(*args, **kwargs))
 
         # Past `nn.Module.__setattr__`, which would register a module.
         object.__setattr__(target, name, watched)
@@ -167,7 +146,7 @@ def main() -> None:
     """Measure, print the table and write the figures."""
     own, overrides = command_line.split(sys.argv[1:], {"label": ""})
     labels = [own["label"]] if own["label"] else []
-    fixed = "logger=none", "trainer.eval_episodes=0", "collector.compile=false"
+    fixed = "logger=none", "trainer.eval_episodes=0"
     cfg = command_line.compose([*overrides, *fixed])
     device = cfg.resolved_device()
     figures = measure(cfg)
