@@ -14,6 +14,7 @@ from weakref import WeakSet
 import torch
 import warp as wp
 
+from ksim_rl.checks import check_count
 from ksim_rl.device import recording, upstream
 from ksim_rl.device.streams import checked_device, warp_device, warp_scope, warp_stream
 
@@ -111,10 +112,7 @@ class Captured:
         warmup: int = 2,
         require_graphs: bool = False,
     ) -> None:
-        if warmup < 1:
-            raise ValueError(
-                f"warmup={warmup}: expected at least 1, since kernels cannot be compiled in a capture"
-            )
+        check_count("warmup", warmup)  # kernels cannot be compiled in a capture
         self.body = body
         self.device = checked_device(device)
         self.warmup = warmup

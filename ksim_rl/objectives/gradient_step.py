@@ -1,5 +1,6 @@
 """This module makes gradient steps without host syncs, skips what is not finite, and adapts the learning rate."""
 
+import functools
 from collections.abc import Iterable, Mapping
 
 import torch
@@ -8,6 +9,9 @@ from torch import Tensor, nn
 
 from ksim_rl import ranks
 from ksim_rl.objectives.algorithm_cfg import OnPolicyCfg
+
+# Without it each gradient would begin with a kernel that writes a one.
+_ones = functools.cache(torch.ones)
 
 
 class NonFiniteStepsError(RuntimeError):
@@ -135,7 +139,8 @@ def go_back(
     """
     for name in losses:
         optimizers[name].zero_grad(set_to_none=True)
-    torch.autograd.backward(list(losses.values()))
+    ends = list(losses.values())
+    torch.autograd.backward(ends, [_ones((), dtype=end.dtype, device=end.device) for end in ends])
     if ranks.size() > 1:
         learnt = [parameter.grad for name in losses for parameter in _parameters(optimizers[name])]
         gradients = [gradient for gradient in learnt if gradient is not None]

@@ -167,8 +167,7 @@ class World(views.DataViews):
         on its way. With hooks the substeps are launches of their own, with the hooks' torch work in between; without,
         all of them are one. Inside an outer capture both become part of its graph.
         """
-        if n < 1:
-            raise ValueError(f"n={n}: expected at least 1 substep")
+        check_count("n", n)
         check_choice("sensors", sensors, ("last", "contacts", "every"))
         if not before and not after:
             self._graphs.run(("step", n, sensors), lambda: self._launch_substeps(n, sensors))

@@ -220,8 +220,7 @@ PENDULUM_SWINGUP = Task(
     description="swing a pendulum up with little torque and hold it there",
     cfg=pendulum_swingup,
     # Few envs, short rollouts and small minibatches, for a CPU: solved after 200 to 310 thousand env states, with each
-    # of seeds 1 to 8. Without entropy some starts are never swung up after the whole schedule (seeds 11 to 16: means of
-    # 728 to 899, with it 885 to 944). With a rate that stays one of eight ended unsolved.
+    # of seeds 1 to 8. Without entropy some starts are never swung up (seeds 11 to 16: 728 to 899, with it 885 to 944).
     training=_training(
         num_envs=64,
         data=DatasetCfg(num_env_states_per_minibatch=512, num_minibatches=4),

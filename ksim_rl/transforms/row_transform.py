@@ -319,10 +319,9 @@ class FollowsLevel(Transform):
                     f"level has shape {tuple(level.shape)} and dtype {level.dtype}: expected () and torch.float32"
                 )
             self._buffers["level"] = level
-        elif 0.0 <= level <= 1.0:
-            self.level.fill_(level)
         else:
-            raise ValueError(f"level={level!r}: expected a number in [0, 1]")
+            checks.check_in_range("level", level, low=0.0, high=1.0)
+            self.level.fill_(level)
         return self
 
 
