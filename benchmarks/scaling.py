@@ -60,8 +60,13 @@ def growth(figures: dict[int, dict[str, float]]) -> dict[str, float]:
     return {f"growth_{SMALL}_to_{LARGE}": ratio}
 
 
-def draw(figures: dict[int, dict[str, float]], path: Path, *, task_name: str, device: str) -> None:
-    """Draw training and raw physics over the number of envs, and the peer's published figure where there is one."""
+def draw(figures: dict[int, dict[str, float]], path: Path, *, task_name: str, device: str) -> str:
+    """Draw training and raw physics over the number of envs, and the peer's published figure where there is one.
+
+    A single number of envs makes no curve, and leaves the chart of an earlier run as it is. Returned is what was done.
+    """
+    if len(figures) < 2:
+        return f"{path} is left as it is: a chart takes two numbers of envs"
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
     sizes = sorted(figures)
     lines = (
@@ -89,6 +94,7 @@ def draw(figures: dict[int, dict[str, float]], path: Path, *, task_name: str, de
     axes.legend(frameon=False, fontsize=9, loc="upper left")
     figure.savefig(path, dpi=150)
     plt.close(figure)
+    return f"drawn in {path}"
 
 
 def main() -> None:
@@ -113,8 +119,7 @@ def main() -> None:
         )
     Console().print(_table(figures, f"{cfg.task_name}, {report.device_name(device)}"))
     chart = report.RESULTS / f"scaling_{cfg.task_name}.png"
-    draw(figures, chart, task_name=cfg.task_name, device=report.device_name(device))
-    print(f"drawn in {chart}")
+    print(draw(figures, chart, task_name=cfg.task_name, device=report.device_name(device)))
 
 
 def _table(figures: dict[int, dict[str, float]], title: str) -> Table:
