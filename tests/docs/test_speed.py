@@ -76,12 +76,20 @@ def test_the_table_of_larger_time_steps(trained: str) -> None:
     assert fell == f"{100 * statistics.fmean(of_seeds(trained, 'fell')):.1f} %"
 
 
+def in_rooms(prefix: str, figure: str) -> str:
+    """Return the cells of the profile's rooms; before, the step was not compiled, and terms were in three of them."""
+    profile = results("profile")
+    rooms = [("terms", "transforms", "rollout") if room == "terms" else (room,) for room in ROOMS]
+    found = [sum(profile.get(f"{prefix}{own}_{figure}", 0) for own in together) for together in rooms]
+    return " | ".join(f"{value:,.0f}" if figure == "kernels" else f"{100 * value:.0f} %" for value in found)
+
+
 def said() -> dict[str, tuple[str, str]]:
     """By what is said: the page, and the words, with the figures that they have to hold."""
     speed, peers = results("throughput"), results("peers")
     learning, scaling = results("learning_time"), results("scaling")
     collector, update = results("collector"), results("update")
-    profile, transforms = results("profile"), results("transforms")
+    transforms = results("transforms")
     memory = [round(speed[f"{GO1}{part}_bytes_per_world"] / 1000) for part in MEMORY]
     return {
         "first": (README, f"trains at {speed[GO1 + 'env_states_per_s'] / 1e6:.2f} million env states"),
@@ -102,6 +110,7 @@ def said() -> dict[str, tuple[str, str]]:
             f"{scaling['h100/g1_velocity_flat/32768/env_states_per_s'] / 1e6:.2f} million",
         ),
         "g1": (PAGE, f"trains at {round(speed[G1 + 'env_states_per_s'], -3):,.0f} with 4096"),
+        "g1 substeps": (PAGE, f"its own substeps take {speed[G1 + 'own_physics_ms']:.2f} ms"),
         "kernels": (PAGE, f"is {speed[GO1 + 'kernels_per_control_step']:.0f} kernels"),
         "g1 physics": (PAGE, f"{speed[G1 + 'iteration_over_physics']:.2f} times its raw physics"),
         "peers": (
@@ -125,10 +134,10 @@ def said() -> dict[str, tuple[str, str]]:
             f"+ {100 * results('randomization')[GO1 + 'reset_share']:.1f} % of a control step",
         ),
         "terrain": (PAGE, f"x {results('terrain')['rough_over_flat']:.2f}"),
-        "profile": (
-            PAGE,
-            " | ".join(f"{100 * profile[f'{GO1}{room}_share']:.0f} %" for room in ROOMS),
-        ),
+        "profile": (PAGE, f"| share | {in_rooms(GO1, 'share')} |"),
+        "kernels of the profile": (PAGE, f"| kernels | {in_rooms(GO1, 'kernels')} |"),
+        "profile before": (PAGE, f"| before | {in_rooms(f'{GO1}before/', 'share')} |"),
+        "kernels before": (PAGE, f"| before | {in_rooms(f'{GO1}before/', 'kernels')} |"),
         "collector": (PAGE, f"x {collector['h200/cartpole/4096/captured_over_stock']:.1f} |"),
         "its graphs": (PAGE, f"x {collector['h200/cartpole/4096/captured_over_stock_with_graphs']:.1f} |"),
         "update": (PAGE, f"x {update['h200/98304/stock_eager_over_update']:.1f} |"),
