@@ -6,6 +6,12 @@
 
 constexpr int MOST_OF_CONE = 6;
 constexpr int EQUALITY = 0, FRICTION = 1, ONE_SIDED = 2, CONE_HEAD = 3, CONE_TANGENT = 4;
+auto kind_by_order = [=](int row) {
+    return row < equalities ? EQUALITY : row < equalities + frictions ? FRICTION : ONE_SIDED;
+};
+auto kind_of = [=](int row) { return ELLIPTIC ? kinds[row] & 15 : kind_by_order(row); };
+// The units of which a cost is measured are all rows but equalities and tangents.
+auto unit_of = [=](int unit) { return ELLIPTIC ? units[unit] : equalities + unit; };
 const int* const slots = problem.slots.data;
 const int* const place_of = by_limbs ? problem.places.data : slots;
 
@@ -46,8 +52,9 @@ each_row(lane, LANES, Singly {}, [&](int row, float* jacobian) {
     }
     residual[row] = product - row_of(problem.efc_aref)[row];
     efc_D[row] = row_of(problem.efc_D)[row];
-    kinds[row] += row < equalities ? EQUALITY : row < equalities + frictions ? FRICTION : ONE_SIDED;
-    bound[row] = row_of(problem.efc_frictionloss)[row];
+    kinds[row] += kind_by_order(row);
+    if (kind_of(row) == FRICTION)
+        bound[row] = row_of(problem.efc_frictionloss)[row];
     require(efc_D[row] > 0.0f && (kind_of(row) != FRICTION || bound[row] >= 0.0f), ROWS_ARE_WHOLE);
     if (ELLIPTIC) {
         const int contact = contact_of[row];
@@ -75,17 +82,12 @@ each_row(lane, LANES, Singly {}, [&](int row, float* jacobian) {
 });
 sync();
 #pragma unroll 1
-for (int first = 0; first < rows; first += LANES) {
+for (int first = 0; ELLIPTIC && first < rows; first += LANES) {
     const int row = first + lane;
-    const bool counts = row >= equalities && row < rows && (!ELLIPTIC || kind_of(row) != CONE_TANGENT);
-#if defined(__CUDA_ARCH__)
-    const unsigned all = __ballot_sync(0xffffffffu, counts);
+    const bool counts = row >= equalities && row < rows && kind_of(row) != CONE_TANGENT;
+    const unsigned all = lanes_where(counts);
     if (counts)
-        units[num_units + __popc(all & ((1u << lane) - 1u))] = row;
-    num_units += __popc(all);
-#else
-    if (counts)
-        units[num_units++] = row;
-#endif
+        units[num_units + count_of(all & before)] = row;
+    num_units += count_of(all);
 }
 sync();

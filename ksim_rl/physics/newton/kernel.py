@@ -4,8 +4,7 @@ MuJoCo Warp launches about ten kernels per iteration, over all worlds, until the
 world waits for another, and what an iteration computes stays on the chip. The algorithm is the same, with the same
 tests of convergence, but for a line search that is no more exact than iterations need; costs agree within the
 tolerance. It is written in C++, since its matrix lies in registers, which needs loops that are unrolled, shuffles and
-shared memory; the CPU compiles the same source, for a warp of one lane. Read its parts in their order: layout.cpp,
-constraints.cpp, cost.cpp, limbs.cpp, tiles.cpp, hessian.cpp, line_search.cpp, newton.cpp.
+shared memory; the CPU compiles the same source, for a warp of one lane. Read its `_PARTS` in their order.
 
 Source of the algorithm: https://mujoco.readthedocs.io/en/stable/computation/index.html; of its bounds and
 tests of convergence: mujoco_warp/_src/solver.py.
@@ -23,8 +22,7 @@ import warp as wp
 from ksim_rl.physics import native
 from ksim_rl.physics.newton.limbs import Limbs, padded
 
-CUDA_LANES = 32
-SORTING_THREADS = 1024
+CUDA_LANES, SORTING_THREADS = 32, 1024
 _PARTS = ("layout", "constraints", "cost", "limbs", "tiles", "hessian", "line_search", "newton")
 _SOURCE = native.source_of("newton", _PARTS)
 
@@ -46,11 +44,12 @@ class Invariant(enum.IntFlag):
     """A line search never returns a point that costs more than its start."""
 
 
-def layout(nv: int, njmax: int, limbs: Limbs, *, elliptic: bool, rows_on_chip: int) -> dict[str, int]:
+def layout(
+    nv: int, njmax: int, limbs: Limbs, *, ntendon: int, elliptic: bool, rows_on_chip: int
+) -> dict[str, int]:
     """Return the sizes of what the lanes of a world share, by the names of the C++, and all of it in `FLOATS`."""
     arms, chains, trunk = len(limbs.trunk) + 1, len(limbs.chains), padded(len(limbs.trunk))
-    limb = len(limbs.chains[-1]) if chains else 1
-    stride = _row_stride(nv)
+    limb, stride = len(limbs.chains[-1]) if chains else 1, _row_stride(nv)
     narrow = _row_stride(trunk + limb) if chains else stride
     # A column of a whole block has the entries of the block twice; one more is that of the gradient.
     column = padded(nv + 1 + (CUDA_LANES if nv >= CUDA_LANES else 0))
@@ -60,7 +59,8 @@ def layout(nv: int, njmax: int, limbs: Limbs, *, elliptic: bool, rows_on_chip: i
     # So many lanes sum the tile of a limb: a power of two. A lane has three rows of it in its registers.
     lanes = 1 << (CUDA_LANES // chains).bit_length() - 1 if chains else 0
     rows, tile = padded(njmax), lanes if len(limbs.trunk) + limb <= min(lanes + 1, 12) else 0
-    floats = (nv + 1) * stride + rows_on_chip * narrow + workspace + spread + 6 * rows
+    bounds = rows if elliptic else padded(min(nv + ntendon, njmax))  # of cones, or else of dry friction
+    floats = (nv + 1) * stride + rows_on_chip * narrow + workspace + spread + bounds + 4 * rows + rows // 2
     return {
         "NV": nv,
         "NJ": njmax,
@@ -72,10 +72,11 @@ def layout(nv: int, njmax: int, limbs: Limbs, *, elliptic: bool, rows_on_chip: i
         "SPREAD": spread,
         "WORKSPACE": workspace,
         "COLUMN": column,
+        "BOUNDS": bounds,
         "ROWS_ON_CHIP": rows_on_chip,
         "TILE": tile,
         "ELLIPTIC": elliptic,
-        "FLOATS": floats + (4 * rows if elliptic else 0) + (rows // 2 if tile else 0),
+        "FLOATS": floats + (4 * rows + rows // 2 if elliptic else 0) + (rows // 2 if tile else 0),
     }
 
 

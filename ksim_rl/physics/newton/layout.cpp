@@ -47,13 +47,12 @@ float* const stiffness = rate;  // d2s/dr2, between two line searches; 0 where a
 float* const force = rate + PADDED_ROWS;  // -ds/dr
 int* const contact_of = (int*)force;  // of a row with a cone, or -1, until there are forces
 float* const efc_D = force + PADDED_ROWS;
-float* const bound = efc_D + PADDED_ROWS;  // most dry friction, mu of a cone's head, friction of its tangents
+float* const bounds = efc_D + PADDED_ROWS;
 // Of each row its kind, 16 times the rows of its cone, 256 times its limb, and 4096 times its place in the cone.
-unsigned short* const kinds = (unsigned short*)(bound + PADDED_ROWS);
-short* const units = (short*)kinds + PADDED_ROWS;  // the rows whose cost is measured: all but equalities and tangents
+unsigned short* const kinds = (unsigned short*)(bounds + BOUNDS);
+short* const units = (short*)kinds + PADDED_ROWS;  // with cones: the rows whose cost is measured
 float* const cones = (float*)(units + PADDED_ROWS);
 short* const listed = (short*)(memory + FLOATS) - PADDED_ROWS;  // with tiles (part 5): the rows, limb by limb
-int num_units = 0;
 
 // What a lane has of the vectors of the degrees of freedom, and of the Hessian. The gradient, then y of
 // L y = gradient, then the search direction stand in one place.
@@ -67,7 +66,9 @@ int limbs[BLOCKS], places[BLOCKS];  // the limb of each, -1 in the trunk, and it
 auto row_of = [=](auto& array) { return array.data + (size_t)world * array.shape[1]; };
 auto of_world = [=](auto& array) { return array.data[world % array.shape[0]]; };
 const int rows = wp::min(problem.nefc.data[world], NJ);
-const int equalities = problem.ne.data[world], frictions = problem.nf.data[world];
+const int equalities = wp::min(problem.ne.data[world], rows), frictions = problem.nf.data[world];
+float* const bound = bounds - equalities;  // most dry friction, mu of a cone's head, friction of its tangents
+int num_units = ELLIPTIC ? 0 : rows - equalities;
 const float impratio = of_world(problem.impratio_invsqrt);
 const float tolerance = of_world(problem.tolerance);
 const float ls_tolerance = of_world(problem.ls_tolerance);
@@ -112,12 +113,26 @@ UNROLL
 #endif
     return a;
 };
-auto any = [](bool holds) {
+// The lanes for which it holds, a bit for each; how many they are, and the first of them.
+auto lanes_where = [](bool holds) -> unsigned {
 #if defined(__CUDA_ARCH__)
-    holds = __any_sync(0xffffffffu, holds);
+    return __ballot_sync(0xffffffffu, holds);
 #endif
     return holds;
 };
+auto count_of = [](unsigned lanes) -> int {
+#if defined(__CUDA_ARCH__)
+    return __popc(lanes);
+#endif
+    return lanes;
+};
+auto first_of = [](unsigned lanes) {
+#if defined(__CUDA_ARCH__)
+    return __ffs(lanes) - 1;
+#endif
+    return 0;
+};
+const unsigned before = (1u << lane) - 1u;  // the lanes before this one
 auto across = [](float value, int distance) {
 #if defined(__CUDA_ARCH__)
     value = __shfl_xor_sync(0xffffffffu, value, distance);
@@ -137,7 +152,6 @@ auto ratio = [](float dividend, float divisor) { return dividend / (divisor == 0
 auto is_dof = [&](int block) { return block * LANES + lane < NV; };
 auto slot_of = [&](int block) { return wp::min(block * LANES + lane, NV - 1); };
 auto dof_of = [&](int block) { return problem.dofs.data[slot_of(block)]; };
-auto kind_of = [&](int row) { return kinds[row] & 15; };
 auto cone_size = [&](int row) { return kinds[row] >> 4 & 15; };
 auto limb_of = [&](int row) { return kinds[row] >> 8 & 15; };
 auto head_of = [&](int row) { return row - (kinds[row] >> 12); };
@@ -158,7 +172,7 @@ for (int row = lane; row < rows; row += LANES) {
     if (ELLIPTIC)
         contact_of[row] = row_of(problem.efc_type)[row] == ELLIPTIC_CONTACT ? row_of(problem.efc_id)[row] : -1;
 }
-const bool by_limbs = LIMBS > 0 && !any(couples);
+const bool by_limbs = LIMBS > 0 && lanes_where(couples) == 0;
 const int width = by_limbs ? NARROW : STRIDE, near_rows = wp::min(rows, ROWS_ON_CHIP * NARROW / width);
 float* const far = row_of(problem.scratch) - near_rows * width;
 // Calls body(row, its J) for the rows first, first + stride, ...: those on chip, then those that found no

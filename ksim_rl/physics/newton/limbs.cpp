@@ -58,7 +58,7 @@ auto add_to_own_rows = [&](float scale, float push, const float* vector, int lim
 UNROLL
     for (int block = 0; block < BLOCKS; ++block) {
         const float own = touches(block, limb) ? vector[places[block]] : 0.0f, weight = scale * own;
-        if ((LANES == 1 || block > 0) && !any(own != 0.0f))
+        if ((LANES == 1 || block > 0) && lanes_where(own != 0.0f) == 0)
             continue;
         qfrc_constraint[block] += push * own;
 UNROLL

@@ -139,7 +139,7 @@ auto search_line = [&](float slope, float half_curvature, float slope_0, float n
         Point sum {0.0f, 0.0f, 0.0f};
 #pragma unroll 1
         for (int unit = lane % TEAM; unit < num_units; unit += TEAM) {
-            const Point point = unit_point(units[unit], there);
+            const Point point = unit_point(unit_of(unit), there);
             sum.cost += point.cost;
             sum.slope += point.slope;
             sum.curvature += point.curvature;

@@ -16,10 +16,9 @@ from ksim_rl.physics.sim_cfg import SimCfg
 
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
-# What a world may have of a multiprocessor's shared memory: ten such worlds live there at once. On an H200 a prototype
-# took 212 us for 4096 worlds of G1; with 5600 floats (nine worlds) 217, with room for twelve 222 and for thirteen 237.
-# Of many worlds twelve do, if an eighth of the rows fit: 1850 us instead of 1901 for 32768.
-FLOATS_PER_WORLD, FLOATS_OF_MANY = 5536, 4400
+# What a world may have of a multiprocessor's shared memory: ten such worlds live there at once. Of many eleven do, if
+# an eighth of the rows fit (H200, 32768 worlds of G1, own substeps: 11.88 ms; with ten 11.93, with twelve 12.14).
+FLOATS_PER_WORLD, FLOATS_OF_MANY = 5536, 5048
 # A multiprocessor has 228 KiB of shared memory, of which each block takes another KiB, and in each quarter, where
 # warps stay, 512 registers for a lane. With 72 of them as many worlds of Go1 run at once as the memory lets, 28. With
 # 96 only 20 do, and fewer values lie in memory meanwhile, which is faster where most worlds run at once anyway (H200,
@@ -41,7 +40,7 @@ def unsuited(mj_model: mujoco.MjModel, *, njmax: int) -> str | None:
     opt, nv = mj_model.opt, mj_model.nv
     elliptic = bool(opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC)
     limbs = limbs_of(mj_model.dof_parentid.tolist())
-    floats = layout(nv, njmax, limbs, elliptic=elliptic, rows_on_chip=0)["FLOATS"]
+    floats = layout(nv, njmax, limbs, ntendon=mj_model.ntendon, elliptic=elliptic, rows_on_chip=0)["FLOATS"]
     reasons = {
         "the solver is not Newton's": opt.solver != mujoco.mjtSolver.mjSOL_NEWTON,
         f"the integrator is {mujoco.mjtIntegrator(opt.integrator).name}": opt.integrator not in INTEGRATORS,
@@ -96,17 +95,17 @@ def solver(
     """
     m, d, efc = warp_model, warp_data_E, warp_data_E.efc
     elliptic = bool(m.opt.cone == mjw.ConeType.ELLIPTIC)
-    on_cuda = d.qpos.device.is_cuda
+    device, on_cuda = d.qpos.device, d.qpos.device.is_cuda
     limbs = limbs_of(m.dof_parentid.numpy().tolist())
-    sizes = layout(m.nv, d.njmax, limbs, elliptic=elliptic, rows_on_chip=0)
+    sizes_with = partial(layout, m.nv, d.njmax, limbs, ntendon=m.ntendon, elliptic=elliptic)
+    sizes = sizes_with(rows_on_chip=0)
     stride, narrow = sizes["STRIDE"], sizes["NARROW"]
     if rows_on_chip is None:
         is_tight = d.nworld > FEW_WORLDS and sizes["FLOATS"] + d.njmax // 8 * narrow <= FLOATS_OF_MANY
         room = (FLOATS_OF_MANY if is_tight else FLOATS_PER_WORLD) - sizes["FLOATS"]
         rows_on_chip = min(-(-d.njmax // 2), max(0, room // narrow)) if on_cuda else d.njmax
-    sizes = layout(m.nv, d.njmax, limbs, elliptic=elliptic, rows_on_chip=rows_on_chip)
+    sizes = sizes_with(rows_on_chip=rows_on_chip)
     far_floats = (d.njmax - rows_on_chip * narrow // stride) * stride
-    device = d.qpos.device
     own = {
         "efc_J_colind": efc.J_colind.reshape((d.nworld, -1)),
         "efc_J": efc.J.reshape((d.nworld, -1)),

@@ -7,17 +7,15 @@ constexpr bool HAS_LAST = TILE_ROWS > TILE_LANES;  // the last row has no lane: 
 int tile_begin = 0, tile_end = 0;  // where the rows of a lane's tile are listed
 int tile_slot = 0, tile_length = 0;  // the slots of its limb
 
-#if defined(__CUDA_ARCH__)
 auto list_rows = [&] {
-    const unsigned before = (1u << lane) - 1u;
     int count = 0;
 #pragma unroll 1
     for (int limb = 0; limb < LIMBS; ++limb) {
         int slot = 0, length = 0;
 UNROLL
         for (int block = 0; block < BLOCKS; ++block) {
-            slot += __popc(__ballot_sync(0xffffffffu, is_dof(block) && limbs[block] < limb));
-            length += __popc(__ballot_sync(0xffffffffu, is_dof(block) && limbs[block] == limb));
+            slot += count_of(lanes_where(is_dof(block) && limbs[block] < limb));
+            length += count_of(lanes_where(is_dof(block) && limbs[block] == limb));
         }
         const bool own = lane / TILE_LANES == limb;
         if (own) {
@@ -28,19 +26,16 @@ UNROLL
 #pragma unroll 1
         for (int first = 0; first < rows; first += LANES) {
             const bool counts = first + lane < rows && limb_of(first + lane) == limb;
-            const unsigned all = __ballot_sync(0xffffffffu, counts);
+            const unsigned all = lanes_where(counts);
             if (counts)
-                listed[count + __popc(all & before)] = first + lane;
-            count += __popc(all);
+                listed[count + count_of(all & before)] = first + lane;
+            count += count_of(all);
         }
         if (own)
             tile_end = count;
     }
     sync();
 };
-#else
-auto list_rows = [] {};
-#endif
 // In the curved zone of a cone (part 6) the terms along its slip follow its last row, from what its rows have left.
 auto sum_tiles = [&] {
     const int limb = wp::min(lane / TILE_LANES, LIMBS - 1), own = wp::min(lane % TILE_LANES, LAST);
