@@ -72,8 +72,8 @@ By `ksim-rl reproduce tasks`, and for Go1, G1 and `g1_track_*` `ksim-rl reproduc
 with [one protocol](tables.md#the-protocol).
 
 * **env states**, **seconds**: of a run's training, its first iteration included. Runs of G1 and Go1 on flat ground had
-  a GPU of their own, those of `g1_track_*` shared one with another, and the rest with up to nine; a run that is alone
-  takes less time. On a CPU a run had one core.
+  a GPU of their own, the others shared one with up to ten; a run that is alone takes less time. On a CPU a run had one
+  core.
 * **return**: the mean over the final policy's episodes and over the seeds, with the standard deviation between seeds.
 * **asked for**: what came out, and in brackets what should: *solved at* of the mean return; for the worst seed the
   rewards for following a velocity command (2 each at most, over the last million env states of training), the share of

@@ -95,7 +95,8 @@ def check_solutions(world: World) -> None:
     for twice, our_iterations_E in ours:
         torch.testing.assert_close(twice[1] / scale_E1, qacc_EL / scale_E1, atol=5e-4, rtol=0)
         assert torch.equal(*twice)
-        assert (our_iterations_E - iterations_E).abs().float().mean() < 0.5
+        # Which of them takes fewer differs by world, and with the order of contacts.
+        assert (our_iterations_E - iterations_E).float().mean() < 0.35
 
 
 @pytest.mark.gpu
