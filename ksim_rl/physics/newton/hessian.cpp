@@ -7,7 +7,7 @@ auto times_mass = [&](float* result, const float* own) {
 UNROLL
     for (int block = 0; block < BLOCKS; ++block) {
         float product = 0.0f;
-#pragma unroll BLOCKS > 1 ? 7 : NV  // long code has to be fetched
+#pragma unroll BLOCKS > 1 ? 7 : NV  // long code has to be fetched (H200, 32768 worlds of G1: 7.5 ms, 7.7 if unrolled)
         for (int dof = 0; dof < NV; ++dof)
             product += mass[dof * STRIDE + slot_of(block)] * shared[dof];
         result[block] = fabsf(own[block]) <= LARGEST ? product : own[block];
@@ -70,7 +70,7 @@ UNROLL
         }
     };
     add_rows(0, near_rows, chip);
-    if (ROWS_ON_CHIP * NARROW < NJ * STRIDE)
+    if (HAS_FAR_ROWS)
         add_rows(near_rows, rows, far);
     if (!ELLIPTIC)
         return;

@@ -29,6 +29,7 @@ world = problem.order.data[world];
 constexpr float TINY = 1e-15f, LARGEST = 3e38f;
 constexpr float NOISE = 8.0f * 1.1920929e-07f;  // rounding of a sum of some float32 terms
 constexpr int BLOCKS = (NV + LANES - 1) / LANES;
+constexpr bool HAS_FAR_ROWS = ROWS_ON_CHIP * NARROW < NJ * STRIDE;  // some may find no room on the chip
 constexpr int LIMB_BEGIN = (TRUNK + 3) / 4 * 4, LIMB_STRIDE = (LIMB + 3) / 4 * 4, PADDED_ROWS = (NJ + 3) / 4 * 4;
 
 #if defined(__CUDA_ARCH__)
@@ -187,7 +188,7 @@ auto each_row = [&](int first, int stride, auto pace, auto body) {
 #pragma unroll decltype(pace)::AT_ONCE
     for (int row = first; row < near_rows; row += stride)
         body(row, chip + row * width);
-    if (ROWS_ON_CHIP * NARROW < NJ * STRIDE)
+    if (HAS_FAR_ROWS)
 #pragma unroll 1
         for (int row = near_rows + first; row < rows; row += stride)
             body(row, far + row * width);
