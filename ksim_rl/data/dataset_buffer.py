@@ -108,8 +108,7 @@ class DatasetBuffer(ReplayBuffer):
     into storage whose addresses never change; `sample` gives the next minibatch `["B"]`; `epoch` gives
     `num_minibatches` of them that cover the dataset exactly once; `all` gives the dataset `["D"]`. None of them makes a
     host sync, so whole epochs can be captured in a CUDA graph. Rows with a non-finite element are removed, masked and
-    counted: see `DatasetStorage`. Stored are the leaves at `keys`, None for all; `seed` is of the order of the env
-    states.
+    counted: see `DatasetStorage`. Stored are the leaves at `keys`, None for all; `seed` is of the env states' order.
     """
 
     def __init__(

@@ -34,8 +34,7 @@ def explain(
 ) -> str:
     """Return one table per manager: index, name, shape, weight, mode and parameters other than defaults of each term.
 
-    `shapes` are those of observation terms, [E, ...], and `action_sizes` numbers of columns; a line has `width`
-    characters.
+    `shapes` are those of observation terms, [E, ...], and `action_sizes` numbers of columns; lines are `width` long.
     """
     output = io.StringIO()
     console = Console(

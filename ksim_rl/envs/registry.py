@@ -82,8 +82,7 @@ def _tree(name: str) -> dict[str, Any]:
 def make_cfg(name: str, overrides: Sequence[str] = ()) -> ManagerBasedRlEnvCfg:
     """Return a task's config with Hydra overrides applied, such as `"task.rewards.upright.weight=0.5"`.
 
-    A ValueError names the task or field that does not exist, or the value that is not valid, before any model is
-    compiled.
+    A ValueError names the task or field that does not exist, or the value that is not valid, before models compile.
     """
     if not overrides:
         return task(name).cfg()

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import torch
 from jaxtyping import Float
 from tensordict import TensorDictBase
-from tensordict.nn import CompositeDistribution, TensorDictModule
+from tensordict.nn import CompositeDistribution
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Distribution
@@ -29,6 +29,7 @@ from ksim_rl.modules.distributions import (
 )
 from ksim_rl.modules.mlp import Device, linear, mlp
 from ksim_rl.modules.network import ObservingNetwork, OnPolicyNetworkCfg
+from ksim_rl.modules.upstream import TensorModule
 from ksim_rl.transforms.specs import path_of
 
 MIN_STD = 1e-3
@@ -373,7 +374,7 @@ def make_probabilistic(
     mixed = isinstance(head, MixedHead)
     parameter_keys = head.parameter_keys if mixed else list(head.parameter_names)  # type: ignore[union-attr,arg-type]
     return ProbabilisticActor(
-        TensorDictModule(network, in_keys=in_keys, out_keys=parameter_keys),
+        TensorModule(network, in_keys=in_keys, out_keys=parameter_keys),
         in_keys=[PARAMETERS] if mixed else parameter_keys,
         out_keys=action_keys,
         spec=action_spec,

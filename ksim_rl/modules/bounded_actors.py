@@ -16,6 +16,7 @@ from ksim_rl.modules.actor import action_range
 from ksim_rl.modules.distributions import TanhGaussian
 from ksim_rl.modules.mlp import Device
 from ksim_rl.modules.network import ObservingNetwork, OffPolicyNetworkCfg
+from ksim_rl.modules.upstream import TensorModule
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +100,7 @@ class SquashedPolicy(BoundedActor):
 def make_deterministic_actor(cfg: DeterministicActorCfg, **network: Any) -> TensorDictModule:
     """Build a policy that reads "actor" and writes "action" [..., action_dim], within the bounds of the spec."""
     policy = DeterministicPolicy(cfg, **network)
-    return TensorDictModule(policy, in_keys=["actor"], out_keys=["action"])
+    return TensorModule(policy, in_keys=["actor"], out_keys=["action"])
 
 
 def make_squashed_actor(cfg: SquashedActorCfg, **network: Any) -> ProbabilisticActor:
@@ -110,7 +111,7 @@ def make_squashed_actor(cfg: SquashedActorCfg, **network: Any) -> ProbabilisticA
     """
     policy = SquashedPolicy(cfg, **network)
     return ProbabilisticActor(
-        TensorDictModule(policy, in_keys=["actor"], out_keys=["loc", "scale"]),
+        TensorModule(policy, in_keys=["actor"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         out_keys=["action"],
         distribution_class=TanhGaussian,

@@ -18,6 +18,7 @@ from ksim_rl.modules.network import (
     OffPolicyNetworkCfg,
     OnPolicyNetworkCfg,
 )
+from ksim_rl.modules.upstream import TensorModule
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,13 +35,17 @@ class ValueNetwork(LayeredNetwork):
         super().__init__(cfg, obs_dim=obs_dim, output_dim=1, output_gain=cfg.output_gain, device=device)
 
 
+class Critic(TensorModule, ValueOperator):
+    """TorchRL's `ValueOperator` of a network whose outputs are tensors."""
+
+
 def make_critic(cfg: CriticCfg, *, obs_dim: int, device: Device = None) -> ValueOperator:
     """Build the critic as TorchRL's `ValueOperator`.
 
     Reads `cfg.in_keys`, `obs_dim` numbers side by side, and writes `state_value` [..., 1].
     """
     network = ValueNetwork(cfg, obs_dim=obs_dim, device=device)
-    return ValueOperator(network, in_keys=list(cfg.in_keys), out_keys=["state_value"])
+    return Critic(network, in_keys=list(cfg.in_keys), out_keys=["state_value"])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +100,7 @@ def make_q_network(
     """
     network = QNetwork(cfg, obs_dim=obs_dim, action_dim=action_dim, device=device)
     out_key = "state_action_value" if cfg.num_atoms == 1 else "state_action_logits"
-    return TensorDictModule(network, in_keys=["critic", "action"], out_keys=[out_key])
+    return TensorModule(network, in_keys=["critic", "action"], out_keys=[out_key])
 
 
 class Discriminator(nn.Module):

@@ -15,6 +15,7 @@ from ksim_rl.checked import Checked, Count, Filled, Name, NonNegative
 from ksim_rl.checks import check_choice, check_in_range
 from ksim_rl.device.running_moments import RunningMoments, publish
 from ksim_rl.modules.mlp import ACTIVATIONS, Device, mlp
+from ksim_rl.modules.upstream import TensorModule
 
 ObservationKey = str | tuple[str, ...]
 _NestedKey = Annotated[tuple[Name, ...], Filled("expected a name, or a list of names for a nested key")]
@@ -180,4 +181,4 @@ class LayeredNetwork(ObservingNetwork):
 def make_shared_trunk(cfg: SharedTrunkCfg, *, obs_dim: int, device: Device = None) -> TensorDictModule:
     """Build the layers that write "features" [..., L], the common part of TorchRL's `ActorValueOperator`."""
     network = LayeredNetwork(cfg, obs_dim=obs_dim, output_dim=None, device=device)
-    return TensorDictModule(network, in_keys=list(cfg.in_keys), out_keys=[FEATURES])
+    return TensorModule(network, in_keys=list(cfg.in_keys), out_keys=[FEATURES])

@@ -167,8 +167,7 @@ class RecurrentModule(TensorDictModule):
     def forward(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> TensorDictBase:
         """Write features and next state into `tensordict`, and return it.
 
-        Raises ValueError where there is no state, or where sequences are expected and the batch is not [B, T] with
-        `is_init`.
+        Raises ValueError where there is no state, or where a batch of sequences is not [B, T] with `is_init`.
         """
         obs = side_by_side([tensordict.get(key) for key in self.obs_keys])
         reset = tensordict.get(RESET_KEY, None)

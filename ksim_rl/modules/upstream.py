@@ -1,9 +1,12 @@
-"""This module holds what `modules` uses of torch beyond its documented interfaces.
+"""This module holds what `modules` uses of torch and tensordict beyond their documented interfaces.
 
 `tests/modules/test_upstream.py` names the part that a new version moved.
 """
 
+from typing import Any
+
 import torch
+from tensordict.nn import TensorDictModule
 
 _ATEN = torch.ops.aten
 
@@ -14,3 +17,15 @@ fused_lstm_cell = _ATEN._thnn_fused_lstm_cell
 fused_lstm_cell_backward = _ATEN._thnn_fused_lstm_cell_backward_impl
 fused_gru_cell = _ATEN._thnn_fused_gru_cell
 fused_gru_cell_backward = _ATEN._thnn_fused_gru_cell_backward
+
+
+class TensorModule(TensorDictModule):
+    """A `TensorDictModule` of tensors; that of tensordict 0.14 imports pandas to see whether an output is a frame."""
+
+    def _write_to_tensordict(
+        self, tensordict: Any, tensors: Any, tensordict_out: Any = None, out_keys: Any = None
+    ) -> Any:
+        into = tensordict if tensordict_out is None else tensordict_out
+        for key, tensor in zip(self.out_keys_source if out_keys is None else out_keys, tensors, strict=True):
+            into.set(key, tensor)
+        return into

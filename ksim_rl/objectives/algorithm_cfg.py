@@ -209,8 +209,7 @@ class OffPolicyCfg(GradientCfg):
     Fujimoto et al., arXiv 1802.09477); with "mean" each network learns from its own target, and the mean is climbed.
 
     `compile` lets `torch.compile` fuse the kernels of the losses on CUDA: half the time of a gradient step, for most of
-    a minute at the first one. `symmetry="augment"` takes the mirror image of every second env state, for robots that
-    are their own.
+    a minute at the first one. `symmetry="augment"` mirrors every second env state, for robots that are their own image.
     """
 
     gamma: Share = 0.99

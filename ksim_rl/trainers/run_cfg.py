@@ -50,8 +50,7 @@ class TrainerCfg(Checked):
     reaches its value in one and the same iteration; figures of evaluations count as well.
 
     With `overlap` the metrics of an iteration are read while the next one runs; None does so on CUDA. Where nothing
-    else asks for them earlier, `stop_at` and the guards then act one iteration later. What is learned, logged and saved
-    is the same.
+    else asks for them earlier, `stop_at` and the guards then act one iteration later; nothing else changes.
 
     `num_threads` are torch's on the CPU. None takes one for a run on the CPU, so that the same seed gives the same bits
     on every machine: torch's sums depend on how many threads share them, so another number stands for other bits, as

@@ -49,8 +49,7 @@ class OffPolicyUpdate(RolloutUpdate):
     Until each env has made `learning_starts` steps, rollouts have random actions and there are no gradient steps. From
     then on an update is `num_minibatches` gradient steps of the critics, each followed by one of the target networks,
     and by one of the actor (and the temperature) every `policy_delay`, which divides that number. For `cfg.symmetry`,
-    `mirror` has the mirror images of what the networks read and of the action. The `shared` are the other arguments of
-    `RolloutUpdate`.
+    `mirror` has mirror images of what the networks read and of the action; `shared`, `RolloutUpdate`'s other arguments.
     """
 
     def __init__(

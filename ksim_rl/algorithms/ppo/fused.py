@@ -5,13 +5,14 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor, nn
 
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate
 from ksim_rl.data import EpochSampler
 from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, TanhGaussian, ValueNetwork
 from ksim_rl.modules.actor import GaussianHead, TanhGaussianHead
+from ksim_rl.modules.upstream import TensorModule
 from ksim_rl.objectives import SymmetricAugmentation
 from ksim_rl.objectives.fused_ppo import ACTIVATIONS, FusedNetworks, why_not_fused
 from ksim_rl.objectives.fused_ppo.layout import Observer
@@ -69,7 +70,7 @@ class FusedBehavior(ProbabilisticTensorDictSequential):
             loc = self._fused.means(network.joined(*observations))
             return loc, network.head.scale().expand_as(loc)
 
-        parts[0] = TensorDictModule(parameters_of, **keys)
+        parts[0] = TensorModule(parameters_of, **keys)
         super().__init__(*parts)
         self._fused, self._is_steady = fused, False
 

@@ -110,8 +110,7 @@ class FusedLayout:
     then all biases and the std, in blocks whose sizes are the same in both rows: the outputs are padded to `out`,
     a power of two, and so is the observation to `obs` where the kernels are `chained`, though it is `stored` as a
     multiple of 16; what else differs between both, or is no multiple of 16, is padded to one. The outputs of a
-    `std_layer` follow those of the last layer, and its biases are in the place of the std. Padding is zero, and so is
-    its gradient.
+    `std_layer` follow those of the last layer, its biases in the place of the std. Padding is zero, as is its gradient.
     """
 
     def __init__(self, networks: FusedNetworks, *, chained: bool | None = None) -> None:

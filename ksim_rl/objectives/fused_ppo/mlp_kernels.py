@@ -1,8 +1,7 @@
 """This module has the Triton kernels that run a whole MLP, forward and back, for a block of env states at a time.
 
 The widest hidden layer never exists as a whole: its columns are computed in chunks, and each chunk is multiplied into
-the next layer at once. Products take the dtype of the weights (bfloat16, or float32, as TF32 on a GPU) and add up in
-float32.
+the next layer at once. Products take the weights' dtype (bfloat16, or float32, as TF32 on a GPU), sums float32.
 
 `docs/fused_ppo.md` has a diagram of the memory and derives the gradients. D env states are in the dataset, B in the
 minibatch; OBS and OUT are the padded widths of observation and outputs, H1 to H3 those between, and ACTIONS

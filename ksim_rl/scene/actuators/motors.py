@@ -55,8 +55,7 @@ class DCMotorActuator(IdealPDActuator):
     At velocity v the voltage allows efforts between `saturation_effort * (-1 - v / velocity_limit)` and
     `saturation_effort * (1 - v / velocity_limit)`: the straight speed-torque line of a brushed or field-oriented motor
     (Lynch and Park, Modern Robotics, 2017, section 8.9.1), from the stall effort (N m or N) to the no-load velocity
-    (rad/s or m/s). The current allows `effort_limit` in both directions. Beyond the velocity limit the motor can only
-    brake.
+    (rad/s or m/s). The current allows `effort_limit` in both directions. Beyond the velocity limit it can only brake.
     """
 
     saturation_effort: Positive

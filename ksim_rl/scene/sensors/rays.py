@@ -35,8 +35,7 @@ class GridPattern(RayPattern):
     """Parallel rays that start at the points of a grid, parallel to the sensor's xy plane and `height` (m) above it.
 
     Points run along x (forward) first, from back to front, and these rows along y, from right to left; `size` are the
-    edges along x and y, and `resolution` is the distance of neighbours, m. Rays that start low do not see what is
-    higher.
+    edges along x and y, and `resolution` is the distance of neighbours, m. Rays that start low miss what is higher.
     """
 
     size: Annotated[tuple[float, float], Within(low=0.0)] = (1.6, 1.0)

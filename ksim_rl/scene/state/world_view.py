@@ -201,8 +201,7 @@ class WorldView:
     # -- actuators -----------------------------------------------------------------------------------------------
 
     def actuator_param(self, name: str, joints: Patterns | None = None) -> Float[Tensor, "E L"]:
-        """Return a number of explicit actuators, such as "stiffness", which all of `joints` must have, to read or
-        write.
+        """Return a number of explicit actuators, such as "stiffness", that all `joints` have, to read or write.
 
         What an event writes holds from the next substep on, and until it is written again: resets leave it alone.
         Built-in actuators have model fields instead (`actuators.builtin`).
