@@ -40,11 +40,11 @@ class ReplayStorage(SavedByStateDict, Storage):
     on the terminal observation. So an env state costs its observation once, not twice: for Go1 (120 observed numbers,
     12 actions) 535 bytes instead of 1015, 2.2 GB for 1000 env states of 4096 envs. One more place holds the newest one.
 
-    `write` and `get` make no host sync and can be captured in a CUDA graph: where the next goes is on the device.
+    `write` and `get` make no host sync and can be captured in a CUDA graph: the next one's place is on the device.
 
     `get` returns env states with what follows `n_step` steps later: ("next", "reward") is the sum of discounted rewards
     until then, and "steps_to_next_obs" says how many they are, as TorchRL's losses read it. The sum ends early at the
-    end of an episode, whose terminal observation then follows, at one that is not finite, and at the newest.
+    end of an episode, whose terminal observation follows, at an env state that is not finite, and at the newest one.
 
     An env state with an element that is not finite is stored as invalid, with zeros for such elements, and counted.
     Invalid places have ("collector", "mask") False, which TorchRL's losses leave out of their means. All that is stored

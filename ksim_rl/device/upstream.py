@@ -47,7 +47,7 @@ def free_cublas_workspaces() -> None:
 def recorded_arguments(launch: wp.Launch) -> ctypes.Structure:
     """Return the bytes of the one struct that a recorded launch passes to its kernel, for writing them in one go.
 
-    `Launch.set_param_at_index` packs field by field. The first one is the size of the launch. Checked with Warp 1.19.
+    `Launch.set_param_at_index` packs field by field. The first parameter is the launch's size. Checked with Warp 1.19.
     """
     return launch.params[1]
 

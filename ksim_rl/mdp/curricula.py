@@ -56,7 +56,7 @@ class LinearLevel(LevelCurriculum):
 class SteppedLevel(LevelCurriculum):
     """The level moves by 1 / `num_levels` whenever the mean score of the last episodes is high or low enough.
 
-    A mean score below `lower_below` makes it easier, None never. Before a move `min_episodes` end, None: one per env.
+    A mean below `lower_below` makes it easier; None never does. `min_episodes` end before each move; None: one per env.
     """
 
     raise_above: float
@@ -142,7 +142,7 @@ class TerrainLevels(OfCommand, OfEntity, CurriculumTerm):
     whole episode, be it that it was slow or that it fell. An env that has mastered the last level goes on at a random
     one, so that none is forgotten. The rule is that of Rudin et al., "Learning to walk in minutes", 2022.
 
-    The command is a velocity (vx, vy, ...) in m/s; `up_distance` is a share of half a patch's edge.
+    The command is a velocity (vx, vy, ...), m/s; `up_distance` a share of the way from a patch's centre to its edge.
     """
 
     up_distance: Annotated[float, Within(low=0.0, high=1.0, low_open=True)] = 0.8

@@ -9,7 +9,7 @@ from types import FrameType
 class InterruptRequest:
     """While entered, the first signal is remembered instead of raised; a second one interrupts at once.
 
-    What is `said` then is what follows from it. Outside the main thread, where Python allows none, none is installed.
+    `said` tells then what follows. Outside the main thread, where Python allows no handlers, nothing is installed.
     """
 
     def __init__(self, said: str = "the run ends after this iteration; once more ends it at once") -> None:

@@ -42,7 +42,7 @@ def record(
 
     The env has the part `Pictures`, and `path` ends in `.mp4`; without a video encoder a `.gif` beside it is written
     instead. It plays at real speed, `step_dt` being the seconds of an env step, with as near to `fps` pictures per
-    second as whole steps allow: at most one for each. A VideoUnavailableError says what is missing and the fix.
+    second as whole steps allow: at most one each. A VideoUnavailableError says why nothing can be rendered, and a fix.
     """
     if _failed:
         raise VideoUnavailableError(_failed[0])

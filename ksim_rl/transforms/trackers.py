@@ -122,7 +122,7 @@ class EpisodeTracker(_Tracker):
 class SuccessTracker(_Tracker):
     """Whether an episode has succeeded, bool; where `done` is True, that of the whole episode.
 
-    In keys are observations, rewards or done flags: above the threshold is success, once in it ("any") or now ("last").
+    In keys: observations, rewards, done flags; success is above the threshold, once an episode ("any") or now ("last").
 
     Example:
         >>> tracker = SuccessTracker("reached_goal")

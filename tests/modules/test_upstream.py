@@ -71,10 +71,12 @@ def test_a_module_of_tensors_writes_what_that_of_tensordict_writes():
     )
     td = observed()
     assert (ours(td.clone()) == theirs(td.clone())).all()
-    assert (ours(td, tensordict_out=TensorDict(batch_size=[4])).sorted_keys) == ["low", "nested"]
+    assert ours(td, tensordict_out=TensorDict(batch_size=[4])).sorted_keys == ["low", "nested"]
     assert td.sorted_keys == ["action", "actor", "critic"]
     with pytest.raises(ValueError, match="zip"):
         upstream.TensorModule(lambda x: (x, x, x), **keys)(td)
+    with pytest.raises(AssertionError, match="into what they read"):
+        upstream.TensorModule(lambda x: (x, x), **keys, inplace=False)(td)
 
 
 @pytest.mark.parametrize(

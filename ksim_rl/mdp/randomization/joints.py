@@ -169,8 +169,8 @@ class RandomizeActuator(OfJoints, Randomize, operation="scale"):
 class RandomizeActuatorGains(RandomizeActuator, drawn=("stiffness", "damping")):
     """Gains of the servos that drive joints: stiffness, N m / rad or N / m; damping, N m s / rad or N s / m.
 
-    MuJoCo's position servo keeps one stiffness in its gain and its bias, and its velocity servo one damping; both
-    places are written. Explicit actuators keep theirs in `EnvView.actuator_param`, never below 0. None leaves one.
+    MuJoCo's position servo keeps one stiffness in its gain and its bias, its velocity servo one damping; both places
+    are written. Explicit actuators keep theirs in `EnvView.actuator_param`, never below 0. None leaves a gain alone.
     """
 
     stiffness: Pair | None = None

@@ -39,7 +39,7 @@ class SelfCollision(OfContacts, RewardTerm):
     """Number of physics substeps of the env step in which a self-contact force exceeds a threshold.
 
     The sensor is one of the robot against itself: `ContactSensor(subtrees=(root,), against=root,
-    against_kind="subtree", reduce="strongest", every_substep=True)`. Without `every_substep` it sees the last one only.
+    against_kind="subtree", reduce="strongest", every_substep=True)`. Without `every_substep` only the last is seen.
     """
 
     threshold: NonNegative = 10.0

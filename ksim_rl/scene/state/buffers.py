@@ -161,8 +161,8 @@ class SharedValues:
 class ActuatorParams:
     """Buffers by name (`stiffness`, `effort_limit`, ...), float32 [E, L], in the order of `joint_pos_EL`.
 
-    They start at the numbers of the config, are read at each substep, are saved with the env, and stay when rows reset;
-    so an event may write them in place, for some rows, at any moment. Joints without such a number have a 0.
+    They start at the numbers of the config, are read at each substep, saved with the env, and stay when rows reset; so
+    an event may write them in place, for some rows, at any moment. Joints without such a number have 0 there, unread.
     """
 
     def __init__(self, buffers: Buffers, joint_names: Sequence[str], device: torch.device) -> None:
