@@ -6,7 +6,6 @@
 import argparse
 import ast
 import io
-import keyword
 import re
 import sys
 import tokenize
@@ -18,25 +17,6 @@ from pathlib import Path
 from tests import signatures
 
 PACKAGE = "ksim_rl"
-# Lines of the rooms that train; the rooms around them, the command line and ways to other libraries among them, have
-# ceilings of their own, so that neither pays for the other.
-PACKAGE_LINES = 37_000
-ROOMS_AROUND = {
-    "adapters": 620,
-    "cli": 900,
-    "clips": 900,
-    "compiled": 1_040,
-    "diagnosis": 800,
-    "export": 2_760,
-    "ranks": 900,
-    "runs": 800,
-    "suites": 1_750,
-    "tables": 640,
-    "testing": 740,
-    "tracking": 1_400,
-    "viewer": 1_400,
-    "zoo": 300,
-}
 ROOM_SHARE = 0.25
 FILE_LINES = 450
 FOLDER_FILES = 30
@@ -56,18 +36,6 @@ ROOMS_WITHOUT_PROBES = (
 # Folders of tests that belong to no single room.
 TESTS_OF_ALL_ROOMS = {"benchmarks", "docs", "examples", "gpu", "integration"}
 
-_VERBS = re.compile(
-    r"\b(?:is|are|has|have|does|do|can|may|must|needs?|stays?|stands?|lies?|lives?|holds?|goes|go|"
-    r"(?!this|its|envs|terms|axes|always|bodies|joints|tensors|besides|as|plus|less|across|thus|robots|"
-    r"observations|rewards|actions|classes|names|rows|values|worlds|units|sensors|"
-    r"others|theirs|ours|yours|hers|his|ones|numbers|steps|sites|geoms)[a-z]+(?:es|s)\b|[a-z]+ed\b)",
-    re.IGNORECASE,
-)
-_NOT_A_SUBJECT = re.compile(r"^(?:What|Which|Where|How|Whether|Says|Why|When|Who)\b(?!.*, )")
-_RELATIVE = re.compile(
-    r",? (?:that|which|who|whose|where|when|as|if|while|until|for which|from which)\b[^,.;:]*"
-)
-_IN_QUOTES = re.compile(r"`[^`]*`")
 _PROBED = re.compile(r"env|inner|world", re.IGNORECASE)
 
 
@@ -210,18 +178,6 @@ def _strong_components(edges: dict[str, list[str]]) -> list[list[str]]:
 # ---- limits: each returns what breaks it ----
 
 
-def package_size(house: House) -> list[str]:
-    """Return the size of the rooms that train, if it is too large."""
-    total = sum(room.lines for room in house.rooms() if room.name not in ROOMS_AROUND)
-    return [f"{total:,} lines: fewer than {PACKAGE_LINES:,} expected"] if total >= PACKAGE_LINES else []
-
-
-def rooms_around(house: House) -> list[str]:
-    """Return rooms beside training that are above their ceilings."""
-    sizes = {room.name: room.lines for room in house.rooms() if room.name in ROOMS_AROUND}
-    return [f"{name} has {lines:,} lines" for name, lines in sizes.items() if lines > ROOMS_AROUND[name]]
-
-
 def room_shares(house: House) -> list[str]:
     """Return rooms with too large a share."""
     total = sum(house.lines.values())
@@ -291,31 +247,6 @@ def _is_probe(node: ast.AST) -> bool:
     return asks and bool(_PROBED.search(ast.unparse(node.args[0])))
 
 
-def docstrings(house: House) -> list[str]:
-    """Return module docstrings whose first sentence is none."""
-    found = []
-    for path, text in house.texts.items():
-        if not (tree := signatures.parse(text)).body:
-            continue
-        first = re.split(r"(?<=[.!?])\s+|\n\n|: ", (ast.get_docstring(tree) or "").strip())[0].replace(
-            "\n", " "
-        )
-        if not is_sentence(first):
-            found.append(f"{house.name(path)}: {first}")
-    return found
-
-
-def is_sentence(text: str) -> bool:
-    """Say whether there is a subject and a verb of its own, as far as word forms tell."""
-    if not text or _NOT_A_SUBJECT.match(text):
-        return False
-    main = _RELATIVE.sub("", _IN_QUOTES.sub("thing", text))
-    words = main.split()
-    return any(_VERBS.fullmatch(word.strip(",.;:()")) for word in words[1:]) and not keyword.iskeyword(
-        words[0]
-    )
-
-
 def tests_in_place(house: House) -> list[str]:
     """Return rooms without tests, folders of tests without a room, and tests that lie beside another room's."""
     tests = house.checkout / "tests"
@@ -338,8 +269,6 @@ def tests_in_place(house: House) -> list[str]:
 
 
 LIMITS: dict[str, Callable[[House], list[str]]] = {
-    f"the rooms that train have fewer than {PACKAGE_LINES:,} lines": package_size,
-    "the rooms around them keep their ceilings": rooms_around,
     f"no room has more than {ROOM_SHARE:.0%} of the lines": room_shares,
     f"no file has more than {FILE_LINES} lines": file_lengths,
     f"no folder has more than {FOLDER_FILES} files": folder_sizes,
@@ -349,7 +278,6 @@ LIMITS: dict[str, Callable[[House], list[str]]] = {
     "tensors of public functions have named axes": bare_tensors,
     "tensor names carry their dims": suffixes,
     "rooms ask the contract what an env has": probes,
-    "module docstrings are sentences": docstrings,
     "tests lie where their modules do": tests_in_place,
 }
 
