@@ -18,6 +18,7 @@ from ksim_rl.compiled import row_code
 from ksim_rl.compiled.cells import CTYPES, Cells, Element, Loop, NotARowError
 from ksim_rl.compiled.lanes import BLOCK, DEAL, LANES, SHARED, Own, Work, schedule, source
 from ksim_rl.device import kernel_loading, random
+from ksim_rl.device.extents import extent
 from ksim_rl.device.quick_launch import QuickLaunch, arguments_of
 from ksim_rl.device.recording import Operation, Recorder
 
@@ -34,12 +35,6 @@ _COUNTS = frozenset(
 
 def _storage(tensor: Tensor) -> int:
     return tensor.untyped_storage().data_ptr()
-
-
-def _extent(tensor: Tensor) -> tuple[int, int]:
-    """Return the address of a tensor's first number, and the one behind the last."""
-    last = sum((size - 1) * stride for size, stride in zip(tensor.shape, tensor.stride(), strict=True))
-    return tensor.data_ptr(), tensor.data_ptr() + (last + 1) * tensor.element_size()
 
 
 @dataclass(eq=False)
@@ -60,14 +55,14 @@ class _Memory:
         used = [tensor for one in operations for tensor in (*one.read(), *one.made) if tensor.numel()]
         starts: dict[tuple[int, int], int] = {}
         start, end = 0, 0
-        for first, last in sorted({_extent(tensor) for tensor in used if _storage(tensor) not in made}):
+        for first, last in sorted({extent(tensor) for tensor in used if _storage(tensor) not in made}):
             start, end = first if first >= end else start, max(end, last)
             starts[first, last] = start
         return cls(made=made, starts=starts)
 
     def place(self, tensor: Tensor) -> int:
         storage = _storage(tensor)
-        return storage if storage in self.made or not tensor.numel() else self.starts[_extent(tensor)]
+        return storage if storage in self.made or not tensor.numel() else self.starts[extent(tensor)]
 
     def width(self, place: int) -> int:
         """Return how many numbers a storage of the recording has."""

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,12 @@ _recording = _Recording()
 def is_recording() -> bool:
     """Whether this thread writes down what torch computes: then every kernel has to be an operator of torch."""
     return _recording.recorder is not None
+
+
+def paused() -> AbstractContextManager[None]:
+    """Write nothing down in this block, if this thread writes down anything at all."""
+    recorder = _recording.recorder
+    return nullcontext() if recorder is None else recorder.paused()
 
 
 def launched(launch: Callable[[], None]) -> bool:
@@ -97,16 +103,22 @@ class Recorder(TorchDispatchMode):
             _recording.recorder = self
         read = {id(tensor) for tensor in _tensors((args, kwargs))}
         made = [tensor for tensor in _tensors(result) if id(tensor) not in read]
-        written = list(_written(func, args, kwargs))
+        written = written_by(func, args, kwargs)
         if made or written:
             self.entries.append(Operation(func, args, kwargs, made, written))
         return result
 
 
-def _written(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Iterator[Tensor]:
+def written_by(
+    func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> list[Shaped[Tensor, "*?shape"]]:
+    """Return the tensors among the arguments of an operator that it writes."""
+    written: list[Tensor] = []
     for place, argument in enumerate(func._schema.arguments):
         if argument.alias_info is not None and argument.alias_info.is_write:
-            yield from _tensors(args[place] if place < len(args) else kwargs.get(argument.name))
+            given = args[place] if place < len(args) else kwargs.get(argument.name)
+            written += _tensors(given)
+    return written
 
 
 @contextmanager

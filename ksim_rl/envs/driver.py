@@ -1,12 +1,19 @@
 """This module is what an env and its managers drive terms with; terms themselves see the driver's view only."""
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from functools import partial
 from typing import Any
 
+from jaxtyping import Bool
+from torch import Tensor
+
 from ksim_rl.envs.non_finite import NonFiniteTerms
+from ksim_rl.envs.term_guard import TermGuard
 from ksim_rl.envs.view import EnvView, Readings
 from ksim_rl.physics import World
-from ksim_rl.scene.sensors import Sensor
+from ksim_rl.scene.sensors import Sensor, SensorTracker
+from ksim_rl.scene.state.buffers import Kept
 from ksim_rl.scene.state.simulation import Simulation
 
 
@@ -21,18 +28,34 @@ class EnvDriver(Simulation):
         self.readings = Readings(self)
         self.non_finite = NonFiniteTerms(self.num_envs, self.step_count)
         self.view = EnvView(self, self.readings, **parts)
+        self.guard = TermGuard(self, self.readings, self.view)
 
     def add_sensors(self, sensors: Mapping[str, Sensor]) -> None:
         """Let sensors read the worlds from now on."""
         for name, sensor in sensors.items():
             tracker = self.readings.sensors[name] = sensor.track(name, self.view)
             if tracker.every_substep:
-                self.after_substep.append(tracker.update_substep)
+                self.after_substep.append(partial(self._update_in_substep, name, tracker))
                 only = tracker.contacts_only and self.substep_sensors != "every"
                 self.substep_sensors = "contacts" if only else "every"
 
+    def update_sensors(self) -> None:
+        """Let each sensor read the env step that has just been made."""
+        for name, tracker in self.readings.sensors.items():
+            with self.scope(f"sensors/{name}", part=tracker):
+                tracker.update()
+
+    def _update_in_substep(self, name: str, tracker: SensorTracker) -> None:
+        with self.scope(f"sensors/{name}", part=tracker):
+            tracker.update_substep()
+
     def freeze(self) -> None:
-        """End construction: no new buffers, and all that lives on is known to `detached`."""
+        """End construction: no new buffers."""
         super().freeze()
         self.non_finite.start()
-        self._lasting.add(self.view.default_qpos_L.untyped_storage().data_ptr())
+
+    def watch(
+        self, part: object, mask_E: Bool[Tensor, " E"] | None
+    ) -> AbstractContextManager[Mapping[str, Kept]]:
+        """Refuse what a part must not write, wherever that is watched: see `TermGuard`."""
+        return self.guard.watch(self.reader, part, mask_E)

@@ -108,12 +108,13 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self.view = self.driver.view
         self.load_managers()
         self.driver.freeze()
-        readings = {"obs": self.observation_manager.read(), "command": self.command_manager.values}
+        readings = {"obs": self.observation_manager.examples, "command": self.command_manager.values}
         size, bounds_L2 = self.action_manager.size, self.action_manager.bounds_L2
         self.observation_spec, self.full_action_spec, self.full_reward_spec, self.full_done_spec = make_specs(
             readings, size, bounds_L2, batch_size=self.batch_size, device=self.device
         )
         self.seed(-1 if cfg.seed is None else cfg.seed)
+        self._rehearse()
 
     # -- what it is made of --------------------------------------------------------------------------------------
 
@@ -146,6 +147,26 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self.metric_manager = MetricManager(cfg.metrics, driver)
         self.curriculum_manager = CurriculumManager(cfg.curriculum, driver)
         self._log = EpisodeLog(driver, self.reward_manager, self.termination_manager, self.metric_manager)
+
+    def _rehearse(self) -> None:
+        """Refuse terms that write what is not theirs, by a ValueError: run each, and put back all that has changed."""
+        driver = self.driver
+        writing = (self.event_manager, self.curriculum_manager, self.command_manager, self.action_manager)
+        reading = (self.reward_manager, self.termination_manager, self.metric_manager)
+        with driver.guard.rehearsal():
+            for manager in writing:
+                manager.rehearse()
+            self.joint_drives.apply()
+            self.world.refresh()
+            driver.refreshed()
+            driver.update_sensors()
+            # Twice: what a term changes in a quantity that it is the first to read shows the second time.
+            for _ in range(2):
+                self.observation_manager.read()
+                for manager in reading:
+                    manager.rehearse()
+        # Numbers of the rehearsal are of no state that anybody sees.
+        driver.non_finite.start()
 
     @property
     def unwrapped(self) -> "ManagerBasedRlEnv":
@@ -208,8 +229,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         driver.refreshed()
 
         driver.episode_step_E.add_(1)
-        for tracker in driver.readings.sensors.values():
-            tracker.update()
+        driver.update_sensors()
         terminated_E, truncated_E = self.termination_manager.step(finite_E)
         done_E = terminated_E | truncated_E
         reward_E = self.reward_manager.step(finite_E)
@@ -244,10 +264,11 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         driver.refreshed()
         self.command_manager.refresh(mask_E)
         no_E1 = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
-        return self._env_state(done=no_E1, terminated=no_E1.clone(), truncated=no_E1.clone())
+        flags = {"done": no_E1, "terminated": no_E1.clone(), "truncated": no_E1.clone()}
+        return self._env_state(reset_E=mask_E, **flags)
 
-    def _env_state(self, **leaves: Tensor) -> TensorDict:
-        data: dict[str, Any] = {"obs": self.observation_manager.read()}
+    def _env_state(self, *, reset_E: Tensor | None = None, **leaves: Tensor) -> TensorDict:
+        data: dict[str, Any] = {"obs": self.observation_manager.read(reset_E)}
         if self.command_manager.values:
             data["command"] = {name: value.clone() for name, value in self.command_manager.values.items()}
         return TensorDict(data | leaves, batch_size=self.batch_size, device=self.device, names=[dims.E])

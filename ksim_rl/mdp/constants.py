@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ksim_rl.checks import near
+from ksim_rl.device.constants import as_constant
 from ksim_rl.scene.names import Index, as_index
 
 
@@ -22,7 +23,7 @@ def constant(values: Sequence[float], device: torch.device) -> Float[Tensor, " L
 def _constant(values: tuple[float, ...], device: torch.device) -> Tensor:
     # Made outside of inference mode: the tensor outlives the mode of the call that happens to come first.
     with torch.inference_mode(False):
-        return torch.tensor(values, dtype=torch.float32, device=device)
+        return as_constant(torch.tensor(values, dtype=torch.float32, device=device))
 
 
 def array_constant(values: np.ndarray, device: torch.device) -> Float[Tensor, "*shape"]:
@@ -38,7 +39,8 @@ def index_constant(ids: Sequence[int], device: torch.device) -> Int[Tensor, " N"
 @cache
 def _index_constant(ids: tuple[int, ...], device: torch.device) -> Index:
     with torch.inference_mode(False):
-        return as_index(ids, device)
+        index = as_index(ids, device)
+    return as_constant(index) if isinstance(index, Tensor) else index
 
 
 def values_by_name(field: str, table: Mapping[str, float], names: Sequence[str]) -> tuple[float, ...]:

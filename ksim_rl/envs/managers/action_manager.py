@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.term import ActionTerm
+from ksim_rl.scene.state.buffers import ENV
 
 
 class ActionManager:
@@ -25,7 +26,7 @@ class ActionManager:
         self._parts: list[tuple[str, ActionTerm, slice]] = []
         start = 0
         for name, term in terms.items():
-            with self._driver.scope(f"actions/{name}"):
+            with self._driver.scope(f"actions/{name}", part=term):
                 self.sizes[name] = term.size(view)
                 bounds.append(term.bounds(view))
             stop = start + self.sizes[name]
@@ -40,8 +41,8 @@ class ActionManager:
         self._arrived = self._accepts_any.numpy()
         self._has_warned = False
         buffers, readings = driver.buffers, driver.readings
-        self._action_EL = readings.action_EL = buffers.get("actions.action_EL", start)
-        self._last_action_EL = readings.last_action_EL = buffers.get("actions.last_action_EL", start)
+        self._action_EL = readings.action_EL = buffers.get("actions.action_EL", start, owner=ENV)
+        self._last_action_EL = readings.last_action_EL = buffers.get("actions.last_action_EL", start, owner=ENV)
         self._run_terms(self._action_EL)
 
     def apply(self, action_EL: Float[Tensor, "E L"]) -> Bool[Tensor, " E"]:
@@ -53,6 +54,10 @@ class ActionManager:
         self._run_terms(self._action_EL)
         self._watch(finite_E)
         return finite_E
+
+    def rehearse(self) -> None:
+        """Run each term once more; the caller puts back what changes."""
+        self._run_terms(self._action_EL)
 
     def _watch(self, finite_E: Tensor) -> None:
         """Say once that no row's action was finite; on a GPU a few steps late, and not from within a graph."""
@@ -70,5 +75,5 @@ class ActionManager:
 
     def _run_terms(self, action_EL: Float[Tensor, "E L"]) -> None:
         for scope, term, columns in self._parts:
-            with self._driver.scope(scope):
+            with self._driver.scope(scope, part=term):
                 term(self._view, action_EL[:, columns])

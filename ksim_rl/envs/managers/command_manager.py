@@ -1,6 +1,7 @@
 """This module keeps the commands: clocks, resampling, and the vectors that policy and rewards see."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 
 import torch
 from jaxtyping import Bool, Float, Shaped
@@ -10,6 +11,7 @@ from ksim_rl.checks import check_known
 from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.masked_reset import mask_from_env_ids
 from ksim_rl.envs.term import CommandTerm
+from ksim_rl.scene.state.buffers import ENV, Kept, only_in_rows
 
 
 class CommandManager:
@@ -24,15 +26,18 @@ class CommandManager:
         self._terms = dict(terms)
         self.values = driver.readings.commands
         self._clocks = {
-            name: view.buffers.get(f"commands/{name}.time_left_E")
+            name: view.buffers.get(f"commands/{name}.time_left_E", owner=ENV)
             for name, term in terms.items()
             if term.resampling_time_range_s is not None
         }
+        # What each term writes whenever its vector is computed; most write nothing then.
+        self._kept: dict[str, dict[str, Kept]] = {name: {} for name in terms}
         nobody_E = torch.zeros(view.num_envs, dtype=torch.bool, device=view.device)
         for name, term in terms.items():
-            with self._driver.scope(f"commands/{name}"):
+            with self._driver.scope(f"commands/{name}", part=term, mask_E=nobody_E):
                 term.resample(view, nobody_E)
-                value_EK = term(view)
+            value_EK = self._computed(name)
+            with self._driver.scope(f"commands/{name}"):
                 if term.ranges:
                     # Columns beyond those of `ranges` are the term's own.
                     columns = term.shared_ranges(view).unbind(-1)
@@ -42,7 +47,9 @@ class CommandManager:
                     f"command term {name!r} returns shape {tuple(value_EK.shape)}: expected [{view.num_envs}, K], one "
                     "row per env"
                 )
-            self.values[name] = view.buffers.get(f"commands/{name}.value_EK", value_EK.shape[1])
+            self.values[name] = view.buffers.get(
+                f"commands/{name}.value_EK", value_EK.shape[1], owner=ENV
+            )
             driver.non_finite.watch("command", self.values[name], (name,), value_EK.shape[1:])
 
     def time_left(self, name: str) -> Float[Tensor, " E"]:
@@ -76,11 +83,15 @@ class CommandManager:
         for name, term in self._terms.items():
             self._draw(name, term, mask_E, "reset", self._view.reset_count_E)
 
-    def refresh(self, mask_E: Bool[Tensor, " E"]) -> None:
-        """Recompute the command vectors of the rows of `mask_E` from the current state and targets."""
-        for name, term in self._terms.items():
-            with self._driver.scope(f"commands/{name}"):
-                value_EK = term(self._view)
+    def refresh(self, mask_E: Bool[Tensor, " E"], *, is_step: bool = False) -> None:
+        """Recompute the command vectors of the rows of `mask_E` from the current state and targets.
+
+        What terms keep advances in these rows only; what all envs share of it, only if this `is_step` of the env.
+        """
+        for name in self._terms:
+            kept = list(self._kept[name].values())
+            with only_in_rows(mask_E, kept, is_step=is_step) if kept else nullcontext():
+                value_EK = self._computed(name)
             held_EK = self.values[name]
             held_EK.copy_(torch.where(mask_E[:, None], value_EK, held_EK))
             self._driver.non_finite.watch("command", held_EK, (name,), (held_EK.shape[1],))
@@ -94,7 +105,22 @@ class CommandManager:
                 clock_E.sub_(self._view.step_dt)
                 due_E = (clock_E < 0.5 * self._view.step_dt) & going_on_E
                 self._draw(name, term, due_E, "step", self._view.step_count)
-        self.refresh(going_on_E)
+        self.refresh(going_on_E, is_step=True)
+
+    def rehearse(self) -> None:
+        """Run each term once more; the caller puts back what changes."""
+        nobody_E = torch.zeros(self._view.num_envs, dtype=torch.bool, device=self._view.device)
+        self.resample(nobody_E)
+        for name in self._terms:
+            self._computed(name)
+
+    def _computed(self, name: str) -> Tensor:
+        """Return the vector of a term in the current state, and learn what it writes on the way."""
+        term = self._terms[name]
+        with self._driver.scope(f"commands/{name}", part=term) as written:
+            value_EK = term(self._view)
+        self._kept[name].update(written)
+        return value_EK
 
     def _draw(
         self, name: str, term: CommandTerm, mask_E: Bool[Tensor, " E"], moment: str, counter: Tensor
@@ -104,5 +130,5 @@ class CommandManager:
             with self._driver.scope(f"commands/{name}/clock/{moment}", counter):
                 drawn_E = self._view.uniform(1, *term.resampling_time_range_s)[:, 0]
             clock_E.copy_(torch.where(mask_E, drawn_E, clock_E))
-        with self._driver.scope(f"commands/{name}", counter, draws=moment):
+        with self._driver.scope(f"commands/{name}", counter, draws=moment, part=term, mask_E=mask_E):
             term.resample(self._view, mask_E)

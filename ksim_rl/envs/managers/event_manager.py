@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.term import EventTerm
+from ksim_rl.scene.state.buffers import ENV
 
 
 class EventManager:
@@ -28,26 +29,27 @@ class EventManager:
             for mode, parts in self._by_mode.items()
         }
         clocked = self._by_mode.get("interval", [])
-        self._clocks = {scope: view.buffers.get(f"{scope}.time_left_E") for scope, _ in clocked}
-        nobody_E = torch.zeros(view.num_envs, dtype=torch.bool, device=view.device)
-        for name, term in terms.items():
-            with self._driver.scope(f"events/{name}"):
-                term(view, nobody_E)
+        self._clocks = {scope: view.buffers.get(f"{scope}.time_left_E", owner=ENV) for scope, _ in clocked}
+        self.rehearse()
+
+    def rehearse(self) -> None:
+        """Run each event for no row, which changes nothing."""
+        nobody_E = torch.zeros(self._view.num_envs, dtype=torch.bool, device=self._view.device)
+        for name, term in self.terms.items():
+            self._run(f"events/{name}", term, nobody_E)
 
     def startup(self) -> None:
         """Run the startup events for all rows; their numbers depend on the seed only."""
         everybody_E = torch.ones(self._view.num_envs, dtype=torch.bool, device=self._view.device)
         for scope, term in self._by_mode.get("startup", []):
-            with self._driver.scope(scope, self._driver.startup_counter):
-                term(self._view, everybody_E)
+            self._run(scope, term, everybody_E, self._driver.startup_counter)
         self._view.world.set_const(self._fields.get("startup", ()))
 
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Run the reset events for the rows of `mask_E`, and restart their interval clocks."""
         view = self._view
         for scope, term in self._by_mode.get("reset", []):
-            with self._driver.scope(scope, view.reset_count_E):
-                term(view, mask_E)
+            self._run(scope, term, mask_E, view.reset_count_E)
         view.world.set_const(self._fields.get("reset", ()), mask_E)
         for scope, term in self._by_mode.get("interval", []):
             with self._driver.scope(f"{scope}/clock", view.reset_count_E):
@@ -63,8 +65,7 @@ class EventManager:
             due_E = clock_E < 0.5 * view.step_dt
             with self._driver.scope(f"{scope}/interval"):
                 self._restart(scope, term, due_E)
-            with self._driver.scope(scope):
-                term(view, due_E)
+            self._run(scope, term, due_E)
             if term.per_world_fields:
                 written.append(due_E)
         if written:
@@ -72,9 +73,14 @@ class EventManager:
         if "step" in self._by_mode:
             everybody_E = torch.ones(view.num_envs, dtype=torch.bool, device=view.device)
             for scope, term in self._by_mode["step"]:
-                with self._driver.scope(scope):
-                    term(view, everybody_E)
+                self._run(scope, term, everybody_E)
             view.world.set_const(self._fields["step"], everybody_E)
+
+    def _run(
+        self, scope: str, term: EventTerm, mask_E: Bool[Tensor, " E"], counter: Tensor | None = None
+    ) -> None:
+        with self._driver.scope(scope, counter, part=term, mask_E=mask_E):
+            term(self._view, mask_E)
 
     def _restart(self, scope: str, term: EventTerm, mask_E: Bool[Tensor, " E"]) -> None:
         assert term.interval_range_s is not None

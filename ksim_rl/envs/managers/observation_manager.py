@@ -1,25 +1,34 @@
 """This module reads each observation term once, clean; what groups add is done by transforms."""
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 
 import torch
-from jaxtyping import Shaped
+from jaxtyping import Bool, Shaped
 from torch import Tensor
 
 from ksim_rl.envs.driver import EnvDriver
+from ksim_rl.scene.state.buffers import Kept, only_in_rows
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg
 
 IMAGE_DTYPES = (torch.float32, torch.int32, torch.uint8)
 
 
 class ObservationManager:
-    """Computes the union of the groups' terms; what groups add to them is done by transforms."""
+    """Computes the union of the groups' terms; what groups add to them is done by transforms.
+
+    `examples` are readings of no state in particular, without memory, which have the shapes and types of all others.
+    """
 
     def __init__(self, groups: Mapping[str, ObservationGroupCfg], driver: EnvDriver) -> None:
         self._driver = driver
         self._view = view = driver.view
         self.terms = {name: cfg.term for group in groups.values() for name, cfg in group.terms.items()}
-        for name, reading in self.read().items():
+        # What each term writes whenever it is read; most write nothing.
+        self._kept: dict[str, dict[str, Kept]] = {name: {} for name in self.terms}
+        readings = self.read()
+        self.examples = {name: reading.to("meta") for name, reading in readings.items()}
+        for name, reading in readings.items():
             if getattr(self.terms[name], "is_image", False):
                 fits = reading.ndim in (3, 4) and reading.dtype in IMAGE_DTYPES
                 expected = f"[{view.num_envs}, H, W] or [{view.num_envs}, H, W, C], float32, int32 or uint8"
@@ -31,27 +40,44 @@ class ObservationManager:
                     f"observation term {name!r} returns {reading.dtype} {tuple(reading.shape)}: expected {expected}"
                 )
 
-    def read(self) -> dict[str, Shaped[Tensor, " E *?leaf"]]:
-        """Return the readings of the current state by term, none of them aliasing the state.
+    def read(self, reset_E: Bool[Tensor, " E"] | None = None) -> dict[str, Shaped[Tensor, " E *?leaf"]]:
+        """Return the readings of the current state by term, in memory of their own: nobody else reads or writes it.
 
-        They are float32 [E, L], side by side in one tensor, and images [E, H, W] or [E, H, W, C].
+        They are float32 [E, L], side by side in one tensor, and images [E, H, W] or [E, H, W, C]. What terms keep in
+        their buffers advances in all rows, once per env step, or after a reset in the rows of `reset_E` only; the
+        readings of its other rows then mean nothing.
         """
-        readings, vectors = {}, []
-        for name, term in self.terms.items():
-            with self._driver.scope(f"observations/{name}"):
-                readings[name] = term(self._view)
-            if readings[name].ndim == 2 and readings[name].dtype == torch.float32:
+        readings: dict[str, Tensor] = {}
+        vectors: list[str] = []
+        for name in self.terms:
+            reading = self._read_one(name, reset_E)
+            readings[name] = reading
+            if reading.ndim == 2 and reading.dtype == torch.float32:
                 vectors.append(name)
-            else:
-                readings[name] = self._driver.detached(readings[name])
+        for name, reading in readings.items():
+            # A term may return a window onto the state, or a quantity that others read too.
+            if name not in vectors or len(vectors) == 1:
+                readings[name] = reading.clone()
+        watch = self._driver.non_finite.watch
         if len(vectors) < 2:
             for name, value in readings.items():
                 if value.is_floating_point() and value.ndim > 1:
                     flat_EL = value.flatten(1)
-                    self._driver.non_finite.watch("observation", flat_EL, (name,), flat_EL.shape[1:])
-            return {name: self._driver.detached(value) for name, value in readings.items()}
+                    watch("observation", flat_EL, (name,), flat_EL.shape[1:])
+            return readings
         # One copy for all of them, which also takes them off the state.
         together_EL = torch.cat([readings[name] for name in vectors], dim=1)
         widths = [readings[name].shape[1] for name in vectors]
-        self._driver.non_finite.watch("observation", together_EL, vectors, widths)
+        watch("observation", together_EL, vectors, widths)
         return readings | dict(zip(vectors, together_EL.split(widths, dim=1), strict=True))
+
+    def _read_one(self, name: str, reset_E: Tensor | None) -> Tensor:
+        kept = self._kept[name]
+        rows = nullcontext()
+        if reset_E is not None and kept:
+            rows = only_in_rows(reset_E, list(kept.values()), is_step=False)
+        with rows:
+            with self._driver.scope(f"observations/{name}", part=self.terms[name]) as written:
+                reading = self.terms[name](self._view)
+            kept.update(written)
+        return reading

@@ -10,6 +10,7 @@ from torch import Tensor
 from ksim_rl.checks import near
 from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.term import CurriculumTerm, MetricTerm, RewardTerm, TerminationTerm
+from ksim_rl.scene.state.buffers import ENV
 
 
 class _OutcomeManager:
@@ -28,7 +29,7 @@ class _OutcomeManager:
         """Return what each term says of the current state, [E] each, in any dtype unless one is asked for."""
         values, shape = [], (self._view.num_envs,)
         for name, term in self._terms.items():
-            with self._driver.scope(f"{self.kind}s/{name}"):
+            with self._driver.scope(f"{self.kind}s/{name}", part=term):
                 value_E = term(self._view)
             if value_E.shape != shape or dtype not in (None, value_E.dtype):
                 raise ValueError(
@@ -37,6 +38,10 @@ class _OutcomeManager:
                 )
             values.append(value_E)
         return values
+
+    def rehearse(self) -> None:
+        """Run each term once more; the caller puts back what changes."""
+        self._values()
 
 
 class RewardManager(_OutcomeManager):
@@ -60,7 +65,7 @@ class RewardManager(_OutcomeManager):
         super().__init__(computed, driver)
         self._scale = scale
         self.weights_R = torch.tensor([term.weight for term in computed.values()], device=driver.view.device)
-        self.episode_sums_ER = driver.view.buffers.get("rewards.episode_sums_ER", len(self.names))
+        self.episode_sums_ER = driver.view.buffers.get("rewards.episode_sums_ER", len(self.names), owner=ENV)
         driver.readings.reward_weights.update(zip(self.names, self.weights_R.unbind(), strict=True))
         driver.readings.episode_rewards.update(zip(self.names, self.episode_sums_ER.unbind(-1), strict=True))
         self.step(self._everybody_E())
@@ -121,7 +126,7 @@ class MetricManager(_OutcomeManager):
 
     def __init__(self, terms: Mapping[str, MetricTerm], driver: EnvDriver) -> None:
         super().__init__(terms, driver)
-        self._held_EM = driver.view.buffers.get("metrics.held_EM", len(self.names))
+        self._held_EM = driver.view.buffers.get("metrics.held_EM", len(self.names), owner=ENV)
         reductions = [term.reduce for term in terms.values()]
         self._occurring = frozenset(reductions)
         self._is_mean_M, self._is_last_M, self._is_max_M = (
@@ -174,13 +179,20 @@ class CurriculumManager(_OutcomeManager):
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Adapt to the episodes that just ended in the rows of `mask_E`."""
         for index, (name, term) in enumerate(self._terms.items()):
-            with self._driver.scope(f"curriculum/{name}", self._view.reset_count_E):
+            scope, counter = f"curriculum/{name}", self._view.reset_count_E
+            with self._driver.scope(scope, counter, part=term, mask_E=mask_E):
                 level = term(self._view, mask_E)
             if level.shape != ():
                 raise ValueError(
                     f"curriculum term {name!r} returns shape {tuple(level.shape)}: expected (), one level for all envs"
                 )
             self.levels_C[index].copy_(level)
+
+    def rehearse(self) -> None:
+        """Adapt to no episode, which changes nothing."""
+        levels_C = self.levels_C.clone()
+        self.reset(~self._everybody_E())
+        self.levels_C.copy_(levels_C)
 
 
 class EpisodeLog:

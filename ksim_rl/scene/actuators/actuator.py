@@ -25,7 +25,7 @@ class Drive:
 
     def __init__(self, name: str, simulation: Simulation, view: WorldView, joint_ids: Sequence[int]) -> None:
         self.num_envs, self.num_joints, self.device = view.num_envs, len(joint_ids), view.device
-        self._name, self._simulation, self._view = name, simulation, view
+        self.name, self._simulation, self._view = name, simulation, view
         self._joints = view.joints().some(joint_ids)
         self._motors = as_index([view.targets.motor(i) for i in joint_ids], view.device)
         self._at_reset: list[Callable[[Bool[Tensor, " E"]], None]] = []
@@ -38,7 +38,8 @@ class Drive:
         self, name: str, *shape: int, dtype: torch.dtype = torch.float32, keep: bool = False
     ) -> Shaped[Tensor, " E *shape"]:
         """Return a buffer of the law; rows that reset are zeroed unless `keep`."""
-        return self._view.buffers.get(f"{self._name}.{name}", *shape, dtype=dtype, keep=keep)
+        full_name = f"{self.name}.{name}"
+        return self._view.buffers.get(full_name, *shape, dtype=dtype, keep=keep, owner=self.name)
 
     def on_reset(self, draw: Callable[[Bool[Tensor, " E"]], None]) -> None:
         """Call `draw` with the mask of the rows that reset; it may draw by `integers`."""
@@ -51,7 +52,7 @@ class Drive:
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Draw anew for the rows of `mask_E`."""
         if self._at_reset:
-            with self._simulation.scope(self._name, self._view.reset_count_E, draws="reset"):
+            with self._simulation.scope(self.name, self._view.reset_count_E, draws="reset"):
                 for draw in self._at_reset:
                     draw(mask_E)
 

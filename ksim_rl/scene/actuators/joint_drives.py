@@ -76,19 +76,23 @@ class JointDrives:
                 view.targets.leave_to_law(joints, actuator.takes)
                 for name, value in actuator.params.items():
                     view.actuator_params.add(name, joints, value)
-        self._drives: list[tuple[Drive, Law]] = []
+        self._simulation = simulation
+        self._drives: list[tuple[Drive, Actuator, Law]] = []
         for number, (actuator, joints) in enumerate(groups.values()):
             drive = Drive(f"actuators/{number}", simulation, view, sorted(joints))
-            self._drives.append((drive, actuator.law(drive)))
+            self._drives.append((drive, actuator, actuator.law(drive)))
         if self._drives:
-            self._apply()
-            simulation.before_substep.append(self._apply)
+            self.apply()
+            simulation.before_substep.append(self.apply)
 
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Draw the lags of the rows of `mask_E`."""
-        for drive, _ in self._drives:
+        for drive, _, _ in self._drives:
             drive.reset(mask_E)
 
-    def _apply(self) -> None:
-        for drive, law in self._drives:
-            drive.write(law(drive.state(), drive.target()))
+    def apply(self) -> None:
+        """Write the controls of the present state and targets, as before each substep."""
+        for drive, actuator, law in self._drives:
+            with self._simulation.scope(drive.name, part=actuator):
+                control_EN = law(drive.state(), drive.target())
+            drive.write(control_EN)

@@ -1,7 +1,9 @@
 """This module holds what terms keep from step to step: buffers with a row per env, and values that all envs share."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Shaped
@@ -12,6 +14,31 @@ from ksim_rl.device import recording
 
 # Numbers per env that an arena has room for; a wider buffer has one of its own.
 ARENA_WIDTH = 128
+ENV = "env"
+"""The owner of what managers keep, and no term writes."""
+
+
+class Kept(NamedTuple):
+    """A tensor that a part of an env writes each time it runs; without rows, all envs share it."""
+
+    tensor: Tensor
+    has_rows: bool
+
+
+@contextmanager
+def only_in_rows(mask_E: Bool[Tensor, " E"], kept: Sequence[Kept], *, is_step: bool) -> Iterator[None]:
+    """Let the code inside change what is kept in the rows of `mask_E` only.
+
+    What all envs share changes in steps only (`is_step`): a reset is no step of the envs that go on.
+    """
+    before = [one.tensor.clone() for one in kept]
+    yield
+    for (tensor, has_rows), old in zip(kept, before, strict=True):
+        if has_rows:
+            rows = mask_E.view(-1, *[1] * (tensor.ndim - 1))
+            tensor.copy_(torch.where(rows, tensor, old))
+        elif not is_step:
+            tensor.copy_(old)
 
 
 class Arena:
@@ -61,6 +88,7 @@ class Buffers:
         self._buffers: dict[str, Tensor] = {}
         self._initial: dict[str, Tensor] = {}
         self._kept: set[str] = set()
+        self._owners: dict[str, str] = {}
         self._arenas: list[Arena] = []
         self.is_frozen = False
 
@@ -71,11 +99,14 @@ class Buffers:
         dtype: torch.dtype = torch.float32,
         keep: bool = False,
         initial: Shaped[Tensor, "*initial"] | None = None,
+        owner: str = "",
     ) -> Shaped[Tensor, " E *shape"]:
         """Return the buffer `name`; the first call makes it, later ones must agree in shape and dtype.
 
         `keep` leaves it alone when rows reset; `initial` (read each time, so it may change) is what it holds at first
-        and after a reset, else zeros. A ValueError where it differs from what exists, or is new after construction.
+        and after a reset, else zeros. `owner` is the scope of the one part that writes it, `ENV` for a manager, and
+        empty for what events and actions write for all to read. A ValueError where it differs from what exists, or is
+        new after construction.
         """
         buffer = self._buffers.get(name)
         if buffer is None:
@@ -88,6 +119,7 @@ class Buffers:
             else:
                 buffer = self._arena(math.prod(shape), dtype).take(shape)
             self._buffers[name] = buffer
+            self._owners[name] = owner
             if keep:
                 self._kept.add(name)
             if initial is not None:
@@ -121,6 +153,10 @@ class Buffers:
         """Return the buffers by name."""
         return dict(self._buffers)
 
+    def owner(self, name: str) -> str:
+        """Return the owner of a buffer, as it was given when the buffer was made."""
+        return self._owners[name]
+
     def _arena(self, width: int, dtype: torch.dtype) -> Arena:
         """Return an arena with room for so many numbers per env."""
         if not any(arena.has_room(width, dtype) for arena in self._arenas):
@@ -134,12 +170,20 @@ class SharedValues:
     def __init__(self, device: torch.device) -> None:
         self._device = device
         self._tensors: dict[str, Tensor] = {}
+        self._owners: dict[str, str] = {}
         self._frozen = False
 
     def get(
-        self, name: str, initial: float | Sequence[float] | Sequence[Sequence[float]]
+        self,
+        name: str,
+        initial: float | Sequence[float] | Sequence[Sequence[float]],
+        *,
+        owner: str = "",
     ) -> Float[Tensor, "*shape"]:
-        """Return the tensor `name`, always the same, which starts at `initial`; a ValueError if it is new too late."""
+        """Return the tensor `name`, always the same, which starts at `initial`; a ValueError if it is new too late.
+
+        `owner` is the scope of the one part that writes it; empty for what curricula write.
+        """
         tensor = self._tensors.get(name)
         if tensor is None:
             if self._frozen:
@@ -147,6 +191,7 @@ class SharedValues:
             with torch.inference_mode(False):
                 tensor = torch.tensor(initial, dtype=torch.float32, device=self._device)
             self._tensors[name] = tensor
+            self._owners[name] = owner
         return tensor
 
     def freeze(self) -> None:
@@ -156,6 +201,10 @@ class SharedValues:
     def by_name(self) -> dict[str, Float[Tensor, "*?shape"]]:
         """Return the tensors by name."""
         return dict(self._tensors)
+
+    def owner(self, name: str) -> str:
+        """Return the owner of a tensor, as it was given when the tensor was made."""
+        return self._owners[name]
 
 
 class ActuatorParams:

@@ -17,12 +17,23 @@ def quantity(compute: Callable[[Any], Shaped[Tensor, "*shape"]]) -> property:
             value = owner.cache[name] = compute(owner)
         return value
 
+    read.__name__ = name
     return property(read, doc=compute.__doc__)
 
 
-def quantity_of(part: str, whole: property) -> property:
+class QuantityOf(property):
+    """A property that is a quantity of the object in the attribute `part`, in whose cache it stands as `cached_as`."""
+
+    part: str
+    cached_as: str
+
+
+def quantity_of(part: str, whole: property) -> QuantityOf:
     """Make a property that is the quantity `whole` of the object in the attribute `part`."""
-    return property(lambda owner: whole.__get__(getattr(owner, part)), doc=whole.__doc__)
+    made = QuantityOf(lambda owner: whole.__get__(getattr(owner, part)), doc=whole.__doc__)
+    made.part = part
+    made.cached_as = getattr(whole.fget, "__name__", "")
+    return made
 
 
 def first_of(part: str, whole: property) -> property:

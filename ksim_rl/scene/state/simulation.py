@@ -1,18 +1,21 @@
 """This module drives the worlds of an env: it knows when the state changes, whose turn it is, and what is kept."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int64, Shaped
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from ksim_rl.device import random
 from ksim_rl.physics import World
 from ksim_rl.scene.names import Index
-from ksim_rl.scene.state.buffers import Buffers, SharedValues
+from ksim_rl.scene.state.buffers import ENV, Buffers, Kept, SharedValues
 from ksim_rl.scene.state.ground import Ground
+
+UNWATCHED: AbstractContextManager[Mapping[str, Kept]] = nullcontext({})
+"""The watch of what nobody watches."""
 
 
 class Simulation:
@@ -24,6 +27,7 @@ class Simulation:
     Attributes:
         ground: what heights are measured from.
         reader: who reads at the moment, for the error about stale quantities.
+        is_writing: whether `write` is at work, which is the only way to write positions and velocities.
         is_frozen: whether construction has ended.
         physics_dt, step_dt: s, of a substep and of an env step.
         max_episode_length: env steps; 0 for no limit.
@@ -46,7 +50,7 @@ class Simulation:
         self.step_count = torch.zeros_like(self.seed)
         self.reset_count_E = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self.episode_step_E = torch.zeros_like(self.reset_count_E)
-        self.time_out_offset_E = self.buffers.get("time_out_offset_E", dtype=torch.int64)
+        self.time_out_offset_E = self.buffers.get("time_out_offset_E", dtype=torch.int64, owner=ENV)
         self.before_substep: list[Callable[[], None]] = []
         self.after_substep: list[Callable[[], None]] = []
         self.substep_sensors: Literal["last", "contacts", "every"] = "last"
@@ -56,7 +60,7 @@ class Simulation:
         self._body_root = torch.tensor(world.mj_model.body_rootid, device=self.device, dtype=torch.int64)
         self._counter = self.startup_counter
         self._scope, self._draw_scope, self._draws = "", "", 0
-        self._lasting: set[int] = set()
+        self.is_writing = False
 
     def new_cache(self) -> dict[str, Any]:
         """Return a dict for quantities, tensors or tuples of them, that is emptied whenever the state changes."""
@@ -95,7 +99,11 @@ class Simulation:
         value_EN: Float[Tensor, "E N"],
     ) -> None:
         """Copy the rows of `mask_E` into some columns of the state."""
-        state_EL[:, columns] = torch.where(mask_E[:, None], value_EN, state_EL[:, columns])
+        self.is_writing = True
+        try:
+            state_EL[:, columns] = torch.where(mask_E[:, None], value_EN, state_EL[:, columns])
+        finally:
+            self.is_writing = False
         self.changed()
 
     def point_velocity(self, point_EN3: Float[Tensor, "E N 3"], body: Index) -> Float[Tensor, "E N 3"]:
@@ -108,23 +116,44 @@ class Simulation:
 
     @contextmanager
     def scope(
-        self, name: str, counter: Int64[Tensor, "*envs"] | None = None, *, draws: str = ""
-    ) -> Iterator[None]:
+        self,
+        name: str,
+        counter: Int64[Tensor, "*envs"] | None = None,
+        *,
+        draws: str = "",
+        part: object = None,
+        mask_E: Bool[Tensor, " E"] | None = None,
+    ) -> Iterator[Mapping[str, Kept]]:
         """Run a term under a name, which separates its buffers and draws from others' and stands before its errors.
 
         `counter` keys the draws (the step count unless given), and `draws` tells apart the moments of one term whose
-        counters may coincide.
+        counters may coincide. `part` is what runs, if what it writes is to be watched, and `mask_E` the rows that it
+        may write. Gives what the part has written of its own, by name, where it was watched (see `watch`).
         """
         self._scope, self._draw_scope, self._draws = name, f"{name}@{draws}", 0
         self.reader = name
         self._counter = self.step_count if counter is None else counter
         try:
-            yield
+            with self.watch(part, mask_E) as written:
+                yield written
         except ValueError as error:
             # A term does not know its own place in the config.
             raise ValueError(f"{name.replace('/', '.')}: {error}") from error
         finally:
             self._scope = self.reader = ""
+
+    def watch(
+        self, part: object, mask_E: Bool[Tensor, " E"] | None
+    ) -> AbstractContextManager[Mapping[str, Kept]]:
+        """Watch what a part writes while it runs under `reader`; whoever drives terms may refuse some of it.
+
+        Here nothing is watched.
+        """
+        return UNWATCHED
+
+    def caches(self) -> list[dict[str, Any]]:
+        """Return the caches of computed quantities."""
+        return list(self._caches)
 
     def scoped(self, name: str) -> str:
         """Return the full name of a buffer of the term that runs."""
@@ -137,15 +166,7 @@ class Simulation:
         return random.row_keys(self.seed, stream, self._counter, self.num_envs)
 
     def freeze(self) -> None:
-        """End construction: no new buffers, and all that lives on is known to `detached`."""
+        """End construction: no new buffers."""
         self.is_frozen = self.world.is_frozen = True
         self.buffers.freeze()
         self.shared_values.freeze()
-        groups = (self.buffers.by_name(), self.world.views(), self.shared_values.by_name())
-        lasting = [tensor for group in groups for tensor in group.values()]
-        lasting += [self.episode_step_E, *self.world.per_world_fields().values()]
-        self._lasting = {tensor.untyped_storage().data_ptr() for tensor in lasting}
-
-    def detached(self, value: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*shape"]:
-        """Return `value`, copied if it shares memory with something that later steps overwrite."""
-        return value.clone() if value.untyped_storage().data_ptr() in self._lasting else value

@@ -183,6 +183,18 @@ class WorldView:
             raise ValueError(f"no sensor {name!r}: {near(name, self._sensor_slices)}")
         return self._simulation.derived().sensordata_EL[:, self._sensor_slices[name]]
 
+    def parts(self) -> dict[str, object]:
+        """Return what holds the quantities and tables of the view, by how a term spells it."""
+        parts: dict[str, object] = {"view": self, "view.joints()": self._every_joint, "view.terrain": self.terrain}
+        for name, entity in self.entities.items():
+            parts[f"view.entity({name!r})"] = entity
+        for (kind, patterns), elements in self._named.items():
+            plural = "bodies" if kind == "body" else f"{kind}s"
+            parts[f"view.{plural}({list(patterns)})"] = elements
+        for file, motion in self._motions.items():
+            parts[f"view.motion({file!r})"] = motion
+        return parts
+
     def derived(self) -> World:
         """Return the world for reading what derives from the state: `Simulation.derived`."""
         return self._simulation.derived()
@@ -213,14 +225,19 @@ class WorldView:
     def buffer(
         self, name: str, *shape: int, dtype: torch.dtype = torch.float32, keep: bool = False
     ) -> Shaped[Tensor, " E *shape"]:
-        """Return a buffer that belongs to the calling term; rows that reset are zeroed unless `keep`."""
-        return self.buffers.get(self._simulation.scoped(name), *shape, dtype=dtype, keep=keep)
+        """Return a buffer that belongs to the calling term; rows that reset are zeroed unless `keep`.
+
+        What a term writes into it in each call advances once per env step.
+        """
+        full_name, owner = self._simulation.scoped(name), self._simulation.reader
+        return self.buffers.get(full_name, *shape, dtype=dtype, keep=keep, owner=owner)
 
     def shared(
         self, name: str, initial: float | Sequence[float] | Sequence[Sequence[float]]
     ) -> Float[Tensor, "*shape"]:
         """Return a float32 tensor of the calling term that all envs share; it starts at `initial` and is saved."""
-        return self._simulation.shared_values.get(self._simulation.scoped(name), initial)
+        full_name, owner = self._simulation.scoped(name), self._simulation.reader
+        return self._simulation.shared_values.get(full_name, initial, owner=owner)
 
     def uniform(
         self, n: int, low: float | Float[Tensor, "*low"] = 0.0, high: float | Float[Tensor, "*high"] = 1.0

@@ -1,0 +1,234 @@
+"""The memory that terms reach through their view, piece by piece: what it is called, and who may write it."""
+
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+from jaxtyping import Shaped
+from torch import Tensor
+from torch.utils._pytree import tree_leaves
+
+from ksim_rl.device.constants import constants
+from ksim_rl.device.extents import extent
+from ksim_rl.envs.view import EnvView, Readings
+from ksim_rl.physics import views
+from ksim_rl.scene.state.buffers import ENV
+from ksim_rl.scene.state.quantity import QuantityOf
+from ksim_rl.scene.state.simulation import Simulation
+
+STATE, MOCAP, INPUT, COMPUTED = "state", "mocap", "input", "computed"
+"""Of the worlds: positions and velocities, poses of mocap bodies, what else the physics reads, and what it computes."""
+FIELD, MODEL = "field", "model"
+"""Model fields that differ between worlds, and what all worlds share of the model."""
+PARAMETER, DIFFICULTY = "parameter", "difficulty"
+"""Tables and targets that events and actions write for all to read, and what curricula write."""
+TABLE, QUANTITY = "table", "quantity"
+"""What nobody writes once it is made, and quantities that were computed once for all who read them."""
+
+_KIND_OF_ARRAY = {"qpos": STATE, "qvel": STATE, "mocap_pos": MOCAP, "mocap_quat": MOCAP}
+_KIND_OF_ARRAY |= dict.fromkeys((*views.SUBSTEP_INPUTS, "eq_active", "userdata"), INPUT) | _KIND_OF_ARRAY
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Piece:
+    """A piece of memory: its name as a term spells it, its owner, and where it lies (first byte, and the one behind).
+
+    The owner is the scope of a term ("rewards/upright"), or one of the kinds above. `tensor` is None where a piece is
+    known by its place alone; one that `has_rows` has a row per env.
+    """
+
+    name: str
+    owner: str
+    start: int
+    end: int
+    tensor: Tensor | None = None
+    has_rows: bool = False
+
+
+def _piece(name: str, owner: str, tensor: Shaped[Tensor, "*shape"], *, has_rows: bool = False) -> Piece:
+    start, end = extent(tensor)
+    return Piece(name=name, owner=owner, start=start, end=end, tensor=tensor, has_rows=has_rows)
+
+
+class TermMemory:
+    """Finds whose memory a tensor lies in.
+
+    What lasts is listed anew only when there is more of it, as while an env is constructed; quantities, which come and
+    go with each state, are looked up when they are asked for.
+    """
+
+    def __init__(self, simulation: Simulation, readings: Readings, view: EnvView) -> None:
+        self._simulation, self._readings, self._view = simulation, readings, view
+        self._pieces: list[Piece] = []
+        self._starts: list[int] = []
+        self._listed_at: tuple[int, ...] = ()
+        self._aliases = _aliases(view)
+
+    def lasting(self) -> list[Piece]:
+        """Return all that lasts, by address; no two pieces overlap, but for columns of one table."""
+        counts = self._counts()
+        if counts != self._listed_at:
+            self._pieces = self._listed()
+            self._starts = [piece.start for piece in self._pieces]
+            self._listed_at = counts
+        return self._pieces
+
+    def quantities(self) -> list[Piece]:
+        """Return the quantities that are computed now and are no windows onto something that lasts."""
+        return [piece for piece in self._quantities() if self._lasting_at(piece.start, piece.end) is None]
+
+    def holder(self, tensor: Shaped[Tensor, "*shape"]) -> Piece | None:
+        """Return the piece that a tensor lies in; None for memory that the view does not give."""
+        if not tensor.numel():
+            return None
+        start, end = extent(tensor)
+        lasting = self._lasting_at(start, end)
+        if lasting is not None:
+            return lasting
+        for quantity in self._quantities():
+            if quantity.start < end and start < quantity.end:
+                return quantity
+        return None
+
+    def spelled(self, tensor: Shaped[Tensor, "*shape"], piece: Piece) -> str:
+        """Return how a term spells what it has written: a quantity, even where that is a window onto the piece."""
+        quantities = list(self._quantities())
+        for quantity in quantities:
+            if quantity.tensor is tensor:
+                return quantity.name
+        place = extent(tensor)
+        for quantity in quantities:
+            if (quantity.start, quantity.end) == place:
+                return quantity.name
+        return piece.name
+
+    def _lasting_at(self, start: int, end: int) -> Piece | None:
+        pieces = self.lasting()
+        place = bisect_left(self._starts, end) - 1
+        if place >= 0 and pieces[place].end > start:
+            return pieces[place]
+        return None
+
+    def _counts(self) -> tuple[int, ...]:
+        """Return how much there is of each kind that still grows while an env is constructed."""
+        simulation, readings, view = self._simulation, self._readings, self._view
+        tables = (simulation.buffers.by_name(), simulation.shared_values.by_name(), readings.reward_weights)
+        return (*map(len, tables), len(readings.terminations), len(view.parts()), len(constants()))
+
+    def _listed(self) -> list[Piece]:
+        found = [
+            *self._of_env(),
+            *self._of_buffers(),
+            *self._of_worlds(),
+            *self._of_tables(),
+        ]
+        # What is listed first keeps its name: of a per-world field, that of the view, not that of Warp's model.
+        by_start: dict[int, Piece] = {}
+        for piece in found:
+            by_start.setdefault(piece.start, piece)
+        return [by_start[start] for start in sorted(by_start)]
+
+    def _of_env(self) -> Iterator[Piece]:
+        """List what managers write, and what curricula write."""
+        readings = self._readings
+        for name, weight in readings.reward_weights.items():
+            yield _piece(f"view.reward_weights[{name!r}]", DIFFICULTY, weight)
+        for name, flag_E in readings.terminations.items():
+            yield _piece(f"view.terminations[{name!r}]", ENV, flag_E)
+
+    def _of_buffers(self) -> Iterator[Piece]:
+        spelled = {id(tensor): f"view.{name}" for name, tensor in _tensors_of(self._view)}
+        spelled |= {id(tensor): f"view.{name}" for name, tensor in _tensors_of(self._readings)}
+        for name, value_EK in self._readings.commands.items():
+            spelled[id(value_EK)] = f"view.command({name!r})"
+        buffers, shared = self._simulation.buffers, self._simulation.shared_values
+        for name, buffer in buffers.by_name().items():
+            if buffer.numel():
+                called = spelled.get(id(buffer), f"the buffer {name!r}")
+                yield _piece(called, buffers.owner(name) or PARAMETER, buffer, has_rows=True)
+        for name, value in shared.by_name().items():
+            called = spelled.get(id(value), f"the shared value {name!r}")
+            yield _piece(called, shared.owner(name) or DIFFICULTY, value)
+
+    def _of_worlds(self) -> Iterator[Piece]:
+        world = self._simulation.world
+        for name, field in world.per_world_fields().items():
+            if field.numel():
+                yield _piece(f"view.field({name!r})", FIELD, field, has_rows=True)
+        shown = {name: f"view.world.view({name!r})" for name in views.READABLE}
+        for attribute in views.DataViews.__annotations__:
+            shown[attribute.rpartition("_")[0]] = f"view.world.{attribute}"
+        copied = {*views.STATE, *world.views()} & views.READABLE
+        for name, array in views.arrays(world.warp_data_E).items():
+            if not array.size:
+                continue
+            owner = _KIND_OF_ARRAY.get(name, COMPUTED)
+            called = shown.get(name, f"warp_data_E.{name}")
+            if name in copied:
+                tensor = wp.to_torch(array)
+                has_rows = tensor.ndim > 0 and tensor.shape[0] == world.num_envs
+                yield _piece(called, owner, tensor, has_rows=has_rows)
+            else:
+                yield Piece(name=called, owner=owner, start=array.ptr, end=array.ptr + array.capacity)
+        for name, array in views.arrays(world.warp_model).items():
+            if array.size and array.ptr:
+                called = f"warp_model.{name}"
+                yield Piece(name=called, owner=MODEL, start=array.ptr, end=array.ptr + array.capacity)
+
+    def _of_tables(self) -> Iterator[Piece]:
+        """List the tensors of the view's parts that nothing above has named: clocks, limits, poses, indices."""
+        for spelled, part in self._view.parts().items():
+            for name, tensor in _tensors_of(part):
+                yield _piece(f"{spelled}.{name}", TABLE, tensor)
+        for tensor in constants():
+            if tensor.numel():
+                yield _piece("a constant that all terms share", TABLE, tensor)
+
+    def _quantities(self) -> Iterator[Piece]:
+        owners = {id(vars(part).get("cache")): spelled for spelled, part in self._view.parts().items()}
+        for cache in self._simulation.caches():
+            for key, value in cache.items():
+                # Of elements that a robot reads for itself, as of its root body, no term knows how to spell them.
+                spelled = owners.get(id(cache), "a computed")
+                called = self._aliases.get((id(cache), key))
+                if called is None:
+                    called = f"{spelled}.cache[{key!r}]" if spelled == "view" else f"{spelled}.{key}"
+                for name, tensor in _leaves(called, value):
+                    if tensor.numel():
+                        yield _piece(name, QUANTITY, tensor)
+
+
+def _aliases(view: EnvView) -> dict[tuple[int, str], str]:
+    """Return the view's own names of quantities that are its parts', by cache and key."""
+    aliases: dict[tuple[int, str], str] = {}
+    for base in type(view).__mro__:
+        for name, attribute in vars(base).items():
+            if isinstance(attribute, QuantityOf):
+                cache = getattr(view, attribute.part).cache
+                aliases[id(cache), attribute.cached_as] = f"view.{name}"
+    return aliases
+
+
+def _tensors_of(part: object) -> Iterator[tuple[str, Tensor]]:
+    """Return the tensors that are attributes of an object, tables of tensors included, by what terms call them."""
+    for name, value in vars(part).items():
+        if name == "cache":
+            continue
+        # `_origins_E3` is read as `origins_E3`.
+        yield from _leaves(name.lstrip("_"), value)
+
+
+def _leaves(name: str, value: Any) -> Iterator[tuple[str, Tensor]]:
+    """Return the tensors of a value: itself, or the fields of a named tuple, or what a tuple or list holds."""
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        for field in value._fields:
+            yield from _leaves(f"{name}.{field}", getattr(value, field))
+    elif isinstance(value, Tensor):
+        if value.numel():
+            yield name, value
+    elif isinstance(value, (tuple, list)):
+        for leaf in tree_leaves(value):
+            if isinstance(leaf, Tensor) and leaf.numel():
+                yield name, leaf
