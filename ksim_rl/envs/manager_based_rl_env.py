@@ -3,7 +3,8 @@
 import dataclasses
 import math
 import secrets
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from contextlib import AbstractContextManager
 from typing import Any, ClassVar
 
 import mujoco
@@ -35,6 +36,7 @@ from ksim_rl.envs.managers.outcomes import (
     TerminationManager,
 )
 from ksim_rl.envs.masked_reset import MaskedReset
+from ksim_rl.envs.rehearsal import rehearse
 from ksim_rl.envs.reset_to_default import ResetToDefault
 from ksim_rl.envs.specs import make_specs
 from ksim_rl.physics import World, load_model, prepare_spec
@@ -114,7 +116,17 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             readings, size, bounds_L2, batch_size=self.batch_size, device=self.device
         )
         self.seed(-1 if cfg.seed is None else cfg.seed)
-        self._rehearse()
+        rehearse(
+            self.driver,
+            laws=self.joint_drives,
+            writing=(self.event_manager, self.curriculum_manager, self.command_manager, self.action_manager),
+            reading=(
+                self.observation_manager,
+                self.reward_manager,
+                self.termination_manager,
+                self.metric_manager,
+            ),
+        )
 
     # -- what it is made of --------------------------------------------------------------------------------------
 
@@ -147,26 +159,6 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self.metric_manager = MetricManager(cfg.metrics, driver)
         self.curriculum_manager = CurriculumManager(cfg.curriculum, driver)
         self._log = EpisodeLog(driver, self.reward_manager, self.termination_manager, self.metric_manager)
-
-    def _rehearse(self) -> None:
-        """Refuse terms that write what is not theirs, by a ValueError: run each, and put back all that has changed."""
-        driver = self.driver
-        writing = (self.event_manager, self.curriculum_manager, self.command_manager, self.action_manager)
-        reading = (self.reward_manager, self.termination_manager, self.metric_manager)
-        with driver.guard.rehearsal():
-            for manager in writing:
-                manager.rehearse()
-            self.joint_drives.apply()
-            self.world.refresh()
-            driver.refreshed()
-            driver.update_sensors()
-            # Twice: what a term changes in a quantity that it is the first to read shows the second time.
-            for _ in range(2):
-                self.observation_manager.read()
-                for manager in reading:
-                    manager.rehearse()
-        # Numbers of the rehearsal are of no state that anybody sees.
-        driver.non_finite.start()
 
     @property
     def unwrapped(self) -> "ManagerBasedRlEnv":
@@ -203,6 +195,13 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
     def episode_step_E(self) -> Int64[Tensor, " E"]:
         """Env steps since each episode's start, int64 [E]."""
         return self.view.episode_step_E
+
+    def watching_terms(self) -> AbstractContextManager[None]:
+        """Return a context in which each term that writes what is not its own is refused by a ValueError, by name.
+
+        While an env is built and while its step is compiled or captured, that is so anyway. It takes much time.
+        """
+        return self.driver.guard.watching()
 
     # -- step and reset ------------------------------------------------------------------------------------------
 
@@ -399,12 +398,24 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         """Return the commands, rewards and sensors that draw themselves and that `viewer.draw` names, by name."""
         return drawings(self.cfg, self.view.sensors, self.reward_manager.names)
 
-    def update_visualizers(self, visualizer: DebugVisualizer, env_index: int | None = None) -> None:
-        """Let each part of `setup_manager_visualizers` draw one env: the one that the viewer shows, unless given."""
+    def update_visualizers(
+        self,
+        visualizer: DebugVisualizer,
+        env_index: int | None = None,
+        *,
+        drawn: Collection[str] | None = None,
+    ) -> None:
+        """Let each part of `setup_manager_visualizers`, or those of the names `drawn`, draw one env.
+
+        It is the one that the viewer shows, unless `env_index` says otherwise.
+        """
         shown = self.cfg.viewer.env_index if env_index is None else env_index
-        for scope, part in self.setup_manager_visualizers().items():
-            with self.driver.scope(scope):
-                part.draw_debug(self.view, visualizer, shown)
+        # Whoever draws must not move what it draws.
+        with self.driver.guard.watching(past_torch=False):
+            for scope, part in self.setup_manager_visualizers().items():
+                if drawn is None or scope in drawn:
+                    with self.driver.scope(scope, part=part):
+                        part.draw_debug(self.view, visualizer, shown)
 
     def render(self) -> np.ndarray | None:
         """Return a picture of the current state, None without a render mode; a RuntimeError tells how to get OpenGL."""

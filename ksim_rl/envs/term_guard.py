@@ -121,20 +121,21 @@ class TermGuard:
     """
 
     def __init__(self, simulation: Simulation, readings: Readings, view: EnvView) -> None:
-        self._simulation = simulation
+        self._simulation, self._view = simulation, view
         self._memory = TermMemory(simulation, readings, view)
         self._on_cuda = torch.device(simulation.device).type == "cuda"
         self._seen: set[tuple[str, int]] = set()
-        self._is_on = self._rehearses = False
+        self._is_on = self._compares = self._rehearses = False
 
     @contextmanager
-    def watching(self) -> Iterator[None]:
-        """Watch each call in this block, past torch too; it makes the host wait for the device."""
-        was_on, self._is_on = self._is_on, True
+    def watching(self, *, past_torch: bool = True) -> Iterator[None]:
+        """Watch each call in this block, `past_torch` too, which makes the host wait for the device."""
+        before = self._is_on, self._compares
+        self._is_on, self._compares = True, past_torch
         try:
             yield
         finally:
-            self._is_on = was_on
+            self._is_on, self._compares = before
 
     def watch(
         self, scope: str, part: object, mask_E: Bool[Tensor, " E"] | None
@@ -149,33 +150,48 @@ class TermGuard:
             return UNWATCHED
         self._seen.add(key)
         call = _Call(scope, part, mask_E, {})
-        return self._watched(call, compares=(self._is_on or is_recorded) and not is_captured)
+        return self._watched(call, compares=(self._compares or is_recorded) and not is_captured)
 
     @contextmanager
     def _watched(self, call: _Call, *, compares: bool) -> Iterator[Mapping[str, Kept]]:
         before = self._copied() if compares else []
+        refusals: list[ValueError] = []
 
         def look(operator: str, tensor: Tensor) -> None:
-            self._look(call, operator, tensor)
+            refusal = self._look(call, operator, tensor)
+            if refusal is not None:
+                refusals.append(refusal)
+                raise refusal
 
-        with _Writes(look):
-            yield call.written
+        try:
+            with _Writes(look):
+                yield call.written
+        except Exception as error:
+            # TorchScript makes an error of its own of it, which says nothing.
+            if refusals and error is not refusals[0]:
+                raise refusals[0] from error
+            raise
+        if refusals:
+            # The term itself has caught it.
+            raise refusals[0]
         if compares:
             self._compare(call, before)
 
     # -- by torch ------------------------------------------------------------------------------------------------
 
-    def _look(self, call: _Call, operator: str, tensor: Tensor) -> None:
+    def _look(self, call: _Call, operator: str, tensor: Tensor) -> ValueError | None:
+        """Return what is wrong with a write, if anything is."""
         piece = self._memory.holder(tensor)
         if piece is None:
-            return
+            return None
         is_state = piece.owner == STATE
         if call.may_write(piece) and (self._simulation.is_writing or not is_state):
             self._keep(call, piece)
-            return
+            return None
         name = self._memory.spelled(tensor, piece)
         by_view = is_state and call.may_write(piece)
-        raise ValueError(_refusal(call, f"writes into {name} in place (`{operator}`)", name, piece, by_view=by_view))
+        how = f"writes into {name} in place (`{operator}`)"
+        return ValueError(_refusal(call, how, name, piece, by_view=by_view))
 
     def _keep(self, call: _Call, piece: Piece) -> None:
         """Remember what a term writes that must advance once per env step."""
@@ -235,6 +251,9 @@ class TermGuard:
         for piece, _ in kept:
             if piece.owner in (STATE, MOCAP, INPUT) and piece.tensor.is_floating_point():
                 piece.tensor.add_(_odd_numbers(piece.tensor))
+        # Servos hold their targets, as they do after each reset.
+        everybody_E = torch.ones(simulation.num_envs, dtype=torch.bool, device=simulation.device)
+        self._view.targets.reset(everybody_E)
         simulation.world.refresh()
         simulation.refreshed()
         self._rehearses = True
@@ -269,5 +288,6 @@ def _refusal(call: _Call, how: str, name: str, piece: Piece, *, by_view: bool = 
     if by_view:
         fix = "Write positions and velocities by `view.write_qpos`, `view.joints(...).write_pos` and their like"
     else:
-        fix = f"Write `error = {name} - 0.5` instead of `error = {name}; error -= 0.5`, or change a copy, {name}.clone()"
+        read = name if name.startswith("view.") else "x"
+        fix = f"Write `error = {read} - 0.5` instead of `error = {read}; error -= 0.5`, or change `{read}.clone()`"
     return f"{type(call.part).__name__} {how}{effect}: {call.rule.noun} {call.rule.may}. {fix}"

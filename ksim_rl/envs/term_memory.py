@@ -94,15 +94,16 @@ class TermMemory:
 
     def spelled(self, tensor: Shaped[Tensor, "*shape"], piece: Piece) -> str:
         """Return how a term spells what it has written: a quantity, even where that is a window onto the piece."""
-        quantities = list(self._quantities())
-        for quantity in quantities:
+        start, end = extent(tensor)
+        around: list[Piece] = []
+        for quantity in self._quantities():
             if quantity.tensor is tensor:
                 return quantity.name
-        place = extent(tensor)
-        for quantity in quantities:
-            if (quantity.start, quantity.end) == place:
-                return quantity.name
-        return piece.name
+            if quantity.start <= start and end <= quantity.end:
+                around.append(quantity)
+        # Of several windows the narrowest says most.
+        narrowest = min(around, key=lambda quantity: quantity.end - quantity.start, default=piece)
+        return narrowest.name
 
     def _lasting_at(self, start: int, end: int) -> Piece | None:
         pieces = self.lasting()
@@ -194,10 +195,12 @@ class TermMemory:
                 spelled = owners.get(id(cache), "a computed")
                 called = self._aliases.get((id(cache), key))
                 if called is None:
-                    called = f"{spelled}.cache[{key!r}]" if spelled == "view" else f"{spelled}.{key}"
+                    is_named = spelled != "view" or hasattr(type(self._view), key)
+                    called = f"{spelled}.{key}" if is_named else f"view.cache[{key!r}]"
                 for name, tensor in _leaves(called, value):
-                    if tensor.numel():
-                        yield _piece(name, QUANTITY, tensor)
+                    yield _piece(name, QUANTITY, tensor)
+        for name, sum_E in self._readings.episode_rewards.items():
+            yield _piece(f"view.episode_rewards[{name!r}]", QUANTITY, sum_E)
 
 
 def _aliases(view: EnvView) -> dict[tuple[int, str], str]:

@@ -25,7 +25,8 @@ class PlayMotion(OfMotion, EventTerm):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         start_E = motion_start_time(view, self.file)
-        start_E.copy_(torch.arange(view.num_envs, device=view.device) * view.step_dt)
+        frame_s_E = torch.arange(view.num_envs, device=view.device) * view.step_dt
+        start_E.copy_(torch.where(mask_E, frame_s_E, start_E))
         qpos_EL, qvel_EL = view.motion(self.file).sample(start_E)
         view.write_qpos(mask_E, qpos_EL)
         view.write_qvel(mask_E, qvel_EL)

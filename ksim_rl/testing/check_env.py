@@ -10,6 +10,7 @@ from ksim_rl.checks import unknown_name
 from ksim_rl.testing.check_physics import check_c_engine
 from ksim_rl.testing.check_rows import check_determinism, check_episode_end, check_partial_reset
 from ksim_rl.testing.check_specs import check_actions, check_names, check_torchrl, check_values
+from ksim_rl.testing.check_terms import check_terms
 from ksim_rl.testing.replays import Replays
 from ksim_rl.testing.sync_count import count_syncs
 
@@ -54,6 +55,7 @@ def check_memory(env: EnvBase, num_steps: int) -> None:
 CHECKS: dict[str, Callable[[EnvBase, int], None]] = {
     "names": check_names,
     "values": check_values,
+    "terms": check_terms,
     "torchrl": check_torchrl,
     "actions": check_actions,
     "determinism": check_determinism,
@@ -69,11 +71,12 @@ def check_env(env: EnvBase, *, num_steps: int = 4, skip: Collection[str] = ()) -
     """Check an env with batch size [E], E > 1, against TorchRL's contract and ours; the env's seed and state change.
 
     The checks, by name: `names` (the label "E" on specs and data, ("E", "T") on rollouts), `values` (finite, inside
-    their specs), `torchrl` (`check_env_specs`, which looks at neither), `actions` (wrong shapes and dtypes are
-    refused), `determinism` (by seed, bit for bit, on the CPU), `partial_reset` (other rows stay bit-identical),
-    `episode_end` (the true terminal observation), `syncs` (none), `memory` (no growth) and `c_engine` (20 substeps of a
-    `ManagerBasedRlEnv` against MuJoCo's). They look at rollouts of `num_steps`; `skip` leaves some out. Raises one
-    AssertionError with all findings, each with what to change.
+    their specs), `terms` (of a `ManagerBasedRlEnv`: they write only what is their own), `torchrl` (`check_env_specs`,
+    which looks at neither), `actions` (wrong shapes and dtypes are refused), `determinism` (by seed, bit for bit, on
+    the CPU), `partial_reset` (other rows stay bit-identical), `episode_end` (the true terminal observation), `syncs`
+    (none), `memory` (no growth) and `c_engine` (20 substeps of a `ManagerBasedRlEnv` against MuJoCo's). They look at
+    rollouts of `num_steps`; `skip` leaves some out. Raises one AssertionError with all findings, each with what to
+    change.
     """
     for name in skip:
         if name not in CHECKS:

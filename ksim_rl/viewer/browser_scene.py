@@ -47,21 +47,14 @@ class SceneOfEnv:
             mujoco.mj_collision(self.mj_model, self.data)
         everything, nothing = mujoco.mjtCatBit.mjCAT_ALL.value, (mujoco.MjvPerturb(), mujoco.MjvCamera())
         mujoco.mjv_updateScene(self.mj_model, self.data, self.option, *nothing, everything, self.mjv)
-        draw(self._env, DebugVisualizer(self.mj_model, self.mjv), env_index, drawn)
+        visualizer = DebugVisualizer(self.mj_model, self.mjv)
+        self._env.update_visualizers(visualizer, env_index, drawn=drawn)
 
     def center(self, body: str | None) -> np.ndarray:
         """Return where a camera looks that follows a body, by default the first that moves: m, world frame."""
         moving = np.flatnonzero(self.mj_model.body_weldid)
         index = self.mj_model.body(body).id if body is not None else int(moving[0]) if moving.size else 0
         return self.data.xpos[index].copy()
-
-
-def draw(env: ManagerBasedRlEnv, visualizer: DebugVisualizer, env_index: int, drawn: Collection[str]) -> None:
-    """Let those commands, rewards and sensors draw one env whose names are among `drawn`."""
-    for name, drawing in env.setup_manager_visualizers().items():
-        if name in drawn:
-            with env.driver.scope(name):
-                drawing.draw_debug(env.view, visualizer, env_index)
 
 
 class BrowserScene:

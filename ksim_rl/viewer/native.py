@@ -11,7 +11,6 @@ import mujoco.viewer
 
 from ksim_rl.scene.rendering.rendering import pose_env
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
-from ksim_rl.viewer.browser_scene import draw
 from ksim_rl.viewer.session import SPEEDS, Session
 
 FRAME_S = 1.0 / 60.0
@@ -55,8 +54,7 @@ def show(session: Session, *, note: Callable[[str], None]) -> None:
                 marks = window.user_scn
                 assert marks is not None
                 marks.ngeom = 0
-                every = session.ours.setup_manager_visualizers()
-                draw(session.ours, DebugVisualizer(mj_model, marks), session.env_index, every)
+                session.ours.update_visualizers(DebugVisualizer(mj_model, marks), session.env_index)
             window.sync()
             time.sleep(max(0.001, FRAME_S - (time.monotonic() - start)))
 

@@ -100,16 +100,6 @@ def test_draws_keep_to_their_range():
     assert (drawn_E2 >= low).all() and (drawn_E2 < high).all() and drawn_E2[:, 1].std() > 1.0
 
 
-def test_what_observations_return_shares_no_memory_with_the_state():
-    driver = Bench(FREE_BODY, E, {}).driver
-    view = driver.view
-    driver.freeze()
-    computed = view.projected_gravity_EL
-    assert driver.detached(computed) is computed
-    aliased = view.joint_pos_EL
-    assert driver.detached(aliased).data_ptr() != aliased.data_ptr()
-
-
 def test_a_buffer_starts_at_its_initial_value_whenever_it_starts():
     buffers = Buffers(3, torch.device("cpu"))
     pose_L = torch.tensor([1.0, 2.0])

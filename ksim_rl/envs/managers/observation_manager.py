@@ -25,7 +25,7 @@ class ObservationManager:
         self._view = view = driver.view
         self.terms = {name: cfg.term for group in groups.values() for name, cfg in group.terms.items()}
         # What each term writes whenever it is read; most write nothing.
-        self._kept: dict[str, dict[str, Kept]] = {name: {} for name in self.terms}
+        self._kept: dict[str, dict[str, Kept]] = {}
         readings = self.read()
         self.examples = {name: reading.to("meta") for name, reading in readings.items()}
         for name, reading in readings.items():
@@ -71,8 +71,12 @@ class ObservationManager:
         watch("observation", together_EL, vectors, widths)
         return readings | dict(zip(vectors, together_EL.split(widths, dim=1), strict=True))
 
+    def rehearse(self) -> None:
+        """Read each term once more; the caller puts back what changes."""
+        self.read()
+
     def _read_one(self, name: str, reset_E: Tensor | None) -> Tensor:
-        kept = self._kept[name]
+        kept = self._kept.setdefault(name, {})
         rows = nullcontext()
         if reset_E is not None and kept:
             rows = only_in_rows(reset_E, list(kept.values()), is_step=False)

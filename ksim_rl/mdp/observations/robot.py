@@ -139,13 +139,13 @@ class ProjectedGravity(OfEntity, ObservationTerm):
         gravity_E3 = view.entity(self.entity).projected_gravity_EL
         if self.time_constant == 0.0:
             return gravity_E3
-        # Readings are also taken when other rows reset: the filter moves on only if an env step has passed.
-        steps_E, filtered_E3 = view.buffer("steps_E", dtype=torch.int64), view.buffer("filtered_E3", 3)
-        now_E = view.episode_step_E + 1
+        steps_E = view.buffer("steps_E", dtype=torch.int64)
+        filtered_E3 = view.buffer("filtered_E3", 3)
         gain = 1.0 - math.exp(-view.step_dt / self.time_constant)
-        gain_E = torch.where(steps_E == 0, 1.0, torch.where(steps_E == now_E, 0.0, gain))
+        # The first reading of an episode fills the filter.
+        gain_E = torch.where(steps_E == 0, 1.0, gain)
         filtered_E3.lerp_(gravity_E3, gain_E[:, None])
-        steps_E.copy_(now_E)
+        steps_E.add_(1)
         return torch.nn.functional.normalize(filtered_E3, dim=-1)
 
 

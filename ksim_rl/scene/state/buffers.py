@@ -170,6 +170,7 @@ class SharedValues:
     def __init__(self, device: torch.device) -> None:
         self._device = device
         self._tensors: dict[str, Tensor] = {}
+        self._initial: dict[str, Tensor] = {}
         self._owners: dict[str, str] = {}
         self._frozen = False
 
@@ -190,13 +191,17 @@ class SharedValues:
                 raise ValueError(f"shared value {name!r} is new after construction: ask for it on every path")
             with torch.inference_mode(False):
                 tensor = torch.tensor(initial, dtype=torch.float32, device=self._device)
+                self._initial[name] = tensor.clone()
             self._tensors[name] = tensor
             self._owners[name] = owner
         return tensor
 
     def freeze(self) -> None:
-        """Refuse new tensors from now on."""
+        """Refuse new tensors from now on, and let those of terms start anew, which ran while the env was made."""
         self._frozen = True
+        for name, tensor in self._tensors.items():
+            if self._owners[name]:
+                tensor.copy_(self._initial[name])
 
     def by_name(self) -> dict[str, Float[Tensor, "*?shape"]]:
         """Return the tensors by name."""

@@ -61,13 +61,14 @@ class GoalOrientation(CommandTerm):
         """Draw an orientation; its turn and its count of steps are zero in rows that reset."""
         goal_E4, drawn_E4 = view.buffer("goal_E4", 4), normalize(view.normal(4), dim=-1)
         goal_E4.copy_(torch.where(mask_E[:, None], drawn_E4, goal_E4))
-        self._show(view, goal_E4)
+        shown_E4 = self._shown(view)
+        shown_E4.copy_(torch.where(mask_E[:, None], goal_E4, shown_E4))
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E 4"]:
         """Move the goal if an env step has passed, and return it."""
         goal_E4, turn_E3 = view.buffer("goal_E4", 4), view.buffer("turn_E3", 3)
         steps_E = view.buffer("steps_E", dtype=torch.int64)
-        # Commands are also read when other rows reset, which moves nothing.
+        # No env step has passed when a row has just been reset, so that its goal stays where it was drawn.
         moves_E1 = (steps_E != view.episode_step_E)[:, None]
         is_reached_E1 = (quaternion.angle_between(view.sensor(self.sensor), goal_E4) <= self.reached)[:, None]
         next_E3 = torch.where(is_reached_E1, view.uniform(3, *self.turn), self.decay * turn_E3)
@@ -79,13 +80,14 @@ class GoalOrientation(CommandTerm):
         turned_E4 = normalize(quaternion.multiply(goal_E4, step_E4), dim=-1)
         goal_E4.copy_(torch.where(moves_E1, turned_E4, goal_E4))
         steps_E.copy_(view.episode_step_E)
-        self._show(view, goal_E4)
+        self._shown(view).copy_(goal_E4)
         return goal_E4.clone()
 
-    def _show(self, view: EnvView, goal_E4: Tensor) -> None:
+    def _shown(self, view: EnvView) -> Tensor:
+        """The orientation of the mocap body, [E, 4], to be written in place."""
         # What derives from the pose of that body is read by nobody before the next substep.
         mocap = int(view.world.mj_model.body_mocapid[view.resolver.one("body", self.mocap)])
-        view.world.view("mocap_quat")[:, mocap] = goal_E4
+        return view.world.view("mocap_quat")[:, mocap]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ksim_rl.envs import EnvView, ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.envs.term import ObservationTerm
-from ksim_rl.mdp import JointPos
+from ksim_rl.mdp import JointPos, RandomizeBodyMass
 from tests.envs.probe_env import puck_cfg, puck_env, push
 
 
@@ -84,6 +84,44 @@ def test_a_reading_is_no_window_onto_the_physics():
     push(env, next_E.clone())
     for name, value in kept.items():
         assert torch.equal(next_E["obs", name], value), name
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window(ObservationTerm):
+    """What others read too, and not a copy."""
+
+    onto: str
+
+    def __call__(self, view: EnvView) -> Tensor:
+        if self.onto == "state":
+            return view.joint_pos_EL
+        if self.onto == "quantity":
+            return view.joint_pos_rel_EL
+        if self.onto == "field":
+            return view.field("body_mass")
+        if self.onto == "table":
+            return view.default_joint_pos_EL
+        return view.buffer("kept_E1", 1)
+
+
+@pytest.mark.parametrize("onto", ["state", "quantity", "field", "table", "buffer"])
+@pytest.mark.parametrize("others", [0, 1])
+def test_what_is_done_to_a_reading_in_place_reaches_nobody_else(onto, others):
+    """A transform of a user's may well work in place."""
+    terms = {"window": Window(onto=onto)} | ({"position": JointPos()} if others else {})
+    heavier = {"mass": RandomizeBodyMass(bodies="puck", ranges=(1.0, 1.0), mode="reset")}
+    env = puck_env(events=heavier, **observing(actor=terms))
+    env_state_E = push(env, env.reset())
+    before = env.state_dict()
+    quantity = env.view.joint_pos_rel_EL.clone()
+    for td in (env_state_E["next"], env.maybe_reset(env_state_E["next"].exclude("reward"))):
+        before = env.state_dict()
+        td["obs", "window"].add_(1.0)
+        for name, value in env.state_dict().items():
+            assert not isinstance(value, Tensor) or torch.equal(value, before[name]), name
+        assert torch.equal(env.view.joint_pos_rel_EL, quantity)
+        if others:
+            assert torch.equal(td["obs", "position"], env.view.joint_pos_EL)
 
 
 def test_one_name_cannot_mean_two_terms():

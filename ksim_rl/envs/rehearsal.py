@@ -1,0 +1,37 @@
+"""Each term of a new env runs once where nobody looks, so that one that writes what is not its own is refused at once."""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from ksim_rl.envs.driver import EnvDriver
+from ksim_rl.scene.actuators import JointDrives
+
+
+class Rehearsed(Protocol):
+    """A manager whose terms can run once more."""
+
+    def rehearse(self) -> None:
+        """Run each term for no row, or for all where a term only reads; the caller puts back what changes."""
+
+
+def rehearse(
+    driver: EnvDriver, *, laws: JointDrives, writing: Sequence[Rehearsed], reading: Sequence[Rehearsed]
+) -> None:
+    """Run all terms, and put back all that has changed; a ValueError names the one that wrote what it must not.
+
+    `writing` are the managers of terms that write the worlds, `reading` those of terms that only read them.
+    """
+    with driver.guard.rehearsal():
+        for manager in writing:
+            manager.rehearse()
+            # The next ones may read what derives from the state.
+            driver.world.refresh()
+            driver.refreshed()
+        laws.apply()
+        driver.update_sensors()
+        # Twice: what a term changes in a quantity that it is the first to read shows the second time.
+        for _ in range(2):
+            for manager in reading:
+                manager.rehearse()
+    # Numbers of the rehearsal are of no state that anybody sees.
+    driver.non_finite.start()
