@@ -109,9 +109,7 @@ class Recorder(TorchDispatchMode):
         return result
 
 
-def written_by(
-    func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
-) -> list[Shaped[Tensor, "*?shape"]]:
+def written_by(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[Shaped[Tensor, "*?shape"]]:
     """Return the tensors among the arguments of an operator that it writes."""
     written: list[Tensor] = []
     for place, argument in enumerate(func._schema.arguments):

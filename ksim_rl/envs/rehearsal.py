@@ -1,4 +1,4 @@
-"""Each term of a new env runs once where nobody looks, so that one that writes what is not its own is refused at once."""
+"""Runs each term of a new env where nobody looks, so that one that writes what is not its own is refused at once."""
 
 from collections.abc import Sequence
 from typing import Protocol

@@ -3,8 +3,10 @@
 from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
+import torch
 import warp as wp
 from jaxtyping import Shaped
 from torch import Tensor
@@ -46,6 +48,18 @@ class Piece:
     tensor: Tensor | None = None
     has_rows: bool = False
 
+    @cached_property
+    def bits(self) -> Shaped[Tensor, "*shape"] | None:
+        """The bits of the tensor, as NaN equals no NaN, and 0 equals -0."""
+        return None if self.tensor is None else bits_of(self.tensor)
+
+
+def bits_of(tensor: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*shape"]:
+    """Return the bits of numbers, on the same memory."""
+    if not tensor.is_floating_point():
+        return tensor
+    return tensor.view({2: torch.int16, 4: torch.int32, 8: torch.int64}[tensor.element_size()])
+
 
 def _piece(name: str, owner: str, tensor: Shaped[Tensor, "*shape"], *, has_rows: bool = False) -> Piece:
     start, end = extent(tensor)
@@ -75,19 +89,26 @@ class TermMemory:
             self._listed_at = counts
         return self._pieces
 
-    def quantities(self) -> list[Piece]:
+    def quantities(self) -> list[Shaped[Tensor, "*?shape"]]:
         """Return the quantities that are computed now and are no windows onto something that lasts."""
-        return [piece for piece in self._quantities() if self._lasting_at(piece.start, piece.end) is None]
+        pieces = self.lasting()
+        found: list[Tensor] = []
+        for cache in self._simulation.caches():
+            for value in cache.values():
+                for _, tensor in _leaves("", value):
+                    if self._at(pieces, *extent(tensor)) is None:
+                        found.append(tensor)
+        return found
 
     def holder(self, tensor: Shaped[Tensor, "*shape"]) -> Piece | None:
         """Return the piece that a tensor lies in; None for memory that the view does not give."""
-        if not tensor.numel():
+        if not tensor.numel() or tensor.layout is not torch.strided:
             return None
         start, end = extent(tensor)
-        lasting = self._lasting_at(start, end)
+        lasting = self._at(self.lasting(), start, end)
         if lasting is not None:
             return lasting
-        for quantity in self._quantities():
+        for quantity in self._named_quantities():
             if quantity.start < end and start < quantity.end:
                 return quantity
         return None
@@ -96,7 +117,7 @@ class TermMemory:
         """Return how a term spells what it has written: a quantity, even where that is a window onto the piece."""
         start, end = extent(tensor)
         around: list[Piece] = []
-        for quantity in self._quantities():
+        for quantity in self._named_quantities():
             if quantity.tensor is tensor:
                 return quantity.name
             if quantity.start <= start and end <= quantity.end:
@@ -105,8 +126,8 @@ class TermMemory:
         narrowest = min(around, key=lambda quantity: quantity.end - quantity.start, default=piece)
         return narrowest.name
 
-    def _lasting_at(self, start: int, end: int) -> Piece | None:
-        pieces = self.lasting()
+    def _at(self, pieces: list[Piece], start: int, end: int) -> Piece | None:
+        """Return which of the pieces that last lies between two addresses."""
         place = bisect_left(self._starts, end) - 1
         if place >= 0 and pieces[place].end > start:
             return pieces[place]
@@ -114,9 +135,17 @@ class TermMemory:
 
     def _counts(self) -> tuple[int, ...]:
         """Return how much there is of each kind that still grows while an env is constructed."""
-        simulation, readings, view = self._simulation, self._readings, self._view
-        tables = (simulation.buffers.by_name(), simulation.shared_values.by_name(), readings.reward_weights)
-        return (*map(len, tables), len(readings.terminations), len(view.parts()), len(constants()))
+        simulation, readings = self._simulation, self._readings
+        growing = (
+            simulation.buffers.by_name(),
+            simulation.shared_values.by_name(),
+            simulation.world.views(),
+            readings.reward_weights,
+            readings.terminations,
+            self._view.parts(),
+            constants(),
+        )
+        return tuple(len(one) for one in growing)
 
     def _listed(self) -> list[Piece]:
         found = [
@@ -185,9 +214,11 @@ class TermMemory:
                 yield _piece(f"{spelled}.{name}", TABLE, tensor)
         for tensor in constants():
             if tensor.numel():
-                yield _piece("a constant that all terms share", TABLE, tensor)
+                start, end = extent(tensor)
+                yield Piece(name="a constant that all terms share", owner=TABLE, start=start, end=end)
 
-    def _quantities(self) -> Iterator[Piece]:
+    def _named_quantities(self) -> Iterator[Piece]:
+        """List all quantities, windows too, as terms call them."""
         owners = {id(vars(part).get("cache")): spelled for spelled, part in self._view.parts().items()}
         for cache in self._simulation.caches():
             for key, value in cache.items():
@@ -225,9 +256,9 @@ def _tensors_of(part: object) -> Iterator[tuple[str, Tensor]]:
 
 def _leaves(name: str, value: Any) -> Iterator[tuple[str, Tensor]]:
     """Return the tensors of a value: itself, or the fields of a named tuple, or what a tuple or list holds."""
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        for field in value._fields:
-            yield from _leaves(f"{name}.{field}", getattr(value, field))
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        for field, part in value._asdict().items():  # pyright: ignore[reportAttributeAccessIssue]
+            yield from _leaves(f"{name}.{field}", part)
     elif isinstance(value, Tensor):
         if value.numel():
             yield name, value

@@ -8,7 +8,7 @@ from ksim_rl.testing.replays import Replays, end_episodes_at_next_step
 
 
 def check_terms(env: EnvBase, num_steps: int) -> None:
-    """Terms only read, and write what is their own: an event the state, in its rows, a reward nothing but its buffers."""
+    """Terms write what is their own: an event the state, in its rows, a reward nothing but its buffers."""
     base_env = part(env, ManagerBasedRlEnv)
     if base_env is None:
         return

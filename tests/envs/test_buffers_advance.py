@@ -11,7 +11,13 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import StepCounter
 
 from ksim_rl.collectors import CollectorCfg, RolloutCollector
-from ksim_rl.envs import EnvView, ManagerBasedRlEnv, MaskedTransformedEnv, ObservationGroupCfg, ObservationTermCfg
+from ksim_rl.envs import (
+    EnvView,
+    ManagerBasedRlEnv,
+    MaskedTransformedEnv,
+    ObservationGroupCfg,
+    ObservationTermCfg,
+)
 from ksim_rl.envs.term import CommandTerm, ObservationTerm
 from ksim_rl.mdp import JointPos, ProjectedGravity
 from ksim_rl.testing import check_env
@@ -49,7 +55,9 @@ class CountOfCommand(CommandTerm):
 def counting_env(**fields: Any) -> ManagerBasedRlEnv:
     """Build an env whose episodes end after 4 steps, or in row 2, which moves fast, after 2."""
     readings = {"count": Count(), "position": JointPos()}
-    group = ObservationGroupCfg(terms={name: ObservationTermCfg(term=term) for name, term in readings.items()})
+    group = ObservationGroupCfg(
+        terms={name: ObservationTermCfg(term=term) for name, term in readings.items()}
+    )
     cfg = puck_cfg(
         num_envs=ROWS,
         observations={"actor": group, "critic": group},

@@ -1,6 +1,5 @@
 """A term that writes what is not its own is refused by name: at build, in `check_env`, and while a step is recorded."""
 
-import re
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -13,12 +12,12 @@ from torch import Tensor
 
 from ksim_rl import mdp
 from ksim_rl.collectors import CollectorCfg, RolloutCollector
-from ksim_rl.envs import EnvView, ManagerBasedRlEnv, MjcfRobot, SceneCfg
-from ksim_rl.envs.term import EventTerm, RewardTerm
+from ksim_rl.envs import EnvView, SceneCfg
+from ksim_rl.envs.term import RewardTerm
 from ksim_rl.mdp.constants import constant
 from ksim_rl.scene.actuators import IdealPDActuator, set_actuators
 from ksim_rl.testing import check_env
-from tests.envs.impure_terms import TERMS, BadCommand, BadDraw, BadReward, env_with
+from tests.envs.impure_terms import TERMS, BadDraw, BadReward, env_with
 from tests.envs.probe_env import PUCK_XML, Target, puck_env
 
 
@@ -80,11 +79,11 @@ PAST_TORCH = {"numpy": by_numpy, "Warp": by_warp}
 
 @pytest.mark.parametrize("way", WAYS)
 def test_a_reward_that_moves_the_robot_is_refused_at_build_whatever_the_way(way):
-    wanted = r"rewards\.bad: BadReward writes into view\.joint_pos_EL in place \(`\w+`\), which moves the robot: a reward"
+    wanted = r"rewards\.bad: BadReward writes into view\.joint_pos_EL in place \(`\w+`\), which moves the robot: a rew"
     with pytest.raises(ValueError, match=wanted) as refusal:
         env_with("rewards", BadReward(deed=WAYS[way]))
-    fix = "Write `error = view.joint_pos_EL - 0.5` instead of `error = view.joint_pos_EL; error -= 0.5`"
-    assert fix in str(refusal.value) and "view.joint_pos_EL.clone()" in str(refusal.value)
+    fix = "Write `error = view.joint_pos_EL - 0.5` instead of `error = view.joint_pos_EL; error -= 0.5`, or change "
+    assert fix + "`view.joint_pos_EL.clone()`" in str(refusal.value)
 
 
 @pytest.mark.parametrize("way", PAST_TORCH)
@@ -140,7 +139,7 @@ QUANTITIES = {
     r"view\.world\.xpos_EL": lambda view: view.world.xpos_EL.zero_(),
     r"view\.entity\('puck'\)\.default_root_pos_L": lambda view: view.robot.default_root_pos_L.zero_(),
     r"the buffer 'rewards/peak\.peak_E'": lambda view: view.buffers.by_name()["rewards/peak.peak_E"].zero_(),
-    r"the buffer 'commands/target\.target_E1'": lambda view: view.buffers.by_name()["commands/target.target_E1"].zero_(),
+    r"the buffer 'commands/target\.target_E1'": lambda view: view.buffers.get("commands/target.target_E1", 1).zero_(),
     r"warp_model\.body_mass": lambda view: wp.to_torch(view.world.warp_model.body_mass).mul_(2.0),
     "a constant that all terms share": lambda view: constant((1.0, 2.0), view.device).mul_(2.0),
 }  # fmt: skip
@@ -193,7 +192,9 @@ def press_all(view: EnvView) -> None:
 
 @pytest.mark.parametrize(("deed", "what"), [(unmasked, "qpos_EL"), (press_all, "xfrc_applied_EL")])
 def test_an_event_that_ignores_its_mask_is_refused_at_build(deed, what):
-    with pytest.raises(ValueError, match=rf"events\.bad: BadEvent changes view\.world\.{what} in rows outside"):
+    with pytest.raises(
+        ValueError, match=rf"events\.bad: BadEvent changes view\.world\.{what} in rows outside"
+    ):
         env_with("events", TERMS["events"](deed=deed))
 
 
@@ -201,7 +202,9 @@ def test_an_event_writes_positions_and_velocities_by_the_view_only():
     def deed(view: EnvView) -> None:
         view.world.qvel_EL[:, 0] *= 1.0
 
-    with pytest.raises(ValueError, match=r"events\.bad: .*qvel_EL.*Write positions and velocities by `view\.write_qpos`"):
+    with pytest.raises(
+        ValueError, match=r"events\.bad: .*qvel_EL.*Write positions and velocities by `view\.write_qpos`"
+    ):
         env_with("events", TERMS["events"](deed=deed))
 
 
@@ -218,7 +221,9 @@ def test_a_curriculum_changes_nothing_where_no_episode_ended():
     def deed(view: EnvView) -> None:
         view.level.mul_(0.5)
 
-    with pytest.raises(ValueError, match=r"curriculum\.bad: BadCurriculum changes view\.level in rows outside"):
+    with pytest.raises(
+        ValueError, match=r"curriculum\.bad: BadCurriculum changes view\.level in rows outside"
+    ):
         env_with("curriculum", TERMS["curriculum"](deed=deed))
 
 
@@ -226,7 +231,9 @@ def test_a_command_draws_for_the_rows_of_its_mask():
     def deed(view: EnvView) -> None:
         view.buffer("target_E").add_(1.0)
 
-    with pytest.raises(ValueError, match=r"commands\.bad: BadDraw changes the buffer .* in rows outside of its mask"):
+    with pytest.raises(
+        ValueError, match=r"commands\.bad: BadDraw changes the buffer .* in rows outside of its mask"
+    ):
         env_with("commands", BadDraw(deed=deed))
 
 
@@ -257,7 +264,9 @@ class BadMotor:
 
 def test_the_law_of_an_actuator_is_refused_too():
     scene = SceneCfg(robots={"puck": BadMotor()}, num_envs=2)
-    with pytest.raises(ValueError, match=r"actuators\.0: BadActuator writes into .*qpos_EL.* the law of an actuator only"):
+    with pytest.raises(
+        ValueError, match=r"actuators\.0: BadActuator writes into .*qpos_EL.* the law of an actuator only"
+    ):
         puck_env(scene=scene, actions={"push": mdp.JointPositionAction(joints="rail")})
 
 
@@ -273,7 +282,9 @@ class BadDrawing(Target):
 def test_whoever_draws_is_refused_too():
     env = puck_env(commands={"target": BadDrawing(resampling_time_range_s=None)})
     env.reset()
-    with pytest.raises(ValueError, match=r"commands\.target: BadDrawing writes into view\.joint_pos_EL in place"):
+    with pytest.raises(
+        ValueError, match=r"commands\.target: BadDrawing writes into view\.joint_pos_EL in place"
+    ):
         env.update_visualizers(None)
 
 
@@ -334,7 +345,9 @@ def test_steps_that_are_watched_refuse_it(later):
 def test_a_term_that_is_added_later_is_watched_when_it_first_runs():
     env = env_with("rewards", BadReward(deed=lambda view: None))
     env.observation_manager.terms["late"] = TERMS["observations"](deed=by_operator)
-    with pytest.raises(ValueError, match=r"observations\.late: BadObservation writes into view\.joint_pos_EL"):
+    with pytest.raises(
+        ValueError, match=r"observations\.late: BadObservation writes into view\.joint_pos_EL"
+    ):
         env.reset()
 
 

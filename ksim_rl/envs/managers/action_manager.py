@@ -42,7 +42,9 @@ class ActionManager:
         self._has_warned = False
         buffers, readings = driver.buffers, driver.readings
         self._action_EL = readings.action_EL = buffers.get("actions.action_EL", start, owner=ENV)
-        self._last_action_EL = readings.last_action_EL = buffers.get("actions.last_action_EL", start, owner=ENV)
+        self._last_action_EL = readings.last_action_EL = buffers.get(
+            "actions.last_action_EL", start, owner=ENV
+        )
         self._run_terms(self._action_EL)
 
     def apply(self, action_EL: Float[Tensor, "E L"]) -> Bool[Tensor, " E"]:

@@ -47,9 +47,7 @@ class CommandManager:
                     f"command term {name!r} returns shape {tuple(value_EK.shape)}: expected [{view.num_envs}, K], one "
                     "row per env"
                 )
-            self.values[name] = view.buffers.get(
-                f"commands/{name}.value_EK", value_EK.shape[1], owner=ENV
-            )
+            self.values[name] = view.buffers.get(f"commands/{name}.value_EK", value_EK.shape[1], owner=ENV)
             driver.non_finite.watch("command", self.values[name], (name,), value_EK.shape[1:])
 
     def time_left(self, name: str) -> Float[Tensor, " E"]:

@@ -185,7 +185,11 @@ class WorldView:
 
     def parts(self) -> dict[str, object]:
         """Return what holds the quantities and tables of the view, by how a term spells it."""
-        parts: dict[str, object] = {"view": self, "view.joints()": self._every_joint, "view.terrain": self.terrain}
+        parts: dict[str, object] = {
+            "view": self,
+            "view.joints()": self._every_joint,
+            "view.terrain": self.terrain,
+        }
         for name, entity in self.entities.items():
             parts[f"view.entity({name!r})"] = entity
         for (kind, patterns), elements in self._named.items():

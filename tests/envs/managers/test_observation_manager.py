@@ -111,17 +111,20 @@ def test_what_is_done_to_a_reading_in_place_reaches_nobody_else(onto, others):
     terms = {"window": Window(onto=onto)} | ({"position": JointPos()} if others else {})
     heavier = {"mass": RandomizeBodyMass(bodies="puck", ranges=(1.0, 1.0), mode="reset")}
     env = puck_env(events=heavier, **observing(actor=terms))
-    env_state_E = push(env, env.reset())
-    before = env.state_dict()
-    quantity = env.view.joint_pos_rel_EL.clone()
-    for td in (env_state_E["next"], env.maybe_reset(env_state_E["next"].exclude("reward"))):
-        before = env.state_dict()
-        td["obs", "window"].add_(1.0)
-        for name, value in env.state_dict().items():
-            assert not isinstance(value, Tensor) or torch.equal(value, before[name]), name
-        assert torch.equal(env.view.joint_pos_rel_EL, quantity)
-        if others:
-            assert torch.equal(td["obs", "position"], env.view.joint_pos_EL)
+    next_E = push(env, env.reset())["next"]
+    check_nobody_else_sees(env, next_E, has_others=bool(others))
+    root_E = env.maybe_reset(next_E.exclude("reward"))
+    check_nobody_else_sees(env, root_E, has_others=bool(others))
+
+
+def check_nobody_else_sees(env, td, *, has_others):
+    before, quantity = env.state_dict(), env.view.joint_pos_rel_EL.clone()
+    position = td["obs", "position"].clone() if has_others else None
+    td["obs", "window"].add_(1.0)
+    for name, value in env.state_dict().items():
+        assert not isinstance(value, Tensor) or torch.equal(value, before[name]), name
+    assert torch.equal(env.view.joint_pos_rel_EL, quantity)
+    assert position is None or torch.equal(td["obs", "position"], position)
 
 
 def test_one_name_cannot_mean_two_terms():
