@@ -16,6 +16,7 @@ from ksim_rl.checks import near
 from ksim_rl.device.capture import Captured
 from ksim_rl.envs.contract import Pictures, part
 from ksim_rl.envs.masked_reset import MaskedReset
+from ksim_rl.envs.recorded_python import FollowedGraph
 from ksim_rl.envs.signal_keys import signal_keys
 
 Keys = Mapping[str, NestedKey] | Sequence[NestedKey] | None
@@ -72,6 +73,7 @@ class Stepper:
         self.action_spec = env.full_action_spec[env.action_key]
         self._action = self.action_spec.zero()
         self._run = Captured(self._step, device=self.device)
+        self._followed, self._steps = FollowedGraph(env, self._run), 0
 
     @property
     def root(self) -> TensorDictBase:
@@ -84,6 +86,7 @@ class Stepper:
     @torch.no_grad()
     def reset(self, seed: int | None = None) -> Observations:
         """Reset all envs and return their observations."""
+        self._followed.follow()
         if isinstance(self.env, MaskedReset):
             root_E = self.env.reset(seed=seed)
         else:
@@ -118,6 +121,10 @@ class Stepper:
             )
         root = self.root
         self._action.copy_(action)
+        # Looking takes a share of a step. So a change is noticed after at most as many steps as there were before it.
+        if self._steps.bit_count() == 1:
+            self._followed.follow()
+        self._steps += 1
         self._run()
         next_E = self._out["next"]
         root.update_(self._out["root"])
@@ -143,7 +150,8 @@ class Stepper:
     def _step(self) -> None:
         assert self._root is not None
         td = self._root.copy().set(self.env.action_key, self._action)
-        env_state_E, root_E = self.env.step_and_maybe_reset(td)
+        with self._followed.calling():
+            env_state_E, root_E = self.env.step_and_maybe_reset(td)
         # Outputs of a replay stay where they were recorded.
         self._out = {"next": env_state_E.get("next"), "root": root_E.select(*self._root.keys(True, True))}
 

@@ -1,7 +1,7 @@
 """This module collects rollouts of fixed length from all envs, as one CUDA graph where there is CUDA."""
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -12,17 +12,20 @@ from jaxtyping import Shaped
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
+from torchrl.envs.transforms import Compose, Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl import dims
 from ksim_rl.checked import Checked, Count
 from ksim_rl.checks import check_count
+from ksim_rl.collectors.recording import Policy, Recording
 from ksim_rl.compiled.compiled_step import CompiledStep
-from ksim_rl.device.capture import Captured
+from ksim_rl.device.capture import Captured, eagerly
 from ksim_rl.device.copying import copy_rows
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.envs.contract import EpisodeClock, SimulatedWorld, part
 from ksim_rl.envs.masked_reset import MaskedReset
+from ksim_rl.transforms.row_transform import held_transforms
 from ksim_rl.transforms.specs import spell
 
 
@@ -31,8 +34,10 @@ class CollectorCfg(Checked):
     """Options of `RolloutCollector` that a config may set.
 
     `require_graphs` fails where CUDA graphs are unavailable, instead of running slower with a warning.
-    `compile` makes few kernels of what terms and transforms compute, which is checked once against the env's own steps:
-    rollouts take less time, and are those of the env to rounding. None does so for envs with a `SimulatedWorld`.
+    `compile` makes few kernels of what terms and transforms compute, which are compared with the env's own steps before
+    they are used, and again after 1, 2, 4, 8 ... rollouts: rollouts take less time, and are those of the env to
+    rounding. None does so for envs with a `SimulatedWorld`. `eager` runs the Python of each step instead, without
+    kernels and graphs, which takes much longer: for looking for a fault, and for Python that changes from step to step.
     `stagger_episodes` spreads the time-outs of the envs over an episode's length at the first reset, where the env
     offers it. The first `warmup` rollouts on CUDA run eagerly. In the config of a run, `rollout_length` may be given
     instead of the dataset's size, which then follows from it and the number of envs.
@@ -40,13 +45,19 @@ class CollectorCfg(Checked):
 
     require_graphs: bool = False
     compile: bool | None = None
+    eager: bool = False
     stagger_episodes: bool = False
     warmup: Count = 2
     rollout_length: Count | None = None
 
+    def _check_fields(self) -> None:
+        if self.eager and (self.compile or self.require_graphs):
+            raise ValueError(
+                "eager=True with compile or require_graphs, which ask for the opposite: leave one out"
+            )
+
 
 _exploring = partial(set_exploration_type, ExplorationType.RANDOM)
-Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
 class RolloutCollector:
@@ -54,7 +65,8 @@ class RolloutCollector:
 
     On CUDA the T steps of policy, physics, terms, transforms and resets are one graph: the first rollouts run eagerly
     (they warm the kernels up and are as good as any), the next is captured, and from then on each is one launch. On CPU
-    each control step's physics is one Warp graph and torch stays eager.
+    each control step's physics is one Warp graph and torch stays eager. What was recorded is kept true to the Python
+    that it was recorded from; see `Recording`. A FrozenPythonError names Python that cannot be recorded.
 
     The rollout is the same as that of `EnvBase.rollout(T, policy, break_when_any_done=False, auto_reset=False)`. On
     CUDA the env's `step_and_maybe_reset` must not synchronize (`ManagerBasedRlEnv`, `MaskedTransformedEnv`); on CPU any
@@ -84,20 +96,38 @@ class RolloutCollector:
         self.env, self.policy, self.rollout_length = env, policy, rollout_length
         self._keys = None if keys is None else list(keys)
         self._root: TensorDict | None = None
+        self._transforms: list[Transform] = []  # those that the running episodes have begun with
         self._storage_TE: TensorDict | None = None
+        self._is_allocated = False
         self._leaves: list[tuple[NestedKey, Tensor]] = []
         device = env.device or torch.device("cpu")
         simulates = part(env, SimulatedWorld) is not None
-        self._compiles = simulates if cfg.compile is None else cfg.compile
-        self.compiled_step: CompiledStep | None = None
-        self._run = Captured(
-            self._rollout, device=device, warmup=cfg.warmup, require_graphs=cfg.require_graphs
-        )
+        compiles = simulates if cfg.compile is None else cfg.compile
+        with eagerly(cfg.eager):
+            self._run = Captured(
+                self._rollout, device=device, warmup=cfg.warmup, require_graphs=cfg.require_graphs
+            )
+        self._recording = Recording(env, policy, compiles=compiles and not cfg.eager, graph=self._run)
+
+    @property
+    def compiled_step(self) -> CompiledStep | None:
+        """The env's step as kernels, if it has been compiled."""
+        return self._recording.compiled_step
+
+    @property
+    def unchecked_rollouts(self) -> int:
+        """How many rollouts have been made since the recorded step was last compared with the env's own."""
+        return self._recording.unchecked_rollouts
 
     @torch.no_grad()
     def collect(self) -> TensorDict:
         """Run T steps and return the rollout, `["E","T"]`, whose memory the next call overwrites."""
         self.warm_up()
+        assert self._root is not None
+        if self._recording.before_rollout(self._root, self._act):
+            self._renew_root()
+            self._is_allocated = False
+            self.warm_up()
         self._run()
         if isinstance(self.env, MaskedReset):
             # The env's own reference points into the graph's memory, which the next replay overwrites.
@@ -109,21 +139,37 @@ class RolloutCollector:
         """Compile the env's step, if that has not been done and is wanted; env and draws are left as they were."""
         if self._root is None:
             self.reset()
-        if not self._compiles or self.compiled_step is not None:
+        if not self._recording.wants_kernels:
             return
+        assert self._root is not None
+        self._recording.compile(self._root, self._act)
+        if self.compiled_step is not None:
+            self._allocate(self.compiled_step.env_state_E)
+
+    def _act(self) -> TensorDictBase:
+        """Return what the policy makes of the present root; draws do not count."""
         assert self._root is not None
         device = self._run.device
         with torch.random.fork_rng([device] if device.type == "cuda" else []), _exploring():
-            tensordict = self.policy(self._root.copy())
-            try:
-                self.compiled_step = CompiledStep(self.env, self._root, tensordict)
-            except RuntimeError as error:
-                self._compiles = False
-                warnings.warn(
-                    f"THE ENV'S STEP IS NOT COMPILED, and slower: {error}", RuntimeWarning, stacklevel=2
-                )
-                return
-        self._allocate(self.compiled_step.env_state_E)
+            return self.policy(self._root.copy())
+
+    def _renew_root(self) -> None:
+        """Reset all envs where transforms have changed what an episode begins with."""
+        assert self._root is not None
+        known = {id(transform) for transform in self._transforms}
+        added = [one for one in held_transforms(self.env, Transform) if id(one) not in known]
+        # A chain passes resets on; others that do not override this have nothing to do at one.
+        begins = [
+            one for one in added if type(one)._reset is not Transform._reset and type(one) is not Compose
+        ]
+        if begins or _kinds(self._root) != _kinds_of_roots(self.env):
+            warnings.warn(
+                "transforms have changed, and with them what an episode begins with: all envs are reset",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+            self._root = None
+            self.reset()
 
     @torch.no_grad()
     def made_up_rollout(self) -> TensorDict:
@@ -151,6 +197,7 @@ class RolloutCollector:
     def reset(self) -> None:
         """Reset all envs; the next rollout starts there."""
         root_E = self.env.reset()
+        self._transforms = list(held_transforms(self.env, Transform))
         if self._root is None:
             self._root = root_E.clone()
         else:
@@ -185,14 +232,15 @@ class RolloutCollector:
                     self._store(t, self.compiled_step(env_state_E))
                 return
             for t in range(self.rollout_length):
-                env_state_E, root_E = self.env.step_and_maybe_reset(self.policy(root_E))
+                with self._recording.calling():
+                    env_state_E, root_E = self.env.step_and_maybe_reset(self.policy(root_E))
                 self._store(t, env_state_E)
                 root_E = root_E.select(*root_keys)
         for key in root_keys:
             self._root.get(key).copy_(root_E.get(key))
 
     def _store(self, t: int, env_state_E: TensorDictBase) -> None:
-        if self._storage_TE is None:
+        if not self._is_allocated:
             self._allocate(env_state_E)
         held = [(leaf_TE[t], env_state_E.get(key, None)) for key, leaf_TE in self._leaves]
         pairs = [(kept, value) for kept, value in held if value is not None]
@@ -206,6 +254,33 @@ class RolloutCollector:
                     f"keys: no step produces {key!r}; it produces {sorted(map(spell, produced))}"
                 )
         kept_E = env_state_E.select(*(self._keys or produced))
+        self._is_allocated = True
+        if self._storage_TE is not None and not self._is_for_others(kept_E):
+            return
         storage_TE: Any = kept_E.new_zeros(torch.Size([self.rollout_length, *kept_E.batch_size]))
         self._storage_TE = storage_TE
         self._leaves = list(storage_TE.items(True, True))
+
+    def _is_for_others(self, kept_E: TensorDictBase) -> bool:
+        """Whether the memory that there is was made for other leaves; a ValueError where one has another shape now.
+
+        Who reads rollouts may hold on to their memory, and was made for leaves of these shapes.
+        """
+        assert self._storage_TE is not None
+        present, wanted = _kinds(self._storage_TE[0]), _kinds(kept_E)
+        for key in present.keys() & wanted.keys():
+            if present[key] != wanted[key]:
+                raise ValueError(
+                    f"{spell(key)} was {present[key]} and is {wanted[key]} since transforms of the env have changed: "
+                    "make another collector, and networks for it"
+                )
+        return present.keys() != wanted.keys()
+
+
+def _kinds(tensordict: TensorDictBase) -> dict[NestedKey, str]:
+    """Return dtype and shape of each leaf."""
+    return {key: f"{leaf.dtype} {list(leaf.shape)}" for key, leaf in tensordict.items(True, True)}
+
+
+def _kinds_of_roots(env: EnvBase) -> dict[NestedKey, str]:
+    return _kinds(env.full_observation_spec.zero()) | _kinds(env.full_done_spec.zero())

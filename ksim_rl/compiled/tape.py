@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
+import torch
 import warp as wp
 from jaxtyping import Shaped
 from torch import Tensor
@@ -127,6 +128,8 @@ class Tape:
                 self.parts.append(entry)
             elif self._does_something(entry):
                 self._add(entry)
+            elif torch.Tag.nondeterministic_seeded in entry.function.tags:
+                raise RuntimeError(f"{entry.function} draws numbers on the host, and would draw them once")
         self._own = self._find_own(returned)
         self._kept = [tensor for place, tensor in self._memory.made.items() if place not in self._own]
         modules = [self._compiled(part) for part in self.parts if isinstance(part, Kernel)]

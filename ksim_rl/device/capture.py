@@ -25,6 +25,7 @@ class _Phase(threading.local):
     live = 0
     warming_up = 0
     capturing = 0
+    eager = 0
 
 
 _phase = _Phase()
@@ -35,6 +36,11 @@ _graphs: dict[torch.device, WeakSet[torch.cuda.CUDAGraph]] = {}
 @cache
 def _capture_stream(device: torch.device) -> torch.cuda.Stream:
     return torch.cuda.Stream(device)
+
+
+def runs_eagerly() -> bool:
+    """Whether this thread is in a block of `eagerly`."""
+    return _phase.eager > 0
 
 
 def is_capturing() -> bool:
@@ -92,16 +98,27 @@ def live_launches(*, warming_up: bool = False, capturing: bool = False) -> Itera
         _phase.capturing -= capturing
 
 
+@contextmanager
+def eagerly(wanted: bool = True) -> Iterator[None]:
+    """Make each `Captured` that is made in this block one that never records a graph, where that is `wanted`."""
+    _phase.eager += wanted
+    try:
+        yield
+    finally:
+        _phase.eager -= wanted
+
+
 class Captured:
     """A function without arguments that becomes one CUDA graph; on CPU it stays a plain call.
 
     The first `warmup` calls run eagerly on a stream aside (their work counts), the next one records the graph, and
     from then on each call replays it. So `body` must be fit for replay: it reads and writes tensors that stay where
     they are, allocates no size that depends on data, and neither syncs with the host nor branches on tensor values.
-    What it does in Python happens only while it is eager or recorded. It may draw from the device's default random
-    generator. The graphs of a device have their temporaries in the same memory: no two may run at once, and what one
-    makes lasts as long as something refers to it. With `require_graphs`, a CUDA device without graphs is refused
-    instead of a warning and eager calls.
+    What it does in Python happens only while it is eager or recorded; where that changes, `forget` the graph. It may
+    draw from the device's default random generator. The graphs of a device have their temporaries in the same memory:
+    no two may run at once, and what one makes lasts as long as something refers to it. With `require_graphs`, a CUDA
+    device without graphs is refused instead of a warning and eager calls. Calls are eager while `is_eager`, which
+    those that are made within `eagerly` are for ever.
     """
 
     def __init__(
@@ -116,6 +133,7 @@ class Captured:
         self.body = body
         self.device = checked_device(device)
         self.warmup = warmup
+        self.is_eager = runs_eagerly()
         self._calls = 0
         self._graph: torch.cuda.CUDAGraph | None = None
         self._warp_graph: wp.Graph | None = None
@@ -130,11 +148,17 @@ class Captured:
         """Whether the next call replays a graph."""
         return self._graph is not None
 
+    def forget(self) -> None:
+        """Drop the graph: the next call is eager, as the body may need other kernels now, and the one after records."""
+        self._graph = self._warp_graph = None
+        self._calls = min(self._calls, self.warmup - 1)
+
     def __call__(self) -> None:
         """Run the body: eagerly at first, then as one graph."""
-        if self._graph is not None:
+        if self._graph is not None and not self.is_eager:
             self._graph.replay()
-        elif self._stream is None or _wants_live_launches(self.device):
+        elif self._stream is None or self.is_eager or _wants_live_launches(self.device):
+            # Worlds have graphs of their own where no outer one is to be recorded.
             # Inside another capture, the body is simply a part of that graph.
             self.body()
         elif self._calls < self.warmup:
@@ -206,13 +230,16 @@ class WarpGraphs:
         # The default stream cannot record, so graphs are recorded on a stream of our own and launched on any.
         self._stream = wp.Stream(warp_device(device)) if device.type == "cuda" else None
 
-    def run(self, key: Hashable, launches: Callable[[], None]) -> None:
-        """Run `launches`, in order with torch's current stream. `key` names what it does."""
-        if recording.launched(lambda: self.run(key, launches)):
+    def run(self, key: Hashable, launches: Callable[[], None], *, live: bool = False) -> None:
+        """Run `launches`, in order with torch's current stream. `key` names what it does.
+
+        Where they are `live`, they are issued one by one each time, since their Python has to run.
+        """
+        if recording.launched(lambda: self.run(key, launches, live=live)):
             return
         with warp_scope(self.device):
             replays = _phase.warming_up and key in self._graphs
-            if not self._available or (_wants_live_launches(self.device) and not replays):
+            if live or not self._available or (_wants_live_launches(self.device) and not replays):
                 self._launch_live(launches)
                 return
             if key not in self._graphs:

@@ -1,17 +1,23 @@
 """This module writes down what torch computes and Warp launches, operation by operation, so that it can be compiled."""
 
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from jaxtyping import Shaped
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_leaves
 
 _HOST_READS = frozenset({"_local_scalar_dense", "equal", "item", "masked_select", "nonzero"})
+# On the CPU these never reach the dispatcher.
+_HOST_METHODS = frozenset({Tensor.numpy, Tensor.tolist, Tensor.__array__, Tensor.__dlpack__})
+_INTERNAL = ("/torch/", "/tensordict/", "/contextlib.py", __file__)
 
 
 class _Recording(threading.local):
@@ -95,7 +101,7 @@ class Recorder(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
         if func.overloadpacket.__name__ in _HOST_READS:
-            raise RuntimeError(f"{func} reads the device on the host")
+            raise RuntimeError(f"{func} reads the device on the host, at {_place()}")
         _recording.recorder = None
         try:
             result = func(*args, **kwargs)
@@ -107,6 +113,23 @@ class Recorder(TorchDispatchMode):
         if made or written:
             self.entries.append(Operation(func, args, kwargs, made, written))
         return result
+
+
+class _HostMethods(TorchFunctionMode):
+    """Refuses methods of tensors by which Python reads numbers, which would become constants of the recording."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func in _HOST_METHODS and is_recording():
+            raise RuntimeError(f"{func.__name__} reads the device on the host, at {_place()}")
+        return func(*args, **(kwargs or {}))
+
+
+def _place() -> str:
+    """Return file and line of the code that runs, outside of torch."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and any(part in frame.f_code.co_filename for part in _INTERNAL):
+        frame = frame.f_back
+    return f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"
 
 
 def written_by(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[Shaped[Tensor, "*?shape"]]:
@@ -125,7 +148,7 @@ def recorded() -> Iterator[Recorder]:
     assert _recording.recorder is None, "recordings do not nest"
     recorder = _recording.recorder = Recorder()
     try:
-        with recorder:
+        with _HostMethods(), recorder:
             yield recorder
     finally:
         _recording.recorder = None

@@ -12,7 +12,7 @@ import mujoco_warp
 import numpy as np
 import torch
 import warp
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -314,6 +314,13 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
     def episode_log_reset_(self) -> None:
         """Start the sums of `episode_log` anew."""
         self._log.clear()
+
+    def values_by_term(self) -> dict[str, Float[Tensor, " E"] | Bool[Tensor, " E"]]:
+        """Return what each reward, metric and termination has given in the episodes so far, [E], written in place."""
+        values = {f"rewards.{name}": sum_E for name, sum_E in self.view.episode_rewards.items()}
+        held = zip(self.metric_manager.names, self.metric_manager.held_EM.unbind(-1), strict=True)
+        values |= {f"metrics.{name}": held_E for name, held_E in held}
+        return values | {f"terminations.{name}": flag_E for name, flag_E in self.view.terminations.items()}
 
     def non_finite_terms(self) -> list[str]:
         """Return a line for each term that gave a number that is not finite; reads the device."""

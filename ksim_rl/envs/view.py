@@ -1,6 +1,7 @@
 """This module is what the terms of an env read: the worlds, and what sensors and managers have made of them."""
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import torch
@@ -61,12 +62,15 @@ class EnvView(WorldView):
     def __init__(self, simulation: Simulation, readings: Readings, **parts: Any) -> None:
         super().__init__(simulation, **parts)
         self._readings = readings
-        self.sensors: Mapping[str, SensorTracker] = readings.sensors
-        self.commands: Mapping[str, Float[Tensor, "E ?K"]] = readings.commands
-        self.command_ranges: Mapping[str, Mapping[str, Float[Tensor, " 2"]]] = readings.command_ranges
-        self.reward_weights: Mapping[str, Float[Tensor, ""]] = readings.reward_weights
-        self.episode_rewards: Mapping[str, Float[Tensor, " E"]] = readings.episode_rewards
-        self.terminations: Mapping[str, Bool[Tensor, " E"]] = readings.terminations
+        # Managers hold on to the tensors: one that were put in the place of another would have no effect.
+        self.sensors: Mapping[str, SensorTracker] = MappingProxyType(readings.sensors)
+        self.commands: Mapping[str, Float[Tensor, "E ?K"]] = MappingProxyType(readings.commands)
+        self.command_ranges: Mapping[str, Mapping[str, Float[Tensor, " 2"]]] = MappingProxyType(
+            readings.command_ranges
+        )
+        self.reward_weights: Mapping[str, Float[Tensor, ""]] = MappingProxyType(readings.reward_weights)
+        self.episode_rewards: Mapping[str, Float[Tensor, " E"]] = MappingProxyType(readings.episode_rewards)
+        self.terminations: Mapping[str, Bool[Tensor, " E"]] = MappingProxyType(readings.terminations)
         self.terminated_E, self.truncated_E = readings.terminated_E, readings.truncated_E
         self.level, self.command_cache = readings.level, readings.command_cache
 

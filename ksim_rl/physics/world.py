@@ -170,13 +170,13 @@ class World(views.DataViews):
         check_count("n", n)
         check_choice("sensors", sensors, ("last", "contacts", "every"))
         if not before and not after:
-            self._graphs.run(("step", n, sensors), lambda: self._launch_substeps(n, sensors))
+            self._run_substeps(("step", n, sensors), lambda: self._launch_substeps(n, sensors))
         else:
             for substep in range(n):
                 for hook in before:
                     hook()
                 which = self._sensors_of(substep, n, sensors)
-                self._graphs.run(("substep", which), lambda which=which: self._launch_substep(which))
+                self._run_substeps(("substep", which), lambda which=which: self._launch_substep(which))
                 for hook in after:
                     hook()
         if self._nan_guard is not None:
@@ -189,10 +189,10 @@ class World(views.DataViews):
         velocities are recomputed only if a sensor reads them. With a mask, rows outside of it must be current already.
         """
         if mask_E is None:
-            self._graphs.run("refresh", self._substeps.refresh)
+            self._run_substeps("refresh", self._substeps.refresh)
             return
         self._take_mask(mask_E)
-        self._graphs.run("refresh of rows", lambda: self._substeps.refresh(masked=True))
+        self._run_substeps("refresh of rows", lambda: self._substeps.refresh(masked=True))
 
     def view(self, name: str) -> Shaped[Tensor, "*shape"]:
         """Return the view of an array that is current after `refresh`, and let `refresh` compute it from now on.
@@ -389,6 +389,15 @@ class World(views.DataViews):
         tensors |= {f"field/{name}": tensor for name, tensor in self._fields.items()}
         overflow = self._overflow.arrays
         return tensors | {f"overflow/{name}": wp.to_torch(array) for name, array in overflow.items()}
+
+    def _run_substeps(self, key: Hashable, launches: Callable[[], None]) -> None:
+        """Run launches of MuJoCo Warp's stages, among which callbacks may stand.
+
+        Callbacks are Python, and set at any time: a graph of before would leave them out, and one with them would never
+        run their Python again.
+        """
+        calls_back = any(vars(self.warp_model.callback).values())
+        self._graphs.run(key, launches, live=calls_back)
 
     def _launch_substeps(self, n: int, sensors: str) -> None:
         for substep in range(n):

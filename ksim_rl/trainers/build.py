@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from ksim_rl import envs, ranks
 from ksim_rl.collectors import RolloutCollector
+from ksim_rl.device.capture import eagerly
 from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.modules import RecurrentStatePrimer, recurrent_transforms, state_spec
 from ksim_rl.trainers.algorithm import HasWarmUp, make_update
@@ -39,6 +40,7 @@ def build(
 ) -> Trainer:
     """Build everything that a run needs, with all its memory allocated.
 
+    With `collector.eager` nothing is recorded: the Python of rollouts, evaluations and updates runs each time.
     Torch's global seed, matmul precision and number of CPU threads are set from the config. Without a `run_folder`
     nothing is written; without `resume_from` the run starts anew, with the weights of `cfg.checkpoint` if it has one.
     Raises ValueError where a logger's package is missing, or a checkpoint is of another network or env.
@@ -49,7 +51,8 @@ def build(
     torch.set_num_threads(cfg.trainer.num_threads or default_threads(cfg.resolved_device()))
 
     env = build_env(cfg, num_envs=cfg.num_envs, seed=cfg.seed)
-    update = make_update(cfg, env, resumed=resume_from.state["update"] if resume_from else None)
+    with eagerly(cfg.collector.eager):
+        update = make_update(cfg, env, resumed=resume_from.state["update"] if resume_from else None)
     if cfg.trainer.stop_at and not hooks:  # which may log figures of their own
         check_targets(cfg, update.metrics())
     collector = RolloutCollector(
@@ -121,7 +124,8 @@ def build_evaluator(
     env.eval()
     clock = part(env, EpisodeClock)
     max_steps = (clock and clock.max_episode_length) or UNLIMITED_EPISODE_STEPS
-    return Evaluator(env, actor, max_steps=max_steps, seed=seed)
+    with eagerly(cfg.collector.eager):
+        return Evaluator(env, actor, max_steps=max_steps, seed=seed)
 
 
 def solved_at(cfg: RunCfg) -> float | None:

@@ -57,17 +57,23 @@ class Checkpoint:
 
 
 def save(
-    folder: Path, state: Mapping[str, Any], *, iteration: int, config: Mapping[str, Any], keep: int = 3
+    folder: Path,
+    state: Mapping[str, Any],
+    *,
+    iteration: int,
+    config: Mapping[str, Any],
+    keep: int = 3,
+    trusted: int | None = None,
 ) -> Path:
     """Write one more checkpoint into `folder`, and drop all but the newest `keep`; an OSError leaves these alone.
 
-    With several ranks it has the state of all, which all of them pass here, and rank 0 writes.
+    The newest one of those up to the iteration `trusted` stays as well: whether what came later is right is not known
+    yet. With several ranks it has the state of all, which all of them pass here, and rank 0 writes.
     """
     if ranks.size() > 1 and RANKS not in state:
         whole = {**state, RANKS: ranks.gathered(state_tree.split(state)[0])}
-        return Path(
-            ranks.by_first(lambda: str(save(folder, whole, iteration=iteration, config=config, keep=keep)))
-        )
+        given = {"iteration": iteration, "config": config, "keep": keep, "trusted": trusted}
+        return Path(ranks.by_first(lambda: str(save(folder, whole, **given))))
     folder.mkdir(exist_ok=True)
     tensors, values = state_tree.split(state)
     tensor_bytes = safetensors.torch.save(tensors)
@@ -96,7 +102,10 @@ def save(
         raise
     _flush_folder(folder)
 
+    last_trusted = newest_until(folder, iteration if trusted is None else trusted)
     for old in saved(folder)[:-keep]:
+        if old == last_trusted:
+            continue
         discarded = folder / f"{_DISCARDED}{old.name}"
         # Renamed first, so that a crash while deleting leaves no half checkpoint under a valid name.
         os.replace(old, discarded)
@@ -142,6 +151,12 @@ def saved(folder: Path) -> list[Path]:
         return []
     found = [entry for entry in folder.iterdir() if _order(entry.name) is not None and entry.is_dir()]
     return sorted(found, key=lambda entry: _order(entry.name) or (0, 0))
+
+
+def newest_until(folder: Path, iteration: int) -> Path | None:
+    """Return the newest checkpoint in `folder` of this iteration or an earlier one, None without such."""
+    found = [entry for entry in saved(folder) if (_order(entry.name) or (0, 0))[0] <= iteration]
+    return found[-1] if found else None
 
 
 def load_latest(path: Path, *, note: Callable[[str], None] = warnings.warn) -> Checkpoint:

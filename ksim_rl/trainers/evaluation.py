@@ -11,6 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl import ranks
 from ksim_rl.device.capture import Captured
+from ksim_rl.envs.recorded_python import FollowedGraph
 from ksim_rl.envs.signal_keys import signal_keys
 
 
@@ -41,9 +42,11 @@ class Evaluator:
         self._running_E = torch.ones(num_envs, dtype=torch.bool, device=device)
         self._current_E: TensorDictBase | None = None
         self._step = Captured(self._count_one_step, device=device)
+        self._followed = FollowedGraph(env, self._step, {"policy": policy})
 
     def __call__(self, *, stop: Callable[[], bool] = lambda: False) -> Evaluation | None:
         """Evaluate, reading the device once at the end; None if `stop` says so before that."""
+        self._followed.follow()
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             self._start()
             for _ in range(self.max_steps):
@@ -75,8 +78,9 @@ class Evaluator:
 
     def _count_one_step(self) -> None:
         assert self._current_E is not None
-        acting_E = self.policy(self._current_E.copy())
-        stepped_E, current_E = self.env.step_and_maybe_reset(acting_E)
+        with self._followed.calling():
+            acting_E = self.policy(self._current_E.copy())
+            stepped_E, current_E = self.env.step_and_maybe_reset(acting_E)
         next_E = stepped_E.get("next")
         reward_E, done_E = (next_E.get(key).reshape(-1) for key in self._signals[:2])
         self._return_E.add_(torch.where(self._running_E, reward_E.to(torch.float64), 0.0))

@@ -25,9 +25,10 @@ from ksim_rl.runs.whole_file import whole_file, write_whole
 from ksim_rl.trainers import checkpoint, video
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build, build_env
+from ksim_rl.trainers.outcome import Outcome
 from ksim_rl.trainers.progress import RunProgress
 from ksim_rl.trainers.run_cfg import RunCfg
-from ksim_rl.trainers.trainer import Hook, Outcome, Trainer
+from ksim_rl.trainers.trainer import Hook, Trainer
 from ksim_rl.trainers.trial import first_that_fits
 from ksim_rl.transforms import observation_columns
 

@@ -2,7 +2,7 @@
 
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from ksim_rl.collectors import RolloutCollector
 from ksim_rl.diagnosis.iteration_warnings import warnings_of
 from ksim_rl.diagnosis.probes import probed
 from ksim_rl.envs.contract import EpisodeClock, EpisodeSums, missing_parts, part
+from ksim_rl.envs.recorded_python import FrozenPythonError
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.algorithm import HasProgress, Update, notes_of
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
@@ -29,25 +30,13 @@ from ksim_rl.trainers.metrics import (
     read_physics,
     start_copy,
 )
+from ksim_rl.trainers.outcome import Outcome
 from ksim_rl.trainers.progress import RunClock, RunProgress
 from ksim_rl.trainers.run_cfg import TrainerCfg
+from ksim_rl.trainers.suspect_iterations import with_iterations
 from ksim_rl.transforms import observation_columns
 
 INTERRUPTED = "sum/interrupted"  # how many ranks were asked to stop
-
-
-@dataclass(frozen=True, kw_only=True)
-class Outcome:
-    """How a run ended."""
-
-    iteration: int
-    env_states: int
-    seconds: float
-    evaluation: Evaluation | None
-    solved: bool | None  # None where the task has no threshold, or nothing was evaluated
-    target_met: bool | None  # None where no target was set
-    interrupted_by: signal.Signals | None
-    why: str = ""  # it ended
 
 
 class Hook:
@@ -252,7 +241,10 @@ class Trainer:
     def iterate(self) -> None:
         """Collect a rollout, learn from it, and report what happened: where iterations overlap, in the one before."""
         self.collecting.begin(self.iteration + 1)
-        self.rollout_ET = rollout_ET = self.collector.collect()
+        try:
+            self.rollout_ET = rollout_ET = self.collector.collect()
+        except FrozenPythonError as error:
+            raise with_iterations(error, iteration=self.iteration, folder=self.folder) from error
         self.collecting.end()
         if isinstance(self.update, HasProgress):
             self.update.set_progress(min(self.iteration / self.cfg.num_iterations, 1.0))
@@ -380,6 +372,7 @@ class Trainer:
                 iteration=self.iteration,
                 config=self.config,
                 keep=self.cfg.keep_checkpoints,
+                trusted=self.iteration - self.collector.unchecked_rollouts,
             )
         self.saved_at = self.iteration
         return path

@@ -126,7 +126,7 @@ class MetricManager(_OutcomeManager):
 
     def __init__(self, terms: Mapping[str, MetricTerm], driver: EnvDriver) -> None:
         super().__init__(terms, driver)
-        self._held_EM = driver.view.buffers.get("metrics.held_EM", len(self.names), owner=ENV)
+        self.held_EM = driver.view.buffers.get("metrics.held_EM", len(self.names), owner=ENV)
         reductions = [term.reduce for term in terms.values()]
         self._occurring = frozenset(reductions)
         self._is_mean_M, self._is_last_M, self._is_max_M = (
@@ -142,7 +142,7 @@ class MetricManager(_OutcomeManager):
             return
         value_EM = torch.where(finite_E[:, None], torch.stack(values, dim=-1), 0.0)
         self._driver.non_finite.watch(self.kind, value_EM, self.names)
-        held_EM = self._held_EM
+        held_EM = self.held_EM
         next_EM = held_EM + value_EM
         if "last" in self._occurring:
             next_EM = torch.where(self._is_last_M, value_EM, next_EM)
@@ -156,9 +156,9 @@ class MetricManager(_OutcomeManager):
     def reduced_EM(self) -> Float[Tensor, "E M"]:
         """The reduced values of the episodes so far, float32 [E, M]."""
         if "mean" not in self._occurring:
-            return self._held_EM
-        mean_EM = self._held_EM / self._view.episode_step_E[:, None].clamp(min=1)
-        return torch.where(self._is_mean_M, mean_EM, self._held_EM)
+            return self.held_EM
+        mean_EM = self.held_EM / self._view.episode_step_E[:, None].clamp(min=1)
+        return torch.where(self._is_mean_M, mean_EM, self.held_EM)
 
 
 class CurriculumManager(_OutcomeManager):

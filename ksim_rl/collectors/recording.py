@@ -1,0 +1,168 @@
+"""Keeps what a collector has recorded of an env true to the env, for as long as rollouts go on."""
+
+import warnings
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+
+from ksim_rl.compiled.compiled_step import CompiledStep
+from ksim_rl.compiled.graph_step import GraphStep
+from ksim_rl.compiled.python_watch import Change, listed
+from ksim_rl.compiled.step_check import StepCheck
+from ksim_rl.device.capture import Captured
+from ksim_rl.envs.contract import SimulatedWorld, part
+from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
+from ksim_rl.envs.recorded_python import EAGER, KEEP, FrozenPythonError, RecordedPython
+
+Policy = Callable[[TensorDictBase], TensorDictBase]
+Act = Callable[[], TensorDictBase]
+"""Gives what the policy makes of the present root; its draws do not count."""
+
+
+class Recording:
+    """The recorded step of an env: kernels, if it `compiles`, and on CUDA the `graph` of whole rollouts.
+
+    It is made anew where Python has changed which it was made from. A change that comes again and again makes it wait
+    longer each time: the env's own Python runs meanwhile. What nothing shows but the numbers is found by comparing the
+    recorded step with the env's own, after 1, 2, 4, 8 ... rollouts: so a change is noticed after at most as many
+    rollouts as there were before it.
+
+    Attributes:
+        compiled_step: the kernels, if there are any.
+    """
+
+    def __init__(self, env: EnvBase, policy: Policy, *, compiles: bool, graph: Captured) -> None:
+        self._env, self._compiles, self._graph = env, compiles, graph
+        self._has_graph = graph.device.type == "cuda" and not graph.is_eager
+        # On CUDA the graph of a rollout holds what the policy does in Python, too.
+        self._python = RecordedPython(env, {"policy": policy} if self._has_graph else {})
+        inner = part(env, ManagerBasedRlEnv)
+        self._by_term = dict if inner is None else inner.values_by_term
+        # Other envs cannot be put back to where they were before a comparison.
+        self._can_return = part(env, SimulatedWorld) is not None
+        self.compiled_step: CompiledStep | None = None
+        self._graph_step: GraphStep | None = None
+        self._times, self._waiting = 0, 0
+        # Since the last recording.
+        self._rollouts, self._agreed_after = 0, 0
+
+    @property
+    def wants_kernels(self) -> bool:
+        """Whether the env's step is to be compiled before the next rollout."""
+        return self._compiles and self.compiled_step is None and not self._waiting
+
+    @property
+    def unchecked_rollouts(self) -> int:
+        """How many rollouts have been made since the recorded step was last seen to be the env's own."""
+        return self._rollouts - self._agreed_after
+
+    def compile(self, root_E: TensorDictBase, act: Act) -> None:
+        """Compile the env's step; where that cannot be done, say so, and leave it to graphs or to Python.
+
+        A FrozenPythonError where Python changes from step to step; see `RecordedPython`.
+        """
+        self._try_python(root_E, act)
+        try:
+            self.compiled_step = CompiledStep(
+                self._env, root_E, act(), nan_ends_rows=self._can_return, by_term=self._by_term
+            )
+        except RuntimeError as error:
+            self._compiles = False
+            warnings.warn(
+                f"THE ENV'S STEP IS NOT COMPILED, and slower: {error}", RuntimeWarning, stacklevel=3
+            )
+
+    def calling(self) -> AbstractContextManager[None]:
+        """Be around a step of policy and env in Python: the first ones show whether it can be recorded."""
+        if self._python.is_known or not self._records:
+            return nullcontext()
+        return self._python.calling()
+
+    def before_rollout(self, root_E: TensorDictBase, act: Act) -> list[Change]:
+        """Return what has changed in Python since the recording, which is then forgotten.
+
+        A FrozenPythonError where a change is without effect, or where a comparison shows one that was not seen.
+        """
+        if not (self._records and self._python.is_known):
+            return []
+        changes = self._python.changes()
+        if changes:
+            self._forget(changes)
+        elif self._waiting:
+            self._waiting -= 1
+            self._graph.is_eager = self._waiting > 0
+        elif self._is_recorded:
+            self._check(root_E, act)
+            self._rollouts += 1
+        return changes
+
+    @property
+    def _records(self) -> bool:
+        return self._compiles or self._has_graph
+
+    @property
+    def _is_recorded(self) -> bool:
+        return self.compiled_step is not None or self._graph.ready
+
+    def _try_python(self, root_E: TensorDictBase, act: Act) -> None:
+        """Make the first steps of env and policy in Python, which leave no trace: it takes less than to record them."""
+        check = StepCheck(self._env, root_E, act())
+        with check.left_alone():
+            while not self._python.is_known:
+                with self.calling():
+                    if self._has_graph:
+                        act()
+                    check.own_step()
+
+    def _forget(self, changes: list[Change]) -> None:
+        """Drop what was recorded, and wait with the next recording if this is not the first time."""
+        self._times += self._is_recorded
+        self._waiting = (1 << max(self._times - 1, 0)) - 1
+        what = f"{listed(changes)} since the env's step was recorded: it is recorded anew"
+        if self._waiting:
+            what = (
+                f"{listed(changes)}, and it is not the first change since the env's step was recorded: the Python of "
+                f"each step runs, which is SLOWER, until nothing has changed for {self._waiting} rollouts. {KEEP}"
+            )
+        warnings.warn(what, RuntimeWarning, stacklevel=4)
+        self._drop()
+        self._python.forget()
+        self._rollouts = self._agreed_after = 0
+
+    def _drop(self) -> None:
+        self.compiled_step = self._graph_step = None
+        self._graph.forget()
+        self._graph.is_eager = self._waiting > 0
+
+    def _check(self, root_E: TensorDictBase, act: Act) -> None:
+        """Compare the recorded step with the env's own, if it is time to."""
+        if not self._can_return:
+            return
+        if self.compiled_step is None and self._graph_step is None:
+            self._graph_step = GraphStep(self._env, root_E, act(), self._by_term)
+        if self._rollouts.bit_count() != 1:
+            return
+        step = self.compiled_step or self._graph_step
+        assert step is not None
+        found = step.differences()
+        if not found:
+            self._agreed_after = self._rollouts
+            return
+        suspects = self.unchecked_rollouts
+        if self.compiled_step is not None:
+            # Kernels that are made now agree, unless it is they that are wrong in this state: `compile` says that.
+            self._drop()
+            self.compile(root_E, act)
+            if self.compiled_step is None:
+                warnings.warn(f"they have made the last {suspects} rollouts", RuntimeWarning, stacklevel=4)
+                return
+        names = ", ".join(found[:3])
+        more = f" and {len(found) - 3} more" if len(found) > 3 else ""
+        raise FrozenPythonError(
+            f"the env's own step gives another {names}{more} than what was recorded of it {self._rollouts} rollouts "
+            f"ago, though no Python value has changed that can be seen (it may be in a file or a library): the last "
+            f"{suspects} rollouts may be of what it was then. {KEEP}; {EAGER}",
+            rollouts=suspects,
+        )

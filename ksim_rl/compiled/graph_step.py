@@ -1,0 +1,50 @@
+"""Records one step of an env as a CUDA graph, so that it can be compared with what Python makes later."""
+
+from collections.abc import Callable, Mapping
+
+import torch
+from jaxtyping import Shaped
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ksim_rl.compiled.step_check import StepCheck
+from ksim_rl.device.capture import Captured
+
+
+class GraphStep:
+    """`env.step_and_maybe_reset` as it was when a graph of whole rollouts was recorded.
+
+    The arguments are those of `CompiledStep`; making it leaves the env as it was. Where there are no CUDA graphs it is
+    the env's own step, and never differs.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        root_E: TensorDictBase,
+        tensordict: TensorDictBase,
+        by_term: Callable[[], Mapping[str, Shaped[Tensor, "*?shape"]]] = dict,
+    ) -> None:
+        root_keys = list(root_E.keys(True, True))
+        held = tensordict.copy()
+        for key in tensordict.keys(True, True):
+            if key not in root_keys:
+                held.set(key, tensordict.get(key).clone())
+        self._check = StepCheck(env, root_E, held, by_term)
+        self._run = Captured(self._step, device=env.device or torch.device("cpu"))
+        self._env_state_E: TensorDictBase = held
+        with self._check.left_alone():
+            for _ in range(self._run.warmup + 1):
+                self._run()
+
+    def differences(self) -> list[str]:
+        """Return what the env's own step from the present state gives otherwise; see `StepCheck`."""
+        return self._check.differences(self._replayed)
+
+    def _replayed(self) -> TensorDictBase:
+        self._run()
+        return self._env_state_E
+
+    def _step(self) -> None:
+        self._env_state_E = self._check.own_step()

@@ -1,0 +1,197 @@
+"""Finds the calls by which a step asks the host: its clocks, its random numbers, its files and its environment.
+
+Their answers would become constants of a recording. Code of libraries may ask for purposes of its own.
+"""
+
+import datetime
+import inspect
+import io
+import os
+import random
+import sys
+import types
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ksim_rl.compiled.packages import OURS, is_library, package_of, packages_of
+from ksim_rl.compiled.python_states import state_of
+
+CLOCKS = frozenset(
+    {
+        "clock_gettime",
+        "clock_gettime_ns",
+        "gmtime",
+        "localtime",
+        "monotonic",
+        "monotonic_ns",
+        "perf_counter",
+        "perf_counter_ns",
+        "process_time",
+        "process_time_ns",
+        "thread_time",
+        "time",
+        "time_ns",
+    }
+)
+FILES = frozenset({"listdir", "open", "pread", "read", "scandir", "stat", "urandom"})
+_DATES = frozenset({"now", "today", "utcnow"})
+_ENVIRONMENT = type(os.environ).__getitem__.__code__
+
+CLOCK, RANDOM, FILE, ENVIRONMENT = (
+    "a clock",
+    "random numbers of the host",
+    "a file",
+    "an environment variable",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HostCall:
+    """A call of `name`, which asks for `what`, from the code at `place`, which ran as a part of the env (or none)."""
+
+    what: str
+    name: str
+    place: str
+    part: str
+
+    def __str__(self) -> str:
+        """Say who asks for what, and where."""
+        return f"{self.part or 'the step'} asks for {self.what}, by {self.name} at {self.place}"
+
+
+@contextmanager
+def host_calls(parts: Mapping[str, Any]) -> Iterator[list[HostCall]]:
+    """Collect the calls of this block; `parts` are the objects to which they are ascribed, by name.
+
+    Numbers of numpy's own generator are told by its state, since its functions are not seen when they are called.
+    """
+    tracer = _Tracer(parts)
+    before = sys.getprofile()
+    sys.setprofile(tracer.notice)
+    try:
+        yield tracer.found
+    finally:
+        sys.setprofile(before)
+        tracer.end()
+
+
+class _Tracer:
+    def __init__(self, parts: Mapping[str, Any]) -> None:
+        self.found: list[HostCall] = []
+        self._names = {id(part): name for name, part in parts.items()}
+        self._packages = packages_of(parts.values())
+        classes = {cls for part in parts.values() for cls in type(part).__mro__}
+        self._entries = {
+            function.__code__
+            for cls in classes
+            for function in vars(cls).values()
+            if inspect.isfunction(function)
+        }
+        self._running: list[tuple[types.FrameType, str]] = []
+        self._numpy = _numpy_state()
+
+    def notice(self, frame: types.FrameType, event: str, function: Any) -> None:
+        """Look at one event of Python's profiler."""
+        if event == "c_call":
+            asked = _asked(function)
+            if asked is not None:
+                self._take(asked, _spelled(function), frame)
+        elif event == "call":
+            if frame.f_code is _ENVIRONMENT:
+                self._take(ENVIRONMENT, "os.environ", frame)
+            elif frame.f_code in self._entries:
+                self._begin(frame)
+        elif event == "return" and self._running and self._running[-1][0] is frame:
+            self._end_part()
+
+    def end(self) -> None:
+        """Look at numpy once more, for code that is no part."""
+        self._look_at_numpy("")
+
+    def _begin(self, frame: types.FrameType) -> None:
+        code = frame.f_code
+        owner = frame.f_locals.get(code.co_varnames[0]) if code.co_argcount else None
+        name = self._names.get(id(owner))
+        if name is not None:
+            # What was drawn before this was drawn by whoever called it.
+            self._look_at_numpy(self._part)
+            self._running.append((frame, name))
+
+    def _end_part(self) -> None:
+        self._look_at_numpy(self._part)
+        self._running.pop()
+
+    @property
+    def _part(self) -> str:
+        return self._running[-1][1] if self._running else ""
+
+    def _look_at_numpy(self, part: str) -> None:
+        now = _numpy_state()
+        if now != self._numpy:
+            self._numpy = now
+            place = _place(self._running[-1][0]) if self._running else "an unknown place"
+            self._add(HostCall(what=RANDOM, name="numpy.random", place=place, part=part))
+
+    def _take(self, what: str, name: str, frame: types.FrameType | None) -> None:
+        # Python's own modules ask for whoever calls them: `random.uniform`, `Path.read_text`.
+        while frame is not None and package_of(_module(frame)) in sys.stdlib_module_names:
+            frame = frame.f_back
+        if frame is None:
+            return
+        package = package_of(_module(frame))
+        is_users = package in self._packages or not is_library(package)
+        if is_users and package != OURS:
+            self._add(HostCall(what=what, name=name, place=_place(frame), part=self._part))
+
+    def _add(self, call: HostCall) -> None:
+        if call not in self.found:
+            self.found.append(call)
+
+
+def _asked(function: Any) -> str | None:
+    """Return what a function of C asks the host for, None if nothing."""
+    name = getattr(function, "__name__", "")
+    owner = getattr(function, "__self__", None)
+    if isinstance(owner, types.ModuleType):
+        module = owner.__name__
+        if module == "time" and name in CLOCKS:
+            return CLOCK
+        if module in ("posix", "nt", "io", "_io") and name in FILES:
+            return RANDOM if name == "urandom" else FILE
+        if module == "builtins" and name == "input":
+            return FILE
+        return None
+    if isinstance(owner, type):
+        return CLOCK if issubclass(owner, datetime.date) and name in _DATES else None
+    # `type`, because `isinstance` would ask proxies that warn when they are looked at.
+    kind = type(owner)
+    if issubclass(kind, (random.Random, np.random.Generator, np.random.RandomState)):
+        return RANDOM
+    if issubclass(kind, io.IOBase) and name.startswith("read"):
+        return FILE
+    return None
+
+
+def _spelled(function: Any) -> str:
+    owner = getattr(function, "__self__", None)
+    if isinstance(owner, types.ModuleType):
+        return f"{owner.__name__}.{function.__name__}"
+    kind = owner if isinstance(owner, type) else type(owner)
+    return f"{kind.__name__}.{function.__name__}"
+
+
+def _numpy_state() -> Any:
+    return state_of(np.random.mtrand._rand)
+
+
+def _module(frame: types.FrameType) -> str:
+    return frame.f_globals.get("__name__") or ""
+
+
+def _place(frame: types.FrameType) -> str:
+    return f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"

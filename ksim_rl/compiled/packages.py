@@ -1,0 +1,34 @@
+"""Tells the packages of a user from those of libraries, whose code keeps nothing in Python that a step depends on."""
+
+import functools
+import sys
+from collections.abc import Iterable
+from typing import Any
+
+OURS = "ksim_rl"
+# Their transforms and modules are parts of envs, too.
+_FRAMEWORKS = frozenset({"torch", "torchrl", "tensordict"})
+
+
+def package_of(module: str | None) -> str:
+    """Return the package at the top of a module's name."""
+    return (module or "").partition(".")[0]
+
+
+@functools.cache
+def is_library(package: str) -> bool:
+    """Whether a package at the top is ours, Python's own or installed: then its code is not looked into.
+
+    A package of the user may be installed as well: who looks has to except those that the user's parts come from.
+    """
+    if package == OURS or package in sys.stdlib_module_names:
+        return True
+    spec = getattr(sys.modules.get(package), "__spec__", None)
+    places = [*(getattr(spec, "submodule_search_locations", None) or ()), getattr(spec, "origin", None) or ""]
+    return any("site-packages" in place or "dist-packages" in place for place in places)
+
+
+def packages_of(parts: Iterable[Any]) -> frozenset[str]:
+    """Return the packages that some functions and classes of objects come from, without ours and Python's."""
+    packages = {package_of(getattr(part, "__module__", None)) for part in parts}
+    return frozenset(packages - {OURS} - sys.stdlib_module_names - _FRAMEWORKS)

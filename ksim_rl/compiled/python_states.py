@@ -1,0 +1,68 @@
+"""Tells by plain values where objects stand that change without being replaced: generators, iterators, arrays."""
+
+import random
+import warnings
+import zlib
+from collections.abc import Iterator, Mapping
+from enum import Enum
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+import torch
+
+PLAIN = (
+    type(None),
+    bool,
+    int,
+    float,
+    complex,
+    str,
+    bytes,
+    range,
+    slice,
+    Enum,
+    PurePath,
+    np.generic,
+    torch.device,
+    torch.dtype,
+)
+"""Types whose objects never change, so that an equal one is as good."""
+
+
+def state_of(source: Any) -> int:
+    """Return a number that tells where a generator of random numbers of Python or numpy stands."""
+    if isinstance(source, random.Random):
+        return hash(source.getstate())
+    if isinstance(source, np.random.Generator):
+        return hash(_hashable(source.bit_generator.state))
+    return hash(_hashable(source.get_state(legacy=False)))
+
+
+def _hashable(tree: Any) -> Any:
+    """Return a tree of plain values in which checksums stand for arrays."""
+    if isinstance(tree, np.ndarray):
+        return checksum(tree)
+    if isinstance(tree, Mapping):
+        return tuple((key, _hashable(value)) for key, value in tree.items())
+    return tree
+
+
+def checksum(array: np.ndarray) -> int:
+    """Return a number that tells what an array holds."""
+    return zlib.crc32(array.tobytes())
+
+
+def place_of(iterator: Any) -> str | None:
+    """Return where an iterator of Python's own stands, None where it does not tell."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        try:
+            _, *arguments = iterator.__reduce__()
+        except (TypeError, AttributeError):
+            return None
+    # What it goes through may be large, and is looked at elsewhere if it can change.
+    plain = [argument for argument in arguments if issubclass(type(argument), PLAIN)]
+    nested = [item for part in arguments if isinstance(part, tuple) for item in part]
+    within = [place_of(item) for item in nested if isinstance(item, Iterator)]
+    return repr((plain, [item for item in nested if issubclass(type(item), PLAIN)], within))

@@ -1,0 +1,126 @@
+"""Notices that Python values have changed which a recorded step was made from, and names them."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from operator import is_
+from typing import Any
+
+import torch
+
+from ksim_rl.compiled.python_states import PLAIN
+from ksim_rl.compiled.python_values import ABSENT, Held, held_by
+
+LONGEST = 60
+"""Characters of a value in a text."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Change:
+    """A value that is another one than it was.
+
+    `owner` has it under `key`; `names` say where it is, from each part that depends on it.
+    """
+
+    names: tuple[str, ...]
+    owner: Any
+    key: Any
+    before: Any
+    now: Any
+
+    def __str__(self) -> str:
+        """Name it, with both values where they can be told apart by what they look like."""
+        where = " and ".join(self.names[:3])
+        if len(self.names) > 3:
+            where += f" and {len(self.names) - 3} more"
+        before, now = _shown(self.before), _shown(self.now)
+        if before == now:
+            return f"{where} is another object"
+        return f"{where} was {before} and is {now}"
+
+
+class PythonWatch:
+    """The Python values that some parts depend on, as they were when it last looked.
+
+    Parts are objects by name: terms, transforms, networks. Looking for all values takes some milliseconds; asking
+    whether any of them has changed takes some tens of microseconds, since values that do not change are told by their
+    identity.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._held: list[_Remembered] = []
+
+    def look(self, parts: Mapping[str, Any]) -> None:
+        """Look for all values that the parts depend on now, and remember them."""
+        self._held = [_Remembered.of(held) for held in held_by(parts, self._device)]
+
+    def changes(self) -> list[Change]:
+        """Return what has changed since the last `look`."""
+        found: list[Change] = []
+        for remembered in self._held:
+            if remembered.is_the_same():
+                continue
+            held, before = remembered.held, remembered.before
+            now = held.read()
+            for key in dict.fromkeys((*before, *now)):
+                old, new = before.get(key, ABSENT), now.get(key, ABSENT)
+                if _is_same(old, new):
+                    continue
+                names = tuple(held.spell(path, key) for path in held.paths)
+                found.append(Change(names=names, owner=held.owner, key=key, before=old, now=new))
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Remembered:
+    """Values in one place as they were: by key, and in order. `size` is that of the table that all of them are from."""
+
+    held: Held
+    before: dict[Any, Any]
+    values: list[Any]
+    size: int
+
+    @classmethod
+    def of(cls, held: Held) -> "_Remembered":
+        before = dict(held.read())
+        size = -1 if held.table is None else len(held.table)
+        return cls(held, before, list(before.values()), size)
+
+    def is_the_same(self) -> bool:
+        """Whether each value is the same as before; False also where that takes a closer look."""
+        table, pick = self.held.table, self.held.pick
+        if table is None or len(table) != self.size:
+            now = self.held.read()
+            # Numbers that are worked out are other objects each time.
+            return len(now) == len(self.values) and all(map(_is_same, now.values(), self.values))
+        if pick is None:
+            return all(map(is_, table.values(), self.values))
+        try:
+            return all(map(is_, pick(table), self.values))
+        except KeyError:
+            return False
+
+
+def listed(changes: Iterable[Change], *, most: int = 4) -> str:
+    """Return the changes as one text."""
+    texts = list(dict.fromkeys(map(str, changes)))
+    more = f"; and {len(texts) - most} more" if len(texts) > most else ""
+    return "; ".join(texts[:most]) + more
+
+
+def _is_same(old: Any, new: Any) -> bool:
+    if old is new:
+        return True
+    kind = type(old)
+    if kind is not type(new):
+        return False
+    if issubclass(kind, tuple):
+        return len(old) == len(new) and all(map(_is_same, old, new))
+    return issubclass(kind, PLAIN) and bool(old == new)
+
+
+def _shown(value: Any) -> str:
+    if not issubclass(type(value), (*PLAIN, list, dict, tuple, set)):
+        return f"a {type(value).__name__}"
+    text = value if value is ABSENT else repr(value)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."

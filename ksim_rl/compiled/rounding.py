@@ -1,0 +1,50 @@
+"""Shows what rounding may do to a result: it moves what is computed by one unit in the last place.
+
+A result may be far more sensitive than its size tells: 1 + cos(x) near pi keeps only the last bits of the cosine, which
+another library rounds otherwise. This is the random arithmetic of Vignes, "A stochastic arithmetic for reliable
+scientific computation" (1993), for torch's operators.
+"""
+
+from typing import Any
+
+import torch
+from jaxtyping import Shaped
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_map_only
+
+_NAMES = """
+    _softmax acos acosh add addcdiv addcmul addmm addmv asin asinh atan atan2 atanh baddbmm bmm cos cosh cumprod cumsum
+    div dot erf erfc erfinv exp exp2 expm1 fmod frac gelu hypot lerp linalg_cross linalg_vector_norm log log10 log1p
+    log2 logaddexp logsumexp mean mm mul mv norm pow prod reciprocal remainder rsqrt rsub sigmoid silu sin sinc sinh
+    softplus sqrt square std sub sum tan tanh var xlogy
+"""
+ROUNDED = frozenset(_NAMES.split())
+"""Operators whose results are rounded; others move numbers, compare them, or choose among them."""
+
+
+def nudged(value: Shaped[Tensor, "*shape"], generator: torch.Generator) -> Shaped[Tensor, "*shape"]:
+    """Return a tensor, each floating-point number of which has moved by one unit in the last place, up or down."""
+    if not value.is_floating_point():
+        return value
+    is_up = torch.randint(2, value.shape, generator=generator, device=generator.device).to(value.device)
+    towards = torch.where(is_up.bool(), torch.inf, -torch.inf).to(value.dtype)
+    return torch.where(value.isfinite(), torch.nextafter(value, towards), value)
+
+
+class Nudging(TorchDispatchMode):
+    """Moves, within this context, each number that an operator of torch rounds; `generator` says which way."""
+
+    def __init__(self, generator: torch.Generator) -> None:
+        super().__init__()
+        self._generator = generator
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        name = func.overloadpacket.__name__
+        if name.rstrip("_") not in ROUNDED and name not in ROUNDED:
+            return result
+        if name.endswith("_"):
+            args[0].copy_(nudged(args[0], self._generator))
+            return result
+        return tree_map_only(Tensor, lambda value: nudged(value, self._generator), result)

@@ -1,0 +1,132 @@
+"""Compares a recorded step of an env with the one that the env's own Python makes from the same state."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from jaxtyping import Shaped
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ksim_rl.compiled.differences import Results, differences
+from ksim_rl.compiled.rounding import Nudging, nudged
+
+# What the env last returned is no state of its own, and a recorded step returns it otherwise; how many contacts of all
+# worlds there were at most changes with the smallest difference in one.
+_LEFT_OUT = ("last_root.", "overflow/")
+
+
+def _unchanged(value: Any) -> Any:
+    return value
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """What a step begins from: the state of the env, the root, and what the policy gave."""
+
+    env: dict[str, Any]
+    root_E: TensorDictBase
+    given: dict[NestedKey, Tensor]
+
+
+class StepCheck:
+    """Makes the env's own step in the memory that a recorded one uses, and compares the two.
+
+    `root_E` is the EnvState before a step, in whose memory the one after it is written; `tensordict` is what a policy
+    made of it. `by_term` gives tensors that each step writes in place, by the term that they are of: it is named where
+    they differ.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        root_E: TensorDictBase,
+        tensordict: TensorDictBase,
+        by_term: Callable[[], Mapping[str, Shaped[Tensor, "*?shape"]]] = dict,
+    ) -> None:
+        self._env, self._root_E, self._tensordict, self._by_term = env, root_E, tensordict, by_term
+        self._root_keys = list(root_E.keys(True, True))
+        self._given_keys = [key for key in tensordict.keys(True, True) if key not in self._root_keys]
+
+    def own_step(self) -> TensorDictBase:
+        """Make the env's own step, write the next root, and return the EnvState."""
+        env_state_E, next_root_E = self._env.step_and_maybe_reset(self._tensordict.copy())
+        for key in self._root_keys:
+            self._root_E.get(key).copy_(next_root_E.get(key))
+        return env_state_E
+
+    def differences(self, recorded_step: Callable[[], TensorDictBase]) -> list[str]:
+        """Return what the two steps from the present state give differently, each with the number of rows.
+
+        Both make the same draws. Afterwards env, root, the policy's leaves and torch's random numbers are as they were.
+        """
+        start = self._state()
+        try:
+            with self._draws_forgotten():
+                true = self._results(self.own_step())
+            self._return_to(start)
+            with self._draws_forgotten():
+                found = self._results(recorded_step())
+
+            def moved(number: int) -> Results:
+                generator = torch.Generator().manual_seed(number)
+                self._return_to(start, partial(_nudged, generator=generator))
+                with self._draws_forgotten(), Nudging(generator):
+                    env_state_E = self.own_step()
+                return self._results(env_state_E)
+
+            rows = differences(found, true, num_rows=self._env.batch_size[0], moved=moved)
+        finally:
+            self._return_to(start)
+        return [f"{name} in {number} rows" for name, number in rows.items()]
+
+    @contextmanager
+    def left_alone(self) -> Iterator[None]:
+        """Leave env, root and draws as they are now, whatever steps are made in this block."""
+        start = self._state()
+        try:
+            with self._draws_forgotten():
+                yield
+        finally:
+            self._return_to(start)
+
+    def _draws_forgotten(self) -> AbstractContextManager[None]:
+        device = self._env.device
+        return torch.random.fork_rng([device] if device is not None and device.type == "cuda" else [])
+
+    def _state(self) -> _State:
+        given = {key: self._tensordict.get(key).clone() for key in self._given_keys}
+        return _State(self._env.state_dict(), self._root_E.clone(), given)
+
+    def _return_to(self, start: _State, change: Callable[[Any], Any] = _unchanged) -> None:
+        """Restore a state, or what `change` makes of each tensor of it."""
+        self._env.load_state_dict({name: change(value) for name, value in start.env.items()})
+        for key in self._root_keys:
+            self._root_E.get(key).copy_(change(start.root_E.get(key)))
+        for key, value in start.given.items():
+            self._tensordict.get(key).copy_(change(value))
+
+    def _results(self, env_state_E: TensorDictBase) -> Results:
+        """Copy all that a step leads to: what terms gave, the EnvState, the next root, and the state of the env."""
+        results = {name: value.clone() for name, value in self._by_term().items()}
+        next_E = env_state_E.get("next")
+        results |= {_spelled("next", key): leaf.clone() for key, leaf in next_E.items(True, True)}
+        results |= {_spelled("root", key): leaf.clone() for key, leaf in self._root_E.items(True, True)}
+        for name, value in self._env.state_dict().items():
+            is_own = not any(left_out in name for left_out in _LEFT_OUT)
+            if is_own and isinstance(value, Tensor):
+                results[name] = value
+        return results
+
+
+def _nudged(value: Any, generator: torch.Generator) -> Any:
+    return nudged(value, generator) if isinstance(value, Tensor) else value
+
+
+def _spelled(tree: str, key: NestedKey) -> str:
+    parts = (key,) if isinstance(key, str) else key
+    return ".".join((tree, *map(str, parts)))

@@ -1,0 +1,127 @@
+"""Keeps a recorded step true to the Python that it was recorded from: what changes is noticed and named."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any
+
+import torch
+from torchrl.envs import EnvBase
+
+from ksim_rl.compiled.host_calls import CLOCK, ENVIRONMENT, FILE, RANDOM, HostCall, host_calls
+from ksim_rl.compiled.python_watch import Change, PythonWatch, listed
+from ksim_rl.device.capture import Captured
+from ksim_rl.envs.python_parts import python_parts, why_not
+
+INSTEAD = {
+    CLOCK: "tell the time by `view.episode_time_E` or `view.step_count`",
+    RANDOM: "draw by `view.uniform`, `view.normal` or `view.integers`",
+    FILE: "read files while the env is built, in `__post_init__` of the term",
+    ENVIRONMENT: "read the environment while the env is built, in `__post_init__` of the term",
+}
+KEEP = (
+    "Keep what changes in `view.buffer` (a row per env) or `view.shared`, and count by `view.step_count` or "
+    "`view.episode_step_E`"
+)
+EAGER = "or let the Python of each step run, which takes longer: collector.eager=true"
+
+
+class FrozenPythonError(ValueError):
+    """Python that would be frozen by a recording, or has been; the message names it, and what to write instead.
+
+    The last `rollouts` may have been made with what was frozen.
+    """
+
+    def __init__(self, message: str, *, rollouts: int = 0) -> None:
+        super().__init__(message)
+        self.rollouts = rollouts
+
+
+class RecordedPython:
+    """The Python that steps of an env run, from the first step on.
+
+    A recorded step (kernels, a CUDA graph) runs none of it. So it has to be the same at each step, which the second
+    step shows: `calling` is around each of the first ones. After those, `changes` says what somebody has changed from
+    outside, such as an attribute of a term, or a transform more; then the step has to be recorded anew.
+
+    `others` are objects whose Python becomes part of the recording as well, by name: a policy.
+    """
+
+    def __init__(self, env: EnvBase, others: Mapping[str, Any] | None = None) -> None:
+        self._env, self._others = env, dict(others or {})
+        self._watch = PythonWatch(env.device or torch.device("cpu"))
+        self._calls = 0
+
+    @property
+    def is_known(self) -> bool:
+        """Whether two steps have shown what Python does."""
+        return self._calls >= 2
+
+    @contextmanager
+    def calling(self) -> Iterator[None]:
+        """Be around one of the first steps; a FrozenPythonError after the second where it changed or asked the host.
+
+        What the first one changes may be a cache that it fills.
+        """
+        if self._calls != 1:
+            yield
+        else:
+            with host_calls(self._parts()) as calls:
+                yield
+            self._refuse(calls, self._watch.changes())
+        self._calls += 1
+        self._watch.look(self._parts())
+
+    def forget(self) -> None:
+        """Let the next two steps show anew what Python does."""
+        self._calls = 0
+
+    def changes(self) -> list[Change]:
+        """Return what has changed since the last `look`; a FrozenPythonError if it cannot have an effect any more."""
+        found = self._watch.changes()
+        for change in found:
+            instead = why_not(change)
+            if instead is not None:
+                raise FrozenPythonError(f"{change}, without effect: {instead}")
+        return found
+
+    def _parts(self) -> dict[str, Any]:
+        return python_parts(self._env) | self._others
+
+    def _refuse(self, calls: Sequence[HostCall], changes: Sequence[Change]) -> None:
+        if calls:
+            found = "; ".join(dict.fromkeys(map(str, calls[:3])))
+            instead = INSTEAD[calls[0].what]
+            raise FrozenPythonError(
+                f"{found}: its answer would be frozen, since the Python of a step runs while that is recorded, and no "
+                f"more. Instead {instead}; {EAGER}"
+            )
+        if changes:
+            raise FrozenPythonError(
+                f"{listed(changes)} after one step more: it would be frozen, since the Python of a step runs while "
+                f"that is recorded, and no more. {KEEP}; {EAGER}"
+            )
+
+
+class FollowedGraph:
+    """A CUDA graph of a step of an env, which is recorded anew where the Python has changed that it was recorded from.
+
+    On the CPU, and where graphs are not wanted, Python runs at each step, and there is nothing to follow. `others` see
+    `RecordedPython`.
+    """
+
+    def __init__(self, env: EnvBase, graph: Captured, others: Mapping[str, Any] | None = None) -> None:
+        self._graph = graph
+        self._python = RecordedPython(env, others)
+        self._records = graph.device.type == "cuda" and not graph.is_eager
+
+    def calling(self) -> AbstractContextManager[None]:
+        """Be around a step in Python; see `RecordedPython`."""
+        if self._python.is_known or not self._records:
+            return nullcontext()
+        return self._python.calling()
+
+    def follow(self) -> None:
+        """Forget the graph if Python has changed; a FrozenPythonError if that cannot have an effect any more."""
+        if self._records and self._python.is_known and self._python.changes():
+            self._graph.forget()
+            self._python.forget()
