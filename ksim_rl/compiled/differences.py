@@ -30,15 +30,14 @@ def differences(
     `moved(number)` gives the outcome of the true step when each number that it reads or rounds moves by one unit in its
     last place, up or down, in another way for each `number`. Tensors whose first dim is not `num_rows` are one row.
     """
-    open_rows: dict[str, Tensor] = {}
-    errors: dict[str, Tensor] = {}
+    too_far: dict[str, Tensor] = {}
     for name, values in true.items():
-        if not values.numel():
-            continue
-        too_far = _rows(_is_too_far(found[name], values), num_rows).any(-1)
-        if bool(too_far.any()):
-            open_rows[name] = too_far
-            errors[name] = _error(found[name], values, num_rows)
+        if values.numel():
+            too_far[name] = _rows(_is_too_far(found[name], values), num_rows).any(-1)
+    # One look at the device for all of them: most often there is nothing to see.
+    is_open = torch.stack([rows.any() for rows in too_far.values()]).tolist()
+    open_rows = {name: rows for (name, rows), is_one in zip(too_far.items(), is_open, strict=True) if is_one}
+    errors = {name: _error(found[name], true[name], num_rows) for name in open_rows}
     for number in range(MOST_MOVES):
         if not open_rows:
             break

@@ -184,7 +184,7 @@ REFUSED = {
     "an iterator": (lambda: Calling(ask=itertools.count().__next__), r"rewards\.term\.ask\.place was"),
     "a default argument": (lambda: MutableDefault(), r"rewards\.term: .*defaults of .*value"),
     "an attribute of the view": (lambda: OfView(), r"view\.count was \d+ and is \d+"),
-    "a wall clock": (lambda: WallClock(), r"rewards\.term asks for a clock, by time\.time at test_frozen"),
+    "a wall clock": (lambda: WallClock(), r"rewards\.term asks for a clock, by time\.time at test_recording"),
     "a date": (lambda: Today(), r"rewards\.term asks for a clock, by datetime\.now"),
     "random": (lambda: PythonRandom(), r"rewards\.term asks for random numbers .*, by Random\.random"),
     "numpy.random": (lambda: NumpyRandom(), r"rewards\.term asks for random numbers .*, by numpy\.random"),
