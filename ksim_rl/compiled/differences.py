@@ -34,6 +34,8 @@ def differences(
     for name, values in true.items():
         if values.numel():
             too_far[name] = _rows(_is_too_far(found[name], values), num_rows).any(-1)
+    if not too_far:
+        return {}
     # One look at the device for all of them: most often there is nothing to see.
     is_open = torch.stack([rows.any() for rows in too_far.values()]).tolist()
     open_rows = {name: rows for (name, rows), is_one in zip(too_far.items(), is_open, strict=True) if is_one}

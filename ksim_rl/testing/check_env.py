@@ -8,6 +8,7 @@ from torchrl.envs import EnvBase
 
 from ksim_rl.checks import unknown_name
 from ksim_rl.testing.check_physics import check_c_engine
+from ksim_rl.testing.check_python import check_python
 from ksim_rl.testing.check_rows import check_determinism, check_episode_end, check_partial_reset
 from ksim_rl.testing.check_specs import check_actions, check_names, check_torchrl, check_values
 from ksim_rl.testing.check_terms import check_terms
@@ -63,6 +64,7 @@ CHECKS: dict[str, Callable[[EnvBase, int], None]] = {
     "episode_end": check_episode_end,
     "syncs": check_syncs,
     "memory": check_memory,
+    "python": check_python,
     "c_engine": check_c_engine,
 }
 
@@ -74,7 +76,8 @@ def check_env(env: EnvBase, *, num_steps: int = 4, skip: Collection[str] = ()) -
     their specs), `terms` (of a `ManagerBasedRlEnv`: they write only what is their own), `torchrl` (`check_env_specs`,
     which looks at neither), `actions` (wrong shapes and dtypes are refused), `determinism` (by seed, bit for bit, on
     the CPU), `partial_reset` (other rows stay bit-identical), `episode_end` (the true terminal observation), `syncs`
-    (none), `memory` (no growth) and `c_engine` (20 substeps of a `ManagerBasedRlEnv` against MuJoCo's). They look at
+    (none), `memory` (no growth), `python` (the same in each step, where steps are recorded) and `c_engine` (20
+    substeps of a `ManagerBasedRlEnv` against MuJoCo's). They look at
     rollouts of `num_steps`; `skip` leaves some out. Raises one AssertionError with all findings, each with what to
     change.
     """
