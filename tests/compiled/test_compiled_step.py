@@ -2,6 +2,7 @@
 
 import itertools
 
+import numpy as np
 import pytest
 import torch
 
@@ -9,7 +10,9 @@ from ksim_rl import envs
 from ksim_rl.collectors import CollectorCfg, RolloutCollector
 from ksim_rl.compiled import compiled_step
 from ksim_rl.compiled.compiled_step import CompiledStep
+from ksim_rl.envs.term import RewardTerm
 from tests.absent_models import skipped_without_models
+from tests.envs.probe_env import puck_cfg
 from tests.trainers.target_env import TargetEnv
 
 QUICK = ("cartpole_swingup", "pendulum_swingup")
@@ -89,6 +92,76 @@ def test_a_step_that_gives_something_else_is_not_used(monkeypatch):
     with pytest.warns(RuntimeWarning, match="NOT COMPILED"):
         collector.collect()
     collector.collect()
+
+
+def give_otherwise(monkeypatch, change):
+    """Let `change` have the results of each compiled step, as if its kernels were wrong."""
+    run = CompiledStep._run
+
+    def changed(step):
+        next_E = run(step)
+        change(next_E["next"])
+        return next_E
+
+    monkeypatch.setattr(CompiledStep, "_run", changed)
+
+
+def test_a_number_in_one_row_is_enough(monkeypatch):
+    def change(next_E):
+        next_E["obs", "position"][5, 1] *= 1.0 + 3e-4
+
+    give_otherwise(monkeypatch, change)
+    with pytest.raises(RuntimeError, match=r"another next\.obs\.position in 1 rows than the env"):
+        CompiledStep(*made())
+
+
+def test_rows_that_end_are_compared_as_well(monkeypatch):
+    def change(next_E):
+        next_E["obs", "position"][next_E["done"][:, 0]] += 1.0
+
+    give_otherwise(monkeypatch, change)
+    CompiledStep(*made())
+    with pytest.raises(RuntimeError, match=r"another next\.obs\.position in 5 rows than the env"):
+        CompiledStep(*made(), nan_ends_rows=True)
+
+
+class Sensitive(RewardTerm):
+    """Of the first row no more than the last places of its position, of the others the position, m."""
+
+    def __call__(self, view):
+        position_E = view.joint_pos_EL[:, 0]
+        row_E = torch.arange(view.num_envs, device=view.device)
+        return torch.where(row_E == 0, torch.sin(1e7 * position_E), position_E)
+
+
+@pytest.mark.parametrize(("row", "is_used"), [(0, True), (1, False)])
+def test_a_row_may_differ_as_much_as_rounding_can_change_it(row, is_used, monkeypatch):
+    def change(next_E):
+        next_E["reward"][row] += 1e-3
+
+    give_otherwise(monkeypatch, change)
+    env = envs.build(puck_cfg(num_envs=4, rewards={"sensitive": Sensitive()}, limit=None))
+    root_E = env.step_and_maybe_reset(env.rand_action(env.reset()))[1].clone()
+    given = root_E, env.rand_action(root_E.copy())
+    if is_used:
+        CompiledStep(env, *given)
+        return
+    with pytest.raises(RuntimeError, match=r"another next\.reward in 1 rows than the env"):
+        CompiledStep(env, *given)
+
+
+@pytest.mark.parametrize("read", [torch.Tensor.numpy, torch.Tensor.tolist, np.asarray])
+def test_numbers_that_python_takes_out_of_a_tensor_are_refused(read):
+    env, root_E, tensordict = made()
+    step = env.step_and_maybe_reset
+
+    def reading(td):
+        read(td["action"])
+        return step(td)
+
+    env.__dict__["step_and_maybe_reset"] = reading
+    with pytest.raises(RuntimeError, match=r"on the host, at test_compiled_step\.py:\d+"):
+        CompiledStep(env, root_E, tensordict)
 
 
 def test_a_term_that_reads_the_device_on_the_host_is_named():
