@@ -133,6 +133,8 @@ class World(views.DataViews):
             with warp_scope(self.device):
                 self._nan_guard = NanGuard(self.sim.nan_guard, self.mj_model, self.warp_data_E, self._fields)
         self.gravity_EL = gravity_EL
+        # Ours only launch kernels; those that a program sets later may do anything.
+        self._own_callbacks = dict(vars(self.warp_model.callback))
         super().__init__(self.warp_data_E)
         if self.device.type == "cuda":
             self._load_kernels()
@@ -396,7 +398,7 @@ class World(views.DataViews):
         Callbacks are Python, and set at any time: a graph of before would leave them out, and one with them would never
         run their Python again.
         """
-        calls_back = any(vars(self.warp_model.callback).values())
+        calls_back = vars(self.warp_model.callback) != self._own_callbacks
         self._graphs.run(key, launches, live=calls_back)
 
     def _launch_substeps(self, n: int, sensors: str) -> None:

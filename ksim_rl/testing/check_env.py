@@ -77,8 +77,8 @@ def check_env(env: EnvBase, *, num_steps: int = 4, skip: Collection[str] = ()) -
     which looks at neither), `actions` (wrong shapes and dtypes are refused), `determinism` (by seed, bit for bit, on
     the CPU), `partial_reset` (other rows stay bit-identical), `episode_end` (the true terminal observation), `syncs`
     (none), `memory` (no growth), `python` (the same in each step, where steps are recorded) and `c_engine` (20
-    substeps of a `ManagerBasedRlEnv` against MuJoCo's). They look at
-    rollouts of `num_steps`; `skip` leaves some out. Raises one AssertionError with all findings, each with what to
+    substeps of a `ManagerBasedRlEnv` against MuJoCo's). They look at rollouts of `num_steps`; `skip` leaves some out.
+    Raises one AssertionError with all findings, each with what to
     change.
     """
     for name in skip:

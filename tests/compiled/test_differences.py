@@ -37,7 +37,9 @@ def test_what_moved_inputs_do_to_a_row_explains_an_error_in_this_row_alone():
     found = with_row(with_row(true, 7, 1, 2.0), 8, 1, 2.0)
     assert found_in(found, true, with_row(true, 7, 1, 2.0)) == {"x": 1}
     assert found_in(found, true, with_row(with_row(true, 7, 1, 2.0), 8, 1, 2.0)) == {}
-    assert found_in(found, true, with_row(with_row(true, 7, 1, 2.0), 8, 1, float(true[8, 1]) + 1e-3)) == {"x": 1}
+    assert found_in(found, true, with_row(with_row(true, 7, 1, 2.0), 8, 1, float(true[8, 1]) + 1e-3)) == {
+        "x": 1
+    }
 
 
 def test_each_move_is_another_one():

@@ -30,6 +30,60 @@ def test_a_call_in_a_live_block_leaves_the_world_bit_identical():
     assert torch.equal(graphed.sensordata_EL, live.sensordata_EL)
 
 
+def test_what_is_made_in_a_block_of_eager_is_so_for_ever():
+    with capture.eagerly():
+        assert capture.runs_eagerly()
+        eager = Captured(lambda: None, device="cpu")
+        with capture.eagerly(False):
+            assert capture.runs_eagerly()
+    assert eager.is_eager and not Captured(lambda: None, device="cpu").is_eager
+    assert not capture.runs_eagerly()
+
+
+class FakeGraph:
+    """Counts replays."""
+
+    def __init__(self):
+        self.replays = 0
+
+    def replay(self):
+        self.replays += 1
+
+
+def graphed(monkeypatch, body):
+    """Return a `Captured` that records fake graphs, on a machine without CUDA."""
+    captured = Captured(body, device="cpu", warmup=2)
+    captured._eager_for_ever, captured._stream = False, object()
+    monkeypatch.setattr(captured, "_run_eagerly", lambda _stream: body())
+    monkeypatch.setattr(captured, "_record", lambda _stream: (body(), (FakeGraph(), None))[1])
+    return captured
+
+
+def test_a_graph_that_is_forgotten_is_recorded_after_one_eager_call(monkeypatch):
+    calls = []
+    captured = graphed(monkeypatch, lambda: calls.append(1))
+    for _ in range(5):
+        captured()
+    assert captured.ready and len(calls) == 3
+    captured.forget()
+    assert not captured.ready
+    for _ in range(4):
+        captured()
+    assert captured.ready and len(calls) == 5
+
+
+def test_while_it_is_eager_the_graph_waits(monkeypatch):
+    calls = []
+    captured = graphed(monkeypatch, lambda: calls.append(1))
+    for _ in range(3):
+        captured()
+    captured.is_eager = True
+    captured()
+    captured.is_eager = False
+    captured()
+    assert len(calls) == 4 and captured._graph.replays == 2
+
+
 def test_collection_is_paused_and_comes_back():
     assert gc.isenabled()
     with capture.no_collection():

@@ -55,6 +55,35 @@ def test_a_warm_up_replays_what_exists_and_records_nothing():
     assert (new.issued, new.ran) == (3, 3.0), "recorded only now"
 
 
+def test_what_is_live_is_issued_each_time():
+    graphs, counter = WarpGraphs(CPU), Counter()
+    graphs.run("key", counter)
+    for _ in range(2):
+        graphs.run("key", counter, live=True)
+    graphs.run("key", counter)
+    assert (counter.issued, counter.ran) == (3, 4.0)
+
+
+def test_a_callback_that_is_set_later_is_called_in_each_substep():
+    world = standing_quadrupeds()
+    world.step(2)
+    calls = []
+    world.warp_model.callback.control = lambda m, d: calls.append(1)
+    for _ in range(3):
+        world.step(2)
+    assert len(calls) == 6
+    world.warp_model.callback.control = None
+    world.step(2)
+    assert len(calls) == 6
+
+
+def test_without_a_callback_of_a_program_substeps_are_replayed(monkeypatch):
+    world = standing_quadrupeds()
+    world.step(2)
+    monkeypatch.setattr(world, "_launch_substeps", lambda *_: pytest.fail("issued once more"))
+    world.step(2)
+
+
 @pytest.mark.parametrize("capturing", [True, False])
 def test_a_capture_launches_live_what_has_a_graph(capturing):
     graphs, known = WarpGraphs(CPU), Counter()

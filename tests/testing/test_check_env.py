@@ -1,11 +1,16 @@
+from typing import ClassVar
+
 import pytest
 import torch
 from torchrl.envs import TransformedEnv
 
 from ksim_rl.envs import MaskedTransformedEnv
 from ksim_rl.envs.masked_reset import MaskedReset
+from ksim_rl.envs.term import RewardTerm
 from ksim_rl.testing import CounterEnv, check_env
+from ksim_rl.testing.check_env import CHECKS
 from ksim_rl.transforms import ObservationScale
+from tests.envs.probe_env import puck_env
 
 
 class Masked(MaskedReset, CounterEnv):
@@ -138,6 +143,22 @@ def test_a_good_env_passes():
 def test_what_is_wrong_is_named(env, message):
     with pytest.raises(AssertionError, match=message):
         check_env(env(), num_steps=6)
+
+
+class Counting(RewardTerm):
+    """Counts its own calls."""
+
+    calls: ClassVar[list[int]] = []
+
+    def __call__(self, view):
+        self.calls.append(1)
+        return torch.zeros(view.num_envs)
+
+
+def test_python_that_changes_is_named_where_steps_are_recorded():
+    env = puck_env(rewards={"counting": Counting()})
+    with pytest.raises(AssertionError, match=r"\[python\] rewards\.counting: Counting\.calls\[\d+\]"):
+        check_env(env, skip=[name for name in CHECKS if name != "python"])
 
 
 def test_all_findings_come_at_once():

@@ -55,6 +55,16 @@ def test_only_the_newest_stay_and_no_other_file_is_left(tmp_path):
     assert sorted(entry.name for entry in (tmp_path / "00000020").iterdir()) == [MANIFEST, TENSORS]
 
 
+def test_the_newest_one_that_is_trusted_stays_as_well(tmp_path):
+    for iteration, trusted in ((5, 5), (10, 5), (15, 12), (20, 12), (25, 12)):
+        checkpoint.save(tmp_path, STATE, iteration=iteration, config=CONFIG, keep=2, trusted=trusted)
+    assert [entry.name for entry in checkpoint.saved(tmp_path)] == ["00000010", "00000020", "00000025"]
+    checkpoint.save(tmp_path, STATE, iteration=30, config=CONFIG, keep=2, trusted=30)
+    assert [entry.name for entry in checkpoint.saved(tmp_path)] == ["00000025", "00000030"]
+    assert checkpoint.newest_until(tmp_path, 29) == tmp_path / "00000025"
+    assert checkpoint.newest_until(tmp_path, 24) is None
+
+
 def test_saving_the_same_iteration_again_keeps_both_until_one_is_old(tmp_path):
     first = checkpoint.save(tmp_path, STATE, iteration=5, config=CONFIG)
     second = checkpoint.save(tmp_path, STATE, iteration=5, config=CONFIG)
