@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -10,6 +11,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from ksim_rl.compiled.python_states import PLAIN
+from ksim_rl.compiled.python_values import Listed
+from ksim_rl.compiled.watched_graphs import WatchedGraphs
 from ksim_rl.data import DatasetBuffer, DatasetCfg, SequenceSampler
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
@@ -21,6 +25,12 @@ from ksim_rl.objectives import NonFiniteStepsError, StepGuard, anneal_learning_r
 def in_columns(steps: Sequence[Mapping[str, Num[Tensor, ""]]]) -> dict[str, Num[Tensor, " steps"]]:
     """Return what steps measured, each quantity as a tensor [steps]."""
     return {name: torch.stack([step[name].detach() for step in steps]) for name in steps[0]}
+
+
+def public_objects(owner: Any) -> dict[str, Any]:
+    """Return the attributes of an object that are no numbers or texts, and that its name does not keep private."""
+    named = vars(owner).items()
+    return {name: value for name, value in named if name[0] != "_" and not isinstance(value, PLAIN)}
 
 
 class StepMeans(dict[str, Tensor]):
@@ -46,9 +56,11 @@ class RolloutUpdate(ABC):
     """What the updates have in common: each is one piece of work on a rollout, without a host sync.
 
     On CUDA the first updates run eagerly and the next is captured. So each rollout must be the same memory, which is
-    what `RolloutCollector` gives. The `networks` are all that learn, by the names that a checkpoint gives them; so many
-    as `max_skipped_steps` in a row that are not finite, which `guard` counts, end the run. The env's own keys of reward
-    and flags are `signals`; see `signal_keys`. The `logged` are names of logged means, by the names that steps measure.
+    what `RolloutCollector` gives. Where somebody changes an attribute of a loss, a network or an optimizer from
+    outside, the next one is captured anew. The `networks` are all that learn, by the names that a checkpoint gives
+    them; so many as `max_skipped_steps` in a row that are not finite, which `guard` counts, end the run. The env's own
+    keys of reward and flags are `signals`; see `signal_keys`. The `logged` are names of logged means, by the names that
+    steps measure.
     """
 
     def __init__(
@@ -67,11 +79,15 @@ class RolloutUpdate(ABC):
         self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
         self._run = Captured(self._update, device=self.device)
         self._work = [self._run]  # all that is captured
+        # Plain numbers of an update are its counters, which change with each call.
+        parts = {"update": Listed(self, partial(public_objects, self))}
+        self._watched = WatchedGraphs(self._work, parts, self.device)
 
     def __call__(self, rollout_ET: TensorDictBase) -> None:
         """Learn from a rollout `["E","T"]` of the dataset's size."""
         self._rollout_ET = rollout_ET
-        self._run()
+        with self._watched.watched():
+            self._run()
 
     def warm_up(self, rollout_ET: TensorDictBase) -> None:
         """Compile and capture what updates run, on a made-up rollout, which leaves no trace.
@@ -81,7 +97,8 @@ class RolloutUpdate(ABC):
         """
         kept = state_tree.join(*state_tree.split(self.state_dict()))
         self._rollout_ET = rollout_ET
-        with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
+        devices = [self.device] if self.device.type == "cuda" else []
+        with torch.random.fork_rng(devices), self._watched.watched():
             for work in self._work:
                 for _ in range(work.warmup + 1):
                     work()

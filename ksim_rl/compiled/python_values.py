@@ -119,6 +119,7 @@ class _Search:
             ((random.Random, np.random.Generator, np.random.RandomState), self._at_random_source),
             (weakref.ref, self._at_reference),
             (nn.Module, self._at_network_module),
+            (torch.optim.Optimizer, self._at_optimizer),
         )
         for kind, look in looks:
             # Not `isinstance`, which would ask proxies that warn when they are looked at.
@@ -232,6 +233,9 @@ class _Search:
             entries = vars(module)[part]
             self._hold(entries, path, lambda entries=entries: entries, _attribute, table=entries)
         self._ahead.append((type(module), path))
+
+    def _at_optimizer(self, optimizer: torch.optim.Optimizer, path: str) -> None:
+        self._ahead.append((optimizer.param_groups, f"{path}.param_groups"))
 
     def _at_class(self, cls: type, path: str) -> None:
         if not self._reads_code:

@@ -78,8 +78,7 @@ def check_env(env: EnvBase, *, num_steps: int = 4, skip: Collection[str] = ()) -
     the CPU), `partial_reset` (other rows stay bit-identical), `episode_end` (the true terminal observation), `syncs`
     (none), `memory` (no growth), `python` (the same in each step, where steps are recorded) and `c_engine` (20
     substeps of a `ManagerBasedRlEnv` against MuJoCo's). They look at rollouts of `num_steps`; `skip` leaves some out.
-    Raises one AssertionError with all findings, each with what to
-    change.
+    Raises one AssertionError with all findings, each with what to change.
     """
     for name in skip:
         if name not in CHECKS:

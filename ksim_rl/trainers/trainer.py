@@ -44,7 +44,8 @@ class Hook:
 
     When a hook is called, the run is settled: what the device was asked for is done, `trainer.metrics` are those of the
     present iteration, and the hook may change whatever it likes. CUDA graphs keep the numbers that they were captured
-    with, so a change reaches them only through the tensors that they read: `copy_` into those. Example:
+    with, and are captured anew where these have changed; what changes often, such as a learning rate, reaches them in
+    no time through the tensors that they read: `copy_` into those. Example:
 
         class Annealing(Hook):
             interval = 10

@@ -3,9 +3,12 @@
 import pytest
 import torch
 
-from ksim_rl.algorithms.gradient_steps import RolloutUpdate, StepMeans
+from ksim_rl.algorithms.gradient_steps import RolloutUpdate, StepMeans, public_objects
+from ksim_rl.compiled.python_values import Listed
+from ksim_rl.compiled.python_watch import PythonWatch
 from ksim_rl.objectives import NonFiniteStepsError
 from tests.algorithms.imitation_problems import make_amp, make_distillation
+from tests.algorithms.test_warm_up import PROBLEMS
 from tests.trainers.target_env import make_trainer
 
 
@@ -60,3 +63,20 @@ def test_amp_and_distillation_anneal_the_rate_of_the_policy_too(make):
     assert trainer.metrics["update/learning_rate"] == 0.0
     if make is make_amp:  # whose discriminator has a rate of its own
         assert trainer.update.optimizer.param_groups[0]["lr"].item() == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_an_iteration_changes_no_python_value_that_graphs_are_recorded_from(name):
+    trainer = PROBLEMS[name]()
+    update, policy = trainer.update, trainer.collector.policy
+    parts = {"update": Listed(update, lambda: public_objects(update)), "policy": policy}
+    watch = PythonWatch(torch.device("cpu"))
+    for _ in range(2):
+        trainer.iterate()
+    watch.look(parts)
+    for _ in range(2):
+        trainer.iterate()
+    trainer.settle()
+    assert list(map(str, watch.changes())) == []
+    (next(iter(update.networks.values()))).train(False)
+    assert any("training was True and is False" in str(change) for change in watch.changes())

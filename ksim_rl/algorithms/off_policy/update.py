@@ -114,7 +114,8 @@ class OffPolicyUpdate(RolloutUpdate):
         self._rollout_ET = rollout_ET
         self.steps_made += self.data.num_steps
         learns = self.steps_made >= self.data.learning_starts
-        (self._run if learns else self._store_only)()
+        with self._watched.watched():
+            (self._run if learns else self._store_only)()
         self.behavior.random.fill_(not learns)
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:

@@ -1,0 +1,55 @@
+"""Records CUDA graphs anew where Python values have changed that they were recorded from."""
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+
+from ksim_rl.compiled.python_watch import PythonWatch, listed
+from ksim_rl.device.capture import Captured
+
+MOST_RECORDINGS = 4
+"""Recordings after which Python runs at each call: what changes as often as that would be recorded for ever."""
+
+
+class WatchedGraphs:
+    """Keeps graphs of the same work true to the Python values of their `parts`, by name: what is replayed runs none.
+
+    `watched` is around each call of one of the graphs, a list that may grow.
+    """
+
+    def __init__(self, graphs: Sequence[Captured], parts: Mapping[str, Any], device: torch.device) -> None:
+        self._graphs, self._parts = graphs, parts
+        self._watch = PythonWatch(device)
+        self._num_ready = self._times = 0
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """Forget the graphs before a call if something has changed, and say so."""
+        if self._num_ready:
+            changes = self._watch.changes()
+            if changes:
+                self._forget(listed(changes))
+        yield
+        num_ready = sum(graph.ready for graph in self._graphs)
+        if num_ready != self._num_ready:
+            # What a call does in Python, it has done now; from here on each change is somebody else's.
+            self._watch.look(self._parts)
+            self._num_ready = num_ready
+
+    def _forget(self, changes: str) -> None:
+        self._times += 1
+        self._num_ready = 0
+        runs_python = self._times >= MOST_RECORDINGS
+        what = "Python runs from now on, which is SLOWER" if runs_python else "they are recorded anew"
+        warnings.warn(
+            f"{changes} since CUDA graphs were recorded: {what}. What changes often belongs in a tensor that is "
+            "written in place",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+        for graph in self._graphs:
+            graph.forget()
+            graph.is_eager |= runs_python
