@@ -43,16 +43,8 @@ class CompiledStep:
         nan_ends_rows: bool = False,
         by_term: Callable[[], Mapping[str, Shaped[Tensor, "*?shape"]]] = dict,
     ) -> None:
-        root_keys = list(root_E.keys(True, True))
-        self._changing = [key for key in tensordict.keys(True, True) if key not in root_keys]
-        # Dense and in memory of their own, as later ones are copied here.
-        self._given = [
-            tensordict.get(key).clone(memory_format=torch.contiguous_format) for key in self._changing
-        ]
-        tensordict = tensordict.copy()
-        for key, leaf in zip(self._changing, self._given, strict=True):
-            tensordict.set(key, leaf)
         self._check = StepCheck(env, root_E, tensordict, by_term)
+        self._given = self._check.given
         with self._check.left_alone():
             with recorded() as recorder:
                 self.env_state_E = self._check.own_step()
@@ -72,7 +64,7 @@ class CompiledStep:
 
         The leaves lie in the same memory each time.
         """
-        copy_rows(self._given, [tensordict.get(key) for key in self._changing])
+        copy_rows(list(self._given.values()), [tensordict.get(key) for key in self._given])
         return self._run()
 
     def differences(self) -> list[str]:
@@ -89,8 +81,7 @@ class CompiledStep:
     @contextmanager
     def _rows_ending(self, action_key: NestedKey) -> Iterator[None]:
         """Let some rows end their episodes in this block, but never all of them."""
-        keys = self._changing
-        action = self._given[keys.index(action_key)] if action_key in keys else None
+        action = self._given.get(action_key)
         if action is None or not action.is_floating_point():
             yield
             return

@@ -26,14 +26,9 @@ class GraphStep:
         tensordict: TensorDictBase,
         by_term: Callable[[], Mapping[str, Shaped[Tensor, "*?shape"]]] = dict,
     ) -> None:
-        root_keys = list(root_E.keys(True, True))
-        held = tensordict.copy()
-        for key in tensordict.keys(True, True):
-            if key not in root_keys:
-                held.set(key, tensordict.get(key).clone())
-        self._check = StepCheck(env, root_E, held, by_term)
+        self._check = StepCheck(env, root_E, tensordict, by_term)
         self._run = Captured(self._step, device=env.device or torch.device("cpu"))
-        self._env_state_E: TensorDictBase = held
+        self._env_state_E = tensordict
         with self._check.left_alone():
             for _ in range(self._run.warmup + 1):
                 self._run()

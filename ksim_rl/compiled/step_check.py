@@ -37,8 +37,8 @@ class StepCheck:
     """Makes the env's own step in the memory that a recorded one uses, and compares the two.
 
     `root_E` is the EnvState before a step, in whose memory the one after it is written; `tensordict` is what a policy
-    made of it. `by_term` gives tensors that each step writes in place, by the term that they are of: it is named where
-    they differ.
+    made of it, whose own leaves are copied to `given`, where each step reads them. `by_term` gives tensors that each
+    step writes in place, by the term that they are of: it is named where they differ.
     """
 
     def __init__(
@@ -48,9 +48,15 @@ class StepCheck:
         tensordict: TensorDictBase,
         by_term: Callable[[], Mapping[str, Shaped[Tensor, "*?shape"]]] = dict,
     ) -> None:
-        self._env, self._root_E, self._tensordict, self._by_term = env, root_E, tensordict, by_term
+        self._env, self._root_E, self._by_term = env, root_E, by_term
         self._root_keys = list(root_E.keys(True, True))
-        self._given_keys = [key for key in tensordict.keys(True, True) if key not in self._root_keys]
+        self._tensordict = tensordict.copy()
+        self.given: dict[NestedKey, Tensor] = {}
+        for key in tensordict.keys(True, True):
+            if key not in self._root_keys:
+                # Dense and in memory of their own, as later ones are copied here.
+                self.given[key] = tensordict.get(key).clone(memory_format=torch.contiguous_format)
+                self._tensordict.set(key, self.given[key])
 
     def own_step(self) -> TensorDictBase:
         """Make the env's own step, write the next root, and return the EnvState."""
@@ -99,7 +105,7 @@ class StepCheck:
         return torch.random.fork_rng([device] if device is not None and device.type == "cuda" else [])
 
     def _state(self) -> _State:
-        given = {key: self._tensordict.get(key).clone() for key in self._given_keys}
+        given = {key: value.clone() for key, value in self.given.items()}
         return _State(self._env.state_dict(), self._root_E.clone(), given)
 
     def _return_to(self, start: _State, change: Callable[[Any], Any] = _unchanged) -> None:
@@ -108,7 +114,7 @@ class StepCheck:
         for key in self._root_keys:
             self._root_E.get(key).copy_(change(start.root_E.get(key)))
         for key, value in start.given.items():
-            self._tensordict.get(key).copy_(change(value))
+            self.given[key].copy_(change(value))
 
     def _results(self, env_state_E: TensorDictBase) -> Results:
         """Copy all that a step leads to: what terms gave, the EnvState, the next root, and the state of the env."""
