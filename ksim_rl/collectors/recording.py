@@ -36,12 +36,13 @@ class Recording:
     def __init__(self, env: EnvBase, policy: Policy, *, compiles: bool, graph: Captured) -> None:
         self._env, self._compiles, self._graph = env, compiles, graph
         self._has_graph = graph.device.type == "cuda" and not graph.is_eager
-        # On CUDA the graph of a rollout holds what the policy does in Python, too.
-        self._python = RecordedPython(env, {"policy": policy} if self._has_graph else {})
         inner = part(env, ManagerBasedRlEnv)
         self._by_term = dict if inner is None else inner.values_by_term
         # Other envs cannot be put back to where they were before a comparison.
         self._can_return = part(env, SimulatedWorld) is not None
+        # On CUDA the graph of a rollout holds what the policy does in Python, too.
+        others = {"policy": policy} if self._has_graph else {}
+        self._python = RecordedPython(env, others, is_compared=compiles or self._can_return)
         self.compiled_step: CompiledStep | None = None
         self._graph_step: GraphStep | None = None
         self._times, self._waiting = 0, 0

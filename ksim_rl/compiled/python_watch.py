@@ -6,6 +6,7 @@ from operator import is_
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from ksim_rl.compiled.python_states import PLAIN
 from ksim_rl.compiled.python_values import ABSENT, Held, held_by
@@ -26,6 +27,11 @@ class Change:
     key: Any
     before: Any
     now: Any
+
+    @property
+    def is_of_tensors(self) -> bool:
+        """Whether a tensor is in the place of another one."""
+        return isinstance(self.before, Tensor) and isinstance(self.now, Tensor)
 
     def __str__(self) -> str:
         """Name it, with both values where they can be told apart by what they look like."""

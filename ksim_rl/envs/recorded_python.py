@@ -43,13 +43,19 @@ class RecordedPython:
     step shows: `calling` is around each of the first ones. After those, `changes` says what somebody has changed from
     outside, such as an attribute of a term, or a transform more; then the step has to be recorded anew.
 
-    `others` are objects whose Python becomes part of the recording as well, by name: a policy.
+    `others` are objects whose Python becomes part of the recording as well, by name: a policy. A step that puts a
+    tensor in the place of another one may still be recorded, if it writes it before it reads it. Where the numbers of
+    the recording are compared with those of Python, `is_compared`, that is left to them; else it is refused as well.
     """
 
-    def __init__(self, env: EnvBase, others: Mapping[str, Any] | None = None) -> None:
-        self._env, self._others = env, dict(others or {})
+    def __init__(
+        self, env: EnvBase, others: Mapping[str, Any] | None = None, *, is_compared: bool = False
+    ) -> None:
+        self._env, self._others, self._is_compared = env, dict(others or {}), is_compared
         self._watch = PythonWatch(env.device or torch.device("cpu"))
         self._calls = 0
+        # Places in which each step puts another tensor.
+        self._replaced: set[tuple[int, Any]] = set()
 
     @property
     def is_known(self) -> bool:
@@ -67,7 +73,10 @@ class RecordedPython:
         else:
             with host_calls(self._parts()) as calls:
                 yield
-            self._refuse(calls, self._watch.changes())
+            changes = self._watch.changes()
+            if self._is_compared:
+                self._replaced = {_place(change) for change in changes if change.is_of_tensors}
+            self._refuse(calls, [change for change in changes if _place(change) not in self._replaced])
         self._calls += 1
         self._watch.look(self._parts())
 
@@ -77,7 +86,7 @@ class RecordedPython:
 
     def changes(self) -> list[Change]:
         """Return what has changed since the last `look`; a FrozenPythonError if it cannot have an effect any more."""
-        found = self._watch.changes()
+        found = [change for change in self._watch.changes() if _place(change) not in self._replaced]
         for change in found:
             instead = why_not(change)
             if instead is not None:
@@ -100,6 +109,10 @@ class RecordedPython:
                 f"{listed(changes)} after one step more: it would be frozen, since the Python of a step runs while "
                 f"that is recorded, and no more. {KEEP}; {EAGER}"
             )
+
+
+def _place(change: Change) -> tuple[int, Any]:
+    return id(change.owner), change.key
 
 
 class FollowedGraph:

@@ -13,10 +13,11 @@ def check_python(env: EnvBase, num_steps: int) -> None:
     An env on the CPU without a world of ours may do otherwise, since nothing of it is recorded.
     """
     on_cpu = env.device is None or env.device.type == "cpu"
-    if on_cpu and part(env, SimulatedWorld) is None:
+    is_compared = part(env, SimulatedWorld) is not None
+    if on_cpu and not is_compared:
         return
     replays = Replays(env, num_steps)
-    python = RecordedPython(env)
+    python = RecordedPython(env, is_compared=is_compared)
     root = replays.start()
     index = 0
     try:

@@ -71,6 +71,29 @@ def test_what_the_second_step_changes_is_refused():
         known(env)
 
 
+class Keeping(CounterEnv):
+    """Keeps a tensor of each step, in the place of the last one."""
+
+    def _step(self, tensordict):
+        self.kept = tensordict["action"] + 1.0
+        return super()._step(tensordict)
+
+
+def test_a_tensor_in_the_place_of_another_is_left_to_a_comparison_or_refused():
+    with pytest.raises(FrozenPythonError, match=r"Keeping\.kept is another object"):
+        known(Keeping())
+    env = Keeping()
+    python, step = RecordedPython(env, is_compared=True), stepping(env)
+    for _ in range(4):
+        with python.calling():
+            step()
+        assert not python.is_known or python.changes() == []
+    env.kept = None
+    assert changes(python) == []
+    env.other = None
+    assert changes(python) == ["Keeping.other was (absent) and is None"]
+
+
 def test_after_forgetting_two_steps_are_looked_at_again():
     python = known(puck_env())
     python.forget()
