@@ -12,6 +12,7 @@ from ksim_rl.compiled.graph_step import GraphStep
 from ksim_rl.compiled.python_watch import Change, listed
 from ksim_rl.compiled.step_check import StepCheck
 from ksim_rl.device.capture import Captured
+from ksim_rl.device.streams import waiting_allowed
 from ksim_rl.envs.contract import SimulatedWorld, part
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.recorded_python import EAGER, KEEP, FrozenPythonError, RecordedPython
@@ -95,7 +96,9 @@ class Recording:
             self._waiting -= 1
             self._graph.is_eager = self._waiting > 0
         elif self._is_recorded:
-            self._check(root_E, act)
+            # It happens so seldom that it may wait for the device.
+            with waiting_allowed(self._graph.device):
+                self._check(root_E, act)
             self._rollouts += 1
         return changes
 

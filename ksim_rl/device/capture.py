@@ -150,6 +150,8 @@ class Captured:
 
     def forget(self) -> None:
         """Drop the graph: the next call is eager, as the body may need other kernels now, and the one after records."""
+        if self._graph is not None and self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)  # it may still run
         self._graph = self._warp_graph = None
         self._calls = min(self._calls, self.warmup - 1)
 

@@ -106,6 +106,20 @@ def warp_scope(device: torch.device) -> Iterator[None]:
 
 
 @contextmanager
+def waiting_allowed(device: torch.device) -> Iterator[None]:
+    """Let the host wait for a device in this block, where torch has been asked to make each wait an error."""
+    if device.type != "cuda":
+        yield
+        return
+    mode = torch.cuda.get_sync_debug_mode()
+    torch.cuda.set_sync_debug_mode("default")
+    try:
+        yield
+    finally:
+        torch.cuda.set_sync_debug_mode(mode)
+
+
+@contextmanager
 def beside(aside: wp.Stream | None, *launches: Callable[[], None]) -> Iterator[None]:
     """Let a GPU do what `launches` launch together with the work of this block; without a stream, after it.
 
