@@ -1,10 +1,12 @@
-"""This module finds the parts of an env that draw themselves into its pictures."""
+"""The parts of an env that draw themselves into its pictures."""
 
 import re
 from collections.abc import Collection, Mapping
 
+from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import CommandTerm, RewardTerm
+from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors import SensorTracker
 
 Drawing = CommandTerm | RewardTerm | SensorTracker
@@ -28,3 +30,20 @@ def drawings(
             if wanted and type(part).draw_debug is not base.draw_debug:
                 found[f"{room}/{name}"] = part
     return found
+
+
+def draw(
+    driver: EnvDriver,
+    parts: Mapping[str, Drawing],
+    visualizer: DebugVisualizer,
+    *,
+    env_index: int,
+    drawn: Collection[str] | None,
+) -> None:
+    """Let parts draw one env, all of them or those of the names `drawn`; a ValueError names one that moves it."""
+    with driver.guard.watching(past_torch=False):
+        for name, part in parts.items():
+            if drawn is not None and name not in drawn:
+                continue
+            with driver.scope(name, part=part):
+                part.draw_debug(driver.view, visualizer, env_index)

@@ -20,7 +20,7 @@ from ksim_rl import dims
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.device.streams import checked_device
 from ksim_rl.envs.contract import DifficultyLevels, EpisodeClock, EpisodeSums, Pictures, SimulatedWorld
-from ksim_rl.envs.drawing import Drawing, drawings
+from ksim_rl.envs.drawing import Drawing, draw, drawings
 from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.explain import WIDTH, explain
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
@@ -417,12 +417,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         It is the one that the viewer shows, unless `env_index` says otherwise.
         """
         shown = self.cfg.viewer.env_index if env_index is None else env_index
-        # Whoever draws must not move what it draws.
-        with self.driver.guard.watching(past_torch=False):
-            for scope, part in self.setup_manager_visualizers().items():
-                if drawn is None or scope in drawn:
-                    with self.driver.scope(scope, part=part):
-                        part.draw_debug(self.view, visualizer, shown)
+        draw(self.driver, self.setup_manager_visualizers(), visualizer, env_index=shown, drawn=drawn)
 
     def render(self) -> np.ndarray | None:
         """Return a picture of the current state, None without a render mode; a RuntimeError tells how to get OpenGL."""

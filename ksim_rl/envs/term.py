@@ -4,7 +4,7 @@ A term's parameters are its fields, so that the same object is written in Python
 no tensors: names are resolved through the view, which remembers them, and what a term must keep from step to step is
 a named buffer of the view (`view.buffer`), which advances once per env step. A term must not branch on tensor values,
 read a tensor on the host or allocate sizes that depend on data: the step that calls it is captured into a CUDA graph.
-It writes nothing that the view gives it: what each kind may write is in `term_rules`, and `term_guard` refuses the rest.
+It writes nothing that the view gives it: `term_rules` says what each kind may write, and `term_guard` refuses the rest.
 """
 
 from abc import ABC, abstractmethod

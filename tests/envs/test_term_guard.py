@@ -328,7 +328,8 @@ def test_a_step_is_not_compiled_with_it(later):
 
 
 def test_a_write_past_torch_is_found_while_a_step_is_compiled(later, monkeypatch):
-    monkeypatch.setattr("tests.envs.test_term_guard.by_operator", by_numpy)
+    # NumPy would not come so far: a recording refuses what reads the device on the host.
+    monkeypatch.setattr("tests.envs.test_term_guard.by_operator", by_warp)
     policy = lambda td: td.set("action", torch.zeros(3, 1))  # noqa: E731
     collector = RolloutCollector(later, policy, rollout_length=2, cfg=CollectorCfg(compile=True))
     later.reset()

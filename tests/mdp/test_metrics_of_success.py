@@ -61,7 +61,7 @@ def test_a_target_is_reached_within_the_tolerance(free_body):
     )
     term = mdp.TargetReached(command="reach", tolerance=0.1, site="imu")
     assert free_body.read(term, "metrics/x").tolist() == [1.0, 1.0, 0.0]
-    free_body.view.commands["reach"] += torch.tensor([0.0, 0.0, 1.0])
+    free_body.view.commands["reach"].add_(torch.tensor([0.0, 0.0, 1.0]))
     assert free_body.read(term, "metrics/x").tolist() == [0.0] * 3
     world = mdp.TargetReached(command="reach", tolerance=0.1, site="imu", frame="world")
     assert free_body.read(world, "metrics/x").tolist() == [1.0, 1.0, 0.0]
