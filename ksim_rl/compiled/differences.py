@@ -19,11 +19,11 @@ ALLOWANCE = 10.0
 MOST_MOVES = 16
 """Moves before an error counts as unexplained; most are explained by the first."""
 
-Results = Mapping[str, Shaped[Tensor, "*?shape"]]
+NamedLeaves = Mapping[str, Shaped[Tensor, "*?shape"]]
 
 
 def differences(
-    found: Results, true: Results, *, num_rows: int, moved: Callable[[int], Results]
+    found: NamedLeaves, true: NamedLeaves, *, num_rows: int, moved: Callable[[int], NamedLeaves]
 ) -> dict[str, int]:
     """Return the names of what differs, with the number of rows, in the order of `true`.
 

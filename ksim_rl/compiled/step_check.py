@@ -12,7 +12,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.compiled.differences import Results, differences
+from ksim_rl.compiled.differences import NamedLeaves, differences
 from ksim_rl.compiled.rounding import Nudging, nudged
 
 # What the env last returned is no state of its own, and a recorded step returns it otherwise; how many contacts of all
@@ -78,7 +78,7 @@ class StepCheck:
             with self._draws_forgotten():
                 found = self._results(recorded_step())
 
-            def moved(number: int) -> Results:
+            def moved(number: int) -> NamedLeaves:
                 generator = torch.Generator().manual_seed(number)
                 self._return_to(start, partial(_nudged, generator=generator))
                 with self._draws_forgotten(), Nudging(generator):
@@ -116,7 +116,7 @@ class StepCheck:
         for key, value in start.given.items():
             self.given[key].copy_(change(value))
 
-    def _results(self, env_state_E: TensorDictBase) -> Results:
+    def _results(self, env_state_E: TensorDictBase) -> NamedLeaves:
         """Copy all that a step leads to: what terms gave, the EnvState, the next root, and the state of the env."""
         results = {name: value.clone() for name, value in self._by_term().items()}
         next_E = env_state_E.get("next")
